@@ -8,7 +8,12 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section, require_params
-from sonar_graph.measurements import Floats, LandmarkDetections, Measurements, require_measurements
+from sonar_graph.measurements import (
+    Floats,
+    LandmarkDetections,
+    Measurements,
+    require_measurements,
+)
 from sonar_graph.models import gravity_direction
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.states import (
@@ -62,9 +67,14 @@ class DeadReckoning:
     Params: ClassVar[type[Section]] = DeadReckoningParams
 
     def __init__(
-        self, calibration: Calibration, odometry: MotionSource, params: DeadReckoningParams | None = None
+        self,
+        calibration: Calibration,
+        odometry: MotionSource,
+        params: DeadReckoningParams | None = None,
     ) -> None:
-        require_source(odometry, calibration, "DeadReckoning(calibration, odometry, params)")
+        require_source(
+            odometry, calibration, "DeadReckoning(calibration, odometry, params)"
+        )
         require_params(params, self.Params, "dead-reckoning")
         self._params = params or DeadReckoningParams()
         self._odometry = odometry
@@ -98,22 +108,39 @@ class DeadReckoning:
         if measurements.detections is not None:
             self._record(measurements.detections)
         end_ns = measurements.end_ns
-        epoch_ns = self._odometry.start_by(end_ns) if self._epoch_ns is None else self._epoch_ns
+        epoch_ns = (
+            self._odometry.start_by(end_ns)
+            if self._epoch_ns is None
+            else self._epoch_ns
+        )
         if epoch_ns is None or end_ns < epoch_ns:
             return None
         for reached_ns in self._odometry.epochs(epoch_ns, end_ns).tolist():
-            motion = self._odometry.motion(epoch_ns, reached_ns, ZERO_BIAS, self._attitude(), known_ns=end_ns)
-            self._felt_from = self._felt_from or self._odometry.velocity_at_imu(epoch_ns)
+            motion = self._odometry.motion(
+                epoch_ns, reached_ns, ZERO_BIAS, self._attitude(), known_ns=end_ns
+            )
+            self._felt_from = self._felt_from or self._odometry.velocity_at_imu(
+                epoch_ns
+            )
             self._pose, self._P = self._after(motion)
             self._felt = motion if self._felt is None else self._felt.then(motion)
             epoch_ns = reached_ns
-            if self._felt.duration_s >= self._params.gravity_interval_s and self._calibration.use_gravity:
-                self._level(self._felt, self._felt_from, self._odometry.velocity_at_imu(epoch_ns))
+            if (
+                self._felt.duration_s >= self._params.gravity_interval_s
+                and self._calibration.use_gravity
+            ):
+                self._level(
+                    self._felt,
+                    self._felt_from,
+                    self._odometry.velocity_at_imu(epoch_ns),
+                )
                 self._felt = self._felt_from = None
         self._odometry.forget_before(epoch_ns)
         self._epoch_ns = epoch_ns
         # the provisional motion to the end of the call leaves the state at the epoch
-        provisional = self._odometry.motion(epoch_ns, end_ns, ZERO_BIAS, self._attitude())
+        provisional = self._odometry.motion(
+            epoch_ns, end_ns, ZERO_BIAS, self._attitude()
+        )
         pose, P = self._after(provisional)
         estimate = Estimate(end_ns, pose, P[:6, :6].copy())
         self._estimates.keep(estimate)
@@ -122,9 +149,16 @@ class DeadReckoning:
     def _record(self, detections: LandmarkDetections) -> None:
         """Record the outcome of each detection: ignored or unsound."""
         ids, _ = detections.most_probable()
-        rows = zip(detections.stamps_ns.tolist(), ids.tolist(), detections.are_sound().tolist(), strict=True)
+        rows = zip(
+            detections.stamps_ns.tolist(),
+            ids.tolist(),
+            detections.are_sound().tolist(),
+            strict=True,
+        )
         for stamp_ns, landmark_id, is_sound in rows:
-            self._journal.record(stamp_ns, landmark_id, Outcome.IGNORED if is_sound else Outcome.UNSOUND)
+            self._journal.record(
+                stamp_ns, landmark_id, Outcome.IGNORED if is_sound else Outcome.UNSOUND
+            )
 
     def trajectory(self) -> Trajectory:
         """The causal estimates; dead reckoning does not revise them."""
@@ -146,7 +180,12 @@ class DeadReckoning:
         """world_R_body at the newest epoch."""
         return self._pose.rotation().matrix()
 
-    def _level(self, felt: PreintegratedMotion, begin: tuple[Floats, float], end: tuple[Floats, float]) -> None:
+    def _level(
+        self,
+        felt: PreintegratedMotion,
+        begin: tuple[Floats, float],
+        end: tuple[Floats, float],
+    ) -> None:
         """Correct by gravity's direction over an interval, with the IMU's velocities and variances at its ends."""
         sigma_m_s = math.sqrt(0.5 * (begin[1] + end[1]))
         found = gravity_direction(felt, begin[0], end[0], sigma_m_s, self._calibration)

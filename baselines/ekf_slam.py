@@ -129,7 +129,9 @@ def euler_rates_from_body(roll: float, pitch: float) -> Mat3:
     cr = math.cos(roll)
     cp = math.cos(pitch)
     tp = math.tan(pitch)
-    return Mat3(Vec3(1.0, sr * tp, cr * tp), Vec3(0.0, cr, -sr), Vec3(0.0, sr / cp, cr / cp))
+    return Mat3(
+        Vec3(1.0, sr * tp, cr * tp), Vec3(0.0, cr, -sr), Vec3(0.0, sr / cp, cr / cp)
+    )
 
 
 # -------------------------------------------------------------------------------- prediction
@@ -170,7 +172,9 @@ def pose_arrays(x: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
 
 
 @compiled
-def pose_estimate(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
+def pose_estimate(
+    x: Floats, P: Floats, motion: Motion
+) -> tuple[Floats, Floats, Floats]:
     """R', X' and the covariance ``T P_vv T^T + C`` of delta, shapes (3, 3), (3,) and (6, 6)."""
     after = pose_after(x, motion)
     R = np.empty((3, 3))
@@ -193,7 +197,8 @@ def predict(x: Floats, P: Floats, motion: Motion) -> None:
     P_vv = mat6(P)
     store6(F @ P_vv @ F.T + G @ mat6(motion.C) @ G.T, P)
     for j in range(POSE, len(x)):
-        P_vm_j = Vec6(Vec3(P[0, j], P[1, j], P[2, j]), Vec3(P[3, j], P[4, j], P[5, j]))  # column j
+        # column j
+        P_vm_j = Vec6(Vec3(P[0, j], P[1, j], P[2, j]), Vec3(P[3, j], P[4, j], P[5, j]))
         store_row6(F @ P_vm_j, P, j, 0)
         for i in range(POSE):
             P[i, j] = P[j, i]
@@ -234,7 +239,9 @@ def observe(
 
 
 @compiled
-def update_depth(x: Floats, P: Floats, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+def update_depth(
+    x: Floats, P: Floats, motion: Motion, port: Floats, z_m: float, variance_m2: float
+) -> None:
     """Update by the height of the pressure port, ``(X' + R' q)_z``."""
     R, X, T = pose_after(x, motion)
     q = vec(port)
@@ -279,7 +286,12 @@ class EkfSlam(FilterShell):
     Params: ClassVar[type[Section]] = EkfSlamParams
     name = "ekf-slam"
 
-    def __init__(self, calibration: Calibration, odometry: MotionSource, params: EkfSlamParams | None = None) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        odometry: MotionSource,
+        params: EkfSlamParams | None = None,
+    ) -> None:
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         angles = euler_from_rotation(mat(start.pose().rotation().matrix()))
@@ -289,7 +301,9 @@ class EkfSlam(FilterShell):
         E = np.array(euler_rates_from_body(angles.x, angles.y))
         self._P = np.zeros((MAP, MAP))
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self._P[ROLL:POSE, ROLL:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        self._P[ROLL:POSE, ROLL:POSE] = (
+            E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        )
         self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
         self._overturned: list[str] = []
 
@@ -303,9 +317,15 @@ class EkfSlam(FilterShell):
 
     def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
-        return Judged(*observe(self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z))
+        return Judged(
+            *observe(
+                self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z
+            )
+        )
 
-    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+    def observe_far(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats
+    ) -> Judged | None:
         """Update by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; None if it is near."""
         x = self._x
         P = self._P
@@ -317,7 +337,9 @@ class EkfSlam(FilterShell):
         H = np.zeros((LANDMARK, len(x)))
         H[:, :POSE] = -G_b @ T
         H[:, at : at + LANDMARK] = np.eye(3)  # e is the point seen less p
-        told, R_g = judged_far(e, H @ P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
+        told, R_g = judged_far(
+            e, H @ P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z
+        )
         if told is not None and told.outcome != GATED:
             update(x, P, H, e, R_g)
         return told
@@ -331,7 +353,9 @@ class EkfSlam(FilterShell):
         P = self._P
         sonar = self.sonar
         R, X, T = pose_arrays(x, motion)
-        p, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
+        p, G_b, G_z = locate_from_body(
+            R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z)
+        )
         G_v = G_b @ T
         P_pv = G_v @ P[:POSE]  # (3, n)
         P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T
@@ -339,13 +363,19 @@ class EkfSlam(FilterShell):
         self._x = np.concatenate((x, p))
         self._P = np.block([[P, P_pv.T], [P_pv, symmetric(P_pp)]])
         if stands_on_floor(p[2], P_pp[2, 2], sonar):
-            self._update_numbers([len(x) + 2], np.array([sonar.floor_z_m - p[2]]), [sonar.floor_variance_m2])
+            self._update_numbers(
+                [len(x) + 2],
+                np.array([sonar.floor_z_m - p[2]]),
+                [sonar.floor_variance_m2],
+            )
 
     def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port."""
         update_depth(self._x, self._P, motion, self.port, z_m, variance_m2)
 
-    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+    def update_heading(
+        self, motion: Motion, yaw_rad: float, variance_rad2: float
+    ) -> float:
         """Update by a compass, ``psi' + c``, with Huber's kernel."""
         x = self._x
         P = self._P
@@ -357,14 +387,18 @@ class EkfSlam(FilterShell):
         noise = H_b @ motion.C @ H_b.T
         e = np.array([wrap_angle(yaw_rad - yaw)])
         # judged without the estimated c: a filter that is wrong takes its error for one of the compass
-        off = distance(e, H @ P @ H.T + noise + variance_rad2 + self.compass_variance_rad2)
+        off = distance(
+            e, H @ P @ H.T + noise + variance_rad2 + self.compass_variance_rad2
+        )
         H[0, COMPASS] = 1.0
         e = wrap_angle(e - x[COMPASS])
         scale = huber_scale(e, H @ P @ H.T + noise + variance_rad2)
         update(x, P, H, e, noise + scale * variance_rad2)
         return off
 
-    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+    def update_position(
+        self, motion: Motion, position_m: Floats, cov_m2: Floats
+    ) -> float:
         """Update by the position of the antenna, ``X' + R' q``, with Huber's kernel."""
         x = self._x
         P = self._P
@@ -390,9 +424,13 @@ class EkfSlam(FilterShell):
         """Update Z, roll and pitch by the plane on which the vehicle stays."""
         e = np.array([plane.z_m, 0.0, 0.0]) - self._x[[Z, ROLL, PITCH]]
         tilt_variance = plane.tilt_sigma_rad**2
-        self._update_numbers([Z, ROLL, PITCH], e, [plane.z_sigma_m**2, tilt_variance, tilt_variance])
+        self._update_numbers(
+            [Z, ROLL, PITCH], e, [plane.z_sigma_m**2, tilt_variance, tilt_variance]
+        )
 
-    def _update_numbers(self, places: list[int], e: Floats, variances: list[float]) -> None:
+    def _update_numbers(
+        self, places: list[int], e: Floats, variances: list[float]
+    ) -> None:
         """Update by direct measurements of numbers of the state."""
         update(self._x, self._P, np.eye(len(self._x))[places], e, np.diag(variances))
 

@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import ACCEPTED, Mount, floor_elevation
-from sonar_graph.numerics import LOWER_LEFT, compiled, cross, exp_and_mean, mat, store, store_vector, vec
+from sonar_graph.numerics import (
+    LOWER_LEFT,
+    compiled,
+    cross,
+    exp_and_mean,
+    mat,
+    store,
+    store_vector,
+    vec,
+)
 
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first."""
@@ -82,11 +91,15 @@ class Views(NamedTuple):
 
 def in_frame(views: Views, first: int) -> list[int]:
     """Detections of a frame that are to be used, of which one is given."""
-    return np.flatnonzero((views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)).tolist()
+    return np.flatnonzero(
+        (views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)
+    ).tolist()
 
 
 @compiled
-def read_detections(range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats) -> tuple[Floats, Floats]:
+def read_detections(
+    range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats
+) -> tuple[Floats, Floats]:
     """Detections z (m, 2) and their covariances (m, 2, 2): symmetric, and R_z where the log has none."""
     z = np.empty((len(range_m), 2))
     noise = np.empty((len(range_m), 2, 2))
@@ -134,9 +147,18 @@ class Call(NamedTuple):
 
 
 @compiled
-def in_order(epochs_ns: Ints, reached_ns: Ints, sample_ns: Ints, sample_kind: Ints, views: Views, call: Call) -> Ints:
+def in_order(
+    epochs_ns: Ints,
+    reached_ns: Ints,
+    sample_ns: Ints,
+    sample_kind: Ints,
+    views: Views,
+    call: Call,
+) -> Ints:
     """Order the epochs, samples and frames of a call up to `END`; columns of `Order` as rows, shape (6, n)."""
-    out = np.empty((6, len(epochs_ns) + len(sample_ns) + len(views.stamp_ns) + 1), np.int64)
+    out = np.empty(
+        (6, len(epochs_ns) + len(sample_ns) + len(views.stamp_ns) + 1), np.int64
+    )
     n = epoch = sample = view = 0
     node_ns = call.node_ns
     opened_ns = call.opened_ns
@@ -146,7 +168,9 @@ def in_order(epochs_ns: Ints, reached_ns: Ints, sample_ns: Ints, sample_kind: In
         # pass over what is late, refused, or of the frame that was just ordered
         while sample < len(sample_ns) and sample_ns[sample] < call.since_ns:
             sample += 1
-        while view < len(views.stamp_ns) and (views.stamp_ns[view] == frame_ns or views.outcome[view] != ACCEPTED):
+        while view < len(views.stamp_ns) and (
+            views.stamp_ns[view] == frame_ns or views.outcome[view] != ACCEPTED
+        ):
             view += 1
         # the earliest of what comes next; at equal stamps the lower kind
         kind = END

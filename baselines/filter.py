@@ -116,7 +116,9 @@ def sonar_of(calibration: Calibration, params: FilterParams) -> Sonar:
         aperture_rad=sonar.elevation_aperture_rad,
         floor_z_m=floor.z_m if floor else math.nan,
         floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
-        gate=math.sqrt(-2.0 * math.log(1.0 - params.gate_probability)) if has_gate else math.inf,
+        gate=math.sqrt(-2.0 * math.log(1.0 - params.gate_probability))
+        if has_gate
+        else math.inf,
         kernel_width=params.kernel_width or math.inf,
     )
 
@@ -129,8 +131,14 @@ class FilterShell(ABC):
     has_bias = False
     """True where the state has a gyro bias."""
 
-    def __init__(self, calibration: Calibration, odometry: MotionSource, params: FilterParams) -> None:
-        require_source(odometry, calibration, f"{type(self).__name__}(calibration, odometry, params)")
+    def __init__(
+        self, calibration: Calibration, odometry: MotionSource, params: FilterParams
+    ) -> None:
+        require_source(
+            odometry,
+            calibration,
+            f"{type(self).__name__}(calibration, odometry, params)",
+        )
         require_params(params, self.Params, self.name)
         self.calibration = calibration
         self.odometry = odometry
@@ -144,7 +152,9 @@ class FilterShell(ABC):
         """Stamp of the newest epoch, that of the state."""
         sonar = calibration.sonar
         self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
-        self._interval_ns = round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
+        self._interval_ns = (
+            round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
+        )
         earth = earth_rate_in_world(calibration)
         self._earth = np.zeros(3) if earth is None else earth
         self._has_rate = self.has_bias or earth is not None
@@ -177,7 +187,9 @@ class FilterShell(ABC):
         """Update by range and azimuth of a known landmark, a motion after the state."""
 
     @abstractmethod
-    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+    def observe_far(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats
+    ) -> Judged | None:
         """Update as `observe` by the point seen, where (6) and (7) are not linear enough; None where they are."""
 
     @abstractmethod
@@ -189,14 +201,18 @@ class FilterShell(ABC):
         """Update by the height of the pressure port, a motion after the state."""
 
     @abstractmethod
-    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+    def update_heading(
+        self, motion: Motion, yaw_rad: float, variance_rad2: float
+    ) -> float:
         """Update by the yaw of the body and the compass' bias, a motion after the state.
 
         Returns its distance from the yaw in sigmas, in which the bias of the compass counts as noise.
         """
 
     @abstractmethod
-    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+    def update_position(
+        self, motion: Motion, position_m: Floats, cov_m2: Floats
+    ) -> float:
         """Update by the position of the antenna, a motion after the state; its distance in sigmas."""
 
     @abstractmethod
@@ -252,9 +268,13 @@ class FilterShell(ABC):
         ids, views = self._views(detections, since_ns)
         estimate = None
         try:
-            samples = self._samples(depth, measurements.heading, measurements.positions, since_ns)
+            samples = self._samples(
+                depth, measurements.heading, measurements.positions, since_ns
+            )
             if end_ns >= max(self._reached_ns, self.node_ns):
-                call = Call(since_ns, end_ns, self.node_ns, self._opened_ns, self._interval_ns)
+                call = Call(
+                    since_ns, end_ns, self.node_ns, self._opened_ns, self._interval_ns
+                )
                 estimate = self._run(call, samples, views)
                 self._estimates.keep(estimate)
         except np.linalg.LinAlgError as error:
@@ -263,7 +283,9 @@ class FilterShell(ABC):
                 " not positive definite; give variances above zero in log and calibration"
             ) from error
         if detections is not None:
-            self._journal.extend(detections.stamps_ns, ids, views.outcome, views.e, views.S)
+            self._journal.extend(
+                detections.stamps_ns, ids, views.outcome, views.e, views.S
+            )
         return estimate
 
     def trajectory(self) -> Trajectory:
@@ -277,7 +299,9 @@ class FilterShell(ABC):
         return LandmarkMap(
             ids=np.array(ids, dtype=np.int64),
             positions=np.array([position for position, _ in read]).reshape(-1, 3),
-            covariances=np.array([covariance for _, covariance in read]).reshape(-1, 3, 3),
+            covariances=np.array([covariance for _, covariance in read]).reshape(
+                -1, 3, 3
+            ),
         )
 
     def detections(self) -> DetectionLog:
@@ -308,7 +332,9 @@ class FilterShell(ABC):
         self._kept_ns = start_ns
         self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
-    def _views(self, detections: LandmarkDetections | None, since_ns: int) -> tuple[Ints, Views]:
+    def _views(
+        self, detections: LandmarkDetections | None, since_ns: int
+    ) -> tuple[Ints, Views]:
         """Most probable identities of detections, and their views.
 
         Rows before the first epoch is reached, or older than those done, are refused.
@@ -324,13 +350,22 @@ class FilterShell(ABC):
         for row in np.flatnonzero(outcome == ACCEPTED).tolist():
             # a new landmark gets the next number: rows are used in their order
             slot[row] = self._slots.setdefault(int(ids[row]), len(self._slots))
-        z, R_z = read_detections(detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov, self._R_z)
+        z, R_z = read_detections(
+            detections.range_m,
+            detections.azimuth_rad,
+            detections.range_azimuth_cov,
+            self._R_z,
+        )
         e = np.full((len(ids), 2), math.nan)
         S = np.full((len(ids), 2, 2), math.nan)
         return ids, Views(stamps_ns, slot, z, R_z, outcome, e, S)
 
     def _samples(
-        self, depth: Depth | None, heading: Heading | None, fixes: PositionFixes | None, since_ns: int
+        self,
+        depth: Depth | None,
+        heading: Heading | None,
+        fixes: PositionFixes | None,
+        since_ns: int,
     ) -> Samples:
         """Samples of a call with their noise, in order. Unsound and late rows are refused, but a late fix is used.
 
@@ -338,11 +373,19 @@ class FilterShell(ABC):
         """
         blocks = []
         if depth is not None:  # the odometry has refused its unsound rows
-            blocks.append(self._in_time(self._depths(depth), np.ones(len(depth), np.bool_), since_ns))
+            blocks.append(
+                self._in_time(
+                    self._depths(depth), np.ones(len(depth), np.bool_), since_ns
+                )
+            )
         if heading is not None:
-            blocks.append(self._in_time(self._headings(heading), heading.are_sound(), since_ns))
+            blocks.append(
+                self._in_time(self._headings(heading), heading.are_sound(), since_ns)
+            )
         if fixes is not None:
-            blocks.append(self._in_time(self._fixes(fixes), fixes.are_sound(), since_ns))
+            blocks.append(
+                self._in_time(self._fixes(fixes), fixes.are_sound(), since_ns)
+            )
         if not blocks:
             return NO_SAMPLES
         if len(blocks) == 1:
@@ -361,7 +404,9 @@ class FilterShell(ABC):
         noise = np.zeros((len(depth), 3, 3))
         value[:, 2] = depth.z_m
         variance_m2 = depth.variance_m2
-        noise[:, 2, 2] = np.where(np.isnan(variance_m2), self.calibration.depth.sigma_m**2, variance_m2)
+        noise[:, 2, 2] = np.where(
+            np.isnan(variance_m2), self.calibration.depth.sigma_m**2, variance_m2
+        )
         return _samples(depth.stamps_ns, DEPTH, value, noise)
 
     def _headings(self, heading: Heading) -> Samples:
@@ -369,7 +414,11 @@ class FilterShell(ABC):
         value = np.zeros((len(heading), 3))
         noise = np.zeros((len(heading), 3, 3))
         value[:, 0] = heading.yaw_rad
-        sigma_rad = np.where(np.isnan(heading.sigma_rad), self.calibration.heading.sigma_rad, heading.sigma_rad)
+        sigma_rad = np.where(
+            np.isnan(heading.sigma_rad),
+            self.calibration.heading.sigma_rad,
+            heading.sigma_rad,
+        )
         with np.errstate(over="ignore"):  # of an unsound row, which is refused
             noise[:, 0, 0] = np.square(sigma_rad)
         return _samples(heading.stamps_ns, HEADING, value, noise)
@@ -377,24 +426,34 @@ class FilterShell(ABC):
     def _fixes(self, fixes: PositionFixes) -> Samples:
         """Position fixes, with the calibration's noise where they have none."""
         noise = fixes.covariance_m2.copy()
-        noise[np.isnan(noise).any(axis=(1, 2))] = np.diag(np.square(self.calibration.positions.sigma_m))
+        noise[np.isnan(noise).any(axis=(1, 2))] = np.diag(
+            np.square(self.calibration.positions.sigma_m)
+        )
         return _samples(fixes.stamps_ns, FIX, fixes.position_m, noise)
 
-    def _in_time(self, samples: Samples, is_sound: NDArray[np.bool_], since_ns: int) -> Samples:
+    def _in_time(
+        self, samples: Samples, is_sound: NDArray[np.bool_], since_ns: int
+    ) -> Samples:
         """The sound rows that are not late; the others are refused, or used if they are late fixes."""
         is_late = samples.stamp_ns < since_ns
         is_used = is_sound & ~is_late
         if is_used.all():
             return samples
-        for row in np.flatnonzero(~is_used & (samples.stamp_ns >= self._reached_ns)).tolist():
+        for row in np.flatnonzero(
+            ~is_used & (samples.stamp_ns >= self._reached_ns)
+        ).tolist():
             kind = int(samples.kind[row])
             stamp_ns = int(samples.stamp_ns[row])
             # USBL fixes come seconds late as a rule; the motion since is still known
             if is_sound[row] and kind == FIX and stamp_ns >= self.node_ns - KEPT_NS:
-                self._use_late(stamp_ns, samples.value[row], samples.noise[row], since_ns)
+                self._use_late(
+                    stamp_ns, samples.value[row], samples.noise[row], since_ns
+                )
             else:
                 reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
-                self._refused.append(RefusedRow(SENSORS[kind], stamp_ns, reason, math.nan))
+                self._refused.append(
+                    RefusedRow(SENSORS[kind], stamp_ns, reason, math.nan)
+                )
         return _rows(samples, is_used)
 
     # ---------------------------------------------------------------- events of a call
@@ -402,24 +461,47 @@ class FilterShell(ABC):
     def _run(self, call: Call, samples: Samples, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
         epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, call.end_ns)
-        order = Order(*in_order(epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call))
-        motions = self.odometry.motions(order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS)
+        order = Order(
+            *in_order(
+                epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call
+            )
+        )
+        motions = self.odometry.motions(
+            order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS
+        )
         is_gap = np.isnan(motions.dp[:, 0]).tolist()
-        events = zip(order.kind.tolist(), order.row.tolist(), zip(*motions, strict=True), strict=True)
+        events = zip(
+            order.kind.tolist(),
+            order.row.tolist(),
+            zip(*motions, strict=True),
+            strict=True,
+        )
         for k, (kind, row, columns) in enumerate(events):
             # a gap depends on the state's attitude and bias, so it is bridged when its turn comes
-            motion = self._bridge(order, k, views) if is_gap[k] else self._reduced(Motion(*columns))
+            motion = (
+                self._bridge(order, k, views)
+                if is_gap[k]
+                else self._reduced(Motion(*columns))
+            )
             if kind == EPOCH:
-                self._to_epoch(motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k])
+                self._to_epoch(
+                    motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k]
+                )
             elif kind == FRAME:
                 self._see(motion, views, row)
             elif kind == DEPTH:
-                self.update_depth(motion, samples.value[row, 2], samples.noise[row, 2, 2])
+                self.update_depth(
+                    motion, samples.value[row, 2], samples.noise[row, 2, 2]
+                )
             elif kind == HEADING:
-                distance = self.update_heading(motion, samples.value[row, 0], samples.noise[row, 0, 0])
+                distance = self.update_heading(
+                    motion, samples.value[row, 0], samples.noise[row, 0, 0]
+                )
                 self._contradictions.judge("heading", distance)
             elif kind == FIX:
-                distance = self.update_position(motion, samples.value[row], samples.noise[row])
+                distance = self.update_position(
+                    motion, samples.value[row], samples.noise[row]
+                )
                 self._contradictions.judge("positions", distance)
         R, X, covariance = self.pose_after(motion)
         self.odometry.settle(self.node_ns)
@@ -452,10 +534,14 @@ class FilterShell(ABC):
         duration_s = (epoch_ns - self._opened_ns) * 1e-9
         velocity_i, variance_i = self._opened_velocity
         velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
-        up = up_direction(self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s)
+        up = up_direction(
+            self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s
+        )
         if not math.isnan(up[0]):
             velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
-            sigma_rad = tilt_sigma(duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias)
+            sigma_rad = tilt_sigma(
+                duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias
+            )
             self.update_up(up, sigma_rad, self._turned)
         self._opened_ns = epoch_ns
         self._opened_velocity = (velocity_j, variance_j)
@@ -473,7 +559,9 @@ class FilterShell(ABC):
                 self._landmarks += 1
                 views.outcome[row] = NEW
                 continue
-            judged = self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
+            judged = (
+                self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
+            )
             judged = judged or self.observe(motion, slot, z, R_z)
             views.outcome[row], views.e[row], views.S[row] = judged
 
@@ -488,13 +576,23 @@ class FilterShell(ABC):
         """
         kind = int(order.kind[k])
         end_ns = int(order.end_ns[k])
-        over = self.odometry.motion(self.node_ns, end_ns, self.gyro_bias(), self.attitude(), int(order.stamp_ns[k]))
+        over = self.odometry.motion(
+            self.node_ns,
+            end_ns,
+            self.gyro_bias(),
+            self.attitude(),
+            int(order.stamp_ns[k]),
+        )
         motion = motion_of(over)
         if not np.isfinite(motion.dp).all():
-            raise EstimatorError(f"{self.name}: the motion to {end_ns} ns over a gap is not finite")
+            raise EstimatorError(
+                f"{self.name}: the motion to {end_ns} ns over a gap is not finite"
+            )
         C = motion.C.copy()
         if not self.has_bias:
-            C[3:, 3:] += self.calibration.imu.gyro_bias_sigma**2 * motion.D[3:] @ motion.D[3:].T
+            C[3:, 3:] += (
+                self.calibration.imu.gyro_bias_sigma**2 * motion.D[3:] @ motion.D[3:].T
+            )
         if kind in (DEPTH, HEADING, FIX, FRAME):
             more = len(in_frame(views, int(order.row[k]))) if kind == FRAME else 1
             count = self._used_in_gap.get((self.node_ns, kind), 0) + more
@@ -504,7 +602,9 @@ class FilterShell(ABC):
             self._may_be_far = self.params.far_views
         return motion._replace(C=C)
 
-    def _use_late(self, stamp_ns: int, position_m: Floats, noise: Floats, since_ns: int) -> None:
+    def _use_late(
+        self, stamp_ns: int, position_m: Floats, noise: Floats, since_ns: int
+    ) -> None:
         """Update by a fix of an earlier instant i, by the motion backwards.
 
         From epoch j the antenna was then at ``j_T_i l``, with covariance ``Ad(i_T_j) C Ad(i_T_j)^T``. The state
@@ -513,14 +613,20 @@ class FilterShell(ABC):
         first_ns = min(stamp_ns, self.node_ns)
         last_ns = max(stamp_ns, self.node_ns)
         attitude = self.attitude()
-        between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
+        between = self.odometry.motion(
+            first_ns, last_ns, self.gyro_bias(), attitude, since_ns
+        )
         motion = motion_of(between)
         if stamp_ns < self.node_ns:
             # the attitude is that at the end of the motion: take it back to the start
             attitude = attitude @ motion.dR.T
-            between = self.odometry.motion(first_ns, last_ns, self.gyro_bias(), attitude, since_ns)
+            between = self.odometry.motion(
+                first_ns, last_ns, self.gyro_bias(), attitude, since_ns
+            )
             motion = backwards(between)
-        self._contradictions.judge("positions", self.update_position(motion, position_m, noise))
+        self._contradictions.judge(
+            "positions", self.update_position(motion, position_m, noise)
+        )
 
 
 def motion_of(over: PreintegratedMotion) -> Motion:
@@ -586,4 +692,9 @@ def _samples(stamps_ns: Ints, kind: int, value: Floats, noise: Floats) -> Sample
 
 
 def _rows(samples: Samples, rows: Ints | NDArray[np.bool_]) -> Samples:
-    return Samples(samples.stamp_ns[rows], samples.kind[rows], samples.value[rows], samples.noise[rows])
+    return Samples(
+        samples.stamp_ns[rows],
+        samples.kind[rows],
+        samples.value[rows],
+        samples.noise[rows],
+    )

@@ -247,7 +247,9 @@ def observe(
 
 
 @compiled
-def update_depth(state: InvariantState, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+def update_depth(
+    state: InvariantState, motion: Motion, port: Floats, z_m: float, variance_m2: float
+) -> None:
     """Update by the height of the pressure port, (7)."""
     R, X, D = pose_after(state, motion)
     q = vec(port)
@@ -300,7 +302,10 @@ class InvariantEkf(FilterShell):
     has_bias = True
 
     def __init__(
-        self, calibration: Calibration, odometry: MotionSource, params: InvariantEkfParams | None = None
+        self,
+        calibration: Calibration,
+        odometry: MotionSource,
+        params: InvariantEkfParams | None = None,
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
         self._walk_density = bias_sigmas(calibration)[1]
@@ -323,7 +328,9 @@ class InvariantEkf(FilterShell):
         """Update by range and azimuth of a known landmark, (5)."""
         return Judged(*observe(self._state, 1 + slot, motion, self.sonar, z, R_z))
 
-    def observe_far(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged | None:
+    def observe_far(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats
+    ) -> Judged | None:
         """Update by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
 
         Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
@@ -337,7 +344,9 @@ class InvariantEkf(FilterShell):
         H[:, place_of(1 + slot)] = np.eye(3)
         H[:, BODY] = -np.eye(3)
         H[:, BETA] = -G_b @ D  # (4)
-        told, R_g = judged_far(e, H @ state.P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z)
+        told, R_g = judged_far(
+            e, H @ state.P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z
+        )
         if told is not None and told.outcome != GATED:
             update(state, H, e, R_g)
         return told
@@ -347,7 +356,9 @@ class InvariantEkf(FilterShell):
         state = self._state
         sonar = self.sonar
         R, X, D = pose_arrays(state, motion)
-        g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z))
+        g, G_b, G_z = locate_from_body(
+            R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z)
+        )
         G = np.zeros((POINT, len(state.P)))
         G[:, BODY] = np.eye(3)
         G[:, BETA] = G_b @ D  # (4)
@@ -359,13 +370,20 @@ class InvariantEkf(FilterShell):
         k = len(state.points)
         H = self._height_jacobian(k)
         if stands_on_floor(g[2], (H @ P @ H.T)[0, 0], sonar):
-            update(self._state, H, sonar.floor_z_m - g[2:], np.array([[sonar.floor_variance_m2]]))
+            update(
+                self._state,
+                H,
+                sonar.floor_z_m - g[2:],
+                np.array([[sonar.floor_variance_m2]]),
+            )
 
     def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
         """Update by the height of the pressure port, (7)."""
         update_depth(self._state, motion, self.port, z_m, variance_m2)
 
-    def update_heading(self, motion: Motion, yaw_rad: float, variance_rad2: float) -> float:
+    def update_heading(
+        self, motion: Motion, yaw_rad: float, variance_rad2: float
+    ) -> float:
         """Update by a compass, (10), with Huber's kernel."""
         state = self._state
         R, _, D = pose_arrays(state, motion)
@@ -376,14 +394,18 @@ class InvariantEkf(FilterShell):
         H[:, BETA] = H_b @ D  # (4)
         noise = H_b @ motion.C @ H_b.T
         e = np.array([wrap_angle(yaw_rad - yaw)])
-        off = distance(e, H @ state.P @ H.T + noise + variance_rad2 + self.compass_variance_rad2)
+        off = distance(
+            e, H @ state.P @ H.T + noise + variance_rad2 + self.compass_variance_rad2
+        )
         H[0, BETA_COMPASS] = 1.0
         e = wrap_angle(e - state.bias[COMPASS])
         scale = huber_scale(e, H @ state.P @ H.T + noise + variance_rad2)
         update(state, H, e, noise + scale * variance_rad2)
         return off
 
-    def update_position(self, motion: Motion, position_m: Floats, cov_m2: Floats) -> float:
+    def update_position(
+        self, motion: Motion, position_m: Floats, cov_m2: Floats
+    ) -> float:
         """Update by the position of the antenna, (7), with Huber's kernel."""
         state = self._state
         R, X, D = pose_arrays(state, motion)
@@ -408,8 +430,12 @@ class InvariantEkf(FilterShell):
     def update_plane(self, plane: PlanarMotion) -> None:
         """Update by the plane on which the vehicle stays: height of the body, (7), and tilt, (8)."""
         e = plane.z_m - self._state.points[0, 2:]
-        update(self._state, self._height_jacobian(0), e, np.array([[plane.z_sigma_m**2]]))
-        self._update_tilt(np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), plane.tilt_sigma_rad)
+        update(
+            self._state, self._height_jacobian(0), e, np.array([[plane.z_sigma_m**2]])
+        )
+        self._update_tilt(
+            np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), plane.tilt_sigma_rad
+        )
 
     def _update_tilt(self, up: Floats, by_accel: Floats, sigma_rad: float) -> None:
         """Update by (8); ``by_accel``: A, shape (3, 3)."""
@@ -436,7 +462,9 @@ class InvariantEkf(FilterShell):
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s."""
-        return gyro_bias_of(self._state.bias, self._state.R[2] if self._state.is_level else NO_UP)
+        return gyro_bias_of(
+            self._state.bias, self._state.R[2] if self._state.is_level else NO_UP
+        )
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state.
@@ -475,4 +503,11 @@ def start_state(calibration: Calibration) -> InvariantState:
     P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
     P[BETA, BETA] = np.diag(bias_sigmas(calibration)[0] ** 2)
     body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
-    return InvariantState(R, X[None].copy(), np.zeros(BIASES), symmetric(P), body_p_dvl, calibration.use_gravity)
+    return InvariantState(
+        R,
+        X[None].copy(),
+        np.zeros(BIASES),
+        symmetric(P),
+        body_p_dvl,
+        calibration.use_gravity,
+    )

@@ -44,7 +44,8 @@ def correction(P: Floats, H: Floats, e: Floats, R: Floats) -> Floats:
     for r in range(len(V)):
         for i in range(len(P)):
             for j in range(len(P)):
-                P[i, j] -= V[r, i] * V[r, j]  # the factors commute: P stays symmetric to the last bit
+                # the factors commute: P stays symmetric to the last bit
+                P[i, j] -= V[r, i] * V[r, j]
     return V.T @ (L_inverse @ e)
 
 
@@ -75,7 +76,9 @@ def distance(e: Floats, S: Floats) -> float:
 
 
 @compiled
-def judged(e: Floats, S: Floats, R_z: Floats, gate: float, kernel_width: float) -> tuple[int, Floats]:
+def judged(
+    e: Floats, S: Floats, R_z: Floats, gate: float, kernel_width: float
+) -> tuple[int, Floats]:
     """Outcome of an innovation of range and azimuth, and what a Cauchy kernel adds to R_z, shape (2, 2).
 
     `GATED` where the `distance` exceeds the gate. The kernel has the weight ``w_i = 1 / (1 + e_i^2 / (S_ii k^2))`` and
@@ -131,7 +134,13 @@ def far_covariance(R_z: Floats, range_m: float, aperture_rad: float) -> Floats:
 
 
 def judged_far(
-    e: Floats, cov: Floats, noise: Floats, G_z: Floats, sonar: Sonar, z: Floats, R_z: Floats
+    e: Floats,
+    cov: Floats,
+    noise: Floats,
+    G_z: Floats,
+    sonar: Sonar,
+    z: Floats,
+    R_z: Floats,
 ) -> tuple[Judged | None, Floats]:
     """`judged` for an innovation of a point at elevation 0, by its share along the beam and across it.
 
@@ -151,7 +160,8 @@ def judged_far(
         return None, noise
     noise = noise + G_z @ far_covariance(R_z, z[0], sonar.aperture_rad) @ G_z.T
     beam = G_z[:, :2]  # derivatives by range and azimuth, orthogonal
-    B = np.ascontiguousarray((beam / np.sum(beam * beam, axis=0)).T)  # range and azimuth by the point
+    # range and azimuth by the point
+    B = np.ascontiguousarray((beam / np.sum(beam * beam, axis=0)).T)
     e_z = B @ e
     S_z = symmetric(B @ symmetric(cov + noise) @ B.T)
     outcome, widened = judged(e_z, S_z, R_z, sonar.gate, sonar.kernel_width)
@@ -160,4 +170,7 @@ def judged_far(
 
 def stands_on_floor(z_m: float, variance_m2: float, sonar: Sonar) -> bool:
     """Check that a new landmark's height is within the gate of a floor of known height."""
-    return bool((sonar.floor_z_m - z_m) ** 2 <= FLOOR_GATE * (variance_m2 + sonar.floor_variance_m2))
+    return bool(
+        (sonar.floor_z_m - z_m) ** 2
+        <= FLOOR_GATE * (variance_m2 + sonar.floor_variance_m2)
+    )

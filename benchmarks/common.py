@@ -19,13 +19,22 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 DATA_VARIABLE = "SONAR_GRAPH_DATA"
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
 
 
-def make_parser(description: str | None, *, data: bool = False, workers: bool = False) -> argparse.ArgumentParser:
+def make_parser(
+    description: str | None, *, data: bool = False, workers: bool = False
+) -> argparse.ArgumentParser:
     """The arguments that scripts share; each adds its own."""
     parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="a short version, to see that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="a short version, to see that it runs"
+    )
     if data:
         parser.add_argument(
             "--data",
@@ -34,7 +43,12 @@ def make_parser(description: str | None, *, data: bool = False, workers: bool = 
             help=f"folder with the recordings, packed or unpacked (default: the variable {DATA_VARIABLE})",
         )
     if workers:
-        parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+        parser.add_argument(
+            "--workers",
+            type=int,
+            default=os.cpu_count() or 1,
+            help="processes (default: all cores)",
+        )
     return parser
 
 
@@ -63,7 +77,9 @@ def recording(data: Path | str | None, archive: str, folder: str) -> Iterator[Pa
         Name of the unpacked one, in ``data`` or in the archive.
     """
     if data is None:
-        refuse(f"no recordings: give their folder with --data, or in the environment variable {DATA_VARIABLE}")
+        refuse(
+            f"no recordings: give their folder with --data, or in the environment variable {DATA_VARIABLE}"
+        )
     root = Path(data)
     packed = root / archive
     if (root / folder).is_dir():
@@ -74,21 +90,31 @@ def recording(data: Path | str | None, archive: str, folder: str) -> Iterator[Pa
                 content.extractall(scratch, filter="data")
             yield Path(scratch) / folder
     else:
-        refuse(f"{root} holds neither {archive} nor {folder}/; give the folder that does with --data")
+        refuse(
+            f"{root} holds neither {archive} nor {folder}/; give the folder that does with --data"
+        )
 
 
-def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], workers: int, what: str) -> list[Result]:
+def in_parallel(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, what: str
+) -> list[Result]:
     """``function`` of every item, in the order of the items, by one-thread processes; one worker: in this one."""
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     results: dict[int, Result] = {}
-    for place, result in _one_by_one(function, items) if workers <= 1 else _by_processes(function, items, workers):
+    for place, result in (
+        _one_by_one(function, items)
+        if workers <= 1
+        else _by_processes(function, items, workers)
+    ):
         results[place] = result
         note(f"{what} {items[place]}: {len(results)} of {len(items)}")
     return [results[place] for place in range(len(items))]
 
 
-def _one_by_one(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+def _one_by_one(
+    function: Callable[[Item], Result], items: Sequence[Item]
+) -> Iterator[tuple[int, Result]]:
     for place, item in enumerate(items):
         yield place, function(item)
 
@@ -108,7 +134,14 @@ def print_table(headers: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
     cells = [list(headers), *([_cell(value) for value in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(headers))]
     for row in cells:
-        print("  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]))
+        print(
+            "  ".join(
+                [
+                    row[0].ljust(widths[0]),
+                    *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
+                ]
+            )
+        )
     print()
 
 
@@ -116,11 +149,24 @@ def _cell(value: object) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
-def write_results(name: str, title: str, headers: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def write_results(
+    name: str, title: str, headers: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
     """Write a table to ``benchmarks/results``, with the commit, the machine and the command that measured it."""
     root = Path(__file__).resolve().parent
-    described = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=root, capture_output=True, text=True)
-    command = " ".join(["python", Path(sys.argv[0]).resolve().relative_to(root.parent).as_posix(), *sys.argv[1:]])
+    described = subprocess.run(
+        ["git", "describe", "--always", "--dirty"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+    )
+    command = " ".join(
+        [
+            "python",
+            Path(sys.argv[0]).resolve().relative_to(root.parent).as_posix(),
+            *sys.argv[1:],
+        ]
+    )
     lines = [
         f"# {title}",
         "",

@@ -88,7 +88,15 @@ if TYPE_CHECKING:
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
     from sonar_graph.logs import inspect_log, read_log, write_log
     from sonar_graph.images import SonarFrames
-    from sonar_graph.measurements import Depth, Dvl, Heading, Imu, LandmarkDetections, Measurements, PositionFixes
+    from sonar_graph.measurements import (
+        Depth,
+        Dvl,
+        Heading,
+        Imu,
+        LandmarkDetections,
+        Measurements,
+        PositionFixes,
+    )
     from sonar_graph.navigation import Odometry
     from sonar_graph.recognition import recognise
     from sonar_graph.report import write_report
@@ -141,13 +149,17 @@ def at_first_use(package: str) -> Callable[[str], Any]:
         module = sys.modules[package]
         tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
         listed = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-        places = {alias.name: str(node.module) for node in listed for alias in node.names}
+        places = {
+            alias.name: str(node.module) for node in listed for alias in node.names
+        }
         if places.get(name, "").startswith(f"{package}."):
             setattr(module, name, getattr(import_module(places[name]), name))
             return getattr(module, name)
         if find_spec(f"{package}.{name}"):
             return import_module(f"{package}.{name}")
-        raise AttributeError(f"{package} has no {name!r}; it has: {', '.join(module.__all__)}")
+        raise AttributeError(
+            f"{package} has no {name!r}; it has: {', '.join(module.__all__)}"
+        )
 
     return find
 

@@ -8,7 +8,14 @@ from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+)
 from pydantic._internal._model_construction import ModelMetaclass
 from pydantic.fields import FieldInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -36,12 +43,21 @@ def within(lowest: float, highest: float, expected: str) -> AfterValidator:
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
-Angle = Annotated[Number, within(-2 * np.pi, 2 * np.pi, "radians between -2π and 2π (45° are 0.785)")]
+Angle = Annotated[
+    Number, within(-2 * np.pi, 2 * np.pi, "radians between -2π and 2π (45° are 0.785)")
+]
 Angles = tuple[Angle, Angle, Angle]
-Latitude = Annotated[Number, within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)")]
+Latitude = Annotated[
+    Number,
+    within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)"),
+]
 Rate = Annotated[Number, within(-1, 1, "rad/s between -1 and 1 (1°/s are 0.0175)")]
-Spread = Annotated[Number, within(0, 2 * np.pi, "radians between 0 and 2π (3° are 0.052)")]
-Gravity = Annotated[Number, within(9, 10.5, "m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")]
+Spread = Annotated[
+    Number, within(0, 2 * np.pi, "radians between 0 and 2π (3° are 0.052)")
+]
+Gravity = Annotated[
+    Number, within(9, 10.5, "m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")
+]
 Vector = tuple[Number, Number, Number]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative]
 
@@ -58,9 +74,18 @@ class SectionType(ModelMetaclass):
             for fault in error.errors():
                 told = f"{expectation(fault['type'], fault['msg'])}, not {fault['input']!r:.60}"
                 if fault["type"] == "extra_forbidden":
-                    known = getattr(cls, "model_fields", {}) if len(fault["loc"]) == 1 else {}
-                    told = "there is no such field" + f"; there are: {', '.join(known)}" * bool(known)
-                faults.append(f"{cls.__name__}.{'.'.join(map(str, fault['loc']))}: {told}")
+                    known = (
+                        getattr(cls, "model_fields", {})
+                        if len(fault["loc"]) == 1
+                        else {}
+                    )
+                    told = (
+                        "there is no such field"
+                        + f"; there are: {', '.join(known)}" * bool(known)
+                    )
+                faults.append(
+                    f"{cls.__name__}.{'.'.join(map(str, fault['loc']))}: {told}"
+                )
             raise SettingError("; ".join(faults)) from None
 
 
@@ -75,13 +100,19 @@ class Section(BaseModel, metaclass=SectionType):
             super().__setattr__(name, value)
         except ValidationError:
             changed = f"model_copy(update={{{name!r}: ...}})"
-            raise SettingError(f"{type(self).__name__}.{name} cannot be set; {changed} makes a changed one") from None
+            raise SettingError(
+                f"{type(self).__name__}.{name} cannot be set; {changed} makes a changed one"
+            ) from None
 
 
 def require_params(params: object, kind: type[Section], name: str) -> None:
     """Raise an `EstimatorError` where an estimator's settings are neither None nor of their kind."""
     if params is not None and not isinstance(params, kind):
-        given = f"the class {params.__name__}" if isinstance(params, type) else type(params).__name__
+        given = (
+            f"the class {params.__name__}"
+            if isinstance(params, type)
+            else type(params).__name__
+        )
         raise EstimatorError(
             f"{name}: params: expected {kind.__name__} or None, not {given}; of a dict: {kind.__name__}(**params)"
         )
@@ -107,7 +138,11 @@ def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
     ``reasons``: message for each field, so that the line in a file can be named.
     """
     found = [
-        InitErrorDetails(type=PydanticCustomError(MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
+        InitErrorDetails(
+            type=PydanticCustomError(MISFIT, "{reason}", {"reason": reason}),
+            loc=(name,),
+            input=None,
+        )
         for name, reason in reasons.items()
     ]
     return ValidationError.from_exception_data(model.__name__, found)
@@ -123,7 +158,9 @@ class Mounting(Section):
 
     def pose(self) -> gtsam.Pose3:
         """body_T_sensor."""
-        return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.translation_m))
+        return gtsam.Pose3(
+            gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.translation_m)
+        )
 
 
 class ImuCalibration(Section):
@@ -160,9 +197,14 @@ class DvlCalibration(Section):
     """Time without a sample above which there is a DVL gap, bridged by accelerometers."""
     velocity_walk_density: Positive = 0.1
     """Random walk of the vehicle's velocity, m/s/√s: for gaps of the log and the gate of outliers."""
-    scale_error: Annotated[Number, within(-0.2, 0.2, "a relative error between -0.2 and 0.2 (0.5 % are 0.005)")] = 0.0
+    scale_error: Annotated[
+        Number,
+        within(-0.2, 0.2, "a relative error between -0.2 and 0.2 (0.5 % are 0.005)"),
+    ] = 0.0
     """Known relative error of its velocities, 0.01 where they are 1 % too fast: taken from the rows."""
-    scale_sigma: Annotated[Number, within(0, 0.2, "a relative error between 0 and 0.2 (0.5 % are 0.005)")] = 0.0
+    scale_sigma: Annotated[
+        Number, within(0, 0.2, "a relative error between 0 and 0.2 (0.5 % are 0.005)")
+    ] = 0.0
     """Standard deviation of the relative error that is left; 0: none is estimated."""
 
 

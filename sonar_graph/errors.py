@@ -76,6 +76,6 @@ def expectation(kind: str, message: str) -> str:
     if kind in EXPECTED:
         return f"expected {EXPECTED[kind]}"
     message = message.removeprefix("Value error, ")
-    return re.sub("^Input should be (?=(greater|less))", "expected a number ", message).replace(
-        "Input should be", "expected", 1
-    )
+    return re.sub(
+        "^Input should be (?=(greater|less))", "expected a number ", message
+    ).replace("Input should be", "expected", 1)

@@ -17,7 +17,13 @@ from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
 from sonar_graph.motion import MotionSource
 from sonar_graph.settings import nested, parse, suggestion
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
+from sonar_graph.states import (
+    DetectionLog,
+    Estimate,
+    LandmarkMap,
+    RefusedRow,
+    Trajectory,
+)
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
 DISTRIBUTION = "sonar-graph"
@@ -47,7 +53,9 @@ class Estimator(Protocol):
     Params: ClassVar[type[Section]]
     """Settings of this estimator; each has a default."""
 
-    def __init__(self, calibration: Calibration, odometry: MotionSource, params: Any = None) -> None:
+    def __init__(
+        self, calibration: Calibration, odometry: MotionSource, params: Any = None
+    ) -> None:
         """Make an estimator that has seen nothing.
 
         ``odometry``: its own source of motion, to which `process` gives the rows of IMU and Doppler log. An estimator
@@ -83,7 +91,11 @@ class TellsRefusedRows(Protocol):
 
 def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
     """Rows that an estimator names as not used; empty where it does not implement `TellsRefusedRows`."""
-    return list(estimator.refused_rows()) if isinstance(estimator, TellsRefusedRows) else []
+    return (
+        list(estimator.refused_rows())
+        if isinstance(estimator, TellsRefusedRows)
+        else []
+    )
 
 
 @runtime_checkable
@@ -111,7 +123,11 @@ class HasNewestLandmarks(Protocol):
 
 def newest_landmarks_of(estimator: Estimator) -> LandmarkMap:
     """Landmarks for who cannot wait, of a live run: all there are where it does not implement `HasNewestLandmarks`."""
-    return estimator.newest_landmarks() if isinstance(estimator, HasNewestLandmarks) else estimator.landmarks()
+    return (
+        estimator.newest_landmarks()
+        if isinstance(estimator, HasNewestLandmarks)
+        else estimator.landmarks()
+    )
 
 
 def installed_estimators() -> dict[str, EntryPoint]:
@@ -125,7 +141,9 @@ def installed_estimators() -> dict[str, EntryPoint]:
 def is_foreign(name: str) -> bool:
     """Tell whether another package brings an estimator, whose code may change the process that loads it."""
     point = installed_estimators().get(name)
-    return point is not None and point.dist is not None and point.dist.name != DISTRIBUTION
+    return (
+        point is not None and point.dist is not None and point.dist.name != DISTRIBUTION
+    )
 
 
 def load_estimator(name: str) -> type[Estimator]:
@@ -148,7 +166,11 @@ def load_estimator(name: str) -> type[Estimator]:
     asked: Any = name
     if not isinstance(asked, str):
         kind = asked if isinstance(asked, type) else type(asked)
-        same = [own for own, point in installed.items() if point.value == f"{kind.__module__}:{kind.__name__}"]
+        same = [
+            own
+            for own, point in installed.items()
+            if point.value == f"{kind.__module__}:{kind.__name__}"
+        ]
         given = f"the class {kind.__name__}" if kind is asked else f"{asked!r:.60}"
         raise UnknownEstimatorError(
             f"expected the name of an installed estimator, not {given}; give"
@@ -156,19 +178,38 @@ def load_estimator(name: str) -> type[Estimator]:
         )
     if name not in installed:
         known = ", ".join(installed) or "none; reinstall the package"
-        raise UnknownEstimatorError(f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}")
+        raise UnknownEstimatorError(
+            f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}"
+        )
     try:
         loaded: Any = installed[name].load()
-    except (Exception, SystemExit) as error:  # a third party's import may fail in any way
-        said = f"it calls sys.exit({error})" if isinstance(error, SystemExit) else str(error)
-        raise EstimatorError(f"{name} ({installed[name].value}) cannot be loaded: {said}") from error
-    missing = [m for m in ("Params", "process", "trajectory", "landmarks", "detections") if not hasattr(loaded, m)]
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # a third party's import may fail in any way
+        said = (
+            f"it calls sys.exit({error})"
+            if isinstance(error, SystemExit)
+            else str(error)
+        )
+        raise EstimatorError(
+            f"{name} ({installed[name].value}) cannot be loaded: {said}"
+        ) from error
+    missing = [
+        m
+        for m in ("Params", "process", "trajectory", "landmarks", "detections")
+        if not hasattr(loaded, m)
+    ]
     if missing:
-        raise EstimatorError(f"{name} ({installed[name].value}) lacks {', '.join(missing)} of the estimator contract")
+        raise EstimatorError(
+            f"{name} ({installed[name].value}) lacks {', '.join(missing)} of the estimator contract"
+        )
     return loaded
 
 
-def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str) -> Section:
+def make_params(
+    estimator: type[Estimator], overrides: dict[str, Any], name: str
+) -> Section:
     """An estimator's settings with some replaced.
 
     ``overrides``: values by name; of a setting in a section by its dotted name, ``{"identity.policy": "gate"}``, or
@@ -177,6 +218,12 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
     """
     given: Any = overrides
     if not isinstance(given, dict):
-        advice = "params.model_dump()" if isinstance(given, Section) else '{"name": value}'
-        raise EstimatorError(f"settings of {name}: expected a dict, not {type(given).__name__}; give {advice}")
-    return parse(estimator.Params, nested(overrides), f"settings of {name}", EstimatorError)
+        advice = (
+            "params.model_dump()" if isinstance(given, Section) else '{"name": value}'
+        )
+        raise EstimatorError(
+            f"settings of {name}: expected a dict, not {type(given).__name__}; give {advice}"
+        )
+    return parse(
+        estimator.Params, nested(overrides), f"settings of {name}", EstimatorError
+    )

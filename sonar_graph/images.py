@@ -62,7 +62,9 @@ class SonarFrames:
                 f"SonarFrames.intensity: shape {self.intensity.shape}; stamps, beams and bins are {expected}"
             )
         if np.any(self.stamps_ns[1:] < self.stamps_ns[:-1]):
-            raise MeasurementError("SonarFrames: stamps run backwards; sort the frames by stamp")
+            raise MeasurementError(
+                "SonarFrames: stamps run backwards; sort the frames by stamp"
+            )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -75,7 +77,9 @@ def decibels(samples: NDArray[Any], image: SonarImage) -> NDArray[np.float32]:
     count as one count, real ones below 1/100000 of the full scale as that.
     """
     if image.scale == "decibel":
-        return np.multiply(samples, np.float32(image.decibel_span / image.full_scale), dtype=np.float32)
+        return np.multiply(
+            samples, np.float32(image.decibel_span / image.full_scale), dtype=np.float32
+        )
     least = 1.0 if np.issubdtype(samples.dtype, np.integer) else 1e-5 * image.full_scale
     ratio = np.maximum(samples, np.float32(least)) / np.float32(least)
     return np.float32(20.0 / image.gamma) * np.log10(ratio, dtype=np.float32)

@@ -24,7 +24,9 @@ PAUSE_NS = 86_400 * NS_PER_S
 """A day. No log pauses so long: between rows farther apart a clock was set, and the part with more rows counts."""
 FASTEST_NS = 1e4
 """Shortest mean time between rows of any sensor: 100,000 a second."""
-STAMP_ADVICE = "stamps are nanoseconds; of seconds: np.round(seconds * 1e9).astype(np.int64)"
+STAMP_ADVICE = (
+    "stamps are nanoseconds; of seconds: np.round(seconds * 1e9).astype(np.int64)"
+)
 NO_TRACK = -1
 """Track number of a detection that belongs to no track."""
 ROUNDING = 1e-6
@@ -49,7 +51,9 @@ tells nothing (a direction anywhere on the circle has 1.8 rad)."""
 def no_posterior(probability: Floats) -> NDArray[np.bool_]:
     """Mask, shape (n,), of rows of ``probability``, shape (n, k), that are below 0, NaN, or above 1 in sum."""
     with np.errstate(invalid="ignore", over="ignore"):
-        is_one = (probability >= 0).all(axis=1) & (probability.sum(axis=1) <= 1.0 + ROUNDING)
+        is_one = (probability >= 0).all(axis=1) & (
+            probability.sum(axis=1) <= 1.0 + ROUNDING
+        )
     return np.asarray(~is_one)
 
 
@@ -75,24 +79,43 @@ class Block:
     def __post_init__(self) -> None:
         name, stamps = type(self).__name__, np.asarray(self.stamps_ns)
         if stamps.size == 0:
-            raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
+            raise MeasurementError(
+                f"{name}: a block needs at least one row; leave the block out instead"
+            )
         if stamps.ndim != 1:
-            raise MeasurementError(f"{name}.stamps_ns: expected shape (n,), not {stamps.shape}")
+            raise MeasurementError(
+                f"{name}.stamps_ns: expected shape (n,), not {stamps.shape}"
+            )
         n = len(stamps)
         for column, place, is_whole, shape, is_finite in _columns(type(self)):  # type: ignore[arg-type]  # hash of a row
-            values = _numbers(place, np.asarray(getattr(self, column)), is_whole=is_whole)
+            values = _numbers(
+                place, np.asarray(getattr(self, column)), is_whole=is_whole
+            )
             row_shape = values.shape[1:] if shape is None else shape
             if values.shape[:1] != (n,):
                 advice = "; transpose it" * (values.shape[1:] == (n,))
-                raise MeasurementError(f"{place}: shape {values.shape} has not one row for each of {n} stamps{advice}")
+                raise MeasurementError(
+                    f"{place}: shape {values.shape} has not one row for each of {n} stamps{advice}"
+                )
             if values.shape[1:] != row_shape:
-                raise MeasurementError(f"{place}: expected shape {(n, *row_shape)}, not {values.shape}")
+                raise MeasurementError(
+                    f"{place}: expected shape {(n, *row_shape)}, not {values.shape}"
+                )
             if is_finite and not np.isfinite(values).all():
                 row = np.argwhere(~np.isfinite(values))[0, 0]
-                raise MeasurementError(f"{place}: row {row} is not finite; leave such rows out of the block")
+                raise MeasurementError(
+                    f"{place}: row {row} is not finite; leave such rows out of the block"
+                )
             object.__setattr__(self, column, values)
-        if n > 1 and (backwards := np.flatnonzero(self.stamps_ns[1:] < self.stamps_ns[:-1])).size:
-            raise MeasurementError(f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp")
+        if (
+            n > 1
+            and (
+                backwards := np.flatnonzero(self.stamps_ns[1:] < self.stamps_ns[:-1])
+            ).size
+        ):
+            raise MeasurementError(
+                f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp"
+            )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -103,13 +126,22 @@ class Block:
     def is_too_fast(self) -> bool:
         """True where stamps, at least ten, follow each other faster than any sensor measures."""
         stamps_ns = np.unique(self.stamps_ns)
-        return len(stamps_ns) >= 10 and bool(stamps_ns[-1] - stamps_ns[0] < FASTEST_NS * (len(stamps_ns) - 1))
+        return len(stamps_ns) >= 10 and bool(
+            stamps_ns[-1] - stamps_ns[0] < FASTEST_NS * (len(stamps_ns) - 1)
+        )
 
     def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
         """The block with only the selected rows."""
-        if isinstance(selection, slice) and (selection.step or 1) > 0 and len(self.stamps_ns[selection]):
-            return self.of_valid(*(column[selection] for column in vars(self).values()))  # as the whole is
-        return type(self)(*(getattr(self, column.name)[selection] for column in fields(self)))
+        if (
+            isinstance(selection, slice)
+            and (selection.step or 1) > 0
+            and len(self.stamps_ns[selection])
+        ):
+            # as the whole is
+            return self.of_valid(*(column[selection] for column in vars(self).values()))
+        return type(self)(
+            *(getattr(self, column.name)[selection] for column in fields(self))
+        )
 
     @classmethod
     def of_valid(cls, *columns: NDArray[Any]) -> Self:
@@ -120,13 +152,20 @@ class Block:
 
     def between(self, after_ns: int, until_ns: int) -> Self | None:
         """The rows with ``after_ns < stamp <= until_ns``, or None where there is none."""
-        first, last = np.searchsorted(self.stamps_ns, [after_ns, until_ns], side="right")
+        first, last = np.searchsorted(
+            self.stamps_ns, [after_ns, until_ns], side="right"
+        )
         return self.rows(slice(first, last)) if last > first else None
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """One block from several, in the order given."""
-        return cls(*(np.concatenate([getattr(b, column.name) for b in blocks]) for column in fields(cls)))
+        return cls(
+            *(
+                np.concatenate([getattr(b, column.name) for b in blocks])
+                for column in fields(cls)
+            )
+        )
 
 
 @cache
@@ -135,7 +174,9 @@ def _names(kind: type[Block]) -> list[str]:
 
 
 @cache
-def _columns(kind: type[Block]) -> list[tuple[str, str, bool, tuple[int, ...] | None, bool]]:
+def _columns(
+    kind: type[Block],
+) -> list[tuple[str, str, bool, tuple[int, ...] | None, bool]]:
     """Name, place in errors, and rules of each column: is it whole, the shape of a row, must it be finite."""
     return [
         (
@@ -153,10 +194,22 @@ def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any
     """Column as int64 or float64; refuses floats where integers are expected, instead of truncating them."""
     kinds, expected = ("iu", "integers") if is_whole else ("iufb", "numbers")
     if values.dtype.kind not in kinds and values.size:
-        advice = "; of seconds: np.round(seconds * 1e9).astype(np.int64)" * place.endswith(".stamps_ns")
-        raise MeasurementError(f"{place}: expected {expected}, not {values.dtype}{advice}")
-    if values.dtype.kind == "u" and is_whole and values.size and int(values.max()) > np.iinfo(np.int64).max:
-        raise MeasurementError(f"{place}: expected integers below 2^63, not {values.max()}")
+        advice = (
+            "; of seconds: np.round(seconds * 1e9).astype(np.int64)"
+            * place.endswith(".stamps_ns")
+        )
+        raise MeasurementError(
+            f"{place}: expected {expected}, not {values.dtype}{advice}"
+        )
+    if (
+        values.dtype.kind == "u"
+        and is_whole
+        and values.size
+        and int(values.max()) > np.iinfo(np.int64).max
+    ):
+        raise MeasurementError(
+            f"{place}: expected integers below 2^63, not {values.max()}"
+        )
     return values.astype(np.int64 if is_whole else np.float64, copy=False)
 
 
@@ -240,7 +293,9 @@ class Heading(Block):
 
     def are_sound(self) -> NDArray[np.bool_]:
         """Mask, shape (n,), of rows whose yaw is at most `MOST_YAW_RAD`, and sigma above 0 up to a turn, or unknown."""
-        is_sigma = np.isnan(self.sigma_rad) | ((self.sigma_rad > 0) & (self.sigma_rad <= FULL_TURN_RAD))
+        is_sigma = np.isnan(self.sigma_rad) | (
+            (self.sigma_rad > 0) & (self.sigma_rad <= FULL_TURN_RAD)
+        )
         return np.asarray(is_sigma & (np.abs(self.yaw_rad) <= MOST_YAW_RAD))
 
 
@@ -272,12 +327,23 @@ class PositionFixes(Block):
         """
         with np.errstate(all="ignore"):
             sigmas = np.sqrt(np.einsum("nii->ni", self.covariance_m2))
-            correlations = self.covariance_m2 / (sigmas[:, :, None] * sigmas[:, None, :])
-            is_symmetric = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2)) <= ROUNDING
-            is_definite = (correlations[:, 0, 1] ** 2 < 1 - ROUNDING) & (np.linalg.det(correlations) > ROUNDING)
-            is_covariance = is_symmetric & is_definite & (sigmas <= FARTHEST_FIX_M).all(axis=1)
+            correlations = self.covariance_m2 / (
+                sigmas[:, :, None] * sigmas[:, None, :]
+            )
+            is_symmetric = (
+                np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2))
+                <= ROUNDING
+            )
+            is_definite = (correlations[:, 0, 1] ** 2 < 1 - ROUNDING) & (
+                np.linalg.det(correlations) > ROUNDING
+            )
+            is_covariance = (
+                is_symmetric & is_definite & (sigmas <= FARTHEST_FIX_M).all(axis=1)
+            )
         is_near = (np.abs(self.position_m) <= FARTHEST_FIX_M).all(axis=1)
-        return np.asarray(is_near & (is_covariance | np.isnan(self.covariance_m2).any(axis=(1, 2))))
+        return np.asarray(
+            is_near & (is_covariance | np.isnan(self.covariance_m2).any(axis=(1, 2)))
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -308,14 +374,18 @@ class LandmarkDetections(Block):
     """Identities that the recogniser considers, shape (n, k); -1 fills unused places."""
     id_probability: Floats
     """Posterior of each candidate, shape (n, k), in sum at most 1; the rest is "none of the known landmarks"."""
-    track: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64), metadata={"shape": ()})
+    track: Ints = field(
+        default_factory=lambda: np.empty(0, dtype=np.int64), metadata={"shape": ()}
+    )
     """Track of each row, shape (n,), whose rows show one object; `NO_TRACK` (-1) or left out: no track.
 
     Each row has the posterior given all evidence of the track so far, so the last row's is the best."""
 
     def __post_init__(self) -> None:
         if not len(self.track):
-            object.__setattr__(self, "track", np.full(len(self.stamps_ns), NO_TRACK, dtype=np.int64))
+            object.__setattr__(
+                self, "track", np.full(len(self.stamps_ns), NO_TRACK, dtype=np.int64)
+            )
         super().__post_init__()
         for column in ("candidate_ids", "id_probability"):
             shape = getattr(self, column).shape
@@ -333,7 +403,9 @@ class LandmarkDetections(Block):
             if has_it.any():
                 row = int(has_it.argmax())
                 values = getattr(self, column)[row].tolist()
-                raise MeasurementError(f"LandmarkDetections.{column}: row {row} ({values}) has {fault}")
+                raise MeasurementError(
+                    f"LandmarkDetections.{column}: row {row} ({values}) has {fault}"
+                )
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """Rows of each sonar frame, that is of each stamp."""
@@ -345,9 +417,17 @@ class LandmarkDetections(Block):
         """Mask, shape (n,), of rows with possible range and azimuth, and a positive definite or no covariance (NaN)."""
         a, b, c, d = self.range_azimuth_cov.reshape(-1, 4).T
         with np.errstate(all="ignore"):
-            is_definite = (a > 0) & (a * d - b * c > ROUNDING * a * d) & (np.abs(b - c) <= ROUNDING * np.sqrt(a * d))
-        is_possible = possible_ranges(self.range_m) & (np.abs(self.azimuth_rad) <= FULL_TURN_RAD)
-        return is_possible & (is_definite | np.isnan(self.range_azimuth_cov).any(axis=(1, 2)))
+            is_definite = (
+                (a > 0)
+                & (a * d - b * c > ROUNDING * a * d)
+                & (np.abs(b - c) <= ROUNDING * np.sqrt(a * d))
+            )
+        is_possible = possible_ranges(self.range_m) & (
+            np.abs(self.azimuth_rad) <= FULL_TURN_RAD
+        )
+        return is_possible & (
+            is_definite | np.isnan(self.range_azimuth_cov).any(axis=(1, 2))
+        )
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""
@@ -398,13 +478,24 @@ class Measurements:
     positions: PositionFixes | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.end_ns, bool) or not isinstance(self.end_ns, (int, np.integer)):
+        if isinstance(self.end_ns, bool) or not isinstance(
+            self.end_ns, (int, np.integer)
+        ):
             raise MeasurementError(
                 f"Measurements.end_ns: expected an integer, nanoseconds, not {self.end_ns!r}; of seconds:"
                 " round(seconds * 1e9)"
             )
         require_blocks(self)
-        motion_ns = min([self.end_ns, *(int(rows.stamps_ns[0]) for rows in (self.imu, self.dvl) if rows is not None)])
+        motion_ns = min(
+            [
+                self.end_ns,
+                *(
+                    int(rows.stamps_ns[0])
+                    for rows in (self.imu, self.dvl)
+                    if rows is not None
+                ),
+            ]
+        )
         for rows in (self.depth, self.detections, self.heading, self.positions):
             if rows is None:
                 continue
@@ -423,7 +514,9 @@ class Measurements:
 def require_measurements(value: object, name: str) -> None:
     """Raise a `MeasurementError` where an estimator of this name is given something else to process."""
     if not isinstance(value, Measurements):
-        block = next((field for field, kind in BLOCKS.items() if isinstance(value, kind)), "imu")
+        block = next(
+            (field for field, kind in BLOCKS.items() if isinstance(value, kind)), "imu"
+        )
         raise MeasurementError(
             f"{name}: process(measurements): expected Measurements, not {type(value).__name__}; of blocks:"
             f" Measurements(end_ns, {block}=...)"

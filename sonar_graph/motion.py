@@ -97,10 +97,16 @@ def require_source(odometry: object, calibration: Calibration, call: str) -> Non
     """Refuse what is no calibration, no source of motion (TypeError), or made with another (CalibrationError)."""
     require_calibration(calibration, call)
     if isinstance(odometry, type) or not hasattr(odometry, "motions"):
-        given = odometry.__name__ if isinstance(odometry, type) else type(odometry).__name__
-        raise TypeError(f"{call}: expected a source of motion, such as Odometry(calibration), not {given}")
+        given = (
+            odometry.__name__ if isinstance(odometry, type) else type(odometry).__name__
+        )
+        raise TypeError(
+            f"{call}: expected a source of motion, such as Odometry(calibration), not {given}"
+        )
     if getattr(odometry, "calibration", calibration) != calibration:
-        raise CalibrationError(f"{call}: the odometry was made with another calibration; make both with the same")
+        raise CalibrationError(
+            f"{call}: the odometry was made with another calibration; make both with the same"
+        )
 
 
 class Motions(NamedTuple):
@@ -170,7 +176,12 @@ class MotionSource(Protocol):
         """True for a time without Doppler rows that is too long for a linear velocity."""
 
     def motion(
-        self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
+        self,
+        start_ns: int,
+        end_ns: int,
+        bias: Floats,
+        world_R_i: Floats | None = None,
+        known_ns: int | None = None,
     ) -> PreintegratedMotion:
         """Motion from one instant to another, over gaps too, without the gyro bias (body axes, shape (3,), rad/s).
 
@@ -179,7 +190,9 @@ class MotionSource(Protocol):
         used: to an epoch it is final only if that is an instant at which the epoch is reached.
         """
 
-    def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
+    def motions(
+        self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats
+    ) -> Motions:
         """Motions over n intervals, each from rows stamped no later than its ``known_ns``, for one ``bias`` (3,).
 
         Intervals with a gap are left to `motion`; the Earth's rotation is not removed.

@@ -71,8 +71,13 @@ class Sequence:
         require_blocks(self)
 
     def __repr__(self) -> str:
-        known = self.blocks() | {"truth": self.truth, "true_landmarks": self.true_landmarks}
-        rows = (f"{len(block)} {name}" for name, block in known.items() if block is not None)
+        known = self.blocks() | {
+            "truth": self.truth,
+            "true_landmarks": self.true_landmarks,
+        }
+        rows = (
+            f"{len(block)} {name}" for name, block in known.items() if block is not None
+        )
         return f"Sequence({self.name!r}: {self.duration_s:.1f} s, {', '.join(rows)})"
 
     def _repr_html_(self) -> str:
@@ -82,32 +87,56 @@ class Sequence:
         for name, block in known.items():
             if block is None or not len(block):
                 continue
-            first, last = ((int(stamp_ns) - self.start_ns) * 1e-9 for stamp_ns in block.stamps_ns[[0, -1]])
-            rate = f"{(len(block) - 1) / (last - first):.4g}" if last > first else ABSENT
+            first, last = (
+                (int(stamp_ns) - self.start_ns) * 1e-9
+                for stamp_ns in block.stamps_ns[[0, -1]]
+            )
+            rate = (
+                f"{(len(block) - 1) / (last - first):.4g}" if last > first else ABSENT
+            )
             rows.append([name, str(len(block)), f"{first:.2f}", f"{last:.2f}", rate])
         if self.true_landmarks is not None:
-            rows.append(["true landmarks", str(len(self.true_landmarks)), *[ABSENT] * 3])
+            rows.append(
+                ["true landmarks", str(len(self.true_landmarks)), *[ABSENT] * 3]
+            )
         heads = ["Block", "Rows", "First (s)", "Last (s)", "Rate (Hz)"]
-        return as_html(text_table("sequence", f"Sequence {self.name}, {self.duration_s:.1f} s", heads, rows))
+        return as_html(
+            text_table(
+                "sequence",
+                f"Sequence {self.name}, {self.duration_s:.1f} s",
+                heads,
+                rows,
+            )
+        )
 
     def blocks(self) -> dict[str, Block]:
         """Measurements that there are, by their names in `Measurements`."""
-        return {name: block for name in BLOCKS if (block := getattr(self, name)) is not None}
+        return {
+            name: block for name in BLOCKS if (block := getattr(self, name)) is not None
+        }
 
     @property
     def true_poses(self) -> Trajectory | None:
         """The truth, where it has orientations and not only positions."""
-        return self.truth if self.truth is not None and self.truth.has_orientation else None
+        return (
+            self.truth
+            if self.truth is not None and self.truth.has_orientation
+            else None
+        )
 
     @cached_property
     def start_ns(self) -> int:
         """First instant with IMU and DVL: the start pose of the calibration holds here."""
-        return max(longest_part(self.imu.stamps_ns)[0], longest_part(self.dvl.stamps_ns)[0])
+        return max(
+            longest_part(self.imu.stamps_ns)[0], longest_part(self.dvl.stamps_ns)[0]
+        )
 
     @cached_property
     def end_ns(self) -> int:
         """Last instant with IMU and DVL."""
-        return min(longest_part(self.imu.stamps_ns)[1], longest_part(self.dvl.stamps_ns)[1])
+        return min(
+            longest_part(self.imu.stamps_ns)[1], longest_part(self.dvl.stamps_ns)[1]
+        )
 
     def off_the_clock(self) -> list[RefusedRow]:
         """Rows more than a day before the start or after the end, which `replay` leaves out, or that are too fast."""
@@ -122,7 +151,9 @@ class Sequence:
             RefusedRow(sensor, stamp_ns, Refusal.CLOCK, math.nan)
             for sensor, block in self.blocks().items()
             if block.stamps_ns[0] <= first_ns or block.stamps_ns[-1] > last_ns
-            for stamp_ns in block.stamps_ns[(block.stamps_ns <= first_ns) | (block.stamps_ns > last_ns)].tolist()
+            for stamp_ns in block.stamps_ns[
+                (block.stamps_ns <= first_ns) | (block.stamps_ns > last_ns)
+            ].tolist()
         ]
 
     @property
@@ -149,7 +180,9 @@ class Sequence:
                 f"{self.name}: {self.duration_s:.0f} s at {rate_hz:g} Hz are {count} instants, and at most "
                 f"{MOST_INSTANTS} are asked for: read a part with --start and --end, or lower --rate-hz"
             )
-        instants = np.arange(self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64)
+        instants = np.arange(
+            self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64
+        )
         if self.end_ns < self.start_ns:
             raise MeasurementError(
                 f"{self.name}: the rows of IMU and DVL have no time in common: of two clocks, or of one that was set?"
@@ -164,7 +197,10 @@ class Sequence:
         """Measurements between successive instants; the first item holds all from a day before the start on."""
         after_ns = self.start_ns - PAUSE_NS
         for end_ns in instants_ns.tolist():
-            rows: dict[str, Any] = {name: block.between(after_ns, end_ns) for name, block in self.blocks().items()}
+            rows: dict[str, Any] = {
+                name: block.between(after_ns, end_ns)
+                for name, block in self.blocks().items()
+            }
             yield Measurements(end_ns, **rows)
             after_ns = end_ns
 
@@ -172,11 +208,16 @@ class Sequence:
 def longest_part(stamps_ns: Ints) -> tuple[int, int]:
     """First and last stamp of the part with the most rows between pauses."""
     pauses = np.flatnonzero(np.diff(stamps_ns.astype(np.float64)) > PAUSE_NS) + 1
-    first, end = max(pairwise([0, *pauses.tolist(), len(stamps_ns)]), key=lambda part: part[1] - part[0])
+    first, end = max(
+        pairwise([0, *pauses.tolist(), len(stamps_ns)]),
+        key=lambda part: part[1] - part[0],
+    )
     return int(stamps_ns[first]), int(stamps_ns[end - 1])
 
 
 def require_sequence(value: object, call: str) -> None:
     """Raise a TypeError that names the expected ``call`` where an argument is no `Sequence`."""
     if not isinstance(value, Sequence):
-        raise TypeError(f"{call}: expected a Sequence, not {type(value).__name__}; read_log gives one")
+        raise TypeError(
+            f"{call}: expected a Sequence, not {type(value).__name__}; read_log gives one"
+        )

@@ -23,10 +23,14 @@ _LEAST_SIMILARITY = 0.7
 M = TypeVar("M", bound=BaseModel)
 
 
-def nested(values: dict[str, Any], start: dict[str, Any] | None = None) -> dict[str, Any]:
+def nested(
+    values: dict[str, Any], start: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Settings in sections, from values by dotted names such as ``image.noise_db``, added to those of a start."""
     tree = deepcopy(start or {})
-    for name, value in sorted(values.items(), key=lambda named: named[0].count(".")):  # sections before their settings
+    for name, value in sorted(
+        values.items(), key=lambda named: named[0].count(".")
+    ):  # sections before their settings
         *sections, last = name.split(".")
         place = tree
         for section in sections:
@@ -41,7 +45,11 @@ def flattened(tree: dict[str, Any], section: str = "") -> dict[str, Any]:
     """Values by dotted names, the inverse of `nested`."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
-        flat |= flattened(value, f"{section}{name}.") if isinstance(value, dict) else {f"{section}{name}": value}
+        flat |= (
+            flattened(value, f"{section}{name}.")
+            if isinstance(value, dict)
+            else {f"{section}{name}": value}
+        )
     return flat
 
 
@@ -54,31 +62,67 @@ class Setting(NamedTuple):
     meaning: str
 
 
-def settings_of(model: type[BaseModel], default: BaseModel | None = None, section: str = "") -> list[Setting]:
+def settings_of(
+    model: type[BaseModel], default: BaseModel | None = None, section: str = ""
+) -> list[Setting]:
     """All settings of a model, section after section.
 
     Of a tagged union first its tag, with what each value means, then the settings of all its sections.
     """
     found: dict[str, Setting] = {}
     for name, field in model.model_fields.items():
-        value = getattr(default, name) if default else field.get_default(call_default_factory=True)
-        path, options, tag = f"{section}{name}", list(_sections(field.annotation)), field.discriminator
+        value = (
+            getattr(default, name)
+            if default
+            else field.get_default(call_default_factory=True)
+        )
+        path, options, tag = (
+            f"{section}{name}",
+            list(_sections(field.annotation)),
+            field.discriminator,
+        )
         if isinstance(tag, str):
-            docs = {option: " ".join((option.__doc__ or "").split("\n\n")[0].split()) for option in options}
-            meanings = (f"{' or '.join(_tags(option, tag))}: {docs[option]}" for option in options)
-            found[f"{path}.{tag}"] = Setting(f"{path}.{tag}", getattr(value, tag), " ".join(meanings))
+            docs = {
+                option: " ".join((option.__doc__ or "").split("\n\n")[0].split())
+                for option in options
+            }
+            meanings = (
+                f"{' or '.join(_tags(option, tag))}: {docs[option]}"
+                for option in options
+            )
+            found[f"{path}.{tag}"] = Setting(
+                f"{path}.{tag}", getattr(value, tag), " ".join(meanings)
+            )
             for option in options:
                 others = [other for other in options if other is not option]
-                for setting in settings_of(option, value if isinstance(value, option) else None, f"{path}."):
+                for setting in settings_of(
+                    option, value if isinstance(value, option) else None, f"{path}."
+                ):
                     top = setting.name[len(path) + 1 :].split(".")[0]
-                    with_it = [option, *(other for other in others if top in other.model_fields)]
-                    names = " or ".join(f'"{name}"' for having in with_it for name in _tags(having, tag))
-                    limit = "" if len(with_it) == len(options) else f" Only with {tag} = {names}."
-                    found.setdefault(setting.name, setting._replace(meaning=setting.meaning + limit))
+                    with_it = [
+                        option,
+                        *(other for other in others if top in other.model_fields),
+                    ]
+                    names = " or ".join(
+                        f'"{name}"' for having in with_it for name in _tags(having, tag)
+                    )
+                    limit = (
+                        ""
+                        if len(with_it) == len(options)
+                        else f" Only with {tag} = {names}."
+                    )
+                    found.setdefault(
+                        setting.name, setting._replace(meaning=setting.meaning + limit)
+                    )
         elif isinstance(value, BaseModel):
-            found |= {setting.name: setting for setting in settings_of(type(value), value, f"{path}.")}
+            found |= {
+                setting.name: setting
+                for setting in settings_of(type(value), value, f"{path}.")
+            }
         else:
-            found[path] = Setting(path, value, " ".join(meanings_of(model).get(name, "").split()))
+            found[path] = Setting(
+                path, value, " ".join(meanings_of(model).get(name, "").split())
+            )
     return list(found.values())
 
 
@@ -97,12 +141,19 @@ def meanings_of(model: type[BaseModel]) -> dict[str, str]:
             continue
         for field, below in pairwise(getattr(made, "body", [])):
             match field, below:
-                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(
+                    ast.Constant(str(text))
+                ):
                     found[name] = inspect.cleandoc(text)
     return {name: text for name, text in found.items() if name in model.model_fields}
 
 
-def parse(model: type[M], values: object, source: str, refusal: type[Exception] = CalibrationError) -> M:
+def parse(
+    model: type[M],
+    values: object,
+    source: str,
+    refusal: type[Exception] = CalibrationError,
+) -> M:
     """Plain values, such as from TOML or JSON, as their model.
 
     Parameters
@@ -137,7 +188,9 @@ def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
     for place in short:
         lacking = [e for e in errors if _is_short_list(e) and e["loc"][:-1] == place]
         expected = max(int(e["loc"][-1]) for e in lacking) + 1
-        texts.append(f"{_path(place)}: expected {expected} values, not {_shown(lacking[0]['input'])}")
+        texts.append(
+            f"{_path(place)}: expected {expected} values, not {_shown(lacking[0]['input'])}"
+        )
     return "; ".join(texts)
 
 
@@ -150,35 +203,60 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     if error["type"] == "union_tag_invalid":
         at, given = _walk(model, place), error["ctx"]["tag"]
         known = [name for option in at.options for name in _tags(option, at.tag)]
-        return f"{_path((*at.names, at.tag))}: there is no {given!r}{choice(given, known)}"
+        return (
+            f"{_path((*at.names, at.tag))}: there is no {given!r}{choice(given, known)}"
+        )
     place = field_place(model, place)
     if error["type"] == "missing":
         return f"{_path(place)}: is missing"
-    if error["type"] in ("list_type", "tuple_type") and isinstance(error["input"], dict):
+    if error["type"] in ("list_type", "tuple_type") and isinstance(
+        error["input"], dict
+    ):
         return f"{_path(place)}: expected a list of tables, [[{_path(place)}]] in TOML, not one table"
     if error["type"] == "too_long" and not isinstance(error["input"], str):
         return f"{_path(place)}: expected {error['ctx']['max_length']} values, not {_shown(error['input'])}"
     message = expectation(error["type"], error["msg"])
     if error["type"] == "model_type":
-        like = f"[{_path(place)}] in TOML" if place else "such as " + ", ".join(list(model.model_fields)[:3])
+        like = (
+            f"[{_path(place)}] in TOML"
+            if place
+            else "such as " + ", ".join(list(model.model_fields)[:3])
+        )
         message = f"expected {'a section' if place else 'sections'}, {like}"
-    return f"{_path(place)}: {message}, not {_shown(error['input'])}" if place else message
+    return (
+        f"{_path(place)}: {message}, not {_shown(error['input'])}" if place else message
+    )
 
 
 def unknown_field(place: Place, model: type[BaseModel]) -> str:
     """Message that a field does not exist, with the policy or section that has it, or the most similar one, and all."""
     name, owner = str(place[-1]), _walk(model, place[:-1])
-    fault, whose = f"{_path((*owner.names, name))}: there is no such field", _path(owner.names) or "it"
+    fault, whose = (
+        f"{_path((*owner.names, name))}: there is no such field",
+        _path(owner.names) or "it",
+    )
     if owner.value:
-        others = [f'"{tag}"' for o in owner.options if name in o.model_fields for tag in _tags(o, owner.tag)]
+        others = [
+            f'"{tag}"'
+            for o in owner.options
+            if name in o.model_fields
+            for tag in _tags(o, owner.tag)
+        ]
         if others:
             having = f"{_path((*owner.names, owner.tag))} = {' or '.join(others)}"
             return f'{fault} with {owner.tag} = "{owner.value}"; {having} has it'
         whose = f'{whose} with {owner.tag} = "{owner.value}"'
     if owner.section is None:
         return fault + choice(name, [], whose)
-    fields, inside = list(owner.section.model_fields), [setting.name for setting in settings_of(owner.section)]
-    meant = [_path((*owner.names, *dotted.split("."))) for dotted in inside if dotted.endswith(f".{name}")]
+    fields, inside = (
+        list(owner.section.model_fields),
+        [setting.name for setting in settings_of(owner.section)],
+    )
+    meant = [
+        _path((*owner.names, *dotted.split(".")))
+        for dotted in inside
+        if dotted.endswith(f".{name}")
+    ]
     hint = f"; did you mean {meant[0]}?" if meant else suggestion(name, fields)
     return f"{fault}{hint} {whose} has: {', '.join(fields) or 'none'}"
 
@@ -192,16 +270,27 @@ def choice(name: str, known: Iterable[str], owner: str = "") -> str:
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Question after an unknown name whether the most similar known name is meant; a semicolon where none is."""
     similar = max(known, key=partial(_similarity, name), default="")
-    return f"; did you mean {similar}?" if _similarity(name, similar) >= _LEAST_SIMILARITY else ";"
+    return (
+        f"; did you mean {similar}?"
+        if _similarity(name, similar) >= _LEAST_SIMILARITY
+        else ";"
+    )
 
 
 def _similarity(name: str, known: str) -> float:
     """Similarity from 0 to 1; the beginning of a name counts as well, since units at its end are forgotten."""
-    return max(SequenceMatcher(None, name, text).ratio() for text in (known, known[: len(name)]))
+    return max(
+        SequenceMatcher(None, name, text).ratio()
+        for text in (known, known[: len(name)])
+    )
 
 
 def _is_short_list(error: ErrorDetails) -> bool:
-    return error["type"] == "missing" and bool(error["loc"]) and isinstance(error["loc"][-1], int)
+    return (
+        error["type"] == "missing"
+        and bool(error["loc"])
+        and isinstance(error["loc"][-1], int)
+    )
 
 
 def _shown(value: Any) -> str:
@@ -213,7 +302,9 @@ def _shown(value: Any) -> str:
 
 def _path(place: Place) -> str:
     """Dotted names, without what pydantic adds for the branch of a union."""
-    return ".".join(str(part) for part in place if isinstance(part, int) or part.isidentifier())
+    return ".".join(
+        str(part) for part in place if isinstance(part, int) or part.isidentifier()
+    )
 
 
 def field_place(model: type[BaseModel], place: Place) -> Place:
@@ -236,13 +327,21 @@ class _Spot(NamedTuple):
 def _walk(model: type[BaseModel], place: Place) -> _Spot:
     spot = _Spot((), model, "", "", [model])
     for name in place:
-        picked = [option for option in spot.options if name in _tags(option, spot.tag)] if not spot.value else []
+        picked = (
+            [option for option in spot.options if name in _tags(option, spot.tag)]
+            if not spot.value
+            else []
+        )
         if picked:
             spot = spot._replace(section=picked[0], value=str(name))
             continue
         section = spot.section
         spot = spot._replace(names=(*spot.names, name))
-        if section is not None and isinstance(name, str) and name in section.model_fields:
+        if (
+            section is not None
+            and isinstance(name, str)
+            and name in section.model_fields
+        ):
             field = section.model_fields[name]
             options = list(_sections(field.annotation))
             tag = field.discriminator if isinstance(field.discriminator, str) else ""
@@ -273,7 +372,13 @@ def toml_value(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{toml_key(key)} = {toml_value(item)}" for key, item in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(
+                f"{toml_key(key)} = {toml_value(item)}" for key, item in value.items()
+            )
+            + "}"
+        )
     if isinstance(value, Sequence):
         return "[" + ", ".join(map(toml_value, value)) + "]"
     raise TypeError(f"{type(value).__name__} has no TOML form")
@@ -281,7 +386,11 @@ def toml_value(value: Any) -> str:
 
 def toml_key(name: str) -> str:
     """A key as TOML, in quotes where it needs them."""
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _text(name)
+    return (
+        name
+        if name.replace("_", "").replace("-", "").isalnum() and name.isascii()
+        else _text(name)
+    )
 
 
 def _text(value: str) -> str:
@@ -298,11 +407,20 @@ def toml_template(model: type[BaseModel], stated: BaseModel, remark: str) -> str
     default = model()
     lines = _template_lines(model, default, stated, "", remark, is_nested=False)
     for name, field in model.model_fields.items():
-        section = next((part for part in get_args(field.annotation) if _is_section(part)), None)
+        section = next(
+            (part for part in get_args(field.annotation) if _is_section(part)), None
+        )
         value = getattr(stated, name)
         if _is_section(field.annotation):
-            inside = _template_lines(type(value), getattr(default, name), value, "", remark)
-            lines += ["", f"# {_sentence(field.annotation.__doc__)}", f"[{name}]", *inside]
+            inside = _template_lines(
+                type(value), getattr(default, name), value, "", remark
+            )
+            lines += [
+                "",
+                f"# {_sentence(field.annotation.__doc__)}",
+                f"[{name}]",
+                *inside,
+            ]
         elif section is not None:
             absent = "# " * (value is None)
             lines += ["", f"# {_sentence(section.__doc__)}", f"{absent}[{name}]"]
@@ -339,7 +457,9 @@ def _template_lines(
         shown = value if value is not None else 0.0
         line = f"{prefix}{name} = {toml_value(shown)}"
         notes = " ".join(filter(None, [meaning, f"({remark})" if is_said else ""]))
-        lines.append(("" if is_said else "# ") + line + (f"  # {notes}" if notes else ""))
+        lines.append(
+            ("" if is_said else "# ") + line + (f"  # {notes}" if notes else "")
+        )
     return lines
 
 

@@ -86,13 +86,32 @@ class Trajectory:
         rows = [["poses", str(len(self))]]
         if len(self):
             length_m = np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()
-            rows.append(["duration", f"{(int(self.stamps_ns[-1]) - int(self.stamps_ns[0])) * 1e-9:.2f} s"])
+            rows.append(
+                [
+                    "duration",
+                    f"{(int(self.stamps_ns[-1]) - int(self.stamps_ns[0])) * 1e-9:.2f} s",
+                ]
+            )
             rows.append(["length of the path", f"{length_m:.2f} m"])
-            for axis, low, high in zip("xyz", self.positions.min(axis=0), self.positions.max(axis=0), strict=True):
+            for axis, low, high in zip(
+                "xyz",
+                self.positions.min(axis=0),
+                self.positions.max(axis=0),
+                strict=True,
+            ):
                 rows.append([axis, f"{low:.3f} to {high:.3f} m"])
-            rows.append(["orientations", "known" if self.has_orientation else "unknown"])
-            rows.append(["covariances", "unknown" if np.isnan(self.covariances).all() else "known"])
-        return as_html(text_table("trajectory", "Trajectory", ["Quantity", "Value"], rows))
+            rows.append(
+                ["orientations", "known" if self.has_orientation else "unknown"]
+            )
+            rows.append(
+                [
+                    "covariances",
+                    "unknown" if np.isnan(self.covariances).all() else "known",
+                ]
+            )
+        return as_html(
+            text_table("trajectory", "Trajectory", ["Quantity", "Value"], rows)
+        )
 
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
@@ -101,20 +120,33 @@ class Trajectory:
         rotations = np.array([e.world_T_body.rotation().matrix() for e in estimates])
         return cls(
             stamps_ns=np.fromiter((e.stamp_ns for e in estimates), np.int64, n),
-            positions=np.array([e.world_T_body.translation() for e in estimates]).reshape(n, 3),
-            quaternions_xyzw=Rotation.from_matrix(rotations.reshape(n, 3, 3)).as_quat() if n else np.empty((0, 4)),
+            positions=np.array(
+                [e.world_T_body.translation() for e in estimates]
+            ).reshape(n, 3),
+            quaternions_xyzw=Rotation.from_matrix(rotations.reshape(n, 3, 3)).as_quat()
+            if n
+            else np.empty((0, 4)),
             covariances=np.array([e.covariance for e in estimates]).reshape(n, 6, 6),
         )
 
     @classmethod
-    def without_covariances(cls, stamps_ns: Ints, positions: Floats, quaternions_xyzw: Floats) -> Trajectory:
+    def without_covariances(
+        cls, stamps_ns: Ints, positions: Floats, quaternions_xyzw: Floats
+    ) -> Trajectory:
         """Trajectory of unknown uncertainty, such as a reference."""
-        return cls(stamps_ns, positions, quaternions_xyzw, np.full((len(stamps_ns), 6, 6), np.nan))
+        return cls(
+            stamps_ns,
+            positions,
+            quaternions_xyzw,
+            np.full((len(stamps_ns), 6, 6), np.nan),
+        )
 
     @classmethod
     def of_positions(cls, stamps_ns: Ints, positions: Floats) -> Trajectory:
         """Reference of positions only, such as from satellites: orientations are not known (NaN)."""
-        return cls.without_covariances(stamps_ns, positions, np.full((len(stamps_ns), 4), np.nan))
+        return cls.without_covariances(
+            stamps_ns, positions, np.full((len(stamps_ns), 4), np.nan)
+        )
 
     @property
     def has_orientation(self) -> bool:
@@ -124,34 +156,55 @@ class Trajectory:
     def rotations(self) -> Rotation:
         """world_R_body of every row; a `MeasurementError` where only positions are known."""
         if not self.has_orientation:
-            raise MeasurementError("Trajectory: only its positions are known; see has_orientation")
+            raise MeasurementError(
+                "Trajectory: only its positions are known; see has_orientation"
+            )
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
     def matrices(self) -> Floats:
         """world_R_body of every row, shape (n, 3, 3), computed once; NaN where only positions are known."""
-        return np.asarray(self.rotations().as_matrix()) if self.has_orientation else np.full((len(self), 3, 3), np.nan)
+        return (
+            np.asarray(self.rotations().as_matrix())
+            if self.has_orientation
+            else np.full((len(self), 3, 3), np.nan)
+        )
 
     def rows(self, selection: slice | Ints) -> Trajectory:
         """The trajectory with only the selected rows."""
-        return Trajectory(*(getattr(self, column.name)[selection] for column in fields(self)))
+        return Trajectory(
+            *(getattr(self, column.name)[selection] for column in fields(self))
+        )
 
     def at(self, stamps_ns: Ints) -> Trajectory:
         """Poses at other instants: position linear, rotation along the shortest arc; without covariances.
 
         Raises `MeasurementError` when an instant lies outside the trajectory.
         """
-        if len(stamps_ns) and (stamps_ns[0] < self.stamps_ns[0] or stamps_ns[-1] > self.stamps_ns[-1]):
-            raise MeasurementError("Trajectory.at: an instant lies outside it; select the common time span first")
-        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, side="right"), 1, len(self) - 1)
+        if len(stamps_ns) and (
+            stamps_ns[0] < self.stamps_ns[0] or stamps_ns[-1] > self.stamps_ns[-1]
+        ):
+            raise MeasurementError(
+                "Trajectory.at: an instant lies outside it; select the common time span first"
+            )
+        after = np.clip(
+            np.searchsorted(self.stamps_ns, stamps_ns, side="right"), 1, len(self) - 1
+        )
         before = after - 1
         interval_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         share = ((stamps_ns - self.stamps_ns[before]) / interval_ns)[:, None]
-        positions = self.positions[before] + share * (self.positions[after] - self.positions[before])
+        positions = self.positions[before] + share * (
+            self.positions[after] - self.positions[before]
+        )
         if not self.has_orientation:
             return Trajectory.of_positions(stamps_ns, positions)
-        start, end = Rotation.from_quat(self.quaternions_xyzw[before]), Rotation.from_quat(self.quaternions_xyzw[after])
-        quaternions = (start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())).as_quat()
+        start, end = (
+            Rotation.from_quat(self.quaternions_xyzw[before]),
+            Rotation.from_quat(self.quaternions_xyzw[after]),
+        )
+        quaternions = (
+            start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())
+        ).as_quat()
         return Trajectory.without_covariances(stamps_ns, positions, quaternions)
 
 
@@ -196,18 +249,42 @@ class LandmarkMap:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return f"LandmarkMap({len(self)} landmarks, ids {reprlib.repr(self.ids.tolist())})"
+        return (
+            f"LandmarkMap({len(self)} landmarks, ids {reprlib.repr(self.ids.tolist())})"
+        )
 
     def _repr_html_(self) -> str:
         """Positions with their standard deviations, for a notebook: of the first `MOST_ROWS` landmarks."""
         sigmas = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
         rows = [
-            [str(id_), *(f"{at:.3f}" for at in position), *(ABSENT if np.isnan(one) else f"{one:.3f}" for one in sigma)]
-            for id_, position, sigma in zip(self.ids[:MOST_ROWS].tolist(), self.positions, sigmas, strict=False)
+            [
+                str(id_),
+                *(f"{at:.3f}" for at in position),
+                *(ABSENT if np.isnan(one) else f"{one:.3f}" for one in sigma),
+            ]
+            for id_, position, sigma in zip(
+                self.ids[:MOST_ROWS].tolist(), self.positions, sigmas, strict=False
+            )
         ]
-        left_out = f"; {len(self) - MOST_ROWS} more are not shown" if len(self) > MOST_ROWS else ""
-        heads = ["ID", "x (m)", "y (m)", "z (m)", "sigma x (m)", "sigma y (m)", "sigma z (m)"]
-        return as_html(text_table("landmark-map", f"Map of {len(self)} landmarks{left_out}", heads, rows))
+        left_out = (
+            f"; {len(self) - MOST_ROWS} more are not shown"
+            if len(self) > MOST_ROWS
+            else ""
+        )
+        heads = [
+            "ID",
+            "x (m)",
+            "y (m)",
+            "z (m)",
+            "sigma x (m)",
+            "sigma y (m)",
+            "sigma z (m)",
+        ]
+        return as_html(
+            text_table(
+                "landmark-map", f"Map of {len(self)} landmarks{left_out}", heads, rows
+            )
+        )
 
 
 class Outcome(StrEnum):
@@ -216,7 +293,9 @@ class Outcome(StrEnum):
     USED = "used"
     NEW = "new landmark"
     USED_LATER = "used later, when its identity was known"
-    PLACED_LATER = "used later, when its landmark, of unknown identity, had been seen often enough"
+    PLACED_LATER = (
+        "used later, when its landmark, of unknown identity, had been seen often enough"
+    )
     MOVED = "used: taken back from one landmark and given to another"
     GATED = "refused: innovation outside the gate"
     REASSIGNED = "used: its place says that it is another landmark"
@@ -226,7 +305,9 @@ class Outcome(StrEnum):
     FORGOTTEN = "refused: its identity did not become known in time"
     TAKEN_BACK = "taken back: its track is of no known landmark"
     REPEATED = "refused: the frame shows this landmark elsewhere, more probably"
-    TRACK_REPEATED = "refused: the frame has another row of its track, of which one object is seen"
+    TRACK_REPEATED = (
+        "refused: the frame has another row of its track, of which one object is seen"
+    )
     UNSOUND = "refused: its range is not above 0 and at most 100 km, or its covariance not positive definite"
     WITHHELD = "withheld: with it the estimate could not be determined"
     LATE = "refused: older than what was already processed"
@@ -270,15 +351,17 @@ class Refusal(StrEnum):
 
     OUTLIER = "refused: no vehicle reaches this velocity from the last"
     LATE = "refused: the motion that it belongs to was already used"
-    UNCONFIRMED = "refused: no other velocity confirms it, and none before it is near enough"
-    WAITED = "not used: it came after a gap, and only the velocity that confirmed it was"
+    UNCONFIRMED = (
+        "refused: no other velocity confirms it, and none before it is near enough"
+    )
+    WAITED = (
+        "not used: it came after a gap, and only the velocity that confirmed it was"
+    )
     UNSOUND = "refused: its covariance is not positive definite, or no sensor gives its value or its noise"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
     BEYOND_SENSOR = "refused: no gyro or accelerometer measures this"
     OUT_OF_REACH = "refused: no vehicle reaches this depth from the last, or no other depth confirms it"
-    CLOCK = (
-        "refused: more than a day from the rows that follow or precede; was the clock set between, or are these not ns?"
-    )
+    CLOCK = "refused: more than a day from the rows that follow or precede; was the clock set between, or are these not ns?"
     RATE = "not used: stamps follow each other faster than any sensor measures; are they nanoseconds?"
 
 
@@ -323,11 +406,22 @@ class DetectionJournal:
         self._stamps_ns.append(stamp_ns)
         self._ids.append(landmark_id)
         self._outcomes.append(OUTCOME_NUMBERS[outcome])
-        self._innovations.extend(UNKNOWN[:2] if innovation is None else innovation.tolist())
-        self._innovation_covs.extend(UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist())
+        self._innovations.extend(
+            UNKNOWN[:2] if innovation is None else innovation.tolist()
+        )
+        self._innovation_covs.extend(
+            UNKNOWN if innovation_cov is None else innovation_cov.ravel().tolist()
+        )
         return self._forgotten + len(self) - 1
 
-    def extend(self, stamps_ns: Ints, ids: Ints, outcomes: NDArray[np.int8], innovations: Floats, covs: Floats) -> None:
+    def extend(
+        self,
+        stamps_ns: Ints,
+        ids: Ints,
+        outcomes: NDArray[np.int8],
+        innovations: Floats,
+        covs: Floats,
+    ) -> None:
         """Append rows, with outcomes as `OUTCOME_NUMBERS`; NaN without a prediction."""
         self._stamps_ns.frombytes(stamps_ns.tobytes())
         self._ids.frombytes(ids.tobytes())
@@ -342,7 +436,9 @@ class DetectionJournal:
             stamps_ns=np.array(self._stamps_ns, dtype=np.int64),
             landmark_ids=np.array(self._ids, dtype=np.int64),
             innovations=np.array(self._innovations, dtype=np.float64).reshape(n, 2),
-            innovation_covs=np.array(self._innovation_covs, dtype=np.float64).reshape(n, 2, 2),
+            innovation_covs=np.array(self._innovation_covs, dtype=np.float64).reshape(
+                n, 2, 2
+            ),
             outcomes=[OUTCOMES[number] for number in self._outcomes],
         )
 

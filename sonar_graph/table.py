@@ -95,10 +95,22 @@ def absent(parts: int = 1) -> Cell:
     return Cell(ABSENT, (math.nan,) * parts)
 
 
-def text_table(name: str, title: str, headings: list[str], rows: list[list[str]], *, numbers: bool = True) -> Table:
+def text_table(
+    name: str,
+    title: str,
+    headings: list[str],
+    rows: list[list[str]],
+    *,
+    numbers: bool = True,
+) -> Table:
     """A table of texts: the first column of words, the others of numbers or of words too."""
-    columns = [Column(heading, heading, is_number=numbers and k > 0) for k, heading in enumerate(headings)]
-    return Table(name, title, "", columns, [[words(text) for text in row] for row in rows])
+    columns = [
+        Column(heading, heading, is_number=numbers and k > 0)
+        for k, heading in enumerate(headings)
+    ]
+    return Table(
+        name, title, "", columns, [[words(text) for text in row] for row in rows]
+    )
 
 
 def as_html(table: Table, *, is_sortable: bool = False) -> str:
@@ -113,7 +125,10 @@ def as_html(table: Table, *, is_sortable: bool = False) -> str:
         breakable = re.sub(r"([/=_,])", r"\1<wbr>", escape(text))
         return f'<span class="run run-{run % RUN_COLOURS}">{breakable}</span>'
 
-    sortable, is_numeric = (' class="sortable"' if is_sortable else ""), ' class="number"'
+    sortable, is_numeric = (
+        (' class="sortable"' if is_sortable else ""),
+        ' class="number"',
+    )
     lines = [f'<table{sortable} id="table-{escape(table.name)}">']
     caption = f"{table.title}. {table.caption}" if table.caption else table.title
     lines.append(f"<caption><span>{escape(caption)}</span></caption>")
@@ -133,7 +148,9 @@ def as_html(table: Table, *, is_sortable: bool = False) -> str:
             heading += f' <span class="warning">{escape(column.warning)}</span>'
         if is_sortable:
             heading = f'<button type="button">{heading}</button>'
-        lines.append(f'<th scope="col"{is_numeric if column.is_number else ""}>{heading}</th>')
+        lines.append(
+            f'<th scope="col"{is_numeric if column.is_number else ""}>{heading}</th>'
+        )
     lines += ["</tr>", "</thead>", "<tbody>"]
     for index, row in enumerate(table.rows):
         if index in table.sections:

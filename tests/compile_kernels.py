@@ -46,5 +46,7 @@ def images() -> str:
 
 if __name__ == "__main__":
     with ProcessPoolExecutor(3, mp_context=get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(job) for job in (filters, images, smoother)]):
+        for done in as_completed(
+            [pool.submit(job) for job in (filters, images, smoother)]
+        ):
             print(f"compiled: {done.result()}", file=sys.stderr, flush=True)

@@ -22,14 +22,22 @@ if TYPE_CHECKING:
     from .recognition.imaged_lane import Lane
 
 os.environ["MPLBACKEND"] = "Agg"
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # before numpy is loaded, here and in the workers
+for name in (
+    "OPENBLAS_NUM_THREADS",
+    "OMP_NUM_THREADS",
+):  # before numpy is loaded, here and in the workers
     os.environ.setdefault(name, "1")
-if threading.current_thread() is threading.main_thread():  # a shell's job in the background ignores interrupts
+if (
+    threading.current_thread() is threading.main_thread()
+):  # a shell's job in the background ignores interrupts
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.register_profile("thorough", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "thorough", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.register_profile("fast", settings.get_profile("thorough"), max_examples=20)
-settings.load_profile("fast")  # --hypothesis-profile=thorough: a hundred examples for each property
+# --hypothesis-profile=thorough: a hundred examples for each property
+settings.load_profile("fast")
 
 
 @pytest.fixture(scope="session")
@@ -37,14 +45,18 @@ def recordings() -> Path:
     """The folder with recorded data."""
     folder = os.environ.get("SONAR_GRAPH_DATA")
     if not folder:
-        pytest.skip("recorded data is found through the environment variable SONAR_GRAPH_DATA, which is not set")
+        pytest.skip(
+            "recorded data is found through the environment variable SONAR_GRAPH_DATA, which is not set"
+        )
     if not Path(folder).is_dir():
         pytest.skip(f"SONAR_GRAPH_DATA={folder} is not a folder")
     return Path(folder)
 
 
 @pytest.fixture(scope="session")
-def unpacked(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def unpacked(
+    recordings: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
     """Unpacks an archive among the recordings, once a session, and gives the folder with its content."""
     folders: dict[str, Path] = {}
 

@@ -29,7 +29,11 @@ class SourceFiles:
 
     def __init__(self, root: Path, packages: tuple[str, ...]) -> None:
         self._root = root
-        files = [path for package in packages for path in sorted((root / package).rglob("*.py"))]
+        files = [
+            path
+            for package in packages
+            for path in sorted((root / package).rglob("*.py"))
+        ]
         self._modules = {self._name(path): path for path in files}
         self._listed: dict[str, dict[str, str]] = {}
         self._trees = {path: ast.parse(path.read_text("utf-8")) for path in files}
@@ -39,8 +43,13 @@ class SourceFiles:
         """Files that each file imports while it runs."""
         found: Graph = {}
         for module, path in self._modules.items():
-            targets = [self._definition(*one) for one in self._imported(module, is_typing=False)]
-            found[path] = {target for target in targets if target is not None and target != path}
+            targets = [
+                self._definition(*one)
+                for one in self._imported(module, is_typing=False)
+            ]
+            found[path] = {
+                target for target in targets if target is not None and target != path
+            }
         return found
 
     def shown(self, path: Path) -> str:
@@ -83,7 +92,11 @@ class SourceFiles:
         # A package may import its names at their first use: it then lists them under TYPE_CHECKING.
         if module not in self._listed:
             listed = self._imported(module, is_typing=True)
-            self._listed[module] = {one.name: one.module for one in listed if one.name and one.module != module}
+            self._listed[module] = {
+                one.name: one.module
+                for one in listed
+                if one.name and one.module != module
+            }
         if name not in self._listed[module]:
             return path
         return self._definition(self._listed[module][name], name) or path
@@ -120,7 +133,11 @@ def reachable(graph: Graph, start: Path) -> set[Path]:
 def tangles(graph: Graph) -> list[frozenset[Path]]:
     """Largest sets of files in which every file imports every other one, directly or through others."""
     below = {path: reachable(graph, path) for path in graph}
-    found = {frozenset(other for other in below[path] if path in below[other]) for path in graph if path in below[path]}
+    found = {
+        frozenset(other for other in below[path] if path in below[other])
+        for path in graph
+        if path in below[path]
+    }
     return sorted(found, key=sorted)
 
 

@@ -10,12 +10,34 @@ from scipy.spatial.transform import Rotation
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam, EkfSlamParams
 from baselines.invariant_ekf import InvariantEkf, InvariantEkfParams
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.estimator import Estimator
-from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Heading, Imu, Measurements, PositionFixes
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Depth,
+    Dvl,
+    Floats,
+    Heading,
+    Imu,
+    Measurements,
+    PositionFixes,
+)
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, RobustKernel, SmootherParams
+from sonar_graph.slam import (
+    GaussianKernel,
+    Isam2,
+    Isam2Params,
+    KeyframeParams,
+    RobustKernel,
+    SmootherParams,
+)
 from sonar_graph.states import Estimate, Refusal
 from sonar_graph.testing import aided_world
 
@@ -26,7 +48,9 @@ EVERY_NODE = KeyframeParams(max_interval_s=0.1)
 SMOOTHERS = {
     name: Isam2Params(
         kernel=GaussianKernel(),
-        smoother=SmootherParams(lag_s=lag_s, relinearize_threshold=1e-6, waiting_gain=0.0),
+        smoother=SmootherParams(
+            lag_s=lag_s, relinearize_threshold=1e-6, waiting_gain=0.0
+        ),
         keyframes=EVERY_NODE,
     )
     for name, lag_s in (("everything kept", 1e6), ("three seconds kept", 3.1))
@@ -34,23 +58,39 @@ SMOOTHERS = {
 smoothers = pytest.mark.parametrize("params", SMOOTHERS.values(), ids=SMOOTHERS)
 
 
-def run(estimator: Estimator, sequence: Sequence, rate_hz: float = 1 / STEP_S) -> list[Estimate]:
-    answers = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+def run(
+    estimator: Estimator, sequence: Sequence, rate_hz: float = 1 / STEP_S
+) -> list[Estimate]:
+    answers = [
+        estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))
+    ]
     return [answer for answer in answers if answer is not None]
 
 
-def difference(one: list[Estimate], other: list[Estimate], axes: slice = slice(0, 6)) -> tuple[float, float]:
+def difference(
+    one: list[Estimate], other: list[Estimate], axes: slice = slice(0, 6)
+) -> tuple[float, float]:
     """Largest difference of pose (m, rad) and of the covariance of some axes, relative to the sigmas."""
     assert [e.stamp_ns for e in one] == [e.stamp_ns for e in other]
     poses, covs = [], []
     for a, b in zip(one, other, strict=True):
-        poses.append(np.abs(a.world_T_body.inverse().compose(b.world_T_body).matrix() - np.eye(4)).max())
+        poses.append(
+            np.abs(
+                a.world_T_body.inverse().compose(b.world_T_body).matrix() - np.eye(4)
+            ).max()
+        )
         sigma = np.sqrt(np.diag(b.covariance)[axes])
-        covs.append(np.abs((a.covariance - b.covariance)[axes, axes] / np.outer(sigma, sigma)).max())
+        covs.append(
+            np.abs(
+                (a.covariance - b.covariance)[axes, axes] / np.outer(sigma, sigma)
+            ).max()
+        )
     return max(poses), max(covs)
 
 
-def made(kind: type[Estimator], calibration: Calibration, params: Any = None) -> Estimator:
+def made(
+    kind: type[Estimator], calibration: Calibration, params: Any = None
+) -> Estimator:
     return kind(calibration, Odometry(calibration), params)
 
 
@@ -72,18 +112,30 @@ def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
     ):
         for k, estimate in enumerate(run(estimator, sequence), 1):
             mean, variance = numbers.solution(k + 1)
-            assert estimate.world_T_body.translation()[0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
-            assert estimate.covariance[3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-6 * variance[f"x{k}"] ** 0.5)
+            assert estimate.world_T_body.translation()[0] == pytest.approx(
+                mean[f"x{k}"], abs=1e-6
+            )
+            assert estimate.covariance[3, 3] == pytest.approx(
+                variance[f"x{k}"], abs=1e-6 * variance[f"x{k}"] ** 0.5
+            )
         found = estimator.landmarks()
         assert found.ids.tolist() == [4, 7]
-        assert found.positions[:, 0] == pytest.approx([mean["l4"], mean["l7"]], abs=1e-6)
-        assert found.covariances[:, 0, 0] == pytest.approx([variance["l4"], variance["l7"]], abs=1e-6)
+        assert found.positions[:, 0] == pytest.approx(
+            [mean["l4"], mean["l7"]], abs=1e-6
+        )
+        assert found.covariances[:, 0, 0] == pytest.approx(
+            [variance["l4"], variance["l7"]], abs=1e-6
+        )
 
 
 @pytest.mark.parametrize(
-    ("params", "kernel_width"), [(EkfSlamParams(), 0.0), (InvariantEkfParams(), 1.5)], ids=["ekf-slam", "invariant-ekf"]
+    ("params", "kernel_width"),
+    [(EkfSlamParams(), 0.0), (InvariantEkfParams(), 1.5)],
+    ids=["ekf-slam", "invariant-ekf"],
 )
-def test_filters_judge_detections_as_the_smoother_does_by_default_and_ekf_slam_as_published(params, kernel_width):
+def test_filters_judge_detections_as_the_smoother_does_by_default_and_ekf_slam_as_published(
+    params, kernel_width
+):
     smoother = Isam2Params()
     assert smoother.kernel == RobustKernel(shape="cauchy", width=1.5)
     assert params.kernel_width == kernel_width
@@ -100,8 +152,16 @@ def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
     An azimuth says less of y from farther off, which filters do not linearise anew: 2e-6 of the variance of y.
     """
     sequence, _ = rail(NODES)
-    truth, fixes_ns = run(filters(sequence.calibration)[0], sequence), sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10
-    x = np.array([[estimate.world_T_body.translation()[0] + 0.12, 0.0, 0.0] for estimate in truth])[: len(fixes_ns)]
+    truth, fixes_ns = (
+        run(filters(sequence.calibration)[0], sequence),
+        sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10,
+    )
+    x = np.array(
+        [
+            [estimate.world_T_body.translation()[0] + 0.12, 0.0, 0.0]
+            for estimate in truth
+        ]
+    )[: len(fixes_ns)]
     fixes = PositionFixes(fixes_ns, x, np.tile(0.1 * np.eye(3), (len(fixes_ns), 1, 1)))
     aided = replace(sequence, positions=fixes) if with_fixes else sequence
     three = *filters(sequence.calibration), made(Isam2, sequence.calibration, params)
@@ -110,7 +170,12 @@ def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
         assert max(difference(estimates, smoother, slice(3, 4))) < 1e-6
         assert difference(estimates, smoother, slice(3, 6))[1] < 1e-5
     if with_fixes:
-        assert difference(ekf, run(filters(sequence.calibration)[0], sequence, 10), slice(3, 4))[1] > 0.1
+        assert (
+            difference(
+                ekf, run(filters(sequence.calibration)[0], sequence, 10), slice(3, 4)
+            )[1]
+            > 0.1
+        )
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
@@ -118,15 +183,23 @@ def test_headings_of_a_biased_compass_are_the_textbook_s_scalar_update(kind):
     """At rest: n of them have the variance ``bias^2 + sigma^2 / n``, and ``1 / P' = 1 / P + 1 / R``."""
     n, yaw_rad, sigma, bias, prior = 21, 0.01, 0.02, 0.05, 0.3
     sequence, _ = rail()
-    start = sequence.calibration.start.model_copy(update={"rpy_sigma_rad": (1e-6, 1e-6, prior)})
+    start = sequence.calibration.start.model_copy(
+        update={"rpy_sigma_rad": (1e-6, 1e-6, prior)}
+    )
     known = sequence.calibration.model_copy(update={"start": start})
     still = replace(sequence.dvl, velocity=np.zeros((NODES, 3)))
     heading = Heading(sequence.dvl.stamps_ns, np.full(n, yaw_rad), np.full(n, sigma))
-    at_rest = replace(sequence, calibration=known, dvl=still, heading=heading, detections=None)
+    at_rest = replace(
+        sequence, calibration=known, dvl=still, heading=heading, detections=None
+    )
     estimate = run(made(kind, known), at_rest, 1.0)[-1]
     R = bias**2 + sigma**2 / n
-    assert estimate.world_T_body.rotation().yaw() == pytest.approx(yaw_rad * prior**2 / (prior**2 + R), abs=1e-6)
-    assert estimate.covariance[2, 2] == pytest.approx(1 / (1 / prior**2 + 1 / R), rel=1e-3)
+    assert estimate.world_T_body.rotation().yaw() == pytest.approx(
+        yaw_rad * prior**2 / (prior**2 + R), abs=1e-6
+    )
+    assert estimate.covariance[2, 2] == pytest.approx(
+        1 / (1 / prior**2 + 1 / R), rel=1e-3
+    )
 
 
 @smoothers
@@ -139,15 +212,23 @@ def test_the_smoothed_trajectory_is_least_squares_with_all_measurements(params):
     smoothed = estimator.trajectory()
     for k in range(1, NODES):
         assert smoothed.positions[k - 1, 0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
-        assert smoothed.covariances[k - 1, 3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-6)
+        assert smoothed.covariances[k - 1, 3, 3] == pytest.approx(
+            variance[f"x{k}"], abs=1e-6
+        )
     assert smoothed.covariances[9, 3, 3] < causal[9].covariance[3, 3] - 1e-6
-    assert smoothed.positions[-1, 0] == pytest.approx(causal[-1].world_T_body.translation()[0], abs=1e-6)
+    assert smoothed.positions[-1, 0] == pytest.approx(
+        causal[-1].world_T_body.translation()[0], abs=1e-6
+    )
 
 
 def winding(gyro_bias_sigma: float = 0.0) -> Sequence:
     """A minute of driving, turning and leaning, with lever arms, and nothing that could correct it."""
     calibration = Calibration(
-        imu=ImuCalibration(gyro_noise_density=1e-3, gyro_bias_sigma=gyro_bias_sigma, gyro_bias_walk_density=0.0),
+        imu=ImuCalibration(
+            gyro_noise_density=1e-3,
+            gyro_bias_sigma=gyro_bias_sigma,
+            gyro_bias_walk_density=0.0,
+        ),
         dvl=DvlCalibration(
             velocity_sigma_m_s=(0.01, 0.02, 0.03),
             mounting=Mounting(translation_m=(-0.4, 0.1, -0.2), rpy_rad=(0, 0, 0.8)),
@@ -167,7 +248,11 @@ def winding(gyro_bias_sigma: float = 0.0) -> Sequence:
         "winding",
         calibration,
         Imu(imu_ns, 0.15 * rates, np.full((len(imu_ns), 3), np.nan)),
-        Dvl(dvl_ns, into_dvl.apply([0.5, 0, 0] + 0.1 * velocities), np.full((len(dvl_ns), 3, 3), np.nan)),
+        Dvl(
+            dvl_ns,
+            into_dvl.apply([0.5, 0, 0] + 0.1 * velocities),
+            np.full((len(dvl_ns), 3, 3), np.nan),
+        ),
     )
 
 
@@ -180,7 +265,14 @@ def test_without_sightings_all_are_dead_reckoning():
     sequence = winding()
     reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
     for kind in (EkfSlam, InvariantEkf, Isam2):
-        assert max(difference(run(made(kind, sequence.calibration), sequence, 3.7), reckoned)) < 1e-6
+        assert (
+            max(
+                difference(
+                    run(made(kind, sequence.calibration), sequence, 3.7), reckoned
+                )
+            )
+            < 1e-6
+        )
 
 
 @pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
@@ -188,7 +280,9 @@ def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind)
     """A constant bias of which nothing is learnt: unknown, and the same at all times."""
     sequence = winding(gyro_bias_sigma=2e-3)
     reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
-    poses, covariances = difference(run(made(kind, sequence.calibration), sequence, 3.7), reckoned)
+    poses, covariances = difference(
+        run(made(kind, sequence.calibration), sequence, 3.7), reckoned
+    )
     assert poses < 1e-6
     assert covariances < 1e-3
     unaware = run(made(DeadReckoning, winding().calibration), sequence, 3.7)
@@ -199,7 +293,10 @@ def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind)
 def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
     """Rows of a sensor come 2 s late, in a call that ends before the one before: a fix counts, the others cannot."""
     sequence, _ = rail(NODES)
-    estimator, others = made(kind, sequence.calibration), made(kind, sequence.calibration)
+    estimator, others = (
+        made(kind, sequence.calibration),
+        made(kind, sequence.calibration),
+    )
     run(estimator, sequence), run(others, sequence)
     end_ns = sequence.end_ns
     late_ns = np.array([end_ns - 3 * NS_PER_S, end_ns - 2 * NS_PER_S])
@@ -208,15 +305,30 @@ def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
         int(late_ns[-1]),
         depth=Depth(late_ns, z_m, sigma**2),
         heading=Heading(late_ns, yaw_rad, sigma),
-        positions=PositionFixes(late_ns, np.full((2, 3), 0.3), np.tile(1e-6 * np.eye(3), (2, 1, 1))),
+        positions=PositionFixes(
+            late_ns, np.full((2, 3), 0.3), np.tile(1e-6 * np.eye(3), (2, 1, 1))
+        ),
     )
     assert estimator.process(late) is None
     named = [(row.sensor, row.stamp_ns, row.reason) for row in estimator.refused_rows()]
-    expected = [(sensor, int(t), Refusal.LATE) for sensor in ("depth", "heading") for t in late_ns]
-    assert sorted(named) == sorted([*((r.sensor, r.stamp_ns, r.reason) for r in others.refused_rows()), *expected])
+    expected = [
+        (sensor, int(t), Refusal.LATE)
+        for sensor in ("depth", "heading")
+        for t in late_ns
+    ]
+    assert sorted(named) == sorted(
+        [*((r.sensor, r.stamp_ns, r.reason) for r in others.refused_rows()), *expected]
+    )
     asked = Measurements(end_ns + 1)
-    (after,), (without,) = ([e] for e in (estimator.process(asked), others.process(asked)))
-    assert np.linalg.norm(after.world_T_body.translation() - without.world_T_body.translation()) > 0.01
+    (after,), (without,) = (
+        [e] for e in (estimator.process(asked), others.process(asked))
+    )
+    assert (
+        np.linalg.norm(
+            after.world_T_body.translation() - without.world_T_body.translation()
+        )
+        > 0.01
+    )
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
@@ -224,27 +336,43 @@ def test_rows_from_before_the_first_epoch_are_not_called_late(kind):
     """A sensor that is switched on first."""
     sequence, _ = rail(NODES)
     early_ns = np.array([T0_NS - 2 * NS_PER_S, T0_NS - NS_PER_S])
-    depth, heading = Depth(early_ns, np.zeros(2), np.full(2, 1e-4)), Heading(early_ns, np.zeros(2), np.full(2, 0.01))
-    fixes = PositionFixes(early_ns, np.full((2, 3), 9.0), np.tile(1e-6 * np.eye(3), (2, 1, 1)))
-    estimator, others = made(kind, sequence.calibration), made(kind, sequence.calibration)
-    estimates = run(estimator, replace(sequence, depth=depth, heading=heading, positions=fixes))
+    depth, heading = (
+        Depth(early_ns, np.zeros(2), np.full(2, 1e-4)),
+        Heading(early_ns, np.zeros(2), np.full(2, 0.01)),
+    )
+    fixes = PositionFixes(
+        early_ns, np.full((2, 3), 9.0), np.tile(1e-6 * np.eye(3), (2, 1, 1))
+    )
+    estimator, others = (
+        made(kind, sequence.calibration),
+        made(kind, sequence.calibration),
+    )
+    estimates = run(
+        estimator, replace(sequence, depth=depth, heading=heading, positions=fixes)
+    )
     estimator.process(Measurements(sequence.end_ns, heading=heading, positions=fixes))
     assert not estimator.refused_rows()
     assert max(difference(estimates, run(others, sequence))) == 0.0
-    estimates = [e.process(Measurements(sequence.end_ns + 1)) for e in (estimator, others)]
+    estimates = [
+        e.process(Measurements(sequence.end_ns + 1)) for e in (estimator, others)
+    ]
     assert max(difference(estimates[:1], estimates[1:])) == 0.0
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 def test_headings_of_one_stamp_in_two_calls_both_count(kind):
     sequence, _ = rail(NODES)
-    start = sequence.calibration.start.model_copy(update={"rpy_sigma_rad": (1e-6, 1e-6, 0.3)})
+    start = sequence.calibration.start.model_copy(
+        update={"rpy_sigma_rad": (1e-6, 1e-6, 0.3)}
+    )
     known = sequence.calibration.model_copy(update={"start": start})
     sigmas = []
     for count in range(3):
         estimator = made(kind, known)
         middle_ns = int(sequence.dvl.stamps_ns[NODES // 2])
-        for step in replace(sequence, calibration=known, detections=None).replay(sequence.instants(1 / STEP_S)):
+        for step in replace(sequence, calibration=known, detections=None).replay(
+            sequence.instants(1 / STEP_S)
+        ):
             estimate = estimator.process(step)
             for _ in range(count * (step.end_ns == middle_ns + NS_PER_S)):
                 row = Heading(np.array([step.end_ns]), np.zeros(1), np.full(1, 0.3))
@@ -252,47 +380,78 @@ def test_headings_of_one_stamp_in_two_calls_both_count(kind):
         assert not estimator.refused_rows()
         sigmas.append(estimate.covariance[2, 2])
     one, two = 0.05**2 + 0.3**2, 0.05**2 + 0.3**2 / 2
-    assert sigmas == pytest.approx([0.09, 1 / (1 / 0.09 + 1 / one), 1 / (1 / 0.09 + 1 / two)], rel=1e-2)
+    assert sigmas == pytest.approx(
+        [0.09, 1 / (1 / 0.09 + 1 / one), 1 / (1 / 0.09 + 1 / two)], rel=1e-2
+    )
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 @pytest.mark.parametrize(
-    ("wrong", "said"), [("heading", "headings contradict its yaw"), ("positions", "position fixes")]
+    ("wrong", "said"),
+    [("heading", "headings contradict its yaw"), ("positions", "position fixes")],
 )
-def test_an_estimate_too_sure_to_follow_its_headings_or_fixes_says_how_many_contradict_it(kind, wrong, said):
+def test_an_estimate_too_sure_to_follow_its_headings_or_fixes_says_how_many_contradict_it(
+    kind, wrong, said
+):
     """Its compass' bias follows them in time and hides that. Single outliers and an unsure start are no matter."""
     world = aided_world()
-    sure = world.calibration.start.model_copy(update={"rpy_sigma_rad": (1e-3,) * 3, "position_sigma_m": (1e-3,) * 3})
+    sure = world.calibration.start.model_copy(
+        update={"rpy_sigma_rad": (1e-3,) * 3, "position_sigma_m": (1e-3,) * 3}
+    )
     off, wide = {"heading": (2.0, {"rpy_sigma_rad": (0.01, 0.01, 2.0)})}.get(
         wrong, (40.0, {"position_sigma_m": (50.0,) * 3})
     )
     unsure = sure.model_copy(update=wide)
-    for start, share, is_told in ((sure, 1, True), (sure, 10, False), (unsure, 1, False), (sure, 0, False)):
+    for start, share, is_told in (
+        (sure, 1, True),
+        (sure, 10, False),
+        (unsure, 1, False),
+        (sure, 0, False),
+    ):
         heading, fixes = world.heading, world.positions
         yaw_rad, places = heading.yaw_rad.copy(), fixes.position_m.copy()
         if share:
-            (yaw_rad if wrong == "heading" else places[:, :2])[::share] += off  # depths know z
+            (yaw_rad if wrong == "heading" else places[:, :2])[::share] += (
+                off  # depths know z
+            )
         known = world.calibration.model_copy(update={"start": start})
         given = replace(world, calibration=known, detections=None)
         if wrong == "heading":
-            given = replace(given, heading=replace(heading, yaw_rad=yaw_rad), positions=None)
+            given = replace(
+                given, heading=replace(heading, yaw_rad=yaw_rad), positions=None
+            )
         else:
-            given = replace(given, heading=None, positions=replace(fixes, position_m=places))
+            given = replace(
+                given, heading=None, positions=replace(fixes, position_m=places)
+            )
         estimator = made(kind, known)
         run(estimator, given)
         told = [line for line in estimator.withheld() if said in line]
         assert bool(told) == is_told, (share, start == sure, estimator.withheld())
         if told:
             count, judged = map(int, told[0].split(" ")[0:3:2])
-            assert 0.8 * judged < count <= judged <= len(heading if wrong == "heading" else fixes)
+            assert (
+                0.8 * judged
+                < count
+                <= judged
+                <= len(heading if wrong == "heading" else fixes)
+            )
 
 
 NO_ROWS = {
     "sigma of more than a turn": Heading(np.array([0]), np.zeros(1), np.full(1, 1e200)),
-    "more turns than a double keeps": Heading(np.array([0]), np.full(1, 1e300), np.full(1, 0.01)),
-    "beyond the Earth": PositionFixes(np.array([0]), np.full((1, 3), 1e12), np.eye(3)[None]),
-    "beyond everything": PositionFixes(np.array([0]), np.full((1, 3), 1e200), np.full((1, 3, 3), np.nan)),
-    "sigma beyond the Earth": PositionFixes(np.array([0]), np.zeros((1, 3)), 1e300 * np.eye(3)[None]),
+    "more turns than a double keeps": Heading(
+        np.array([0]), np.full(1, 1e300), np.full(1, 0.01)
+    ),
+    "beyond the Earth": PositionFixes(
+        np.array([0]), np.full((1, 3), 1e12), np.eye(3)[None]
+    ),
+    "beyond everything": PositionFixes(
+        np.array([0]), np.full((1, 3), 1e200), np.full((1, 3, 3), np.nan)
+    ),
+    "sigma beyond the Earth": PositionFixes(
+        np.array([0]), np.zeros((1, 3)), 1e300 * np.eye(3)[None]
+    ),
 }
 
 
@@ -302,9 +461,17 @@ def test_a_heading_or_fix_that_no_sensor_gives_is_named_and_changes_nothing(kind
     sequence, _ = rail(NODES)
     at_ns = T0_NS + 5 * NS_PER_S
     sensor = "heading" if isinstance(row, Heading) else "positions"
-    estimator, others = made(kind, sequence.calibration), made(kind, sequence.calibration)
-    estimates = run(estimator, replace(sequence, **{sensor: replace(row, stamps_ns=np.array([at_ns]))}))
-    assert [refused[:3] for refused in estimator.refused_rows()] == [(sensor, at_ns, Refusal.UNSOUND)]
+    estimator, others = (
+        made(kind, sequence.calibration),
+        made(kind, sequence.calibration),
+    )
+    estimates = run(
+        estimator,
+        replace(sequence, **{sensor: replace(row, stamps_ns=np.array([at_ns]))}),
+    )
+    assert [refused[:3] for refused in estimator.refused_rows()] == [
+        (sensor, at_ns, Refusal.UNSOUND)
+    ]
     assert max(difference(estimates, run(others, sequence))) < 1e-9
 
 
@@ -315,11 +482,19 @@ def test_unknown_noise_of_a_heading_or_fix_is_the_calibration_s(kind):
     heading, fixes = world.heading, world.positions
     ends = []
     for sigma in (np.nan, 1.0, 1.5):
-        noise = sigma * world.calibration.heading.sigma_rad, sigma * np.array(world.calibration.positions.sigma_m)
+        noise = (
+            sigma * world.calibration.heading.sigma_rad,
+            sigma * np.array(world.calibration.positions.sigma_m),
+        )
         covs = np.tile(np.diag(np.square(noise[1])), (len(fixes), 1, 1))
         covs[:, 0, 1] = covs[:, 1, 0] = np.nan if np.isnan(sigma) else 0.0
-        told = replace(heading, sigma_rad=np.full(len(heading), noise[0])), replace(fixes, covariance_m2=covs)
+        told = (
+            replace(heading, sigma_rad=np.full(len(heading), noise[0])),
+            replace(fixes, covariance_m2=covs),
+        )
         sequence = replace(world, heading=told[0], positions=told[1])
-        ends.append(run(kind(world.calibration, Odometry(world.calibration)), sequence, 1.0))
+        ends.append(
+            run(kind(world.calibration, Odometry(world.calibration)), sequence, 1.0)
+        )
     assert max(difference(ends[0], ends[1])) < 1e-9
     assert max(difference(ends[0], ends[2])) > 1e-4

@@ -19,9 +19,13 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {key: value for key, value in os.environ.items() if key != "SONAR_GRAPH_DATA"}
+    environment = {
+        key: value for key, value in os.environ.items() if key != "SONAR_GRAPH_DATA"
+    }
     command = [sys.executable, str(BENCHMARKS / script), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=600, env=environment
+    )
 
 
 def figures(script: str, *arguments: str) -> dict[str, Any]:
@@ -36,10 +40,17 @@ def test_what_cannot_be_run_is_one_line_and_exit_code_2(tmp_path):
     for command, told in (
         (("validation/mrclam.py",), "--data"),
         (("validation/mrclam.py", "--data", str(tmp_path)), "--data"),
-        (("validation/filter_consistency.py", "--basins", "nominal,deep"), "--basins, --estimators: unknown: deep"),
+        (
+            ("validation/filter_consistency.py", "--basins", "nominal,deep"),
+            "--basins, --estimators: unknown: deep",
+        ),
     ):
         done = run(*command)
-        assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1)
+        assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (
+            2,
+            "",
+            1,
+        )
         assert told in done.stderr
 
 
@@ -55,7 +66,11 @@ class Quick(NamedTuple):
 
 
 TWO_WORKERS = ("--workers", "2")
-NESTED = [f"{kind}_{share}" for kind in ("detections", "diagnostics", "scans") for share in ("ratio", "shared_ratio")]
+NESTED = [
+    f"{kind}_{share}"
+    for kind in ("detections", "diagnostics", "scans")
+    for share in ("ratio", "shared_ratio")
+]
 # fmt: off
 QUICK = {
     "performance/dense_log.py": Quick(  # landmarks known to half a metre are nearer to the batch than a third of that
@@ -111,11 +126,16 @@ def test_a_script_names_its_figures(script):
 @pytest.mark.slow
 def test_preintegration_names_its_figures():
     found = figures("performance/preintegration.py")
-    assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
+    assert found["gtsam_cpp_ratio"] == pytest.approx(
+        found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3
+    )
     assert found["gtsam_python_ratio"] > 1
     assert found["gtsam_python_ratio"] > found["with_add_ratio"]
     assert len(found["factor_us"]) == 3
-    assert found["factor_us"]["OdometryWithBias (Python)"] > found["factor_us"]["BetweenFactorPose3 (compiled)"]
+    assert (
+        found["factor_us"]["OdometryWithBias (Python)"]
+        > found["factor_us"]["BetweenFactorPose3 (compiled)"]
+    )
 
 
 @pytest.mark.slow
@@ -134,9 +154,12 @@ def test_preintegration_consistency_tells_rules_apart():
 @pytest.mark.slow
 def test_recognition_names_its_figures():
     found = figures("performance/recognition.py")
-    parts = sum(found[f"{part}_ms"] for part in ("selection", "tracking", "look", "beliefs"))
+    parts = sum(
+        found[f"{part}_ms"] for part in ("selection", "tracking", "look", "beliefs")
+    )
     assert 0.5 * found["frame_ms"] < parts < found["frame_ms"]
-    assert found["detections"] > 0  # landmarks were looked at, else the comparison with designs would cost nothing
+    # landmarks were looked at, else the comparison with designs would cost nothing
+    assert found["detections"] > 0
     assert found["median_ms"] < found["p99_ms"]
     assert found["rss_growth_mb"] < found["peak_rss_mb"]
     is_compared = importlib.util.find_spec("actag") is not None
@@ -161,10 +184,21 @@ def test_batch_intervals_tell_methods_apart():
     found = figures("validation/batch_intervals.py", "--workers", "1")
     assert found["pairs"] == [6, 10, 20, 50]
     for shares in found["held"].values():
-        assert all(len(of_kind) == 4 and 0.2 < min(of_kind) <= max(of_kind) <= 1 for of_kind in shares.values())
-    assert found["held"]["BCa"]["normal"][0] < found["held"]["reported"]["normal"][0] - 0.03
+        assert all(
+            len(of_kind) == 4 and 0.2 < min(of_kind) <= max(of_kind) <= 1
+            for of_kind in shares.values()
+        )
+    assert (
+        found["held"]["BCa"]["normal"][0]
+        < found["held"]["reported"]["normal"][0] - 0.03
+    )
     assert found["length"]["Student"]["normal"] == [1.0] * 4
-    assert found["length"]["BCa"]["normal"][0] < 0.85 < 1 < found["length"]["reported"]["normal"][0]
+    assert (
+        found["length"]["BCa"]["normal"][0]
+        < 0.85
+        < 1
+        < found["length"]["reported"]["normal"][0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -178,10 +212,17 @@ def test_batch_intervals_tell_methods_apart():
         ({"difference": float("inf")}, 1, 1),
     ],
 )
-def test_ekf_step_fails_when_a_full_run_misses_a_target(changes, of_full_run, of_quick_run, monkeypatch):
+def test_ekf_step_fails_when_a_full_run_misses_a_target(
+    changes, of_full_run, of_quick_run, monkeypatch
+):
     monkeypatch.syspath_prepend(str(BENCHMARKS / "performance"))
     ekf_step = importlib.import_module("ekf_step")
-    met = {"log_s": 0.5, "filterpy_ratio": 50.0, "filterpy_node_ratio": 20.0, "difference": 1e-12} | changes
+    met = {
+        "log_s": 0.5,
+        "filterpy_ratio": 50.0,
+        "filterpy_node_ratio": 20.0,
+        "difference": 1e-12,
+    } | changes
     assert ekf_step.meets_targets(met) == (of_full_run == 0)
     assert ekf_step.exit_code(met, quick=False) == of_full_run
     assert ekf_step.exit_code(met, quick=True) == of_quick_run
@@ -190,7 +231,9 @@ def test_ekf_step_fails_when_a_full_run_misses_a_target(changes, of_full_run, of
 @pytest.mark.slow
 def test_consistency_names_its_figures_and_draws(tmp_path):
     picture = tmp_path / "anees.png"
-    found = figures("validation/consistency.py", "--workers", "2", "--out", str(picture))
+    found = figures(
+        "validation/consistency.py", "--workers", "2", "--out", str(picture)
+    )
     for quantity in ("position", "yaw"):
         low, high = found[f"band_{quantity}"]
         assert low < 1 < high
@@ -202,22 +245,36 @@ def test_consistency_names_its_figures_and_draws(tmp_path):
 
 @pytest.mark.slow
 def test_filter_consistency_names_its_figures_and_tells_filters_apart():
-    found = figures("validation/filter_consistency.py", "--workers", "2", "--estimators", "ekf,invariant")
+    found = figures(
+        "validation/filter_consistency.py",
+        "--workers",
+        "2",
+        "--estimators",
+        "ekf,invariant",
+    )
     for basin in ("nominal", "hard", "hard_without_bias"):
         for quantity in ("position", "yaw"):
             low, high = found[f"{basin}_band_{quantity}"]
             assert low < 1 < high
             for estimator in ("ekf", "invariant"):
                 value = found[f"{basin}_{estimator}_{quantity}_anees"]
-                assert found[f"{basin}_{estimator}_{quantity}_inside"] == (low <= value <= high)
-        assert found[f"{basin}_ekf_yaw_anees"] != pytest.approx(found[f"{basin}_invariant_yaw_anees"], rel=1e-3)
+                assert found[f"{basin}_{estimator}_{quantity}_inside"] == (
+                    low <= value <= high
+                )
+        assert found[f"{basin}_ekf_yaw_anees"] != pytest.approx(
+            found[f"{basin}_invariant_yaw_anees"], rel=1e-3
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.recording
 def test_isam2_settings_names_what_they_do(recordings):
-    found = figures("validation/isam2_settings.py", "--data", str(recordings), "--workers", "2")
-    (frames, keyframes, updates, _), (_, dense, *_), (_, same, all_updates, _) = found["effort"]
+    found = figures(
+        "validation/isam2_settings.py", "--data", str(recordings), "--workers", "2"
+    )
+    (frames, keyframes, updates, _), (_, dense, *_), (_, same, all_updates, _) = found[
+        "effort"
+    ]
     assert keyframes == same < dense
     assert updates < all_updates
     assert 0.9 * frames < dense < 1.1 * frames
@@ -234,7 +291,9 @@ def test_real_frames_names_its_figures(recordings, tmp_path):
     arguments = ("--data", str(recordings), "--workers", "1", "--figure", str(figure))
     found = figures("validation/real_frames.py", *arguments)
     assert found["frames"] == 15
-    assert {"ours", "soca", "soca_power", "median", "actag", "lead", "passed"} <= set(found)
+    assert {"ours", "soca", "soca_power", "median", "actag", "lead", "passed"} <= set(
+        found
+    )
     for low, high in zip(found["lead_from"], found["lead_to"], strict=True):
         assert -1 < low <= high < 1
     assert max(found["ours"]) > 0.8
@@ -245,20 +304,43 @@ def test_real_frames_names_its_figures(recordings, tmp_path):
 def test_golden_runs_are_kept_once_and_differ_in_what_was_changed(tmp_path):
     chosen = ("--logs", "basin-tracks", "--estimators", "ekf-slam")
     for folder in ("old", "new"):
-        done = run("validation/golden.py", "keep", str(tmp_path / folder), "--quick", *chosen)
+        done = run(
+            "validation/golden.py", "keep", str(tmp_path / folder), "--quick", *chosen
+        )
         assert done.returncode == 0, done.stderr
-    assert "already kept" in run("validation/golden.py", "keep", str(tmp_path / "new"), "--quick", *chosen).stderr
-    same = run("validation/golden.py", "compare", str(tmp_path / "old"), str(tmp_path / "new"))
-    assert (same.returncode, same.stdout.splitlines()[-1]) == (0, "1 runs compared, tolerance 1e-09: equal")
+    assert (
+        "already kept"
+        in run(
+            "validation/golden.py", "keep", str(tmp_path / "new"), "--quick", *chosen
+        ).stderr
+    )
+    same = run(
+        "validation/golden.py", "compare", str(tmp_path / "old"), str(tmp_path / "new")
+    )
+    assert (same.returncode, same.stdout.splitlines()[-1]) == (
+        0,
+        "1 runs compared, tolerance 1e-09: equal",
+    )
     kept = tmp_path / "new" / "basin-tracks" / "ekf-slam.npz"
     with np.load(kept) as content:
         arrays = dict(content)
     arrays["smoothed_positions"][3, 1] += 0.25
     arrays["detection_outcomes"][5] = "GATED"
     np.savez_compressed(kept, **arrays)
-    other = run("validation/golden.py", "compare", str(tmp_path / "old"), str(tmp_path / "new"))
+    other = run(
+        "validation/golden.py", "compare", str(tmp_path / "old"), str(tmp_path / "new")
+    )
     assert other.returncode == 1
-    assert other.stdout.splitlines()[1].split()[2:10] == ["0", "0", "2.5e-01", "0", "0", "0", "0", "1"]
+    assert other.stdout.splitlines()[1].split()[2:10] == [
+        "0",
+        "0",
+        "2.5e-01",
+        "0",
+        "0",
+        "0",
+        "0",
+        "1",
+    ]
 
 
 def test_a_worse_ratio_of_speed_is_a_loss_in_both_directions(monkeypatch):
@@ -280,18 +362,34 @@ def test_every_script_is_listed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("script", "arguments"), [("damaged_logs.py", TWO_WORKERS), ("damaged_sonar_files.py", ())])
+@pytest.mark.parametrize(
+    ("script", "arguments"),
+    [("damaged_logs.py", TWO_WORKERS), ("damaged_sonar_files.py", ())],
+)
 def test_damaged_files_end_in_no_crash_and_no_silent_error(script, arguments):
     found = figures(f"validation/{script}", *arguments)
-    assert (found["files"], found["crashes"], found["hangs"], found["silent_errors"]) == (60, 0, 0, 0)
+    assert (
+        found["files"],
+        found["crashes"],
+        found["hangs"],
+        found["silent_errors"],
+    ) == (60, 0, 0, 0)
     assert found["recovered_share"] == 1
-    assert found.get("unseen_samples") != 0  # flipped samples of sonar files are among the damages
+    # flipped samples of sonar files are among the damages
+    assert found.get("unseen_samples") != 0
 
 
 @pytest.mark.slow
 def test_hostile_input_ends_in_no_traceback_and_loses_nothing():
     found = figures("validation/hostile_input.py", "--seed", "5")
-    names = ("cases", "tracebacks", "hangs", "silent_errors", "files_lost", "interrupts_missed")
+    names = (
+        "cases",
+        "tracebacks",
+        "hangs",
+        "silent_errors",
+        "files_lost",
+        "interrupts_missed",
+    )
     assert [found[name] for name in names] == [32, 0, 0, 0, 0, 0]
     assert found["peak_rss_mb"] <= 1500
 
@@ -300,7 +398,11 @@ def test_hostile_input_ends_in_no_traceback_and_loses_nothing():
 def test_unknown_landmarks_finds_all_in_a_short_basin():
     found = figures("validation/unknown_landmarks.py", "--workers", "1")
     assert found["passed"]
-    assert found["basin"]["unknown"]["landmarks"] == found["basin"]["known"]["landmarks"] == 4
+    assert (
+        found["basin"]["unknown"]["landmarks"]
+        == found["basin"]["known"]["landmarks"]
+        == 4
+    )
     assert found["basin"]["unknown"]["used"] > 0.9 * found["basin"]["known"]["used"]
 
 
@@ -315,8 +417,18 @@ def test_mrclam_names_its_figures(recordings):
 
 @pytest.mark.slow
 def test_fairness_has_a_row_for_each_choice_and_tells_some_apart():
-    worlds, names = ("--worlds", "basin0.001", "--estimators", "ekf-slam,invariant-ekf"), ("default", "bias")
-    rows = figures("validation/fairness.py", *worlds, "--choices", ",".join(names), "--workers", "1")["rows"]
+    worlds, names = (
+        ("--worlds", "basin0.001", "--estimators", "ekf-slam,invariant-ekf"),
+        ("default", "bias"),
+    )
+    rows = figures(
+        "validation/fairness.py",
+        *worlds,
+        "--choices",
+        ",".join(names),
+        "--workers",
+        "1",
+    )["rows"]
     assert [(row["estimator"], row["choice"]) for row in rows] == [
         (estimator, name)
         for estimator, told in (("ekf-slam", "bias in Q"), ("invariant-ekf", "no bias"))
@@ -340,20 +452,40 @@ def a_run(rows: list[tuple[int, int, int, float, int]]) -> Any:
     kept = importlib.import_module("recognition_runs")
     begin_s = np.array([0.0, 100.0, 200.0, 300.0])
     passes = kept.Passes(
-        np.array([1, 2, -1, -2]), np.array(["disc", "square", "weed", "lid"]), begin_s, begin_s + 50, np.full(4, 50)
+        np.array([1, 2, -1, -2]),
+        np.array(["disc", "square", "weed", "lid"]),
+        begin_s,
+        begin_s + 50,
+        np.full(4, 50),
     )
-    second, track, named, probability, label = (np.array(column) for column in zip(*rows, strict=True))
+    second, track, named, probability, label = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     error = np.tile([0.01, 0.0], (len(rows), 1))
     covariance = np.tile(np.eye(2), (len(rows), 1, 1))
     is_named = named > 0
     confidence = np.where(is_named, probability, 0.8)
     return kept.Run(
         passes,
-        {"r": kept.Detections(second, track, named, probability, confidence, is_named, label, error, covariance)},
+        {
+            "r": kept.Detections(
+                second,
+                track,
+                named,
+                probability,
+                confidence,
+                is_named,
+                label,
+                error,
+                covariance,
+            )
+        },
     )
 
 
-def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_judge_a_track_by_its_end(scenes):
+def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_judge_a_track_by_its_end(
+    scenes,
+):
     unjudged = importlib.import_module("recognition_runs").UNJUDGED
     run = a_run([
         (10, 1, 2, 0.90, 1), (20, 1, 1, 0.995, 1),  # wrong at first, right at its end
@@ -363,7 +495,10 @@ def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_jud
         (400, 5, 1, 0.60, unjudged),  # between things: accepted, not right, no track to judge
     ])  # fmt: skip
     found = scenes.summary([run, run], "r")
-    counted = {name: (found[name]["hits"], found[name]["passes"]) for name in ("recognised", "natural", "look_alikes")}
+    counted = {
+        name: (found[name]["hits"], found[name]["passes"])
+        for name in ("recognised", "natural", "look_alikes")
+    }
     assert counted == {"recognised": (2, 4), "natural": (0, 2), "look_alikes": (2, 2)}
     assert (found["accepted"], found["right"]) == (8, 0.25)
     assert (found["tracks"], found["wrong_above_99"]) == (8, (2, 4))
@@ -371,7 +506,9 @@ def test_scenes_count_passes_of_landmarks_and_of_each_group_of_strangers_and_jud
     assert found["nis"] == found["nis_of_reports"] == pytest.approx(0.01**2 / 2)
     assert not scenes.reaches("hard", found)
     fine = {name: {"hits": 19, "passes": 20} for name in ("recognised",)}
-    fine |= {name: {"hits": 0, "passes": 20} for name in ("natural", "look_alikes")} | {"ece_of_tracks": 0.01}
+    fine |= {name: {"hits": 0, "passes": 20} for name in ("natural", "look_alikes")} | {
+        "ece_of_tracks": 0.01
+    }
     assert scenes.reaches("0 dB", fine)
     assert not scenes.reaches("0 dB", fine | {"recognised": {"hits": 18, "passes": 20}})
     assert scenes.reaches("-4.5 dB", fine | {"recognised": {"hits": 18, "passes": 20}})
@@ -384,11 +521,13 @@ def test_an_error_that_repeats_counts_as_often_as_it_is_reported(scenes, monkeyp
     monkeypatch.setattr(scenes, "read_confusion", lambda _: Model)
     found = scenes.summary([a_run([(k, 1, 1, 0.9, 1) for k in range(21)])], "r")
     assert found["nis"] == pytest.approx(0.01**2 / 2)
-    assert found["nis_of_reports"] == pytest.approx(3 * 0.01**2 / 2)  # rows 0, 10 and 20
+    # rows 0, 10 and 20
+    assert found["nis_of_reports"] == pytest.approx(3 * 0.01**2 / 2)
 
 
 def test_wilsons_interval_is_the_published_one(scenes):
-    assert scenes.wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)  # Newcombe 1998, table I
+    # Newcombe 1998, table I
+    assert scenes.wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
     assert scenes.wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
 
 
@@ -415,20 +554,32 @@ def falsified(table) -> Any:
 def judged(kept: Any, error_m: float | None) -> Any:
     nees = {"position": 1.0, "yaw": 2.0}
     if error_m is None:
-        return kept.Judged("failed", "of a sudden", None, None, None, 0, None, None, None)
+        return kept.Judged(
+            "failed", "of a sudden", None, None, None, 0, None, None, None
+        )
     return kept.Judged("ok", "", error_m, error_m, error_m, 4, nees, nees, nees)
 
 
 def runs(kept: Any, *errors_m: float | None) -> list[dict[str, Any]]:
     """Dead reckoning off by 0.3 m, and one policy."""
-    return [{"dead reckoning": judged(kept, 0.3), "iSAM2, robust": judged(kept, error)} for error in errors_m]
+    return [
+        {"dead reckoning": judged(kept, 0.3), "iSAM2, robust": judged(kept, error)}
+        for error in errors_m
+    ]
 
 
 def test_a_mean_over_survivors_is_not_given(table, kept):
     clean = runs(kept, 0.1, 0.1, 0.1, 0.1)
     found = table.summarise(runs(kept, 0.1, None, 0.1, 2.0), clean, "iSAM2, robust")
     assert (found["failed"], found["lost"]) == (0.25, 0.5)
-    for figure in ("smoothed_m", "causal_m", "landmarks_m", "above_clean_m", "loss", "final_nees_yaw"):
+    for figure in (
+        "smoothed_m",
+        "causal_m",
+        "landmarks_m",
+        "above_clean_m",
+        "loss",
+        "final_nees_yaw",
+    ):
         assert np.isnan(found[figure])
     whole = table.summarise(runs(kept, 0.1, 0.3, 0.1, 2.0), clean, "iSAM2, robust")
     assert (whole["failed"], whole["lost"], whole["final_nees_yaw"]) == (0.0, 0.25, 2.0)
@@ -445,15 +596,24 @@ def test_differences_are_paired_by_seed(table, kept):
 
 
 def test_the_best_policy_is_the_one_whose_worst_case_is_best(table, kept, monkeypatch):
-    monkeypatch.setattr(table, "ESTIMATORS", dict.fromkeys(("EKF-SLAM", "iSAM2, a", "iSAM2, b")))
+    monkeypatch.setattr(
+        table, "ESTIMATORS", dict.fromkeys(("EKF-SLAM", "iSAM2, a", "iSAM2, b"))
+    )
 
-    def told(ekf: float, a: float, b: float, b_map: float = 0.0) -> dict[str, dict[str, float]]:
+    def told(
+        ekf: float, a: float, b: float, b_map: float = 0.0
+    ) -> dict[str, dict[str, float]]:
         losses = {"EKF-SLAM": (ekf, ekf), "iSAM2, a": (a, 0.0), "iSAM2, b": (b, b_map)}
         return {
-            name: {"loss": track, "landmark_loss": map_, "more_missing": 0.0} for name, (track, map_) in losses.items()
+            name: {"loss": track, "landmark_loss": map_, "more_missing": 0.0}
+            for name, (track, map_) in losses.items()
         }
 
-    figures = {kept.Case(0.1): told(0, 0.1, 0.2), kept.Case(0.1, 5.0): told(0, 0.9, 0.3), kept.Case(0.2): told(0, 0, 9)}
+    figures = {
+        kept.Case(0.1): told(0, 0.1, 0.2),
+        kept.Case(0.1, 5.0): told(0, 0.9, 0.3),
+        kept.Case(0.2): told(0, 0, 9),
+    }
     assert table.best_policy(figures) == ("iSAM2, b", 0.3)
     figures[kept.Case(0.1, 5.0, 5.0)] = told(0, 0.1, 0.1, b_map=0.8)
     assert table.best_policy(figures) == ("iSAM2, b", 0.8)
@@ -474,20 +634,31 @@ def test_landmarks_that_are_not_found_are_no_gain(table, kept):
 
 def collected(falsified: Any, failing: dict[tuple[str, float], int]) -> dict[str, Any]:
     """Every run as good as any other, but for some robots' of some estimators and shares."""
-    cases = list(itertools.product(falsified.ROBOTS, (0.0, falsified.SHARE), falsified.ESTIMATORS))
+    cases = list(
+        itertools.product(
+            falsified.ROBOTS, (0.0, falsified.SHARE), falsified.ESTIMATORS
+        )
+    )
     runs = [
-        dict.fromkeys(FIGURES, np.nan if robot <= failing.get((label, share), 0) else 0.1)
+        dict.fromkeys(
+            FIGURES, np.nan if robot <= failing.get((label, share), 0) else 0.1
+        )
         for robot, share, label in cases
     ]
     return falsified.collect(cases, runs)
 
 
-def test_a_mean_of_recorded_runs_is_over_all_robots_and_none_that_counts_is_lost(falsified):
+def test_a_mean_of_recorded_runs_is_over_all_robots_and_none_that_counts_is_lost(
+    falsified,
+):
     share = falsified.SHARE
     figures = collected(falsified, {("isam2 robust", share): 1})
     assert figures["isam2_robust_smoothed_wrong"] is None
     assert figures["isam2_robust_growth"] is None
-    assert (figures["isam2_robust_lost_wrong"], figures["isam2_robust_lost_right"]) == (1, 0)
+    assert (figures["isam2_robust_lost_wrong"], figures["isam2_robust_lost_right"]) == (
+        1,
+        0,
+    )
     assert figures["isam2_gate_smoothed_wrong"] == pytest.approx(0.1)
     for failing, is_met in (
         ({}, True),
@@ -498,10 +669,16 @@ def test_a_mean_of_recorded_runs_is_over_all_robots_and_none_that_counts_is_lost
         assert falsified.is_met(collected(falsified, failing)) is is_met
 
 
-def test_what_is_kept_belongs_to_one_run_of_one_version(table, kept, tmp_path, monkeypatch):
+def test_what_is_kept_belongs_to_one_run_of_one_version(
+    table, kept, tmp_path, monkeypatch
+):
     job = kept.Job(kept.Case(0.1), 3, True, tmp_path)
     name = "iSAM2, robust"
-    others = [replace(job, seed=4), replace(job, is_quick=False), replace(job, case=kept.Case(0.1, 5.0))]
+    others = [
+        replace(job, seed=4),
+        replace(job, is_quick=False),
+        replace(job, case=kept.Case(0.1, 5.0)),
+    ]
     files = [other.file(name) for other in (job, *others)] + [job.file("iSAM2, gate")]
     monkeypatch.setattr(kept, "source_version", lambda: "another")
     assert len({*files, job.file(name)}) == 6
@@ -511,12 +688,27 @@ def test_what_is_kept_belongs_to_one_run_of_one_version(table, kept, tmp_path, m
 @pytest.mark.slow
 def test_a_command_that_is_given_again_gives_the_same_table_from_what_is_kept(tmp_path):
     script = BENCHMARKS / "validation" / "identities.py"
-    asked = [sys.executable, str(script), "--quick", "--seeds", "2", "--kinds", "0", "--workers", "2"]
+    asked = [
+        sys.executable,
+        str(script),
+        "--quick",
+        "--seeds",
+        "2",
+        "--kinds",
+        "0",
+        "--workers",
+        "2",
+    ]
     asked += ["--keep", str(tmp_path)]
     first = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
     files = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     lost = sorted(files)[0]
     lost.unlink()
-    assert subprocess.run(asked, capture_output=True, text=True, check=True).stdout == first
-    assert {path for path in tmp_path.iterdir() if path.stat().st_mtime_ns != files[path]} == {lost}
+    assert (
+        subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+        == first
+    )
+    assert {
+        path for path in tmp_path.iterdir() if path.stat().st_mtime_ns != files[path]
+    } == {lost}
     assert json.loads(first.splitlines()[-1])["runs"] == 2

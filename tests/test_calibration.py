@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, ImuCalibration, Mounting, SonarImage, Start
+from sonar_graph.calibration import (
+    Calibration,
+    ImuCalibration,
+    Mounting,
+    SonarImage,
+    Start,
+)
 from sonar_graph.errors import CalibrationError, SettingError
 from sonar_graph.images import decibels
 from sonar_graph.settings import meanings_of, parse
@@ -16,14 +22,20 @@ lengths = st.floats(-5, 5)
 @given(st.tuples(lengths, lengths, lengths), st.tuples(angles, angles, angles))
 def test_mounting_turns_about_z_after_y_after_x(translation_m, rpy_rad):
     body_T_sensor = Mounting(translation_m=translation_m, rpy_rad=rpy_rad).pose()
-    expected = Rotation.from_euler("xyz", rpy_rad).as_matrix()  # fixed axes x, y, z: Rz Ry Rx
+    expected = Rotation.from_euler(
+        "xyz", rpy_rad
+    ).as_matrix()  # fixed axes x, y, z: Rz Ry Rx
     np.testing.assert_allclose(body_T_sensor.rotation().matrix(), expected, atol=1e-12)
     np.testing.assert_array_equal(body_T_sensor.translation(), translation_m)
 
 
 def test_start_heading_is_positive_to_the_left():
-    ahead_of_body = Start(position_m=(1.0, 2.0, 0.0), rpy_rad=(0.0, 0.0, np.pi / 2)).pose()
-    np.testing.assert_allclose(ahead_of_body.transformFrom(np.array([1.0, 0, 0])), [1, 3, 0], atol=1e-12)
+    ahead_of_body = Start(
+        position_m=(1.0, 2.0, 0.0), rpy_rad=(0.0, 0.0, np.pi / 2)
+    ).pose()
+    np.testing.assert_allclose(
+        ahead_of_body.transformFrom(np.array([1.0, 0, 0])), [1, 3, 0], atol=1e-12
+    )
 
 
 def test_sonar_pitched_down_looks_at_the_floor():
@@ -33,7 +45,9 @@ def test_sonar_pitched_down_looks_at_the_floor():
 
 def test_calibration_survives_json():
     calibration = parse(
-        Calibration, {"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}}, "x"
+        Calibration,
+        {"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}},
+        "x",
     )
     assert Calibration.model_validate_json(calibration.model_dump_json()) == calibration
 
@@ -73,16 +87,46 @@ def test_wrong_field_is_refused_by_source_and_name(values, field):
             {"start": {"rpy_sigma_rad": [0.01, 0.01, -0.01]}},
             "rpy_sigma_rad.2: expected a number greater than or equal to 0",
         ),
-        ({"start": {"position_m": [0, float("nan"), 0]}}, "position_m.1: expected a finite number"),
-        ({"imu": {"gyro_noise_density": float("inf")}}, "gyro_noise_density: expected a finite number"),
-        ({"imu": {"gyro_noise_density": "1e-4"}}, "gyro_noise_density: expected a number, not '1e-4'"),
-        ({"earth_rate_latitude_rad": 48.0}, "earth_rate_latitude_rad: expected radians between -π/2 and π/2"),
-        ({"dvl": {"mounting": {"rpy_rad": [0, 0, 45]}}}, "dvl.mounting.rpy_rad.2: expected radians between -2π and 2π"),
-        ({"start": {"rpy_rad": [0, 0, -90]}}, "start.rpy_rad.2: expected radians between -2π and 2π"),
-        ({"imu": {"gyro_bias_rad_s": [0, 1000, 0]}}, "imu.gyro_bias_rad_s.1: expected rad/s between -1 and 1"),
-        ({"dvl": {"scale_sigma": 5}}, "dvl.scale_sigma: expected a relative error between 0 and 0.2"),
-        ({"heading": {"bias_sigma_rad": 90}}, "heading.bias_sigma_rad: expected radians between 0 and 2π"),
-        ({"heading": {"sigma_rad": 90}}, "heading.sigma_rad: expected radians between 0 and 2π"),
+        (
+            {"start": {"position_m": [0, float("nan"), 0]}},
+            "position_m.1: expected a finite number",
+        ),
+        (
+            {"imu": {"gyro_noise_density": float("inf")}},
+            "gyro_noise_density: expected a finite number",
+        ),
+        (
+            {"imu": {"gyro_noise_density": "1e-4"}},
+            "gyro_noise_density: expected a number, not '1e-4'",
+        ),
+        (
+            {"earth_rate_latitude_rad": 48.0},
+            "earth_rate_latitude_rad: expected radians between -π/2 and π/2",
+        ),
+        (
+            {"dvl": {"mounting": {"rpy_rad": [0, 0, 45]}}},
+            "dvl.mounting.rpy_rad.2: expected radians between -2π and 2π",
+        ),
+        (
+            {"start": {"rpy_rad": [0, 0, -90]}},
+            "start.rpy_rad.2: expected radians between -2π and 2π",
+        ),
+        (
+            {"imu": {"gyro_bias_rad_s": [0, 1000, 0]}},
+            "imu.gyro_bias_rad_s.1: expected rad/s between -1 and 1",
+        ),
+        (
+            {"dvl": {"scale_sigma": 5}},
+            "dvl.scale_sigma: expected a relative error between 0 and 0.2",
+        ),
+        (
+            {"heading": {"bias_sigma_rad": 90}},
+            "heading.bias_sigma_rad: expected radians between 0 and 2π",
+        ),
+        (
+            {"heading": {"sigma_rad": 90}},
+            "heading.sigma_rad: expected radians between 0 and 2π",
+        ),
         ({"gravity_m_s2": 9810}, "gravity_m_s2: expected m/s² between 9 and 10.5"),
     ],
 )
@@ -93,8 +137,14 @@ def test_a_number_that_nothing_can_have_is_refused(values, message):
 
 
 def test_numbers_at_the_edge_of_what_can_be_are_taken():
-    exact = {"start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]}, "imu": {"gyro_noise_density": 0}}
-    aided = {"heading": {"bias_sigma_rad": 0, "sigma_rad": 2 * np.pi}, "dvl": {"scale_sigma": 0.2}}
+    exact = {
+        "start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]},
+        "imu": {"gyro_noise_density": 0},
+    }
+    aided = {
+        "heading": {"bias_sigma_rad": 0, "sigma_rad": 2 * np.pi},
+        "dvl": {"scale_sigma": 0.2},
+    }
     biased = parse(Calibration, {"imu": {"gyro_bias_rad_s": [1, 0, -1]}} | aided, "x")
     assert biased.imu.gyro_bias_rad_s == (1, 0, -1)
     at_pole = {"earth_rate_latitude_rad": -np.pi / 2, "gravity_m_s2": 9.832}
@@ -107,7 +157,9 @@ def test_every_wrong_field_is_named_at_once():
 
 
 def test_calibration_cannot_be_changed():
-    with pytest.raises(SettingError, match=r"Calibration.gravity_m_s2 cannot be set; model_copy"):
+    with pytest.raises(
+        SettingError, match=r"Calibration.gravity_m_s2 cannot be set; model_copy"
+    ):
         Calibration().gravity_m_s2 = 1.0  # type: ignore[misc]
 
 
@@ -136,12 +188,30 @@ def test_linear_counts_are_decibels_of_the_amplitude_whatever_the_gamma(gamma):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: ImuCalibration(gyro_noise_density=-1), "ImuCalibration.gyro_noise_density: expected a number greater"),
-        (lambda: Mounting(rpy=(0, 0, 1)), "Mounting.rpy: there is no such field; there are: translation_m, rpy_rad"),
-        (lambda: Calibration(imu={"gyro": 1}), "Calibration.imu.gyro: there is no such field$"),
-        (lambda: Calibration(heading=False), "Calibration.heading: expected a section, not False"),
-        (lambda: Calibration(use_gravity="perhaps"), "Calibration.use_gravity: expected true or false, not 'perhaps'"),
-        (lambda: Start(position_m=3, rpy_rad=(9, 0, 0)), "Start.position_m: expected a list.*; Start.rpy_rad.0: expec"),
+        (
+            lambda: ImuCalibration(gyro_noise_density=-1),
+            "ImuCalibration.gyro_noise_density: expected a number greater",
+        ),
+        (
+            lambda: Mounting(rpy=(0, 0, 1)),
+            "Mounting.rpy: there is no such field; there are: translation_m, rpy_rad",
+        ),
+        (
+            lambda: Calibration(imu={"gyro": 1}),
+            "Calibration.imu.gyro: there is no such field$",
+        ),
+        (
+            lambda: Calibration(heading=False),
+            "Calibration.heading: expected a section, not False",
+        ),
+        (
+            lambda: Calibration(use_gravity="perhaps"),
+            "Calibration.use_gravity: expected true or false, not 'perhaps'",
+        ),
+        (
+            lambda: Start(position_m=3, rpy_rad=(9, 0, 0)),
+            "Start.position_m: expected a list.*; Start.rpy_rad.0: expec",
+        ),
     ],
 )
 def test_a_section_made_by_hand_names_what_does_not_fit_in_one_line(make, said):

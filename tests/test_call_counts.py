@@ -20,22 +20,33 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 # Calls for each sonar frame. To accept a new number, write the measured one here.
-ACCEPTED = {"dead-reckoning": 167.3, "ekf-slam": 126.9, "invariant-ekf": 170.7, "isam2": 323.5}
+ACCEPTED = {
+    "dead-reckoning": 167.3,
+    "ekf-slam": 126.9,
+    "invariant-ekf": 170.7,
+    "isam2": 323.5,
+}
 MOST_GROWTH = 1.1
 """A count may grow by a tenth."""
 NOT_COUNTED = ("<listcomp>", "<dictcomp>", "<setcomp>")
-FOLDERS = tuple(f"{Path(str(package.__file__)).parent}/" for package in (sonar_graph, baselines))
+FOLDERS = tuple(
+    f"{Path(str(package.__file__)).parent}/" for package in (sonar_graph, baselines)
+)
 MOST_NAMED = 8
 """Functions named in a failure."""
 
 
 @pytest.fixture(scope="module")
 def mission() -> Sequence:
-    return simulate_mission(MissionOptions(duration_s=40.0, landmarks=12, frame_rate_hz=2.0, seed=3))
+    return simulate_mission(
+        MissionOptions(duration_s=40.0, landmarks=12, frame_rate_hz=2.0, seed=3)
+    )
 
 
 def run(sequence: Sequence, name: str, steps: list[Measurements]) -> None:
-    estimator = load_estimator(name)(sequence.calibration, Odometry(sequence.calibration))
+    estimator = load_estimator(name)(
+        sequence.calibration, Odometry(sequence.calibration)
+    )
     for step in steps:
         estimator.process(step)
 
@@ -46,10 +57,15 @@ def calls(sequence: Sequence, name: str, steps: list[Measurements]) -> Counter[s
 
     def count(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
-        if event == "call" and code.co_name not in NOT_COUNTED and code.co_filename.startswith(FOLDERS):
+        if (
+            event == "call"
+            and code.co_name not in NOT_COUNTED
+            and code.co_filename.startswith(FOLDERS)
+        ):
             found[f"{Path(code.co_filename).name}: {code.co_qualname}"] += 1
 
-    run(sequence, name, steps)  # what is compiled or cached at the first use is not counted
+    # what is compiled or cached at the first use is not counted
+    run(sequence, name, steps)
     gc.disable()  # a finaliser would be counted wherever the collector happens to run
     before = sys.getprofile()
     sys.setprofile(count)
@@ -69,7 +85,10 @@ def test_calls_for_each_frame_do_not_grow(mission: Sequence, name: str) -> None:
     steps = list(mission.replay(frames))
     found = calls(mission, name, steps)
     measured = found.total() / len(steps)
-    most = ", ".join(f"{function} {count / len(steps):.1f}" for function, count in found.most_common(MOST_NAMED))
+    most = ", ".join(
+        f"{function} {count / len(steps):.1f}"
+        for function, count in found.most_common(MOST_NAMED)
+    )
     assert measured <= MOST_GROWTH * ACCEPTED[name], (
         f"{name}: {measured:.1f} calls a frame, accepted {ACCEPTED[name]:.1f}. Most: {most}."
         f' If the growth is meant, set ACCEPTED["{name}"] = {measured:.1f} in {Path(__file__).name}.'

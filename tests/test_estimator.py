@@ -6,7 +6,12 @@ import pytest
 from sonar_graph import estimator as module
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
-from sonar_graph.estimator import Estimator, installed_estimators, load_estimator, make_params
+from sonar_graph.estimator import (
+    Estimator,
+    installed_estimators,
+    load_estimator,
+    make_params,
+)
 from sonar_graph.evaluation import compare, run_estimator
 from sonar_graph.navigation import Odometry
 from sonar_graph.testing import small_world
@@ -32,8 +37,15 @@ class OnlyTrajectory:
 
 def announce(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
     """Let entry points with these names and values be installed."""
-    points = [EntryPoint(name.replace("_", "-"), value, module.ENTRY_POINT_GROUP) for name, value in values.items()]
-    monkeypatch.setattr(module, "entry_points", lambda group: points if group == module.ENTRY_POINT_GROUP else [])
+    points = [
+        EntryPoint(name.replace("_", "-"), value, module.ENTRY_POINT_GROUP)
+        for name, value in values.items()
+    ]
+    monkeypatch.setattr(
+        module,
+        "entry_points",
+        lambda group: points if group == module.ENTRY_POINT_GROUP else [],
+    )
 
 
 def test_those_that_come_along_load_with_default_settings():
@@ -49,7 +61,10 @@ def test_third_party_is_found_by_its_name_without_being_imported(monkeypatch):
     assert list(installed_estimators()) == ["broken", "one"]
     with pytest.raises(UnknownEstimatorError, match="'three'; installed: broken, one"):
         load_estimator("three")
-    with pytest.raises(EstimatorError, match=r"broken \(no_such_package:X\) cannot be loaded: .*no_such_package"):
+    with pytest.raises(
+        EstimatorError,
+        match=r"broken \(no_such_package:X\) cannot be loaded: .*no_such_package",
+    ):
         load_estimator("broken")
 
 
@@ -79,13 +94,27 @@ def test_a_class_or_an_instance_in_the_place_of_a_name_is_answered_with_its_name
     kind = load_estimator("ekf-slam")
     for asked, said in (
         (kind, "not the class EkfSlam; give 'ekf-slam', or announce"),
-        (kind(Calibration(), Odometry(Calibration())), "not <.*EkfSlam object.*; give 'ekf-slam', or"),
+        (
+            kind(Calibration(), Odometry(Calibration())),
+            "not <.*EkfSlam object.*; give 'ekf-slam', or",
+        ),
         (Nothing, "not the class Nothing; give 'dead-reckoning' or 'ekf-slam' or"),
         (None, "not None; give 'dead-reckoning'"),
     ):
-        for run in (lambda name: run_estimator(small_world(), name), lambda name: compare(small_world(), [name])):
-            with pytest.raises(UnknownEstimatorError, match=f"expected the name of an installed estimator, {said}"):
+        for run in (
+            lambda name: run_estimator(small_world(), name),
+            lambda name: compare(small_world(), [name]),
+        ):
+            with pytest.raises(
+                UnknownEstimatorError,
+                match=f"expected the name of an installed estimator, {said}",
+            ):
                 run(asked)
-    for settings, said in (("gain=2", 'not str; give {"name": value}'), (kind.Params(), r"give params.model_dump\(\)")):
-        with pytest.raises(EstimatorError, match=f"settings of ekf-slam: expected a dict, .*{said}"):
+    for settings, said in (
+        ("gain=2", 'not str; give {"name": value}'),
+        (kind.Params(), r"give params.model_dump\(\)"),
+    ):
+        with pytest.raises(
+            EstimatorError, match=f"settings of ekf-slam: expected a dict, .*{said}"
+        ):
             run_estimator(small_world(), "ekf-slam", settings)  # type: ignore[arg-type]

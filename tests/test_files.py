@@ -43,7 +43,11 @@ def write(
 
 
 def contents(folder: Path) -> dict[str, str]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in (".lock", ".sonar_graph.json"))
+    files = (
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path.name not in (".lock", ".sonar_graph.json")
+    )
     return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
 
 
@@ -51,20 +55,29 @@ def test_a_result_replaces_what_an_earlier_one_wrote_and_leaves_all_else(tmp_pat
     write(tmp_path, {"a.json": "1", "runs/x/b.json": "1", "runs/y/b.json": "1"})
     (tmp_path / "runs" / "y" / "notes").write_text("mine")
     write(tmp_path, {"a.json": "2", "runs/z/b.json": "2"})
-    assert contents(tmp_path) == {"a.json": "2", "runs/z/b.json": "2", "runs/y/notes": "mine"}
+    assert contents(tmp_path) == {
+        "a.json": "2",
+        "runs/z/b.json": "2",
+        "runs/y/notes": "mine",
+    }
     assert not (tmp_path / "runs" / "x").exists()
 
 
 @pytest.mark.parametrize("name", ["a.json", "runs/x/b.json"])
 @pytest.mark.parametrize("is_changed", [False, True])
-def test_a_file_of_others_or_one_changed_since_is_replaced_only_when_told_and_never_removed(tmp_path, name, is_changed):
+def test_a_file_of_others_or_one_changed_since_is_replaced_only_when_told_and_never_removed(
+    tmp_path, name, is_changed
+):
     new = {"a.json": "2", "runs/x/b.json": "2"}
     if is_changed:
         write(tmp_path, dict.fromkeys(new, "1"))
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text("mine")
     before = contents(tmp_path)
-    with pytest.raises(EvaluationError, match=rf"holds {name}, which sonar-graph did not write .*--overwrite"):
+    with pytest.raises(
+        EvaluationError,
+        match=rf"holds {name}, which sonar-graph did not write .*--overwrite",
+    ):
         write(tmp_path, new)
     assert contents(tmp_path) == before
     write(tmp_path, {other: "2" for other in new if other != name})
@@ -165,20 +178,29 @@ with result_written(Path(sys.argv[1]), "comparison"), replacing(Path(sys.argv[1]
 
 
 @pytest.mark.parametrize("is_new", [False, True])
-def test_what_a_killed_command_left_is_removed_by_the_next_one_and_nothing_else(tmp_path, is_new):
+def test_what_a_killed_command_left_is_removed_by_the_next_one_and_nothing_else(
+    tmp_path, is_new
+):
     if not is_new:
         write(tmp_path, {"a.json": "1"})
     mine = {f".{name}.{'0' * 24}.partial.json": "mine" for name in "ab"}
     for name, content in mine.items():
         (tmp_path / name).write_text(content)
-    assert subprocess.run([sys.executable, "-c", WRITER, str(tmp_path)], check=False).returncode == -9
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", WRITER, str(tmp_path)], check=False
+        ).returncode
+        == -9
+    )
     assert len(contents(tmp_path)) == len(mine) + 2 + (not is_new)
     write(tmp_path, {"a.json": "2"})
     assert contents(tmp_path) == mine | {"a.json": "2"}
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_is_left_as_it_was(tmp_path):
+def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_is_left_as_it_was(
+    tmp_path,
+):
     (tmp_path / "there").mkdir()
     for name in ("made", "there"):
         with pytest.raises(RuntimeError):
@@ -190,13 +212,24 @@ def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_is_left_as
 
 
 @pytest.mark.parametrize(
-    "manifest", ["", "[]", '{"kind": "comparison"}', '{"format": 1, "kind": "x", "files": 3}', "[" * 9999]
+    "manifest",
+    [
+        "",
+        "[]",
+        '{"kind": "comparison"}',
+        '{"format": 1, "kind": "x", "files": 3}',
+        "[" * 9999,
+    ],
 )
-def test_a_manifest_that_is_not_ours_is_refused_and_nothing_outside_the_folder_is_touched(tmp_path, manifest):
+def test_a_manifest_that_is_not_ours_is_refused_and_nothing_outside_the_folder_is_touched(
+    tmp_path, manifest
+):
     folder = tmp_path / "out"
     write(folder, {"a.json": "1"})
     (folder / ".sonar_graph.json").write_text(manifest)
-    with pytest.raises(EvaluationError, match=r"\.sonar_graph\.json: is not as sonar-graph writes it"):
+    with pytest.raises(
+        EvaluationError, match=r"\.sonar_graph\.json: is not as sonar-graph writes it"
+    ):
         write(folder, {"a.json": "2"})
     (tmp_path / "mine").write_text("mine")
     for name in ("../mine", str(tmp_path / "mine")):
@@ -212,7 +245,9 @@ def test_a_manifest_that_is_not_ours_is_refused_and_nothing_outside_the_folder_i
 def test_a_folder_holds_one_kind_of_result(tmp_path):
     write(tmp_path, {"a.json": "1"})
     with (
-        pytest.raises(EvaluationError, match="holds a comparison, and would become a batch"),
+        pytest.raises(
+            EvaluationError, match="holds a comparison, and would become a batch"
+        ),
         result_written(tmp_path, "batch"),
     ):
         pass
@@ -230,13 +265,22 @@ with result_folder(Path(sys.argv[1]), "comparison"):
 """
 
 
-def test_second_process_is_refused_until_the_first_is_killed_although_its_children_live(tmp_path):
-    with subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
+def test_second_process_is_refused_until_the_first_is_killed_although_its_children_live(
+    tmp_path,
+):
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as process:
         child = int(process.stdout.readline())
         try:
-            with pytest.raises(EvaluationError) as refused, result_folder(tmp_path, KIND):
+            with (
+                pytest.raises(EvaluationError) as refused,
+                result_folder(tmp_path, KIND),
+            ):
                 pass
-            assert str(refused.value).startswith(f"{tmp_path}: another command is writing to this folder; ")
+            assert str(refused.value).startswith(
+                f"{tmp_path}: another command is writing to this folder; "
+            )
             process.kill()
             process.wait()
             os.kill(child, 0)
@@ -251,13 +295,18 @@ def test_a_lock_is_of_one_folder_and_ends_with_the_block_also_by_an_error(tmp_pa
     with pytest.raises(KeyboardInterrupt), result_folder(tmp_path, KIND):
         raise KeyboardInterrupt
     with result_folder(tmp_path, KIND), result_folder(tmp_path / "other", KIND):
-        with pytest.raises(EvaluationError, match="another command"), result_folder(tmp_path, KIND):
+        with (
+            pytest.raises(EvaluationError, match="another command"),
+            result_folder(tmp_path, KIND),
+        ):
             pass
         write(tmp_path, {"a.json": "1"})
 
 
 @pytest.mark.parametrize("content", ["", "mine"])
-def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_run_is_removed(tmp_path, content):
+def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_run_is_removed(
+    tmp_path, content
+):
     (tmp_path / ".lock").write_text(content)
     with result_folder(tmp_path, KIND):
         pass
@@ -268,18 +317,29 @@ def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_ru
     assert (tmp_path / ".lock").exists() == bool(content)
 
 
-def test_a_lock_whose_file_is_removed_by_the_command_that_had_it_is_none(tmp_path, monkeypatch):
+def test_a_lock_whose_file_is_removed_by_the_command_that_had_it_is_none(
+    tmp_path, monkeypatch
+):
     def replace_and_lock(_descriptor: int) -> None:
         (tmp_path / ".lock").unlink()
         (tmp_path / ".lock").touch()
 
-    monkeypatch.setattr(sys.modules[result_folder.__module__], "_lock", replace_and_lock)
-    with pytest.raises(EvaluationError, match="another command"), result_folder(tmp_path, KIND):
+    monkeypatch.setattr(
+        sys.modules[result_folder.__module__], "_lock", replace_and_lock
+    )
+    with (
+        pytest.raises(EvaluationError, match="another command"),
+        result_folder(tmp_path, KIND),
+    ):
         pass
 
 
-@pytest.mark.parametrize("act", [lambda folder: write(folder, {"a.json": "2"}), remove_written])
-def test_what_is_behind_a_linked_folder_is_not_removed_even_if_it_is_as_we_wrote_it(tmp_path, act):
+@pytest.mark.parametrize(
+    "act", [lambda folder: write(folder, {"a.json": "2"}), remove_written]
+)
+def test_what_is_behind_a_linked_folder_is_not_removed_even_if_it_is_as_we_wrote_it(
+    tmp_path, act
+):
     folder, mine = tmp_path / "out", tmp_path / "mine"
     write(folder, {"a.json": "1", "runs/x/b.json": "1"})
     (folder / "runs").rename(mine)
@@ -298,7 +358,9 @@ def test_a_lock_that_is_a_link_or_a_folder_is_refused(tmp_path):
         folder.mkdir()
         make(folder / ".lock")
         with (
-            pytest.raises(EvaluationError, match=r"\.lock: cannot be opened .*choose another"),
+            pytest.raises(
+                EvaluationError, match=r"\.lock: cannot be opened .*choose another"
+            ),
             result_folder(folder, KIND),
         ):
             pass
@@ -314,5 +376,8 @@ def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch, number):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", no_lock)
-    with pytest.raises(EvaluationError, match="cannot be locked against a second"), result_folder(tmp_path, KIND):
+    with (
+        pytest.raises(EvaluationError, match="cannot be locked against a second"),
+        result_folder(tmp_path, KIND),
+    ):
         pass

@@ -19,10 +19,37 @@ from .import_circles import SourceFiles, shortest_circle, tangles
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("sonar_graph", "baselines")
-FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-USERS = [path for folder in ("benchmarks", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
-QUESTION_WORDS = {"what", "which", "whether", "how", "of", "those", "it", "that", "where", "who", "whose", "so", "as"}
-ROOMS_WITH_EXAMPLES = ("testing", "navigation", "slam", "sonar", "evaluation", "simulation")
+FILES = [
+    path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))
+]
+USERS = [
+    path
+    for folder in ("benchmarks", "docs")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+]
+QUESTION_WORDS = {
+    "what",
+    "which",
+    "whether",
+    "how",
+    "of",
+    "those",
+    "it",
+    "that",
+    "where",
+    "who",
+    "whose",
+    "so",
+    "as",
+}
+ROOMS_WITH_EXAMPLES = (
+    "testing",
+    "navigation",
+    "slam",
+    "sonar",
+    "evaluation",
+    "simulation",
+)
 
 
 def module_name(path: Path) -> str:
@@ -32,7 +59,11 @@ def module_name(path: Path) -> str:
 
 def imports(path: Path) -> Iterator[tuple[str, list[str]]]:
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+        if (
+            isinstance(node, ast.ImportFrom)
+            and node.module
+            and node.module.split(".")[0] in PACKAGES
+        ):
             yield node.module, [alias.name for alias in node.names]
 
 
@@ -46,7 +77,11 @@ def imports_past_a_table_of_contents(path: Path) -> list[str]:
     for module, _ in imports(path):
         package = module.rpartition(".")[0]
         is_module = module in MODULES and MODULES[module].name != "__init__.py"
-        if is_module and package not in PACKAGES and not f"{own}.".startswith(f"{package}."):
+        if (
+            is_module
+            and package not in PACKAGES
+            and not f"{own}.".startswith(f"{package}.")
+        ):
             past.append(module)
     return past
 
@@ -57,12 +92,20 @@ def test_nobody_imports_past_the_table_of_contents_of_a_package(path: Path) -> N
 
 
 def test_an_import_past_a_table_of_contents_is_found() -> None:
-    navigation = next(path for path in FILES if path.parent.name == "navigation" and path.name == "odometry.py")
+    navigation = next(
+        path
+        for path in FILES
+        if path.parent.name == "navigation" and path.name == "odometry.py"
+    )
     assert imports_past_a_table_of_contents(navigation) == []
-    assert imports_past_a_table_of_contents(Path(__file__).parent / "slam" / "test_factors.py")
+    assert imports_past_a_table_of_contents(
+        Path(__file__).parent / "slam" / "test_factors.py"
+    )
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if p.name == "__init__.py"], ids=module_name)
+@pytest.mark.parametrize(
+    "path", [p for p in FILES if p.name == "__init__.py"], ids=module_name
+)
 def test_a_package_is_a_short_table_of_contents_with_few_modules(path: Path) -> None:
     if path.parent != ROOT / "sonar_graph":
         assert path.read_text("utf-8").count("\n") <= 30
@@ -88,10 +131,19 @@ def source() -> SourceFiles:
 
 def test_no_files_import_each_other_in_a_circle(source: SourceFiles) -> None:
     found = tangles(source.imports)
-    new = [tangle for tangle in found if {source.shown(path) for path in tangle} not in KNOWN_TANGLES]
-    circles = [" -> ".join(map(source.shown, shortest_circle(source.imports, tangle))) for tangle in new]
+    new = [
+        tangle
+        for tangle in found
+        if {source.shown(path) for path in tangle} not in KNOWN_TANGLES
+    ]
+    circles = [
+        " -> ".join(map(source.shown, shortest_circle(source.imports, tangle)))
+        for tangle in new
+    ]
     assert not circles, "\n".join(circles)
-    assert len(KNOWN_TANGLES) == len(found), "a circle is gone: remove it from KNOWN_TANGLES"
+    assert len(KNOWN_TANGLES) == len(found), (
+        "a circle is gone: remove it from KNOWN_TANGLES"
+    )
 
 
 def test_no_further_folders_import_each_other(source: SourceFiles) -> None:
@@ -100,12 +152,21 @@ def test_no_further_folders_import_each_other(source: SourceFiles) -> None:
         for target in targets:
             folders = (source.shown(path.parent), source.shown(target.parent))
             # A table of contents lists files of folders below, and everything may use the files of the root.
-            if path.name != "__init__.py" and folders[0] != folders[1] and "sonar_graph" not in folders:
+            if (
+                path.name != "__init__.py"
+                and folders[0] != folders[1]
+                and "sonar_graph" not in folders
+            ):
                 examples[folders] = f"{source.shown(path)} -> {source.shown(target)}"
     mutual = {pair for pair in examples if pair[::-1] in examples and pair[0] < pair[1]}
-    new = [f"{examples[pair]}, {examples[pair[::-1]]}" for pair in sorted(mutual - KNOWN_MUTUAL_FOLDERS)]
+    new = [
+        f"{examples[pair]}, {examples[pair[::-1]]}"
+        for pair in sorted(mutual - KNOWN_MUTUAL_FOLDERS)
+    ]
     assert not new, "\n".join(new)
-    assert not KNOWN_MUTUAL_FOLDERS - mutual, "these import each other no more: remove them from the list"
+    assert not KNOWN_MUTUAL_FOLDERS - mutual, (
+        "these import each other no more: remove them from the list"
+    )
 
 
 def test_names_of_files_and_of_public_classes_occur_once() -> None:
@@ -123,7 +184,9 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     asking, total = [], 0
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (
+                text := ast.get_docstring(node)
+            ):
                 total += 1
                 if text.split()[0].strip(":,.").lower() in QUESTION_WORDS:
                     asking.append(f"{path.relative_to(ROOT)}: {text.splitlines()[0]}")
@@ -133,15 +196,30 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
 def test_the_front_door_loads_nothing_heavy() -> None:
     heavy = ("gtsam", "numba", "matplotlib", "scipy", "numpy", "cv2", "pydantic")
     code = f"import sys, sonar_graph; print([m for m in {heavy} if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
-@pytest.mark.parametrize("package", ["sonar_graph", "sonar_graph.devices", "sonar_graph.logs", "sonar_graph.report"])
-def test_names_that_are_imported_at_first_use_are_those_that_are_listed(package: str) -> None:
+@pytest.mark.parametrize(
+    "package",
+    ["sonar_graph", "sonar_graph.devices", "sonar_graph.logs", "sonar_graph.report"],
+)
+def test_names_that_are_imported_at_first_use_are_those_that_are_listed(
+    package: str,
+) -> None:
     module = import_module(package)
     tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
-    listed = {a.name for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    listed = {
+        a.name
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for a in node.names
+    }
     assert listed == set(module.__all__)
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
 
@@ -149,7 +227,12 @@ def test_names_that_are_imported_at_first_use_are_those_that_are_listed(package:
 def test_reading_a_log_loads_no_compiler_and_no_plots() -> None:
     heavy = ("numba", "matplotlib", "cv2", "jinja2")
     code = f"import sys; from sonar_graph import read_log, inspect_log; print([m for m in {heavy} if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
 def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
@@ -159,9 +242,13 @@ def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
 
 def run_examples(found: object, name: str) -> int:
     """Run the examples in a docstring, as a user who has imported nothing; the number of examples."""
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    runner = doctest.DocTestRunner(
+        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    )
     module = sys.modules[getattr(found, "__module__", "sonar_graph")]
-    for test in doctest.DocTestFinder(recurse=False).find(found, name, module=module, globs=dict(vars(module))):
+    for test in doctest.DocTestFinder(recurse=False).find(
+        found, name, module=module, globs=dict(vars(module))
+    ):
         runner.run(test)
     assert runner.failures == 0, name
     return runner.tries
@@ -171,7 +258,9 @@ NAMES = tomllib.loads((ROOT / "docs" / "reference" / "names.toml").read_text("ut
 LISTED = [(package, name) for package, names in NAMES.items() for name in names]
 
 
-@pytest.mark.parametrize(("package", "name"), LISTED, ids=[".".join(one) for one in LISTED])
+@pytest.mark.parametrize(
+    ("package", "name"), LISTED, ids=[".".join(one) for one in LISTED]
+)
 def test_every_name_of_the_reference_has_an_example_that_runs(
     package: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,11 +287,17 @@ def test_an_example_that_is_wrong_is_found(capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize("room", ROOMS_WITH_EXAMPLES)
-def test_examples_of_a_room_run(room: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_of_a_room_run(
+    room: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also of those of its names that the reference does not list."""
     monkeypatch.chdir(tmp_path)
     module: ModuleType = import_module(f"sonar_graph.{room}")
-    others = {name: getattr(module, name) for name in module.__all__ if name not in NAMES[module.__name__]}
+    others = {
+        name: getattr(module, name)
+        for name in module.__all__
+        if name not in NAMES[module.__name__]
+    }
     for name, found in others.items():
         if isinstance(found, type | FunctionType):
             run_examples(found, name)

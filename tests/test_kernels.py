@@ -31,10 +31,21 @@ CALLS = "import loops; assert loops.twice(2) == 4; assert loops.thrice(2) == 6; 
 ERASED = "\r\x1b[2K"
 
 
-def told(folder: Path, program: str = CALLS, stderr: int = subprocess.PIPE, **environment: str) -> str:
+def told(
+    folder: Path,
+    program: str = CALLS,
+    stderr: int = subprocess.PIPE,
+    **environment: str,
+) -> str:
     path = os.pathsep.join([str(folder), str(Path(__file__).parents[1])])
     env = {**os.environ, "PYTHONPATH": path, **environment}
-    done = subprocess.run([sys.executable, "-W", "error", "-c", program], stderr=stderr, text=True, check=True, env=env)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        stderr=stderr,
+        text=True,
+        check=True,
+        env=env,
+    )
     return done.stderr or ""
 
 
@@ -47,14 +58,23 @@ def loops(tmp_path: Path) -> Path:
 def test_the_first_compilation_is_told_once_and_later_ones_are_not(loops):
     assert told(loops) == f"{compiling.NOTICE}\n"
     assert told(loops) == ""
-    assert told(loops, "import loops; assert loops.thrice(1.5) == 4.5") == ""  # compiled, but not the first time
+    # compiled, but not the first time
+    assert told(loops, "import loops; assert loops.thrice(1.5) == 4.5") == ""
 
 
-def test_a_class_or_module_that_a_new_version_has_no_more_is_no_mistake_of_the_cache(loops):
-    head, pair = "from typing import NamedTuple\n", "class {}(NamedTuple):\n    a: int\n"
+def test_a_class_or_module_that_a_new_version_has_no_more_is_no_mistake_of_the_cache(
+    loops,
+):
+    head, pair = (
+        "from typing import NamedTuple\n",
+        "class {}(NamedTuple):\n    a: int\n",
+    )
     loop = "from sonar_graph.numerics import compiled\n@compiled\ndef first(pair):\n    return pair.a\n"
     (loops / "pairs.py").write_text(head + pair.format("Pair"))
-    for name, of_pairs in (("Pair", "from pairs import Pair\n\n"), *((n, pair.format(n)) for n in ("Couple", "Two"))):
+    for name, of_pairs in (
+        ("Pair", "from pairs import Pair\n\n"),
+        *((n, pair.format(n)) for n in ("Couple", "Two")),
+    ):
         (loops / "loops.py").write_text(head + of_pairs + loop)
         told(loops, f"import loops; assert loops.first(loops.{name}(2)) == 2")
         (loops / "pairs.py").unlink(missing_ok=True)
@@ -64,7 +84,11 @@ def test_a_long_wait_is_told_with_what_is_compiled_and_how_far_it_is(loops):
     program = f"from sonar_graph.numerics import compiling; compiling.TELL_EVERY_S = 0.0; {CALLS}"
     lines = ("twice (1 of about 2)", "thrice (2 of about 2)", "twice (3 of about 3)")
     assert told(loops, program) == "\n".join(
-        [compiling.NOTICE, *(f"compiling for the first use: {line}" for line in lines), ""]
+        [
+            compiling.NOTICE,
+            *(f"compiling for the first use: {line}" for line in lines),
+            "",
+        ]
     )
 
 
@@ -111,8 +135,14 @@ CALLEE = """
 def inner(x):
     return x + {offset}
 """
-CHECKED = {"imported": "from sonar_graph.numerics.jit import compiled", "decorator": "@compiled"}
-UNCHECKED = {"imported": "import numba", "decorator": "@numba.njit(cache=True, error_model='numpy')"}
+CHECKED = {
+    "imported": "from sonar_graph.numerics.jit import compiled",
+    "decorator": "@compiled",
+}
+UNCHECKED = {
+    "imported": "import numba",
+    "decorator": "@numba.njit(cache=True, error_model='numpy')",
+}
 Ask = Callable[..., tuple[float, int]]
 
 
@@ -122,12 +152,24 @@ def ask(monkeypatch) -> Ask:
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     names = ("limits", "callee", "caller")
 
-    def ask(folder: Path, how: dict[str, str] = CHECKED, offset: float = 1.0, limit: float = 0.0) -> tuple[float, int]:
-        texts = f"LIMIT = {limit}\n", CALLEE.format(**how, offset=offset), CALLER.format(**how)
+    def ask(
+        folder: Path,
+        how: dict[str, str] = CHECKED,
+        offset: float = 1.0,
+        limit: float = 0.0,
+    ) -> tuple[float, int]:
+        texts = (
+            f"LIMIT = {limit}\n",
+            CALLEE.format(**how, offset=offset),
+            CALLER.format(**how),
+        )
         for name, text in zip(names, texts, strict=True):
             sys.modules.pop(name, None)
             folder.mkdir(exist_ok=True)
-            if not (folder / f"{name}.py").exists() or (folder / f"{name}.py").read_text() != text:
+            if (
+                not (folder / f"{name}.py").exists()
+                or (folder / f"{name}.py").read_text() != text
+            ):
                 (folder / f"{name}.py").write_text(text)
         monkeypatch.syspath_prepend(folder)
         importlib.invalidate_caches()
@@ -147,13 +189,20 @@ def test_cached_code_is_used_until_what_it_was_compiled_from_changes(ask, tmp_pa
     for path in here.glob("*.py"):
         os.utime(path, ns=(2_000_000_000 * 10**9,) * 2)
     assert ask(here) == (20.0, 0)
-    shutil.copytree(here, there)  # times of sources are those of the copy, as of an installed package
+    # times of sources are those of the copy, as of an installed package
+    shutil.copytree(here, there)
     shutil.rmtree(here)
     assert ask(there) == (20.0, 0)
     assert ask(there, offset=2.5) == (35.0, 2)
-    assert ask(there, offset=2.5, limit=4.0) == (39.0, 1)  # a number of a file without compiled functions
+    # a number of a file without compiled functions
+    assert ask(there, offset=2.5, limit=4.0) == (
+        39.0,
+        1,
+    )
 
 
 def test_without_the_check_the_old_answer_comes_from_the_cache(ask, tmp_path):
     """Negative control."""
-    assert ask(tmp_path, UNCHECKED)[0] == ask(tmp_path, UNCHECKED, offset=2.5)[0] == 20.0
+    assert (
+        ask(tmp_path, UNCHECKED)[0] == ask(tmp_path, UNCHECKED, offset=2.5)[0] == 20.0
+    )

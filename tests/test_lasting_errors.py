@@ -10,9 +10,23 @@ from scipy.spatial.transform import Rotation
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu, PositionFixes
-from sonar_graph.models import BIASES, COMPASS, HEADING, SCALE, TILT, by_biases, gyro_bias_of
+from sonar_graph.models import (
+    BIASES,
+    COMPASS,
+    HEADING,
+    SCALE,
+    TILT,
+    by_biases,
+    gyro_bias_of,
+)
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
@@ -22,31 +36,50 @@ END_NS = 60_000_000_000
 
 
 def turning(
-    calibration: Calibration, roll_rad: float = 0.3, rate_rad_s: float = 0.3, accel_bias=(0.0, 0.0, 0.0), scale=0.0
+    calibration: Calibration,
+    roll_rad: float = 0.3,
+    rate_rad_s: float = 0.3,
+    accel_bias=(0.0, 0.0, 0.0),
+    scale=0.0,
 ) -> Sequence:
     """A minute of exact rows of a vehicle that circles about the vertical, rolled, at 0.5 m/s."""
-    imu_ns, dvl_ns = np.arange(0, END_NS + 1, 20_000_000), np.arange(0, END_NS + 1, 200_000_000)
+    imu_ns, dvl_ns = (
+        np.arange(0, END_NS + 1, 20_000_000),
+        np.arange(0, END_NS + 1, 200_000_000),
+    )
     up = Rotation.from_euler("x", roll_rad).inv().apply([0.0, 0.0, 1.0])
-    ahead, arm = np.array([0.5, 0.0, 0.0]), np.array(calibration.dvl.mounting.translation_m)
-    gyro, force = rate_rad_s * up, G * up + np.cross(rate_rad_s * up, ahead) + accel_bias
+    ahead, arm = (
+        np.array([0.5, 0.0, 0.0]),
+        np.array(calibration.dvl.mounting.translation_m),
+    )
+    gyro, force = (
+        rate_rad_s * up,
+        G * up + np.cross(rate_rad_s * up, ahead) + accel_bias,
+    )
     velocity = (ahead + np.cross(gyro, arm)) * (1.0 + scale)
     unknown = np.full((len(dvl_ns), 3, 3), np.nan)
     imu = Imu(imu_ns, np.tile(gyro, (len(imu_ns), 1)), np.tile(force, (len(imu_ns), 1)))
     start = calibration.start.model_copy(update={"rpy_rad": (roll_rad, 0.0, 0.0)})
     world = calibration.model_copy(update={"start": start})
-    return Sequence("circle", world, imu, Dvl(dvl_ns, np.tile(velocity, (len(dvl_ns), 1)), unknown))
+    return Sequence(
+        "circle", world, imu, Dvl(dvl_ns, np.tile(velocity, (len(dvl_ns), 1)), unknown)
+    )
 
 
 def known(**imu: float) -> Calibration:
     return Calibration(
-        imu=ImuCalibration(**({"gyro_noise_density": 1e-4, "accel_noise_density": 1e-3} | imu)),
+        imu=ImuCalibration(
+            **({"gyro_noise_density": 1e-4, "accel_noise_density": 1e-3} | imu)
+        ),
         dvl=DvlCalibration(mounting=Mounting(translation_m=ARM)),
     )
 
 
 def ran(kind: type, sequence: Sequence, rate_hz: float = 1.0):
     estimator = kind(sequence.calibration, Odometry(sequence.calibration))
-    estimates = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+    estimates = [
+        estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))
+    ]
     return estimator, [estimate for estimate in estimates if estimate is not None]
 
 
@@ -94,14 +127,18 @@ def test_the_scale_lengthens_the_way_of_the_doppler_log():
     level = np.eye(3) - np.outer(vertical @ dR, vertical @ dR)
     for up in (vertical, np.zeros(3)):  # with gravity and without
         by_b = by_biases(np.zeros((6, 3)), dR, dp, up, vertical, np.array(ARM))
-        np.testing.assert_allclose(by_b[:, SCALE], [*moved[:3], *(level @ moved[3:])], atol=1e-3)
+        np.testing.assert_allclose(
+            by_b[:, SCALE], [*moved[:3], *(level @ moved[3:])], atol=1e-3
+        )
     assert np.abs(moved[3:] - level @ moved[3:]).max() > 0.1
     bias = np.array([0.01, -0.02, 0.03])
     sequence = turning(known(), scale=0.05)
     imu = sequence.calibration.imu.model_copy(update={"gyro_bias_rad_s": tuple(bias)})
     dvl = sequence.calibration.dvl.model_copy(update={"scale_error": 0.05})
     told = sequence.calibration.model_copy(update={"imu": imu, "dvl": dvl})
-    biased = replace(sequence.imu, angular_velocity=sequence.imu.angular_velocity + bias)
+    biased = replace(
+        sequence.imu, angular_velocity=sequence.imu.angular_velocity + bias
+    )
     found = motion_of(replace(sequence, calibration=told, imu=biased))
     assert found.i_T_j.equals(exact.i_T_j, 1e-9)
     assert not motion_of(replace(sequence, imu=biased)).i_T_j.equals(exact.i_T_j, 1e-2)
@@ -120,7 +157,9 @@ def test_gravity_tells_the_tilt_and_nothing_of_the_heading(kind):
     up = both[0][1][-1].world_T_body.rotation().matrix()[2]
     assert up @ told @ up == pytest.approx(up @ untold @ up, rel=1e-2)
     share = 0.3 if kind is DeadReckoning else 0.1  # which estimates no bias
-    assert np.trace(told) - up @ told @ up < share * (np.trace(untold) - up @ untold @ up)
+    assert np.trace(told) - up @ told @ up < share * (
+        np.trace(untold) - up @ untold @ up
+    )
     if kind is DeadReckoning:
         return
     turned = biases_of(both[0][0])[1][HEADING, HEADING]
@@ -133,7 +172,11 @@ def test_gravity_corrects_the_tilt_alone_where_a_bias_is_considered():
     sequence = turning(known(gyro_bias_sigma=1e-2), accel_bias=(0.5, 0.3, 0.0))
     reckoner, estimates = ran(DeadReckoning, sequence)
     root = 0.1 * np.random.default_rng(0).normal(size=(9, 9))
-    reckoner._P, before, ahead = root @ root.T, estimates[-1].world_T_body, (np.array([0.5, 0.0, 0.0]), 1e-4)
+    reckoner._P, before, ahead = (
+        root @ root.T,
+        estimates[-1].world_T_body,
+        (np.array([0.5, 0.0, 0.0]), 1e-4),
+    )
     reckoner._level(motion_of(sequence), ahead, ahead)
     turn = gtsam.Rot3.Logmap(before.rotation().between(reckoner._pose.rotation()))
     assert np.linalg.norm(turn) > 1e-3
@@ -144,12 +187,19 @@ def test_gravity_corrects_the_tilt_alone_where_a_bias_is_considered():
 @estimators
 def test_turns_tell_the_accelerometers_bias_from_a_tilt(kind):
     """The tilt stays in the world and the bias in the body; ``b_accel = 0`` leaves the vehicle askew."""
-    bias, exact = np.array([0.1, -0.05, 0.0]), {"gyro_noise_density": 1e-5, "gyro_bias_sigma": 0.0}
+    bias, exact = (
+        np.array([0.1, -0.05, 0.0]),
+        {"gyro_noise_density": 1e-5, "gyro_bias_sigma": 0.0},
+    )
     start = Start(rpy_sigma_rad=(0.02, 0.02, 1e-3))
     found = {}
     for sigma in (0.1, 1e-9):
-        calibration = known(accel_bias_sigma=sigma, accel_bias_walk_density=0.0, **exact)
-        sequence = turning(calibration.model_copy(update={"start": start}), 0.0, 0.2, bias)
+        calibration = known(
+            accel_bias_sigma=sigma, accel_bias_walk_density=0.0, **exact
+        )
+        sequence = turning(
+            calibration.model_copy(update={"start": start}), 0.0, 0.2, bias
+        )
         estimator, estimates = ran(kind, sequence)
         up = estimates[-1].world_T_body.rotation().matrix()[2]
         found[sigma] = np.linalg.norm(up[:2])
@@ -166,38 +216,67 @@ def test_turns_tell_the_accelerometers_bias_from_a_tilt(kind):
 def test_depth_tells_nothing_of_the_scale_by_noise(kind, use_gravity: bool):
     """On a level path every vertical way is noise, which a scale error of 1 would explain."""
     dvl = DvlCalibration(mounting=Mounting(translation_m=ARM), scale_sigma=0.2)
-    sequence = turning(known().model_copy(update={"dvl": dvl, "use_gravity": use_gravity}), roll_rad=0.0)
+    sequence = turning(
+        known().model_copy(update={"dvl": dvl, "use_gravity": use_gravity}),
+        roll_rad=0.0,
+    )
     velocity = sequence.dvl.velocity.copy()
     velocity[:, 2] += 0.01 * np.random.default_rng(0).standard_normal(len(velocity))
     stamps_ns = sequence.imu.stamps_ns[::10]
     depth = Depth(stamps_ns, np.zeros(len(stamps_ns)), np.full(len(stamps_ns), 1e-6))
-    b, cov = biases_of(ran(kind, replace(sequence, dvl=replace(sequence.dvl, velocity=velocity), depth=depth))[0])
+    b, cov = biases_of(
+        ran(
+            kind,
+            replace(
+                sequence, dvl=replace(sequence.dvl, velocity=velocity), depth=depth
+            ),
+        )[0]
+    )
     assert b[SCALE] == pytest.approx(0.0, abs=1e-3)
     assert cov[SCALE, SCALE] == pytest.approx(0.2**2, rel=1e-2)
 
 
 def headings(sequence: Sequence, off_rad: float, every: int = 10) -> Heading:
     stamps_ns = sequence.imu.stamps_ns[::every]
-    return Heading(stamps_ns, 0.3 * stamps_ns * 1e-9 + off_rad, np.full(len(stamps_ns), 0.02))
+    return Heading(
+        stamps_ns, 0.3 * stamps_ns * 1e-9 + off_rad, np.full(len(stamps_ns), 0.02)
+    )
 
 
-def circle_fixes(sequence: Sequence, at_ns: np.ndarray, antenna: np.ndarray) -> PositionFixes:
+def circle_fixes(
+    sequence: Sequence, at_ns: np.ndarray, antenna: np.ndarray
+) -> PositionFixes:
     angle = 0.3 * at_ns * 1e-9
-    centre_out = 0.5 / 0.3 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle), np.zeros(len(angle))])
-    arms = (Rotation.from_euler("z", angle[:, None]) * Rotation.from_euler("x", 0.3)).apply(antenna)
-    return PositionFixes(at_ns, centre_out + arms, np.tile(0.04 * np.eye(3), (len(at_ns), 1, 1)))
+    centre_out = (
+        0.5
+        / 0.3
+        * np.column_stack([np.sin(angle), 1.0 - np.cos(angle), np.zeros(len(angle))])
+    )
+    arms = (
+        Rotation.from_euler("z", angle[:, None]) * Rotation.from_euler("x", 0.3)
+    ).apply(antenna)
+    return PositionFixes(
+        at_ns, centre_out + arms, np.tile(0.04 * np.eye(3), (len(at_ns), 1, 1))
+    )
 
 
 def aided(**update) -> Sequence:
-    calibration = known(gyro_bias_sigma=1e-2).model_copy(update={"start": Start(rpy_sigma_rad=(0.3, 0.3, 0.5))})
+    calibration = known(gyro_bias_sigma=1e-2).model_copy(
+        update={"start": Start(rpy_sigma_rad=(0.3, 0.3, 0.5))}
+    )
     sequence = turning(calibration)
     start = sequence.calibration.start.model_copy(update={"rpy_rad": (0.3, 0.0, 0.4)})
-    return replace(sequence, calibration=sequence.calibration.model_copy(update={"start": start} | update))
+    return replace(
+        sequence,
+        calibration=sequence.calibration.model_copy(update={"start": start} | update),
+    )
 
 
 def yaw_error(estimate) -> float:
     true = 0.3 * estimate.stamp_ns * 1e-9
-    return abs(float(np.angle(np.exp(1j * (estimate.world_T_body.rotation().yaw() - true)))))
+    return abs(
+        float(np.angle(np.exp(1j * (estimate.world_T_body.rotation().yaw() - true))))
+    )
 
 
 every_estimator = pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
@@ -208,25 +287,38 @@ def test_a_heading_turns_an_estimator_right_and_outliers_do_not_turn_it_wrong(ki
     """0.4 rad off at the start; a fifth of the samples half a turn off; the compass' bias leaves the rest unsure."""
     sequence = aided()
     plain = headings(sequence, 0.0)
-    wrong = replace(plain, yaw_rad=plain.yaw_rad + np.where(np.arange(len(plain)) % 5 == 2, np.pi, 0.0))
+    wrong = replace(
+        plain,
+        yaw_rad=plain.yaw_rad + np.where(np.arange(len(plain)) % 5 == 2, np.pi, 0.0),
+    )
     assert yaw_error(ran(kind, sequence)[1][-1]) > 0.3
     for heading in (plain, wrong):
         assert yaw_error(ran(kind, replace(sequence, heading=heading))[1][-1]) < 0.03
     _, estimates = ran(kind, replace(sequence, heading=plain))
     up = estimates[-1].world_T_body.rotation().matrix()[2]
-    assert up @ estimates[-1].covariance[:3, :3] @ up == pytest.approx(0.05**2, rel=0.1), "the bias of all samples"
+    assert up @ estimates[-1].covariance[:3, :3] @ up == pytest.approx(
+        0.05**2, rel=0.1
+    ), "the bias of all samples"
 
 
 @every_estimator
-def test_position_fixes_give_place_and_heading_by_the_antenna_and_the_compass_its_bias(kind):
+def test_position_fixes_give_place_and_heading_by_the_antenna_and_the_compass_its_bias(
+    kind,
+):
     antenna = np.array([0.5, -0.3, 1.0])
-    positions = aided().calibration.positions.model_copy(update={"antenna_m": tuple(antenna)})
+    positions = aided().calibration.positions.model_copy(
+        update={"antenna_m": tuple(antenna)}
+    )
     sequence = aided(positions=positions)
-    fixes = circle_fixes(sequence, np.arange(500_000_000, END_NS, 1_030_000_000), antenna)
+    fixes = circle_fixes(
+        sequence, np.arange(500_000_000, END_NS, 1_030_000_000), antenna
+    )
     biased = replace(sequence, positions=fixes, heading=headings(sequence, 0.1))
     estimator, estimates = ran(kind, biased)
     assert yaw_error(estimates[-1]) < 0.05
-    compass = estimator.state()[1][6] if kind is EkfSlam else biases_of(estimator)[0][COMPASS]
+    compass = (
+        estimator.state()[1][6] if kind is EkfSlam else biases_of(estimator)[0][COMPASS]
+    )
     assert compass == pytest.approx(0.1, abs=0.05)
     true = circle_fixes(sequence, np.array([END_NS]), np.zeros(3)).position_m[0]
     near = np.linalg.norm(estimates[-1].world_T_body.translation() - true)
@@ -247,9 +339,13 @@ def test_a_late_fix_counts_while_rows_of_its_time_are_kept_and_is_named_when_not
         estimator = kind(sequence.calibration, Odometry(sequence.calibration))
         for step in sequence.replay(sequence.instants(1.0)):
             is_now = step.end_ns == 35_000_000_000 + late_ns
-            estimate = estimator.process(replace(step, positions=fix) if is_now else step)
+            estimate = estimator.process(
+                replace(step, positions=fix) if is_now else step
+            )
         ends[late_ns] = estimate.world_T_body.translation()
         late = [row for row in estimator.refused_rows() if row.sensor == "positions"]
-        assert [row.stamp_ns for row in late] == ([35_000_000_000] if late_ns == 24_000_000_000 else [])
+        assert [row.stamp_ns for row in late] == (
+            [35_000_000_000] if late_ns == 24_000_000_000 else []
+        )
     assert ends[7_000_000_000] == pytest.approx(ends[0], abs=0.15)
     assert np.linalg.norm(ends[24_000_000_000] - ends[0]) > 0.2

@@ -27,17 +27,25 @@ from sonar_graph.measurements import (
 
 def depth(stamps_ns: list[int]) -> Depth:
     """Rows whose height says which row they were."""
-    return Depth(np.array(stamps_ns), np.arange(len(stamps_ns), dtype=float), np.full(len(stamps_ns), np.nan))
+    return Depth(
+        np.array(stamps_ns),
+        np.arange(len(stamps_ns), dtype=float),
+        np.full(len(stamps_ns), np.nan),
+    )
 
 
-sorted_stamps = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20).map(sorted)
+sorted_stamps = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20).map(
+    sorted
+)
 
 
 @given(sorted_stamps, st.lists(st.integers(-(2**62), 2**62), max_size=5))
 def test_windows_between_consecutive_cuts_hold_every_row_once(stamps_ns, cuts_ns):
     block = depth(stamps_ns)
     edges = [np.iinfo(np.int64).min, *sorted(cuts_ns), np.iinfo(np.int64).max]
-    windows = [block.between(after, until) for after, until in itertools.pairwise(edges)]
+    windows = [
+        block.between(after, until) for after, until in itertools.pairwise(edges)
+    ]
     rows = np.concatenate([window.z_m for window in windows if window is not None])
     np.testing.assert_array_equal(rows, block.z_m)
 
@@ -51,16 +59,27 @@ def test_window_excludes_its_beginning_and_includes_its_end_and_is_none_without_
 def test_frames_are_the_rows_of_each_stamp(stamps_ns):
     n = len(stamps_ns)
     ids, posterior = np.arange(n)[:, None], np.ones((n, 1))
-    block = LandmarkDetections(np.array(stamps_ns), np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), ids, posterior)
+    block = LandmarkDetections(
+        np.array(stamps_ns),
+        np.ones(n),
+        np.zeros(n),
+        np.full((n, 2, 2), np.nan),
+        ids,
+        posterior,
+    )
     frames = list(block.frames())
-    assert [set(frame.stamps_ns.tolist()) for frame in frames] == [{stamp} for stamp in sorted(set(stamps_ns))]
+    assert [set(frame.stamps_ns.tolist()) for frame in frames] == [
+        {stamp} for stamp in sorted(set(stamps_ns))
+    ]
     assert LandmarkDetections.concatenate(frames).candidate_ids.tolist() == ids.tolist()
 
 
 @given(sorted_stamps, st.integers(0, 20))
 def test_concatenation_undoes_a_split(stamps_ns, at):
     block = depth(stamps_ns)
-    parts = [part for part in (slice(None, at), slice(at, None)) if len(stamps_ns[part])]
+    parts = [
+        part for part in (slice(None, at), slice(at, None)) if len(stamps_ns[part])
+    ]
     joined = Depth.concatenate([block.rows(part) for part in parts])
     np.testing.assert_array_equal(joined.stamps_ns, block.stamps_ns)
     np.testing.assert_array_equal(joined.z_m, block.z_m)
@@ -68,7 +87,11 @@ def test_concatenation_undoes_a_split(stamps_ns, at):
 
 @pytest.mark.parametrize(
     ("stamps_ns", "said"),
-    [([], "at least one row"), ([1, 5, 5, 4], "backwards after row 2"), ([2**62, -(2**62)], "backwards after row 0")],
+    [
+        ([], "at least one row"),
+        ([1, 5, 5, 4], "backwards after row 2"),
+        ([2**62, -(2**62)], "backwards after row 0"),
+    ],
 )
 def test_no_rows_and_stamps_that_run_backwards_are_refused(stamps_ns, said):
     """Also where they lie farther apart than an integer holds."""
@@ -86,7 +109,9 @@ def test_whole_number_columns_become_floats_and_identities_stay_whole():
 @given(arrays.arrays(np.float64, (6, 4), elements=st.floats(0, 0.25)))
 def test_most_probable_identity_has_the_largest_posterior(posterior):
     ids = np.arange(24).reshape(6, 4)
-    block = LandmarkDetections(np.arange(6), np.ones(6), np.zeros(6), np.zeros((6, 2, 2)), ids, posterior)
+    block = LandmarkDetections(
+        np.arange(6), np.ones(6), np.zeros(6), np.zeros((6, 2, 2)), ids, posterior
+    )
     best, probability = block.most_probable()
     for row in range(6):
         assert probability[row] == max(posterior[row])
@@ -98,7 +123,9 @@ def test_numbers_without_a_meaning_for_not_measured_must_be_finite(bad):
     """Named with their row; a specific force may be missing."""
     rate = np.zeros((3, 3))
     rate[1, 2] = bad
-    with pytest.raises(MeasurementError, match=r"Imu.angular_velocity: row 1 is not finite"):
+    with pytest.raises(
+        MeasurementError, match=r"Imu.angular_velocity: row 1 is not finite"
+    ):
         Imu(np.arange(3), rate, np.zeros((3, 3)))
     Imu(np.arange(3), np.zeros((3, 3)), np.full((3, 3), np.nan))
 
@@ -106,7 +133,10 @@ def test_numbers_without_a_meaning_for_not_measured_must_be_finite(bad):
 @pytest.mark.parametrize(
     ("stamps", "expected"),
     [
-        (np.array([0.0, 0.005, 0.01]), r"expected integers, not float64; of seconds: np\.round\(seconds \* 1e9\)"),
+        (
+            np.array([0.0, 0.005, 0.01]),
+            r"expected integers, not float64; of seconds: np\.round\(seconds \* 1e9\)",
+        ),
         (np.array([0.0, 5e6, 1e7]), "expected integers, not float64; of seconds"),
         (np.array([[0, 1, 2]]), r"expected shape \(n,\), not \(1, 3\)"),
     ],
@@ -122,20 +152,55 @@ def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
 @pytest.mark.parametrize(
     ("made", "message"),
     [
-        (lambda n: Imu(n, np.zeros((5, 2)), np.zeros((5, 3))), r"Imu.angular_velocity: expected shape (5, 3)"),
-        (lambda n: Imu(n, np.zeros((5, 3)), np.zeros(5)), r"Imu.specific_force: expected shape (5, 3), not (5,)"),
-        (lambda n: Imu(n, np.zeros((4, 3)), np.zeros((5, 3))), r"Imu.angular_velocity: "),
-        (lambda n: Imu(n, np.zeros((5, 3)), np.zeros((4, 3))), r"Imu.specific_force: "),
-        (lambda n: Imu(n, np.zeros((3, 5)), np.zeros((3, 5))), r"one row for each of 5 stamps; transpose it"),
-        (lambda n: Dvl(n, np.zeros(5), np.zeros((5, 3, 3))), r"Dvl.velocity: expected shape (5, 3), not (5,)"),
-        (lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))), r"Dvl.velocity_cov: expected shape (5, 3, 3)"),
-        (lambda n: Dvl(n[:3], np.zeros((3, 3)), np.eye(3)), r"Dvl.velocity_cov: expected shape (3, 3, 3)"),
-        (lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)), r"Depth.z_m: expected shape (5,), not (5, 1)"),
-        (lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)), r"Heading.yaw_rad: expected shape (5,), not (5, 1)"),
-        (lambda n: PositionFixes(n, np.zeros((5, 2)), np.zeros((5, 3, 3))), r"position_m: expected shape (5, 3)"),
-        (lambda n: PositionFixes(n, np.zeros((5, 3)), np.zeros((5, 3))), r"covariance_m2: expected shape (5, 3, 3)"),
         (
-            lambda n: LandmarkDetections(n, n, n, np.zeros((5, 2)), np.zeros((5, 1)), np.ones((5, 1))),
+            lambda n: Imu(n, np.zeros((5, 2)), np.zeros((5, 3))),
+            r"Imu.angular_velocity: expected shape (5, 3)",
+        ),
+        (
+            lambda n: Imu(n, np.zeros((5, 3)), np.zeros(5)),
+            r"Imu.specific_force: expected shape (5, 3), not (5,)",
+        ),
+        (
+            lambda n: Imu(n, np.zeros((4, 3)), np.zeros((5, 3))),
+            r"Imu.angular_velocity: ",
+        ),
+        (lambda n: Imu(n, np.zeros((5, 3)), np.zeros((4, 3))), r"Imu.specific_force: "),
+        (
+            lambda n: Imu(n, np.zeros((3, 5)), np.zeros((3, 5))),
+            r"one row for each of 5 stamps; transpose it",
+        ),
+        (
+            lambda n: Dvl(n, np.zeros(5), np.zeros((5, 3, 3))),
+            r"Dvl.velocity: expected shape (5, 3), not (5,)",
+        ),
+        (
+            lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))),
+            r"Dvl.velocity_cov: expected shape (5, 3, 3)",
+        ),
+        (
+            lambda n: Dvl(n[:3], np.zeros((3, 3)), np.eye(3)),
+            r"Dvl.velocity_cov: expected shape (3, 3, 3)",
+        ),
+        (
+            lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)),
+            r"Depth.z_m: expected shape (5,), not (5, 1)",
+        ),
+        (
+            lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)),
+            r"Heading.yaw_rad: expected shape (5,), not (5, 1)",
+        ),
+        (
+            lambda n: PositionFixes(n, np.zeros((5, 2)), np.zeros((5, 3, 3))),
+            r"position_m: expected shape (5, 3)",
+        ),
+        (
+            lambda n: PositionFixes(n, np.zeros((5, 3)), np.zeros((5, 3))),
+            r"covariance_m2: expected shape (5, 3, 3)",
+        ),
+        (
+            lambda n: LandmarkDetections(
+                n, n, n, np.zeros((5, 2)), np.zeros((5, 1)), np.ones((5, 1))
+            ),
             r"LandmarkDetections.range_azimuth_cov: expected shape (5, 2, 2), not (5, 2)",
         ),
     ],
@@ -146,18 +211,39 @@ def test_columns_of_another_shape_are_refused_by_name(made, message):
 
 
 def test_detections_belong_to_no_track_unless_said():
-    columns = np.array([1, 1, 1]), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), np.ones((3, 1), int), np.ones((3, 1))
-    alone, tracked = LandmarkDetections(*columns), LandmarkDetections(*columns, np.array([5, 6, 5]))
+    columns = (
+        np.array([1, 1, 1]),
+        np.ones(3),
+        np.zeros(3),
+        np.zeros((3, 2, 2)),
+        np.ones((3, 1), int),
+        np.ones((3, 1)),
+    )
+    alone, tracked = (
+        LandmarkDetections(*columns),
+        LandmarkDetections(*columns, np.array([5, 6, 5])),
+    )
     assert alone.track.tolist() == [-1, -1, -1]
-    assert LandmarkDetections.concatenate([alone, tracked]).rows(slice(2, 5)).track.tolist() == [-1, 5, 6]
+    assert LandmarkDetections.concatenate([alone, tracked]).rows(
+        slice(2, 5)
+    ).track.tolist() == [-1, 5, 6]
     with pytest.raises(MeasurementError, match=r"LandmarkDetections\.track"):
         LandmarkDetections(*columns, np.array([5, 6]))
 
 
 def seen(**columns) -> LandmarkDetections:
-    two = {"stamps_ns": [1, 1], "range_m": [3.0, 4.0], "azimuth_rad": [0.0, 0.1], "range_azimuth_cov": UNSAID}
+    two = {
+        "stamps_ns": [1, 1],
+        "range_m": [3.0, 4.0],
+        "azimuth_rad": [0.0, 0.1],
+        "range_azimuth_cov": UNSAID,
+    }
     return LandmarkDetections(
-        **(two | {"candidate_ids": [[1, 2], [1, 2]], "id_probability": [[0.9, 0.1]] * 2} | columns)
+        **(
+            two
+            | {"candidate_ids": [[1, 2], [1, 2]], "id_probability": [[0.9, 0.1]] * 2}
+            | columns
+        )
     )
 
 
@@ -167,36 +253,70 @@ UNSAID = np.full((2, 2, 2), np.nan)
 @pytest.mark.parametrize(
     ("columns", "said"),
     [
-        ({"candidate_ids": [[1.0, 2.0]] * 2}, r"candidate_ids: expected integers, not float64"),
-        ({"candidate_ids": [["a", "b"]] * 2}, r"candidate_ids: expected integers, not <U1"),
+        (
+            {"candidate_ids": [[1.0, 2.0]] * 2},
+            r"candidate_ids: expected integers, not float64",
+        ),
+        (
+            {"candidate_ids": [["a", "b"]] * 2},
+            r"candidate_ids: expected integers, not <U1",
+        ),
         ({"range_m": ["near", "far"]}, r"range_m: expected numbers, not <U4"),
         ({"track": [0.5, 1.5]}, r"track: expected integers, not float64"),
-        ({"candidate_ids": [1, 2]}, r"candidate_ids: expected shape \(n, k\).*not \(2,\)"),
-        ({"id_probability": [[0.9]] * 2}, r"id_probability: expected shape \(n, k\).*not \(2, 1\)"),
-        ({"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))}, r"candidate_ids: expected shape"),
-        ({"candidate_ids": [[1, 2], [1, 2**56]]}, r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number"),
+        (
+            {"candidate_ids": [1, 2]},
+            r"candidate_ids: expected shape \(n, k\).*not \(2,\)",
+        ),
+        (
+            {"id_probability": [[0.9]] * 2},
+            r"id_probability: expected shape \(n, k\).*not \(2, 1\)",
+        ),
+        (
+            {"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))},
+            r"candidate_ids: expected shape",
+        ),
+        (
+            {"candidate_ids": [[1, 2], [1, 2**56]]},
+            r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
+        ),
         (
             {"candidate_ids": [[1, 2], [2**63 - 1, 2]]},
             r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
         ),
         ({"track": [[1], [2]]}, r"track: expected shape \(2,\), not \(2, 1\)"),
-        ({"candidate_ids": np.array([[1, 2], [1, 2**63]], np.uint64)}, r"candidate_ids: expected integers below 2\^63"),
-        ({"id_probability": [[0.9, 0.1], [97.0, 1.0]]}, r"id_probability: row 1 .* has probabilities .* 97 % is 0\.97"),
-        ({"id_probability": [[0.9, 0.2], [0.9, 0.1]]}, r"id_probability: row 0 .* more than 1 in sum"),
-        ({"id_probability": [[0.9, -0.1], [0.9, 0.1]]}, r"id_probability: row 0 .* not between 0 and 1"),
+        (
+            {"candidate_ids": np.array([[1, 2], [1, 2**63]], np.uint64)},
+            r"candidate_ids: expected integers below 2\^63",
+        ),
+        (
+            {"id_probability": [[0.9, 0.1], [97.0, 1.0]]},
+            r"id_probability: row 1 .* has probabilities .* 97 % is 0\.97",
+        ),
+        (
+            {"id_probability": [[0.9, 0.2], [0.9, 0.1]]},
+            r"id_probability: row 0 .* more than 1 in sum",
+        ),
+        (
+            {"id_probability": [[0.9, -0.1], [0.9, 0.1]]},
+            r"id_probability: row 0 .* not between 0 and 1",
+        ),
         ({"id_probability": [[np.nan, 0.1], [0.9, 0.1]]}, r"id_probability: row 0"),
     ],
 )
 def test_detections_that_cannot_be_are_named_in_one_line(columns, said):
     assert len(seen()) == 2
-    with pytest.raises(MeasurementError, match=rf"^LandmarkDetections\.{said}") as caught:
+    with pytest.raises(
+        MeasurementError, match=rf"^LandmarkDetections\.{said}"
+    ) as caught:
         seen(**columns)
     assert "\n" not in str(caught.value)
 
 
 def test_the_largest_identity_and_rounding_of_single_precision_pass():
     single = np.array([[0.9, 0.1], [0.7, 0.3]], np.float32)
-    assert seen(candidate_ids=[[1, 2**56 - 1]] * 2, id_probability=single * np.float32(1 + 1e-7)).track.tolist() == [
+    assert seen(
+        candidate_ids=[[1, 2**56 - 1]] * 2, id_probability=single * np.float32(1 + 1e-7)
+    ).track.tolist() == [
         -1,
         -1,
     ]
@@ -204,33 +324,54 @@ def test_the_largest_identity_and_rounding_of_single_precision_pass():
 
 @pytest.mark.parametrize("end", [1.5, 2.0, "3", None, True])
 def test_an_end_is_an_integer(end):
-    with pytest.raises(MeasurementError, match=r"^Measurements\.end_ns: expected an integer, nanoseconds"):
+    with pytest.raises(
+        MeasurementError,
+        match=r"^Measurements\.end_ns: expected an integer, nanoseconds",
+    ):
         Measurements(end)  # type: ignore[arg-type]
     assert Measurements(np.int64(3)).end_ns == 3  # type: ignore[arg-type]
 
 
 def test_a_range_is_above_zero_and_at_most_100_km():
     assert possible_ranges(np.array([1e-9, 1.0, 100_000.0])).all()
-    assert not possible_ranges(np.array([0.0, -1.0, np.nextafter(100_000.0, np.inf), np.inf, np.nan])).any()
+    assert not possible_ranges(
+        np.array([0.0, -1.0, np.nextafter(100_000.0, np.inf), np.inf, np.nan])
+    ).any()
 
 
 def test_an_azimuth_lies_within_a_full_turn():
-    for azimuth, is_sound in ((-np.pi, True), (2 * np.pi, True), (-2 * np.pi, True), (6.3, False), (-40.0, False)):
+    for azimuth, is_sound in (
+        (-np.pi, True),
+        (2 * np.pi, True),
+        (-2 * np.pi, True),
+        (6.3, False),
+        (-40.0, False),
+    ):
         assert seen(azimuth_rad=[azimuth, 0.0]).are_sound().tolist() == [is_sound, True]
 
 
-@given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.integers(-70, 70), st.integers(-70, 70))
-def test_a_detection_is_sound_where_its_covariance_has_eigenvalues_above_zero(root, i, j):
+@given(
+    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
+    st.integers(-70, 70),
+    st.integers(-70, 70),
+)
+def test_a_detection_is_sound_where_its_covariance_has_eigenvalues_above_zero(
+    root, i, j
+):
     for more in (0.1, -0.1):
         A = np.reshape(root, (2, 2))
         cov = A @ A.T + more * np.eye(2)
         least = np.linalg.eigvalsh(cov)[0]
         scale = np.diag([10.0**i, 10.0**j])
-        assert np.abs(least) < 1e-3 or bool(seen(range_azimuth_cov=[scale @ cov @ scale] * 2).are_sound()[0]) == (
-            least > 0
-        )
+        assert np.abs(least) < 1e-3 or bool(
+            seen(range_azimuth_cov=[scale @ cov @ scale] * 2).are_sound()[0]
+        ) == (least > 0)
     assert seen(range_azimuth_cov=np.full((2, 2, 2), np.nan)).are_sound().all()
-    for wrong in ([[1.0, 0.1], [0.2, 1.0]], [[np.inf, 0.0], [0.0, 1.0]], [[1.0, -np.inf], [np.inf, 1.0]]):
+    for wrong in (
+        [[1.0, 0.1], [0.2, 1.0]],
+        [[np.inf, 0.0], [0.0, 1.0]],
+        [[1.0, -np.inf], [np.inf, 1.0]],
+    ):
         assert not seen(range_azimuth_cov=[wrong, np.eye(2)]).are_sound()[0]
 
 
@@ -239,9 +380,13 @@ def test_posteriors_that_were_rounded_to_single_precision_still_are():
     assert not no_posterior(exact.astype(np.float32).astype(np.float64)).any()
 
 
-@pytest.mark.parametrize("row", [[0.5, 0.500002], [-1e-9, 0.5], [0.5, np.nan], [np.inf, 0.0], [2.0, -1.5]])
+@pytest.mark.parametrize(
+    "row", [[0.5, 0.500002], [-1e-9, 0.5], [0.5, np.nan], [np.inf, 0.0], [2.0, -1.5]]
+)
 def test_what_is_no_posterior_is_told_from_one_beside_it(row):
-    assert no_posterior(np.array([row, [0.0, 0.0], [1.0, 0.0], [0.5, 0.5]])).tolist() == [True, False, False, False]
+    assert no_posterior(
+        np.array([row, [0.0, 0.0], [1.0, 0.0], [0.5, 0.5]])
+    ).tolist() == [True, False, False, False]
 
 
 def test_the_largest_identity_is_the_last_that_a_key_gives_back():
@@ -255,33 +400,55 @@ def test_a_block_in_the_place_of_another_is_refused_by_name():
     heading = Heading(np.array([3]), np.zeros(1), np.ones(1))
     assert Measurements(5, heading=heading).heading is heading
     for name in ("imu", "dvl", "depth", "detections", "positions"):
-        kind = {"detections": "LandmarkDetections", "positions": "PositionFixes"}.get(name, name)
-        with pytest.raises(MeasurementError, match=rf"(?i)Measurements\.{name}: expected {kind} or None, not Heading"):
+        kind = {"detections": "LandmarkDetections", "positions": "PositionFixes"}.get(
+            name, name
+        )
+        with pytest.raises(
+            MeasurementError,
+            match=rf"(?i)Measurements\.{name}: expected {kind} or None, not Heading",
+        ):
             Measurements(5, **{name: heading})  # type: ignore[arg-type]
-    with pytest.raises(MeasurementError, match="heading: expected Heading or None, not list"):
+    with pytest.raises(
+        MeasurementError, match="heading: expected Heading or None, not list"
+    ):
         Measurements(5, heading=[heading])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "block",
-    [depth([3, 5]), Heading([3, 5], [0, 0], [1, 1]), PositionFixes([3, 5], np.zeros((2, 3)), np.ones((2, 3, 3)))],
+    [
+        depth([3, 5]),
+        Heading([3, 5], [0, 0], [1, 1]),
+        PositionFixes([3, 5], np.zeros((2, 3)), np.ones((2, 3, 3))),
+    ],
 )  # type: ignore[list-item]
 def test_rows_after_the_end_of_a_call_are_refused_by_name(block):
     name = {Depth: "depth", Heading: "heading", PositionFixes: "positions"}[type(block)]
     assert len(getattr(Measurements(5, **{name: block}), name)) == 2
-    with pytest.raises(MeasurementError, match=rf"{type(block).__name__} has a row at 5 ns, after end_ns = 4"):
+    with pytest.raises(
+        MeasurementError,
+        match=rf"{type(block).__name__} has a row at 5 ns, after end_ns = 4",
+    ):
         Measurements(4, **{name: block})
 
 
 def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
     """Unknown noise (NaN) is none of them, and of a covariance only what rounding of single precision explains."""
     sigmas = [np.nan, 0.01, 0.0, -1.0, np.inf]
-    assert Heading(np.arange(5), np.zeros(5), np.array(sigmas)).are_sound().tolist() == [True, True, *[False] * 3]
+    assert Heading(
+        np.arange(5), np.zeros(5), np.array(sigmas)
+    ).are_sound().tolist() == [True, True, *[False] * 3]
     good = np.array([[4.0, 1.9, 0.0], [1.9, 1.0, 0.0], [0.0, 0.0, 1e8]])
-    skew, indefinite, infinite, unknown = good.copy(), good.copy(), good.copy(), good.copy()
+    skew, indefinite, infinite, unknown = (
+        good.copy(),
+        good.copy(),
+        good.copy(),
+        good.copy(),
+    )
     skew[0, 1], infinite[2, 2], unknown[0, 0] = 1.8, np.inf, np.nan
     indefinite[0, 1] = indefinite[1, 0] = 2.1
-    cyclic = np.array([[1.0, 0.9, 0.9], [0.9, 1.0, -0.9], [0.9, -0.9, 1.0]])  # indefinite, though no pair of axes is
+    # indefinite, though no pair of axes is
+    cyclic = np.array([[1.0, 0.9, 0.9], [0.9, 1.0, -0.9], [0.9, -0.9, 1.0]])
     sound = [good, 1e-9 * good, good.astype(np.float32), unknown]
     covs = np.stack([*sound, skew, indefinite, cyclic, infinite, -good, 0 * good])
     fixes = PositionFixes(np.arange(10), np.zeros((10, 3)), covs)
@@ -293,7 +460,10 @@ def test_a_heading_counts_turns_while_a_double_keeps_them_and_its_sigma_is_at_mo
         (-1e9, 2 * np.pi, True), (1e9, np.nan, True), (-1.001e9, 0.1, False), (1e300, np.nan, False),
         (0.0, 6.3, False), (0.0, 1e200, False),
     ):  # fmt: skip
-        assert Heading([0, 1], [yaw, 0.0], [sigma, 0.1]).are_sound().tolist() == [is_sound, True]
+        assert Heading([0, 1], [yaw, 0.0], [sigma, 0.1]).are_sound().tolist() == [
+            is_sound,
+            True,
+        ]
     assert np.spacing(1e9) < 1.2e-7
 
 
@@ -305,14 +475,35 @@ def test_a_fix_and_its_sigma_are_within_a_quarter_of_the_earth_s_circumference(a
     ):  # fmt: skip
         positions, covs = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
         positions[0, axis], covs[0, axis, axis] = at, variance
-        assert PositionFixes([0, 1], positions, covs).are_sound().tolist() == [is_sound, True]
+        assert PositionFixes([0, 1], positions, covs).are_sound().tolist() == [
+            is_sound,
+            True,
+        ]
 
 
-@pytest.mark.parametrize("block", [Heading([20], [0], [1]), PositionFixes([20], np.zeros((1, 3)), np.ones((1, 3, 3)))])
-def test_rows_more_than_a_day_before_all_else_are_refused_by_name_as_stamps_in_seconds(block):
+@pytest.mark.parametrize(
+    "block",
+    [
+        Heading([20], [0], [1]),
+        PositionFixes([20], np.zeros((1, 3)), np.ones((1, 3, 3))),
+    ],
+)
+def test_rows_more_than_a_day_before_all_else_are_refused_by_name_as_stamps_in_seconds(
+    block,
+):
     """Of the call's end or its first motion, for a whole log may be one call."""
-    field, now_ns = ("heading" if isinstance(block, Heading) else "positions"), PAUSE_NS + 21
-    with pytest.raises(MeasurementError, match=rf"{type(block).__name__} has a row at 20 ns, .*of seconds: np.round"):
+    field, now_ns = (
+        ("heading" if isinstance(block, Heading) else "positions"),
+        PAUSE_NS + 21,
+    )
+    with pytest.raises(
+        MeasurementError,
+        match=rf"{type(block).__name__} has a row at 20 ns, .*of seconds: np.round",
+    ):
         Measurements(now_ns, **{field: block})
     Measurements(now_ns - 1, **{field: block})
-    Measurements(now_ns, imu=Imu([PAUSE_NS], np.zeros((1, 3)), np.zeros((1, 3))), **{field: block})
+    Measurements(
+        now_ns,
+        imu=Imu([PAUSE_NS], np.zeros((1, 3)), np.zeros((1, 3))),
+        **{field: block},
+    )

@@ -11,7 +11,9 @@ from sonar_graph import Odometry
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.testing import check_estimator
 
-FILE = Path(__file__).parents[1] / "benchmarks" / "published_rules" / "published_rules.py"
+FILE = (
+    Path(__file__).parents[1] / "benchmarks" / "published_rules" / "published_rules.py"
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +41,30 @@ def test_held_velocities_lie_on_either_side_of_our_odometry(rules):
     expected = ours.motion(start_ns, end_ns, bias, known_ns=ours.reached_ns(end_ns))
 
     def by(rule):
-        source = type("OfRule", (rules.RuleOdometry,), {"rule": rule})(world.calibration)
+        source = type("OfRule", (rules.RuleOdometry,), {"rule": rule})(
+            world.calibration
+        )
         source.add(world.imu, world.dvl)
         return source.motion(start_ns, end_ns, bias, known_ns=ours.reached_ns(end_ns))
 
-    middle, held, newest = (by(rule) for rule in (rules.TRAPEZOID, rules.ZOH_PREVIOUS, rules.ZOH_CURRENT))
-    off = np.array([one.i_T_j.translation() - expected.i_T_j.translation() for one in (held, newest)])
+    middle, held, newest = (
+        by(rule) for rule in (rules.TRAPEZOID, rules.ZOH_PREVIOUS, rules.ZOH_CURRENT)
+    )
+    off = np.array(
+        [
+            one.i_T_j.translation() - expected.i_T_j.translation()
+            for one in (held, newest)
+        ]
+    )
     assert (np.linalg.norm(off, axis=1) > 1e-5).all()
     assert off[0] @ off[1] < 0
-    assert np.linalg.norm(middle.i_T_j.translation() - expected.i_T_j.translation()) < 0.2 * np.linalg.norm(off[0])
+    assert np.linalg.norm(
+        middle.i_T_j.translation() - expected.i_T_j.translation()
+    ) < 0.2 * np.linalg.norm(off[0])
     sigmas = np.sqrt(np.diag(expected.covariance))
     for one in (middle, held, newest):
         assert one.i_T_j.rotation().equals(expected.i_T_j.rotation(), 1e-8)
         assert np.diag(one.covariance) == pytest.approx(sigmas**2, rel=0.1)
-        assert one.D_bias == pytest.approx(expected.D_bias, abs=0.04 * np.abs(expected.D_bias).max())
+        assert one.D_bias == pytest.approx(
+            expected.D_bias, abs=0.04 * np.abs(expected.D_bias).max()
+        )

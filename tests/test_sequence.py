@@ -11,7 +11,9 @@ from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Heading, Imu, Positio
 from sonar_graph.sequence import Sequence
 
 
-def recording(imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, float] = (0.0, 10.0)) -> Sequence:
+def recording(
+    imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, float] = (0.0, 10.0)
+) -> Sequence:
     """IMU at 50 Hz and DVL at 7 Hz between the given times, depth at 10 Hz from before to after."""
     epoch_ns = 1_700_000_000 * NS_PER_S
 
@@ -27,7 +29,9 @@ def recording(imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, floa
         Dvl(dvl, np.zeros((len(dvl), 3)), np.full((len(dvl), 3, 3), np.nan)),
         Depth(depth, np.zeros(len(depth)), np.full(len(depth), np.nan)),
         heading=Heading(depth + 1, np.zeros(len(depth)), np.full(len(depth), np.nan)),
-        positions=PositionFixes(dvl + 2, np.zeros((len(dvl), 3)), np.full((len(dvl), 3, 3), np.nan)),
+        positions=PositionFixes(
+            dvl + 2, np.zeros((len(dvl), 3)), np.full((len(dvl), 3, 3), np.nan)
+        ),
     )
 
 
@@ -36,7 +40,10 @@ def test_start_and_end_have_both_imu_and_dvl():
     assert sequence.start_ns == sequence.dvl.stamps_ns[0]
     assert sequence.end_ns == sequence.dvl.stamps_ns[-1]
     assert sequence.duration_s == pytest.approx(7.0)
-    assert recording(imu_s=(2.0, 9.0)).start_ns == recording(imu_s=(2.0, 9.0)).imu.stamps_ns[0]
+    assert (
+        recording(imu_s=(2.0, 9.0)).start_ns
+        == recording(imu_s=(2.0, 9.0)).imu.stamps_ns[0]
+    )
 
 
 @given(st.floats(0.3, 40))
@@ -50,7 +57,10 @@ def test_instants_are_equally_spaced_inside_the_sequence(rate_hz):
 
 
 def test_sequence_shorter_than_a_step_is_refused():
-    with pytest.raises(MeasurementError, match=r"are \d+ instants, and at most 10000000 .*--start and --end"):
+    with pytest.raises(
+        MeasurementError,
+        match=r"are \d+ instants, and at most 10000000 .*--start and --end",
+    ):
         recording().instants(1e8)
     with pytest.raises(MeasurementError, match=r"too short for 0\.05 Hz"):
         recording().instants(0.05)
@@ -62,9 +72,15 @@ def test_replay_hands_out_every_row_once_and_in_time(rate_hz):
     steps = list(sequence.replay(sequence.instants(rate_hz)))
     last_ns = steps[-1].end_ns
     for name in ("imu", "dvl", "depth", "heading", "positions"):
-        handed = [getattr(step, name).stamps_ns for step in steps if getattr(step, name) is not None]
+        handed = [
+            getattr(step, name).stamps_ns
+            for step in steps
+            if getattr(step, name) is not None
+        ]
         all_stamps = getattr(sequence, name).stamps_ns
-        np.testing.assert_array_equal(np.concatenate(handed), all_stamps[all_stamps <= last_ns])
+        np.testing.assert_array_equal(
+            np.concatenate(handed), all_stamps[all_stamps <= last_ns]
+        )
     for before, step in itertools.pairwise(steps):
         if step.imu is not None:
             assert before.end_ns < step.imu.stamps_ns[0]

@@ -15,9 +15,15 @@ angles = st.floats(-3.1, 3.1)
 def turning(n: int = 11, step_rad: float = 0.3) -> Trajectory:
     """Constant speed along x and constant yaw rate, a second a row."""
     yaw = step_rad * np.arange(n)
-    quaternions = np.column_stack([np.zeros(n), np.zeros(n), np.sin(yaw / 2), np.cos(yaw / 2)])
-    positions = np.column_stack([np.arange(n, dtype=float), np.zeros(n), np.full(n, -1.0)])
-    return Trajectory.without_covariances(np.arange(n, dtype=np.int64) * 10**9, positions, quaternions)
+    quaternions = np.column_stack(
+        [np.zeros(n), np.zeros(n), np.sin(yaw / 2), np.cos(yaw / 2)]
+    )
+    positions = np.column_stack(
+        [np.arange(n, dtype=float), np.zeros(n), np.full(n, -1.0)]
+    )
+    return Trajectory.without_covariances(
+        np.arange(n, dtype=np.int64) * 10**9, positions, quaternions
+    )
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
@@ -25,7 +31,9 @@ def test_trajectory_through_estimates_keeps_their_poses(roll, pitch, yaw):
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([1.0, -2.0, 3.0]))
     covariance = np.diag(np.arange(1.0, 7.0))
     path = Trajectory.from_estimates([Estimate(5, pose, covariance)])
-    np.testing.assert_allclose(path.rotations().as_matrix()[0], pose.rotation().matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        path.rotations().as_matrix()[0], pose.rotation().matrix(), atol=1e-12
+    )
     np.testing.assert_array_equal(path.positions[0], pose.translation())
     np.testing.assert_array_equal(path.covariances[0], covariance)
 
@@ -37,9 +45,19 @@ def test_trajectory_through_no_estimate_is_empty():
 
 
 def test_results_say_themselves_in_a_line():
-    two = LandmarkMap(np.array([1, 7]), np.arange(6.0).reshape(2, 3), np.zeros((2, 3, 3)))
-    log = DetectionLog(np.zeros(3, int), np.zeros(3, int), np.zeros((3, 2)), np.zeros((3, 2, 2)), [Outcome.USED] * 3)
-    assert [repr(each) for each in (turning(), Trajectory.from_estimates([]), two, log)] == [
+    two = LandmarkMap(
+        np.array([1, 7]), np.arange(6.0).reshape(2, 3), np.zeros((2, 3, 3))
+    )
+    log = DetectionLog(
+        np.zeros(3, int),
+        np.zeros(3, int),
+        np.zeros((3, 2)),
+        np.zeros((3, 2, 2)),
+        [Outcome.USED] * 3,
+    )
+    assert [
+        repr(each) for each in (turning(), Trajectory.from_estimates([]), two, log)
+    ] == [
         "Trajectory(11 poses, 0 to 10000000000 ns)",
         "Trajectory(0 poses)",
         "LandmarkMap(2 landmarks, ids [1, 7])",
@@ -51,7 +69,9 @@ def test_poses_at_the_own_instants_are_the_own_poses():
     path = turning()
     again = path.at(path.stamps_ns)
     np.testing.assert_allclose(again.positions, path.positions, atol=1e-12)
-    np.testing.assert_allclose((again.rotations().inv() * path.rotations()).magnitude(), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        (again.rotations().inv() * path.rotations()).magnitude(), 0, atol=1e-12
+    )
 
 
 @given(st.floats(0, 1), st.floats(-3, 3))
@@ -74,9 +94,13 @@ def test_interpolation_is_that_of_scipy():
     asked_ns = np.sort(rng.integers(stamps_ns[0], stamps_ns[-1], 200))
     there = path.at(asked_ns)
     by_scipy = Slerp(stamps_ns.astype(float), rotations)(asked_ns.astype(float))
-    np.testing.assert_allclose((there.rotations().inv() * by_scipy).magnitude(), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        (there.rotations().inv() * by_scipy).magnitude(), 0, atol=1e-12
+    )
     line = make_interp_spline(stamps_ns.astype(float), positions, k=1)
-    np.testing.assert_allclose(there.positions, line(asked_ns.astype(float)), atol=1e-12)
+    np.testing.assert_allclose(
+        there.positions, line(asked_ns.astype(float)), atol=1e-12
+    )
 
 
 def test_one_row_is_there_at_its_own_instant_and_no_instants_give_no_rows():
@@ -92,7 +116,9 @@ def test_interpolated_poses_claim_no_covariance():
 def test_interpolation_keeps_nanoseconds_of_an_epoch():
     path = turning(2)
     epoch_ns = 1_700_000_000 * 10**9
-    late = Trajectory.without_covariances(path.stamps_ns + epoch_ns, path.positions, path.quaternions_xyzw)
+    late = Trajectory.without_covariances(
+        path.stamps_ns + epoch_ns, path.positions, path.quaternions_xyzw
+    )
     moved_m = late.at(np.array([epoch_ns + 1])).positions[0, 0]
     assert moved_m == pytest.approx(1e-9, rel=1e-6)
 
@@ -105,7 +131,9 @@ def test_instants_outside_are_refused(outside_ns):
 
 def test_stamps_must_increase_strictly():
     with pytest.raises(MeasurementError, match="increase"):
-        Trajectory.without_covariances(np.array([1, 1]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
+        Trajectory.without_covariances(
+            np.array([1, 1]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1))
+        )
 
 
 def test_rows_select_every_column_alike():

@@ -14,21 +14,31 @@ THEORY = Path(__file__).parents[1] / "docs" / "theory"
 def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
     picture = tmp_path / "recognition.png"
     command = [sys.executable, "-W", "error", THEORY / "recognition.py", picture]
-    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=120)
+    done = subprocess.run(
+        command, capture_output=True, text=True, encoding="utf-8", timeout=120
+    )
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 13
     page = (THEORY / "recognition.md").read_text(encoding="utf-8")
     assert f"```\n{done.stdout}```\n" in page
-    drawn, shown = (cv2.imread(os.fspath(path)) for path in (picture, THEORY.parent / "images" / "recognition.png"))
+    drawn, shown = (
+        cv2.imread(os.fspath(path))
+        for path in (picture, THEORY.parent / "images" / "recognition.png")
+    )
     assert drawn.shape == shown.shape
 
 
 def test_the_picture_of_scenes_is_what_its_script_draws(tmp_path):
     picture = tmp_path / "scenes.png"
     command = [sys.executable, "-W", "error", THEORY / "sonar_image.py", picture]
-    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=120)
+    done = subprocess.run(
+        command, capture_output=True, text=True, encoding="utf-8", timeout=120
+    )
     assert done.returncode == 0, done.stderr
-    drawn, shown = (cv2.imread(os.fspath(path)) for path in (picture, THEORY.parent / "images" / "scenes.png"))
+    drawn, shown = (
+        cv2.imread(os.fspath(path))
+        for path in (picture, THEORY.parent / "images" / "scenes.png")
+    )
     assert drawn.shape == shown.shape
 
 

@@ -32,8 +32,14 @@ def output(folder: Path, *command: object, **environment: str) -> str:
     script, *words = map(str, command)
     asked = [Path(sys.executable).parent / script, *words]
     told = os.environ | environment
-    done = subprocess.run(asked, cwd=folder, capture_output=True, text=True, timeout=600, env=told)
-    is_doubt = "inspect" in command and done.returncode in (1, 3) and not done.stderr.startswith("sonar-graph:")
+    done = subprocess.run(
+        asked, cwd=folder, capture_output=True, text=True, timeout=600, env=told
+    )
+    is_doubt = (
+        "inspect" in command
+        and done.returncode in (1, 3)
+        and not done.stderr.startswith("sonar-graph:")
+    )
     assert done.returncode == 0 or is_doubt, f"{command}\n{done.stdout}{done.stderr}"
     return done.stdout
 
@@ -54,10 +60,14 @@ def number_after(text: str, pattern: str) -> float:
 
 
 @pytest.mark.slow
-def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_estimator(tmp_path):
+def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_estimator(
+    tmp_path,
+):
     printed = run("01_first_comparison.py", tmp_path)
     for landmark, true in TRUE_LANDMARKS.items():
-        row = re.search(rf"^ +{landmark} +(-?[\d.]+) +(-?[\d.]+) +([\d.]+)$", printed, re.MULTILINE)
+        row = re.search(
+            rf"^ +{landmark} +(-?[\d.]+) +(-?[\d.]+) +([\d.]+)$", printed, re.MULTILINE
+        )
         assert row, printed
         assert float(row[1]) == pytest.approx(true[0], abs=0.3)
         assert float(row[2]) == pytest.approx(true[1], abs=0.3)
@@ -71,7 +81,9 @@ def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_esti
 def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     printed = run("02_library.py", tmp_path)
     assert number_after(printed, r"in 10\.00 s:") == pytest.approx(0.39 * 10, abs=1.5)
-    assert abs(number_after(printed, "turns it by")) == pytest.approx(1e-4 * 10, rel=0.01)
+    assert abs(number_after(printed, "turns it by")) == pytest.approx(
+        1e-4 * 10, rel=0.01
+    )
     assert "landmarks [1, 2, 3, 4]" in printed
     assert "120 poses" in printed or "119 poses" in printed
     assert 0 < abs(number_after(printed, r"landmarks \[1, 2\]:")) < 1
@@ -79,7 +91,10 @@ def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     bias, sigma = number_after(printed, "about z:"), number_after(printed, "±")
     assert abs(bias - 0.01) < 3.5 * sigma < 1e-3
     assert number_after(printed, "after 20 s:") < 0.05
-    off_m, sigma_m = number_after(printed, "gap of 5 s:"), number_after(printed, "1 sigma ")
+    off_m, sigma_m = (
+        number_after(printed, "gap of 5 s:"),
+        number_after(printed, "1 sigma "),
+    )
     assert off_m < 3.5 * sigma_m < 0.2
 
 
@@ -87,12 +102,18 @@ def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
 def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path):
     printed = run("06_recogniser.py", tmp_path)
     last = printed[printed.rindex(": landmark 3 (") :]
-    identity, certainty, range_m = re.search(r"landmark (\d) \(([\d.]+)\) at ([\d.]+)", last).groups()
+    identity, certainty, range_m = re.search(
+        r"landmark (\d) \(([\d.]+)\) at ([\d.]+)", last
+    ).groups()
     assert identity == "3"
     assert float(certainty) > 0.9
-    assert float(range_m) == pytest.approx(number_after(last, "true, of the last: landmark 3 at"), abs=0.01)
+    assert float(range_m) == pytest.approx(
+        number_after(last, "true, of the last: landmark 3 at"), abs=0.01
+    )
     azimuth_deg = number_after(last, "mm,")
-    assert azimuth_deg == pytest.approx(number_after(last, r"true, of the last: landmark 3 at [\d.]+ m,"), abs=0.3)
+    assert azimuth_deg == pytest.approx(
+        number_after(last, r"true, of the last: landmark 3 at [\d.]+ m,"), abs=0.3
+    )
 
 
 @pytest.mark.slow
@@ -104,7 +125,12 @@ def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path):
     lines = re.findall(r"^    (evo_\w+ .*)$|`(evo_\w+ [^`]*)`", page, re.MULTILINE)
     assert len(lines) == 4
     for indented, inline in lines:
-        printed = output(tmp_path, *(indented or inline).split(), HOME=str(tmp_path), MPLBACKEND="Agg")
+        printed = output(
+            tmp_path,
+            *(indented or inline).split(),
+            HOME=str(tmp_path),
+            MPLBACKEND="Agg",
+        )
         assert "rmse" in printed or "poses" in printed
     (program,) = blocks(page, "python")
     assert_landmarks_are_true(output(tmp_path, "python", "-c", program), 0.3)
@@ -115,7 +141,9 @@ def assert_landmarks_are_true(printed: str, off_m: float) -> int:
     seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", printed)
     assert seen
     for landmark, x_m, y_m in seen:
-        assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=off_m)
+        assert (float(x_m), float(y_m)) == pytest.approx(
+            TRUE_LANDMARKS[int(landmark)], abs=off_m
+        )
     return len(seen)
 
 
@@ -126,7 +154,9 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
     (configuration,) = blocks(page, "toml")
     store = get_typestore(Stores.ROS1_NOETIC)
     with Writer(tmp_path / "old.bag") as writer:
-        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        connection = writer.add_connection(
+            "/chatter", "std_msgs/msg/String", typestore=store
+        )
         text = store.types["std_msgs/msg/String"]("hello")
         writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/String"))
     output(tmp_path, "python", "-W", "error", "-c", making)
@@ -137,22 +167,36 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
         words, _, target = line.partition(" > ")
         printed[words] = output(tmp_path, "sonar-graph", *words.split())
         if target:  # what is printed is a starting point; the page's own text is where the reader ends
-            assert '# topic = "/nav/dvl"\n# type = "my_msgs/msg/Speed"' in printed[words]
+            assert (
+                '# topic = "/nav/dvl"\n# type = "my_msgs/msg/Speed"' in printed[words]
+            )
             (tmp_path / target).write_text(configuration, encoding="utf-8")
-    first, second = printed["inspect dive.mcap"], printed["inspect dive.mcap --log-config dive.toml"]
+    first, second = (
+        printed["inspect dive.mcap"],
+        printed["inspect dive.mcap --log-config dive.toml"],
+    )
     assert "not usable for compare: no DVL" in first
     assert "gravity is felt along -z" in first
     assert "less than the atmosphere's" in first
-    assert not {"warning", "not usable", "left out"} & set(re.findall("warning|not usable|left out", second))
+    assert not {"warning", "not usable", "left out"} & set(
+        re.findall("warning|not usable|left out", second)
+    )
     for program in others:
         output(tmp_path, "python", "-W", "error", "-c", program)
     # What is read from the log that the page makes is what was simulated, whatever the axes and units between.
     truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
-    found = read_log(tmp_path / "dive.mcap", config=read_log_config(tmp_path / "dive.toml"))
-    np.testing.assert_allclose(found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-12)
-    np.testing.assert_allclose(found.imu.specific_force, truth.imu.specific_force, atol=1e-12)
+    found = read_log(
+        tmp_path / "dive.mcap", config=read_log_config(tmp_path / "dive.toml")
+    )
+    np.testing.assert_allclose(
+        found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        found.imu.specific_force, truth.imu.specific_force, atol=1e-12
+    )
     np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-12)
-    scale = truth.calibration.gravity_m_s2 / 9.80665  # the calibration does not travel in a foreign log
+    # the calibration does not travel in a foreign log
+    scale = truth.calibration.gravity_m_s2 / 9.80665
     np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m * scale, atol=1e-9)
 
 
@@ -161,7 +205,11 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path)
     page = (TUTORIALS / "07_batches.md").read_text(encoding="utf-8")
     (suite,), (program,) = blocks(page, "toml"), blocks(page, "python")
     commands = re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
-    assert [command.split()[1] for command in commands] == ["lap.toml", "bless", "lap.toml"]
+    assert [command.split()[1] for command in commands] == [
+        "lap.toml",
+        "bless",
+        "lap.toml",
+    ]
     (tmp_path / "lap.toml").write_text(suite, encoding="utf-8")
     for command in commands:
         said = output(tmp_path, "python", "-m", "sonar_graph", *command.split())
@@ -175,12 +223,20 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path)
 
 def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path):
     page = (TUTORIALS / "09_from_a_recording.md").read_text(encoding="utf-8")
-    (tmp_path / "over.toml").write_text(textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1]))
+    (tmp_path / "over.toml").write_text(
+        textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
+    )
     assert "floor.z_m" in PartialCalibration.read(tmp_path / "over.toml").fields()
-    assert f'Of one landmark and of "none of them" {LEAST_FRAMES} labelled frames are needed' in page
+    assert (
+        f'Of one landmark and of "none of them" {LEAST_FRAMES} labelled frames are needed'
+        in page
+    )
     (labels,) = blocks(page, "csv")
     (tmp_path / "labels.csv").write_text(labels)
-    assert [label.id for label in read_labels(tmp_path / "labels.csv", Path("joined.mcap")).labels] == [1, None]
+    assert [
+        label.id
+        for label in read_labels(tmp_path / "labels.csv", Path("joined.mcap")).labels
+    ] == [1, None]
     for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
         command, *more = words.split()
         options = {option for option in more if option.startswith("--")}
@@ -197,25 +253,36 @@ nbformat.write(notebook, "executed.ipynb")
 
 
 @pytest.mark.slow
-def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when_it_is_run(tmp_path):
-    pytest.importorskip("nbclient", reason="nbclient is not installed: pip install nbclient ipykernel")
+def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when_it_is_run(
+    tmp_path,
+):
+    pytest.importorskip(
+        "nbclient", reason="nbclient is not installed: pip install nbclient ipykernel"
+    )
     stored = json.loads((TUTORIALS / "12_notebook.ipynb").read_text("utf-8"))
     codes = [cell for cell in stored["cells"] if cell["cell_type"] == "code"]
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in codes)
+    assert all(
+        cell["outputs"] == [] and cell["execution_count"] is None for cell in codes
+    )
     output(tmp_path, "python", "-c", EXECUTE, TUTORIALS / "12_notebook.ipynb")
     cells = json.loads((tmp_path / "executed.ipynb").read_text("utf-8"))["cells"]
     shown = [one.get("data", {}) for cell in cells for one in cell.get("outputs", [])]
     tables = ["".join(one["text/html"]) for one in shown if "text/html" in one]
-    assert [re.findall(r'<table id="table-([\w-]+)"', table)[0] for table in tables] == [
-        *("sequence", "compact", "trajectory", "landmark-map")
-    ]
+    assert [
+        re.findall(r'<table id="table-([\w-]+)"', table)[0] for table in tables
+    ] == [*("sequence", "compact", "trajectory", "landmark-map")]
     assert sum("image/svg+xml" in one for one in shown) == 2
     assert "at the same 240 instants" in "".join(cells[-1]["outputs"][0]["text"])
 
 
-def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulated_run(tmp_path):
+def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulated_run(
+    tmp_path,
+):
     page = (TUTORIALS / "11_tables.md").read_text(encoding="utf-8")
-    ((making,), (configuration, more, vehicle)) = blocks(page, "python"), blocks(page, "toml")
+    ((making,), (configuration, more, vehicle)) = (
+        blocks(page, "python"),
+        blocks(page, "toml"),
+    )
     parse_csv_config(tomllib.loads(configuration) | tomllib.loads(more), "the page")
     PartialCalibration.parse(tomllib.loads(vehicle), "the page")
     output(tmp_path, "python", "-W", "error", "-c", making)
@@ -223,13 +290,25 @@ def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulate
         words, _, target = line.partition(" > ")
         printed = output(tmp_path, "sonar-graph", *words.split())
         if target:  # the guess is what the page says, but for the axes of the IMU
-            said = [row.partition("  #")[0] for row in printed.splitlines() if not row.startswith("#") and row]
-            assert said == [row for row in configuration.splitlines() if row and row != 'rotation = "frd"']
+            said = [
+                row.partition("  #")[0]
+                for row in printed.splitlines()
+                if not row.startswith("#") and row
+            ]
+            assert said == [
+                row
+                for row in configuration.splitlines()
+                if row and row != 'rotation = "frd"'
+            ]
             (tmp_path / target).write_text(configuration, encoding="utf-8")
     truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
     found = read_log(tmp_path / "dive.mcap")
-    np.testing.assert_allclose(found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-9)
-    np.testing.assert_allclose(found.imu.specific_force, truth.imu.specific_force, atol=1e-9)
+    np.testing.assert_allclose(
+        found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.imu.specific_force, truth.imu.specific_force, atol=1e-9
+    )
     np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-9)
     np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m, atol=1e-9)
 
@@ -244,13 +323,18 @@ def test_first_page_makes_a_sequence_a_report_and_a_log_from_arrays(tmp_path):
 def test_every_tutorial_is_listed_and_run():
     listed = (TUTORIALS / "README.md").read_text(encoding="utf-8")
     run_here = Path(__file__).read_text(encoding="utf-8")
-    for script in (*TUTORIALS.glob("0*"), *TUTORIALS.glob("11*")):  # 10 is run in tests/live
+    for script in (
+        *TUTORIALS.glob("0*"),
+        *TUTORIALS.glob("11*"),
+    ):  # 10 is run in tests/live
         assert script.name in listed
         assert script.name in run_here
 
 
 @pytest.mark.slow
-def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it_says(tmp_path):
+def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it_says(
+    tmp_path,
+):
     pytest.importorskip("dask", reason="needs sonar-graph[bench]")
     page = (TUTORIALS / "08_doubtful_identities.md").read_text(encoding="utf-8")
     (suite,) = blocks(page, "toml")
@@ -269,8 +353,14 @@ def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it
         ),
     }.items():
         assert said in printed[words]
-    compared, asked = (output(tmp_path, "python", "-W", "error", "-c", program) for program in blocks(page, "python"))
-    off_m = [number_after(compared, rf"{name} [\d.]+") for name in ("default", "gate", "max-mixture")]
+    compared, asked = (
+        output(tmp_path, "python", "-W", "error", "-c", program)
+        for program in blocks(page, "python")
+    )
+    off_m = [
+        number_after(compared, rf"{name} [\d.]+")
+        for name in ("default", "gate", "max-mixture")
+    ]
     assert off_m[1] > 2
     assert max(off_m[0], off_m[2]) < 0.1
     assert assert_landmarks_are_true(asked, 0.2) == 4

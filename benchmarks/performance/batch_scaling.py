@@ -48,7 +48,12 @@ class Stopwatch:
         """Note a run."""
         row = outcome.row
         assert row["status"] == "ok", row["reason"]
-        self._kept.append((time.perf_counter(), float(row["read_s"] or 0) + float(row["estimate_s"] or 0)))
+        self._kept.append(
+            (
+                time.perf_counter(),
+                float(row["read_s"] or 0) + float(row["estimate_s"] or 0),
+            )
+        )
 
     def total_s(self) -> float:
         """From the start of the cluster to the last run."""
@@ -72,14 +77,22 @@ def measure(suite: Path, folder: Path, workers: int) -> Stopwatch:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--workers", type=int, default=min(4, CPU_COUNT), help="beside one (default: cores, at most 4)")
-    parser.add_argument("--runs", type=int, default=LEAST_RUNS, help=f"seeds (default: {LEAST_RUNS})")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=min(4, CPU_COUNT),
+        help="beside one (default: cores, at most 4)",
+    )
+    parser.add_argument(
+        "--runs", type=int, default=LEAST_RUNS, help=f"seeds (default: {LEAST_RUNS})"
+    )
     arguments = parser.parse_args()
     runs = 8 if arguments.quick else arguments.runs
     with tempfile.TemporaryDirectory() as scratch:
         suite = Path(scratch) / "suite.toml"
         suite.write_text(SUITE.format(seeds=1))
-        measure(suite, Path(scratch) / "warm", 1)  # kernels are compiled once on a machine
+        # kernels are compiled once on a machine
+        measure(suite, Path(scratch) / "warm", 1)
         suite.write_text(SUITE.format(seeds=runs))
         one = measure(suite, Path(scratch) / "one", 1)
         many = measure(suite, Path(scratch) / "many", arguments.workers)
@@ -93,11 +106,17 @@ def main() -> None:
         "speedup_ratio": one.total_s() / many.total_s(),
         "overhead_s": one.overhead_s(),
     }
-    figures["passed"] = figures["speedup_ratio"] >= target and figures["overhead_s"] < OVERHEAD_S
+    figures["passed"] = (
+        figures["speedup_ratio"] >= target and figures["overhead_s"] < OVERHEAD_S
+    )
     print_table(
         ("", "measured", "target"),
         [
-            (f"speedup, {arguments.workers} workers", figures["speedup_ratio"], f"at least {target:g}"),
+            (
+                f"speedup, {arguments.workers} workers",
+                figures["speedup_ratio"],
+                f"at least {target:g}",
+            ),
             ("overhead of a run, s", figures["overhead_s"], f"below {OVERHEAD_S:g}"),
         ],
     )

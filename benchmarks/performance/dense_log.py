@@ -38,7 +38,13 @@ from gtsam.symbol_shorthand import L
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, make_parser, note, print_figures, recording, write_results
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, PlanarMotion, SonarCalibration
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    PlanarMotion,
+    SonarCalibration,
+)
 from sonar_graph.logs.convert import read_dlr, read_mrclam
 from sonar_graph.measurements import NS_PER_S, Dvl, Imu, LandmarkDetections
 from sonar_graph.navigation import Odometry
@@ -68,11 +74,19 @@ def survey(landmarks: int = 1000, seed: int = 1) -> Sequence:
 def repeated_survey(minutes: float, seed: int = 1) -> Sequence:
     """A field of 60 m x 60 m with 200 landmarks, surveyed to and fro for so long, with a frame every 4 s."""
     lanes = round(60.0 * minutes * SPEED_M_S / (60.0 + np.pi * APART_M / 2))
-    return along_lanes(lanes, 60.0, 200, seed, lanes_a_lap=10, frame_every=round(4.0 * RATE_HZ))
+    return along_lanes(
+        lanes, 60.0, 200, seed, lanes_a_lap=10, frame_every=round(4.0 * RATE_HZ)
+    )
 
 
 def along_lanes(
-    lanes: int, lane_m: float, landmarks: int, seed: int, *, lanes_a_lap: int = 10**6, frame_every: int = 1
+    lanes: int,
+    lane_m: float,
+    landmarks: int,
+    seed: int,
+    *,
+    lanes_a_lap: int = 10**6,
+    frame_every: int = 1,
 ) -> Sequence:
     """Measurements along lanes, 6 m apart; after ``lanes_a_lap`` lanes the vehicle goes back over them."""
     rng = np.random.default_rng(seed)
@@ -90,7 +104,15 @@ def along_lanes(
     heading = np.concatenate([[0.0], np.cumsum(rates) * dt])
     middle = 0.5 * (heading[1:] + heading[:-1])
     chord = SPEED_M_S * dt * np.sinc(np.array(rates) * dt / (2 * np.pi))
-    xy = np.vstack([[0.0, 0.0], np.cumsum(np.column_stack([chord * np.cos(middle), chord * np.sin(middle)]), axis=0)])
+    xy = np.vstack(
+        [
+            [0.0, 0.0],
+            np.cumsum(
+                np.column_stack([chord * np.cos(middle), chord * np.sin(middle)]),
+                axis=0,
+            ),
+        ]
+    )
     stamps_ns = (np.arange(n + 1) * (NS_PER_S // round(RATE_HZ))).astype(np.int64)
     gyro, velocity = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
     gyro[1:, 2] = rates + GYRO_NOISE / np.sqrt(dt) * rng.standard_normal(n)
@@ -102,10 +124,16 @@ def along_lanes(
             continue
         away = points - xy[k]
         distance = np.hypot(*away.T)
-        azimuth = (np.arctan2(away[:, 1], away[:, 0]) - heading[k] + np.pi) % (2 * np.pi) - np.pi
-        seen = np.flatnonzero((distance < RANGE_MAX_M) & (np.abs(azimuth) < HALF_APERTURE_RAD)).tolist()
+        azimuth = (np.arctan2(away[:, 1], away[:, 0]) - heading[k] + np.pi) % (
+            2 * np.pi
+        ) - np.pi
+        seen = np.flatnonzero(
+            (distance < RANGE_MAX_M) & (np.abs(azimuth) < HALF_APERTURE_RAD)
+        ).tolist()
         rows += [(k, i, distance[i], azimuth[i]) for i in seen]
-    frames, ids, distances, azimuths = (np.array(column) for column in zip(*rows, strict=True))
+    frames, ids, distances, azimuths = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     m = len(rows)
     detections = LandmarkDetections(
         stamps_ns[frames],
@@ -116,9 +144,15 @@ def along_lanes(
         np.ones((m, 1)),
     )
     calibration = Calibration(
-        imu=ImuCalibration(gyro_noise_density=GYRO_NOISE, gyro_bias_sigma=0.0, gyro_bias_walk_density=0.0),
+        imu=ImuCalibration(
+            gyro_noise_density=GYRO_NOISE,
+            gyro_bias_sigma=0.0,
+            gyro_bias_walk_density=0.0,
+        ),
         dvl=DvlCalibration(velocity_sigma_m_s=(SPEED_SIGMA_M_S, SPEED_SIGMA_M_S, 1e-3)),
-        sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
+        sonar=SonarCalibration(
+            range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD
+        ),
         planar=PlanarMotion(),
         use_gravity=False,
         odometry_interpolation="hold-past",
@@ -137,12 +171,18 @@ def run(sequence: Sequence, until_s: float | None = None) -> dict[str, Any]:
     """Figures of one log."""
     assert sequence.detections is not None
     stamps = np.unique(sequence.detections.stamps_ns)
-    end_ns = sequence.end_ns if until_s is None else sequence.start_ns + round(until_s * NS_PER_S)
+    end_ns = (
+        sequence.end_ns
+        if until_s is None
+        else sequence.start_ns + round(until_s * NS_PER_S)
+    )
     stamps = stamps[(stamps > sequence.start_ns) & (stamps <= end_ns)]
     estimator = Isam2(sequence.calibration, Odometry(sequence.calibration))
     cpu_s, wall_s = [], []
     gaps_at_tenths_m = []
-    tenths = set(np.linspace(len(stamps) / 10, len(stamps) - 1, 10).astype(int).tolist())
+    tenths = set(
+        np.linspace(len(stamps) / 10, len(stamps) - 1, 10).astype(int).tolist()
+    )
     for k, step in enumerate(sequence.replay(stamps)):
         cpu, wall = time.thread_time(), time.perf_counter()
         estimator.process(step)
@@ -155,14 +195,24 @@ def run(sequence: Sequence, until_s: float | None = None) -> dict[str, Any]:
     start = time.thread_time()
     batch = estimator.landmarks()
     finish_s = time.thread_time() - start
-    gaps_m = [np.linalg.norm((live.atPoint3(L(i)) - p)[:2]) for i, p in zip(batch.ids, batch.positions, strict=True)]
+    gaps_m = [
+        np.linalg.norm((live.atPoint3(L(i)) - p)[:2])
+        for i, p in zip(batch.ids, batch.positions, strict=True)
+    ]
     spread_m = np.sqrt(batch.covariances[:, 0, 0] + batch.covariances[:, 1, 1])
-    ratios = [sigmas(estimator, "window", keyframe=newest) / sigmas(estimator, "history", keyframe=newest)]
+    ratios = [
+        sigmas(estimator, "window", keyframe=newest)
+        / sigmas(estimator, "history", keyframe=newest)
+    ]
     for i, exact in zip(batch.ids.tolist(), batch.covariances, strict=True):
-        ratios.append(sigmas(estimator, "window", landmark=i) / np.sqrt(np.diag(exact)[:2]))
+        ratios.append(
+            sigmas(estimator, "window", landmark=i) / np.sqrt(np.diag(exact)[:2])
+        )
     ratio = np.concatenate(ratios)
     cpu_ms = 1e3 * np.array(cpu_s)
-    by_ten_minutes_s = np.bincount((stamps - sequence.start_ns) // (600 * NS_PER_S), weights=cpu_s)
+    by_ten_minutes_s = np.bincount(
+        (stamps - sequence.start_ns) // (600 * NS_PER_S), weights=cpu_s
+    )
     return {
         "log": sequence.name,
         "updates": len(stamps),
@@ -190,7 +240,9 @@ def live_gap_m(estimator: Isam2) -> float:
     return float(apart_m.max(initial=0.0))
 
 
-def sigmas(estimator: Isam2, over: Literal["window", "history"], **of: int) -> np.ndarray:
+def sigmas(
+    estimator: Isam2, over: Literal["window", "history"], **of: int
+) -> np.ndarray:
     """Standard deviations of yaw and horizontal position of a keyframe, or of the horizontal position of a landmark."""
     variances = np.diag(estimator.marginal(**of, over=over))
     return np.sqrt(variances[[2, 3, 4]] if "keyframe" in of else variances[:2])
@@ -203,8 +255,12 @@ def logs(data: Path | str | None, *, is_quick: bool) -> Iterator[Sequence]:
     if is_quick:
         return
     for number in (9, 6):
-        with recording(data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}") as folder:
-            for robot in sorted(int(path.name[5]) for path in folder.glob("Robot?_Odometry.dat")):
+        with recording(
+            data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}"
+        ) as folder:
+            for robot in sorted(
+                int(path.name[5]) for path in folder.glob("Robot?_Odometry.dat")
+            ):
                 yield read_mrclam(folder, robot)
     with recording(data, "dlr.tar.xz", "dlr") as folder:
         yield read_dlr(folder)
@@ -230,10 +286,24 @@ def main() -> None:
             found.append(run(sequence, 120.0 if arguments.quick else None))
             print_figures(found[-1])
     if not found:
-        sys.exit(f"--only {arguments.only}: no log has that in its name; expected a part of one, as in the docstring")
+        sys.exit(
+            f"--only {arguments.only}: no log has that in its name; expected a part of one, as in the docstring"
+        )
     if not arguments.quick and not arguments.only:
-        headers = ("log", "keyframes", "median ms", "p99 ms", "longest ms", "of real time", "last batch s")
-        headers += ("live from batch at the end m", "at tenths m", "s in each ten minutes")
+        headers = (
+            "log",
+            "keyframes",
+            "median ms",
+            "p99 ms",
+            "longest ms",
+            "of real time",
+            "last batch s",
+        )
+        headers += (
+            "live from batch at the end m",
+            "at tenths m",
+            "s in each ten minutes",
+        )
         names = (
             "log",
             "keyframes",
@@ -245,12 +315,18 @@ def main() -> None:
             "landmark_gap_m",
         )
         rows = [
-            (*(each[name] for name in names), listed(each["gaps_at_tenths_m"]), listed(each["by_ten_minutes_s"]))
+            (
+                *(each[name] for name in names),
+                listed(each["gaps_at_tenths_m"]),
+                listed(each["by_ten_minutes_s"]),
+            )
             for each in found
         ]
         write_results("smoother.md", "The smoother on dense logs", headers, rows)
     recorded = [each for each in found if not each["log"].startswith("survey")] or found
-    figures: dict[str, Any] = {name: max(each[name] for each in recorded) for name in (*TARGETS, "gap_sigmas")}
+    figures: dict[str, Any] = {
+        name: max(each[name] for each in recorded) for name in (*TARGETS, "gap_sigmas")
+    }
     figures["real_time_ratio"] = max(each["real_time_ratio"] for each in found)
     for name, limit in TARGETS.items():
         print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")

@@ -38,7 +38,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import THREAD_VARIABLES
 
 for variable in THREAD_VARIABLES:
-    os.environ.setdefault(variable, "1")  # before numpy: the processor time of one thread is the whole time
+    # before numpy: the processor time of one thread is the whole time
+    os.environ.setdefault(variable, "1")
 
 import filterpy_ekf
 import numpy as np
@@ -59,23 +60,48 @@ MOST_LOG_S, LEAST_FILTERPY_RATIO = 0.5, 50.0
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_S:.0f} s of mission instead of {FULL_S:.0f} s")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help=f"{QUICK_S:.0f} s of mission instead of {FULL_S:.0f} s",
+    )
     quick = parser.parse_args().quick
-    sequence = simulate_mission(MissionOptions(duration_s=QUICK_S if quick else FULL_S, landmarks=20))
+    sequence = simulate_mission(
+        MissionOptions(duration_s=QUICK_S if quick else FULL_S, landmarks=20)
+    )
     windows = list(sequence.replay(sequence.instants(RATE_HZ)))
     calibration, kinds = sequence.calibration, (EkfSlam, InvariantEkf)
     for kind in kinds:
         timed_run(kind(calibration, Odometry(calibration)), windows[:60])
-    rounds = [[timed_run(kind(calibration, Odometry(calibration)), windows) for kind in kinds] for _ in range(ROUNDS)]
-    durations_s, invariant_s = (min(of_kind, key=np.sum) for of_kind in zip(*rounds, strict=True))
+    rounds = [
+        [timed_run(kind(calibration, Odometry(calibration)), windows) for kind in kinds]
+        for _ in range(ROUNDS)
+    ]
+    durations_s, invariant_s = (
+        min(of_kind, key=np.sum) for of_kind in zip(*rounds, strict=True)
+    )
     median_us, p99_us = 1e6 * np.percentile(durations_s, [50, 99])
-    print(f"{len(windows)} updates: median {median_us:.0f} µs, p99 {p99_us:.0f} µs, sum {durations_s.sum():.3f} s")
-    compared = compare_filterpy(sequence, windows, FILTERPY_QUICK_S if quick else FILTERPY_S)
-    own = {"log_s": float(durations_s.sum()), "invariant_log_s": float(invariant_s.sum())}
+    print(
+        f"{len(windows)} updates: median {median_us:.0f} µs, p99 {p99_us:.0f} µs, sum {durations_s.sum():.3f} s"
+    )
+    compared = compare_filterpy(
+        sequence, windows, FILTERPY_QUICK_S if quick else FILTERPY_S
+    )
+    own = {
+        "log_s": float(durations_s.sum()),
+        "invariant_log_s": float(invariant_s.sum()),
+    }
     figures = own | {"mission_s": sequence.duration_s, **compared}
     passed = meets_targets(figures)
-    print(json.dumps({name: float(f"{value:.4g}") for name, value in figures.items()} | {"passed": passed}))
+    print(
+        json.dumps(
+            {name: float(f"{value:.4g}") for name, value in figures.items()}
+            | {"passed": passed}
+        )
+    )
     return exit_code(figures, quick=quick)
 
 
@@ -86,7 +112,10 @@ def is_same(figures: dict[str, float]) -> bool:
 
 def meets_targets(figures: dict[str, float]) -> bool:
     """Check that the comparison is valid and both targets are met."""
-    fast = figures["log_s"] <= MOST_LOG_S and figures["filterpy_ratio"] >= LEAST_FILTERPY_RATIO
+    fast = (
+        figures["log_s"] <= MOST_LOG_S
+        and figures["filterpy_ratio"] >= LEAST_FILTERPY_RATIO
+    )
     return bool(fast and is_same(figures))
 
 
@@ -104,19 +133,28 @@ def timed_run(slam: EkfSlam | InvariantEkf, windows: list[Measurements]) -> Floa
     return np.array(durations_s)
 
 
-def compare_filterpy(sequence: Sequence, windows: list[Measurements], part_s: float) -> dict[str, float]:
+def compare_filterpy(
+    sequence: Sequence, windows: list[Measurements], part_s: float
+) -> dict[str, float]:
     until_ns = sequence.start_ns + round(part_s * NS_PER_S)
     part = [window for window in windows if window.end_ns <= until_ns]
     ours_s, sample_s, node_s, in_filterpy_s = [], [], [], []
     for _ in range(ROUNDS):
         ours = EkfSlam(sequence.calibration, Odometry(sequence.calibration))
         ours_s.append(timed_run(ours, part).sum())
-        seconds, by_sample = timed_filterpy(sequence, part[-1].end_ns, predicts_by_node=False)
+        seconds, by_sample = timed_filterpy(
+            sequence, part[-1].end_ns, predicts_by_node=False
+        )
         sample_s.append(seconds)
         in_filterpy_s.append(by_sample.seconds)
-        seconds, by_node = timed_filterpy(sequence, part[-1].end_ns, predicts_by_node=True)
+        seconds, by_node = timed_filterpy(
+            sequence, part[-1].end_ns, predicts_by_node=True
+        )
         node_s.append(seconds)
-    steps, worst = by_sample.nodes, max(difference(ours, by_sample), difference(ours, by_node))
+    steps, worst = (
+        by_sample.nodes,
+        max(difference(ours, by_sample), difference(ours, by_node)),
+    )
     print(
         f"{steps} steps, {len(by_sample.x)} states: ours {1e6 * min(ours_s) / steps:.0f} µs a step, filterpy with a"
         f" prediction a sample {1e6 * min(sample_s) / steps:.0f} µs, of these {1e6 * min(in_filterpy_s) / steps:.0f} in"
@@ -145,7 +183,12 @@ def difference(ours: EkfSlam, theirs: filterpy_ekf.FilterpyRun) -> float:
     if (node_ns, len(x)) != (theirs.node_ns, len(theirs.x)):
         return np.inf
     sigma = np.sqrt(np.diag(P))
-    return float(max(np.abs(theirs.x - x).max(), np.abs((theirs.P - P) / np.outer(sigma, sigma)).max()))
+    return float(
+        max(
+            np.abs(theirs.x - x).max(),
+            np.abs((theirs.P - P) / np.outer(sigma, sigma)).max(),
+        )
+    )
 
 
 if __name__ == "__main__":

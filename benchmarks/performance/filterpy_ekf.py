@@ -83,7 +83,9 @@ class FilterpySlam:
         before, W = self.pose(), body_rates(self.ekf.x)
         after = before.compose(motion.i_T_j)
         R, R_after = before.rotation().matrix(), after.rotation().matrix()
-        self.ekf.x = np.concatenate([after.translation(), after.rotation().rpy(), self.ekf.x[6:]])
+        self.ekf.x = np.concatenate(
+            [after.translation(), after.rotation().rpy(), self.ekf.x[6:]]
+        )
         E_after = np.linalg.inv(body_rates(self.ekf.x))
         self.ekf.F, G = np.eye(n), np.zeros((n, 6))
         self.ekf.F[:3, 3:6] = -R @ gtsam.Rot3.Hat(motion.i_T_j.translation()) @ W
@@ -93,7 +95,15 @@ class FilterpySlam:
         self.ekf.predict_x = lambda _: None  # the mean has moved already
         self.ekf.predict()
 
-    def update(self, z: Floats, predicted: Floats, H: Floats, R: Floats, *, wrapped: tuple[int, ...] = ()) -> None:
+    def update(
+        self,
+        z: Floats,
+        predicted: Floats,
+        H: Floats,
+        R: Floats,
+        *,
+        wrapped: tuple[int, ...] = (),
+    ) -> None:
         """Correct as filterpy does, with some innovations wrapped."""
 
         def residual(measured: Floats, expected: Floats) -> Floats:
@@ -111,26 +121,43 @@ class FilterpySlam:
         H = np.zeros((1, len(self.ekf.x)))
         H[0, at] = 1.0
         angle = (0,) if 3 <= at < 6 else ()
-        self.update(np.array([value]), self.ekf.x[[at]], H, np.array([[variance]]), wrapped=angle)
+        self.update(
+            np.array([value]),
+            self.ekf.x[[at]],
+            H,
+            np.array([[variance]]),
+            wrapped=angle,
+        )
 
     def carried(self, motion: PreintegratedMotion) -> tuple[gtsam.Pose3, Floats]:
         """The body a motion after the state, and the derivative of its perturbation by the pose state."""
         pose, W = self.pose(), body_rates(self.ekf.x)
         to_perturbation = np.zeros((6, 6))
         to_perturbation[:3, 3:], to_perturbation[3:, :3] = W, pose.rotation().matrix().T
-        return pose.compose(motion.i_T_j), motion.i_T_j.inverse().AdjointMap() @ to_perturbation
+        return pose.compose(
+            motion.i_T_j
+        ), motion.i_T_j.inverse().AdjointMap() @ to_perturbation
 
-    def update_depth(self, motion: PreintegratedMotion, z_m: float, variance: float) -> None:
+    def update_depth(
+        self, motion: PreintegratedMotion, z_m: float, variance: float
+    ) -> None:
         """Correct by the height of the pressure port a motion after the state."""
         pose, T = self.carried(motion)
-        port, down = np.array(self.calibration.depth.port_m), pose.rotation().matrix()[2]
+        port, down = (
+            np.array(self.calibration.depth.port_m),
+            pose.rotation().matrix()[2],
+        )
         by_body = np.concatenate([-down @ gtsam.Rot3.Hat(port), down])[None]
         H = np.zeros((1, len(self.ekf.x)))
         H[:, :6] = by_body @ T
         R = variance + by_body @ motion.covariance @ by_body.T
-        self.update(np.array([z_m]), np.array([pose.translation()[2] + down @ port]), H, R)
+        self.update(
+            np.array([z_m]), np.array([pose.translation()[2] + down @ port]), H, R
+        )
 
-    def detect(self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats) -> None:
+    def detect(
+        self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats
+    ) -> None:
         """Correct by range and azimuth a motion after the state, or augment."""
         if landmark not in self.slots:
             self.augment(motion, landmark, z, R)
@@ -138,31 +165,47 @@ class FilterpySlam:
         pose, T = self.carried(motion)
         at = 6 + 3 * self.slots[landmark]
         body_T_sonar = self.calibration.sonar.mounting.pose()
-        predicted, by_body, by_landmark = range_azimuth_jacobians(pose, body_T_sonar, self.ekf.x[at : at + 3])
+        predicted, by_body, by_landmark = range_azimuth_jacobians(
+            pose, body_T_sonar, self.ekf.x[at : at + 3]
+        )
         H = np.zeros((2, len(self.ekf.x)))
         H[:, :6], H[:, at : at + 3] = by_body @ T, by_landmark
         R = R + by_body @ motion.covariance @ by_body.T
         self.update(z, predicted, H, R, wrapped=(1,))
 
-    def augment(self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats) -> None:
+    def augment(
+        self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats
+    ) -> None:
         """Append a landmark."""
         pose, T = self.carried(motion)
-        sonar, floor, n = self.calibration.sonar, self.calibration.floor, len(self.ekf.x)
+        sonar, floor, n = (
+            self.calibration.sonar,
+            self.calibration.floor,
+            len(self.ekf.x),
+        )
         body_T_sonar = sonar.mounting.pose()
         aperture, elevation = sonar.elevation_aperture_rad, None
         if floor:
-            elevation = elevation_on_floor(pose.compose(body_T_sonar), z[0], z[1], floor.z_m, aperture)
-        point, by_body, by_view = locate_jacobians(pose, body_T_sonar, z[0], z[1], elevation or 0.0)
+            elevation = elevation_on_floor(
+                pose.compose(body_T_sonar), z[0], z[1], floor.z_m, aperture
+            )
+        point, by_body, by_view = locate_jacobians(
+            pose, body_T_sonar, z[0], z[1], elevation or 0.0
+        )
         noise = np.zeros((3, 3))
         noise[:2, :2], noise[2, 2] = R, aperture**2 / 12
         J = np.eye(n + 3, n)
         J[n:, :6] = by_body @ T
         P = J @ self.ekf.P @ J.T
-        P[n:, n:] += by_body @ motion.covariance @ by_body.T + by_view @ noise @ by_view.T
+        P[n:, n:] += (
+            by_body @ motion.covariance @ by_body.T + by_view @ noise @ by_view.T
+        )
         self.ekf.x, self.ekf.P = np.concatenate([self.ekf.x, point]), P
         self.ekf.dim_x, self.ekf._I = n + 3, np.eye(n + 3)
         self.slots[landmark] = len(self.slots)
-        if floor and (floor.z_m - point[2]) ** 2 <= FLOOR_GATE * (P[n + 2, n + 2] + floor.sigma_m**2):
+        if floor and (floor.z_m - point[2]) ** 2 <= FLOOR_GATE * (
+            P[n + 2, n + 2] + floor.sigma_m**2
+        ):
             self.update_state(n + 2, floor.z_m, floor.sigma_m**2)
 
 
@@ -181,15 +224,29 @@ class _Feed:
     def motions(self, stamps_ns: Ints, known_ns: int) -> list[PreintegratedMotion]:
         """Motions from each stamp to the next, from rows stamped no later than an instant."""
         known = np.full(len(stamps_ns) - 1, known_ns)
-        rows = zip(*self.odometry.motions(stamps_ns[:-1], stamps_ns[1:], known, NO_BIAS), strict=True)
+        rows = zip(
+            *self.odometry.motions(stamps_ns[:-1], stamps_ns[1:], known, NO_BIAS),
+            strict=True,
+        )
         return [
-            PreintegratedMotion(gtsam.Pose3(gtsam.Rot3(dR), dp), C, D, NO_BIAS, duration_s, impulse / duration_s)
-            for (dR, dp, C, D, impulse), duration_s in zip(rows, np.diff(stamps_ns) * 1e-9, strict=True)
+            PreintegratedMotion(
+                gtsam.Pose3(gtsam.Rot3(dR), dp),
+                C,
+                D,
+                NO_BIAS,
+                duration_s,
+                impulse / duration_s,
+            )
+            for (dR, dp, C, D, impulse), duration_s in zip(
+                rows, np.diff(stamps_ns) * 1e-9, strict=True
+            )
         ]
 
     def advance(self, until_ns: int) -> None:
         epochs_ns, reached = self.odometry.epochs_reached(self.node_ns, until_ns)
-        for node_ns, reached_ns in zip(epochs_ns.tolist(), reached.tolist(), strict=True):
+        for node_ns, reached_ns in zip(
+            epochs_ns.tolist(), reached.tolist(), strict=True
+        ):
             stamps_ns = np.array([self.node_ns, node_ns])
             if not self.predicts_by_node:
                 imu_ns = self.sequence.imu.stamps_ns
@@ -197,15 +254,24 @@ class _Feed:
                 stamps_ns = np.unique(np.concatenate([stamps_ns, imu_ns[first:last]]))
                 stamps_ns = stamps_ns[stamps_ns >= self.node_ns]
             motions = self.motions(stamps_ns, reached_ns)
-            self.slam.timed(lambda motions=motions: [self.slam.predict(motion) for motion in motions])  # type: ignore[misc]
+            self.slam.timed(
+                lambda motions=motions: [
+                    self.slam.predict(motion) for motion in motions
+                ]
+            )  # type: ignore[misc]
             self.node_ns, self.nodes = node_ns, self.nodes + 1
-            if self.slam.calibration.use_gravity and node_ns - self.opened_ns >= GRAVITY_INTERVAL_NS:
+            if (
+                self.slam.calibration.use_gravity
+                and node_ns - self.opened_ns >= GRAVITY_INTERVAL_NS
+            ):
                 self.gravity(reached_ns)
 
     def gravity(self, reached_ns: int) -> None:
         calibration = self.slam.calibration
         stamps_ns = np.array([self.opened_ns, self.node_ns])
-        ends, variances = zip(*(self.odometry.velocity_at_imu(int(t)) for t in stamps_ns), strict=True)
+        ends, variances = zip(
+            *(self.odometry.velocity_at_imu(int(t)) for t in stamps_ns), strict=True
+        )
         (motion,) = self.motions(stamps_ns, reached_ns)
         sigma_m_s = math.sqrt(0.5 * sum(variances))
         self.opened_ns = self.node_ns
@@ -214,8 +280,14 @@ class _Feed:
             return
         up, sigma = found
         level = math.hypot(up[1], up[2])
-        self.slam.timed(lambda: self.slam.update_state(3, math.atan2(up[1], up[2]), (sigma / level) ** 2))
-        self.slam.timed(lambda: self.slam.update_state(4, math.atan2(-up[0], level), sigma**2))
+        self.slam.timed(
+            lambda: self.slam.update_state(
+                3, math.atan2(up[1], up[2]), (sigma / level) ** 2
+            )
+        )
+        self.slam.timed(
+            lambda: self.slam.update_state(4, math.atan2(-up[0], level), sigma**2)
+        )
 
     def provisional(self, until_ns: int) -> PreintegratedMotion:
         return self.odometry.motion(self.node_ns, until_ns, NO_BIAS, None, until_ns)
@@ -227,7 +299,9 @@ class _Feed:
         if np.isnan(variance):
             variance = self.slam.calibration.depth.sigma_m**2
         motion = self.provisional(int(depth.stamps_ns[row]))
-        self.slam.timed(lambda: self.slam.update_depth(motion, depth.z_m[row], variance))
+        self.slam.timed(
+            lambda: self.slam.update_depth(motion, depth.z_m[row], variance)
+        )
 
     def detection(self, row: int) -> None:
         detections = self.sequence.detections
@@ -245,7 +319,9 @@ class _Feed:
         self.slam.timed(lambda: self.slam.detect(motion, int(ids[0]), z, R))
 
 
-def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) -> FilterpyRun:
+def run(
+    sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False
+) -> FilterpyRun:
     """Feed a sequence up to an instant; without the Earth's rotation and the planar constraint.
 
     Parameters
@@ -254,7 +330,12 @@ def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) ->
         Predict once a DVL node, over the motion preintegrated since the node before, and not once a sample.
     """
     odometry = Odometry(sequence.calibration)
-    odometry.add(*(rows.between(sequence.start_ns - 1, until_ns) for rows in (sequence.imu, sequence.dvl)))
+    odometry.add(
+        *(
+            rows.between(sequence.start_ns - 1, until_ns)
+            for rows in (sequence.imu, sequence.dvl)
+        )
+    )
     start_ns = odometry.start_by(until_ns)
     assert start_ns is not None
     slam = FilterpySlam(sequence.calibration)
@@ -263,14 +344,18 @@ def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) ->
     if sequence.depth is not None:
         events += [(int(t), 0, row) for row, t in enumerate(sequence.depth.stamps_ns)]
     if sequence.detections is not None:
-        events += [(int(t), 1, row) for row, t in enumerate(sequence.detections.stamps_ns)]
+        events += [
+            (int(t), 1, row) for row, t in enumerate(sequence.detections.stamps_ns)
+        ]
     for stamp_ns, kind, row in sorted(events):
         if stamp_ns > until_ns or odometry.start_by(stamp_ns) is None:
             continue
         feed.advance(stamp_ns)
         (feed.depth, feed.detection)[kind](row)
     feed.advance(until_ns)
-    return FilterpyRun(feed.node_ns, slam.ekf.x, slam.ekf.P, slam.slots, feed.nodes, slam.seconds)
+    return FilterpyRun(
+        feed.node_ns, slam.ekf.x, slam.ekf.P, slam.slots, feed.nodes, slam.seconds
+    )
 
 
 def body_rates(x: Floats) -> Floats:

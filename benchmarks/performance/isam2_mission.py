@@ -28,7 +28,13 @@ from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
-from sonar_graph.models import BIASES, bias_sigmas, by_biases, elevation_on_floor, locate
+from sonar_graph.models import (
+    BIASES,
+    bias_sigmas,
+    by_biases,
+    elevation_on_floor,
+    locate,
+)
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -100,7 +106,9 @@ class PlainIsam2:
         self._graph.push_back(factors.start_prior(X(0), self._calibration))
 
     def _add_pose(self, node_ns: int, measurements: Measurements) -> None:
-        motion = self._odometry.motion(self._node_ns, node_ns, NO_BIAS, known_ns=measurements.end_ns)
+        motion = self._odometry.motion(
+            self._node_ns, node_ns, NO_BIAS, known_ns=measurements.end_ns
+        )
         self._pose = self._pose.compose(motion.i_T_j)
         self._graph.push_back(self._odometry_factor(motion))
         self._index += 1
@@ -109,31 +117,52 @@ class PlainIsam2:
         self._odometry.forget_before(node_ns)
         depth = measurements.depth.between(0, node_ns) if measurements.depth else None
         if depth is not None:
-            port, sigma_m = np.array(self._calibration.depth.port_m), self._calibration.depth.sigma_m
-            self._graph.push_back(factors.depth(X(self._index), float(depth.z_m[-1]), port, sigma_m))
+            port, sigma_m = (
+                np.array(self._calibration.depth.port_m),
+                self._calibration.depth.sigma_m,
+            )
+            self._graph.push_back(
+                factors.depth(X(self._index), float(depth.z_m[-1]), port, sigma_m)
+            )
 
     def _odometry_factor(self, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
         return factors.odometry(X(self._index), X(self._index + 1), motion)
 
     def _add_sightings(self, detections: LandmarkDetections) -> None:
-        motion = self._odometry.motion(self._node_ns, int(detections.stamps_ns[-1]), NO_BIAS)
+        motion = self._odometry.motion(
+            self._node_ns, int(detections.stamps_ns[-1]), NO_BIAS
+        )
         body_T_sonar = motion.i_T_j.compose(self._body_T_sonar)
         ids, probabilities = detections.most_probable()
         for row in np.flatnonzero(probabilities > 0.7).tolist():
             z = np.array([detections.range_m[row], detections.azimuth_rad[row]])
-            self._sight(int(ids[row]), body_T_sonar, z, detections.range_azimuth_cov[row])
+            self._sight(
+                int(ids[row]), body_T_sonar, z, detections.range_azimuth_cov[row]
+            )
 
-    def _sight(self, landmark: int, body_T_sonar: gtsam.Pose3, z: np.ndarray, cov: np.ndarray) -> None:
+    def _sight(
+        self, landmark: int, body_T_sonar: gtsam.Pose3, z: np.ndarray, cov: np.ndarray
+    ) -> None:
         key, floor = L(landmark), self._calibration.floor
         if landmark not in self._seen:
             self._seen.add(landmark)
             world_T_sonar = self._pose.compose(body_T_sonar)
             aperture = self._calibration.sonar.elevation_aperture_rad
-            elevation = elevation_on_floor(world_T_sonar, z[0], z[1], floor.z_m, aperture) if floor else None
-            self._values.insert(key, locate(world_T_sonar, z[0], z[1], elevation or 0.0))
+            elevation = (
+                elevation_on_floor(world_T_sonar, z[0], z[1], floor.z_m, aperture)
+                if floor
+                else None
+            )
+            self._values.insert(
+                key, locate(world_T_sonar, z[0], z[1], elevation or 0.0)
+            )
             if floor:
-                self._graph.push_back(factors.floor_prior(key, floor.z_m, floor.sigma_m))
-        made = factors.landmark_sighting(X(self._index), key, body_T_sonar, z, cov, lambda noise: noise)
+                self._graph.push_back(
+                    factors.floor_prior(key, floor.z_m, floor.sigma_m)
+                )
+        made = factors.landmark_sighting(
+            X(self._index), key, body_T_sonar, z, cov, lambda noise: noise
+        )
         for factor in made.values():
             self._graph.push_back(factor)
 
@@ -146,7 +175,9 @@ class PlainIsam2WithBias(PlainIsam2):
         if self._node_ns is None:
             return
         self._values.insert(B(0), np.zeros(BIASES))
-        self._graph.push_back(factors.bias_prior(B(0), bias_sigmas(self._calibration)[0]))
+        self._graph.push_back(
+            factors.bias_prior(B(0), bias_sigmas(self._calibration)[0])
+        )
 
     def _odometry_factor(self, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
         dR, dp = motion.i_T_j.rotation().matrix(), motion.i_T_j.translation()
@@ -192,14 +223,22 @@ def race(sequence: Sequence) -> Race:
             for step in steps:
                 with clocks[name]:
                     pose = process(step)
-                positions[name].append(pose.translation() if pose else np.full(3, np.nan))
+                positions[name].append(
+                    pose.translation() if pose else np.full(3, np.nan)
+                )
         note(f"{min(turn * TURN, len(instants))} of {len(instants)} frames")
     finish = Stopwatch()
     with finish:
         ours.trajectory()
-    truth = sequence.truth.at(instants).positions if sequence.truth else np.full((len(instants), 3), np.nan)
+    truth = (
+        sequence.truth.at(instants).positions
+        if sequence.truth
+        else np.full((len(instants), 3), np.nan)
+    )
     error_m = {
-        name: float(np.sqrt(np.nanmean(np.sum((np.array(said) - truth)[:, :2] ** 2, axis=1))))
+        name: float(
+            np.sqrt(np.nanmean(np.sum((np.array(said) - truth)[:, :2] ** 2, axis=1)))
+        )
         for name, said in positions.items()
     }
     return Race(clocks, finish, error_m)
@@ -233,13 +272,30 @@ def report(result: Race) -> dict[str, float | int | bool]:
                 result.error_m[name],
             )
         )
-    print_table(("", "CPU s", "clock s", "median ms", "p99 ms", "max ms", "last/first tenth", "error m"), rows)
-    print(f"smoothed trajectory of the whole mission, asked once at the end: {result.finish.wall_s[0]:.2f} s\n")
-    ours, plain, with_bias = (result.clocks[name] for name in ("ours", "plain", "plain, bias"))
+    print_table(
+        (
+            "",
+            "CPU s",
+            "clock s",
+            "median ms",
+            "p99 ms",
+            "max ms",
+            "last/first tenth",
+            "error m",
+        ),
+        rows,
+    )
+    print(
+        f"smoothed trajectory of the whole mission, asked once at the end: {result.finish.wall_s[0]:.2f} s\n"
+    )
+    ours, plain, with_bias = (
+        result.clocks[name] for name in ("ours", "plain", "plain, bias")
+    )
     figures: dict[str, float | int | bool] = {
         "plain_ratio": sum(ours.cpu_s) / sum(plain.cpu_s),
         "plain_with_bias_ratio": sum(ours.cpu_s) / sum(with_bias.cpu_s),
-        "plain_ratio_with_finish": (sum(ours.cpu_s) + sum(result.finish.cpu_s)) / sum(plain.cpu_s),
+        "plain_ratio_with_finish": (sum(ours.cpu_s) + sum(result.finish.cpu_s))
+        / sum(plain.cpu_s),
         "p99_ms": rows[0][4],
         "p99_cpu_ms": float(np.quantile(np.array(ours.cpu_s) * 1e3, 0.99)),
         "decile_ratio": rows[0][6],
@@ -266,16 +322,28 @@ def decile_ratio(durations: np.ndarray) -> float:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--landmarks", type=int, default=20, help="the targets are stated for at most 20")
+    parser.add_argument(
+        "--landmarks",
+        type=int,
+        default=20,
+        help="the targets are stated for at most 20",
+    )
     arguments = parser.parse_args()
     duration_s = 120.0 if arguments.quick else 2040.0
     note("warming up: compiled functions load at their first use")
     race(simulate_mission(MissionOptions(duration_s=20.0)))
-    options = MissionOptions(duration_s=duration_s, landmarks=arguments.landmarks, frame_rate_hz=FRAME_RATE_HZ)
+    options = MissionOptions(
+        duration_s=duration_s,
+        landmarks=arguments.landmarks,
+        frame_rate_hz=FRAME_RATE_HZ,
+    )
     figures = report(race(simulate_mission(options)))
     for name, limit in TARGETS.items():
         print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")
-    conclude({"duration_s": duration_s, "landmarks": arguments.landmarks, **figures}, is_quick=arguments.quick)
+    conclude(
+        {"duration_s": duration_s, "landmarks": arguments.landmarks, **figures},
+        is_quick=arguments.quick,
+    )
 
 
 if __name__ == "__main__":

@@ -36,7 +36,12 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 
 COMMAND = [sys.executable, "-m", "sonar_graph"]
 FILES = ("causal.tum", "trajectory.tum", "landmarks.csv")
-IMU, ODOMETRY, IMAGE, DETECTED = "/imu/data", "/sonar_graph/odometry", "/sonar/image", "/sonar_graph/detections"
+IMU, ODOMETRY, IMAGE, DETECTED = (
+    "/imu/data",
+    "/sonar_graph/odometry",
+    "/sonar/image",
+    "/sonar_graph/detections",
+)
 STAMP_AT = 4
 """Place of the stamp in a CDR payload that begins with a header."""
 START_S = 60.0
@@ -45,7 +50,9 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def stamp_of(payload):
-    seconds, nanoseconds = np.frombuffer(payload[STAMP_AT : STAMP_AT + 8], "<u4").tolist()
+    seconds, nanoseconds = np.frombuffer(
+        payload[STAMP_AT : STAMP_AT + 8], "<u4"
+    ).tolist()
     return seconds * 1_000_000_000 + nanoseconds
 
 
@@ -66,14 +73,21 @@ class Ear:
             stamp_ns = stamp_of(sample.payload.to_bytes())
             self.arrived[topic][stamp_ns] = now_ns
             if topic in self.sent:
-                _, self.sent[topic][stamp_ns], _, _ = ATTACHMENT.unpack_from(sample.attachment.to_bytes())
+                _, self.sent[topic][stamp_ns], _, _ = ATTACHMENT.unpack_from(
+                    sample.attachment.to_bytes()
+                )
         elif topic == "/sonar_graph/state":
             self.states.append(sample.payload.to_bytes())
 
     def latencies_ms(self, source, topic):
         """Times from the sending of a message of a source to the arrival of one of another topic with its stamp."""
         arrived, sent = self.arrived[topic], self.sent[source]
-        return np.array([(arrived[stamp] - sent[stamp]) * 1e-6 for stamp in sorted(arrived.keys() & sent.keys())])
+        return np.array(
+            [
+                (arrived[stamp] - sent[stamp]) * 1e-6
+                for stamp in sorted(arrived.keys() & sent.keys())
+            ]
+        )
 
 
 def free_port():
@@ -100,7 +114,10 @@ def cpu_s(pid):
 def start_live(folder, endpoint, estimator, more=()):
     options = ["--connect", endpoint, "--estimator", estimator, *more]
     live = subprocess.Popen(
-        [*COMMAND, "live", "-o", str(folder), *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*COMMAND, "live", "-o", str(folder), *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
     said = []
     for line in live.stdout:
@@ -120,14 +137,22 @@ def end_live(live):
 def differing_bytes(live, record, folder, estimator):
     """Bytes in which the files of a live run differ from those of `run` on its record; -1 for other lengths."""
     subprocess.run(
-        [*COMMAND, "run", str(record), "-o", str(folder), "--estimator", estimator], check=True, capture_output=True
+        [*COMMAND, "run", str(record), "-o", str(folder), "--estimator", estimator],
+        check=True,
+        capture_output=True,
     )
     count = 0
     for name in FILES:
-        mine, theirs = ((place / "runs" / estimator / name).read_bytes() for place in (live, folder))
+        mine, theirs = (
+            (place / "runs" / estimator / name).read_bytes() for place in (live, folder)
+        )
         if len(mine) != len(theirs):
             return -1
-        count += int(np.count_nonzero(np.frombuffer(mine, np.uint8) != np.frombuffer(theirs, np.uint8)))
+        count += int(
+            np.count_nonzero(
+                np.frombuffer(mine, np.uint8) != np.frombuffer(theirs, np.uint8)
+            )
+        )
     return count
 
 
@@ -153,7 +178,12 @@ def one(folder, log, duration_s, estimator, rate, kill_at_s=None, is_cut=False):
         subprocess.run(["pkill", "-KILL", "-P", str(live.pid)], check=False)
         live.kill()
         live.communicate()
-        live = start_live(folder / "resumed", endpoint, estimator, ["--resume", str(folder / "live" / "record.mcap")])
+        live = start_live(
+            folder / "resumed",
+            endpoint,
+            estimator,
+            ["--resume", str(folder / "live" / "record.mcap")],
+        )
         result["resume_s"] = round(time.monotonic() - killed_s, 2)
     place = folder / ("live" if kill_at_s is None else "resumed")
     try:
@@ -161,12 +191,17 @@ def one(folder, log, duration_s, estimator, rate, kill_at_s=None, is_cut=False):
     except subprocess.TimeoutExpired:
         player.send_signal(signal.SIGINT)
         player.communicate(timeout=START_S)
-    result["cpu_share"] = round((cpu_s(live.pid) - before_s) / (time.monotonic() - begun_s), 3)
+    result["cpu_share"] = round(
+        (cpu_s(live.pid) - before_s) / (time.monotonic() - begun_s), 3
+    )
     time.sleep(1.0)
     end_live(live)
     ear.session.close()
     counts = json.loads((place / "live.json").read_text())["messages"]
-    result["lost"], result["dropped"] = sum(counts["lost"].values()), sum(counts["dropped"].values())
+    result["lost"], result["dropped"] = (
+        sum(counts["lost"].values()),
+        sum(counts["dropped"].values()),
+    )
     result["dropped_for"] = counts["dropped"]
     latencies = {
         "bare": ear.latencies_ms(IMU, IMU),
@@ -176,17 +211,30 @@ def one(folder, log, duration_s, estimator, rate, kill_at_s=None, is_cut=False):
     for name, values in latencies.items():
         if len(values):
             p50, p99 = np.percentile(values, [50, 99])
-            result |= {f"{name}_p50_ms": round(p50, 2), f"{name}_p99_ms": round(p99, 2), f"{name}_count": len(values)}
+            result |= {
+                f"{name}_p50_ms": round(p50, 2),
+                f"{name}_p99_ms": round(p99, 2),
+                f"{name}_count": len(values),
+            }
             result[f"{name}_max_ms"] = round(values.max(), 1)
     if ear.sent[IMAGE]:
-        result["within_50_ms"] = round(float(np.mean(latencies["image_to_detections"] <= 50.0)), 3)
-        result["images"], result["recognised"] = counts["received"][IMAGE], counts["received"].get(DETECTED, 0)
-        result["images_dropped"] = sum(n for what, n in counts["dropped"].items() if what.startswith(IMAGE))
+        result["within_50_ms"] = round(
+            float(np.mean(latencies["image_to_detections"] <= 50.0)), 3
+        )
+        result["images"], result["recognised"] = (
+            counts["received"][IMAGE],
+            counts["received"].get(DETECTED, 0),
+        )
+        result["images_dropped"] = sum(
+            n for what, n in counts["dropped"].items() if what.startswith(IMAGE)
+        )
     for key in ("predictor_p99_us", "predictor_cpu_p99_us"):
         result[key] = stated(ear.states, key)
     result["cold_product_p99_us"] = cold_product_p99_us()
     result["load"] = round(os.getloadavg()[1], 1)
-    result["differing_bytes"] = differing_bytes(place, place / "record.mcap", folder / "again", estimator)
+    result["differing_bytes"] = differing_bytes(
+        place, place / "record.mcap", folder / "again", estimator
+    )
     return result
 
 
@@ -195,7 +243,9 @@ def twice(imu):
     columns = []
     for column in (imu.stamps_ns, imu.angular_velocity, imu.specific_force):
         between = (
-            column[:-1] + (column[1:] - column[:-1]) // 2 if column.ndim == 1 else 0.5 * (column[:-1] + column[1:])
+            column[:-1] + (column[1:] - column[:-1]) // 2
+            if column.ndim == 1
+            else 0.5 * (column[:-1] + column[1:])
         )
         both = np.empty((2 * len(column) - 1, *column.shape[1:]), column.dtype)
         both[::2], both[1::2] = column, between
@@ -223,13 +273,19 @@ def cold_product_p99_us():
 
 
 def write_mission(path, duration_s):
-    mission = simulate_mission(MissionOptions(duration_s=duration_s, dvl="explorer", frame_rate_hz=10.0))
+    mission = simulate_mission(
+        MissionOptions(duration_s=duration_s, dvl="explorer", frame_rate_hz=10.0)
+    )
     write_log(path, replace(mission, imu=twice(mission.imu)))
 
 
 def write_basin(path, _):
     options = ["--images", "--set", "laps=1", "--set", "duration_s=150"]
-    subprocess.run([*COMMAND, "simulate", "basin", "-o", str(path), *options], check=True, capture_output=True)
+    subprocess.run(
+        [*COMMAND, "simulate", "basin", "-o", str(path), *options],
+        check=True,
+        capture_output=True,
+    )
 
 
 class Case(NamedTuple):
@@ -246,17 +302,28 @@ class Case(NamedTuple):
         """Tell whether the aims hold that are no matter of the machine's other load, and those of a run at its pace."""
         is_met = result["differing_bytes"] == 0 and result["lost"] == 0
         if self.with_images:
-            is_met &= result["images"] == result["recognised"] + result["images_dropped"]
+            is_met &= (
+                result["images"] == result["recognised"] + result["images_dropped"]
+            )
         elif self.rate == 1.0 and self.kill_at_s is None:
-            is_met &= result["stamp_to_pose_p99_ms"] <= result["bare_p99_ms"] + 10.0 and result["cpu_share"] <= 0.25
+            is_met &= (
+                result["stamp_to_pose_p99_ms"] <= result["bare_p99_ms"] + 10.0
+                and result["cpu_share"] <= 0.25
+            )
         return is_met
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--estimators", default="isam2,ekf-slam,invariant-ekf,dead-reckoning")
-    parser.add_argument("--only", type=int, nargs="*", help="numbers of the cases, from 0")
+    parser.add_argument(
+        "--estimators", default="isam2,ekf-slam,invariant-ekf,dead-reckoning"
+    )
+    parser.add_argument(
+        "--only", type=int, nargs="*", help="numbers of the cases, from 0"
+    )
     given = parser.parse_args()
     long_s, short_s = (60.0, 20.0) if given.quick else (1800.0, 60.0)
     first, *others = given.estimators.split(",")
@@ -266,7 +333,9 @@ def main():
         Case("killed and resumed", first, 2 * short_s, kill_at_s=0.5 * short_s),
         Case("three times the pace", first, long_s / 2, rate=3.0),
         Case("with images", first, 40.0, with_images=True),
-        Case("with images, three times the pace", first, 90.0, rate=3.0, with_images=True),
+        Case(
+            "with images, three times the pace", first, 90.0, rate=3.0, with_images=True
+        ),
     ]
     is_met = True
     for number, case in enumerate(cases):
@@ -276,8 +345,16 @@ def main():
             folder = Path(scratch)
             log = folder / "log.mcap"
             (write_basin if case.with_images else write_mission)(log, case.duration_s)
-            how = case.duration_s, case.estimator, case.rate, case.kill_at_s, case.with_images
-            result = {"case": case.name, "duration_s": case.duration_s} | one(folder, log, *how)
+            how = (
+                case.duration_s,
+                case.estimator,
+                case.rate,
+                case.kill_at_s,
+                case.with_images,
+            )
+            result = {"case": case.name, "duration_s": case.duration_s} | one(
+                folder, log, *how
+            )
         print(json.dumps(result), flush=True)
         is_met &= case.is_met(result)
     raise SystemExit(not is_met)

@@ -49,10 +49,26 @@ FULL = (2039.0, 2000)
 QUICK = (60.0, 60)
 ROUNDS, OTHERS_ROUNDS = 4, 3
 MIB = 1 << 20
-TARGETS = {"limit_ratio": 2.0, "rosbags_ratio": 8.0, "mcap_ros2_ratio": 20.0, "peak_rss_mb": 150.0}
+TARGETS = {
+    "limit_ratio": 2.0,
+    "rosbags_ratio": 8.0,
+    "mcap_ros2_ratio": 20.0,
+    "peak_rss_mb": 150.0,
+}
 COLUMNS = {
-    IMU: [*(f"{field}.{axis}" for field in ("angular_velocity", "linear_acceleration") for axis in "xyz")],
-    DVL: [*(f"velocity.{axis}" for axis in "xyz"), "velocity_covar", "velocity_mode", "num_good_beams"],
+    IMU: [
+        *(
+            f"{field}.{axis}"
+            for field in ("angular_velocity", "linear_acceleration")
+            for axis in "xyz"
+        )
+    ],
+    DVL: [
+        *(f"velocity.{axis}" for axis in "xyz"),
+        "velocity_covar",
+        "velocity_mode",
+        "num_good_beams",
+    ],
     DEPTH: ["fluid_pressure", "variance"],
     ODOMETRY: [
         *(f"pose.pose.position.{axis}" for axis in "xyz"),
@@ -76,7 +92,9 @@ def limit(path: Path) -> int:
                 return total
             if opcode == 0x06:
                 _, _, size, crc, letters = struct.unpack_from("<QQQII", content)
-                data = decompressor.decompress(memoryview(content)[40 + letters :], max_output_size=size)
+                data = decompressor.decompress(
+                    memoryview(content)[40 + letters :], max_output_size=size
+                )
                 assert zlib.crc32(data) == crc
                 total += len(data)
 
@@ -85,21 +103,37 @@ def pieces(path: Path) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     """The columns of one topic in one chunk after another."""
     for topic in stream(path, lambda kind: Keep.ALL if kind in SENSORS else Keep.NONE):
         for group in topic.messages():
-            stamps_ns = group["header.stamp.sec"].astype(np.int64) * 10**9 + group["header.stamp.nanosec"]
-            yield topic.name, {"stamp_ns": stamps_ns} | {name: group[name] for name in COLUMNS[topic.name]}
+            stamps_ns = (
+                group["header.stamp.sec"].astype(np.int64) * 10**9
+                + group["header.stamp.nanosec"]
+            )
+            yield (
+                topic.name,
+                {"stamp_ns": stamps_ns}
+                | {name: group[name] for name in COLUMNS[topic.name]},
+            )
 
 
 def load(path: Path) -> Columns:
     """The columns of all sensors."""
-    parts: dict[str, dict[str, list[np.ndarray]]] = defaultdict(lambda: defaultdict(list))
+    parts: dict[str, dict[str, list[np.ndarray]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
     for topic, columns in pieces(path):
         for name, values in columns.items():
             parts[topic][name].append(values.copy())
-    return {t: {name: np.concatenate(p) for name, p in columns.items()} for t, columns in parts.items()}
+    return {
+        t: {name: np.concatenate(p) for name, p in columns.items()}
+        for t, columns in parts.items()
+    }
 
 
 def add_up(path: Path) -> float:
-    return sum(float(values.sum()) for _, columns in pieces(path) for values in columns.values())
+    return sum(
+        float(values.sum())
+        for _, columns in pieces(path)
+        for values in columns.values()
+    )
 
 
 def read_with_sequence(path: Path) -> None:
@@ -116,7 +150,9 @@ def rosbags(path: Path) -> Iterator[tuple[str, Any]]:
     typestore = get_typestore(Stores.EMPTY)
     for topic, kind in TYPES.items():
         found = get_types_from_msg(definition_of(topic), kind)
-        typestore.register({name: found[name] for name in found.keys() - typestore.fielddefs.keys()})
+        typestore.register(
+            {name: found[name] for name in found.keys() - typestore.fielddefs.keys()}
+        )
     with Reader(path) as reader:
         connections = [c for c in reader.connections if c.topic in COLUMNS]
         for connection, _, raw in reader.messages(connections=connections):
@@ -129,7 +165,9 @@ def mcap_ros2(path: Path) -> Iterator[tuple[str, Any]]:
 
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages(topics=list(COLUMNS)):
+        for _, channel, _, message in reader.iter_decoded_messages(
+            topics=list(COLUMNS)
+        ):
             yield channel.topic, message
 
 
@@ -153,13 +191,18 @@ def agrees(columns: Columns, path: Path) -> bool:
     return rows == {topic: len(found["stamp_ns"]) for topic, found in columns.items()}
 
 
-def timed(sides: dict[str, Callable[[], object]], rounds: int, best_s: dict[str, float]) -> None:
+def timed(
+    sides: dict[str, Callable[[], object]], rounds: int, best_s: dict[str, float]
+) -> None:
     for number in range(rounds):
         for name, run in sides.items():
             before = time.perf_counter()
             run()
             best_s[name] = min(best_s.get(name, np.inf), time.perf_counter() - before)
-        note(f"round {number + 1} of {rounds}: " + ", ".join(f"{name} {best_s[name]:.3f} s" for name in sides))
+        note(
+            f"round {number + 1} of {rounds}: "
+            + ", ".join(f"{name} {best_s[name]:.3f} s" for name in sides)
+        )
 
 
 WHAT = {"add-up": add_up, "arrays": load, "sequence": read_with_sequence}
@@ -168,19 +211,27 @@ WHAT = {"add-up": add_up, "arrays": load, "sequence": read_with_sequence}
 def peak_rss_mb(path: Path, what: str) -> float:
     """Peak memory of a separate process."""
     command = [sys.executable, __file__, "--measure", what, str(path)]
-    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return float(
+        subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    )
 
 
 def measure(what: str, path: Path) -> int:
     WHAT[what](path)
-    status = Path("/proc/self/status").read_text(encoding="ascii")  # getrusage would count the parent's memory too
+    # getrusage would count the parent's memory too
+    status = Path("/proc/self/status").read_text(encoding="ascii")
     print(int(re.search(r"VmHWM:\s+(\d+) kB", status)[1]) * 1024 / 1e6)
     return 0
 
 
 def main() -> int:
     parser = make_parser(__doc__)
-    parser.add_argument("--measure", nargs=2, metavar=("WHAT", "LOG"), help="only print the peak memory, in MB")
+    parser.add_argument(
+        "--measure",
+        nargs=2,
+        metavar=("WHAT", "LOG"),
+        help="only print the peak memory, in MB",
+    )
     options = parser.parse_args()
     if options.measure:
         return measure(options.measure[0], Path(options.measure[1]))
@@ -200,7 +251,10 @@ def compare(path: Path, *, quick: bool) -> dict[str, Any]:
         "ours": lambda: load(path),
         "sequence": lambda: read_with_sequence(path),
     }
-    others = {"rosbags": lambda: exhaust(rosbags, path), "mcap_ros2": lambda: exhaust(mcap_ros2, path)}
+    others = {
+        "rosbags": lambda: exhaust(rosbags, path),
+        "mcap_ros2": lambda: exhaust(mcap_ros2, path),
+    }
     timed(fast, ROUNDS, best_s)
     for _ in range(1 if quick else OTHERS_ROUNDS):
         timed({**fast, **others}, 1, best_s)
@@ -211,14 +265,17 @@ def compare(path: Path, *, quick: bool) -> dict[str, Any]:
         "mcap_ros2_ratio": best_s["mcap_ros2"] / best_s["ours"],
         "peak_rss_mb": peak_rss_mb(path, "add-up"),
         "arrays_rss_mb": peak_rss_mb(path, "arrays"),
-        "arrays_mb": sum(v.nbytes for found in columns.values() for v in found.values()) / 1e6,
+        "arrays_mb": sum(v.nbytes for found in columns.values() for v in found.values())
+        / 1e6,
         "sequence_ratio": best_s["sequence"] / best_s["limit"],
         "sequence_rss_mb": peak_rss_mb(path, "sequence"),
         **{f"{name}_s": seconds for name, seconds in best_s.items()},
     }
     print_table(["side", "best (s)"], best_s.items())
     is_met = all(
-        figures[name] <= target if name in ("limit_ratio", "peak_rss_mb") else figures[name] >= target
+        figures[name] <= target
+        if name in ("limit_ratio", "peak_rss_mb")
+        else figures[name] >= target
         for name, target in TARGETS.items()
     )
     rounded = {name: float(f"{value:.4g}") for name, value in figures.items()}

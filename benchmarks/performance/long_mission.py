@@ -34,7 +34,15 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import NS_PER_S, Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Block,
+    Depth,
+    Dvl,
+    Imu,
+    LandmarkDetections,
+    Measurements,
+)
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -44,7 +52,12 @@ from sonar_graph.states import Estimate
 TARGETS = {"decile_ratio": 1.3, "max_update_ms": 100.0, "memory_growth_ratio": 1.1}
 PIECE_S = 60.0
 TENTHS = 10
-BLOCKS: dict[str, type[Block]] = {"imu": Imu, "dvl": Dvl, "depth": Depth, "detections": LandmarkDetections}
+BLOCKS: dict[str, type[Block]] = {
+    "imu": Imu,
+    "dvl": Dvl,
+    "depth": Depth,
+    "detections": LandmarkDetections,
+}
 
 
 @dataclass(frozen=True)
@@ -56,13 +69,18 @@ class StoredMission:
     @property
     def calibration(self) -> Calibration:
         """Poses of the vehicle."""
-        return Calibration.model_validate_json((self.folder / "calibration.json").read_text())
+        return Calibration.model_validate_json(
+            (self.folder / "calibration.json").read_text()
+        )
 
     @property
     def frames_ns(self) -> np.ndarray:
         """Stamps of the frames with detections, within IMU and Doppler log."""
         stamps = np.unique(np.load(self.folder / "detections.stamps_ns.npy"))
-        ends = [np.load(self.folder / f"{name}.stamps_ns.npy", mmap_mode="r")[-1] for name in ("imu", "dvl")]
+        ends = [
+            np.load(self.folder / f"{name}.stamps_ns.npy", mmap_mode="r")[-1]
+            for name in ("imu", "dvl")
+        ]
         return stamps[stamps < min(ends)]
 
     def measurements(self) -> Iterator[Measurements]:
@@ -71,12 +89,22 @@ class StoredMission:
         piece_ns = round(PIECE_S * NS_PER_S)
         after_ns = int(np.iinfo(np.int64).min)
         for first_ns in range(int(frames_ns[0]), int(frames_ns[-1]) + 1, piece_ns):
-            instants = frames_ns[(frames_ns >= first_ns) & (frames_ns < first_ns + piece_ns)]
+            instants = frames_ns[
+                (frames_ns >= first_ns) & (frames_ns < first_ns + piece_ns)
+            ]
             if not len(instants):
                 continue
-            piece = {name: self._rows(name, after_ns, int(instants[-1])) for name in BLOCKS}
+            piece = {
+                name: self._rows(name, after_ns, int(instants[-1])) for name in BLOCKS
+            }
             for end_ns in instants.tolist():
-                yield Measurements(end_ns, **{n: b.between(after_ns, end_ns) if b else None for n, b in piece.items()})
+                yield Measurements(
+                    end_ns,
+                    **{
+                        n: b.between(after_ns, end_ns) if b else None
+                        for n, b in piece.items()
+                    },
+                )
                 after_ns = end_ns
 
     def _rows(self, name: str, after_ns: int, until_ns: int) -> Block | None:
@@ -85,13 +113,21 @@ class StoredMission:
         first, last = np.searchsorted(stamps, [after_ns, until_ns], side="right")
         if first == last:
             return None
-        columns = (np.load(path, mmap_mode="r")[first:last].copy() for path in _paths(self.folder, name))
+        columns = (
+            np.load(path, mmap_mode="r")[first:last].copy()
+            for path in _paths(self.folder, name)
+        )
         return BLOCKS[name](*columns)
 
     def true_positions(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Shape (n, 3), m."""
-        at, positions = np.load(self.folder / "truth_ns.npy"), np.load(self.folder / "truth.npy")
-        return np.column_stack([np.interp(stamps_ns, at, column) for column in positions.T])
+        at, positions = (
+            np.load(self.folder / "truth_ns.npy"),
+            np.load(self.folder / "truth.npy"),
+        )
+        return np.column_stack(
+            [np.interp(stamps_ns, at, column) for column in positions.T]
+        )
 
 
 def _paths(folder: Path, name: str) -> list[Path]:
@@ -120,13 +156,21 @@ class Record:
         self.stamps_ns = np.zeros(calls, dtype=np.int64)
         self.positions = np.full((calls, 3), np.nan)
 
-    def add(self, seconds: tuple[float, float, float], keyframes: int, estimate: Estimate | None) -> None:
+    def add(
+        self,
+        seconds: tuple[float, float, float],
+        keyframes: int,
+        estimate: Estimate | None,
+    ) -> None:
         """One call: by the processor, by the wall, and by what counts as its own."""
         k, self.calls = self.calls, self.calls + 1
         self.cpu_s[k], self.wall_s[k], self.own_s[k] = seconds
         self.resident_mb[k], self.keyframes[k] = resident_mb(), keyframes
         if estimate is not None:
-            self.stamps_ns[k], self.positions[k] = estimate.stamp_ns, estimate.world_T_body.translation()
+            self.stamps_ns[k], self.positions[k] = (
+                estimate.stamp_ns,
+                estimate.world_T_body.translation(),
+            )
 
 
 def resident_mb() -> float:
@@ -143,16 +187,25 @@ def interrupted() -> int:
 def run(mission: StoredMission, params: Isam2Params) -> tuple[Isam2, Record]:
     """The estimator over the whole mission."""
     total, noted = len(mission.frames_ns), time.monotonic()
-    estimator, record = Isam2(mission.calibration, Odometry(mission.calibration), params), Record(total)
+    estimator, record = (
+        Isam2(mission.calibration, Odometry(mission.calibration), params),
+        Record(total),
+    )
     for step in mission.measurements():
-        interruptions, cpu, wall = interrupted(), time.thread_time(), time.perf_counter()
+        interruptions, cpu, wall = (
+            interrupted(),
+            time.thread_time(),
+            time.perf_counter(),
+        )
         estimate = estimator.process(step)
         cpu_s, wall_s = time.thread_time() - cpu, time.perf_counter() - wall
         own_s = wall_s if interrupted() == interruptions else cpu_s
         record.add((cpu_s, wall_s, own_s), estimator.keyframe_count, estimate)
         if time.monotonic() - noted > 10:
             noted = time.monotonic()
-            note(f"{record.calls} of {total} frames, {record.resident_mb[record.calls - 1]:.0f} MB")
+            note(
+                f"{record.calls} of {total} frames, {record.resident_mb[record.calls - 1]:.0f} MB"
+            )
     return estimator, record
 
 
@@ -184,14 +237,27 @@ def tenths(record: Record) -> list[dict[str, float]]:
     return rows
 
 
-def report(mission: StoredMission, estimator: Isam2, record: Record) -> dict[str, float | int | bool]:
+def report(
+    mission: StoredMission, estimator: Isam2, record: Record
+) -> dict[str, float | int | bool]:
     """Print the table; the figures by name."""
     rows = tenths(record)
-    print_table(("tenth", *rows[0]), [(str(k), *row.values()) for k, row in enumerate(rows, start=1)])
-    wall_ms, own_ms, cpu_ms = 1e3 * record.wall_s, 1e3 * record.own_s, 1e3 * record.cpu_s
+    print_table(
+        ("tenth", *rows[0]),
+        [(str(k), *row.values()) for k, row in enumerate(rows, start=1)],
+    )
+    wall_ms, own_ms, cpu_ms = (
+        1e3 * record.wall_s,
+        1e3 * record.own_s,
+        1e3 * record.cpu_s,
+    )
     longest = int(np.argmax(own_ms))
-    print(f"longest call: number {longest} of {record.calls}, {own_ms[longest]:.1f} ms\n")
-    off_m = (record.positions - mission.true_positions(record.stamps_ns))[record.stamps_ns > 0, :2]
+    print(
+        f"longest call: number {longest} of {record.calls}, {own_ms[longest]:.1f} ms\n"
+    )
+    off_m = (record.positions - mission.true_positions(record.stamps_ns))[
+        record.stamps_ns > 0, :2
+    ]
     figures: dict[str, float | int | bool] = {
         "decile_ratio": rows[-1]["keyframe_ms"] / rows[0]["keyframe_ms"],
         "max_update_ms": float(own_ms.max()),
@@ -218,7 +284,9 @@ def report(mission: StoredMission, estimator: Isam2, record: Record) -> dict[str
 
 def simulated(options: MissionOptions, folder: Path) -> StoredMission:
     """The mission, simulated by a process whose memory is not ours."""
-    child = multiprocessing.get_context("spawn").Process(target=store, args=(options, folder))
+    child = multiprocessing.get_context("spawn").Process(
+        target=store, args=(options, folder)
+    )
     child.start()
     child.join()
     if child.exitcode:
@@ -228,16 +296,32 @@ def simulated(options: MissionOptions, folder: Path) -> StoredMission:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--hours", type=float, help="of the mission (default: 8; with --quick 0.25)")
+    parser.add_argument(
+        "--hours", type=float, help="of the mission (default: 8; with --quick 0.25)"
+    )
     parser.add_argument("--landmarks", type=int, default=20)
     parser.add_argument("--history", choices=["bounded", "whole"], default="bounded")
-    parser.add_argument("--remembered", type=float, default=900.0, help="seconds of poses and outcomes; 0: all")
-    parser.add_argument("--trace", action="store_true", help="say which lines hold more memory at the end")
+    parser.add_argument(
+        "--remembered",
+        type=float,
+        default=900.0,
+        help="seconds of poses and outcomes; 0: all",
+    )
+    parser.add_argument(
+        "--trace",
+        action="store_true",
+        help="say which lines hold more memory at the end",
+    )
     arguments = parser.parse_args()
     hours = arguments.hours or (0.25 if arguments.quick else 8.0)
     bounded = BoundedHistory(remembered_s=arguments.remembered or None)
-    params = Isam2Params(history=bounded if arguments.history == "bounded" else WholeHistory())
-    with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
+    params = Isam2Params(
+        history=bounded if arguments.history == "bounded" else WholeHistory()
+    )
+    with (
+        tempfile.TemporaryDirectory() as first,
+        tempfile.TemporaryDirectory() as second,
+    ):
         note("warming up: compiled functions load at their first use")
         run(simulated(MissionOptions(duration_s=60.0), Path(first)), params)
         note(f"simulating {hours:g} h")
@@ -255,7 +339,9 @@ def main() -> None:
     for name, limit in TARGETS.items():
         print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")
     is_quick = arguments.quick or hours < 8 or arguments.history != "bounded"
-    conclude({"hours": hours, "landmarks": arguments.landmarks, **figures}, is_quick=is_quick)
+    conclude(
+        {"hours": hours, "landmarks": arguments.landmarks, **figures}, is_quick=is_quick
+    )
 
 
 if __name__ == "__main__":

@@ -105,7 +105,9 @@ def write_mission(
         writer.add_metadata("mission", {"site": "basin", "depth_m": "12.5"})
         channels = {}
         for topic, kind in TYPES.items():
-            schema = writer.register_schema(kind, "ros2msg", definition_of(topic).encode())
+            schema = writer.register_schema(
+                kind, "ros2msg", definition_of(topic).encode()
+            )
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for time_ns, topic, payload in merge(*streams, key=lambda entry: entry[0]):
             writer.add_message(channels[topic], time_ns, payload, time_ns)
@@ -122,17 +124,29 @@ def _messages(topic: str, stamps_ns: Ints, payloads: Bytes) -> Iterator[Entry]:
         yield time_ns, topic, payload.tobytes()
 
 
-def _sensor(topic: str, duration_s: float, rng: np.random.Generator) -> tuple[Ints, Bytes]:
+def _sensor(
+    topic: str, duration_s: float, rng: np.random.Generator
+) -> tuple[Ints, Bytes]:
     count = round(duration_s * RATES_HZ[topic])
-    stamps_ns = START_NS + np.arange(count, dtype=np.int64) * round(1e9 / RATES_HZ[topic])
-    fields = {IMU: _imu, DVL: _dvl, DEPTH: _depth, ODOMETRY: _odometry}[topic](count, rng)
+    stamps_ns = START_NS + np.arange(count, dtype=np.int64) * round(
+        1e9 / RATES_HZ[topic]
+    )
+    fields = {IMU: _imu, DVL: _dvl, DEPTH: _depth, ODOMETRY: _odometry}[topic](
+        count, rng
+    )
     values = {**_header(stamps_ns, topic), **fields}
-    return stamps_ns, encode(parse_definition(TYPES[topic], definition_of(topic)), count, values)
+    return stamps_ns, encode(
+        parse_definition(TYPES[topic], definition_of(topic)), count, values
+    )
 
 
 def _header(stamps_ns: Ints, topic: str) -> dict[str, object]:
     frame = topic.split("/")[1] + "_link"
-    return {"header.stamp.sec": stamps_ns // 10**9, "header.stamp.nanosec": stamps_ns % 10**9, "header.frame_id": frame}
+    return {
+        "header.stamp.sec": stamps_ns // 10**9,
+        "header.stamp.nanosec": stamps_ns % 10**9,
+        "header.frame_id": frame,
+    }
 
 
 def _vector(prefix: str, values: Floats, axes: str = "xyz") -> dict[str, Floats]:
@@ -163,21 +177,31 @@ def _depth(count: int, rng: np.random.Generator) -> dict[str, object]:
 
 def _odometry(count: int, rng: np.random.Generator) -> dict[str, object]:
     yaw_rad = np.cumsum(rng.normal(0, 1e-3, count))
-    quaternions = np.column_stack([np.zeros((count, 2)), np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)])
+    quaternions = np.column_stack(
+        [np.zeros((count, 2)), np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)]
+    )
     return {
-        **_vector("pose.pose.position", np.cumsum(rng.normal(0, 0.01, (count, 3)), axis=0)),
+        **_vector(
+            "pose.pose.position", np.cumsum(rng.normal(0, 0.01, (count, 3)), axis=0)
+        ),
         **_vector("pose.pose.orientation", quaternions, "xyzw"),
         "pose.covariance": np.diag(np.full(6, 0.01)).ravel(),
         **_vector("twist.twist.linear", rng.normal(0, 0.3, (count, 3))),
     }
 
 
-def _sonar(duration_s: float, frames: int, repeats: int, rng: np.random.Generator) -> Iterator[Entry]:
+def _sonar(
+    duration_s: float, frames: int, repeats: int, rng: np.random.Generator
+) -> Iterator[Entry]:
     """Speckle with echoes that move through the fan."""
     kind = parse_definition(TYPES[SONAR], SONAR_DEFINITION)
-    stamps_ns = START_NS + (np.arange(frames) * duration_s * 1e9 / max(frames, 1)).astype(np.int64)
+    stamps_ns = START_NS + (
+        np.arange(frames) * duration_s * 1e9 / max(frames, 1)
+    ).astype(np.int64)
     directions = np.linspace(-0.5, 0.5, BEAMS)
-    speckle = (20 * rng.gamma(2.0, 1.0, (64 * BINS, BEAMS))).clip(0, 255).astype(np.uint8)
+    speckle = (
+        (20 * rng.gamma(2.0, 1.0, (64 * BINS, BEAMS))).clip(0, 255).astype(np.uint8)
+    )
     for i, stamp_ns in enumerate(stamps_ns.tolist()):
         start = int(rng.integers(0, 63 * BINS))
         image = speckle[start : start + BINS].copy()

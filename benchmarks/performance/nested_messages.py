@@ -38,10 +38,21 @@ class Kind(NamedTuple):
     strings: tuple[str, ...]
 
     def schema(self) -> str:
-        shared = ("std_msgs/Header", "geometry_msgs/Pose", "geometry_msgs/Point", "geometry_msgs/Quaternion")
-        shared += ("builtin_interfaces/Time", "geometry_msgs/PoseWithCovariance", "geometry_msgs/Vector3")
+        shared = (
+            "std_msgs/Header",
+            "geometry_msgs/Pose",
+            "geometry_msgs/Point",
+            "geometry_msgs/Quaternion",
+        )
+        shared += (
+            "builtin_interfaces/Time",
+            "geometry_msgs/PoseWithCovariance",
+            "geometry_msgs/Vector3",
+        )
         texts = {name: DEFINITIONS[name] for name in shared} | self.others
-        return self.fields + "".join(f"{RULE}\nMSG: {name}\n{text}\n" for name, text in texts.items())
+        return self.fields + "".join(
+            f"{RULE}\nMSG: {name}\n{text}\n" for name, text in texts.items()
+        )
 
 
 def word(rng: np.random.Generator) -> str:
@@ -50,7 +61,10 @@ def word(rng: np.random.Generator) -> str:
 
 def draw_detections(rng: np.random.Generator) -> dict[str, Any]:
     results = [
-        [{"hypothesis": {"class_id": word(rng), "score": rng.random()}} for _ in range(rng.integers(1, 4))]
+        [
+            {"hypothesis": {"class_id": word(rng), "score": rng.random()}}
+            for _ in range(rng.integers(1, 4))
+        ]
         for _ in range(rng.integers(1, 6))
     ]
     return {"detections": [{"results": some, "id": word(rng)} for some in results]}
@@ -58,11 +72,19 @@ def draw_detections(rng: np.random.Generator) -> dict[str, Any]:
 
 def draw_diagnostics(rng: np.random.Generator) -> dict[str, Any]:
     pairs = [{"key": word(rng), "value": word(rng)} for _ in range(6)]
-    return {"status": [{"level": 1, "name": word(rng), "message": word(rng), "values": pairs} for _ in range(4)]}
+    return {
+        "status": [
+            {"level": 1, "name": word(rng), "message": word(rng), "values": pairs}
+            for _ in range(4)
+        ]
+    }
 
 
 def draw_scan(rng: np.random.Generator) -> dict[str, Any]:
-    return {"header": {"frame_id": word(rng)}, "ranges": rng.random(int(rng.integers(10, 2000))).tolist()}
+    return {
+        "header": {"frame_id": word(rng)},
+        "ranges": rng.random(int(rng.integers(10, 2000))).tolist(),
+    }
 
 
 KINDS = {
@@ -74,7 +96,11 @@ KINDS = {
             "some_msgs/Hypothesis": "string class_id\nfloat64 score",
         },
         draw_detections,
-        ("detections.results.hypothesis.score", "detections.center.position.x", "detections.center.position.y"),
+        (
+            "detections.results.hypothesis.score",
+            "detections.center.position.x",
+            "detections.center.position.y",
+        ),
         ("detections.results.hypothesis.class_id",),
     ),
     "diagnostics": Kind(
@@ -87,14 +113,24 @@ KINDS = {
         ("status.level",),
         ("status.name", "status.values.value"),
     ),
-    "scans": Kind("std_msgs/Header header\nfloat32[] ranges\n", {}, draw_scan, ("ranges",), ("header.frame_id",)),
+    "scans": Kind(
+        "std_msgs/Header header\nfloat32[] ranges\n",
+        {},
+        draw_scan,
+        ("ranges",),
+        ("header.frame_id",),
+    ),
 }
 NAME = "some_msgs/msg/Root"
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} messages instead of {FULL}")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help=f"{QUICK} messages instead of {FULL}"
+    )
     count = QUICK if parser.parse_args().quick else FULL
     found: dict[str, float] = {}
     is_same = True
@@ -103,7 +139,9 @@ def main() -> int:
             ours_us, theirs_us, agree = compare(kind, count, shared)
             is_same = is_same and agree
             found[f"{name}_{label}"] = float(f"{theirs_us / ours_us:.3g}")
-            print(f"{name}, {shared} a layout: {ours_us:.1f} µs a message, mcap-ros2-support {theirs_us:.1f} µs")
+            print(
+                f"{name}, {shared} a layout: {ours_us:.1f} µs a message, mcap-ros2-support {theirs_us:.1f} µs"
+            )
     print(json.dumps(found | {"same": is_same}))
     return 0 if is_same else 1
 
@@ -112,7 +150,11 @@ def compare(kind: Kind, count: int, shared: int) -> tuple[float, float, bool]:
     """Microseconds a message of both, and whether they found the same."""
     rng, schema = np.random.default_rng(0), kind.schema()
     encoder = serialize_dynamic(NAME, schema)[NAME]
-    payloads = [payload for _ in range(count // shared) for payload in [encoder(kind.draw(rng))] * shared]
+    payloads = [
+        payload
+        for _ in range(count // shared)
+        for payload in [encoder(kind.draw(rng))] * shared
+    ]
     theirs, ours = by_message(kind, schema, payloads), by_column(kind, schema, payloads)
     times = [[timed(read) for read in (ours, theirs)] for _ in range(ROUNDS)]
     ours_s, theirs_s = np.min(times, axis=0)
@@ -125,8 +167,13 @@ def timed(read: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def by_column(kind: Kind, schema: str, payloads: list[bytes]) -> Callable[[], list[list[list[Any]]]]:
-    definition, sizes = parse_definition(NAME, schema), np.array([len(p) for p in payloads])
+def by_column(
+    kind: Kind, schema: str, payloads: list[bytes]
+) -> Callable[[], list[list[list[Any]]]]:
+    definition, sizes = (
+        parse_definition(NAME, schema),
+        np.array([len(p) for p in payloads]),
+    )
     stacks = []
     for size in np.unique(sizes):
         rows = np.flatnonzero(sizes == size)
@@ -145,12 +192,17 @@ def by_column(kind: Kind, schema: str, payloads: list[bytes]) -> Callable[[], li
     return read
 
 
-def by_message(kind: Kind, schema: str, payloads: list[bytes]) -> Callable[[], list[list[list[Any]]]]:
+def by_message(
+    kind: Kind, schema: str, payloads: list[bytes]
+) -> Callable[[], list[list[list[Any]]]]:
     decoder = generate_dynamic(NAME, schema)[NAME]
     paths = [path.split(".") for path in (*kind.numbers, *kind.strings)]
 
     def read() -> list[list[list[Any]]]:
-        return [[list(leaves(message, path)) for path in paths] for message in map(decoder, payloads)]
+        return [
+            [list(leaves(message, path)) for path in paths]
+            for message in map(decoder, payloads)
+        ]
 
     return read
 

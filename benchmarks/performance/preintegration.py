@@ -49,7 +49,9 @@ NS = 1_000_000_000
 IMU_HZ, DVL_HZ = 200, 5
 GTSAM_CPP_NS = 150.0
 FEW_S, MANY_S = 1, 60
-CALIBRATION = Calibration(imu=ImuCalibration(gyro_noise_density=1e-3, accel_noise_density=1e-3))
+CALIBRATION = Calibration(
+    imu=ImuCalibration(gyro_noise_density=1e-3, accel_noise_density=1e-3)
+)
 NO_BIAS = np.zeros(3)
 
 
@@ -60,7 +62,9 @@ def samples() -> tuple[Imu, Dvl]:
     rate = 0.2 * np.sin(t * np.array([0.7, 1.1, 0.4]))
     force = np.array([0.0, 0.0, 9.81]) + 0.2 * np.cos(t * np.array([0.5, 0.9, 1.3]))
     velocity = 0.5 * np.sin(s * np.array([0.4, 0.6, 0.8]))
-    return Imu(quick, rate, force), Dvl(slow, velocity, np.full((len(slow), 3, 3), np.nan))
+    return Imu(quick, rate, force), Dvl(
+        slow, velocity, np.full((len(slow), 3, 3), np.nan)
+    )
 
 
 def filled(rows: tuple[Imu, Dvl]) -> Odometry:
@@ -87,7 +91,9 @@ class AnyBias:
 
     def __call__(self, seconds: int) -> PreintegratedMotion:
         self._biases.reverse()
-        return self._odometry.motion(0, seconds * NS, self._biases[0], known_ns=self._known_ns)
+        return self._odometry.motion(
+            0, seconds * NS, self._biases[0], known_ns=self._known_ns
+        )
 
 
 def gtsam_params() -> gtsam.PreintegrationParams:
@@ -98,11 +104,15 @@ def gtsam_params() -> gtsam.PreintegrationParams:
     return params
 
 
-def per_sample(rows: tuple[Imu, Dvl], seconds: int) -> gtsam.PreintegratedImuMeasurements:
+def per_sample(
+    rows: tuple[Imu, Dvl], seconds: int
+) -> gtsam.PreintegratedImuMeasurements:
     theirs, dt = gtsam.PreintegratedImuMeasurements(gtsam_params()), 1 / IMU_HZ
     integrate = theirs.integrateMeasurement
     for force, rate in zip(
-        list(rows[0].specific_force[: seconds * IMU_HZ]), list(rows[0].angular_velocity), strict=False
+        list(rows[0].specific_force[: seconds * IMU_HZ]),
+        list(rows[0].angular_velocity),
+        strict=False,
     ):
         integrate(force, rate, dt)
     return theirs
@@ -110,9 +120,13 @@ def per_sample(rows: tuple[Imu, Dvl], seconds: int) -> gtsam.PreintegratedImuMea
 
 def scenario(seconds: int) -> None:
     """GTSAM's own loop in C++ over a motion that it makes up as it goes."""
-    motion = gtsam.AcceleratingScenario(gtsam.Rot3(), np.zeros(3), np.zeros(3), np.array([0.1, 0, 0]), np.full(3, 0.1))
+    motion = gtsam.AcceleratingScenario(
+        gtsam.Rot3(), np.zeros(3), np.zeros(3), np.array([0.1, 0, 0]), np.full(3, 0.1)
+    )
     unbiased = gtsam.imuBias.ConstantBias()
-    gtsam.ScenarioRunner(motion, gtsam_params(), 1 / IMU_HZ, unbiased).integrate(seconds, unbiased, False)
+    gtsam.ScenarioRunner(motion, gtsam_params(), 1 / IMU_HZ, unbiased).integrate(
+        seconds, unbiased, False
+    )
 
 
 def fastest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
@@ -126,8 +140,13 @@ def fastest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, fl
     return best
 
 
-def factors(rows: tuple[Imu, Dvl]) -> tuple[dict[str, gtsam.NonlinearFactor], gtsam.Values]:
-    motion, theirs = filled(rows).motion(0, FEW_S * NS, NO_BIAS, known_ns=MANY_S * NS), per_sample(rows, FEW_S)
+def factors(
+    rows: tuple[Imu, Dvl],
+) -> tuple[dict[str, gtsam.NonlinearFactor], gtsam.Values]:
+    motion, theirs = (
+        filled(rows).motion(0, FEW_S * NS, NO_BIAS, known_ns=MANY_S * NS),
+        per_sample(rows, FEW_S),
+    )
     values = gtsam.Values()
     values.insert(X(0), gtsam.Pose3())
     values.insert(X(1), motion.i_T_j)
@@ -138,7 +157,9 @@ def factors(rows: tuple[Imu, Dvl]) -> tuple[dict[str, gtsam.NonlinearFactor], gt
     noise = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
     return {
         "OdometryWithBias (Python)": OdometryWithBias(X(0), X(1), B(1), motion),
-        "BetweenFactorPose3 (compiled)": gtsam.BetweenFactorPose3(X(0), X(1), motion.i_T_j, noise),
+        "BetweenFactorPose3 (compiled)": gtsam.BetweenFactorPose3(
+            X(0), X(1), motion.i_T_j, noise
+        ),
         "ImuFactor (compiled)": gtsam.ImuFactor(X(0), V(0), X(1), V(1), B(0), theirs),
     }, values
 
@@ -182,11 +203,17 @@ def calls_us(rows: tuple[Imu, Dvl], rounds: int) -> dict[str, float]:
     times = 20
     works: dict[str, Callable[[], object]] = {
         "epoch_us": lambda: odometry.motions(starts_ns, ends_ns, known_ns, NO_BIAS),
-        "provisional_us": lambda: many(lambda: odometry.motion(0, newest_ns, NO_BIAS), times),
+        "provisional_us": lambda: many(
+            lambda: odometry.motion(0, newest_ns, NO_BIAS), times
+        ),
         "add_us": add_all,
     }
     seconds = fastest(works, rounds)
-    counts = {"epoch_us": len(starts_ns), "provisional_us": times, "add_us": len(blocks)}
+    counts = {
+        "epoch_us": len(starts_ns),
+        "provisional_us": times,
+        "add_us": len(blocks),
+    }
     return {name: 1e6 * seconds[name] / count for name, count in counts.items()}
 
 
@@ -200,10 +227,19 @@ def main() -> int:
     made, values = factors(rows)
     times = 30  # short enough that some rounds are not disturbed
     lines = fastest(
-        {name: lambda f=factor: many(lambda: f.linearize(values), times) for name, factor in made.items()}, 7 * rounds
+        {
+            name: lambda f=factor: many(lambda: f.linearize(values), times)
+            for name, factor in made.items()
+        },
+        7 * rounds,
     )
-    factor_us = {name: round(1e6 * seconds / times, 2) for name, seconds in lines.items()}
-    print_table(["a sample", "ns"], [["ours", slopes["ours"]], ["GTSAM from Python", slopes["gtsam"]]])
+    factor_us = {
+        name: round(1e6 * seconds / times, 2) for name, seconds in lines.items()
+    }
+    print_table(
+        ["a sample", "ns"],
+        [["ours", slopes["ours"]], ["GTSAM from Python", slopes["gtsam"]]],
+    )
     print_table(["linearisation", "µs"], list(factor_us.items()))
     figures = {
         "ours_ns": slopes["ours"],
@@ -216,7 +252,9 @@ def main() -> int:
         "with_add_ratio": float((cost["gtsam"] / (cost["ours"] + cost["add"])).min()),
         **calls_us(rows, rounds),
     }
-    rounded: dict[str, object] = {name: float(f"{value:.4g}") for name, value in figures.items()}
+    rounded: dict[str, object] = {
+        name: float(f"{value:.4g}") for name, value in figures.items()
+    }
     passed = figures["gtsam_cpp_ratio"] <= 1 and figures["gtsam_python_ratio"] >= 6
     print_figures({**rounded, "factor_us": factor_us, "passed": passed})
     return 0

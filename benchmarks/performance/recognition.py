@@ -51,7 +51,12 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs import read_log, read_sonar_frames, sonar_image_messages, write_log
+from sonar_graph.logs import (
+    read_log,
+    read_sonar_frames,
+    sonar_image_messages,
+    write_log,
+)
 from sonar_graph.recognition import recognise_images
 from sonar_graph.recognition.session import one_by_one
 from sonar_graph.recognition.sonar_motion import SonarMotions
@@ -65,13 +70,23 @@ from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.tracker import Tracker
 
 TOPIC = "/sonar/image"
-FULL = BasinOptions(duration_s=680.0, laps=1, frame_rate_hz=5.0, seed=1, image=ImageOptions())
-QUICK = BasinOptions(duration_s=130.0, laps=1, frame_rate_hz=2.0, seed=1, image=ImageOptions())
+FULL = BasinOptions(
+    duration_s=680.0, laps=1, frame_rate_hz=5.0, seed=1, image=ImageOptions()
+)
+QUICK = BasinOptions(
+    duration_s=130.0, laps=1, frame_rate_hz=2.0, seed=1, image=ImageOptions()
+)
 ACTAG_EVERY = 16
 """Frames: AcTag gets one of so many."""
 TAG_FAMILY, TAG_SIZE_M = "AcTag24h10", 0.3
 CROWDS, CROWDED_FRAMES = (5, 50), 40
-MOST = {"frame_ms": 3.0, "frame_of_5_ms": 3.0, "frame_of_50_ms": 15.0, "simulate_frame_ms": 25.0, "rss_growth_mb": 32.0}
+MOST = {
+    "frame_ms": 3.0,
+    "frame_of_5_ms": 3.0,
+    "frame_of_50_ms": 15.0,
+    "simulate_frame_ms": 25.0,
+    "rss_growth_mb": 32.0,
+}
 LEAST_ACTAG_RATIO = 30.0
 PARTS = {
     "selection": (recogniser, "select_candidates"),
@@ -111,7 +126,9 @@ class Clocks:
 
         with ExitStack() as stack:
             for name, (owner, method) in PARTS.items():
-                stack.enter_context(patch.object(owner, method, timed(name, getattr(owner, method))))
+                stack.enter_context(
+                    patch.object(owner, method, timed(name, getattr(owner, method)))
+                )
             yield
 
 
@@ -149,19 +166,35 @@ def make_actag(frames: SonarFrames) -> Any:
     try:
         from actag import AcTag
     except ImportError:
-        note("AcTag is not installed, so that nothing is compared with it: pip install 'sonar-graph[actag]'")
+        note(
+            "AcTag is not installed, so that nothing is compared with it: pip install 'sonar-graph[actag]'"
+        )
         return None
     opening_rad = float(np.ptp(frames.azimuths_rad))
-    return AcTag(float(frames.ranges_m[0]), float(frames.ranges_m[-1]), opening_rad, TAG_FAMILY, TAG_SIZE_M)
+    return AcTag(
+        float(frames.ranges_m[0]),
+        float(frames.ranges_m[-1]),
+        opening_rad,
+        TAG_FAMILY,
+        TAG_SIZE_M,
+    )
 
 
 def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
     """Both sides over the frames of a log, a chunk each in turn; the number of detections."""
-    motions, ours, theirs = SonarMotions(sequence), Recogniser(sequence.calibration), None
+    motions, ours, theirs = (
+        SonarMotions(sequence),
+        Recogniser(sequence.calibration),
+        None,
+    )
     found = number = 0
     for block in read_sonar_frames(path):
         theirs = theirs or make_actag(block)
-        seen = [frame for frame in one_by_one(block) if motions.covers(int(frame.stamps_ns[0]))]
+        seen = [
+            frame
+            for frame in one_by_one(block)
+            if motions.covers(int(frame.stamps_ns[0]))
+        ]
         known = []
         for frame in seen:
             with clocks.timing("motion"):
@@ -186,30 +219,58 @@ def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
 def crowded_frame_ms(objects: int) -> float:
     """Mean time for a frame with so many objects, each of which is compared with the designs."""
     rng = np.random.default_rng(0)
-    ranges_m, azimuths_rad = np.linspace(1.0, 10.0, 512), np.radians(np.linspace(-14.4, 14.4, 96))
-    x, y = ranges_m * np.cos(azimuths_rad)[:, None], ranges_m * np.sin(azimuths_rad)[:, None]
-    places = [(r, a) for r in np.arange(2.0, 9.7, 0.62) for a in np.arange(-0.25 + 0.32 / r, 0.25 - 0.32 / r, 0.62 / r)]
+    ranges_m, azimuths_rad = (
+        np.linspace(1.0, 10.0, 512),
+        np.radians(np.linspace(-14.4, 14.4, 96)),
+    )
+    x, y = (
+        ranges_m * np.cos(azimuths_rad)[:, None],
+        ranges_m * np.sin(azimuths_rad)[:, None],
+    )
+    places = [
+        (r, a)
+        for r in np.arange(2.0, 9.7, 0.62)
+        for a in np.arange(-0.25 + 0.32 / r, 0.25 - 0.32 / r, 0.62 / r)
+    ]
     power = np.ones_like(x)
     for number, row in enumerate(rng.permutation(len(places))[:objects].tolist()):
         r, a = places[row]
         dx, dy = np.abs(x - r * np.cos(a)), np.abs(y - r * np.sin(a))
-        power[(np.hypot(dx, dy) < 0.15) if number % 2 else (np.maximum(dx, dy) < 0.13)] = 10**1.2
-    params = RecogniserParams(detection=DetectionParams(max_candidates=objects), independent=False)
-    ours, clocks, still = Recogniser(Calibration(), params=params), Clocks(), SonarStep.none()
+        power[
+            (np.hypot(dx, dy) < 0.15) if number % 2 else (np.maximum(dx, dy) < 0.13)
+        ] = 10**1.2
+    params = RecogniserParams(
+        detection=DetectionParams(max_candidates=objects), independent=False
+    )
+    ours, clocks, still = (
+        Recogniser(Calibration(), params=params),
+        Clocks(),
+        SonarStep.none(),
+    )
     for frame in range(CROWDED_FRAMES):
         level = 35 + 10 * np.log10(power * rng.exponential(size=power.shape) + 1e-9)
         picture = np.clip(np.rint(level * 255 / 80), 0, 255).astype(np.uint8)
-        block = SonarFrames(np.array([frame * 200_000_000]), picture[None], ranges_m, azimuths_rad)
+        block = SonarFrames(
+            np.array([frame * 200_000_000]), picture[None], ranges_m, azimuths_rad
+        )
         with clocks.timing("frame"):
             ours.process(block, still if frame else None)
-    assert sum(sighting is not None and sighting.fit is not None for sighting in ours.sightings) >= 0.9 * objects
+    assert (
+        sum(
+            sighting is not None and sighting.fit is not None
+            for sighting in ours.sightings
+        )
+        >= 0.9 * objects
+    )
     return float(np.mean(clocks.cpu_ms["frame"][CROWDED_FRAMES // 4 :]))
 
 
 def peak_rss_mb(path: Path) -> float:
     """Peak memory of a separate process that runs `recognise`."""
     command = [sys.executable, __file__, "--measure", str(path)]
-    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return float(
+        subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    )
 
 
 def measure(path: Path) -> None:
@@ -224,8 +285,17 @@ def report(clocks: Clocks) -> dict[str, Any]:
     """Print the table; the figures by name."""
     mean = {name: float(np.mean(values)) for name, values in clocks.cpu_ms.items()}
     rows = [
-        (name, len(cpu), mean[name], float(np.median(cpu)), float(np.quantile(cpu, 0.99)), float(np.mean(wall)))
-        for name, cpu, wall in ((name, clocks.cpu_ms[name], clocks.wall_ms[name]) for name in mean)
+        (
+            name,
+            len(cpu),
+            mean[name],
+            float(np.median(cpu)),
+            float(np.quantile(cpu, 0.99)),
+            float(np.mean(wall)),
+        )
+        for name, cpu, wall in (
+            (name, clocks.cpu_ms[name], clocks.wall_ms[name]) for name in mean
+        )
         if name not in ("simulation", "compared")
     ]
     print_table(("", "times", "mean ms", "median ms", "p99 ms", "mean wall ms"), rows)
@@ -240,7 +310,9 @@ def report(clocks: Clocks) -> dict[str, Any]:
         "frame_wall_ms": float(np.mean(walls["frame"])),
         "actag_ms": mean["actag"] if has_actag else None,
         "actag_ratio": mean["actag"] / mean["compared"] if has_actag else None,
-        "actag_wall_ratio": float(np.sum(walls["actag"]) / np.sum(walls["compared"])) if has_actag else None,
+        "actag_wall_ratio": float(np.sum(walls["actag"]) / np.sum(walls["compared"]))
+        if has_actag
+        else None,
         "simulate_frame_ms": mean["simulation"],
     }
 
@@ -248,12 +320,17 @@ def report(clocks: Clocks) -> dict[str, Any]:
 def meets_targets(figures: dict[str, Any]) -> bool:
     """Check that all targets are met; without AcTag they are not."""
     ratio = figures["actag_ratio"]
-    return all(figures[name] <= limit for name, limit in MOST.items()) and (ratio or 0.0) >= LEAST_ACTAG_RATIO
+    return (
+        all(figures[name] <= limit for name, limit in MOST.items())
+        and (ratio or 0.0) >= LEAST_ACTAG_RATIO
+    )
 
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--measure", type=Path, metavar="LOG", help="only print the peak memory, in MB")
+    parser.add_argument(
+        "--measure", type=Path, metavar="LOG", help="only print the peak memory, in MB"
+    )
     arguments = parser.parse_args()
     if arguments.measure:
         measure(arguments.measure)
@@ -277,11 +354,23 @@ def measured(options: BasinOptions) -> dict[str, Any]:
             detections = race(path, sequence, clocks)
         note("measuring memory")
         peaks_mb = peak_rss_mb(shorter), peak_rss_mb(path)
-    figures = report(clocks) | {"peak_rss_mb": peaks_mb[1], "rss_growth_mb": peaks_mb[1] - peaks_mb[0]}
-    figures |= {"frames_mb": 96 * 512 * (frames - frames // 4) / 1e6, "frames": frames, "detections": detections}
-    figures |= {f"frame_of_{objects}_ms": crowded_frame_ms(objects) for objects in CROWDS}
+    figures = report(clocks) | {
+        "peak_rss_mb": peaks_mb[1],
+        "rss_growth_mb": peaks_mb[1] - peaks_mb[0],
+    }
+    figures |= {
+        "frames_mb": 96 * 512 * (frames - frames // 4) / 1e6,
+        "frames": frames,
+        "detections": detections,
+    }
+    figures |= {
+        f"frame_of_{objects}_ms": crowded_frame_ms(objects) for objects in CROWDS
+    }
     figures["passed"] = meets_targets(figures)
-    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in figures.items()}
+    return {
+        name: float(f"{value:.4g}") if isinstance(value, float) else value
+        for name, value in figures.items()
+    }
 
 
 if __name__ == "__main__":

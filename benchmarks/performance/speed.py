@@ -40,12 +40,23 @@ class Headline(NamedTuple):
 
 
 HEADLINES = {
-    "filterpy_ratio": Headline("filterpy / EKF-SLAM", "ekf_step", "higher", lambda found: found["filterpy_ratio"]),
+    "filterpy_ratio": Headline(
+        "filterpy / EKF-SLAM",
+        "ekf_step",
+        "higher",
+        lambda found: found["filterpy_ratio"],
+    ),
     "invariant_ratio": Headline(
-        "invariant EKF / EKF-SLAM", "ekf_step", "lower", lambda found: found["invariant_log_s"] / found["log_s"]
+        "invariant EKF / EKF-SLAM",
+        "ekf_step",
+        "lower",
+        lambda found: found["invariant_log_s"] / found["log_s"],
     ),
     "gtsam_cpp_ratio": Headline(
-        "preintegration, ours / GTSAM in C++", "preintegration", "lower", lambda found: found["gtsam_cpp_ratio"]
+        "preintegration, ours / GTSAM in C++",
+        "preintegration",
+        "lower",
+        lambda found: found["gtsam_cpp_ratio"],
     ),
     "gtsam_python_ratio": Headline(
         "preintegration, GTSAM from Python / ours",
@@ -54,19 +65,32 @@ HEADLINES = {
         lambda found: found["gtsam_python_ratio"],
     ),
     "plain_ratio": Headline(
-        "iSAM2 / plain gtsam.ISAM2, all updates", "isam2_mission", "lower", lambda found: found["plain_ratio"]
+        "iSAM2 / plain gtsam.ISAM2, all updates",
+        "isam2_mission",
+        "lower",
+        lambda found: found["plain_ratio"],
     ),
     "p99_ratio": Headline(
-        "iSAM2 / plain gtsam.ISAM2, 99 % of updates", "isam2_mission", "lower", lambda found: found["p99_ratio"]
+        "iSAM2 / plain gtsam.ISAM2, 99 % of updates",
+        "isam2_mission",
+        "lower",
+        lambda found: found["p99_ratio"],
     ),
 }
 
 
 def figures_of(script: str, *, is_quick: bool) -> Figures:
     """The last line of a script."""
-    command = [sys.executable, str(FOLDER / f"{script}.py"), *(["--quick"] if is_quick else [])]
+    command = [
+        sys.executable,
+        str(FOLDER / f"{script}.py"),
+        *(["--quick"] if is_quick else []),
+    ]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode not in (0, 1):  # 1: it missed a target of its own, and its figures hold
+    if done.returncode not in (
+        0,
+        1,
+    ):  # 1: it missed a target of its own, and its figures hold
         raise SystemExit(f"{script}.py ended with exit code {done.returncode}")
     try:
         found: Figures = json.loads(done.stdout.splitlines()[-1])
@@ -95,7 +119,9 @@ def loss(headline: Headline, accepted: float, measured: float) -> float:
     return accepted / measured - 1.0
 
 
-def report(measured: dict[str, list[float]], accepted: dict[str, float]) -> dict[str, float]:
+def report(
+    measured: dict[str, list[float]], accepted: dict[str, float]
+) -> dict[str, float]:
     """Print the table; the loss of every ratio that has an accepted value."""
     rows: list[tuple[object, ...]] = []
     losses = {}
@@ -108,22 +134,38 @@ def report(measured: dict[str, list[float]], accepted: dict[str, float]) -> dict
         else:
             beside = ("-", "-")
         rows.append((headline.what, headline.better, median(values), spread, *beside))
-    print_table(("ratio of times", "better", "measured", "all rounds", "accepted", "slower by"), rows)
+    print_table(
+        ("ratio of times", "better", "measured", "all rounds", "accepted", "slower by"),
+        rows,
+    )
     return losses
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = make_parser(__doc__)
-    parser.add_argument("--rounds", type=int, default=1, help="how often each script runs")
-    parser.add_argument("--accept", action="store_true", help=f"write the measured ratios to {ACCEPTED.name}")
-    parser.add_argument("--tolerance", type=float, default=0.15, help="largest relative loss of speed that is accepted")
+    parser.add_argument(
+        "--rounds", type=int, default=1, help="how often each script runs"
+    )
+    parser.add_argument(
+        "--accept",
+        action="store_true",
+        help=f"write the measured ratios to {ACCEPTED.name}",
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=0.15,
+        help="largest relative loss of speed that is accepted",
+    )
     return parser.parse_args()
 
 
 def main() -> None:
     arguments = parse_arguments()
     form = "quick" if arguments.quick else "full"
-    kept: dict[str, dict[str, float]] = json.loads(ACCEPTED.read_text("utf-8")) if ACCEPTED.is_file() else {}
+    kept: dict[str, dict[str, float]] = (
+        json.loads(ACCEPTED.read_text("utf-8")) if ACCEPTED.is_file() else {}
+    )
     measured = measure(max(arguments.rounds, 1), is_quick=arguments.quick)
     losses = report(measured, kept.get(form, {}))
     ratios = {name: float(f"{median(values):.4g}") for name, values in measured.items()}
@@ -131,7 +173,9 @@ def main() -> None:
         kept[form] = ratios
         ACCEPTED.write_text(json.dumps(kept, indent=2) + "\n", "utf-8")
         note(f"accepted: {ACCEPTED}")
-    passed = arguments.accept or all(one <= arguments.tolerance for one in losses.values())
+    passed = arguments.accept or all(
+        one <= arguments.tolerance for one in losses.values()
+    )
     conclude({**ratios, "passed": passed}, is_quick=arguments.quick)
 
 

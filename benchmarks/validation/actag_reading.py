@@ -44,15 +44,23 @@ def write_designs(folder: Path, settings: AcTagSettings) -> Path:
     return file
 
 
-def errors_of(found: LandmarkDetections, truth: FrameTruth) -> list[tuple[float, float] | None]:
+def errors_of(
+    found: LandmarkDetections, truth: FrameTruth
+) -> list[tuple[float, float] | None]:
     """Errors of range and azimuth of each detection; None where no such tag is."""
     errors: list[tuple[float, float] | None] = []
     for row, tag in enumerate(found.candidate_ids[:, 0].tolist()):
         at = np.flatnonzero(truth.ids == tag)
         off = [
-            (found.range_m[row] - truth.range_m()[0, a], found.azimuth_rad[row] - truth.azimuth_rad()[0, a]) for a in at
+            (
+                found.range_m[row] - truth.range_m()[0, a],
+                found.azimuth_rad[row] - truth.azimuth_rad()[0, a],
+            )
+            for a in at
         ]
-        errors += [e if np.hypot(e[0], 2 * e[1]) < FAR_M else None for e in off] or [None]
+        errors += [e if np.hypot(e[0], 2 * e[1]) < FAR_M else None for e in off] or [
+            None
+        ]
     return errors
 
 
@@ -67,11 +75,17 @@ def run(options: BasinOptions, settings: AcTagSettings) -> dict[str, float]:
     spent_s = 0.0
     for block in simulate_basin_frames(options, frames_per_block=1):
         pose = pose_of(block.truth)
-        step = None if before is None else SonarStep(before.between(pose), np.zeros((6, 6)))
+        step = (
+            None
+            if before is None
+            else SonarStep(before.between(pose), np.zeros((6, 6)))
+        )
         before, frames, start = pose, frames + 1, time.perf_counter()
         found = recogniser.process(block.frames, step)
         spent_s += time.perf_counter() - start
-        whole = block.truth.ids[(block.truth.share_in_view[0] == 1) & (block.truth.ids > 0)]
+        whole = block.truth.ids[
+            (block.truth.share_in_view[0] == 1) & (block.truth.ids > 0)
+        ]
         in_view += len(whole)
         if found is not None:
             decoded += len(np.intersect1d(whole, found.candidate_ids))
@@ -92,7 +106,12 @@ def run(options: BasinOptions, settings: AcTagSettings) -> dict[str, float]:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--corrections", type=int, default=AcTagSettings().bit_corrections, help="bits put right")
+    parser.add_argument(
+        "--corrections",
+        type=int,
+        default=AcTagSettings().bit_corrections,
+        help="bits put right",
+    )
     arguments = parser.parse_args()
     settings = AcTagSettings(bit_corrections=arguments.corrections)
     with tempfile.TemporaryDirectory() as folder:
@@ -101,8 +120,15 @@ def main() -> None:
         except CalibrationError as error:
             refuse(str(error))
         note(f"one lap past {len(TAGS)} tags")
-        values = {"duration_s": 130.0, "laps": 1, "frame_rate_hz": 1.0 if arguments.quick else 5.0}
-        figures = run(BasinOptions.model_validate(values | {"image": {"designs": str(file)}}), settings)
+        values = {
+            "duration_s": 130.0,
+            "laps": 1,
+            "frame_rate_hz": 1.0 if arguments.quick else 5.0,
+        }
+        figures = run(
+            BasinOptions.model_validate(values | {"image": {"designs": str(file)}}),
+            settings,
+        )
     print_table(["figure", "value"], figures.items())
     conclude({**figures, "passed": figures["wrong"] == 0}, is_quick=arguments.quick)
 

@@ -49,7 +49,9 @@ Figures = dict[str, Any]
 def imu_place(folder: Path, number: int) -> PlaceFit:
     """Estimate of the IMU's place from one trajectory."""
     recorded = read_akit(folder, number)
-    offset = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration).offset.value
+    offset = match_dvl_to_imu(
+        recorded.imu, recorded.dvl, recorded.calibration
+    ).offset.value
     return fit_place(replace(recorded, dvl=shifted(recorded.dvl, offset)))
 
 
@@ -64,9 +66,15 @@ def run(folder: Path, places: dict[int, Floats], number: int) -> Figures:
     recorded = read_akit(folder, number)
     assert recorded.truth is not None
     dvl = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration)
-    reference = match_reference_to_imu(recorded.imu, recorded.truth, recorded.calibration)
+    reference = match_reference_to_imu(
+        recorded.imu, recorded.truth, recorded.calibration
+    )
     aligned = realigned(recorded, dvl.offset.value, reference.offset.value)
-    whole, placed, unplaced = reckoned(aligned), with_imu_at(aligned, places[number]), with_imu_at(aligned, np.zeros(3))
+    whole, placed, unplaced = (
+        reckoned(aligned),
+        with_imu_at(aligned, places[number]),
+        with_imu_at(aligned, np.zeros(3)),
+    )
     return {
         "dvl_offset": (dvl.offset.value, dvl.offset.sigma),
         "reference_offset": (reference.offset.value, reference.offset.sigma),
@@ -74,16 +82,25 @@ def run(folder: Path, places: dict[int, Floats], number: int) -> Figures:
         "as_converted": final_error(recorded, reckoned(recorded)),
         "aligned": final_error(aligned, whole),
         "gaps": [gap_error(placed, whole, begin) for begin in GAP_STARTS_S],
-        "gaps_as_converted": [gap_error(aligned, whole, begin) for begin in GAP_STARTS_S],
-        "gaps_unbiased": [gap_error(without_accel_bias(placed), whole, begin) for begin in GAP_STARTS_S],
+        "gaps_as_converted": [
+            gap_error(aligned, whole, begin) for begin in GAP_STARTS_S
+        ],
+        "gaps_unbiased": [
+            gap_error(without_accel_bias(placed), whole, begin)
+            for begin in GAP_STARTS_S
+        ],
         "gaps_unplaced": [gap_error(unplaced, whole, begin) for begin in GAP_STARTS_S],
-        "reference_wander_m": reference_wander(folder, number, recorded.truth.positions),
+        "reference_wander_m": reference_wander(
+            folder, number, recorded.truth.positions
+        ),
         "sightings": sightings(aligned),
         "slam": slam(aligned, number),
     }
 
 
-def realigned(recorded: Sequence, dvl_offset_s: float, reference_offset_s: float) -> Sequence:
+def realigned(
+    recorded: Sequence, dvl_offset_s: float, reference_offset_s: float
+) -> Sequence:
     """Stamps of Doppler log and reference on the IMU's clock, and the start taken there."""
     assert recorded.truth is not None
     dvl, truth = recorded.dvl, recorded.truth
@@ -106,21 +123,31 @@ def shifted(dvl: Dvl, offset_s: float) -> Dvl:
 def with_imu_at(sequence: Sequence, body_p_imu: Floats) -> Sequence:
     """The IMU at another place of the body."""
     x, y, z = body_p_imu.tolist()
-    imu = sequence.calibration.imu.model_copy(update={"mounting": Mounting(translation_m=(x, y, z))})
-    return replace(sequence, calibration=sequence.calibration.model_copy(update={"imu": imu}))
+    imu = sequence.calibration.imu.model_copy(
+        update={"mounting": Mounting(translation_m=(x, y, z))}
+    )
+    return replace(
+        sequence, calibration=sequence.calibration.model_copy(update={"imu": imu})
+    )
 
 
 def without_accel_bias(sequence: Sequence) -> Sequence:
     """With accelerometers that are known to have no bias."""
     imu = sequence.calibration.imu.model_copy(update={"accel_bias_sigma": 0.0})
-    return replace(sequence, calibration=sequence.calibration.model_copy(update={"imu": imu}))
+    return replace(
+        sequence, calibration=sequence.calibration.model_copy(update={"imu": imu})
+    )
 
 
 def reckoned(sequence: Sequence) -> Trajectory:
     """Dead reckoning once a second for as long as there is a reference."""
     assert sequence.truth is not None
     instants = sequence.instants(1.0)
-    result = run_estimator(sequence, "dead-reckoning", instants_ns=instants[instants <= sequence.truth.stamps_ns[-1]])
+    result = run_estimator(
+        sequence,
+        "dead-reckoning",
+        instants_ns=instants[instants <= sequence.truth.stamps_ns[-1]],
+    )
     if result.causal is None:
         raise RuntimeError(f"{sequence.name}: {result.reason}")
     return result.causal
@@ -141,7 +168,9 @@ def start_heading(recorded: Sequence, aligned: Sequence) -> float:
     estimate = reckoned(recorded)
     inside = estimate.stamps_ns <= aligned.truth.stamps_ns[-1]
     truth = aligned.truth.at(estimate.stamps_ns[inside])
-    turned = (estimate.rotations()[np.flatnonzero(inside)] * truth.rotations().inv()).as_rotvec()
+    turned = (
+        estimate.rotations()[np.flatnonzero(inside)] * truth.rotations().inv()
+    ).as_rotvec()
     return float(np.median(turned[:, 2]))
 
 
@@ -155,8 +184,13 @@ def gap_error(aligned: Sequence, whole: Trajectory, begin_s: float) -> dict[str,
     begin_ns = aligned.start_ns + round(begin_s * 1e9)
     end_ns = begin_ns + round(GAP_S * 1e9)
     stamps = aligned.dvl.stamps_ns
-    bridged = replace(aligned, dvl=aligned.dvl.rows((stamps <= begin_ns) | (stamps >= end_ns)))
-    after, sure = reckoned(bridged), reckoned(with_start(bridged, rpy_sigma_rad=(1e-5,) * 3))
+    bridged = replace(
+        aligned, dvl=aligned.dvl.rows((stamps <= begin_ns) | (stamps >= end_ns))
+    )
+    after, sure = (
+        reckoned(bridged),
+        reckoned(with_start(bridged, rpy_sigma_rad=(1e-5,) * 3)),
+    )
     row = int(np.searchsorted(after.stamps_ns, end_ns + CONFIRMED_NS))
     other = int(np.flatnonzero(whole.stamps_ns == after.stamps_ns[row])[0])
     lost = after.positions[row] - whole.positions[other]
@@ -166,8 +200,12 @@ def gap_error(aligned: Sequence, whole: Trajectory, begin_s: float) -> dict[str,
         "lost_m": float(np.linalg.norm(lost)),
         "sigma_m": float(np.sqrt(own.trace())),
         "square": square(lost, own),
-        "literal_square": square(after.positions[row] - truth, world_position_covs(after)[row]),
-        "without_gap_square": square(whole.positions[other] - truth, world_position_covs(whole)[other]),
+        "literal_square": square(
+            after.positions[row] - truth, world_position_covs(after)[row]
+        ),
+        "without_gap_square": square(
+            whole.positions[other] - truth, world_position_covs(whole)[other]
+        ),
     }
 
 
@@ -179,7 +217,9 @@ def square(error: Floats, cov: Floats) -> float:
 def with_start(sequence: Sequence, **changes: Any) -> Sequence:
     """Another start."""
     start = sequence.calibration.start.model_copy(update=changes)
-    return replace(sequence, calibration=sequence.calibration.model_copy(update={"start": start}))
+    return replace(
+        sequence, calibration=sequence.calibration.model_copy(update={"start": start})
+    )
 
 
 def main() -> None:
@@ -187,9 +227,19 @@ def main() -> None:
     arguments = parser.parse_args()
     numbers = RUNS[:1] if arguments.quick else RUNS
     with recording(arguments.data, "akit_1-7.tar.xz", "akit") as folder:
-        fits = in_parallel(partial(imu_place, folder), RUNS, arguments.workers, "IMU's place by trajectory")
-        places = {n: place_of([fit for m, fit in zip(RUNS, fits, strict=True) if m != n]) for n in RUNS}
-        runs = in_parallel(partial(run, folder, places), numbers, arguments.workers, "trajectory")
+        fits = in_parallel(
+            partial(imu_place, folder),
+            RUNS,
+            arguments.workers,
+            "IMU's place by trajectory",
+        )
+        places = {
+            n: place_of([fit for m, fit in zip(RUNS, fits, strict=True) if m != n])
+            for n in RUNS
+        }
+        runs = in_parallel(
+            partial(run, folder, places), numbers, arguments.workers, "trajectory"
+        )
     print_places(fits)
     figures = report(numbers, runs) | {
         "imu_place_m": [fit.body_p_imu.tolist() for fit in fits],
@@ -202,7 +252,16 @@ def main() -> None:
 def print_places(fits: list[PlaceFit]) -> None:
     """IMU's place on the body by trajectory, with standard deviations, and the noise of the Doppler log."""
     print_table(
-        ("IMU's place", *(f"{axis} m" for axis in "xyz"), "±", "±", "±", "accel bias x mm/s²", "y", "DVL noise m/s"),
+        (
+            "IMU's place",
+            *(f"{axis} m" for axis in "xyz"),
+            "±",
+            "±",
+            "±",
+            "accel bias x mm/s²",
+            "y",
+            "DVL noise m/s",
+        ),
         [
             (
                 f"trajectory {n}",

@@ -55,7 +55,12 @@ def fit_place(sequence: Sequence) -> PlaceFit:
         - path.linear_at(seconds, path.impulse)
     )
     slow = seconds[:, None, None] * np.eye(3)
-    columns = [turning, -path.linear_at(seconds, path.turned_time), slow, seconds[:, None, None] * slow]
+    columns = [
+        turning,
+        -path.linear_at(seconds, path.turned_time),
+        slow,
+        seconds[:, None, None] * slow,
+    ]
     found, covariance, variance = _least_squares(np.concatenate(columns, axis=2), x)
     place = body_p_imu - found[SHOWN]
     information = np.asarray(np.linalg.inv(covariance[SHOWN, SHOWN]), np.float64)
@@ -78,4 +83,8 @@ def _least_squares(A: Floats, x: Floats) -> tuple[Floats, Floats, float]:
 def place_of(fits: list[PlaceFit]) -> Floats:
     """The place that several runs tell together, shape (3,), m."""
     total = sum((fit.information for fit in fits), np.zeros((3, 3)))
-    return np.asarray(np.linalg.solve(total, sum((f.information @ f.body_p_imu for f in fits), np.zeros(3))))
+    return np.asarray(
+        np.linalg.solve(
+            total, sum((f.information @ f.body_p_imu for f in fits), np.zeros(3))
+        )
+    )

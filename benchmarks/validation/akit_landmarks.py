@@ -74,9 +74,13 @@ PLACINGS = {
 def slam(aligned: Sequence, seed: int) -> dict[str, Scores]:
     """Scores of all estimators in each placing, the start attitude drawn as wrong as its sigmas say."""
     start = aligned.calibration.start
-    drawn = np.array(start.rpy_rad) + np.array(start.rpy_sigma_rad) * np.random.default_rng(seed).standard_normal(3)
+    drawn = np.array(start.rpy_rad) + np.array(
+        start.rpy_sigma_rad
+    ) * np.random.default_rng(seed).standard_normal(3)
     wrong = start.model_copy(update={"rpy_rad": tuple(drawn.tolist())})
-    return {name: _scores(aligned, placing, wrong) for name, placing in PLACINGS.items()}
+    return {
+        name: _scores(aligned, placing, wrong) for name, placing in PLACINGS.items()
+    }
 
 
 def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
@@ -84,13 +88,22 @@ def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
     placed = add_landmarks(aligned, placing.options)
     changes: dict[str, Any] = {"start": start}
     if placing.sigma_m_s is not None:
-        changes["dvl"] = placed.calibration.dvl.model_copy(update={"velocity_sigma_m_s": placing.sigma_m_s})
-    sequence = replace(placed, calibration=placed.calibration.model_copy(update=changes))
+        changes["dvl"] = placed.calibration.dvl.model_copy(
+            update={"velocity_sigma_m_s": placing.sigma_m_s}
+        )
+    sequence = replace(
+        placed, calibration=placed.calibration.model_copy(update=changes)
+    )
     assert sequence.truth is not None
     stamps_ns = sequence.truth.stamps_ns
-    stamps_ns = stamps_ns[(stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)]
+    stamps_ns = stamps_ns[
+        (stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)
+    ]
     runs = [
-        replace(run_estimator(sequence, name, settings, instants_ns=stamps_ns), estimator=shown)
+        replace(
+            run_estimator(sequence, name, settings, instants_ns=stamps_ns),
+            estimator=shown,
+        )
         for shown, (name, settings) in ESTIMATORS.items()
     ]
     for result in runs:
@@ -99,7 +112,9 @@ def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
     scores = judge(sequence, stamps_ns, runs).scores
     return {
         result.estimator: {
-            name: math.nan if result.status == "failed" else scores[result.estimator][name].value
+            name: math.nan
+            if result.status == "failed"
+            else scores[result.estimator][name].value
             for name in (f"{kind}.{measure}" for kind in KINDS for measure in MEASURES)
         }
         for result in runs
@@ -108,7 +123,10 @@ def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
 
 def sightings(aligned: Sequence) -> dict[str, tuple[float, float]]:
     """Median number of detections of a landmark, and seconds from first to last, for each placing."""
-    return {name: _sightings(add_landmarks(aligned, placing.options)) for name, placing in PLACINGS.items()}
+    return {
+        name: _sightings(add_landmarks(aligned, placing.options))
+        for name, placing in PLACINGS.items()
+    }
 
 
 def _sightings(placed: Sequence) -> tuple[float, float]:
@@ -117,19 +135,29 @@ def _sightings(placed: Sequence) -> tuple[float, float]:
     sure = probability > 0.5
     ids, seconds = ids[sure], placed.detections.stamps_ns[sure] * 1e-9
     seen = [seconds[ids == identity] for identity in np.unique(ids)]
-    return float(np.median([len(times) for times in seen])), float(np.median([np.ptp(times) for times in seen]))
+    return float(np.median([len(times) for times in seen])), float(
+        np.median([np.ptp(times) for times in seen])
+    )
 
 
-def reference_wander(folder: Path, number: int, positions: Floats) -> tuple[float, float]:
+def reference_wander(
+    folder: Path, number: int, positions: Floats
+) -> tuple[float, float]:
     """Difference of the reference's positions from the sum of its velocities: rms over one second, and maximum.
 
     Horizontal, metres. Velocities are integrated along cubic splines, row by row. The sequence may lack the first
     rows of the file, those before its IMU began.
     """
     path = folder / f"Trajectory{number}" / f"GT_trajectory{number}.csv"
-    north, east = read_table(path, REFERENCE_COLUMNS, delimiter=",", header_lines=1).values[-len(positions) :, 4:6].T
+    north, east = (
+        read_table(path, REFERENCE_COLUMNS, delimiter=",", header_lines=1)
+        .values[-len(positions) :, 4:6]
+        .T
+    )
     seconds = np.arange(len(positions), dtype=float)
-    summed = CubicSpline(seconds, np.column_stack([east, north])).antiderivative()(seconds)
+    summed = CubicSpline(seconds, np.column_stack([east, north])).antiderivative()(
+        seconds
+    )
     wander = positions[:, :2] - summed
     wander -= wander[0]
     return float(np.sqrt(np.mean(np.sum(np.diff(wander, axis=0) ** 2, axis=1)))), float(

@@ -39,7 +39,10 @@ def print_trajectories(numbers: tuple[int, ...], runs: list[Figures]) -> None:
         "IMU as converted",
         "IMU by others",
     )
-    gaps = (inside_ellipse(runs, gaps, "square") for gaps in ("gaps_unplaced", "gaps_as_converted", "gaps"))
+    gaps = (
+        inside_ellipse(runs, gaps, "square")
+        for gaps in ("gaps_unplaced", "gaps_as_converted", "gaps")
+    )
     rows = [
         (
             f"trajectory {number}",
@@ -59,7 +62,10 @@ def print_gap_widths(runs: list[Figures]) -> None:
     """Errors in gaps and their claimed sigmas, with and without a bias of the accelerometers."""
     print_table(
         ("IMU by others", "lost rms m", "sigma rms m", "least", "largest", "NEES"),
-        [("as calibrated", *gap_width(runs, "gaps")), ("no accel bias", *gap_width(runs, "gaps_unbiased"))],
+        [
+            ("as calibrated", *gap_width(runs, "gaps")),
+            ("no accel bias", *gap_width(runs, "gaps_unbiased")),
+        ],
     )
 
 
@@ -84,13 +90,20 @@ def gap_figures(runs: list[Figures]) -> Figures:
         "gap_nees_per_dof": calibrated[-1],
         "gap_unbiased_sigma_rms_m": unbiased[1],
         "gap_unbiased_nees_per_dof": unbiased[-1],
-        "gap_share_inside_as_converted": share_inside(runs, "gaps_as_converted", "square"),
+        "gap_share_inside_as_converted": share_inside(
+            runs, "gaps_as_converted", "square"
+        ),
         "gap_lost_as_converted_m": lost_m(runs, "gaps_as_converted"),
         "gap_share_inside_unplaced": share_inside(runs, "gaps_unplaced", "square"),
         "gap_lost_unplaced_m": lost_m(runs, "gaps_unplaced"),
         "gap_share_inside_literally": share_inside(runs, "gaps", "literal_square"),
-        "share_inside_literally_without_gap": share_inside(runs, "gaps", "without_gap_square"),
-        "literal_squares": [[(gap["literal_square"], gap["without_gap_square"]) for gap in r["gaps"]] for r in runs],
+        "share_inside_literally_without_gap": share_inside(
+            runs, "gaps", "without_gap_square"
+        ),
+        "literal_squares": [
+            [(gap["literal_square"], gap["without_gap_square"]) for gap in r["gaps"]]
+            for r in runs
+        ],
     }
 
 
@@ -103,14 +116,17 @@ def slam_figures(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
         "slam": [
             {
                 placing: {
-                    name: {m: v if np.isfinite(v) else None for m, v in own.items()} for name, own in each.items()
+                    name: {m: v if np.isfinite(v) else None for m, v in own.items()}
+                    for name, own in each.items()
                 }
                 for placing, each in r["slam"].items()
             }
             for r in runs
         ],
         "landmarks_help": {
-            f"{placing} {kind}": min(error_ratio(r["slam"][placing], kind) for r in sure)
+            f"{placing} {kind}": min(
+                error_ratio(r["slam"][placing], kind) for r in sure
+            )
             for placing in ("near", "far")
             for kind in ("causal", "smoothed")
         },
@@ -133,10 +149,13 @@ def inside_ellipse(runs: list[Figures], gaps: str, name: str) -> list[list[bool]
     return [[gap[name] <= limit for gap in r[gaps]] for r in runs]
 
 
-def gap_width(runs: list[Figures], gaps: str) -> tuple[float, float, float, float, float]:
+def gap_width(
+    runs: list[Figures], gaps: str
+) -> tuple[float, float, float, float, float]:
     """RMS of error and sigma, least and largest sigma, m, and the NEES per dimension."""
     lost, sigma, squares = (
-        np.array([gap[of] for r in runs for gap in r[gaps]]) for of in ("lost_m", "sigma_m", "square")
+        np.array([gap[of] for r in runs for gap in r[gaps]])
+        for of in ("lost_m", "sigma_m", "square")
     )
     rms = (float(np.sqrt(np.mean(values**2))) for values in (lost, sigma))
     return (*rms, float(sigma.min()), float(sigma.max()), float(squares.mean()) / 3)
@@ -145,21 +164,39 @@ def gap_width(runs: list[Figures], gaps: str) -> tuple[float, float, float, floa
 def print_slam(numbers: tuple[int, ...], runs: list[Figures]) -> None:
     """Causal and smoothed scores of all estimators in each placing."""
     print_table(
-        ("", "reference wanders m/s", "at most m", *(f"{name}: times, s" for name in PLACINGS)),
+        (
+            "",
+            "reference wanders m/s",
+            "at most m",
+            *(f"{name}: times, s" for name in PLACINGS),
+        ),
         [
-            (f"trajectory {n}", *r["reference_wander_m"], *(f"{t:.0f}, {s:.0f}" for t, s in r["sightings"].values()))
+            (
+                f"trajectory {n}",
+                *r["reference_wander_m"],
+                *(f"{t:.0f}, {s:.0f}" for t, s in r["sightings"].values()),
+            )
             for n, r in zip(numbers, runs, strict=True)
         ],
     )
     for placing in PLACINGS:
         rows = [
-            (f"trajectory {n} {name} {kind}", *(r["slam"][placing][name][f"{kind}.{m}"] for m in MEASURES))
+            (
+                f"trajectory {n} {name} {kind}",
+                *(r["slam"][placing][name][f"{kind}.{m}"] for m in MEASURES),
+            )
             for n, r in zip(numbers, runs, strict=True)
-            for name, kind in (("isam2", "smoothed"), *((name, "causal") for name in ESTIMATORS))
+            for name, kind in (
+                ("isam2", "smoothed"),
+                *((name, "causal") for name in ESTIMATORS),
+            )
         ]
         print_table((placing, "raw m", "SE(2) m", "10 s m", "NEES", "yaw NEES"), rows)
 
 
 def error_ratio(scores: dict[str, dict[str, float]], kind: str) -> float:
     """Dead reckoning's error after SE(2) alignment over iSAM2's."""
-    return scores["dead-reckoning"]["causal.ate_se2_m"] / scores["isam2"][f"{kind}.ate_se2_m"]
+    return (
+        scores["dead-reckoning"]["causal.ate_se2_m"]
+        / scores["isam2"][f"{kind}.ate_se2_m"]
+    )

@@ -63,18 +63,27 @@ def command(suite: Path, folder: Path, *options: str) -> list[str]:
 
 def done(folder: Path) -> set[str]:
     """Keys of the runs that are kept."""
-    return {path.parent.name for path in folder.glob("runs/*/row.json") if not path.parent.name.startswith(".")}
+    return {
+        path.parent.name
+        for path in folder.glob("runs/*/row.json")
+        if not path.parent.name.startswith(".")
+    }
 
 
 def table(folder: Path) -> list[dict[str, Any]]:
     """The rows without timings."""
     rows: list[dict[str, Any]] = pq.read_table(folder / RESULTS).to_pylist()
-    return [{name: value for name, value in row.items() if not is_timing(name)} for row in rows]
+    return [
+        {name: value for name, value in row.items() if not is_timing(name)}
+        for row in rows
+    ]
 
 
 def finish(suite: Path, folder: Path, *options: str) -> list[dict[str, Any]]:
     """Run a batch to its end, and read its table."""
-    ended = subprocess.run(command(suite, folder, *options), capture_output=True, text=True)
+    ended = subprocess.run(
+        command(suite, folder, *options), capture_output=True, text=True
+    )
     if ended.returncode:
         raise RuntimeError(ended.stderr)
     return table(folder)
@@ -83,7 +92,9 @@ def finish(suite: Path, folder: Path, *options: str) -> list[dict[str, Any]]:
 @contextlib.contextmanager
 def started(suite: Path, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A batch on its way."""
-    with subprocess.Popen(command(suite, folder), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command(suite, folder), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
         yield process
 
 
@@ -119,7 +130,11 @@ def killed_workers(suite: Path, folder: Path) -> None:
 
 def kill_one(batch: int, is_victim: Callable[[list[str]], bool]) -> None:
     with contextlib.suppress(psutil.Error):
-        victims = [child for child in psutil.Process(batch).children(recursive=True) if is_victim(child.cmdline())]
+        victims = [
+            child
+            for child in psutil.Process(batch).children(recursive=True)
+            if is_victim(child.cmdline())
+        ]
         if victims:
             victims[0].kill()
 
@@ -167,10 +182,24 @@ def own_scheduler() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as processes:
         told = Path(scratch) / "scheduler.json"
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(told)]
+        options = [
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--scheduler-file",
+            str(told),
+        ]
         dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
         commands = [[*dask, *options]]
-        worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(told)]
+        worker = [
+            sys.executable,
+            "-m",
+            "distributed.cli.dask_worker",
+            "--scheduler-file",
+            str(told),
+        ]
         commands += [[*worker, "--nthreads", "1", "--no-dashboard"]] * WORKERS
         for arguments in commands:
             process = processes.enter_context(subprocess.Popen(arguments, **quiet))  # type: ignore[call-overload]
@@ -187,8 +216,12 @@ def await_file(path: Path) -> None:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--kills", type=int, default=10, help="of the whole batch (default: 10)")
-    parser.add_argument("--random", type=int, default=0, help="seed of the moments (default: 0)")
+    parser.add_argument(
+        "--kills", type=int, default=10, help="of the whole batch (default: 10)"
+    )
+    parser.add_argument(
+        "--random", type=int, default=0, help="seed of the moments (default: 0)"
+    )
     arguments = parser.parse_args()
     kills, seeds = (2, 4) if arguments.quick else (arguments.kills, 16)
     with tempfile.TemporaryDirectory() as scratch:
@@ -196,7 +229,11 @@ def main() -> None:
         suite = root / "suite.toml"
         suite.write_text(SUITE.format(seeds=seeds))
         undisturbed = finish(suite, root / "undisturbed")
-        lost = {"batch killed": killed_batches(suite, root / "batch", kills, random.Random(arguments.random))}
+        lost = {
+            "batch killed": killed_batches(
+                suite, root / "batch", kills, random.Random(arguments.random)
+            )
+        }
         killed_workers(suite, root / "workers")
         lost["workers killed"] = len(undisturbed) - len(done(root / "workers"))
         lost["disk full"] = full_disk(suite, root / "full")
@@ -205,9 +242,16 @@ def main() -> None:
         lost["own scheduler"] = len(undisturbed) - len(done(root / "scheduler"))
         again = finish(suite, root / "again")
         names = ("batch", "workers", "full", "scheduler")
-        equal = dict(zip(lost, [table(root / name) == undisturbed for name in names], strict=True))
+        equal = dict(
+            zip(
+                lost, [table(root / name) == undisturbed for name in names], strict=True
+            )
+        )
         equal["run again"], lost["run again"] = again == undisturbed, 0
-    print_table(("", "runs lost", "rows equal"), [(name, lost[name], equal[name]) for name in equal])
+    print_table(
+        ("", "runs lost", "rows equal"),
+        [(name, lost[name], equal[name]) for name in equal],
+    )
     figures = {
         "runs": len(undisturbed),
         "kills": kills,
@@ -215,7 +259,9 @@ def main() -> None:
         "runs_lost": sum(lost.values()),
         "all_ok": all(row["status"] == "ok" for row in undisturbed),
     }
-    figures["passed"] = figures["rows_equal"] and figures["runs_lost"] == 0 and figures["all_ok"]
+    figures["passed"] = (
+        figures["rows_equal"] and figures["runs_lost"] == 0 and figures["all_ok"]
+    )
     conclude(figures, is_quick=arguments.quick)
 
 

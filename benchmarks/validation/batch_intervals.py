@@ -36,13 +36,17 @@ Case = tuple[str, int, int]
 
 def student(values: Floats, _rng: np.random.Generator) -> Interval:
     """Supposes normal differences."""
-    low, high = stats.t.interval(CONFIDENCE, len(values) - 1, values.mean(), stats.sem(values))
+    low, high = stats.t.interval(
+        CONFIDENCE, len(values) - 1, values.mean(), stats.sem(values)
+    )
     return float(low), float(high)
 
 
 def accelerated(values: Floats, rng: np.random.Generator) -> Interval:
     """Bias-corrected, accelerated bootstrap (Efron 1987)."""
-    drawn = stats.bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="BCa", rng=rng)
+    drawn = stats.bootstrap(
+        (values,), np.mean, n_resamples=RESAMPLES, method="BCa", rng=rng
+    )
     return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
 
 
@@ -51,9 +55,17 @@ def studentised(values: Floats, rng: np.random.Generator) -> Interval:
     draws = values[rng.integers(0, len(values), (RESAMPLES, len(values)))]
     errors = draws.std(axis=1, ddof=1) / np.sqrt(len(values))
     distances = draws.mean(axis=1) - values.mean()
-    t = np.where(errors > 0, distances / np.where(errors > 0, errors, 1.0), np.copysign(np.inf, distances))
-    low, high = np.quantile(t, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], method="nearest")
-    return float(values.mean() - high * stats.sem(values)), float(values.mean() - low * stats.sem(values))
+    t = np.where(
+        errors > 0,
+        distances / np.where(errors > 0, errors, 1.0),
+        np.copysign(np.inf, distances),
+    )
+    low, high = np.quantile(
+        t, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], method="nearest"
+    )
+    return float(values.mean() - high * stats.sem(values)), float(
+        values.mean() - low * stats.sem(values)
+    )
 
 
 def reported(values: Floats, _rng: np.random.Generator) -> Interval:
@@ -69,13 +81,17 @@ METHODS: dict[str, Callable[[Floats, np.random.Generator], Interval]] = {
 }
 
 
-def drawn(kind: str, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Floats, float]:
+def drawn(
+    kind: str, shape: tuple[int, int], rng: np.random.Generator
+) -> tuple[Floats, float]:
     """Differences, and their mean."""
     if sigma := SIGMAS.get(kind):
         return rng.lognormal(0.0, sigma, shape), float(np.exp(sigma**2 / 2))
     normal = rng.normal(MEAN, 1.0, shape)
     if kind == LOST:
-        return normal + LOST_BY * (rng.random(shape) < LOST_SHARE), MEAN + LOST_BY * LOST_SHARE
+        return normal + LOST_BY * (
+            rng.random(shape) < LOST_SHARE
+        ), MEAN + LOST_BY * LOST_SHARE
     return normal, MEAN
 
 
@@ -84,7 +100,9 @@ def judged(case: Case) -> Floats:
     kind, pairs, trials = case
     rng = np.random.default_rng([KINDS.index(kind), pairs])
     draws, mean = drawn(kind, (trials, pairs), rng)
-    bounds = np.array([[interval(values, rng) for values in draws] for interval in METHODS.values()])
+    bounds = np.array(
+        [[interval(values, rng) for values in draws] for interval in METHODS.values()]
+    )
     held = np.mean((bounds[:, :, 0] < mean) & (mean < bounds[:, :, 1]), axis=1)
     lengths = np.median(bounds[:, :, 1] - bounds[:, :, 0], axis=1)
     return np.stack([held, lengths / lengths[list(METHODS).index("Student")]], axis=1)
@@ -92,12 +110,18 @@ def judged(case: Case) -> Floats:
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--trials", type=int, default=4000, help="of each case (default: 4000)")
+    parser.add_argument(
+        "--trials", type=int, default=4000, help="of each case (default: 4000)"
+    )
     arguments = parser.parse_args()
     trials = 100 if arguments.quick else arguments.trials
     cases = [(kind, pairs, trials) for kind in KINDS for pairs in PAIRS]
-    found = np.array(in_parallel(judged, cases, arguments.workers, "case")).reshape(len(KINDS), len(PAIRS), -1, 2)
-    for place, name in enumerate(("share that holds the mean", "length over Student's")):
+    found = np.array(in_parallel(judged, cases, arguments.workers, "case")).reshape(
+        len(KINDS), len(PAIRS), -1, 2
+    )
+    for place, name in enumerate(
+        ("share that holds the mean", "length over Student's")
+    ):
         rows = [
             (f"{kind}, {pairs} pairs", *found[k, n, :, place].tolist())
             for k, kind in enumerate(KINDS)
@@ -108,8 +132,14 @@ def main() -> None:
     figures = {
         "trials": trials,
         "pairs": PAIRS,
-        "held": {m: dict(zip(KINDS, shares.tolist(), strict=True)) for m, shares in held.items()},
-        "length": {m: dict(zip(KINDS, found[:, :, i, 1].tolist(), strict=True)) for i, m in enumerate(METHODS)},
+        "held": {
+            m: dict(zip(KINDS, shares.tolist(), strict=True))
+            for m, shares in held.items()
+        },
+        "length": {
+            m: dict(zip(KINDS, found[:, :, i, 1].tolist(), strict=True))
+            for i, m in enumerate(METHODS)
+        },
         "passed": bool(
             np.all(np.abs(held["reported"][0] - CONFIDENCE) <= 0.02)
             and np.all(held["reported"][1:-1] >= np.maximum(0.85, held["BCa"][1:-1]))

@@ -21,7 +21,12 @@ from common import in_parallel, make_parser, print_figures, print_table
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
+from sonar_graph.simulation import (
+    BasinOptions,
+    MissionOptions,
+    simulate_basin,
+    simulate_mission,
+)
 from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -53,9 +58,13 @@ def run_seed(world: str, duration_s: float, seed: int) -> dict[str, Figures]:
 
 def run(sequence: Sequence, settings: dict[str, Any]) -> Figures:
     """One estimator over one run."""
-    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings))
+    estimator = Isam2(
+        sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings)
+    )
     steps = sequence.replay(sequence.instants(RATE_HZ))
-    causal = Trajectory.from_estimates([e for e in map(estimator.process, steps) if e is not None])
+    causal = Trajectory.from_estimates(
+        [e for e in map(estimator.process, steps) if e is not None]
+    )
     smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
     assert sequence.truth is not None
     assert sequence.true_landmarks is not None
@@ -77,7 +86,10 @@ def rms(off: Floats) -> float:
 def position_nees(said: Trajectory, truth: Trajectory) -> Floats:
     """Per degree of freedom, shape (n,); the error in body axes, as the covariance is."""
     off = said.rotations().inv().apply(truth.positions - said.positions)
-    return np.einsum("ni,nij,nj->n", off, np.linalg.inv(said.covariances[:, 3:, 3:]), off) / 3
+    return (
+        np.einsum("ni,nij,nj->n", off, np.linalg.inv(said.covariances[:, 3:, 3:]), off)
+        / 3
+    )
 
 
 def landmark_figures(said: LandmarkMap, true: LandmarkMap) -> Figures:
@@ -95,8 +107,13 @@ def table(results: list[dict[str, Figures]]) -> dict[str, Figures]:
         for quantity in QUANTITIES:
             values = np.array([result[name][quantity] for result in results])
             more = values - np.array([result["whole"][quantity] for result in results])
-            error = float(more.std(ddof=1) / np.sqrt(len(more))) if len(more) > 1 else 0.0
-            figures[name] |= {quantity: float(values.mean()), f"{quantity}_more": float(more.mean())}
+            error = (
+                float(more.std(ddof=1) / np.sqrt(len(more))) if len(more) > 1 else 0.0
+            )
+            figures[name] |= {
+                quantity: float(values.mean()),
+                f"{quantity}_more": float(more.mean()),
+            }
             figures[name][f"{quantity}_error"] = error
             row.append(f"{values.mean():.4f} ({more.mean():+.4f} ± {error:.4f})")
         rows.append(row)
@@ -106,13 +123,20 @@ def table(results: list[dict[str, Figures]]) -> dict[str, Figures]:
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="of each world (default: 24; with --quick 2)")
+    parser.add_argument(
+        "--seeds", type=int, help="of each world (default: 24; with --quick 2)"
+    )
     arguments = parser.parse_args()
     seeds = range(arguments.seeds or (2 if arguments.quick else 24))
-    durations_s = {"mission": 300.0 if arguments.quick else 1800.0, "basin": 400.0 if arguments.quick else 1200.0}
+    durations_s = {
+        "mission": 300.0 if arguments.quick else 1800.0,
+        "basin": 400.0 if arguments.quick else 1200.0,
+    }
     figures = {}
     for world, duration_s in durations_s.items():
-        results = in_parallel(partial(run_seed, world, duration_s), list(seeds), arguments.workers, world)
+        results = in_parallel(
+            partial(run_seed, world, duration_s), list(seeds), arguments.workers, world
+        )
         print(f"{world}, {duration_s:g} s, {len(seeds)} seeds")
         figures[world] = table(results)
     print_figures({"seeds": len(seeds), **figures})

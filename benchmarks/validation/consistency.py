@@ -67,11 +67,20 @@ def run_seed(basin: Basin, seed: int) -> tuple[np.ndarray, Nees, dict[str, float
     for run in comparison.runs:
         if run.status == "failed":
             raise RuntimeError(f"seed {seed}: {run.estimator}: {run.reason}")
-    errors = {short: comparison.errors[name]["causal"] for short, name in ESTIMATORS.items()}
+    errors = {
+        short: comparison.errors[name]["causal"] for short, name in ESTIMATORS.items()
+    }
     nees = {}
     for short, series in errors.items():
-        nees[short, "position"], nees[short, "yaw"] = series.nees_position, series.nees_yaw
-    nis = {name: score.value for name in ESTIMATORS.values() if (score := comparison.score_of(name, "detections.nis"))}
+        nees[short, "position"], nees[short, "yaw"] = (
+            series.nees_position,
+            series.nees_yaw,
+        )
+    nis = {
+        name: score.value
+        for name in ESTIMATORS.values()
+        if (score := comparison.score_of(name, "detections.nis"))
+    }
     return (errors["ekf"].stamps_ns - sequence.start_ns) * 1e-9, nees, nis
 
 
@@ -109,11 +118,15 @@ def judge(nees: np.ndarray, dof: int) -> Verdict:
 def draw(seconds: np.ndarray, nees: Nees, path: Path) -> None:
     """ANEES over time with the band, one panel a quantity."""
     figure = Figure(figsize=(9, 6), layout="constrained")
-    for axes, (quantity, dof) in zip(figure.subplots(2, sharex=True), QUANTITIES.items(), strict=True):
+    for axes, (quantity, dof) in zip(
+        figure.subplots(2, sharex=True), QUANTITIES.items(), strict=True
+    ):
         runs = len(nees["ekf", quantity])
         axes.axhspan(*anees_interval(runs, dof), color="0.9", label="95 % band")
         for short, name in ESTIMATORS.items():
-            axes.plot(seconds, anees_over_runs(nees[short, quantity], dof), lw=1, label=name)
+            axes.plot(
+                seconds, anees_over_runs(nees[short, quantity], dof), lw=1, label=name
+            )
         axes.set_ylabel(f"ANEES of {quantity} / {dof}")
         axes.legend(loc="upper left", ncols=3)
     axes.set_xlabel("time (s)")
@@ -142,21 +155,45 @@ def report(verdicts: dict[tuple[str, str], Verdict]) -> dict[str, Any]:
         )
         figures[f"{short}_{quantity}_anees"] = verdict.final
         figures[f"{short}_{quantity}_anees_over_time"] = verdict.average
-        figures[f"{short}_{quantity}_anees_over_time_interval"] = verdict.average_interval
+        figures[f"{short}_{quantity}_anees_over_time_interval"] = (
+            verdict.average_interval
+        )
         figures[f"share_inside_{short}_{quantity}"] = verdict.share_inside
         figures[f"band_{quantity}"] = verdict.band
-    headers = ("ANEES / dof", "last instant", "band", "", "over time", "95 % interval", "", "instants in band")
+    headers = (
+        "ANEES / dof",
+        "last instant",
+        "band",
+        "",
+        "over time",
+        "95 % interval",
+        "",
+        "instants in band",
+    )
     print_table(headers, rows)
-    held = [verdict for (short, _), verdict in verdicts.items() if short == HELD_TO_BAND]
-    figures["passed"] = all(verdict.final_inside and verdict.average_fits for verdict in held)
+    held = [
+        verdict for (short, _), verdict in verdicts.items() if short == HELD_TO_BAND
+    ]
+    figures["passed"] = all(
+        verdict.final_inside and verdict.average_fits for verdict in held
+    )
     return figures
 
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="number of runs (default: 50; with --quick 4)")
-    parser.add_argument("--first-seed", type=int, default=0, help="runs use this seed and those after it")
-    parser.add_argument("--images", action="store_true", help="recognise landmarks in sonar images")
+    parser.add_argument(
+        "--seeds", type=int, help="number of runs (default: 50; with --quick 4)"
+    )
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=0,
+        help="runs use this seed and those after it",
+    )
+    parser.add_argument(
+        "--images", action="store_true", help="recognise landmarks in sonar images"
+    )
     parser.add_argument("--out", type=Path, help="write a figure (PNG) here")
     arguments = parser.parse_args()
     basin = Basin(240.0, 1) if arguments.quick else Basin(2039.0, 3)
@@ -170,18 +207,29 @@ def main() -> None:
     instants = len(min((run[0] for run in runs), key=len))
     seconds = runs[0][0][:instants]
     kept = seconds > SETTLING_S
-    nees = {key: np.array([run[1][key][:instants][kept] for run in runs]) for key in runs[0][1]}
+    nees = {
+        key: np.array([run[1][key][:instants][kept] for run in runs])
+        for key in runs[0][1]
+    }
     verdicts = {key: judge(values, QUANTITIES[key[1]]) for key, values in nees.items()}
     figures = report(verdicts)
     for name in ESTIMATORS.values():
         nis = np.array([run[2].get(name, np.nan) for run in runs])
         half = 1.96 * float(nis.std(ddof=1)) / np.sqrt(count)
         mean = float(nis.mean())
-        figures |= {f"{name}_nis": mean, f"{name}_nis_interval": (mean - half, mean + half)}
-        print(f"{name}: NIS {mean:.2f} ({mean - half:.2f} to {mean + half:.2f}), median {np.median(nis):.2f}")
+        figures |= {
+            f"{name}_nis": mean,
+            f"{name}_nis_interval": (mean - half, mean + half),
+        }
+        print(
+            f"{name}: NIS {mean:.2f} ({mean - half:.2f} to {mean + half:.2f}), median {np.median(nis):.2f}"
+        )
     if arguments.out:
         draw(seconds[kept], nees, arguments.out)
-    conclude({"runs": count, "duration_s": basin.duration_s, **figures}, is_quick=arguments.quick)
+    conclude(
+        {"runs": count, "duration_s": basin.duration_s, **figures},
+        is_quick=arguments.quick,
+    )
 
 
 if __name__ == "__main__":

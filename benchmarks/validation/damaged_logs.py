@@ -41,7 +41,9 @@ def main() -> int:
     parser = make_parser(__doc__, workers=True)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        damaged = make_files(Path(folder), QUICK_FILES if options.quick else FILES, quick=options.quick)
+        damaged = make_files(
+            Path(folder), QUICK_FILES if options.quick else FILES, quick=options.quick
+        )
         readings = read_all([file.path for file, _ in damaged], options.workers)
         figures = judge(damaged, readings)
     print_figures(figures)
@@ -52,9 +54,14 @@ def make_files(folder: Path, count: int, *, quick: bool) -> list[tuple[Damaged, 
     """Damaged files with what they held."""
     rng = np.random.default_rng(0)
     sources = [(path, read_truth(path)) for path in source_logs(folder)]
-    note(f"{len(sources)} logs of {min(t.count for _, t in sources)} to {max(t.count for _, t in sources)} messages")
+    note(
+        f"{len(sources)} logs of {min(t.count for _, t in sources)} to {max(t.count for _, t in sources)} messages"
+    )
     killed = killed_logs(folder, QUICK_KILLED if quick else KILLED)
-    found = [(Damaged(path, "killed writer", path.read_bytes()), truth) for path, truth in killed]
+    found = [
+        (Damaged(path, "killed writer", path.read_bytes()), truth)
+        for path, truth in killed
+    ]
     kinds = list(DAMAGES)
     while len(found) < count:
         source, truth = sources[len(found) % len(sources)]
@@ -69,7 +76,9 @@ def make_files(folder: Path, count: int, *, quick: bool) -> list[tuple[Damaged, 
     return found
 
 
-def judge(damaged: list[tuple[Damaged, Truth]], readings: list[Reading]) -> dict[str, Any]:
+def judge(
+    damaged: list[tuple[Damaged, Truth]], readings: list[Reading]
+) -> dict[str, Any]:
     totals: Counter[str] = Counter()
     by_kind: dict[str, Counter[str]] = defaultdict(Counter)
     for (file, truth), reading in zip(damaged, readings, strict=True):
@@ -78,9 +87,21 @@ def judge(damaged: list[tuple[Damaged, Truth]], readings: list[Reading]) -> dict
         totals += verdict
         for trouble in ("crashes", "hangs", "silent_errors", "missed", "loose_missed"):
             if verdict[trouble]:
-                note(f"{file.path.name} ({truth.name}, {file.kind}): {trouble} {verdict[trouble]}: {reading.trouble}")
-    headings = ["files", "refused", "in_sound", "missed", "silent_errors", "unprotected_errors"]
-    print_table(["damage", *headings], [[kind, *(c[h] for h in headings)] for kind, c in sorted(by_kind.items())])
+                note(
+                    f"{file.path.name} ({truth.name}, {file.kind}): {trouble} {verdict[trouble]}: {reading.trouble}"
+                )
+    headings = [
+        "files",
+        "refused",
+        "in_sound",
+        "missed",
+        "silent_errors",
+        "unprotected_errors",
+    ]
+    print_table(
+        ["damage", *headings],
+        [[kind, *(c[h] for h in headings)] for kind, c in sorted(by_kind.items())],
+    )
     figures = {
         "files": len(damaged),
         "crashes": totals["crashes"],
@@ -91,26 +112,44 @@ def judge(damaged: list[tuple[Damaged, Truth]], readings: list[Reading]) -> dict
         "refused": totals["refused"],
         "unprotected_errors": totals["unprotected_errors"],
     }
-    return {**figures, "passed": all(figures[name] == target for name, target in TARGETS.items())}
+    return {
+        **figures,
+        "passed": all(figures[name] == target for name, target in TARGETS.items()),
+    }
 
 
 def judge_one(file: Damaged, truth: Truth, reading: Reading) -> Counter[str]:
-    verdict = Counter(files=1, crashes=int(reading.crashed), hangs=int(reading.hung), refused=int(reading.refused))
+    verdict = Counter(
+        files=1,
+        crashes=int(reading.crashed),
+        hangs=int(reading.hung),
+        refused=int(reading.refused),
+    )
     found = {name: Counter(messages) for name, messages in reading.messages.items()}
     for chunk in truth.sound_chunks(file.content):
         verdict["in_sound"] += len(chunk)
-        verdict["missed"] += sum(not found.get(name, {}).get(message, 0) for name, message in chunk)
+        verdict["missed"] += sum(
+            not found.get(name, {}).get(message, 0) for name, message in chunk
+        )
     for name, message in truth.sound_loose(file.content):
         verdict["loose"] += 1
         verdict["loose_missed"] += not found.get(name, {}).get(message, 0)
     if reading.refused or reading.crashed or reading.hung:
         return verdict
-    wrong = sum((count - truth.messages.get(name, Counter())).total() for name, count in found.items())
+    wrong = sum(
+        (count - truth.messages.get(name, Counter())).total()
+        for name, count in found.items()
+    )
     wrong += sum(reading.types[name] != truth.types.get(name) for name in found)
-    wrong += sum(truth.metadata.get(name) != content for name, content in reading.metadata.items())
+    wrong += sum(
+        truth.metadata.get(name) != content
+        for name, content in reading.metadata.items()
+    )
     missing = truth.count - sum(count.total() for count in found.values())
     if wrong and not reading.names_loss:
-        verdict["unprotected_errors" if reading.names_unprotected else "silent_errors"] += wrong
+        verdict[
+            "unprotected_errors" if reading.names_unprotected else "silent_errors"
+        ] += wrong
     if missing > 0 and not (reading.names_loss or reading.names_unprotected):
         verdict["silent_errors"] += missing
     return verdict

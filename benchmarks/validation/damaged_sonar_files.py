@@ -37,7 +37,12 @@ from sonar_recordings import Aris, Ddf, Oculus, images
 
 from sonar_graph.errors import SonarGraphError
 from sonar_graph.logs import read_sonar_frames
-from sonar_graph.logs.convert import SonarConversion, convert_aris, convert_didson, convert_oculus
+from sonar_graph.logs.convert import (
+    SonarConversion,
+    convert_aris,
+    convert_didson,
+    convert_oculus,
+)
 
 FILES, QUICK_FILES = 1000, 60
 FRAMES = 8
@@ -67,9 +72,13 @@ def main() -> int:
     parser = make_parser(__doc__, data=True)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        sources = make_sources(Path(folder), Path(options.data) if options.data else None)
+        sources = make_sources(
+            Path(folder), Path(options.data) if options.data else None
+        )
         note(f"recordings: {', '.join(source.name for source in sources)}")
-        figures = judge_all(make_files(sources, QUICK_FILES if options.quick else FILES), Path(folder))
+        figures = judge_all(
+            make_files(sources, QUICK_FILES if options.quick else FILES), Path(folder)
+        )
     print_figures(figures)
     return 0 if figures["passed"] else 1
 
@@ -85,9 +94,21 @@ def make_sources(folder: Path, data: Path | None) -> list[Source]:
     ]
     real = data / "sonar" if data else Path()
     if (real / "sample.aris").exists():
-        kinds.append(("sample.aris", convert_aris, split(real / "sample.aris", 1024, 1024 + 48 * 2000)))
+        kinds.append(
+            (
+                "sample.aris",
+                convert_aris,
+                split(real / "sample.aris", 1024, 1024 + 48 * 2000),
+            )
+        )
     if (real / "three_pings_8bit.raw").exists():
-        kinds.append(("three_pings_8bit.raw", convert_oculus, split(real / "three_pings_8bit.raw", 0, 182_016)))
+        kinds.append(
+            (
+                "three_pings_8bit.raw",
+                convert_oculus,
+                split(real / "three_pings_8bit.raw", 0, 182_016),
+            )
+        )
     sources = []
     for name, convert, pieces in kinds:
         _, frames = read(convert, b"".join(pieces), folder)
@@ -98,7 +119,10 @@ def make_sources(folder: Path, data: Path | None) -> list[Source]:
 
 def split(path: Path, header: int, size: int) -> list[bytes]:
     content = path.read_bytes()
-    return [content[:header], *(content[at : at + size] for at in range(header, len(content), size))]
+    return [
+        content[:header],
+        *(content[at : at + size] for at in range(header, len(content), size)),
+    ]
 
 
 def make_files(sources: list[Source], count: int) -> Iterator[Damaged]:
@@ -115,14 +139,22 @@ def make_files(sources: list[Source], count: int) -> Iterator[Damaged]:
         yield Damaged(source, kind, content)
 
 
-def read(convert: Convert, content: bytes, folder: Path) -> tuple[SonarConversion, list[Frame]]:
+def read(
+    convert: Convert, content: bytes, folder: Path
+) -> tuple[SonarConversion, list[Frame]]:
     path, log = folder / "damaged.bin", folder / "damaged.mcap"
     path.write_bytes(content)
     done = convert(path, log)
     frames = [
-        (image.tobytes(), stamp_ns, block.ranges_m.tobytes() + block.azimuths_rad.tobytes())
+        (
+            image.tobytes(),
+            stamp_ns,
+            block.ranges_m.tobytes() + block.azimuths_rad.tobytes(),
+        )
         for block in read_sonar_frames(log)
-        for stamp_ns, image in zip(block.stamps_ns.tolist(), block.intensity, strict=True)
+        for stamp_ns, image in zip(
+            block.stamps_ns.tolist(), block.intensity, strict=True
+        )
     ]
     return done, frames
 
@@ -149,13 +181,29 @@ def judge_all(files: Iterator[Damaged], folder: Path) -> dict[str, Any]:
         totals += verdict
         for trouble in ("crashes", "hangs", "silent_errors", "missed"):
             if verdict[trouble]:
-                note(f"file {number} ({file.source.name}, {file.kind}): {trouble} {verdict[trouble]}")
-    headings = ["files", "refused", "read", "intact", "missed", "silent_errors", *UNSEEN]
-    print_table(["damage", *headings], [[kind, *(c[h] for h in headings)] for kind, c in sorted(by_kind.items())])
+                note(
+                    f"file {number} ({file.source.name}, {file.kind}): {trouble} {verdict[trouble]}"
+                )
+    headings = [
+        "files",
+        "refused",
+        "read",
+        "intact",
+        "missed",
+        "silent_errors",
+        *UNSEEN,
+    ]
+    print_table(
+        ["damage", *headings],
+        [[kind, *(c[h] for h in headings)] for kind, c in sorted(by_kind.items())],
+    )
     names = ("files", "crashes", "hangs", "silent_errors", "refused", *UNSEEN)
     figures: dict[str, Any] = {name: totals[name] for name in names}
     figures["recovered_share"] = 1 - totals["missed"] / max(totals["intact"], 1)
-    return {**figures, "passed": all(figures[name] == target for name, target in TARGETS.items())}
+    return {
+        **figures,
+        "passed": all(figures[name] == target for name, target in TARGETS.items()),
+    }
 
 
 def judge(file: Damaged, folder: Path) -> Counter[str]:
@@ -181,7 +229,11 @@ def judge(file: Damaged, folder: Path) -> Counter[str]:
     intact = intact_frames(file)
     images_read = {image for image, _, _ in frames}
     verdict["intact"] = len(intact)
-    verdict["missed"] = 0 if verdict["refused"] else sum(file.source.frames[i][0] not in images_read for i in intact)
+    verdict["missed"] = (
+        0
+        if verdict["refused"]
+        else sum(file.source.frames[i][0] not in images_read for i in intact)
+    )
     if verdict["missed"] and not says_so:
         verdict["silent_errors"] += verdict["missed"]
     return verdict
@@ -190,7 +242,9 @@ def judge(file: Damaged, folder: Path) -> Counter[str]:
 def intact_frames(file: Damaged) -> list[int]:
     """Frames that are in the damaged file together with the one after; the last one with the end of the file."""
     pieces = file.source.pieces[1:]
-    return [i for i in range(len(pieces) - 1) if pieces[i] + pieces[i + 1] in file.content]
+    return [
+        i for i in range(len(pieces) - 1) if pieces[i] + pieces[i + 1] in file.content
+    ]
 
 
 def compare(file: Damaged, frames: list[Frame]) -> Counter[str]:
@@ -200,15 +254,27 @@ def compare(file: Damaged, frames: list[Frame]) -> Counter[str]:
     for image, stamp_ns, geometry in frames:
         meant = recorded_frame(file.source, image, stamp_ns - origin_ns)
         if meant is None:
-            verdict["unseen_shifts" if BY_A_FRAME & set(file.kind.split(" and ")) else "silent_errors"] += 1
+            verdict[
+                "unseen_shifts"
+                if BY_A_FRAME & set(file.kind.split(" and "))
+                else "silent_errors"
+            ] += 1
             continue
         right_image, right_time_ns, right_geometry = file.source.frames[meant]
         verdict["unseen_samples"] += image != right_image
         late_ns = abs(stamp_ns - origin_ns - right_time_ns)
         if late_ns > ROUNDING_NS:
-            verdict["unseen_times" if late_ns < between_neighbours_ns(file.source, meant) else "silent_errors"] += 1
+            verdict[
+                "unseen_times"
+                if late_ns < between_neighbours_ns(file.source, meant)
+                else "silent_errors"
+            ] += 1
         if not same_geometry(geometry, right_geometry):
-            verdict["unseen_settings" if len(frames) < ENOUGH_TO_COMPARE else "silent_errors"] += 1
+            verdict[
+                "unseen_settings"
+                if len(frames) < ENOUGH_TO_COMPARE
+                else "silent_errors"
+            ] += 1
     return verdict
 
 
@@ -231,7 +297,9 @@ def recorded_frame(source: Source, image: bytes, stamp_ns: int) -> int | None:
     for number, (recorded, recorded_ns, _) in enumerate(source.frames):
         if len(recorded) == len(image):
             difference = values ^ np.frombuffer(recorded, np.uint8)
-            is_flip = ((difference & (difference - 1)) == 0) | ((values & (values - 1)) == 0)
+            is_flip = ((difference & (difference - 1)) == 0) | (
+                (values & (values - 1)) == 0
+            )
             if np.all(is_flip) and np.count_nonzero(difference & values) <= MOST_FLIPS:
                 found.append((abs(recorded_ns - stamp_ns), number))
     return min(found)[1] if found else None
@@ -247,7 +315,9 @@ def between_neighbours_ns(source: Source, number: int) -> int:
 
 def same_geometry(one: bytes, other: bytes) -> bool:
     """To a thousandth, by which the speed of sound may drift."""
-    return len(one) == len(other) and bool(np.allclose(np.frombuffer(one), np.frombuffer(other), rtol=DRIFT, atol=1e-9))
+    return len(one) == len(other) and bool(
+        np.allclose(np.frombuffer(one), np.frombuffer(other), rtol=DRIFT, atol=1e-9)
+    )
 
 
 if __name__ == "__main__":

@@ -101,7 +101,11 @@ def missing_block(content: bytes, _: Truth, rng: Generator) -> bytes:
 
 def doubled_block(content: bytes, _: Truth, rng: Generator) -> bytes:
     at = int(rng.integers(8, len(content)))
-    return content[:at] + content[max(at - int(rng.integers(1, 5000)), 0) : at] + content[at:]
+    return (
+        content[:at]
+        + content[max(at - int(rng.integers(1, 5000)), 0) : at]
+        + content[at:]
+    )
 
 
 DAMAGES: dict[str, Callable[[bytes, Truth, Generator], bytes]] = {

@@ -37,9 +37,15 @@ NS = 1_000_000_000
 
 def nees(seed: int) -> Floats:
     """Per dimension, and the error in m, by gap, mode and instant: shape (4, 3, 3, 2)."""
-    sequence = simulate_basin(BasinOptions(seed=seed, duration_s=300.0, laps=1, speed_m_s=0.3, frame_rate_hz=1))
+    sequence = simulate_basin(
+        BasinOptions(
+            seed=seed, duration_s=300.0, laps=1, speed_m_s=0.3, frame_rate_hz=1
+        )
+    )
     begin_s = np.random.default_rng(seed).uniform(20.0, 200.0)
-    return np.array([[judged(sequence, mode, begin_s, gap_s) for mode in MODES] for gap_s in GAPS_S])
+    return np.array(
+        [[judged(sequence, mode, begin_s, gap_s) for mode in MODES] for gap_s in GAPS_S]
+    )
 
 
 def judged(sequence: Sequence, mode: str, begin_s: float, gap_s: float) -> Floats:
@@ -48,17 +54,28 @@ def judged(sequence: Sequence, mode: str, begin_s: float, gap_s: float) -> Float
     begin_ns = sequence.start_ns + round(begin_s * NS)
     end_ns = begin_ns + round(gap_s * NS)
     stamps = sequence.dvl.stamps_ns
-    lost = replace(sequence, dvl=sequence.dvl.rows((stamps <= begin_ns) | (stamps >= end_ns)))
+    lost = replace(
+        sequence, dvl=sequence.dvl.rows((stamps <= begin_ns) | (stamps >= end_ns))
+    )
     if mode == "no accelerometer":
-        lost = replace(lost, imu=replace(lost.imu, specific_force=np.full_like(lost.imu.specific_force, np.nan)))
+        lost = replace(
+            lost,
+            imu=replace(
+                lost.imu, specific_force=np.full_like(lost.imu.specific_force, np.nan)
+            ),
+        )
     if mode == "straight":
         dvl = lost.calibration.dvl.model_copy(update={"gap_s": 1e3})
-        lost = replace(lost, calibration=lost.calibration.model_copy(update={"dvl": dvl}))
+        lost = replace(
+            lost, calibration=lost.calibration.model_copy(update={"dvl": dvl})
+        )
     instants = np.array([end_ns - NS // 20, end_ns + NS // 2, end_ns + 10 * NS])
     found = run_estimator(lost, "dead-reckoning", instants_ns=instants).causal
     assert found is not None
     error = found.positions - sequence.truth.at(instants).positions
-    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(world_position_covs(found)), error)
+    squares = np.einsum(
+        "ni,nij,nj->n", error, np.linalg.inv(world_position_covs(found)), error
+    )
     return np.column_stack([squares / 3, np.linalg.norm(error, axis=1)])
 
 
@@ -70,13 +87,23 @@ def main() -> None:
     found = np.array(in_parallel(nees, range(runs), arguments.workers, "seed"))
     tail = (1 - BAND_PROBABILITY) / 2
     band = [float(chi2.ppf(p, 3 * runs) / (3 * runs)) for p in (tail, 1 - tail)]
-    mean, error_m = found[..., 0].mean(axis=0), np.sqrt(np.square(found[..., 1]).mean(axis=0))
+    mean, error_m = (
+        found[..., 0].mean(axis=0),
+        np.sqrt(np.square(found[..., 1]).mean(axis=0)),
+    )
     rows = [
         (f"{gap_s:g} s, {mode}", *mean[g, m].tolist(), *error_m[g, m].tolist())
         for g, gap_s in enumerate(GAPS_S)
         for m, mode in enumerate(MODES)
     ]
-    print_table(("gap", *(f"NEES/3 {when}" for when in WHEN), *(f"RMSE m {when}" for when in WHEN)), rows)
+    print_table(
+        (
+            "gap",
+            *(f"NEES/3 {when}" for when in WHEN),
+            *(f"RMSE m {when}" for when in WHEN),
+        ),
+        rows,
+    )
     inside = (mean[:, 0] >= band[0]) & (mean[:, 0] <= band[1])
     figures = {
         "runs": runs,

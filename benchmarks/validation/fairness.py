@@ -77,9 +77,13 @@ Case = tuple[str, int, str, str]
 Scores = dict[str, float]
 
 
-def basin(bias_rad_s: float, seed: int, duration_s: float, wrong_ids: float) -> Sequence:
+def basin(
+    bias_rad_s: float, seed: int, duration_s: float, wrong_ids: float
+) -> Sequence:
     """A basin whose gyros have a bias of this sigma."""
-    nominal = simulate_basin(BasinOptions(duration_s=120.0, laps=1)).calibration.imu.gyro_bias_sigma
+    nominal = simulate_basin(
+        BasinOptions(duration_s=120.0, laps=1)
+    ).calibration.imu.gyro_bias_sigma
     options = BasinOptions(
         seed=seed, duration_s=duration_s, laps=max(1, round(duration_s / 333.0)), gyro_bias_scale=bias_rad_s / nominal,
         tracks=True, id_delay_s=5.0, wrong_id_rate=wrong_ids,
@@ -93,24 +97,32 @@ def with_bias_otherwise(sequence: Sequence, estimator: str) -> Sequence:
     imu = calibration.imu
     changed: dict[str, float] = {"gyro_bias_sigma": 0.0}
     if estimator == "ekf-slam":
-        density = math.hypot(imu.gyro_noise_density, imu.gyro_bias_sigma * math.sqrt(BIAS_IN_Q_S))
+        density = math.hypot(
+            imu.gyro_noise_density, imu.gyro_bias_sigma * math.sqrt(BIAS_IN_Q_S)
+        )
         changed = {"gyro_noise_density": density}
     calibration = calibration.model_copy(update={"imu": imu.model_copy(update=changed)})
     return dataclasses.replace(sequence, calibration=calibration)
 
 
-def run_case(folders: dict[int, Path], duration_s: float, wrong_ids: float, case: Case) -> Scores:
+def run_case(
+    folders: dict[int, Path], duration_s: float, wrong_ids: float, case: Case
+) -> Scores:
     """Scores of one estimator with one choice on one run; NaN where it failed."""
     world, number, estimator, variant = case
     if world.startswith("mrclam"):
         sequence = read_mrclam(folders[int(world.removeprefix("mrclam"))], number)
     else:
-        sequence = basin(float(world.removeprefix("basin")), number, duration_s, wrong_ids)
+        sequence = basin(
+            float(world.removeprefix("basin")), number, duration_s, wrong_ids
+        )
     if variant == "bias":
         sequence = with_bias_otherwise(sequence, estimator)
     instants = sequence.instants(RATE_HZ)
     settings = VARIANTS[estimator][variant]
-    run = run_estimator(sequence, estimator, settings, instants_ns=instants, interim_maps=False)
+    run = run_estimator(
+        sequence, estimator, settings, instants_ns=instants, interim_maps=False
+    )
     if run.status == "failed":
         return dict.fromkeys(SCORES, float("nan"))
     (scores,) = judge(sequence, instants, [run]).scores.values()
@@ -122,8 +134,17 @@ def collect(cases: list[Case], runs: list[Scores]) -> list[dict[str, Any]]:
     rows = []
     for world, estimator, variant in dict.fromkeys((w, e, v) for w, _, e, v in cases):
         here = world, estimator, variant
-        chosen = [run for (w, _, e, v), run in zip(cases, runs, strict=True) if (w, e, v) == here]
-        row: dict[str, Any] = {"world": world, "estimator": estimator, "choice": variant, "runs": len(chosen)}
+        chosen = [
+            run
+            for (w, _, e, v), run in zip(cases, runs, strict=True)
+            if (w, e, v) == here
+        ]
+        row: dict[str, Any] = {
+            "world": world,
+            "estimator": estimator,
+            "choice": variant,
+            "runs": len(chosen),
+        }
         if variant == "bias":
             row["choice"] = BIAS[estimator]
         for key in SCORES:
@@ -131,7 +152,12 @@ def collect(cases: list[Case], runs: list[Scores]) -> list[dict[str, Any]]:
             mean = float(np.mean(values)) if values else math.nan
             row[key] = mean if math.isfinite(mean) else None
         row["worst_map_m"] = max(
-            (v for run in chosen if math.isfinite(v := run.get("landmarks.se2_m", math.nan))), default=None
+            (
+                v
+                for run in chosen
+                if math.isfinite(v := run.get("landmarks.se2_m", math.nan))
+            ),
+            default=None,
         )
         row["lost"] = sum(not max(run.values()) <= LOST_M for run in chosen)
         rows.append(row)
@@ -140,12 +166,29 @@ def collect(cases: list[Case], runs: list[Scores]) -> list[dict[str, Any]]:
 
 def main() -> None:
     parser = make_parser(__doc__, data=True, workers=True)
-    worlds = [*(f"mrclam{number}" for number in ROBOTS), *(f"basin{bias:g}" for bias in GYRO_BIASES)]
-    parser.add_argument("--worlds", default=",".join(worlds), help=f"some of {','.join(worlds)}")
-    parser.add_argument("--estimators", default=",".join(VARIANTS), help=f"some of {','.join(VARIANTS)}")
-    parser.add_argument("--choices", help="some of default, gate, ...; those that an estimator has (default: all)")
-    parser.add_argument("--seeds", type=int, default=10, help="basins with each bias (default: 10)")
-    parser.add_argument("--wrong-ids", type=float, default=0.0, help="share of the basins' tracks (default: 0)")
+    worlds = [
+        *(f"mrclam{number}" for number in ROBOTS),
+        *(f"basin{bias:g}" for bias in GYRO_BIASES),
+    ]
+    parser.add_argument(
+        "--worlds", default=",".join(worlds), help=f"some of {','.join(worlds)}"
+    )
+    parser.add_argument(
+        "--estimators", default=",".join(VARIANTS), help=f"some of {','.join(VARIANTS)}"
+    )
+    parser.add_argument(
+        "--choices",
+        help="some of default, gate, ...; those that an estimator has (default: all)",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=10, help="basins with each bias (default: 10)"
+    )
+    parser.add_argument(
+        "--wrong-ids",
+        type=float,
+        default=0.0,
+        help="share of the basins' tracks (default: 0)",
+    )
     arguments = parser.parse_args()
     asked, estimators = arguments.worlds.split(","), arguments.estimators.split(",")
     if unknown := (set(asked) - set(worlds)) | (set(estimators) - set(VARIANTS)):
@@ -155,27 +198,56 @@ def main() -> None:
         choices, duration_s, seeds = choices or "default,gate", 120.0, range(1)
     cases: list[Case] = []
     for world in asked:
-        numbers = ROBOTS[int(world.removeprefix("mrclam"))] if world.startswith("mrclam") else seeds
+        numbers = (
+            ROBOTS[int(world.removeprefix("mrclam"))]
+            if world.startswith("mrclam")
+            else seeds
+        )
         for estimator in estimators:
-            variants = [v for v in VARIANTS[estimator] if choices is None or v in choices.split(",")]
-            cases += [(world, n, estimator, v) for v in variants for n in (numbers[:1] if arguments.quick else numbers)]
+            variants = [
+                v
+                for v in VARIANTS[estimator]
+                if choices is None or v in choices.split(",")
+            ]
+            cases += [
+                (world, n, estimator, v)
+                for v in variants
+                for n in (numbers[:1] if arguments.quick else numbers)
+            ]
     with ExitStack() as unpacked:
         folders = {
             number: unpacked.enter_context(
-                recording(arguments.data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}")
+                recording(
+                    arguments.data,
+                    f"mrclam_ds{number}.tar.xz",
+                    f"MRCLAM_Dataset{number}",
+                )
             )
             for number in ROBOTS
             if f"mrclam{number}" in asked
         }
-        runs = in_parallel(partial(run_case, folders, duration_s, arguments.wrong_ids), cases, arguments.workers, "run")
+        runs = in_parallel(
+            partial(run_case, folders, duration_s, arguments.wrong_ids),
+            cases,
+            arguments.workers,
+            "run",
+        )
     rows = collect(cases, runs)
     shown = ("choice", *SCORES, "worst_map_m", "lost", "runs")
     print_table(
         ("", *shown),
-        [(f"{r['world']} {r['estimator']}", *("-" if r[key] is None else r[key] for key in shown)) for r in rows],
+        [
+            (
+                f"{r['world']} {r['estimator']}",
+                *("-" if r[key] is None else r[key] for key in shown),
+            )
+            for r in rows
+        ],
     )
     judged = [r for r in rows if r["world"] == "mrclam9" and r["choice"] == "default"]
-    passed = all(r["worst_map_m"] is not None and r["worst_map_m"] <= MAP_M for r in judged)
+    passed = all(
+        r["worst_map_m"] is not None and r["worst_map_m"] <= MAP_M for r in judged
+    )
     conclude({"rows": rows, "passed": passed}, is_quick=arguments.quick)
 
 

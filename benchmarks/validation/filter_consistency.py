@@ -37,7 +37,14 @@ sys.path.append(str(Path(__file__).resolve().parent))
 from common import conclude, in_parallel, make_parser, note, print_table, refuse
 from consistency import SETTLING_S, judge
 
-from sonar_graph.evaluation import ErrorSeries, RunResult, compare, landmark_errors, normalised_squares, rmse
+from sonar_graph.evaluation import (
+    ErrorSeries,
+    RunResult,
+    compare,
+    landmark_errors,
+    normalised_squares,
+    rmse,
+)
 from sonar_graph.models import by_biases
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import keyframes
@@ -92,32 +99,61 @@ class Told:
     """Of the sightings of known landmarks."""
 
 
-def run_seed(basin: Basin, names: tuple[str, ...], has_vertical_scale: bool, seed: int) -> dict[str, Told]:
+def run_seed(
+    basin: Basin, names: tuple[str, ...], has_vertical_scale: bool, seed: int
+) -> dict[str, Told]:
     """All estimators on one basin."""
     if has_vertical_scale:
-        whole: Any = lambda D, dR, dp, up, _, arm: by_biases(D, dR, dp, up, np.zeros(3), arm)  # noqa: E731
+
+        def whole(D, dR, dp, up, _, arm):
+            return by_biases(D, dR, dp, up, np.zeros(3), arm)
+
         keyframes.by_biases = whole
-    scale_error = basin.scale_sigma * float(np.random.default_rng((seed, 1)).standard_normal())
-    sequence = simulate_basin(BasinOptions(seed=seed, dvl_scale_error=scale_error, **basin.options))
-    dvl = sequence.calibration.dvl.model_copy(update={"scale_sigma": basin.stated_sigma})
-    sequence = replace(sequence, calibration=sequence.calibration.model_copy(update={"dvl": dvl}))
-    comparison = compare(sequence, [ESTIMATORS[short] for short in names], rate_hz=RATE_HZ)
+    scale_error = basin.scale_sigma * float(
+        np.random.default_rng((seed, 1)).standard_normal()
+    )
+    sequence = simulate_basin(
+        BasinOptions(seed=seed, dvl_scale_error=scale_error, **basin.options)
+    )
+    dvl = sequence.calibration.dvl.model_copy(
+        update={"scale_sigma": basin.stated_sigma}
+    )
+    sequence = replace(
+        sequence, calibration=sequence.calibration.model_copy(update={"dvl": dvl})
+    )
+    comparison = compare(
+        sequence, [ESTIMATORS[short] for short in names], rate_hz=RATE_HZ
+    )
     told = {}
     for short, run in zip(names, comparison.runs, strict=True):
         if run.status == "failed":
             raise RuntimeError(f"seed {seed}: {run.estimator}: {run.reason}")
-        seconds = (comparison.errors[run.estimator]["causal"].stamps_ns - sequence.start_ns) * 1e-9
-        told[short] = tell(run, comparison.errors[run.estimator]["causal"], seconds, sequence.true_landmarks)
+        seconds = (
+            comparison.errors[run.estimator]["causal"].stamps_ns - sequence.start_ns
+        ) * 1e-9
+        told[short] = tell(
+            run,
+            comparison.errors[run.estimator]["causal"],
+            seconds,
+            sequence.true_landmarks,
+        )
     return told
 
 
-def tell(run: RunResult, errors: ErrorSeries, seconds: np.ndarray, true_landmarks: LandmarkMap) -> Told:
+def tell(
+    run: RunResult,
+    errors: ErrorSeries,
+    seconds: np.ndarray,
+    true_landmarks: LandmarkMap,
+) -> Told:
     """The figures of one run."""
     kept = seconds > SETTLING_S
     nees = {"position": errors.nees_position[kept], "yaw": errors.nees_yaw[kept]}
     mapped = landmark_errors(run.landmarks, true_landmarks)
     squares = normalised_squares(mapped.horizontal_m, mapped.horizontal_covs)
-    used, gated = (run.detections.outcomes.count(kind) for kind in (Outcome.USED, Outcome.GATED))
+    used, gated = (
+        run.detections.outcomes.count(kind) for kind in (Outcome.USED, Outcome.GATED)
+    )
     return Told(
         nees=nees,
         landmarks=float(squares.mean() / 2) if len(squares) else float("nan"),
@@ -133,7 +169,9 @@ def spread(values: np.ndarray) -> tuple[float, float, float]:
     return mean, mean - half, mean + half
 
 
-def summarise(basin: str, short: str, runs: list[Told]) -> tuple[list[tuple[object, ...]], dict[str, Any]]:
+def summarise(
+    basin: str, short: str, runs: list[Told]
+) -> tuple[list[tuple[object, ...]], dict[str, Any]]:
     """Rows of the table and figures by name, of one estimator in one basin."""
     rows: list[tuple[object, ...]] = []
     figures: dict[str, Any] = {}
@@ -144,7 +182,17 @@ def summarise(basin: str, short: str, runs: list[Told]) -> tuple[list[tuple[obje
         where = "inside" if verdict.final_inside else "OUTSIDE"
         holds = "holds 1" if verdict.average_fits else "DOES NOT"
         name = f"{ESTIMATORS[short]} {quantity}"
-        rows.append((name, verdict.final, f"{low:.3f}..{high:.3f}", where, verdict.average, f"{a:.3f}..{b:.3f}", holds))
+        rows.append(
+            (
+                name,
+                verdict.final,
+                f"{low:.3f}..{high:.3f}",
+                where,
+                verdict.average,
+                f"{a:.3f}..{b:.3f}",
+                holds,
+            )
+        )
         prefix = f"{basin}_{short}_{quantity}"
         figures[f"{prefix}_anees"] = verdict.final
         figures[f"{prefix}_inside"] = verdict.final_inside
@@ -155,11 +203,25 @@ def summarise(basin: str, short: str, runs: list[Told]) -> tuple[list[tuple[obje
     if np.isfinite(landmarks).all():
         mean, low, high = spread(landmarks)
         holds = "holds 1" if low <= 1 <= high else "DOES NOT"
-        rows.append((f"{ESTIMATORS[short]} landmarks", "", "", "", mean, f"{low:.3f}..{high:.3f}", holds))
+        rows.append(
+            (
+                f"{ESTIMATORS[short]} landmarks",
+                "",
+                "",
+                "",
+                mean,
+                f"{low:.3f}..{high:.3f}",
+                holds,
+            )
+        )
         figures[f"{basin}_{short}_landmarks_anees"] = mean
         figures[f"{basin}_{short}_landmarks_interval"] = low, high
-    figures[f"{basin}_{short}_rms_m"] = float(np.sqrt(np.mean([run.rms_m**2 for run in runs])))
-    figures[f"{basin}_{short}_gated_share"] = float(np.mean([run.gated_share for run in runs]))
+    figures[f"{basin}_{short}_rms_m"] = float(
+        np.sqrt(np.mean([run.rms_m**2 for run in runs]))
+    )
+    figures[f"{basin}_{short}_gated_share"] = float(
+        np.mean([run.gated_share for run in runs])
+    )
     return rows, figures
 
 
@@ -172,19 +234,47 @@ def report(basin: str, told: list[dict[str, Told]]) -> dict[str, Any]:
         rows += more
         figures |= named
     print(f"{basin}: {len(told)} runs")
-    print_table(("ANEES / dof", "last instant", "band", "", "mean", "95 % interval", ""), rows)
-    errors = [(ESTIMATORS[s], figures[f"{basin}_{s}_rms_m"], figures[f"{basin}_{s}_gated_share"]) for s in told[0]]
+    print_table(
+        ("ANEES / dof", "last instant", "band", "", "mean", "95 % interval", ""), rows
+    )
+    errors = [
+        (
+            ESTIMATORS[s],
+            figures[f"{basin}_{s}_rms_m"],
+            figures[f"{basin}_{s}_gated_share"],
+        )
+        for s in told[0]
+    ]
     print_table(("", "position rms, m", "share gated"), errors)
     return figures
 
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="number of runs in each basin (default: 100; with --quick 4)")
-    parser.add_argument("--first-seed", type=int, default=0, help="runs use this seed and those after it")
-    parser.add_argument("--basins", default=",".join(BASINS), help=f"some of {','.join(BASINS)}")
-    parser.add_argument("--estimators", default=",".join(ESTIMATORS), help=f"some of {','.join(ESTIMATORS)}")
-    parser.add_argument("--vertical-scale", action="store_true", help="let vertical ways tell iSAM2 the scale")
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        help="number of runs in each basin (default: 100; with --quick 4)",
+    )
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=0,
+        help="runs use this seed and those after it",
+    )
+    parser.add_argument(
+        "--basins", default=",".join(BASINS), help=f"some of {','.join(BASINS)}"
+    )
+    parser.add_argument(
+        "--estimators",
+        default=",".join(ESTIMATORS),
+        help=f"some of {','.join(ESTIMATORS)}",
+    )
+    parser.add_argument(
+        "--vertical-scale",
+        action="store_true",
+        help="let vertical ways tell iSAM2 the scale",
+    )
     arguments = parser.parse_args()
     count = arguments.seeds or (4 if arguments.quick else 100)
     basins, names = arguments.basins.split(","), tuple(arguments.estimators.split(","))
@@ -196,14 +286,28 @@ def main() -> None:
     figures: dict[str, Any] = {"runs": count}
     for basin in basins:
         note(f"{basin}:")
-        chosen = replace(BASINS[basin], options=BASINS[basin].options | (QUICK if arguments.quick else {}))
-        told = in_parallel(partial(run_seed, chosen, names, arguments.vertical_scale), seeds, arguments.workers, "seed")
+        chosen = replace(
+            BASINS[basin],
+            options=BASINS[basin].options | (QUICK if arguments.quick else {}),
+        )
+        told = in_parallel(
+            partial(run_seed, chosen, names, arguments.vertical_scale),
+            seeds,
+            arguments.workers,
+            "seed",
+        )
         figures |= report(basin, told)
-    judged = [key for key in figures if key.startswith("nominal") and key.endswith("inside")]
+    judged = [
+        key for key in figures if key.startswith("nominal") and key.endswith("inside")
+    ]
     judged = [key for key in judged if key.split("_")[1] in HELD_TO_BAND]
     met = [figures[key] for key in judged]
     low, high = LANDMARK_BAND
-    met += [low <= value <= high for s in HELD_TO_BAND if (value := figures.get(f"scale_{s}_landmarks_anees"))]
+    met += [
+        low <= value <= high
+        for s in HELD_TO_BAND
+        if (value := figures.get(f"scale_{s}_landmarks_anees"))
+    ]
     figures["passed"] = bool(met) and all(met)
     conclude(figures, is_quick=arguments.quick)
 

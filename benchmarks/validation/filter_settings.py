@@ -58,16 +58,31 @@ def read(folders: dict[str, Path], world: str, number: int) -> Sequence:
     if world == "akit":
         recorded = read_akit(folders[world], number)
         assert recorded.truth is not None
-        dvl_offset = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration).offset.value
-        reference_offset = match_reference_to_imu(recorded.imu, recorded.truth, recorded.calibration).offset.value
+        dvl_offset = match_dvl_to_imu(
+            recorded.imu, recorded.dvl, recorded.calibration
+        ).offset.value
+        reference_offset = match_reference_to_imu(
+            recorded.imu, recorded.truth, recorded.calibration
+        ).offset.value
         sequence = add_landmarks(
-            realigned(recorded, dvl_offset, reference_offset), FAR.model_copy(update={"wrong_id_rate": 0.0})
+            realigned(recorded, dvl_offset, reference_offset),
+            FAR.model_copy(update={"wrong_id_rate": 0.0}),
         )
-        dvl = sequence.calibration.dvl.model_copy(update={"velocity_sigma_m_s": SIGMA_AGAINST_REFERENCE_M_S})
-        return replace(sequence, calibration=sequence.calibration.model_copy(update={"dvl": dvl}))
+        dvl = sequence.calibration.dvl.model_copy(
+            update={"velocity_sigma_m_s": SIGMA_AGAINST_REFERENCE_M_S}
+        )
+        return replace(
+            sequence, calibration=sequence.calibration.model_copy(update={"dvl": dvl})
+        )
     if world == "dlr":
         sequence = first_part(read_dlr(folders[world]), DLR_S)
-        reference = run_estimator(sequence, "isam2", {}, instants_ns=sequence.instants(RATE_HZ), interim_maps=False)
+        reference = run_estimator(
+            sequence,
+            "isam2",
+            {},
+            instants_ns=sequence.instants(RATE_HZ),
+            interim_maps=False,
+        )
         return replace(sequence, true_landmarks=reference.landmarks)
     return read_mrclam(folders[world], number)
 
@@ -75,11 +90,16 @@ def read(folders: dict[str, Path], world: str, number: int) -> Sequence:
 def first_part(sequence: Sequence, seconds: float) -> Sequence:
     """The detections up to an instant, and no instants after it."""
     until_ns = sequence.start_ns + round(seconds * NS_PER_S)
-    blocks = {name: block.between(sequence.start_ns - 1, until_ns) for name, block in sequence.blocks().items()}
+    blocks = {
+        name: block.between(sequence.start_ns - 1, until_ns)
+        for name, block in sequence.blocks().items()
+    }
     return replace(sequence, **blocks)
 
 
-def run_world(folders: dict[str, Path], run: tuple[str, int]) -> list[tuple[Case, dict[str, float]]]:
+def run_world(
+    folders: dict[str, Path], run: tuple[str, int]
+) -> list[tuple[Case, dict[str, float]]]:
     """Scores of all estimators at all shares on one run."""
     world, number = run
     right = read(folders, world, number)
@@ -88,13 +108,20 @@ def run_world(folders: dict[str, Path], run: tuple[str, int]) -> list[tuple[Case
     for share in SHARES:
         sequence = falsified(right, share, [SEED, number]) if share else right
         for label, (estimator, settings) in KERNELS.items():
-            result = run_estimator(sequence, estimator, settings, instants_ns=instants, interim_maps=False)
+            result = run_estimator(
+                sequence, estimator, settings, instants_ns=instants, interim_maps=False
+            )
             scores = {"map": math.nan, "causal": math.nan}
             if result.status != "failed":
                 (values,) = judge(sequence, instants, [result]).scores.values()
                 keys = {"map": "landmarks.se2_m", "causal": "causal.ate_se2_m"}
-                scores = {name: values[key].value if key in values else math.nan for name, key in keys.items()}
-            scores["warned"] = float(any("lie outside the 99.9" in line for line in result.withheld))
+                scores = {
+                    name: values[key].value if key in values else math.nan
+                    for name, key in keys.items()
+                }
+            scores["warned"] = float(
+                any("lie outside the 99.9" in line for line in result.withheld)
+            )
             found.append(((world, number, share, label), scores))
     return found
 
@@ -103,7 +130,11 @@ def kernel_rows(found: list[tuple[Case, dict[str, float]]]) -> list[dict[str, An
     """A row for each world, share and estimator."""
     rows = []
     for world, share, label in dict.fromkeys((w, s, e) for (w, _, s, e), _ in found):
-        runs = [scores for (w, _, s, e), scores in found if (w, s, e) == (world, share, label)]
+        runs = [
+            scores
+            for (w, _, s, e), scores in found
+            if (w, s, e) == (world, share, label)
+        ]
         maps = np.array([scores["map"] for scores in runs])
         causal_m = float(np.mean([scores["causal"] for scores in runs]))
         rows.append(
@@ -126,17 +157,25 @@ def far_case(case: tuple[float, str, bool, int]) -> list[tuple[float, float]]:
     """NEES of position over 3 and error, at each of `AFTER_S` after a gap."""
     gap_s, estimator, far_views, seed = case
     options = MissionOptions(
-        seed=seed, duration_s=BEFORE_S + gap_s + 22.0, frame_rate_hz=0.5, false_detections_per_frame=0
+        seed=seed,
+        duration_s=BEFORE_S + gap_s + 22.0,
+        frame_rate_hz=0.5,
+        false_detections_per_frame=0,
     )
     mission = simulate_mission(options)
     assert mission.truth is not None
     seconds = (mission.dvl.stamps_ns - mission.start_ns) / NS_PER_S
     lost = mission.dvl.rows((seconds <= BEFORE_S) | (seconds >= BEFORE_S + gap_s))
-    first_after = np.searchsorted(lost.stamps_ns, mission.start_ns + (BEFORE_S + gap_s) * NS_PER_S)
-    closed_ns = int(lost.stamps_ns[first_after + 1])  # the second row confirms the first
+    first_after = np.searchsorted(
+        lost.stamps_ns, mission.start_ns + (BEFORE_S + gap_s) * NS_PER_S
+    )
+    # the second row confirms the first
+    closed_ns = int(lost.stamps_ns[first_after + 1])
     instants = closed_ns + np.round(np.array(AFTER_S) * NS_PER_S).astype(np.int64)
     sequence = replace(mission, dvl=lost, depth=None)
-    result = run_estimator(sequence, estimator, {"far_views": far_views}, instants_ns=instants)
+    result = run_estimator(
+        sequence, estimator, {"far_views": far_views}, instants_ns=instants
+    )
     assert result.causal is not None
     found = []
     for row, stamp_ns in enumerate(instants.tolist()):
@@ -150,22 +189,47 @@ def far_case(case: tuple[float, str, bool, int]) -> list[tuple[float, float]]:
 
 def main() -> None:
     parser = make_parser(__doc__, data=True, workers=True)
-    parser.add_argument("--part", choices=("kernel", "far"), required=True, help="which of the two tables")
-    parser.add_argument("--worlds", help="kernel: some of mrclam2, mrclam4, mrclam6, mrclam9, dlr, akit (default: all)")
-    parser.add_argument("--seeds", type=int, default=20, help="missions of each gap (default: 20)")
+    parser.add_argument(
+        "--part",
+        choices=("kernel", "far"),
+        required=True,
+        help="which of the two tables",
+    )
+    parser.add_argument(
+        "--worlds",
+        help="kernel: some of mrclam2, mrclam4, mrclam6, mrclam9, dlr, akit (default: all)",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=20, help="missions of each gap (default: 20)"
+    )
     arguments = parser.parse_args()
     if arguments.part == "far":
         seeds = range(2 if arguments.quick else arguments.seeds)
         kinds = [
-            (gap_s, name, far) for gap_s in GAPS_S for name in ("ekf-slam", "invariant-ekf") for far in (False, True)
+            (gap_s, name, far)
+            for gap_s in GAPS_S
+            for name in ("ekf-slam", "invariant-ekf")
+            for far in (False, True)
         ]
         cases = [(*kind, seed) for kind in kinds for seed in seeds]
-        found = np.array(in_parallel(far_case, cases, arguments.workers, "run")).reshape(len(kinds), len(seeds), -1, 2)
+        found = np.array(
+            in_parallel(far_case, cases, arguments.workers, "run")
+        ).reshape(len(kinds), len(seeds), -1, 2)
         rows = []
         for (gap_s, name, far), runs in zip(kinds, found, strict=True):
             errors = np.sqrt(np.mean(runs[..., 1] ** 2, axis=0))
-            rows.append((f"{gap_s:g} s, {name}, {'on' if far else 'off'}", *np.mean(runs[..., 0], axis=0), *errors))
-        headers = ("", *(f"NEES/3 {s:g} s" for s in AFTER_S), *(f"m {s:g} s" for s in AFTER_S))
+            rows.append(
+                (
+                    f"{gap_s:g} s, {name}, {'on' if far else 'off'}",
+                    *np.mean(runs[..., 0], axis=0),
+                    *errors,
+                )
+            )
+        headers = (
+            "",
+            *(f"NEES/3 {s:g} s" for s in AFTER_S),
+            *(f"m {s:g} s" for s in AFTER_S),
+        )
         print_table(headers, rows)
         conclude({"rows": rows, "passed": True}, is_quick=arguments.quick)
         return
@@ -176,16 +240,34 @@ def main() -> None:
             )
             for n in MRCLAM
         }
-        folders["dlr"] = unpacked.enter_context(recording(arguments.data, "dlr.tar.xz", "dlr"))
-        folders["akit"] = unpacked.enter_context(recording(arguments.data, "akit_1-7.tar.xz", "akit"))
-        runs = [(f"mrclam{n}", robot) for n, robots in MRCLAM.items() for robot in robots]
+        folders["dlr"] = unpacked.enter_context(
+            recording(arguments.data, "dlr.tar.xz", "dlr")
+        )
+        folders["akit"] = unpacked.enter_context(
+            recording(arguments.data, "akit_1-7.tar.xz", "akit")
+        )
+        runs = [
+            (f"mrclam{n}", robot) for n, robots in MRCLAM.items() for robot in robots
+        ]
         runs += [("dlr", 1), *(("akit", n) for n in TRAJECTORIES)]
         if arguments.worlds:
             runs = [run for run in runs if run[0] in arguments.worlds.split(",")]
         runs = runs[:2] if arguments.quick else runs
-        found = [one for run in in_parallel(partial(run_world, folders), runs, arguments.workers, "run") for one in run]
+        found = [
+            one
+            for run in in_parallel(
+                partial(run_world, folders), runs, arguments.workers, "run"
+            )
+            for one in run
+        ]
     rows = kernel_rows(found)
-    print_table(tuple(rows[0]), [tuple("-" if value is None else value for value in row.values()) for row in rows])
+    print_table(
+        tuple(rows[0]),
+        [
+            tuple("-" if value is None else value for value in row.values())
+            for row in rows
+        ],
+    )
     conclude({"rows": rows, "passed": True}, is_quick=arguments.quick)
 
 

@@ -25,7 +25,14 @@ from common import conclude, in_parallel, make_parser, print_table
 from scipy.interpolate import make_interp_spline
 from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, Vehicle
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, PositionCalibration, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    PositionCalibration,
+    Start,
+)
 from sonar_graph.evaluation import run_estimator
 from sonar_graph.evaluation.consistency import world_position_covs
 from sonar_graph.measurements import Dvl, Imu, PositionFixes
@@ -86,10 +93,14 @@ def slow_vehicle(rng: np.random.Generator) -> Vehicle:
     yaw = np.cumsum(knot_s * 0.02 * rng.standard_normal(n))
     tilt = 0.01 * rng.standard_normal((2, n))
     angles = make_interp_spline(knots, np.column_stack([*tilt, yaw - yaw[6]]), k=5)
-    surge = np.column_stack([rng.uniform(0.15, 0.25, n), *(0.02 * rng.standard_normal((2, n)))])
+    surge = np.column_stack(
+        [rng.uniform(0.15, 0.25, n), *(0.02 * rng.standard_normal((2, n)))]
+    )
     fine = np.arange(knots[0], knots[-1], 0.05)
     body_velocity = make_interp_spline(knots, surge, k=5)(fine)
-    world_velocity = Rotation.from_euler("ZYX", angles(fine)[:, ::-1]).apply(body_velocity)
+    world_velocity = Rotation.from_euler("ZYX", angles(fine)[:, ::-1]).apply(
+        body_velocity
+    )
     velocity = make_interp_spline(fine, world_velocity, k=5)
     return Vehicle(angles, velocity, velocity.antiderivative())
 
@@ -112,7 +123,9 @@ def drive(seed: int, case: Case) -> Sequence:
     force += ACCEL_NOISE * noise_density * rng.standard_normal(force.shape)
     velocity = vehicle.doppler(dvl_s)
     velocity += VELOCITY_SIGMA_M_S * rng.standard_normal(velocity.shape)
-    fixes_m = vehicle.position(fix_s) + FIX_SIGMA_M * rng.standard_normal((len(fix_s), 3))
+    fixes_m = vehicle.position(fix_s) + FIX_SIGMA_M * rng.standard_normal(
+        (len(fix_s), 3)
+    )
     position_m = vehicle.position(imu_s)
     start_R = vehicle.attitude(np.zeros(1))[0]
     told_R = start_R * Rotation.from_rotvec(START_SIGMA_RAD * rng.standard_normal(3))
@@ -129,7 +142,9 @@ def drive(seed: int, case: Case) -> Sequence:
             accel_bias_sigma=ACCEL_BIAS_SIGMA,
         ),
         dvl=DvlCalibration(
-            mounting=Mounting(translation_m=tuple(BODY_P_DVL.tolist()), rpy_rad=tuple(dvl_rpy)),
+            mounting=Mounting(
+                translation_m=tuple(BODY_P_DVL.tolist()), rpy_rad=tuple(dvl_rpy)
+            ),
             velocity_sigma_m_s=(VELOCITY_SIGMA_M_S,) * 3,
         ),
         use_gravity=case.use_gravity,
@@ -146,9 +161,19 @@ def drive(seed: int, case: Case) -> Sequence:
         name=f"gap {seed}",
         calibration=calibration,
         imu=Imu(stamps_ns, rate, force),
-        dvl=Dvl(np.rint(dvl_s * 1e9).astype(np.int64), velocity, np.full((len(dvl_s), 3, 3), np.nan)),
-        positions=PositionFixes(np.rint(fix_s * 1e9).astype(np.int64), fixes_m, np.full((len(fix_s), 3, 3), np.nan)),
-        truth=Trajectory.without_covariances(stamps_ns, position_m, vehicle.attitude(imu_s).as_quat()),
+        dvl=Dvl(
+            np.rint(dvl_s * 1e9).astype(np.int64),
+            velocity,
+            np.full((len(dvl_s), 3, 3), np.nan),
+        ),
+        positions=PositionFixes(
+            np.rint(fix_s * 1e9).astype(np.int64),
+            fixes_m,
+            np.full((len(fix_s), 3, 3), np.nan),
+        ),
+        truth=Trajectory.without_covariances(
+            stamps_ns, position_m, vehicle.attitude(imu_s).as_quat()
+        ),
     )
 
 
@@ -169,7 +194,12 @@ def scores(sequence: Sequence, name: str) -> Scores:
     assert sequence.truth is not None
     seconds = (causal.stamps_ns - sequence.start_ns) * 1e-9
     error = causal.positions - sequence.truth.at(causal.stamps_ns).positions  # (n, 3)
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(world_position_covs(causal)), error) / 3
+    nees = (
+        np.einsum(
+            "ni,nij,nj->n", error, np.linalg.inv(world_position_covs(causal)), error
+        )
+        / 3
+    )
     squares_m2 = np.square(error).sum(axis=1)
     in_gap = (seconds > GAP_S[0]) & (seconds < GAP_S[1])
     after = (seconds > GAP_S[1] + JUDGED_S[0]) & (seconds < GAP_S[1] + JUDGED_S[1])
@@ -204,11 +234,39 @@ def main() -> None:
             after_m = float(np.sqrt(of_runs.square_after_m2.mean()))
             nees_in_gap = float(of_runs.nees_in_gap.mean())
             leap_m = float(of_runs.leap_m.max())
-            rows.append((f"{name}, {label}", in_gap_m, nees_in_gap, leap_m, after_m, nees, half, worst))
-            figures[f"{name}, {label}"] = {"rms_in_gap_m": in_gap_m, "rms_m": after_m, "nees": nees, "worst": worst}
+            rows.append(
+                (
+                    f"{name}, {label}",
+                    in_gap_m,
+                    nees_in_gap,
+                    leap_m,
+                    after_m,
+                    nees,
+                    half,
+                    worst,
+                )
+            )
+            figures[f"{name}, {label}"] = {
+                "rms_in_gap_m": in_gap_m,
+                "rms_m": after_m,
+                "nees": nees,
+                "worst": worst,
+            }
             if label in JUDGED_CASES and name in JUDGED:
                 passed = passed and nees - half <= 1.0 and worst <= WORST_NEES
-    print_table(("", "rms m in gap", "NEES/3", "leap m", "rms m after", "NEES/3", "+-", "worst seed"), rows)
+    print_table(
+        (
+            "",
+            "rms m in gap",
+            "NEES/3",
+            "leap m",
+            "rms m after",
+            "NEES/3",
+            "+-",
+            "worst seed",
+        ),
+        rows,
+    )
     figures["passed"] = passed
     conclude(figures, is_quick=arguments.quick)
 

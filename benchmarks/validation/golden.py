@@ -38,7 +38,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import THREAD_VARIABLES, make_parser, note, print_table, recording, refuse
 
 for variable in THREAD_VARIABLES:
-    os.environ.setdefault(variable, "1")  # before numpy: sums in several threads differ from run to run
+    # before numpy: sums in several threads differ from run to run
+    os.environ.setdefault(variable, "1")
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -50,7 +51,12 @@ from sonar_graph.evaluation import RunResult, judge, run_estimator
 from sonar_graph.logs.convert import read_akit, read_dlr, read_mrclam, read_stpere
 from sonar_graph.measurements import Floats, Heading, PositionFixes
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
+from sonar_graph.simulation import (
+    BasinOptions,
+    MissionOptions,
+    simulate_basin,
+    simulate_mission,
+)
 from sonar_graph.states import Trajectory
 
 ESTIMATORS = ("dead-reckoning", "ekf-slam", "invariant-ekf", "isam2")
@@ -99,9 +105,14 @@ def mission_with_gaps(_: Path | None) -> Sequence:
     has_lock = np.ones(len(seconds), dtype=bool)
     for begin_s, end_s in GAPS_S:
         has_lock &= (seconds < begin_s) | (seconds >= end_s)
-    heading_ns = mission.instants(1.0)[:-1] + NS_PER_S // 7  # between the Doppler samples
+    # between the Doppler samples
+    heading_ns = mission.instants(1.0)[:-1] + NS_PER_S // 7
     yaw_rad = mission.truth.at(heading_ns).rotations().as_euler("ZYX")[:, 0]
-    yaw_rad = yaw_rad + HEADING_BIAS_RAD + HEADING_SIGMA_RAD * noise.standard_normal(len(heading_ns))
+    yaw_rad = (
+        yaw_rad
+        + HEADING_BIAS_RAD
+        + HEADING_SIGMA_RAD * noise.standard_normal(len(heading_ns))
+    )
     fixes_ns = mission.instants(1.0 / FIX_PERIOD_S)[:-1]
     body = mission.truth.at(fixes_ns)
     antenna = body.positions + body.rotations().apply(ANTENNA_M)
@@ -113,7 +124,9 @@ def mission_with_gaps(_: Path | None) -> Sequence:
         mission,
         calibration=mission.calibration.model_copy(update={"positions": positions}),
         dvl=mission.dvl.rows(has_lock),
-        heading=Heading(heading_ns, yaw_rad, np.full(len(heading_ns), HEADING_SIGMA_RAD)),
+        heading=Heading(
+            heading_ns, yaw_rad, np.full(len(heading_ns), HEADING_SIGMA_RAD)
+        ),
         positions=PositionFixes(fixes_ns, antenna, covariances),
     )
 
@@ -126,7 +139,12 @@ def basin(_: Path | None) -> Sequence:
 def basin_with_tracks(_: Path | None) -> Sequence:
     """Simulated basin in which identities come late and some are wrong or missing."""
     options = BasinOptions(
-        duration_s=600.0, laps=1, tracks=True, wrong_id_rate=0.1, id_delay_s=1.0, anonymous_share=0.1
+        duration_s=600.0,
+        laps=1,
+        tracks=True,
+        wrong_id_rate=0.1,
+        id_delay_s=1.0,
+        anonymous_share=0.1,
     )
     return simulate_basin(options)
 
@@ -135,7 +153,9 @@ def mrclam(number: int, robot: int) -> Callable[[Path | None], Sequence]:
     """Reader of one robot's run."""
 
     def read(data: Path | None) -> Sequence:
-        with recording(data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}") as folder:
+        with recording(
+            data, f"mrclam_ds{number}.tar.xz", f"MRCLAM_Dataset{number}"
+        ) as folder:
             return read_mrclam(folder, robot)
 
     return read
@@ -159,7 +179,9 @@ def dlr(data: Path | None) -> Sequence:
 
 def stpere(data: Path | None) -> Sequence:
     """Vehicle in a marina, with headings and without landmarks."""
-    with recording(data, "stpere.tar.xz", "DVL.log") as table:  # the archive holds files without a folder
+    with recording(
+        data, "stpere.tar.xz", "DVL.log"
+    ) as table:  # the archive holds files without a folder
         return read_stpere(table.parent)
 
 
@@ -237,11 +259,16 @@ class Place:
 
 def keep(arguments: argparse.Namespace) -> None:
     """Run every chosen estimator on every chosen log, and keep the results."""
-    note(f"sonar_graph: {Path(sonar_graph.__file__).parent}, baselines: {Path(str(baselines.__file__)).parent}")
+    note(
+        f"sonar_graph: {Path(sonar_graph.__file__).parent}, baselines: {Path(str(baselines.__file__)).parent}"
+    )
     for name in [name for name in LOGS if name in arguments.logs]:
         log = LOGS[name]
         seconds = min(log.seconds, QUICK_S) if arguments.quick else log.seconds
-        places = [Place(arguments.folder, name, estimator) for estimator in arguments.estimators]
+        places = [
+            Place(arguments.folder, name, estimator)
+            for estimator in arguments.estimators
+        ]
         missing = [place for place in places if not place.is_kept(seconds)]
         if not missing:
             note(f"{name}: already kept")
@@ -257,7 +284,13 @@ def keep_run(sequence: Sequence, place: Place, seconds: float) -> None:
     instants = sequence.instants(RATE_HZ)
     instants = instants[instants <= sequence.start_ns + round(seconds * NS_PER_S)]
     clock = RunClock(f"{place.log} {place.estimator}")
-    run = run_estimator(sequence, place.estimator, instants_ns=instants, interim_maps=False, progress=clock.step_done)
+    run = run_estimator(
+        sequence,
+        place.estimator,
+        instants_ns=instants,
+        interim_maps=False,
+        progress=clock.step_done,
+    )
     finish_s = clock.finish_s()
     summary: dict[str, Any] = {
         "log": place.log,
@@ -277,14 +310,23 @@ def keep_run(sequence: Sequence, place: Place, seconds: float) -> None:
         assert run.detections is not None
         scores = judge(sequence, instants, [run]).scores[run.estimator]
         for name, keys in SCORES.items():
-            summary[name] = next((scores[key].value for key in keys if key in scores), None)
-        summary["outcomes"] = dict(sorted(Counter(outcome.name for outcome in run.detections.outcomes).items()))
-        write_whole(place.arrays, lambda path: np.savez_compressed(path, **arrays_of(run)))
+            summary[name] = next(
+                (scores[key].value for key in keys if key in scores), None
+            )
+        summary["outcomes"] = dict(
+            sorted(Counter(outcome.name for outcome in run.detections.outcomes).items())
+        )
+        write_whole(
+            place.arrays, lambda path: np.savez_compressed(path, **arrays_of(run))
+        )
     text = json.dumps(summary, indent=1)
-    write_whole(place.summary, lambda path: path.write_text(text, "utf-8"))  # last: it marks the run as kept
+    # last: it marks the run as kept
+    write_whole(place.summary, lambda path: path.write_text(text, "utf-8"))
     rms = summary.get("causal_rms_m")
     result = run.reason if rms is None else f"causal rms {rms:.3f} m"
-    note(f"{place.log} {place.estimator}: {run.status} after {summary['processor_s']:.1f} s {result}")
+    note(
+        f"{place.log} {place.estimator}: {run.status} after {summary['processor_s']:.1f} s {result}"
+    )
 
 
 def arrays_of(run: RunResult) -> dict[str, Any]:
@@ -302,7 +344,9 @@ def arrays_of(run: RunResult) -> dict[str, Any]:
     found["map_covariances"] = run.landmarks.covariances
     found["detection_stamps_ns"] = run.detections.stamps_ns
     found["detection_ids"] = run.detections.landmark_ids
-    found["detection_outcomes"] = np.array([outcome.name for outcome in run.detections.outcomes], dtype=np.str_)
+    found["detection_outcomes"] = np.array(
+        [outcome.name for outcome in run.detections.outcomes], dtype=np.str_
+    )
     found["update_s"] = run.update_s
     return found
 
@@ -347,9 +391,13 @@ def compare(arguments: argparse.Namespace) -> None:
         before = json.loads(old.summary.read_text("utf-8"))
         after = json.loads(new.summary.read_text("utf-8"))
         if before["log_digest"] != after["log_digest"]:
-            faults.append(f"{what}: the two logs differ, so the difference of the results means nothing")
+            faults.append(
+                f"{what}: the two logs differ, so the difference of the results means nothing"
+            )
         if "failed" in (before["status"], after["status"]):
-            faults.append(f"{what}: {before['status']} {before['reason']} -> {after['status']} {after['reason']}")
+            faults.append(
+                f"{what}: {before['status']} {before['reason']} -> {after['status']} {after['reason']}"
+            )
             continue
         difference = difference_of(load(old.arrays), load(new.arrays))
         largest = max(difference)
@@ -357,18 +405,39 @@ def compare(arguments: argparse.Namespace) -> None:
             faults.append(f"{what}: differs by {largest:.1e}")
         rows.append((what, *map(shown, difference), *score_changes(before, after)))
     headers = (
-        *("", "causal m", "rad", "smoothed m", "rad", "pose cov", "map m", "map cov", "outcomes"),
+        *(
+            "",
+            "causal m",
+            "rad",
+            "smoothed m",
+            "rad",
+            "pose cov",
+            "map m",
+            "map cov",
+            "outcomes",
+        ),
         *("causal rms m", "change", "smoothed rms m", "change", "map rms m", "change"),
-        *("NEES causal position", "heading", "smoothed position", "heading", "time s", "ratio"),
+        *(
+            "NEES causal position",
+            "heading",
+            "smoothed position",
+            "heading",
+            "time s",
+            "ratio",
+        ),
     )
     print_table(headers, rows)
     for fault in faults:
         print(fault)
-    print(f"{len(rows)} runs compared, tolerance {tolerance:g}: {'NOT EQUAL' if faults else 'equal'}")
+    print(
+        f"{len(rows)} runs compared, tolerance {tolerance:g}: {'NOT EQUAL' if faults else 'equal'}"
+    )
     raise SystemExit(1 if faults or not rows else 0)
 
 
-def pairs(arguments: argparse.Namespace, faults: list[str]) -> Iterator[tuple[Place, Place]]:
+def pairs(
+    arguments: argparse.Namespace, faults: list[str]
+) -> Iterator[tuple[Place, Place]]:
     """Runs that the new folder holds, with those of the old one; what has no partner is a fault."""
     kept = [
         (log, estimator)
@@ -398,7 +467,8 @@ def difference_of(old: dict[str, Any], new: dict[str, Any]) -> Difference:
     causal_m, causal_rad = pose_difference(old, new, "causal")
     smoothed_m, smoothed_rad = pose_difference(old, new, "smoothed")
     covariances = [
-        relative_difference(old[f"{kind}_covariances"], new[f"{kind}_covariances"]) for kind in ("causal", "smoothed")
+        relative_difference(old[f"{kind}_covariances"], new[f"{kind}_covariances"])
+        for kind in ("causal", "smoothed")
     ]
     map_m = math.inf
     if np.array_equal(old["map_ids"], new["map_ids"]):
@@ -406,14 +476,27 @@ def difference_of(old: dict[str, Any], new: dict[str, Any]) -> Difference:
         map_m = float(distances.max(initial=0.0))
     map_covariance = relative_difference(old["map_covariances"], new["map_covariances"])
     outcomes = changed_outcomes(old, new)
-    return Difference(causal_m, causal_rad, smoothed_m, smoothed_rad, max(covariances), map_m, map_covariance, outcomes)
+    return Difference(
+        causal_m,
+        causal_rad,
+        smoothed_m,
+        smoothed_rad,
+        max(covariances),
+        map_m,
+        map_covariance,
+        outcomes,
+    )
 
 
-def pose_difference(old: dict[str, Any], new: dict[str, Any], kind: str) -> tuple[float, float]:
+def pose_difference(
+    old: dict[str, Any], new: dict[str, Any], kind: str
+) -> tuple[float, float]:
     """Largest distance and angle between the poses of two trajectories; infinite at different stamps."""
     if not np.array_equal(old[f"{kind}_stamps_ns"], new[f"{kind}_stamps_ns"]):
         return math.inf, math.inf
-    distances = np.linalg.norm(new[f"{kind}_positions"] - old[f"{kind}_positions"], axis=1)
+    distances = np.linalg.norm(
+        new[f"{kind}_positions"] - old[f"{kind}_positions"], axis=1
+    )
     before = Rotation.from_quat(old[f"{kind}_quaternions_xyzw"])
     after = Rotation.from_quat(new[f"{kind}_quaternions_xyzw"])
     angles = (before.inv() * after).magnitude()
@@ -458,7 +541,12 @@ def score_changes(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
             cells += ["-", "-"]
         else:
             cells += [f"{new:.4f}", f"{new / old - 1.0:+.2%}"]
-    for name in ("causal_position_nees", "causal_heading_nees", "smoothed_position_nees", "smoothed_heading_nees"):
+    for name in (
+        "causal_position_nees",
+        "causal_heading_nees",
+        "smoothed_position_nees",
+        "smoothed_heading_nees",
+    ):
         old, new = before[name], after[name]
         cells.append("-" if old is None or new is None else f"{old:.3g} -> {new:.3g}")
     cells.append(f"{after['processor_s']:.2f}")
@@ -468,7 +556,9 @@ def score_changes(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
 
 def shown(value: float) -> str:
     """A difference as a cell of the table."""
-    return "0" if value == 0 else str(value) if isinstance(value, int) else f"{value:.1e}"
+    return (
+        "0" if value == 0 else str(value) if isinstance(value, int) else f"{value:.1e}"
+    )
 
 
 @contextmanager
@@ -495,15 +585,34 @@ def names(known: tuple[str, ...]) -> Callable[[str], str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    keeping = commands.add_parser("keep", parents=[make_parser("", data=True)], add_help=False)
+    keeping = commands.add_parser(
+        "keep", parents=[make_parser("", data=True)], add_help=False
+    )
     keeping.add_argument("folder", type=Path)
     comparing = commands.add_parser("compare")
     comparing.add_argument("old", type=Path)
     comparing.add_argument("new", type=Path)
-    comparing.add_argument("--tolerance", type=float, default=1e-9, help="largest difference that counts as equal")
+    comparing.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-9,
+        help="largest difference that counts as equal",
+    )
     for command in (keeping, comparing):
-        command.add_argument("--logs", nargs="+", type=names(tuple(LOGS)), default=list(LOGS), metavar="NAME")
-        command.add_argument("--estimators", nargs="+", type=names(ESTIMATORS), default=ESTIMATORS, metavar="NAME")
+        command.add_argument(
+            "--logs",
+            nargs="+",
+            type=names(tuple(LOGS)),
+            default=list(LOGS),
+            metavar="NAME",
+        )
+        command.add_argument(
+            "--estimators",
+            nargs="+",
+            type=names(ESTIMATORS),
+            default=ESTIMATORS,
+            metavar="NAME",
+        )
     arguments = parser.parse_args()
     with stopped_politely():
         if arguments.command == "keep":
@@ -511,7 +620,9 @@ def main() -> None:
             return
         for folder in (arguments.old, arguments.new):
             if not folder.is_dir():
-                refuse(f"{folder} is not a folder; make one with: golden.py keep FOLDER")
+                refuse(
+                    f"{folder} is not a folder; make one with: golden.py keep FOLDER"
+                )
         compare(arguments)
 
 

@@ -59,7 +59,13 @@ reference = "dead-reckoning"
 logs = [{{ name = "sound", log = "{log}" }}]
 estimators = [{{ name = "dead-reckoning" }}]
 """
-TARGETS = {"tracebacks": 0, "hangs": 0, "silent_errors": 0, "files_lost": 0, "interrupts_missed": 0}
+TARGETS = {
+    "tracebacks": 0,
+    "hangs": 0,
+    "silent_errors": 0,
+    "files_lost": 0,
+    "interrupts_missed": 0,
+}
 
 
 @dataclass
@@ -79,20 +85,35 @@ class Outcome:
 
     @property
     def crashed(self) -> bool:
-        return not self.hung and (self.code not in (0, 1, 2, 3) or b"Traceback (most recent call last)" in self.err)
+        return not self.hung and (
+            self.code not in (0, 1, 2, 3)
+            or b"Traceback (most recent call last)" in self.err
+        )
 
     def has_escapes(self) -> bool:
         """True for characters that a terminal obeys; what is printed is UTF-8."""
         said = (self.out + self.err).decode("utf-8", "replace")
-        return any(category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp") and char not in "\n\t" for char in said)
+        return any(
+            category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp") and char not in "\n\t"
+            for char in said
+        )
 
 
 def digest(sequence: Sequence) -> str:
-    columns = [sequence.imu.stamps_ns, sequence.imu.angular_velocity, sequence.imu.specific_force]
+    columns = [
+        sequence.imu.stamps_ns,
+        sequence.imu.angular_velocity,
+        sequence.imu.specific_force,
+    ]
     columns += [sequence.dvl.stamps_ns, sequence.dvl.velocity]
     columns += [sequence.depth.z_m] if sequence.depth is not None else []
-    mountings = [getattr(sequence.calibration, name).mounting.model_dump_json() for name in ("imu", "dvl", "sonar")]
-    return hashlib.sha256(b"".join(column.tobytes() for column in columns) + "".join(mountings).encode()).hexdigest()
+    mountings = [
+        getattr(sequence.calibration, name).mounting.model_dump_json()
+        for name in ("imu", "dvl", "sonar")
+    ]
+    return hashlib.sha256(
+        b"".join(column.tobytes() for column in columns) + "".join(mountings).encode()
+    ).hexdigest()
 
 
 def reading_of(log: Path) -> dict[str, Any]:
@@ -108,12 +129,16 @@ def reading_of(log: Path) -> dict[str, Any]:
 
 def run_apart(case: Case, folder: Path) -> Outcome:
     """The command in a forked process, and the reading of its log after it."""
-    out, err, read = (folder.with_suffix(suffix) for suffix in (".out", ".err", ".read"))
+    out, err, read = (
+        folder.with_suffix(suffix) for suffix in (".out", ".err", ".read")
+    )
     sys.stdout.flush()
     pid = os.fork()
     if pid == 0:
         os.setsid()
-        resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_LIMIT_S, resource.RLIM_INFINITY))
+        resource.setrlimit(
+            resource.RLIMIT_CPU, (PROCESSOR_LIMIT_S, resource.RLIM_INFINITY)
+        )
         for path, target in ((out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), target)
         code = 99
@@ -140,9 +165,18 @@ def run_apart(case: Case, folder: Path) -> Outcome:
             _, status, usage = os.wait4(pid, 0)
             break
         time.sleep(0.005)
-    reading = json.loads(read.read_text()) if read.exists() and read.stat().st_size else {}
+    reading = (
+        json.loads(read.read_text()) if read.exists() and read.stat().st_size else {}
+    )
     code = os.waitstatus_to_exitcode(status)
-    return Outcome(code, seconds, usage.ru_maxrss * 1024 / 1e6, out.read_bytes(), err.read_bytes(), reading)
+    return Outcome(
+        code,
+        seconds,
+        usage.ru_maxrss * 1024 / 1e6,
+        out.read_bytes(),
+        err.read_bytes(),
+        reading,
+    )
 
 
 def states(paths: list[Path]) -> list[object]:
@@ -157,33 +191,63 @@ def states(paths: list[Path]) -> list[object]:
         if stat.S_ISLNK(kind):
             found.append(str(path.readlink()))
         else:
-            found.append(hashlib.sha256(path.read_bytes()).hexdigest() if stat.S_ISREG(kind) else kind)
+            found.append(
+                hashlib.sha256(path.read_bytes()).hexdigest()
+                if stat.S_ISREG(kind)
+                else kind
+            )
     return found
 
 
-def judge(case: Case, outcome: Outcome, sound: dict[str, Any], lost: int) -> Counter[str]:
-    verdict = Counter(cases=1, tracebacks=int(outcome.crashed), hangs=int(outcome.hung), files_lost=lost)
+def judge(
+    case: Case, outcome: Outcome, sound: dict[str, Any], lost: int
+) -> Counter[str]:
+    verdict = Counter(
+        cases=1,
+        tracebacks=int(outcome.crashed),
+        hangs=int(outcome.hung),
+        files_lost=lost,
+    )
     verdict["refused"] = int(outcome.code == 2)
     reading = outcome.reading
     if "error" in reading and not reading["foreseen"]:
         verdict["tracebacks"] += 1
-    is_other = "digest" in reading and reading["digest"] != sound["digest"] and not case.may_differ
-    is_named = any(sound["notes"].get(subject) != note for subject, note in reading.get("notes", {}).items())
-    verdict["silent_errors"] = int(is_other and not is_named) + int(outcome.has_escapes())
+    is_other = (
+        "digest" in reading
+        and reading["digest"] != sound["digest"]
+        and not case.may_differ
+    )
+    is_named = any(
+        sound["notes"].get(subject) != note
+        for subject, note in reading.get("notes", {}).items()
+    )
+    verdict["silent_errors"] = int(is_other and not is_named) + int(
+        outcome.has_escapes()
+    )
     return verdict
 
 
 def formulas() -> int:
     """Cells of tables that begin a formula; numbers do not."""
-    rows = [[text[:200], "-1.5", "1e-3"] for text in NOISE if "\0" not in text and "\r" not in text]
+    rows = [
+        [text[:200], "-1.5", "1e-3"]
+        for text in NOISE
+        if "\0" not in text and "\r" not in text
+    ]
     cells = [cell for row in csv.reader(io.StringIO(csv_text(rows))) for cell in row]
-    wrong = [cell for cell in cells if cell.startswith(("=", "+", "@")) or (cell.startswith("-") and cell != "-1.5")]
+    wrong = [
+        cell
+        for cell in cells
+        if cell.startswith(("=", "+", "@")) or (cell.startswith("-") and cell != "-1.5")
+    ]
     return len(wrong) + (cells.count("-1.5") != len(rows))
 
 
 def with_gaps(path: Path) -> None:
     """A log whose sensors pause, with faults that the estimators bridge."""
-    sequence = simulate_basin(BasinOptions(duration_s=180.0, laps=1, dvl_dropouts_per_hour=100.0))
+    sequence = simulate_basin(
+        BasinOptions(duration_s=180.0, laps=1, dvl_dropouts_per_hour=100.0)
+    )
     seconds = (sequence.imu.stamps_ns - sequence.start_ns) * 1e-9
     is_kept = np.flatnonzero((seconds % 40 < 36) | (seconds < 5))
     write_log(path, replace(sequence, imu=sequence.imu.rows(is_kept)))
@@ -193,7 +257,16 @@ def interrupts(folder: Path, count: int, rng: np.random.Generator) -> Counter[st
     """Ctrl-C at random moments of a comparison."""
     log, verdict = folder / "gaps.mcap", Counter[str]()
     with_gaps(log)
-    command = [sys.executable, "-m", "sonar_graph", "compare", str(log), "--estimators", "isam2,ekf-slam", "-o"]
+    command = [
+        sys.executable,
+        "-m",
+        "sonar_graph",
+        "compare",
+        str(log),
+        "--estimators",
+        "isam2,ekf-slam",
+        "-o",
+    ]
     began = time.monotonic()
     subprocess.run([*command, str(folder / "whole")], check=True, capture_output=True)
     whole_s = time.monotonic() - began
@@ -202,7 +275,9 @@ def interrupts(folder: Path, count: int, rng: np.random.Generator) -> Counter[st
         if verdict["interrupts"] == count:
             break
         out, after_s = folder / f"interrupted{number}", rng.uniform(0.1, 0.97) * whole_s
-        with subprocess.Popen([*command, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        with subprocess.Popen(
+            [*command, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
             time.sleep(after_s)
             if process.poll() is not None:
                 verdict["interrupts_late"] += 1
@@ -214,51 +289,99 @@ def interrupts(folder: Path, count: int, rng: np.random.Generator) -> Counter[st
                 process.kill()
                 said = b"it did not end"
         files = [path.name for path in out.rglob("*") if path.is_file()]
-        is_whole = "comparison.json" in files and not any("partial" in name for name in files)
-        is_sound = process.returncode == 130 and said.splitlines()[-1:] == [b"sonar-graph: interrupted"]
-        if process.returncode == 0 and is_whole:  # it came while the process was already leaving
+        is_whole = "comparison.json" in files and not any(
+            "partial" in name for name in files
+        )
+        is_sound = process.returncode == 130 and said.splitlines()[-1:] == [
+            b"sonar-graph: interrupted"
+        ]
+        if (
+            process.returncode == 0 and is_whole
+        ):  # it came while the process was already leaving
             verdict["interrupts_late"] += 1
             continue
         verdict["interrupts"] += 1
         if not is_sound or not (is_whole or not files):
             verdict["interrupts_missed"] += 1
-            note(f"interrupt after {after_s:.2f} s: exit {process.returncode}, {said[-300:]!r}, {files}")
+            note(
+                f"interrupt after {after_s:.2f} s: exit {process.returncode}, {said[-300:]!r}, {files}"
+            )
     return verdict
 
 
 def main() -> int:
     parser = make_parser(__doc__)
     parser.add_argument("--cases", type=int, help="number of cases (default: 600)")
-    parser.add_argument("--interrupts", type=int, help="number of interrupted comparisons (default: 30)")
+    parser.add_argument(
+        "--interrupts", type=int, help="number of interrupted comparisons (default: 30)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the cases (default: 0)")
     options = parser.parse_args()
     count = options.cases if options.cases is not None else 32 if options.quick else 600
-    interrupted = options.interrupts if options.interrupts is not None else 2 if options.quick else 30
-    totals, by_kind, rss_mb = Counter[str](), defaultdict[str, Counter[str]](Counter), 0.0
+    interrupted = (
+        options.interrupts
+        if options.interrupts is not None
+        else 2
+        if options.quick
+        else 30
+    )
+    totals, by_kind, rss_mb = (
+        Counter[str](),
+        defaultdict[str, Counter[str]](Counter),
+        0.0,
+    )
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         log = SoundLog.written(folder)
         sound = reading_of(folder / "control.mcap")
         (folder / SUITE).write_text(SUITE_TEXT.format(log=log.path))
-        images = ["--duration-s", "119", "--laps", "1", "--images", "--set", "frame_rate_hz=0.3"]
+        images = [
+            "--duration-s",
+            "119",
+            "--laps",
+            "1",
+            "--images",
+            "--set",
+            "frame_rate_hz=0.3",
+        ]
         for command in (  # compiled and loaded before the first fork
             ["compare", str(log.path), "-o", str(folder / COMPARED)],
             ["simulate", "basin", *images, "-o", str(folder / IMAGED)],
         ):
             with contextlib.suppress(SystemExit):
                 sonar_graph(command)
-        batch = ["bench", str(folder / SUITE), "-o", str(folder / BATCH), "--workers", "1"]
-        subprocess.run([sys.executable, "-m", "sonar_graph", *batch], check=True, capture_output=True)
+        batch = [
+            "bench",
+            str(folder / SUITE),
+            "-o",
+            str(folder / BATCH),
+            "--workers",
+            "1",
+        ]
+        subprocess.run(
+            [sys.executable, "-m", "sonar_graph", *batch],
+            check=True,
+            capture_output=True,
+        )
         for own, case in cases(log, count, options.seed):
             before = states(case.protected)
             outcome = run_apart(case, own)
             after = states(case.protected)
-            verdict = judge(case, outcome, sound, sum(a != b for a, b in zip(before, after, strict=True)))
+            verdict = judge(
+                case,
+                outcome,
+                sound,
+                sum(a != b for a, b in zip(before, after, strict=True)),
+            )
             rss_mb = max(rss_mb, outcome.rss_mb)
             totals += verdict
             by_kind[case.kind] += verdict
-            by_kind[case.kind]["rss_mb"] = max(by_kind[case.kind]["rss_mb"], round(outcome.rss_mb))
-            by_kind[case.kind]["slowest_ms"] = max(by_kind[case.kind]["slowest_ms"], round(outcome.seconds * 1e3))
+            by_kind[case.kind]["rss_mb"] = max(
+                by_kind[case.kind]["rss_mb"], round(outcome.rss_mb)
+            )
+            by_kind[case.kind]["slowest_ms"] = max(
+                by_kind[case.kind]["slowest_ms"], round(outcome.seconds * 1e3)
+            )
             if any(verdict[name] for name in TARGETS) or outcome.rss_mb > MOST_RSS_MB:
                 told = " ".join(word[-60:] for word in case.command)
                 note(
@@ -268,11 +391,29 @@ def main() -> int:
             shutil.rmtree(own, ignore_errors=True)
         totals["silent_errors"] += formulas()
         totals += interrupts(folder, interrupted, np.random.default_rng(options.seed))
-    headings = ["cases", "refused", "tracebacks", "hangs", "silent_errors", "files_lost", "rss_mb", "slowest_ms"]
-    print_table(["kind", *headings], [[kind, *(found[h] for h in headings)] for kind, found in by_kind.items()])
-    figures = {name: totals[name] for name in ("cases", "refused", *TARGETS, "interrupts", "interrupts_late")}
+    headings = [
+        "cases",
+        "refused",
+        "tracebacks",
+        "hangs",
+        "silent_errors",
+        "files_lost",
+        "rss_mb",
+        "slowest_ms",
+    ]
+    print_table(
+        ["kind", *headings],
+        [[kind, *(found[h] for h in headings)] for kind, found in by_kind.items()],
+    )
+    figures = {
+        name: totals[name]
+        for name in ("cases", "refused", *TARGETS, "interrupts", "interrupts_late")
+    }
     figures |= {"peak_rss_mb": round(rss_mb), "seed": options.seed}
-    is_passed = all(figures[name] == target for name, target in TARGETS.items()) and rss_mb <= MOST_RSS_MB
+    is_passed = (
+        all(figures[name] == target for name, target in TARGETS.items())
+        and rss_mb <= MOST_RSS_MB
+    )
     print_figures(figures | {"passed": is_passed})
     return 0 if is_passed or options.quick else 1
 

@@ -31,7 +31,9 @@ from identity_runs import ESTIMATORS, Case, Job, Judged, run_job
 from sonar_graph.simulation import LANDMARKS_XY_M
 
 RATES = (0.0, 0.05, 0.1, 0.2)
-KINDS = [Case(0.0, delay_s, bias) for delay_s, bias in product((0.0, 5.0, 20.0), (1.0, 5.0))]
+KINDS = [
+    Case(0.0, delay_s, bias) for delay_s, bias in product((0.0, 5.0, 20.0), (1.0, 5.0))
+]
 KINDS += [Case(0.0, 5.0, wrong_id_share=1.0), Case(0.0, tracks=False)]
 """Each at all rates: identities that are corrected, that are not, and that no track carries."""
 HELD_RATE, MOST_LOSS = 0.1, 0.15
@@ -44,13 +46,21 @@ def cases(kinds: list[Case]) -> Iterator[Case]:
     """Each kind at each rate."""
     for kind in kinds:
         for rate in RATES:
-            yield Case(rate, kind.id_delay_s, kind.gyro_bias_scale, kind.wrong_id_share, kind.tracks)
+            yield Case(
+                rate,
+                kind.id_delay_s,
+                kind.gyro_bias_scale,
+                kind.wrong_id_share,
+                kind.tracks,
+            )
 
 
 def column(runs: Runs, name: str, figure: str) -> np.ndarray:
     """One figure of one estimator in all runs; NaN where it has none."""
     values = [getattr(run[name], figure) for run in runs]
-    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    return np.array(
+        [np.nan if value is None else value for value in values], dtype=np.float64
+    )
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:
@@ -61,7 +71,11 @@ def mean_and_error(values: np.ndarray) -> tuple[float, float]:
 def nees_over_runs(runs: Runs, name: str, figure: str, quantity: str) -> float:
     """Mean over runs; NaN as soon as one has none."""
     values = [getattr(run[name], figure) for run in runs]
-    return float("nan") if None in values else float(np.mean([value[quantity] for value in values]))
+    return (
+        float("nan")
+        if None in values
+        else float(np.mean([value[quantity] for value in values]))
+    )
 
 
 def summarise(runs: Runs, clean: Runs, name: str) -> dict[str, float]:
@@ -72,8 +86,13 @@ def summarise(runs: Runs, clean: Runs, name: str) -> dict[str, float]:
     clean
         The same seeds without wrong identities.
     """
-    smoothed, causal, landmarks = (column(runs, name, f"{kind}_m") for kind in ("smoothed", "causal", "landmarks"))
-    reference, found = column(runs, "dead reckoning", "smoothed_m"), [run[name].landmarks for run in runs]
+    smoothed, causal, landmarks = (
+        column(runs, name, f"{kind}_m") for kind in ("smoothed", "causal", "landmarks")
+    )
+    reference, found = (
+        column(runs, "dead reckoning", "smoothed_m"),
+        [run[name].landmarks for run in runs],
+    )
     cost, cost_error = mean_and_error(smoothed - column(clean, name, "smoothed_m"))
     gain, gain_error = mean_and_error(smoothed - reference)
     figures = {
@@ -91,12 +110,21 @@ def summarise(runs: Runs, clean: Runs, name: str) -> dict[str, float]:
         "above_dead_reckoning_m": gain,
         "above_dead_reckoning_error_m": gain_error,
         "loss": float(smoothed.mean() / column(clean, name, "smoothed_m").mean() - 1),
-        "landmark_loss": float(landmarks.mean() / column(clean, name, "landmarks_m").mean() - 1),
+        "landmark_loss": float(
+            landmarks.mean() / column(clean, name, "landmarks_m").mean() - 1
+        ),
         "more_missing": float(
-            np.mean([c[name].landmarks - r[name].landmarks for c, r in zip(clean, runs, strict=True)])
+            np.mean(
+                [
+                    c[name].landmarks - r[name].landmarks
+                    for c, r in zip(clean, runs, strict=True)
+                ]
+            )
         ),
     }
-    for figure, quantity in product(("causal_nees", "final_nees", "smoothed_nees"), ("position", "yaw")):
+    for figure, quantity in product(
+        ("causal_nees", "final_nees", "smoothed_nees"), ("position", "yaw")
+    ):
         figures[f"{figure}_{quantity}"] = nees_over_runs(runs, name, figure, quantity)
     return figures
 
@@ -126,7 +154,10 @@ def report(case: Case, runs: Runs, clean: Runs) -> dict[str, dict[str, float]]:
     """Print one case's table; its figures by estimator."""
     summaries = {name: summarise(runs, clean, name) for name in ESTIMATORS}
     print(f"{case.wrong_id_rate:.0%} wrong, {case.name}: {len(runs)} runs")
-    rows = [(name, *(figures[key] for key in COLUMNS.values())) for name, figures in summaries.items()]
+    rows = [
+        (name, *(figures[key] for key in COLUMNS.values()))
+        for name, figures in summaries.items()
+    ]
     print_table(("", *COLUMNS), rows)
     return summaries
 
@@ -137,16 +168,26 @@ def best_policy(figures: Figures) -> tuple[str, float]:
     Of trajectory and map; where a run has no figure, or more landmarks are missing than at no wrong identities, it
     counts as infinite.
     """
-    held = [summaries for case, summaries in figures.items() if case.wrong_id_rate == HELD_RATE]
+    held = [
+        summaries
+        for case, summaries in figures.items()
+        if case.wrong_id_rate == HELD_RATE
+    ]
     policies = [name for name in ESTIMATORS if name.startswith("iSAM2")]
-    worst = {name: max(_greatest_loss(told[name]) for told in held) for name in policies}
+    worst = {
+        name: max(_greatest_loss(told[name]) for told in held) for name in policies
+    }
     best = min(worst, key=lambda name: worst[name])
     return best, float(worst[best])
 
 
 def _greatest_loss(told: dict[str, float]) -> float:
     losses = [told["loss"], told["landmark_loss"]]
-    return float(max(losses)) if np.isfinite(losses).all() and told["more_missing"] <= 0 else np.inf
+    return (
+        float(max(losses))
+        if np.isfinite(losses).all() and told["more_missing"] <= 0
+        else np.inf
+    )
 
 
 def flat(figures: Figures) -> dict[str, float | None]:
@@ -157,38 +198,78 @@ def flat(figures: Figures) -> dict[str, float | None]:
         else None
         for case, summaries in figures.items()
         for name, told in summaries.items()
-        for key in ("smoothed_m", "causal_m", "landmarks_m", "missing", "lost", "final_nees_position", "final_nees_yaw")
+        for key in (
+            "smoothed_m",
+            "causal_m",
+            "landmarks_m",
+            "missing",
+            "lost",
+            "final_nees_position",
+            "final_nees_yaw",
+        )
     }
 
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="number of runs of each case (default: 100; with --quick 3)")
-    parser.add_argument("--kinds", default="", help=f"some of 0..{len(KINDS) - 1}, with commas (default: all)")
     parser.add_argument(
-        "--keep", type=Path, help="folder that keeps runs that are done: the same command goes on there"
+        "--seeds",
+        type=int,
+        help="number of runs of each case (default: 100; with --quick 3)",
     )
-    parser.add_argument("--figure", type=Path, help="draw errors against the share of wrong identities into this file")
+    parser.add_argument(
+        "--kinds",
+        default="",
+        help=f"some of 0..{len(KINDS) - 1}, with commas (default: all)",
+    )
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        help="folder that keeps runs that are done: the same command goes on there",
+    )
+    parser.add_argument(
+        "--figure",
+        type=Path,
+        help="draw errors against the share of wrong identities into this file",
+    )
     arguments = parser.parse_args()
     count = arguments.seeds or (3 if arguments.quick else 100)
     if count < 2:
         refuse("--seeds: a spread needs at least 2 runs")
-    wanted = arguments.kinds.split(",") if arguments.kinds else [str(i) for i in range(len(KINDS))]
+    wanted = (
+        arguments.kinds.split(",")
+        if arguments.kinds
+        else [str(i) for i in range(len(KINDS))]
+    )
     if unknown := set(wanted) - {str(i) for i in range(len(KINDS))}:
-        refuse(f"--kinds: unknown: {', '.join(sorted(unknown))}; there are 0 to {len(KINDS) - 1}")
+        refuse(
+            f"--kinds: unknown: {', '.join(sorted(unknown))}; there are 0 to {len(KINDS) - 1}"
+        )
     chosen = list(cases([KINDS[int(i)] for i in wanted]))
-    jobs = [Job(case, seed, arguments.quick, arguments.keep) for seed in range(count) for case in chosen]
+    jobs = [
+        Job(case, seed, arguments.quick, arguments.keep)
+        for seed in range(count)
+        for case in chosen
+    ]
     done = in_parallel(run_job, jobs, arguments.workers, "run")
-    runs = {case: [told for job, told in zip(jobs, done, strict=True) if job.case == case] for case in chosen}
+    runs = {
+        case: [told for job, told in zip(jobs, done, strict=True) if job.case == case]
+        for case in chosen
+    }
     figures: Figures = {}
     for case in chosen:
-        clean = Case(0.0, case.id_delay_s, case.gyro_bias_scale, case.wrong_id_share, case.tracks)
+        clean = Case(
+            0.0, case.id_delay_s, case.gyro_bias_scale, case.wrong_id_share, case.tracks
+        )
         figures[case] = report(case, runs[case], runs[clean])
     if arguments.figure:
         draw(figures, arguments.figure)
     policy, loss = best_policy(figures)
     told: dict[str, Any] = {"runs": count, "cases": len(chosen), "best_policy": policy}
-    told |= {"greatest_loss": None if np.isinf(loss) else loss, "passed": loss <= MOST_LOSS}
+    told |= {
+        "greatest_loss": None if np.isinf(loss) else loss,
+        "passed": loss <= MOST_LOSS,
+    }
     conclude(told | flat(figures), is_quick=arguments.quick)
 
 

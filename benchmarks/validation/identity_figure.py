@@ -25,7 +25,11 @@ SHOWN = {
     "frame by frame": Case(0.0, tracks=False),
 }
 """Kinds of cases, a column each; of these alone all differ."""
-ROWS = {"smoothed": "trajectory, m", "causal": "causal trajectory, m", "landmarks": "map, m"}
+ROWS = {
+    "smoothed": "trajectory, m",
+    "causal": "causal trajectory, m",
+    "landmarks": "map, m",
+}
 """Errors, a row each, and their axis."""
 DRAWN = {
     "EKF-SLAM": (0, "-"),
@@ -42,13 +46,27 @@ ASIDE_PERCENT = 0.3
 
 def draw(figures: Figures, path: Path) -> None:
     """Draw what is there of `SHOWN` into a file."""
-    shown = {title: kind for title, kind in SHOWN.items() if any(_is_of(case, kind) for case in figures)}
-    figure, panels = blank_panels(len(ROWS), max(len(shown), 1), (10.0, 8.4), sharex=True, sharey="row")
+    shown = {
+        title: kind
+        for title, kind in SHOWN.items()
+        if any(_is_of(case, kind) for case in figures)
+    }
+    figure, panels = blank_panels(
+        len(ROWS), max(len(shown), 1), (10.0, 8.4), sharex=True, sharey="row"
+    )
     for column, (title, kind) in enumerate(shown.items()):
-        cases = {case.wrong_id_rate: told for case, told in figures.items() if _is_of(case, kind)}
+        cases = {
+            case.wrong_id_rate: told
+            for case, told in figures.items()
+            if _is_of(case, kind)
+        }
         for row, (error, label) in enumerate(ROWS.items()):
             _panel(panels[row, column], cases, error)
-            name_axes(panels[row, column], "wrong, %" if row == len(ROWS) - 1 else "", label if column == 0 else "")
+            name_axes(
+                panels[row, column],
+                "wrong, %" if row == len(ROWS) - 1 else "",
+                label if column == 0 else "",
+            )
         head_panel(panels[0, column], title)
     legend_above(figure, panels[0, 0])
     arrange(figure)
@@ -56,7 +74,12 @@ def draw(figures: Figures, path: Path) -> None:
 
 
 def _is_of(case: Case, kind: Case) -> bool:
-    return (case.id_delay_s, case.gyro_bias_scale, case.wrong_id_share, case.tracks) == (
+    return (
+        case.id_delay_s,
+        case.gyro_bias_scale,
+        case.wrong_id_share,
+        case.tracks,
+    ) == (
         kind.id_delay_s,
         kind.gyro_bias_scale,
         kind.wrong_id_share,
@@ -64,7 +87,9 @@ def _is_of(case: Case, kind: Case) -> bool:
     )
 
 
-def _panel(panel: Axes, cases: dict[float, dict[str, dict[str, float]]], error: str) -> None:
+def _panel(
+    panel: Axes, cases: dict[float, dict[str, dict[str, float]]], error: str
+) -> None:
     """Mean and standard error at each rate; where a run has no figure there is no mean, and no point."""
     percent = 100 * np.array(list(cases))
     if error != "landmarks":
@@ -74,7 +99,19 @@ def _panel(panel: Axes, cases: dict[float, dict[str, dict[str, float]]], error: 
     else:
         logarithmic(panel, "y")
     for place, (name, (index, line)) in enumerate(DRAWN.items()):
-        means, errors = ([told[name][f"{error}{of}_m"] for told in cases.values()] for of in ("", "_error"))
+        means, errors = (
+            [told[name][f"{error}{of}_m"] for told in cases.values()]
+            for of in ("", "_error")
+        )
         x = percent + ASIDE_PERCENT * (place - 0.5 * (len(DRAWN) - 1))
-        panel.errorbar(x, means, errors, color=colour(index), linestyle=line, linewidth=1.4, capsize=2, label=name)
+        panel.errorbar(
+            x,
+            means,
+            errors,
+            color=colour(index),
+            linestyle=line,
+            linewidth=1.4,
+            capsize=2,
+            label=name,
+        )
     panel.set_xticks(percent)

@@ -11,7 +11,15 @@ import numpy as np
 
 import baselines
 import sonar_graph
-from sonar_graph.evaluation import Comparison, ErrorSeries, RunResult, judge, landmark_errors, rmse, run_estimator
+from sonar_graph.evaluation import (
+    Comparison,
+    ErrorSeries,
+    RunResult,
+    judge,
+    landmark_errors,
+    rmse,
+    run_estimator,
+)
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import LandmarkMap
 
@@ -19,7 +27,13 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "dead reckoning": ("dead-reckoning", {}),
     "EKF-SLAM": ("ekf-slam", {}),
     "invariant EKF": ("invariant-ekf", {}),
-    "iSAM2, gate": ("isam2", {"identity": {"policy": "gate", "longest_wait_s": 0}, "kernel": {"shape": "none"}}),
+    "iSAM2, gate": (
+        "isam2",
+        {
+            "identity": {"policy": "gate", "longest_wait_s": 0},
+            "kernel": {"shape": "none"},
+        },
+    ),
     "iSAM2, robust": ("isam2", {"identity": {"longest_wait_s": 0}}),
     "iSAM2, deferred": ("isam2", {}),
     "iSAM2, max-mixture": ("isam2", {"identity": {"policy": "max-mixture"}}),
@@ -53,8 +67,12 @@ class Case:
 
     def options(self, seed: int, *, is_quick: bool) -> BasinOptions:
         """Options of the simulated basin: less hovering and fewer frames, to afford thousands of runs."""
-        route: dict[str, Any] = {"duration_s": 240.0, "laps": 1} if is_quick else {"duration_s": DURATION_S}
-        return BasinOptions(seed=seed, frame_rate_hz=FRAME_RATE_HZ, **route, **asdict(self))
+        route: dict[str, Any] = (
+            {"duration_s": 240.0, "laps": 1} if is_quick else {"duration_s": DURATION_S}
+        )
+        return BasinOptions(
+            seed=seed, frame_rate_hz=FRAME_RATE_HZ, **route, **asdict(self)
+        )
 
 
 @dataclass(frozen=True)
@@ -92,21 +110,36 @@ class Job:
     """Where runs that are done are kept; None: nowhere."""
 
     def __str__(self) -> str:
-        return f"{self.case.wrong_id_rate:.0%} wrong, {self.case.name}, seed {self.seed}"
+        return (
+            f"{self.case.wrong_id_rate:.0%} wrong, {self.case.name}, seed {self.seed}"
+        )
 
     def file(self, estimator: str) -> Path | None:
         """File of one estimator's figures; another version of the code has other files."""
         if self.folder is None:
             return None
         name, params = ESTIMATORS[estimator]
-        key = json.dumps([asdict(self.case), self.seed, self.is_quick, name, params, source_version()])
+        key = json.dumps(
+            [
+                asdict(self.case),
+                self.seed,
+                self.is_quick,
+                name,
+                params,
+                source_version(),
+            ]
+        )
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"
 
 
 def source_version() -> str:
     """A hash of all that a run's result depends on."""
     roots = [Path(str(package.__file__)).parent for package in (sonar_graph, baselines)]
-    files = [(path.relative_to(root.parent), path) for root in roots for path in root.rglob("*.py")]
+    files = [
+        (path.relative_to(root.parent), path)
+        for root in roots
+        for path in root.rglob("*.py")
+    ]
     digest = hashlib.sha256(Path(__file__).read_bytes())
     for name, path in sorted(files):
         digest.update(str(name).encode() + path.read_bytes())
@@ -116,19 +149,29 @@ def source_version() -> str:
 def run_job(job: Job) -> dict[str, Judged]:
     """Every estimator on the same detections; those that are kept already are read instead."""
     files = {name: job.file(name) for name in ESTIMATORS}
-    judged = {name: _read(file) for name, file in files.items() if file is not None and file.exists()}
+    judged = {
+        name: _read(file)
+        for name, file in files.items()
+        if file is not None and file.exists()
+    }
     missing = [name for name in ESTIMATORS if name not in judged]
     if missing:
         sequence = simulate_basin(job.case.options(job.seed, is_quick=job.is_quick))
         instants_ns = sequence.instants(RATE_HZ)
         for name in missing:
-            run = run_estimator(sequence, *ESTIMATORS[name], instants_ns=instants_ns, interim_maps=False)
-            judged[name] = _judged(run, judge(sequence, instants_ns, [run]), sequence.true_landmarks)
+            run = run_estimator(
+                sequence, *ESTIMATORS[name], instants_ns=instants_ns, interim_maps=False
+            )
+            judged[name] = _judged(
+                run, judge(sequence, instants_ns, [run]), sequence.true_landmarks
+            )
             _write(files[name], judged[name])
     return judged
 
 
-def _judged(run: RunResult, comparison: Comparison, true_landmarks: LandmarkMap) -> Judged:
+def _judged(
+    run: RunResult, comparison: Comparison, true_landmarks: LandmarkMap
+) -> Judged:
     if run.status == "failed" or run.landmarks is None:
         return Judged("failed", run.reason, None, None, None, 0, None, None, None)
     errors = comparison.errors[run.estimator]
@@ -150,7 +193,11 @@ def _judged(run: RunResult, comparison: Comparison, true_landmarks: LandmarkMap)
 def _settled(series: ErrorSeries) -> ErrorSeries:
     """Without the first instants, at which the start is still known."""
     kept = series.stamps_ns >= series.stamps_ns[0] + int(SETTLING_S * 1e9)
-    rows = {f.name: rows[kept] for f in fields(series) if isinstance(rows := getattr(series, f.name), np.ndarray)}
+    rows = {
+        f.name: rows[kept]
+        for f in fields(series)
+        if isinstance(rows := getattr(series, f.name), np.ndarray)
+    }
     return replace(series, **rows)
 
 

@@ -51,10 +51,19 @@ NS = 1_000_000_000
 
 def judged(seed: int) -> tuple[Floats, Floats]:
     """NEES by hole, mode, quantity and instant, shape (3, 3, 3, 2); of position by start and instant, shape (5, 2)."""
-    sequence = simulate_basin(BasinOptions(seed=seed, duration_s=300.0, laps=1, speed_m_s=0.3, frame_rate_hz=1))
+    sequence = simulate_basin(
+        BasinOptions(
+            seed=seed, duration_s=300.0, laps=1, speed_m_s=0.3, frame_rate_hz=1
+        )
+    )
     begin_s = np.random.default_rng(seed).uniform(20.0, 240.0)
-    holes = [[after_hole(sequence, mode, begin_s, hole_s) for mode in MODES] for hole_s in HOLES_S]
-    return np.array(holes), np.array([after_start(sequence, wrong) for wrong in STARTS.values()])
+    holes = [
+        [after_hole(sequence, mode, begin_s, hole_s) for mode in MODES]
+        for hole_s in HOLES_S
+    ]
+    return np.array(holes), np.array(
+        [after_start(sequence, wrong) for wrong in STARTS.values()]
+    )
 
 
 def after_hole(sequence: Sequence, mode: str, begin_s: float, hole_s: float) -> Floats:
@@ -62,13 +71,23 @@ def after_hole(sequence: Sequence, mode: str, begin_s: float, hole_s: float) -> 
     begin_ns = sequence.start_ns + round(begin_s * NS)
     end_ns = begin_ns + round(hole_s * NS)
     stamps = sequence.imu.stamps_ns
-    lost = replace(sequence, imu=sequence.imu.rows((stamps <= begin_ns) | (stamps >= end_ns)))
+    lost = replace(
+        sequence, imu=sequence.imu.rows((stamps <= begin_ns) | (stamps >= end_ns))
+    )
     if mode == "noise only":
         lost = with_turns(lost, np.zeros(3), OWN_TIME_S)
     if mode == "own rates":
-        lost = with_turns(lost, np.sqrt(np.mean(sequence.imu.angular_velocity**2, axis=0)), OWN_TIME_S)
+        lost = with_turns(
+            lost, np.sqrt(np.mean(sequence.imu.angular_velocity**2, axis=0)), OWN_TIME_S
+        )
     found, truth = reckoned(lost, end_ns + NS // 5)
-    return np.array([heading_nees(found, truth), position_nees(found, truth), pose_nees(found, truth)])
+    return np.array(
+        [
+            heading_nees(found, truth),
+            position_nees(found, truth),
+            pose_nees(found, truth),
+        ]
+    )
 
 
 def with_turns(sequence: Sequence, sigma_rad_s: Floats, time_s: float) -> Sequence:
@@ -76,7 +95,9 @@ def with_turns(sequence: Sequence, sigma_rad_s: Floats, time_s: float) -> Sequen
     x, y, z = sigma_rad_s.tolist()
     update = {"turn_sigma_rad_s": (x, y, z), "turn_time_s": (time_s,) * 3}
     imu = sequence.calibration.imu.model_copy(update=update)
-    return replace(sequence, calibration=sequence.calibration.model_copy(update={"imu": imu}))
+    return replace(
+        sequence, calibration=sequence.calibration.model_copy(update={"imu": imu})
+    )
 
 
 def after_start(sequence: Sequence, wrong: list[list[float]]) -> Floats:
@@ -99,23 +120,38 @@ def reckoned(sequence: Sequence, instant_ns: int) -> tuple[Trajectory, Trajector
 def heading_nees(found: Trajectory, truth: Trajectory) -> Floats:
     """About the world's vertical, shape (2,)."""
     R = found.rotations().as_matrix()
-    error = (R @ (truth.rotations().inv() * found.rotations()).as_rotvec()[..., None])[:, 2, 0]
-    return np.asarray(error**2 / np.einsum("ni,nij,nj->n", R[:, 2], found.covariances[:, :3, :3], R[:, 2]))
+    error = (R @ (truth.rotations().inv() * found.rotations()).as_rotvec()[..., None])[
+        :, 2, 0
+    ]
+    return np.asarray(
+        error**2
+        / np.einsum("ni,nij,nj->n", R[:, 2], found.covariances[:, :3, :3], R[:, 2])
+    )
 
 
 def position_nees(found: Trajectory, truth: Trajectory) -> Floats:
     """Per dimension, shape (2,)."""
     error = found.positions - truth.positions
-    return np.einsum("ni,nij,nj->n", error, np.linalg.inv(world_position_covs(found)), error) / 3
+    return (
+        np.einsum(
+            "ni,nij,nj->n", error, np.linalg.inv(world_position_covs(found)), error
+        )
+        / 3
+    )
 
 
 def pose_nees(found: Trajectory, truth: Trajectory) -> Floats:
     """Per dimension, shape (2,)."""
     poses = [
-        [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(one.rotations().as_matrix(), one.positions, strict=True)]
+        [
+            gtsam.Pose3(gtsam.Rot3(R), p)
+            for R, p in zip(one.rotations().as_matrix(), one.positions, strict=True)
+        ]
         for one in (found, truth)
     ]
-    error = np.array([gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(*poses, strict=True)])
+    error = np.array(
+        [gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(*poses, strict=True)]
+    )
     return np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances), error) / 6
 
 
@@ -136,7 +172,10 @@ def main() -> None:
         ]
         print_table((f"{name} NEES after a hole", *whens), rows)
     by_start = starts.mean(axis=0)
-    rows = [(start, *values) for start, values in zip(STARTS, by_start.tolist(), strict=True)]
+    rows = [
+        (start, *values)
+        for start, values in zip(STARTS, by_start.tolist(), strict=True)
+    ]
     print_table(("first velocities", "position, 10 s", "position, end"), rows)
     over_holes = mean[:, :, [0, 2]].mean(axis=0).max(axis=(1, 2))
     figures = {
@@ -145,7 +184,10 @@ def main() -> None:
         "mean_nees": {mode: mean[:, m].tolist() for m, mode in enumerate(MODES)},
         "median_nees": {mode: median[:, m].tolist() for m, mode in enumerate(MODES)},
         "starts": dict(zip(STARTS, by_start.tolist(), strict=True)),
-        "passed": bool(over_holes[1] <= LARGEST < over_holes[0] and np.all(by_start[:, 0] <= 1.5 * by_start[0, 0])),
+        "passed": bool(
+            over_holes[1] <= LARGEST < over_holes[0]
+            and np.all(by_start[:, 0] <= 1.5 * by_start[0, 0])
+        ),
     }
     conclude(figures, is_quick=arguments.quick)
 

@@ -68,10 +68,14 @@ def effort(sequence: Sequence) -> Effort:
     finally:
         JointCovariance.of = compute  # type: ignore[method-assign]
     is_last = stamps_ns > stamps_ns[-1] - LAST_NS
-    return Effort(sum(cpu_s), float(np.array(cpu_s)[is_last].sum()), asked / len(stamps_ns))
+    return Effort(
+        sum(cpu_s), float(np.array(cpu_s)[is_last].sum()), asked / len(stamps_ns)
+    )
 
 
-def surveys(sequence: Sequence, module: Any, name: str, values: tuple[float, ...]) -> None:
+def surveys(
+    sequence: Sequence, module: Any, name: str, values: tuple[float, ...]
+) -> None:
     """One survey for each value of a constant."""
     default = getattr(module, name)
     rows = []
@@ -100,7 +104,14 @@ def gaps(seeds: int) -> None:
             squares_m2.append(scores["causal.ate_raw_m"].value ** 2)
             nees.append(scores["causal.nees_position"].value)
         cpu_s = time.thread_time() - start_s
-        rows.append((f"{share:g}", cpu_s, float(np.sqrt(np.mean(squares_m2))), float(np.mean(nees))))
+        rows.append(
+            (
+                f"{share:g}",
+                cpu_s,
+                float(np.sqrt(np.mean(squares_m2))),
+                float(np.mean(nees)),
+            )
+        )
     keyframes.LEAST_BIAS_SHARE = default
     print_table(("LEAST_BIAS_SHARE", "CPU s", "causal rms m", "NEES"), rows)
 

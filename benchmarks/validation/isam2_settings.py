@@ -29,7 +29,12 @@ from sonar_graph.evaluation import compare
 from sonar_graph.logs.convert import read_mrclam
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
+from sonar_graph.simulation import (
+    BasinOptions,
+    MissionOptions,
+    simulate_basin,
+    simulate_mission,
+)
 from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.slam.smoother import Changed, Smoother, solve
 
@@ -44,7 +49,10 @@ EFFORTS: dict[str, dict[str, Any]] = {
     "gain 0": {"smoother": {"waiting_gain": 0.0}},
 }
 KERNELS: dict[str, dict[str, Any]] = {
-    "huber 2.0, gate 0.999": {"identity": {"policy": "gate"}, "kernel": {"shape": "huber", "width": 2.0}},
+    "huber 2.0, gate 0.999": {
+        "identity": {"policy": "gate"},
+        "kernel": {"shape": "huber", "width": 2.0},
+    },
     "cauchy 1.5, no gate": {},
     "cauchy 1.0, no gate": {"kernel": {"width": 1.0}},
     "no kernel, no gate": {"kernel": {"shape": "none"}},
@@ -62,7 +70,9 @@ def run(sequence: Sequence, settings: dict[str, Any]) -> tuple[Isam2, int, float
         updates += 1
         return update(smoother, time_s)
 
-    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings))
+    estimator = Isam2(
+        sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings)
+    )
     pieces = list(sequence.replay(sequence.instants(RATE_HZ)))
     Smoother.update = counted  # type: ignore[method-assign]
     try:
@@ -75,7 +85,9 @@ def run(sequence: Sequence, settings: dict[str, Any]) -> tuple[Isam2, int, float
 
 
 def keyframes_of(estimator: Isam2) -> int:
-    return sum(gtsam.Symbol(key).chr() == ord("x") for key in list(estimator.values.keys()))
+    return sum(
+        gtsam.Symbol(key).chr() == ord("x") for key in list(estimator.values.keys())
+    )
 
 
 def from_least_cost(estimator: Isam2) -> tuple[float, float, float]:
@@ -86,7 +98,11 @@ def from_least_cost(estimator: Isam2) -> tuple[float, float, float]:
     off = gtsam.Pose3.Logmap(least.atPose3(newest).between(own.atPose3(newest)))
     cov = gtsam.Marginals(graph.linearize(least), least).marginalCovariance(newest)
     sigmas = float(np.sqrt(off @ np.linalg.solve(cov, off) / 6))
-    return graph.error(own) / graph.error(least), 1e3 * float(np.linalg.norm(off[3:])), sigmas
+    return (
+        graph.error(own) / graph.error(least),
+        1e3 * float(np.linalg.norm(off[3:])),
+        sigmas,
+    )
 
 
 def laps(seconds: float) -> int:
@@ -95,7 +111,9 @@ def laps(seconds: float) -> int:
 
 
 def basin(seconds: float, seed: int = 0) -> Sequence:
-    return simulate_basin(BasinOptions(seed=seed, duration_s=seconds, laps=laps(seconds)))
+    return simulate_basin(
+        BasinOptions(seed=seed, duration_s=seconds, laps=laps(seconds))
+    )
 
 
 def mission(seconds: float, seed: int = 0) -> Sequence:
@@ -111,14 +129,24 @@ def effort(seconds: float, case: str) -> tuple[int, int, int, float]:
     assert sequence.detections is not None
     run(basin(150.0), EFFORTS[case])  # compiles
     estimator, updates, cpu_s = run(sequence, EFFORTS[case])
-    return len(list(sequence.detections.frames())), keyframes_of(estimator), updates, cpu_s
+    return (
+        len(list(sequence.detections.frames())),
+        keyframes_of(estimator),
+        updates,
+        cpu_s,
+    )
 
 
 def waiting(seconds: float, seed: int) -> list[float]:
     """Causal aligned error by gain, m."""
     sequence, found = mission(seconds, seed), []
     for gain in GAINS:
-        compared = compare(sequence, ["isam2"], {"isam2": {"smoother": {"waiting_gain": gain}}}, rate_hz=RATE_HZ)
+        compared = compare(
+            sequence,
+            ["isam2"],
+            {"isam2": {"smoother": {"waiting_gain": gain}}},
+            rate_hz=RATE_HZ,
+        )
         found.append(compared.scores["isam2"]["causal.ate_yaw_m"].value)
     return found
 
@@ -126,7 +154,12 @@ def waiting(seconds: float, seed: int) -> list[float]:
 def relinearised(seconds: float, case: tuple[str, float]) -> tuple[float, float, float]:
     """Scores of iSAM2 alone."""
     world, threshold = case
-    return from_least_cost(run(WORLDS[world](seconds), {"smoother": {**ALONE, "relinearize_threshold": threshold}})[0])
+    return from_least_cost(
+        run(
+            WORLDS[world](seconds),
+            {"smoother": {**ALONE, "relinearize_threshold": threshold}},
+        )[0]
+    )
 
 
 def marginalised(seconds: float, world: str) -> tuple[float, float, float]:
@@ -136,15 +169,25 @@ def marginalised(seconds: float, world: str) -> tuple[float, float, float]:
 
 def kernels_in_basin(seconds: float, seed: int) -> Scores:
     """Errors and NEES where no detection is an outlier."""
-    options = BasinOptions(seed=seed, duration_s=seconds, laps=laps(seconds), gyro_bias_scale=0, accel_bias_scale=0)
+    options = BasinOptions(
+        seed=seed,
+        duration_s=seconds,
+        laps=laps(seconds),
+        gyro_bias_scale=0,
+        accel_bias_scale=0,
+    )
     return with_kernels(
-        simulate_basin(options), 1.0, ("causal.ate_raw_m", "smoothed.ate_raw_m", "causal.nees_position")
+        simulate_basin(options),
+        1.0,
+        ("causal.ate_raw_m", "smoothed.ate_raw_m", "causal.nees_position"),
     )
 
 
 def kernels_on_robot(folder: Path, robot: int) -> Scores:
     """Errors on real detections."""
-    return with_kernels(read_mrclam(folder, robot), RATE_HZ, ("smoothed.ate_se2_m", "landmarks.se2_m"))
+    return with_kernels(
+        read_mrclam(folder, robot), RATE_HZ, ("smoothed.ate_se2_m", "landmarks.se2_m")
+    )
 
 
 def with_kernels(sequence: Sequence, rate_hz: float, keys: tuple[str, ...]) -> Scores:
@@ -159,18 +202,31 @@ def print_kernels(title: str, found: list[Scores]) -> dict[str, Any]:
     """Averages over runs, and the largest."""
     keys = list(next(iter(found[0].values())))
     rows = [
-        (name, *(f(values) for key in keys for values in [[of[name][key] for of in found]] for f in (np.mean, np.max)))
+        (
+            name,
+            *(
+                f(values)
+                for key in keys
+                for values in [[of[name][key] for of in found]]
+                for f in (np.mean, np.max)
+            ),
+        )
         for name in KERNELS
     ]
     rows = [(name, *(float(value) for value in values)) for name, *values in rows]
-    print_table((title, *(f"{key}{which}" for key in keys for which in (" (mean)", " (most)"))), rows)
+    print_table(
+        (title, *(f"{key}{which}" for key in keys for which in (" (mean)", " (most)"))),
+        rows,
+    )
     return {f"{title}, {name}": values for name, *values in rows}
 
 
 def main() -> None:
     parser = make_parser(__doc__, data=True, workers=True)
     arguments = parser.parse_args()
-    scale, missions, seeds, robots = (0.5, 2, 2, (1,)) if arguments.quick else (1.0, 6, 24, (1, 2, 3, 4, 5))
+    scale, missions, seeds, robots = (
+        (0.5, 2, 2, (1,)) if arguments.quick else (1.0, 6, 24, (1, 2, 3, 4, 5))
+    )
     spread = partial(in_parallel, workers=arguments.workers)
     figures: dict[str, Any] = {}
     with recording(arguments.data, "mrclam_ds6.tar.xz", "MRCLAM_Dataset6") as folder:
@@ -179,9 +235,14 @@ def main() -> None:
             ("basin", "frames", "keyframes", "updates", "CPU s"),
             [(name, *row) for name, row in zip(EFFORTS, done, strict=True)],
         )
-        errors = np.array(spread(partial(waiting, scale * LONG_S), range(missions), what="mission"))
+        errors = np.array(
+            spread(partial(waiting, scale * LONG_S), range(missions), what="mission")
+        )
         by_gain = (1e3 * np.sqrt(np.mean(errors**2, axis=0))).tolist()
-        print_table(("waiting gain", "causal rms, mm"), list(zip(map(str, GAINS), by_gain, strict=True)))
+        print_table(
+            ("waiting gain", "causal rms, mm"),
+            list(zip(map(str, GAINS), by_gain, strict=True)),
+        )
         cases = [(world, threshold) for world in WORLDS for threshold in THRESHOLDS]
         off = spread(partial(relinearised, scale * SHORT_S), cases, what="threshold")
         named = [
@@ -189,11 +250,26 @@ def main() -> None:
             for (world, threshold), row in zip(cases, off, strict=True)
         ]
         off = spread(partial(marginalised, scale * LONG_S), list(WORLDS), what="world")
-        named += [(f"{world}, by default", *row) for world, row in zip(WORLDS, off, strict=True)]
+        named += [
+            (f"{world}, by default", *row)
+            for world, row in zip(WORLDS, off, strict=True)
+        ]
         print_table(("against the least cost", "cost ratio", "mm", "sigmas"), named)
-        figures |= print_kernels("basin", spread(partial(kernels_in_basin, scale * LONG_S), range(seeds), what="seed"))
-        figures |= print_kernels("MRCLAM", spread(partial(kernels_on_robot, folder), robots, what="robot"))
-    figures |= {"effort": done, "waiting_rms_mm": by_gain, **{name: row for name, *row in named}, "passed": True}
+        figures |= print_kernels(
+            "basin",
+            spread(
+                partial(kernels_in_basin, scale * LONG_S), range(seeds), what="seed"
+            ),
+        )
+        figures |= print_kernels(
+            "MRCLAM", spread(partial(kernels_on_robot, folder), robots, what="robot")
+        )
+    figures |= {
+        "effort": done,
+        "waiting_rms_mm": by_gain,
+        **{name: row for name, *row in named},
+        "passed": True,
+    }
     print_figures(figures)
 
 

@@ -41,14 +41,22 @@ class Truth:
 
     @property
     def data_end(self) -> int:
-        return next((start for opcode, start, _ in self.records if opcode == 0x0F), len(self.content))
+        return next(
+            (start for opcode, start, _ in self.records if opcode == 0x0F),
+            len(self.content),
+        )
 
     def _is_in(self, damaged: bytes, start: int, end: int) -> bool:
-        return damaged[start:end] == self.content[start:end] or self.content[start:end] in damaged
+        return (
+            damaged[start:end] == self.content[start:end]
+            or self.content[start:end] in damaged
+        )
 
     def _is_described(self, damaged: bytes) -> bool:
         """Check that the first chunk, or the summary, with all channels is there."""
-        first = next((record for record in self.records if record[1] in self.chunks), None)
+        first = next(
+            (record for record in self.records if record[1] in self.chunks), None
+        )
         if first is not None and self._is_in(damaged, *first[1:]):
             return True
         return self.has_summary and damaged.endswith(self.content[self.data_end :])
@@ -63,7 +71,11 @@ class Truth:
     def sound_loose(self, damaged: bytes) -> Iterator[Named]:
         """Messages without chunk whose bytes are all there, and the descriptions before them too."""
         ends = {start: end for _, start, end in self.records}
-        described = [(start, end) for opcode, start, end in self.records if opcode in (3, 4) and start < self.data_end]
+        described = [
+            (start, end)
+            for opcode, start, end in self.records
+            if opcode in (3, 4) and start < self.data_end
+        ]
         if self.loose and all(self._is_in(damaged, *place) for place in described):
             for start, named in self.loose.items():
                 if self._is_in(damaged, start, ends[start]):
@@ -77,7 +89,9 @@ def read_truth(path: Path) -> Truth:
         for schema, channel, message in NonSeekingReader(stream).iter_messages():
             counter = truth.messages.setdefault(channel.topic, Counter())
             counter[_payload(message)] += 1
-            truth.types[channel.topic] = (schema.name, schema.data.decode()) if schema else ("", "")
+            truth.types[channel.topic] = (
+                (schema.name, schema.data.decode()) if schema else ("", "")
+            )
     _locate(truth, path)
     return truth
 
@@ -104,10 +118,14 @@ def _locate(truth: Truth, path: Path) -> None:
                     topics[item.id] = item.topic
                     truth.has_summary |= start > truth.data_end
                 elif isinstance(item, Message) and isinstance(record, Chunk):
-                    truth.chunks[start].append((topics[item.channel_id], _payload(item)))
+                    truth.chunks[start].append(
+                        (topics[item.channel_id], _payload(item))
+                    )
                 elif isinstance(item, Message):
                     truth.loose[start] = topics[item.channel_id], _payload(item)
                 elif isinstance(item, Metadata):
-                    truth.metadata[item.name] = {k: v for k, v in item.metadata.items() if k != "crc32"}
+                    truth.metadata[item.name] = {
+                        k: v for k, v in item.metadata.items() if k != "crc32"
+                    }
                 elif isinstance(item, Schema):
                     continue

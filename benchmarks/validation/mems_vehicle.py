@@ -30,7 +30,13 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, note, print_table
 
 from baselines import invariant_ekf
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.evaluation import compare
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.sequence import Sequence
@@ -43,7 +49,12 @@ BAND, WORST_RATIO = (0.7, 1.4), 1.5
 GRAVITY, TURN_RATE, TURN_ROLL = 9.80665, 0.1, np.radians(2.0)
 DVL_ARM, DVL_RPY = np.array([-0.3, 0.0, -0.1]), np.array([np.pi, 0.0, 1.0])
 CALIBRATION = Calibration(
-    imu=ImuCalibration(gyro_noise_density=2e-3, gyro_bias_sigma=1e-3, accel_noise_density=1e-2, accel_bias_sigma=0.1),
+    imu=ImuCalibration(
+        gyro_noise_density=2e-3,
+        gyro_bias_sigma=1e-3,
+        accel_noise_density=1e-2,
+        accel_bias_sigma=0.1,
+    ),
     dvl=DvlCalibration(
         velocity_sigma_m_s=(0.08, 0.08, 0.08),
         mounting=Mounting(translation_m=tuple(DVL_ARM), rpy_rad=tuple(DVL_RPY)),
@@ -63,12 +74,17 @@ def vehicle(seed: int, duration_s: float, gyro_bias_scale: float) -> Sequence:
         rates += [TURN_RATE * rng.choice([-1.0, 1.0])] * rng.integers(2, 9)
     knots, rate = knot_s * (np.arange(len(rates)) - 2.0), np.array(rates)
     turning = make_interp_spline(knots, rate, k=3)
-    yaw, roll = turning.antiderivative(), make_interp_spline(knots, TURN_ROLL / TURN_RATE * rate, k=3)
+    yaw, roll = (
+        turning.antiderivative(),
+        make_interp_spline(knots, TURN_ROLL / TURN_RATE * rate, k=3),
+    )
     pitch = make_interp_spline(knots, 0.01 * rng.standard_normal(len(knots)), k=3)
     surge = make_interp_spline(knots, rng.uniform(0.2, 0.4, len(knots)), k=3)
 
     def attitude(t: np.ndarray) -> Rotation:
-        return Rotation.from_euler("ZYX", np.column_stack([yaw(t) - yaw(0.0), pitch(t), roll(t)]))
+        return Rotation.from_euler(
+            "ZYX", np.column_stack([yaw(t) - yaw(0.0), pitch(t), roll(t)])
+        )
 
     def body_rate(t: np.ndarray) -> np.ndarray:
         a, b, da, db, dc = roll(t), pitch(t), roll(t, 1), pitch(t, 1), turning(t)
@@ -86,16 +102,25 @@ def vehicle(seed: int, duration_s: float, gyro_bias_scale: float) -> Sequence:
     def world_velocity(t: np.ndarray) -> np.ndarray:
         return attitude(t).apply(ahead(t))
 
-    imu_s, dvl_s = np.arange(0.0, duration_s, 0.1), np.arange(0.0, duration_s, 1.0 / 1.5)
+    imu_s, dvl_s = (
+        np.arange(0.0, duration_s, 0.1),
+        np.arange(0.0, duration_s, 1.0 / 1.5),
+    )
     fine_s = np.arange(0.0, duration_s + 0.05, 0.1)
     acceleration = (world_velocity(imu_s + 1e-3) - world_velocity(imu_s - 1e-3)) / 2e-3
     force = attitude(imu_s).inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY]))
     imu, dt = CALIBRATION.imu, 0.1
-    gyro = body_rate(imu_s) + gyro_bias_scale * imu.gyro_bias_sigma * rng.standard_normal(3)
+    gyro = body_rate(
+        imu_s
+    ) + gyro_bias_scale * imu.gyro_bias_sigma * rng.standard_normal(3)
     gyro += imu.gyro_noise_density / np.sqrt(dt) * rng.standard_normal(gyro.shape)
     force += imu.accel_bias_sigma * rng.standard_normal(3)
     force += imu.accel_noise_density / np.sqrt(dt) * rng.standard_normal(force.shape)
-    doppler = Rotation.from_euler("xyz", DVL_RPY).inv().apply(ahead(dvl_s) + np.cross(body_rate(dvl_s), DVL_ARM))
+    doppler = (
+        Rotation.from_euler("xyz", DVL_RPY)
+        .inv()
+        .apply(ahead(dvl_s) + np.cross(body_rate(dvl_s), DVL_ARM))
+    )
     doppler += CALIBRATION.dvl.velocity_sigma_m_s * rng.standard_normal(doppler.shape)
     is_outlier = rng.uniform(size=len(dvl_s)) < 0.01
     is_outlier[:5] = False
@@ -103,8 +128,12 @@ def vehicle(seed: int, duration_s: float, gyro_bias_scale: float) -> Sequence:
     steps = attitude(fine_s[:-1] + 0.05).apply(ahead(fine_s[:-1] + 0.05)) * 0.1
     position = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])[: len(imu_s)]
     stamps_ns = np.rint(imu_s * 1e9).astype(np.int64)
-    truth = Trajectory.without_covariances(stamps_ns, position, attitude(imu_s).as_quat())
-    start = CALIBRATION.start.model_copy(update={"rpy_rad": _start(attitude(np.zeros(1))[0], rng)})
+    truth = Trajectory.without_covariances(
+        stamps_ns, position, attitude(imu_s).as_quat()
+    )
+    start = CALIBRATION.start.model_copy(
+        update={"rpy_rad": _start(attitude(np.zeros(1))[0], rng)}
+    )
     unknown = np.full((len(dvl_s), 3, 3), np.nan)
     return Sequence(
         f"survey {seed}",
@@ -116,7 +145,9 @@ def vehicle(seed: int, duration_s: float, gyro_bias_scale: float) -> Sequence:
 
 
 def _start(attitude: Rotation, rng: np.random.Generator) -> tuple[float, float, float]:
-    wrong = attitude * Rotation.from_rotvec(CALIBRATION.start.rpy_sigma_rad * rng.standard_normal(3))
+    wrong = attitude * Rotation.from_rotvec(
+        CALIBRATION.start.rpy_sigma_rad * rng.standard_normal(3)
+    )
     yaw, pitch, roll = wrong.as_euler("ZYX").tolist()
     return roll, pitch, yaw
 
@@ -132,13 +163,17 @@ class Run:
     """Of roll and pitch together, per degree of freedom, averaged over the run."""
 
 
-def run_seed(duration_s: float, scale: float, has_one_bias: bool, seed: int) -> dict[str, Run]:
+def run_seed(
+    duration_s: float, scale: float, has_one_bias: bool, seed: int
+) -> dict[str, Run]:
     """All estimators on one survey."""
     if has_one_bias:
         nowhere: Any = lambda *_: np.zeros(3)  # noqa: E731
         start: Any = invariant_ekf.start_state
         Keyframes._up = nowhere
-        invariant_ekf.start_state = lambda calibration: start(calibration)._replace(is_level=False)
+        invariant_ekf.start_state = lambda calibration: start(calibration)._replace(
+            is_level=False
+        )
     sequence = vehicle(seed, duration_s, scale)
     comparison = compare(sequence, list(ESTIMATORS), rate_hz=0.5)
     told = {}
@@ -158,44 +193,89 @@ def tell(causal: Trajectory, truth: Trajectory | None) -> Run:
     heading = np.unwrap(yaws[0] - yaws[1])
     up = true.inv().apply([0.0, 0.0, 1.0])
     variance = np.einsum("ni,nij,nj->n", up, causal.covariances[:, :3, :3], up)
-    level = (causal.rotations().inv().apply([0.0, 0.0, 1.0]) - up) if len(errors) else errors
+    level = (
+        (causal.rotations().inv().apply([0.0, 0.0, 1.0]) - up)
+        if len(errors)
+        else errors
+    )
     # R = R^ Exp(-e): the estimated up less the true one is -e x up, whose level part are pitch and roll
     tilts = np.column_stack([level[:, 1], -level[:, 0]])
-    squares = np.einsum("ni,nij,nj->n", tilts, np.linalg.inv(causal.covariances[:, :2, :2]), tilts)
+    squares = np.einsum(
+        "ni,nij,nj->n", tilts, np.linalg.inv(causal.covariances[:, :2, :2]), tilts
+    )
     settled = slice(len(squares) // 10, None)
-    return Run(float(heading[-1]), float(heading[-1] ** 2 / variance[-1]), float(squares[settled].mean() / 2))
+    return Run(
+        float(heading[-1]),
+        float(heading[-1] ** 2 / variance[-1]),
+        float(squares[settled].mean() / 2),
+    )
 
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="number of runs in each case (default: 60; with --quick 3)")
-    parser.add_argument("--first-seed", type=int, default=0, help="runs use this seed and those after it")
-    parser.add_argument("--one-bias", action="store_true", help="one gyro bias for tilt and heading")
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        help="number of runs in each case (default: 60; with --quick 3)",
+    )
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=0,
+        help="runs use this seed and those after it",
+    )
+    parser.add_argument(
+        "--one-bias", action="store_true", help="one gyro bias for tilt and heading"
+    )
     arguments = parser.parse_args()
-    count, duration_s = arguments.seeds or (3 if arguments.quick else 60), 300.0 if arguments.quick else 3000.0
+    count, duration_s = (
+        arguments.seeds or (3 if arguments.quick else 60),
+        300.0 if arguments.quick else 3000.0,
+    )
     seeds = range(arguments.first_seed, arguments.first_seed + count)
     figures: dict[str, Any] = {"runs": count, "duration_s": duration_s}
     for case, scale in CASES.items():
         note(f"gyro bias {case}:")
-        told = in_parallel(partial(run_seed, duration_s, scale, arguments.one_bias), seeds, arguments.workers, "seed")
+        told = in_parallel(
+            partial(run_seed, duration_s, scale, arguments.one_bias),
+            seeds,
+            arguments.workers,
+            "seed",
+        )
         rows = []
         for name in ESTIMATORS:
             runs = [run[name] for run in told]
             row = {
-                "heading_deg": float(np.degrees(np.sqrt(np.mean([run.heading_rad**2 for run in runs])))),
-                "largest_deg": float(np.degrees(max(abs(run.heading_rad) for run in runs))),
+                "heading_deg": float(
+                    np.degrees(np.sqrt(np.mean([run.heading_rad**2 for run in runs])))
+                ),
+                "largest_deg": float(
+                    np.degrees(max(abs(run.heading_rad) for run in runs))
+                ),
                 "heading_nees": float(np.mean([run.heading_nees for run in runs])),
                 "tilt_nees": float(np.mean([run.tilt_nees for run in runs])),
             }
             rows.append((name, *row.values()))
             figures |= {f"{case}_{name}_{key}": value for key, value in row.items()}
         print(f"gyro bias {case}: {count} runs")
-        print_table(("at the end", "heading rms, deg", "largest, deg", "heading NEES", "tilt NEES"), rows)
+        print_table(
+            (
+                "at the end",
+                "heading rms, deg",
+                "largest, deg",
+                "heading NEES",
+                "tilt NEES",
+            ),
+            rows,
+        )
     low, high = BAND
     nees = [figures[f"drawn_{name}_heading_nees"] for name in HELD_TO_BAND]
     worst = max(figures[f"zero_{name}_heading_deg"] for name in HELD_TO_BAND)
     figures["worst_ratio"] = worst / figures["zero_ekf-slam_heading_deg"]
-    figures["passed"] = all(low <= value <= high for value in nees) and figures["worst_ratio"] <= WORST_RATIO
+    figures["passed"] = (
+        all(low <= value <= high for value in nees)
+        and figures["worst_ratio"] <= WORST_RATIO
+    )
     conclude(figures, is_quick=arguments.quick)
 
 

@@ -49,7 +49,9 @@ def run_robot(folder: Path, case: tuple[int, str]) -> Scores:
     """All scores of all estimators on one robot's run under one protocol."""
     robot, protocol = case
     sequence = read_mrclam(folder, robot)
-    instants = frame_instants(sequence) if protocol == "frames" else sequence.instants(RATE_HZ)
+    instants = (
+        frame_instants(sequence) if protocol == "frames" else sequence.instants(RATE_HZ)
+    )
     found: Scores = {}
     for label, (name, settings) in ESTIMATORS.items():
         run = run_estimator(sequence, name, settings, instants_ns=instants)
@@ -83,30 +85,47 @@ class Target:
 def collect(runs: list[Scores]) -> dict[str, Any]:
     """The figures by name."""
     figures: dict[str, Any] = {}
-    names = {"isam2": "isam2", "ekf": "ekf-slam", "gated_ekf": "ekf-slam, gate", "dead_reckoning": "dead-reckoning"}
+    names = {
+        "isam2": "isam2",
+        "ekf": "ekf-slam",
+        "gated_ekf": "ekf-slam, gate",
+        "dead_reckoning": "dead-reckoning",
+    }
     for short, name in names.items():
         for kind in ("smoothed", "causal") if short == "isam2" else ("causal",):
             errors = [run[name][f"{kind}.ate_se2_m"] for run in runs]
             figures[f"{short}_{kind}_ate_m"] = errors
             figures[f"{short}_{kind}_ate_mean_m"] = float(np.mean(errors))
     figures["landmark_error_m"] = [run["isam2"]["landmarks.se2_m"] for run in runs]
-    figures["ekf_landmark_error_m"] = [run["ekf-slam"]["landmarks.se2_m"] for run in runs]
+    figures["ekf_landmark_error_m"] = [
+        run["ekf-slam"]["landmarks.se2_m"] for run in runs
+    ]
     return figures
 
 
 def targets(figures: dict[str, Any]) -> list[Target]:
     """Targets, and whether they are met."""
     return [
-        Target("iSAM2 smoothed ATE, worst robot", max(figures["isam2_smoothed_ate_m"]), 0.17),
+        Target(
+            "iSAM2 smoothed ATE, worst robot",
+            max(figures["isam2_smoothed_ate_m"]),
+            0.17,
+        ),
         Target("iSAM2 smoothed ATE, mean", figures["isam2_smoothed_ate_mean_m"], 0.125),
-        Target("EKF-SLAM with a gate, causal ATE, worst robot", max(figures["gated_ekf_causal_ate_m"]), 0.50),
+        Target(
+            "EKF-SLAM with a gate, causal ATE, worst robot",
+            max(figures["gated_ekf_causal_ate_m"]),
+            0.50,
+        ),
         Target("iSAM2 causal ATE, mean", figures["isam2_causal_ate_mean_m"], 0.23),
         Target(
             "iSAM2 causal ATE, mean, against that EKF-SLAM's",
             figures["isam2_causal_ate_mean_m"],
             figures["gated_ekf_causal_ate_mean_m"],
         ),
-        Target("iSAM2 landmark error, worst robot", max(figures["landmark_error_m"]), 0.15),
+        Target(
+            "iSAM2 landmark error, worst robot", max(figures["landmark_error_m"]), 0.15
+        ),
     ]
 
 
@@ -160,7 +179,10 @@ def main() -> None:
         ("target", "measured m", "at most m", ""),
         [(t.what, t.measured, t.limit, "met" if t.met else "NOT MET") for t in checks],
     )
-    conclude({"robots": robots, **figures, "passed": all(t.met for t in checks)}, is_quick=arguments.quick)
+    conclude(
+        {"robots": robots, **figures, "passed": all(t.met for t in checks)},
+        is_quick=arguments.quick,
+    )
 
 
 if __name__ == "__main__":

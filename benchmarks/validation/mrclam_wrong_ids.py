@@ -27,8 +27,14 @@ ROBOTS = (1, 2, 3, 4, 5)
 SHARE, SEED, RATE_HZ, LOST_M = 0.1, 6, 2.0, 1.0
 POLICIES = ("gate", "robust", "max-mixture")
 ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
-    **{f"isam2 {policy}": ("isam2", {"identity": {"policy": policy}}) for policy in POLICIES},
-    "isam2 gate alone": ("isam2", {"identity": {"policy": "gate"}, "kernel": {"shape": "none"}}),
+    **{
+        f"isam2 {policy}": ("isam2", {"identity": {"policy": policy}})
+        for policy in POLICIES
+    },
+    "isam2 gate alone": (
+        "isam2",
+        {"identity": {"policy": "gate"}, "kernel": {"shape": "none"}},
+    ),
     "ekf-slam": ("ekf-slam", {}),
     "invariant-ekf": ("invariant-ekf", {}),
 }
@@ -48,7 +54,9 @@ def falsified(sequence: Sequence, share: float, seed: list[int]) -> Sequence:
     known = np.unique(ids)
     for row in np.flatnonzero(rng.random(len(ids)) < share):
         ids[row, 0] = rng.choice(known[known != ids[row, 0]])
-    return dataclasses.replace(sequence, detections=dataclasses.replace(detections, candidate_ids=ids))
+    return dataclasses.replace(
+        sequence, detections=dataclasses.replace(detections, candidate_ids=ids)
+    )
 
 
 def run_case(folder: Path, case: tuple[int, float, str]) -> Errors:
@@ -57,12 +65,18 @@ def run_case(folder: Path, case: tuple[int, float, str]) -> Errors:
     sequence = falsified(read_mrclam(folder, robot), share, [SEED, robot])
     instants = sequence.instants(RATE_HZ)
     name, settings = ESTIMATORS[label]
-    run = run_estimator(sequence, name, settings, instants_ns=instants, interim_maps=False)
+    run = run_estimator(
+        sequence, name, settings, instants_ns=instants, interim_maps=False
+    )
     if run.status == "failed":
-        return dict.fromkeys(("smoothed", "causal", "landmarks", "time_s"), float("nan"))
+        return dict.fromkeys(
+            ("smoothed", "causal", "landmarks", "time_s"), float("nan")
+        )
     (scores,) = judge(sequence, instants, [run]).scores.values()
     causal = scores["causal.ate_se2_m"].value
-    smoothed = scores["smoothed.ate_se2_m"].value if "smoothed.ate_se2_m" in scores else causal
+    smoothed = (
+        scores["smoothed.ate_se2_m"].value if "smoothed.ate_se2_m" in scores else causal
+    )
     return {
         "smoothed": smoothed,
         "causal": causal,
@@ -76,13 +90,22 @@ def collect(cases: list[tuple[int, float, str]], runs: list[Errors]) -> dict[str
     figures: dict[str, Any] = {}
     for label in ESTIMATORS:
         for share, word in ((0.0, "right"), (SHARE, "wrong")):
-            chosen = [run for (_, s, name), run in zip(cases, runs, strict=True) if (s, name) == (share, label)]
+            chosen = [
+                run
+                for (_, s, name), run in zip(cases, runs, strict=True)
+                if (s, name) == (share, label)
+            ]
             key = label.replace(" ", "_").replace("-", "_")
             for figure in ("smoothed", "causal", "landmarks", "time_s"):
                 mean = float(np.mean([run[figure] for run in chosen]))
                 figures[f"{key}_{figure}_{word}"] = mean if np.isfinite(mean) else None
-            figures[f"{key}_lost_{word}"] = sum(not run["smoothed"] <= LOST_M for run in chosen)
-        right, wrong = figures[f"{key}_smoothed_right"], figures[f"{key}_smoothed_wrong"]
+            figures[f"{key}_lost_{word}"] = sum(
+                not run["smoothed"] <= LOST_M for run in chosen
+            )
+        right, wrong = (
+            figures[f"{key}_smoothed_right"],
+            figures[f"{key}_smoothed_wrong"],
+        )
         figures[f"{key}_growth"] = wrong / right if right and wrong else None
     return figures
 
@@ -104,24 +127,67 @@ def print_estimators(figures: dict[str, Any]) -> None:
     rows = []
     for label in ESTIMATORS:
         key = label.replace(" ", "_").replace("-", "_")
-        columns = ("smoothed_right", "smoothed_wrong", "growth", "causal_right", "causal_wrong")
-        rest = ("landmarks_right", "landmarks_wrong", "lost_wrong", "time_s_right", "time_s_wrong")
-        rows.append((label, *("-" if (v := figures[f"{key}_{c}"]) is None else v for c in columns + rest)))
-    headers = ("", "smoothed m", "10 % wrong", "growth", "causal m", "10 % wrong", "landmarks m", "10 % wrong")
+        columns = (
+            "smoothed_right",
+            "smoothed_wrong",
+            "growth",
+            "causal_right",
+            "causal_wrong",
+        )
+        rest = (
+            "landmarks_right",
+            "landmarks_wrong",
+            "lost_wrong",
+            "time_s_right",
+            "time_s_wrong",
+        )
+        rows.append(
+            (
+                label,
+                *(
+                    "-" if (v := figures[f"{key}_{c}"]) is None else v
+                    for c in columns + rest
+                ),
+            )
+        )
+    headers = (
+        "",
+        "smoothed m",
+        "10 % wrong",
+        "growth",
+        "causal m",
+        "10 % wrong",
+        "landmarks m",
+        "10 % wrong",
+    )
     print_table((*headers, "lost", "s", "10 % wrong"), rows)
 
 
 def main() -> None:
     parser = make_parser(__doc__, data=True, workers=True)
-    parser.add_argument("--robots", type=int, nargs="+", default=ROBOTS, help="those to run (default: all five)")
+    parser.add_argument(
+        "--robots",
+        type=int,
+        nargs="+",
+        default=ROBOTS,
+        help="those to run (default: all five)",
+    )
     arguments = parser.parse_args()
     robots = ROBOTS[:1] if arguments.quick else tuple(arguments.robots)
-    cases = [(robot, share, label) for robot in robots for share in (0.0, SHARE) for label in ESTIMATORS]
+    cases = [
+        (robot, share, label)
+        for robot in robots
+        for share in (0.0, SHARE)
+        for label in ESTIMATORS
+    ]
     with recording(arguments.data, "mrclam_ds6.tar.xz", "MRCLAM_Dataset6") as folder:
         runs = in_parallel(partial(run_case, folder), cases, arguments.workers, "run")
     figures = collect(cases, runs)
     print_estimators(figures)
-    conclude({"robots": robots, "seed": SEED, **figures, "passed": is_met(figures)}, is_quick=arguments.quick)
+    conclude(
+        {"robots": robots, "seed": SEED, **figures, "passed": is_met(figures)},
+        is_quick=arguments.quick,
+    )
 
 
 if __name__ == "__main__":

@@ -67,8 +67,15 @@ def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int]]:
         for child in ast.iter_child_nodes(node):
             child._parent = node  # type: ignore[attr-defined]  # for `_statement_of`
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            annotations = [a.annotation for a in ast.walk(node.args) if isinstance(a, ast.arg)] + [node.returns]
-            untouched |= {id(n) for a in (*annotations, *node.decorator_list) if a for n in ast.walk(a)}
+            annotations = [
+                a.annotation for a in ast.walk(node.args) if isinstance(a, ast.arg)
+            ] + [node.returns]
+            untouched |= {
+                id(n)
+                for a in (*annotations, *node.decorator_list)
+                if a
+                for n in ast.walk(a)
+            }
         elif isinstance(node, ast.AnnAssign):
             untouched |= {id(n) for n in ast.walk(node.annotation)}
         elif isinstance(node, ast.Raise | ast.JoinedStr):
@@ -82,7 +89,11 @@ def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int]]:
             untouched.add(id(node))  # of nested functions, once
             if isinstance(node, ast.Compare):
                 yield from ((node, "comparison", k) for k in range(len(node.ops)))
-            elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _is_text(node):
+            elif (
+                isinstance(node, ast.BinOp)
+                and type(node.op) in OPERATORS
+                and not _is_text(node)
+            ):
                 yield node, "operator", 0
             elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
                 yield node, "sign", 0
@@ -92,7 +103,11 @@ def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int]]:
                 yield node, "and/or", 0
             elif isinstance(node, ast.If | ast.IfExp | ast.While):
                 yield node, "condition", 0
-            elif isinstance(node, ast.Return) and node.value is not None and not isinstance(node.value, ast.Constant):
+            elif (
+                isinstance(node, ast.Return)
+                and node.value is not None
+                and not isinstance(node.value, ast.Constant)
+            ):
                 yield node, "return", 0
             elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
                 yield node, "call", 0
@@ -100,7 +115,8 @@ def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int]]:
 
 def _is_text(node: ast.BinOp) -> bool:
     return any(
-        isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
+        isinstance(n, ast.JoinedStr)
+        or (isinstance(n, ast.Constant) and isinstance(n.value, str))
         for n in ast.walk(node)
     )
 
@@ -157,12 +173,17 @@ def _mutant(root: Path, path: Path, k: int) -> Mutant:
     first, last = statement.lineno, statement.end_lineno or statement.lineno
     node._site = k  # type: ignore[attr-defined]  # a mark for the transformer
     line = getattr(node, "lineno", first)
-    changed = ast.unparse(ast.fix_missing_locations(_Replace(k, number).visit(statement)))
+    changed = ast.unparse(
+        ast.fix_missing_locations(_Replace(k, number).visit(statement))
+    )
     indent = text.splitlines()[first - 1][: statement.col_offset]
     lines = text.split("\n")
     lines[first - 1 : last] = [indent + row for row in changed.split("\n")]
     old, new = before.split("\n"), changed.split("\n")
-    shown = next(((a, b) for a, b in zip(old, new, strict=False) if a.split() != b.split()), (old[0], new[0]))
+    shown = next(
+        ((a, b) for a, b in zip(old, new, strict=False) if a.split() != b.split()),
+        (old[0], new[0]),
+    )
     return Mutant(
         str(path.relative_to(root)),
         line,
@@ -213,16 +234,26 @@ def tests_of(root: Path, path: str) -> list[str]:
         imported = set()
         for node in ast.walk(ast.parse(test.read_text("utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module:
-                imported |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+                imported |= {
+                    node.module,
+                    *(f"{node.module}.{alias.name}" for alias in node.names),
+                }
             elif isinstance(node, ast.Import):
                 imported |= {alias.name for alias in node.names}
         name = str(test.relative_to(root))
         if module in imported:
             direct.append(name)
-        elif any(i == package or i.startswith(package + ".") for i in imported) and package not in PACKAGES:
+        elif (
+            any(i == package or i.startswith(package + ".") for i in imported)
+            and package not in PACKAGES
+        ):
             near.append(name)
     room = root / "tests" / Path(path).parts[1 if path.startswith("sonar_graph") else 0]
-    inside = [str(p.relative_to(root)) for p in sorted(room.rglob("test_*.py"))] if room.is_dir() else []
+    inside = (
+        [str(p.relative_to(root)) for p in sorted(room.rglob("test_*.py"))]
+        if room.is_dir()
+        else []
+    )
     return list(dict.fromkeys([*direct, *near, *inside])) or ["tests"]
 
 
@@ -233,7 +264,13 @@ def judge(root: Path, mutant: Mutant, tests: list[str]) -> str:
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "checkout")
-        shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".git", ".venv", "build", "demo", "node_modules"))
+        shutil.copytree(
+            root,
+            copy,
+            ignore=shutil.ignore_patterns(
+                ".git", ".venv", "build", "demo", "node_modules"
+            ),
+        )
         (copy / mutant.path).write_text(mutant.source, "utf-8")
         outcome, failed = run_tests(copy, tests)
     if outcome == "killed" and run_tests(root, failed)[0] != "survived":
@@ -244,7 +281,18 @@ def judge(root: Path, mutant: Mutant, tests: list[str]) -> str:
 def run_tests(copy: Path, tests: list[str]) -> tuple[str, list[str]]:
     """Outcome of the tests, and the first that fails; a module that cannot be imported fails with its test file."""
     environment = os.environ | {"PYTHONPATH": str(copy)}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-rfE", "--tb=no", "-p", "no:cacheprovider", *tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-rfE",
+        "--tb=no",
+        "-p",
+        "no:cacheprovider",
+        *tests,
+    ]
     process = subprocess.Popen(
         command, cwd=copy, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
         text=True, encoding="utf-8", errors="replace",
@@ -257,26 +305,45 @@ def run_tests(copy: Path, tests: list[str]) -> tuple[str, list[str]]:
         return "timeout", []
     if process.returncode == 0:
         return "survived", []
-    failed = re.findall(r"^(?:FAILED|ERROR) (tests/\S+\.py(?:::.*?)?)(?: - |$)", said, re.MULTILINE)
+    failed = re.findall(
+        r"^(?:FAILED|ERROR) (tests/\S+\.py(?:::.*?)?)(?: - |$)", said, re.MULTILINE
+    )
     if not failed:
-        raise RuntimeError(f"pytest ended with {process.returncode} and has judged nothing: {' '.join(tests[:3])} ...")
+        raise RuntimeError(
+            f"pytest ended with {process.returncode} and has judged nothing: {' '.join(tests[:3])} ..."
+        )
     return "killed", failed[:1]
 
 
 def main() -> None:
     """Choose, break, test, count."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="the checkout to judge")
+    parser.add_argument(
+        "--root",
+        type=Path,
+        default=Path(__file__).parents[2],
+        help="the checkout to judge",
+    )
     parser.add_argument("--mutants", type=int, default=60)
     parser.add_argument("--seed", type=int, default=16)
     parser.add_argument("--keep", type=Path, help="JSON file with the results so far")
-    parser.add_argument("--against", type=Path, help="an older checkout that judges the survivors")
-    parser.add_argument("--workers", type=int, default=1, help="faults judged side by side; one a core")
-    parser.add_argument("--quick", action="store_true", help="three mutants, to see that it runs")
+    parser.add_argument(
+        "--against", type=Path, help="an older checkout that judges the survivors"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=1, help="faults judged side by side; one a core"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="three mutants, to see that it runs"
+    )
     arguments = parser.parse_args()
     root = arguments.root.resolve()
     mutants = choose(root, 3 if arguments.quick else arguments.mutants, arguments.seed)
-    kept: dict[str, str] = json.loads(arguments.keep.read_text()) if arguments.keep and arguments.keep.exists() else {}
+    kept: dict[str, str] = (
+        json.loads(arguments.keep.read_text())
+        if arguments.keep and arguments.keep.exists()
+        else {}
+    )
     writing = Lock()
 
     def remember(key: str, root: Path, mutant: Mutant) -> str:
@@ -296,20 +363,38 @@ def main() -> None:
             return list(pool.map(remember, keys, [root] * len(keys), mutants))
 
     outcomes = judged([f"{m.name} {m.after}" for m in mutants], root, mutants)
-    survivors = [m for m, outcome in zip(mutants, outcomes, strict=True) if outcome == "survived"]
-    figures = {"mutants": len(mutants), "survived": len(survivors), "survival": round(len(survivors) / len(mutants), 3)}
+    survivors = [
+        m for m, outcome in zip(mutants, outcomes, strict=True) if outcome == "survived"
+    ]
+    figures = {
+        "mutants": len(mutants),
+        "survived": len(survivors),
+        "survival": round(len(survivors) / len(mutants), 3),
+    }
     said = ["not judged"] * len(survivors)
     if arguments.against:
         old_root = arguments.against.resolve()
         older = [same_fault(m, old_root) for m in survivors]
         there = [o for o in older if o]
-        answers = iter(judged([f"older {o.name} {o.after}" for o in there], old_root, there))
+        answers = iter(
+            judged([f"older {o.name} {o.after}" for o in there], old_root, there)
+        )
         said = [next(answers) if o else "not there" for o in older]
-        figures |= {"found_by_older_tests": sum(s not in ("survived", "not there") for s in said)}
-    rows = [[m.name, m.before[:60], m.after[:70], s] for m, s in zip(survivors, said, strict=True)]
+        figures |= {
+            "found_by_older_tests": sum(
+                s not in ("survived", "not there") for s in said
+            )
+        }
+    rows = [
+        [m.name, m.before[:60], m.after[:70], s]
+        for m, s in zip(survivors, said, strict=True)
+    ]
     print_table(["survivor", "before", "fault", "older tests"], rows)
     if arguments.against:
-        figures |= {"not_comparable": said.count("not there"), "passed": figures["found_by_older_tests"] == 0}
+        figures |= {
+            "not_comparable": said.count("not there"),
+            "passed": figures["found_by_older_tests"] == 0,
+        }
     conclude({"passed": True} | figures, is_quick=arguments.quick)
 
 

@@ -74,7 +74,9 @@ class Case:
     """Time between the knots of the vehicle's splines."""
 
     def __str__(self) -> str:
-        length = f"{self.keyframe_s:g} s" + (f" x {self.keyframes}" if self.keyframes > 1 else "")
+        length = f"{self.keyframe_s:g} s" + (
+            f" x {self.keyframes}" if self.keyframes > 1 else ""
+        )
         length += " brisk" if self.knot_s < 3.0 else ""
         return f"{length}, {self.gyro_density:g}, {1e3 * self.dvl_sigma:g} mm/s, {self.dvl_hz:g} Hz"
 
@@ -100,7 +102,9 @@ class Case:
             return "brisk"
         return "chain" if self.keyframes > 1 else "keyframe"
 
-    def calibration(self, gyro_is_noisy: bool = True, gap_s: float = 1.5) -> Calibration:
+    def calibration(
+        self, gyro_is_noisy: bool = True, gap_s: float = 1.5
+    ) -> Calibration:
         """The sensors as they are; a covariance without gyro noise where asked for."""
         rpy = BODY_R_DVL.as_euler("xyz").tolist()
         imu = ImuCalibration(
@@ -111,25 +115,37 @@ class Case:
         )
         dvl = DvlCalibration(
             velocity_sigma_m_s=(self.dvl_sigma,) * 3,
-            mounting=Mounting(translation_m=tuple(BODY_P_DVL.tolist()), rpy_rad=tuple(rpy)),
+            mounting=Mounting(
+                translation_m=tuple(BODY_P_DVL.tolist()), rpy_rad=tuple(rpy)
+            ),
             gap_s=gap_s,
         )
         return Calibration(imu=imu, dvl=dvl)
 
 
-def measure(vehicle: Vehicle, start_s: float, case: Case, rng: np.random.Generator) -> Measured:
+def measure(
+    vehicle: Vehicle, start_s: float, case: Case, rng: np.random.Generator
+) -> Measured:
     """Samples of one run, stamped from zero; those of the IMU begin at an arbitrary phase."""
     length_s = case.keyframe_s * case.keyframes
     dvl_t = np.arange(round(length_s * case.dvl_hz) + 1) / case.dvl_hz
     dvl_ns = np.round(dvl_t * NS).astype(np.int64)
-    imu_ns = np.round((np.arange(-2, length_s * IMU_HZ + 3) + rng.uniform()) / IMU_HZ * NS).astype(np.int64)
+    imu_ns = np.round(
+        (np.arange(-2, length_s * IMU_HZ + 3) + rng.uniform()) / IMU_HZ * NS
+    ).astype(np.int64)
     t = start_s + imu_ns / NS
     noise = rng.standard_normal((2, len(t), 3)) * np.sqrt(IMU_HZ)
     true_rate = vehicle.rate(t)
     rate = true_rate + case.gyro_density * noise[0]
     force = vehicle.specific_force(t) + ACCEL_DENSITY * noise[1]
-    velocity = vehicle.doppler(start_s + dvl_t) + case.dvl_sigma * rng.standard_normal((len(dvl_t), 3))
-    return Measured(Imu(imu_ns, rate, force), Dvl(dvl_ns, velocity, np.full((len(dvl_t), 3, 3), np.nan)), true_rate)
+    velocity = vehicle.doppler(start_s + dvl_t) + case.dvl_sigma * rng.standard_normal(
+        (len(dvl_t), 3)
+    )
+    return Measured(
+        Imu(imu_ns, rate, force),
+        Dvl(dvl_ns, velocity, np.full((len(dvl_t), 3, 3), np.nan)),
+        true_rate,
+    )
 
 
 def motions_of(case: Case, measured: Measured) -> list[list[PreintegratedMotion]]:
@@ -140,14 +156,22 @@ def motions_of(case: Case, measured: Measured) -> list[list[PreintegratedMotion]
         odometry = filled(case.calibration(gap_s=gap_s), measured.imu, measured.dvl)
         known_ns = int(measured.imu.stamps_ns[-1])
         spans = pairwise(ends_ns)
-        found.append([odometry.motion(i, j, NO_BIAS, known_ns=known_ns) for i, j in spans])
+        found.append(
+            [odometry.motion(i, j, NO_BIAS, known_ns=known_ns) for i, j in spans]
+        )
     for rule, gyro_is_noisy in RULES:
-        imu = measured.imu if gyro_is_noisy else replace(measured.imu, angular_velocity=measured.true_rate)
+        imu = (
+            measured.imu
+            if gyro_is_noisy
+            else replace(measured.imu, angular_velocity=measured.true_rate)
+        )
         calibration = case.calibration(gyro_is_noisy)
         rows = filled(calibration, imu, measured.dvl).rows()
         sensors = Sensors.of(calibration)
         spans = pairwise(ends_ns)
-        found.append([motion_by_rule(rows, rule, i, j, NO_BIAS, sensors) for i, j in spans])
+        found.append(
+            [motion_by_rule(rows, rule, i, j, NO_BIAS, sensors) for i, j in spans]
+        )
     return found
 
 
@@ -162,14 +186,18 @@ def true_motion(vehicle: Vehicle, start_s: float, duration_s: float) -> gtsam.Po
     ends = np.array([start_s, start_s + duration_s])
     R_i, R_j = vehicle.attitude(ends)
     p_i, p_j = vehicle.position(ends)
-    return gtsam.Pose3(gtsam.Rot3((R_i.inv() * R_j).as_matrix()), R_i.inv().apply(p_j - p_i))
+    return gtsam.Pose3(
+        gtsam.Rot3((R_i.inv() * R_j).as_matrix()), R_i.inv().apply(p_j - p_i)
+    )
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> float:
     return float(error @ np.linalg.solve(covariance, error)) / len(error)
 
 
-def one_run(vehicle: Vehicle, start_s: float, case: Case, measured: Measured) -> list[float]:
+def one_run(
+    vehicle: Vehicle, start_s: float, case: Case, measured: Measured
+) -> list[float]:
     """NEES per dimension by column, then the squared errors of the displacement, ours and as gaps, m²."""
     truth = true_motion(vehicle, start_s, case.keyframe_s * case.keyframes)
     columns, squares = [], []
@@ -193,31 +221,57 @@ def means(case: Case) -> list[float]:
         if run % 20 == 0:
             vehicle = make_vehicle(run, length_s + 20.0, case.knot_s)
         start_s = rng.uniform(0.0, 20.0)
-        values.append(one_run(vehicle, start_s, case, measure(vehicle, start_s, case, rng)))
+        values.append(
+            one_run(vehicle, start_s, case, measure(vehicle, start_s, case, rng))
+        )
     return [float(value) for value in np.mean(values, axis=0)]
 
 
 def main() -> int:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--runs", type=int, default=1000, help="for each case (default: 1000)")
+    parser.add_argument(
+        "--runs", type=int, default=1000, help="for each case (default: 1000)"
+    )
     arguments = parser.parse_args()
     runs = 40 if arguments.quick else arguments.runs
     grid = product((1.0, 5.0), (1e-4, 1e-3), (0.003, 0.01), (4.0, 5.0, 10.0))
     cases = [Case(*values, keyframes=1, runs=runs) for values in grid]
     cases += [
-        Case(1.0, gyro, sigma, 5.0, keyframes=2 if arguments.quick else CHAIN, runs=runs)
+        Case(
+            1.0, gyro, sigma, 5.0, keyframes=2 if arguments.quick else CHAIN, runs=runs
+        )
         for gyro, sigma in product((1e-4, 1e-3), (0.003, 0.01))
     ]
-    cases += [Case(1.0, 1e-4, sigma, hz, 1, runs, knot_s=1.0) for sigma, hz in product((0.003, 0.01), (4.0, 10.0))]
+    cases += [
+        Case(1.0, 1e-4, sigma, hz, 1, runs, knot_s=1.0)
+        for sigma, hz in product((0.003, 0.01), (4.0, 10.0))
+    ]
     cases = cases[::5] if arguments.quick else cases
-    cases += [Case(1.0, 1e-4, 0.005, hz, 1, runs, knot_s) for knot_s, hz in product((3.0, 1.0), (1.0, 2.0))]
+    cases += [
+        Case(1.0, 1e-4, 0.005, hz, 1, runs, knot_s)
+        for knot_s, hz in product((3.0, 1.0), (1.0, 2.0))
+    ]
     found = in_parallel(means, cases, arguments.workers, "case")
-    rows = [(case, row) for case, row in zip(cases, found, strict=True) if case.group != "slow"]
-    print_table(["keyframe, gyro density, DVL", *COLUMNS], [[str(case), *row[:6]] for case, row in rows])
-    slow = [(case, row) for case, row in zip(cases, found, strict=True) if case.group == "slow"]
+    rows = [
+        (case, row)
+        for case, row in zip(cases, found, strict=True)
+        if case.group != "slow"
+    ]
+    print_table(
+        ["keyframe, gyro density, DVL", *COLUMNS],
+        [[str(case), *row[:6]] for case, row in rows],
+    )
+    slow = [
+        (case, row)
+        for case, row in zip(cases, found, strict=True)
+        if case.group == "slow"
+    ]
     print_table(
         ["slow log", "ours, rms mm", "ANEES", "as gaps, rms mm", "ANEES"],
-        [[str(case), 1e3 * row[6] ** 0.5, row[1], 1e3 * row[7] ** 0.5, row[2]] for case, row in slow],
+        [
+            [str(case), 1e3 * row[6] ** 0.5, row[1], 1e3 * row[7] ** 0.5, row[2]]
+            for case, row in slow
+        ],
     )
     print_figures(figures(cases, found))
     return 0
@@ -227,15 +281,26 @@ def figures(cases: list[Case], found: list[list[float]]) -> dict[str, object]:
     """Extremes over single keyframes, chains and brisk keyframes; of slow logs every case."""
     named: dict[str, object] = {"runs": cases[0].runs, "cases": len(cases)}
     for group in ("keyframe", "chain", "brisk"):
-        rows = np.array([row for case, row in zip(cases, found, strict=True) if case.group == group])
+        rows = np.array(
+            [row for case, row in zip(cases, found, strict=True) if case.group == group]
+        )
         for name, column in zip(COLUMNS, rows.T, strict=False):
-            named[f"{group}_{name}_anees"] = [round(float(column.min()), 3), round(float(column.max()), 3)]
+            named[f"{group}_{name}_anees"] = [
+                round(float(column.min()), 3),
+                round(float(column.max()), 3),
+            ]
     for case, row in zip(cases, found, strict=True):
         if case.group == "slow":
             pace = "brisk" if case.knot_s < 3.0 else "gentle"
             numbers = 1e3 * row[6] ** 0.5, row[1], 1e3 * row[7] ** 0.5, row[2]
-            named[f"{pace}, {case.dvl_hz:g} Hz rms_mm, anees, as gaps"] = [round(number, 3) for number in numbers]
-    poses = [row[0] for case, row in zip(cases, found, strict=True) if case.group in ("keyframe", "chain")]
+            named[f"{pace}, {case.dvl_hz:g} Hz rms_mm, anees, as gaps"] = [
+                round(number, 3) for number in numbers
+            ]
+    poses = [
+        row[0]
+        for case, row in zip(cases, found, strict=True)
+        if case.group in ("keyframe", "chain")
+    ]
     named["passed"] = BAND[0] <= min(poses) and max(poses) <= BAND[1]
     return named
 

@@ -83,12 +83,19 @@ def read_one(path: Path) -> Reading:
     try:
         recording = scan(path, lambda _: Keep.ALL)
         reading = Reading(
-            messages={name: _payloads(topic) for name, topic in recording.topics.items()},
-            types={name: (topic.type_name, topic.schema_text) for name, topic in recording.topics.items()},
+            messages={
+                name: _payloads(topic) for name, topic in recording.topics.items()
+            },
+            types={
+                name: (topic.type_name, topic.schema_text)
+                for name, topic in recording.topics.items()
+            },
             metadata=recording.metadata,
             names_loss=bool(recording.corrupt or recording.ending),
             names_unprotected=bool(recording.damage.unprotected),
-            trouble="; ".join([*recording.corrupt, recording.ending or "", *recording.damage.remarks]),
+            trouble="; ".join(
+                [*recording.corrupt, recording.ending or "", *recording.damage.remarks]
+            ),
         )
         for topic in recording.topics.values():
             if topic.is_ros2:

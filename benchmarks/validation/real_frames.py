@@ -46,7 +46,12 @@ from common import conclude, in_parallel, make_parser, note, print_table, record
 from sonar_graph.calibration import SonarImage
 from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.cfar import LEAST_COUNT, DetectionParams, odd_counts, select_candidates
+from sonar_graph.sonar.cfar import (
+    LEAST_COUNT,
+    DetectionParams,
+    odd_counts,
+    select_candidates,
+)
 from sonar_graph.sonar.regions import measure_regions
 
 Image = NDArray[np.uint8]
@@ -83,7 +88,12 @@ class Frame:
 
 def frames_of(folder: Path) -> Iterator[Path]:
     """Image files in the order of their numbers."""
-    return iter(sorted((folder / "Images").glob("*.png"), key=lambda path: int(re.findall(r"\d+", path.stem)[-1])))
+    return iter(
+        sorted(
+            (folder / "Images").glob("*.png"),
+            key=lambda path: int(re.findall(r"\d+", path.stem)[-1]),
+        )
+    )
 
 
 def read_frame(path: Path) -> Frame:
@@ -94,9 +104,17 @@ def read_frame(path: Path) -> Frame:
     ranges = np.arange(np.ceil(r0) + 1, np.floor(r1))
     columns = apex[0] - np.sin(azimuths)[:, None] * ranges
     rows = apex[1] - np.cos(azimuths)[:, None] * ranges
-    polar = cv2.remap(picture, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
+    polar = cv2.remap(
+        picture, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR
+    )
     annotation = path.parents[1] / "BoxAnnotations" / f"{path.stem}.xml"
-    return Frame(np.asarray(polar), ranges * METRES_A_PIXEL, azimuths, apex, read_boxes(annotation))
+    return Frame(
+        np.asarray(polar),
+        ranges * METRES_A_PIXEL,
+        azimuths,
+        apex,
+        read_boxes(annotation),
+    )
 
 
 def read_boxes(path: Path) -> list[tuple[str, Box]]:
@@ -105,16 +123,22 @@ def read_boxes(path: Path) -> list[tuple[str, Box]]:
     for thing in ElementTree.parse(path).getroot().findall("object"):
         corner = thing.find("bndbox")
         assert corner is not None
-        x, y, w, h = (float(corner.findtext(key, "nan")) for key in ("x", "y", "w", "h"))
+        x, y, w, h = (
+            float(corner.findtext(key, "nan")) for key in ("x", "y", "w", "h")
+        )
         found.append((thing.findtext("name", ""), (x, y, w, h)))
     return found
 
 
 def fit_fan(picture: Image) -> tuple[tuple[float, float], float, tuple[float, float]]:
     """Apex (column, row), half of the opening angle, and smallest and largest range in pixels."""
-    lit = cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    lit = cv2.morphologyEx(
+        (picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
+    )
     rows = np.flatnonzero(lit.any(axis=1))
-    middle = rows[(rows > rows[0] + 0.2 * len(rows)) & (rows < rows[0] + 0.85 * len(rows))]
+    middle = rows[
+        (rows > rows[0] + 0.2 * len(rows)) & (rows < rows[0] + 0.85 * len(rows))
+    ]
     left = np.array([np.flatnonzero(lit[row])[0] for row in middle])
     right = np.array([np.flatnonzero(lit[row])[-1] for row in middle])
     (a, b), (c, d) = robust_line(middle, left), robust_line(middle, right)
@@ -122,14 +146,20 @@ def fit_fan(picture: Image) -> tuple[tuple[float, float], float, tuple[float, fl
     column = a * row + b
     half = (np.arctan(abs(a)) + np.arctan(abs(c))) / 2
     at = np.flatnonzero(lit[:, round(column)])
-    return (float(column), float(row)), float(half), (float(row - at[-1]), float(row - at[0]))
+    return (
+        (float(column), float(row)),
+        float(half),
+        (float(row - at[-1]), float(row - at[0])),
+    )
 
 
 def robust_line(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, float]:
     """Slope and offset, fitted twice: the second time without what is more than 3 pixels off."""
     slope, offset = np.polyfit(x, y, 1)
     near = np.abs(slope * x + offset - y) < 3
-    slope, offset = np.polyfit(x[near], y[near], 1) if near.sum() > 20 else (slope, offset)
+    slope, offset = (
+        np.polyfit(x[near], y[near], 1) if near.sum() > 20 else (slope, offset)
+    )
     return float(slope), float(offset)
 
 
@@ -138,10 +168,14 @@ Detector = Callable[[Frame, DetectionParams], tuple[Labels, NDArray[Any]]]
 """Label image and the labels of the accepted regions."""
 
 
-def ours(change: dict[str, float], frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
+def ours(
+    change: dict[str, float], frame: Frame, settings: DetectionParams
+) -> tuple[Labels, NDArray[Any]]:
     level = decibels(frame.polar, SonarImage())
     params = settings.model_copy(update=change)
-    candidates = select_candidates(level, frame.ranges_m, frame.azimuths_rad, None, params)
+    candidates = select_candidates(
+        level, frame.ranges_m, frame.azimuths_rad, None, params
+    )
     return candidates.labels, candidates.accepted + 1
 
 
@@ -159,10 +193,19 @@ def soca_factor(pfa: float, training: int = 40) -> float:
     return float(brentq(excess, 0.0, 1e9))
 
 
-def soca(setting: tuple[float, float], is_power: bool, frame: Frame, settings: DetectionParams) -> Any:
+def soca(
+    setting: tuple[float, float],
+    is_power: bool,
+    frame: Frame,
+    settings: DetectionParams,
+) -> Any:
     pfa, gate = setting
     image = frame.polar.astype(np.float64)
-    cells = 10 ** (decibels(frame.polar, SonarImage()).astype(np.float64) / 10) if is_power else image
+    cells = (
+        10 ** (decibels(frame.polar, SonarImage()).astype(np.float64) / 10)
+        if is_power
+        else image
+    )
     half, guard = 20, 5
     total = np.pad(np.cumsum(cells, axis=1), ((0, 0), (1, 0)))
     bins = cells.shape[1]
@@ -170,41 +213,82 @@ def soca(setting: tuple[float, float], is_power: bool, frame: Frame, settings: D
     before = total[:, at - guard] - total[:, at - guard - half]
     after = total[:, at + guard + half + 1] - total[:, at + guard + 1]
     mask = np.zeros(cells.shape, dtype=np.uint8)
-    mask[:, at] = (cells[:, at] > soca_factor(pfa) * np.minimum(before, after) / half) & (image[:, at] > gate)
+    mask[:, at] = (
+        cells[:, at] > soca_factor(pfa) * np.minimum(before, after) / half
+    ) & (image[:, at] > gate)
     return regions_of(mask, frame, settings)
 
 
-def median(offset_db: float, frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
+def median(
+    offset_db: float, frame: Frame, settings: DetectionParams
+) -> tuple[Labels, NDArray[Any]]:
     level = decibels(frame.polar, SonarImage())
-    smooth = cv2.blur(level, counts(settings.smoothing_m, frame)[::-1], borderType=cv2.BORDER_REFLECT_101)
-    return regions_of((smooth - np.median(smooth, axis=0) > offset_db).astype(np.uint8), frame, settings)
+    smooth = cv2.blur(
+        level,
+        counts(settings.smoothing_m, frame)[::-1],
+        borderType=cv2.BORDER_REFLECT_101,
+    )
+    return regions_of(
+        (smooth - np.median(smooth, axis=0) > offset_db).astype(np.uint8),
+        frame,
+        settings,
+    )
 
 
-def actag(offset: float, frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
+def actag(
+    offset: float, frame: Frame, settings: DetectionParams
+) -> tuple[Labels, NDArray[Any]]:
     padded = cv2.copyMakeBorder(frame.polar, 4, 4, 4, 4, cv2.BORDER_REPLICATE)
     filtered = np.asarray(cv2.medianBlur(padded, 9))[4:-4, 4:-4]
     window = np.ones((17, 17), np.uint8)
-    low = cv2.erode(filtered, window, borderType=cv2.BORDER_REPLICATE).astype(np.float64)
-    high = cv2.dilate(filtered, window, borderType=cv2.BORDER_REPLICATE).astype(np.float64)
-    return regions_of((filtered >= (low + high) / 2 - offset).astype(np.uint8), frame, settings)
+    low = cv2.erode(filtered, window, borderType=cv2.BORDER_REPLICATE).astype(
+        np.float64
+    )
+    high = cv2.dilate(filtered, window, borderType=cv2.BORDER_REPLICATE).astype(
+        np.float64
+    )
+    return regions_of(
+        (filtered >= (low + high) / 2 - offset).astype(np.uint8), frame, settings
+    )
 
 
 def counts(length_m: float, frame: Frame) -> list[int]:
     """Beams and bins of a length, as `select_candidates` takes them."""
-    beam_m = abs(frame.azimuths_rad[1] - frame.azimuths_rad[0]) * frame.ranges_m[[0, -1]].mean()
-    return [max(count, LEAST_COUNT) for count in odd_counts(length_m, (float(beam_m), METRES_A_PIXEL))]
+    beam_m = (
+        abs(frame.azimuths_rad[1] - frame.azimuths_rad[0])
+        * frame.ranges_m[[0, -1]].mean()
+    )
+    return [
+        max(count, LEAST_COUNT)
+        for count in odd_counts(length_m, (float(beam_m), METRES_A_PIXEL))
+    ]
 
 
-def regions_of(mask: Image, frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
+def regions_of(
+    mask: Image, frame: Frame, settings: DetectionParams
+) -> tuple[Labels, NDArray[Any]]:
     """Regions of a mask, closed and gated as ours are."""
-    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones(counts(settings.closing_m, frame), np.uint8))
+    closed = cv2.morphologyEx(
+        mask, cv2.MORPH_CLOSE, np.ones(counts(settings.closing_m, frame), np.uint8)
+    )
     count, labels = cv2.connectedComponents(closed, connectivity=8, ltype=cv2.CV_32S)
     contrast = frame.polar.astype(np.float32)
-    found = measure_regions(contrast, np.asarray(labels), count - 1, frame.ranges_m, frame.azimuths_rad, None)
-    is_sized = (found.area_m2 >= settings.min_area_m2) & (found.area_m2 <= settings.max_area_m2)
+    found = measure_regions(
+        contrast,
+        np.asarray(labels),
+        count - 1,
+        frame.ranges_m,
+        frame.azimuths_rad,
+        None,
+    )
+    is_sized = (found.area_m2 >= settings.min_area_m2) & (
+        found.area_m2 <= settings.max_area_m2
+    )
     accepted = np.flatnonzero(is_sized & (found.extent_m <= settings.max_extent_m))
     strength = (found.level_db * found.area_m2)[accepted]
-    return np.asarray(labels), accepted[np.argsort(-strength)][: settings.max_candidates] + 1
+    return np.asarray(labels), accepted[np.argsort(-strength)][
+        : settings.max_candidates
+    ] + 1
 
 
 @dataclass(frozen=True)
@@ -219,18 +303,27 @@ class Score:
 def score(frame: Frame, labels: Labels, accepted: NDArray[Any]) -> Score:
     """Compare regions with boxes."""
     regions = [cartesian_box(frame, labels, int(label)) for label in accepted]
-    found = tuple(any(is_hit(*region, box) for region in regions) for _, box in frame.boxes)
+    found = tuple(
+        any(is_hit(*region, box) for region in regions) for _, box in frame.boxes
+    )
     return Score(len(accepted), found)
 
 
-def cartesian_box(frame: Frame, labels: Labels, label: int) -> tuple[tuple[float, float], Box]:
+def cartesian_box(
+    frame: Frame, labels: Labels, label: int
+) -> tuple[tuple[float, float], Box]:
     """Centroid and bounding box of a region in the Cartesian frame."""
     beam, bin_ = np.nonzero(labels == label)
     r = frame.ranges_m[bin_] / METRES_A_PIXEL
     x = frame.apex[0] - r * np.sin(frame.azimuths_rad[beam])
     y = frame.apex[1] - r * np.cos(frame.azimuths_rad[beam])
     centroid = float(np.average(x, weights=r)), float(np.average(y, weights=r))
-    return centroid, (float(x.min()), float(y.min()), float(np.ptp(x)), float(np.ptp(y)))
+    return centroid, (
+        float(x.min()),
+        float(y.min()),
+        float(np.ptp(x)),
+        float(np.ptp(y)),
+    )
 
 
 def is_hit(centroid: tuple[float, float], region: Box, box: Box) -> bool:
@@ -242,11 +335,63 @@ def is_hit(centroid: tuple[float, float], region: Box, box: Box) -> bool:
     return is_inside and shared >= LEAST_OVERLAP * (w * h + p * q - shared)
 
 
-OURS = (0.2, 0.05, 0.02, 0.01, 3e-3, 1e-3, 1e-4, 1e-6, 1e-9, 1e-13, 1e-20, 1e-30, 1e-45, 1e-60, 1e-90)
+OURS = (
+    0.2,
+    0.05,
+    0.02,
+    0.01,
+    3e-3,
+    1e-3,
+    1e-4,
+    1e-6,
+    1e-9,
+    1e-13,
+    1e-20,
+    1e-30,
+    1e-45,
+    1e-60,
+    1e-90,
+)
 STRONGEST = (1, 2, 3, 4, 5, 6, 8, 12, 16)
-SOCA = tuple((pfa, gate) for gate in (0, 65, 100) for pfa in (0.3, 0.25, 0.2, 0.17, 0.14, 0.12, 0.1, 0.01))
-PFAS = (0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10, 1e-12, 1e-15, 1e-20)
-MEDIAN_OFFSETS_DB = (6.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0, 20.0, 22.0, 25.0, 28.0)
+SOCA = tuple(
+    (pfa, gate)
+    for gate in (0, 65, 100)
+    for pfa in (0.3, 0.25, 0.2, 0.17, 0.14, 0.12, 0.1, 0.01)
+)
+PFAS = (
+    0.1,
+    0.03,
+    0.01,
+    3e-3,
+    1e-3,
+    1e-4,
+    1e-5,
+    1e-6,
+    1e-7,
+    1e-8,
+    1e-10,
+    1e-12,
+    1e-15,
+    1e-20,
+)
+MEDIAN_OFFSETS_DB = (
+    6.0,
+    8.0,
+    9.0,
+    10.0,
+    11.0,
+    12.0,
+    13.0,
+    14.0,
+    15.0,
+    16.0,
+    17.0,
+    18.0,
+    20.0,
+    22.0,
+    25.0,
+    28.0,
+)
 OFFSETS = (1.0, 0.0, -2.0, -4.0, -6.0, -8.0, -11.0, -15.0, -20.0, -25.0, -30.0, -40.0)
 
 
@@ -269,13 +414,21 @@ def detectors() -> dict[str, list[tuple[object, Detector]]]:
 def strongest(detector: Detector) -> list[tuple[object, Detector]]:
     """A detector that keeps its strongest regions only."""
 
-    def limited(limit: int, frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
+    def limited(
+        limit: int, frame: Frame, settings: DetectionParams
+    ) -> tuple[Labels, NDArray[Any]]:
         return detector(frame, settings.model_copy(update={"max_candidates": limit}))
 
     return [(k, partial(limited, k)) for k in STRONGEST]
 
 
-PUBLISHED: dict[str, object] = {"ours": 1e-3, "soca": (0.1, 65), "soca-power": 0.1, "median": 12.0, "actag": 1.0}
+PUBLISHED: dict[str, object] = {
+    "ours": 1e-3,
+    "soca": (0.1, 65),
+    "soca-power": 0.1,
+    "median": 12.0,
+    "actag": 1.0,
+}
 """The setting each comes with."""
 
 
@@ -292,7 +445,9 @@ class Counts:
     """Walls found."""
 
 
-def judge_frame(settings: DetectionParams, path: Path) -> dict[tuple[str, object], tuple[Score, tuple[str, ...]]]:
+def judge_frame(
+    settings: DetectionParams, path: Path
+) -> dict[tuple[str, object], tuple[Score, tuple[str, ...]]]:
     """Every detector at every setting on one frame, with the names of the boxes."""
     cv2.setNumThreads(1)
     frame = read_frame(path)
@@ -304,7 +459,9 @@ def judge_frame(settings: DetectionParams, path: Path) -> dict[tuple[str, object
     }
 
 
-def curves(paths: Sequence[Path], settings: DetectionParams, workers: int) -> tuple[list[Counts], Floats, Floats]:
+def curves(
+    paths: Sequence[Path], settings: DetectionParams, workers: int
+) -> tuple[list[Counts], Floats, Floats]:
     """All settings of all detectors, and the number of objects and of walls in each frame."""
     judged = in_parallel(partial(judge_frame, settings), paths, workers, "frame")
     names = [next(iter(frame.values()))[1] for frame in judged]
@@ -318,7 +475,14 @@ def curves(paths: Sequence[Path], settings: DetectionParams, workers: int) -> tu
             for one, of in zip(scores, names, strict=True)
         ]
         hits = np.array([sum(one.found) for one in scores], float) - at_walls
-        found.append(Counts(*key, np.array([one.candidates for one in scores], float), hits, np.array(at_walls, float)))
+        found.append(
+            Counts(
+                *key,
+                np.array([one.candidates for one in scores], float),
+                hits,
+                np.array(at_walls, float),
+            )
+        )
     return found, objects, walls
 
 
@@ -331,7 +495,13 @@ def rates_of(found: Sequence[Counts], objects: Floats, weights: Floats) -> Rates
     rates = {}
     for name in dict.fromkeys(each.detector for each in found):
         candidates, hits = (
-            np.array([getattr(each, what) @ weights for each in found if each.detector == name])
+            np.array(
+                [
+                    getattr(each, what) @ weights
+                    for each in found
+                    if each.detector == name
+                ]
+            )
             for what in ("candidates", "hits")
         )
         rates[name] = candidates / weights.sum(), hits / (objects @ weights)
@@ -341,13 +511,18 @@ def rates_of(found: Sequence[Counts], objects: Floats, weights: Floats) -> Rates
 def envelope(rates: Rates, detector: str, budgets: Sequence[float]) -> list[float]:
     """The best hit rate of a detector with at most so many candidates a frame."""
     candidates, hit_rate = rates[detector]
-    return [float(hit_rate[candidates <= budget].max(initial=0.0)) for budget in budgets]
+    return [
+        float(hit_rate[candidates <= budget].max(initial=0.0)) for budget in budgets
+    ]
 
 
 def leads(rates: Rates) -> Floats:
     """What ours finds more than the best other detector, each by the better of its ways, by budget."""
     ways = {
-        name: np.maximum(*(envelope(rates, way, BUDGETS) for way in (name, f"{name}-strongest"))) for name in PUBLISHED
+        name: np.maximum(
+            *(envelope(rates, way, BUDGETS) for way in (name, f"{name}-strongest"))
+        )
+        for name in PUBLISHED
     }
     return np.asarray(ways.pop("ours") - np.max(list(ways.values()), axis=0))
 
@@ -359,7 +534,13 @@ def lead_intervals(found: Sequence[Counts], objects: Floats, seed: int = 1) -> F
     for _ in range(RESAMPLES):
         starts = rng.integers(0, n, max(1, n // BLOCK_FRAMES))
         at = (starts[:, None] + np.arange(BLOCK_FRAMES)) % n
-        drawn.append(leads(rates_of(found, objects, np.bincount(at.ravel(), minlength=n).astype(float))))
+        drawn.append(
+            leads(
+                rates_of(
+                    found, objects, np.bincount(at.ravel(), minlength=n).astype(float)
+                )
+            )
+        )
     return np.asarray(np.quantile(drawn, (0.025, 0.975), axis=0))
 
 
@@ -377,10 +558,21 @@ def draw(rates: Rates, path: Path) -> None:
         (dots,) = axes.plot(candidates, hit_rate, mark, label=name, ms=4, alpha=0.5)
         color = dots.get_color()
         axes.plot(budgets, envelope(rates, name, budgets), lw=1.2, color=color)
-        axes.plot(budgets, envelope(rates, f"{name}-strongest", budgets), ":", lw=1.2, color=color)
+        axes.plot(
+            budgets,
+            envelope(rates, f"{name}-strongest", budgets),
+            ":",
+            lw=1.2,
+            color=color,
+        )
         at = [setting for setting, _ in settings[name]].index(PUBLISHED[name])
         axes.plot(candidates[at], hit_rate[at], mark, ms=10, mfc="none", color=color)
-    axes.set(xscale="log", xlabel="candidates a frame", ylabel="objects found (without walls)", ylim=(0, 1))
+    axes.set(
+        xscale="log",
+        xlabel="candidates a frame",
+        ylabel="objects found (without walls)",
+        ylim=(0, 1),
+    )
     axes.grid(alpha=0.3)
     axes.legend(title="large: as it comes\ndotted: strongest only", frameon=False)
     figure.savefig(path, dpi=150)
@@ -402,7 +594,13 @@ def main() -> None:
     print_table(
         ("detector", "setting", "candidates a frame", "objects found", "walls found"),
         [
-            (c.detector, str(c.setting), c.candidates.mean(), c.hits.sum() / objects.sum(), c.walls.sum() / walls.sum())
+            (
+                c.detector,
+                str(c.setting),
+                c.candidates.mean(),
+                c.hits.sum() / objects.sum(),
+                c.walls.sum() / walls.sum(),
+            )
             for c in found
         ],
     )
@@ -410,7 +608,10 @@ def main() -> None:
     best = {name: envelope(rates, name, BUDGETS) for name in rates}
     lead, (low, high) = leads(rates), lead_intervals(found, objects)
     rows = [*best.items(), ("lead of ours", lead), ("from (95 %)", low), ("to", high)]
-    print_table(("objects found with at most", *(f"{b:g}" for b in BUDGETS)), [(name, *row) for name, row in rows])
+    print_table(
+        ("objects found with at most", *(f"{b:g}" for b in BUDGETS)),
+        [(name, *row) for name, row in rows],
+    )
     if arguments.figure:
         draw(rates, arguments.figure)
     figures: dict[str, Any] = {
@@ -418,8 +619,15 @@ def main() -> None:
         "candidates_a_frame": list(BUDGETS),
         "passed": bool((lead > 0).all()),
     }
-    figures |= {name.replace("-", "_"): [round(rate, 4) for rate in row] for name, row in best.items()}
-    figures |= {"lead": lead.round(4).tolist(), "lead_from": low.round(4).tolist(), "lead_to": high.round(4).tolist()}
+    figures |= {
+        name.replace("-", "_"): [round(rate, 4) for rate in row]
+        for name, row in best.items()
+    }
+    figures |= {
+        "lead": lead.round(4).tolist(),
+        "lead_from": low.round(4).tolist(),
+        "lead_to": high.round(4).tolist(),
+    }
     conclude(figures, is_quick=arguments.quick)
 
 

@@ -52,7 +52,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "speckle anew in every frame": {"speckle": "frame"},
     "without multipath": {"multipath": False},
     "equally spaced beams": {"measured_lens": False},
-    "landmarks 3 dB brighter": {"designs": str(Path(__file__).with_name("brighter_landmarks.toml"))},
+    "landmarks 3 dB brighter": {
+        "designs": str(Path(__file__).with_name("brighter_landmarks.toml"))
+    },
     "sound speed 1 % off": {"sound_speed_error": 0.01},
     "window of 7 m": {"window_m": 7.0},
     "window of 9 m": {"window_m": 9.0},
@@ -81,7 +83,9 @@ class Case:
     def run(self, seed: int) -> Run:
         """One seed, or what was kept of it."""
         image = ImageOptions.model_validate(VARIANTS[self.variant])
-        options = BasinOptions(duration_s=self.duration_s, laps=self.laps, seed=seed, image=image)
+        options = BasinOptions(
+            duration_s=self.duration_s, laps=self.laps, seed=seed, image=image
+        )
         return kept_run(self._path(seed), options, self.rules)
 
     def _path(self, seed: int) -> Path | None:
@@ -94,11 +98,20 @@ class Case:
 def digest() -> str:
     """Hash of the code and the model; other code does not go on from kept runs."""
     root = Path(sonar_graph.__file__).parent
-    here = [Path(__file__).with_name(name) for name in ("recognition_runs.py", "brighter_landmarks.toml")]
+    here = [
+        Path(__file__).with_name(name)
+        for name in ("recognition_runs.py", "brighter_landmarks.toml")
+    ]
     files = [*sorted(root.glob("*.*")), *here]
     for folder in ("sonar", "simulation", "navigation", "evaluation"):
-        files += sorted(path for path in (root / folder).rglob("*.*") if path.suffix in {".py", ".json", ".toml"})
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+        files += sorted(
+            path
+            for path in (root / folder).rglob("*.*")
+            if path.suffix in {".py", ".json", ".toml"}
+        )
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[
+        :12
+    ]
 
 
 @dataclass(frozen=True)
@@ -118,7 +131,9 @@ class Summary:
 
     @property
     def passed(self) -> bool:
-        return self.nis_inside and all(low <= self.figures[name] <= high for name, (low, high) in TARGETS.items())
+        return self.nis_inside and all(
+            low <= self.figures[name] <= high for name, (low, high) in TARGETS.items()
+        )
 
 
 def summarise(runs: list[Run], rule: str) -> Summary:
@@ -126,22 +141,39 @@ def summarise(runs: list[Run], rule: str) -> Summary:
     found = [run.detections[rule] for run in runs]
     accepted = [d.is_named & (d.probability >= ACCEPTED) for d in found]
     right = [a & (d.named == d.label) for a, d in zip(accepted, found, strict=True)]
-    watched = [_watched(run, d, a, r) for run, d, a, r in zip(runs, found, accepted, right, strict=True)]
-    recognised, fooled, delays_s = (np.concatenate([getattr(w, n) for w in watched]) for n in Watched._fields[:3])
-    middles, means = (np.concatenate([getattr(w, n) for w in watched]) for n in ("nis", "mean_nis"))
+    watched = [
+        _watched(run, d, a, r)
+        for run, d, a, r in zip(runs, found, accepted, right, strict=True)
+    ]
+    recognised, fooled, delays_s = (
+        np.concatenate([getattr(w, n) for w in watched]) for n in Watched._fields[:3]
+    )
+    middles, means = (
+        np.concatenate([getattr(w, n) for w in watched]) for n in ("nis", "mean_nis")
+    )
     error = np.concatenate([d.error[r] for d, r in zip(found, right, strict=True)])
-    everything = np.concatenate([normalised(d, r) for d, r in zip(found, right, strict=True)])
+    everything = np.concatenate(
+        [normalised(d, r) for d, r in zip(found, right, strict=True)]
+    )
     judged = _reliability(found, [np.arange(len(d.named)) for d in found])
     freedom = 2 * len(middles)
     band = chi2.ppf([0.025, 0.975], freedom) / freedom
     of_seeds = np.array([w.nis.mean() for w in watched if len(w.nis)])
-    half = 1.96 * of_seeds.std(ddof=1) / np.sqrt(len(of_seeds)) if len(of_seeds) > 1 else 0.0
+    half = (
+        1.96 * of_seeds.std(ddof=1) / np.sqrt(len(of_seeds))
+        if len(of_seeds) > 1
+        else 0.0
+    )
     figures = {
         "passes_recognised": float(np.mean(recognised)),
-        "accepted_right": float(sum(r.sum() for r in right) / max(sum(a.sum() for a in accepted), 1)),
+        "accepted_right": float(
+            sum(r.sum() for r in right) / max(sum(a.sum() for a in accepted), 1)
+        ),
         "false_accepts": float(np.mean(fooled)) if len(fooled) else 0.0,
         "ece": judged.expected_error,
-        "ece_of_passes": _reliability(found, [w.middle for w in watched]).expected_error,
+        "ece_of_passes": _reliability(
+            found, [w.middle for w in watched]
+        ).expected_error,
         "range_rms_m": float(np.sqrt(np.mean(error[:, 0] ** 2))),
         "azimuth_rms_deg": float(np.degrees(np.sqrt(np.mean(error[:, 1] ** 2)))),
         "nis": float(np.mean(middles)),
@@ -151,7 +183,14 @@ def summarise(runs: list[Run], rule: str) -> Summary:
     }
     total = int(sum(a.sum() for a in accepted))
     interval = float(of_seeds.mean() - half), float(of_seeds.mean() + half)
-    return Summary(figures, (float(band[0]), float(band[1])), interval, len(recognised), total, judged)
+    return Summary(
+        figures,
+        (float(band[0]), float(band[1])),
+        interval,
+        len(recognised),
+        total,
+        judged,
+    )
 
 
 class Watched(NamedTuple):
@@ -171,7 +210,9 @@ class Watched(NamedTuple):
     """Row of the middle detection of every pass that has one."""
 
 
-def _watched(run: Run, found: Detections, accepted: np.ndarray, right: np.ndarray) -> Watched:
+def _watched(
+    run: Run, found: Detections, accepted: np.ndarray, right: np.ndarray
+) -> Watched:
     recognised, fooled, delay_s, nis, mean_nis, middle = [], [], [], [], [], []
     for row, rows in _by_pass(run.passes, found):
         middle += [rows[len(rows) // 2]] if len(rows) else []
@@ -184,7 +225,10 @@ def _watched(run: Run, found: Detections, accepted: np.ndarray, right: np.ndarra
             delay_s.append(found.stamp_s[hits[0]] - run.passes.begin_s[row])
             nis.append(normalised(found, hits[len(hits) // 2]))
             mean_nis.append(normalised_mean(found, hits))
-    return Watched(*map(np.array, (recognised, fooled, delay_s, nis, mean_nis)), np.array(middle, dtype=int))
+    return Watched(
+        *map(np.array, (recognised, fooled, delay_s, nis, mean_nis)),
+        np.array(middle, dtype=int),
+    )
 
 
 def _by_pass(passes: Passes, found: Detections) -> list[tuple[int, np.ndarray]]:
@@ -192,14 +236,18 @@ def _by_pass(passes: Passes, found: Detections) -> list[tuple[int, np.ndarray]]:
     result = []
     for row in range(len(passes.object_id)):
         during = passes.during(row, found.stamp_s)
-        result.append((row, np.flatnonzero(during & (found.label == passes.object_id[row]))))
+        result.append(
+            (row, np.flatnonzero(during & (found.label == passes.object_id[row])))
+        )
     return result
 
 
 def normalised(found: Detections, rows: Any) -> np.ndarray:
     """Normalised squared error per degree of freedom."""
     e, C = found.error[rows], found.covariance[rows]
-    return np.asarray(np.einsum("...i,...i->...", e, np.linalg.solve(C, e[..., None])[..., 0]) / 2)
+    return np.asarray(
+        np.einsum("...i,...i->...", e, np.linalg.solve(C, e[..., None])[..., 0]) / 2
+    )
 
 
 def normalised_mean(found: Detections, rows: np.ndarray) -> float:
@@ -211,23 +259,54 @@ def normalised_mean(found: Detections, rows: np.ndarray) -> float:
 
 def _reliability(found: list[Detections], rows: list[np.ndarray]) -> Reliability:
     """Accuracy of the most probable class, where the truth is known."""
-    confidence = np.concatenate([d.confidence[r] for d, r in zip(found, rows, strict=True)])
+    confidence = np.concatenate(
+        [d.confidence[r] for d, r in zip(found, rows, strict=True)]
+    )
     label = np.concatenate([d.label[r] for d, r in zip(found, rows, strict=True)])
-    said = np.concatenate([np.where(d.is_named, d.named, NONE)[r] for d, r in zip(found, rows, strict=True)])
+    said = np.concatenate(
+        [
+            np.where(d.is_named, d.named, NONE)[r]
+            for d, r in zip(found, rows, strict=True)
+        ]
+    )
     judged = label != UNJUDGED
-    return reliability(confidence[judged], (said == np.maximum(label, NONE))[judged].astype(float))
+    return reliability(
+        confidence[judged], (said == np.maximum(label, NONE))[judged].astype(float)
+    )
 
 
 def show(summaries: dict[str, Summary]) -> None:
     """One line a case."""
-    headers = ("", "passes", "named", "after s", "accepted", "right", "false", "ECE", "of passes")
+    headers = (
+        "",
+        "passes",
+        "named",
+        "after s",
+        "accepted",
+        "right",
+        "false",
+        "ECE",
+        "of passes",
+    )
     errors = ("range mm", "azimuth deg", "NIS", "band", "NIS of all", "pass mean NIS")
     rows = []
     for name, s in summaries.items():
         f = s.figures
         band = f"{s.nis_band[0]:.2f}..{s.nis_band[1]:.2f}"
-        accepted = (s.accepted, f"{f['accepted_right']:.4f}", f["false_accepts"], f["ece"], f["ece_of_passes"])
-        accuracy = (f"{f['range_rms_m'] * 1e3:.1f}", f["azimuth_rms_deg"], f["nis"], band, f["nis_of_all"])
+        accepted = (
+            s.accepted,
+            f"{f['accepted_right']:.4f}",
+            f["false_accepts"],
+            f["ece"],
+            f["ece_of_passes"],
+        )
+        accuracy = (
+            f"{f['range_rms_m'] * 1e3:.1f}",
+            f["azimuth_rms_deg"],
+            f["nis"],
+            band,
+            f["nis_of_all"],
+        )
         named = (s.passes, f["passes_recognised"], f"{f['seconds_to_name']:.1f}")
         rows.append((name, *named, *accepted, *accuracy, f["pass_mean_nis"]))
     print_table((*headers, *errors), rows)
@@ -242,9 +321,17 @@ def draw(ours: Summary, literal: Summary, path: Path) -> None:
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="number of basins (default: 20; with --quick 2)")
-    parser.add_argument("--work", type=Path, help="keep what came of each basin in this folder, and go on from it")
-    parser.add_argument("--out", type=Path, help="write the reliability of both rules here (PNG)")
+    parser.add_argument(
+        "--seeds", type=int, help="number of basins (default: 20; with --quick 2)"
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        help="keep what came of each basin in this folder, and go on from it",
+    )
+    parser.add_argument(
+        "--out", type=Path, help="write the reliability of both rules here (PNG)"
+    )
     arguments = parser.parse_args()
     if arguments.work is not None:
         arguments.work.mkdir(parents=True, exist_ok=True)
@@ -253,7 +340,10 @@ def main() -> None:
     seeds = range(arguments.seeds or (2 if arguments.quick else 20))
     whole = published("as it is", (OURS, LITERAL), arguments.work)
     runs = in_parallel(whole.run, seeds, arguments.workers, "basin")
-    summaries = {"ours": summarise(runs, OURS), "2014, as printed": summarise(runs, LITERAL)}
+    summaries = {
+        "ours": summarise(runs, OURS),
+        "2014, as printed": summarise(runs, LITERAL),
+    }
     for variant in VARIANTS:
         case = short(variant, (OURS,), arguments.work)
         runs = in_parallel(case.run, seeds, arguments.workers, variant)
@@ -262,9 +352,23 @@ def main() -> None:
     ours, literal = summaries["ours"], summaries["2014, as printed"]
     if arguments.out is not None:
         draw(ours, literal, arguments.out)
-    others = {name: summary.figures for name, summary in summaries.items() if summary is not ours}
-    figures: dict[str, Any] = {"seeds": len(seeds), "passes": ours.passes, "accepted": ours.accepted, **ours.figures}
-    figures |= {"nis_band": ours.nis_band, "nis_of_seeds": ours.nis_of_seeds, "others": others, "passed": ours.passed}
+    others = {
+        name: summary.figures
+        for name, summary in summaries.items()
+        if summary is not ours
+    }
+    figures: dict[str, Any] = {
+        "seeds": len(seeds),
+        "passes": ours.passes,
+        "accepted": ours.accepted,
+        **ours.figures,
+    }
+    figures |= {
+        "nis_band": ours.nis_band,
+        "nis_of_seeds": ours.nis_of_seeds,
+        "others": others,
+        "passed": ours.passed,
+    }
     conclude(figures, is_quick=arguments.quick)
 
 

@@ -48,11 +48,24 @@ from sonar_graph.recognition.confusion_fit import (
 from sonar_graph.recognition.session import RecognitionSession, one_by_one
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.sonar_image import ImageOptions
-from sonar_graph.sonar import SHIPPED, IdentityParams, Recogniser, read_confusion, soft_scores
+from sonar_graph.sonar import (
+    SHIPPED,
+    IdentityParams,
+    Recogniser,
+    read_confusion,
+    soft_scores,
+)
 from sonar_graph.sonar.bayes import bounded_evidence
 
-RANDOM, WINDOWS_M, MILD = (*range(3001, 3041), *range(3210, 3219)), {3121: 8.0, 3122: 9.5, 3123: 5.0}, range(3201, 3210)
-OTHERS = {seed: ("bare_landmarks.toml", "mixed_landmarks.toml")[seed // 2 % 2] for seed in range(3300, 3316)}
+RANDOM, WINDOWS_M, MILD = (
+    (*range(3001, 3041), *range(3210, 3219)),
+    {3121: 8.0, 3122: 9.5, 3123: 5.0},
+    range(3201, 3210),
+)
+OTHERS = {
+    seed: ("bare_landmarks.toml", "mixed_landmarks.toml")[seed // 2 % 2]
+    for seed in range(3300, 3316)
+}
 """Basins of other designs, which share the weights of the evidence."""
 ACCURACY = (1002, 1004)
 FOAM_M, SAME_HEIGHT_M = 0.012, 0.003
@@ -89,7 +102,11 @@ def conditions_of(seed: int) -> dict[str, Any]:
     if seed in WINDOWS_M:
         return {"window_m": WINDOWS_M[seed], "contrast_db": float(drawn["contrast_db"])}
     few = ("contrast_db", "plate_db", "foam_height_m", "sediment", "fouling")
-    return {few[k]: float(drawn[few[k]]) for k in {seed % 5, seed // 2 % 5}} if seed in MILD else {}
+    return (
+        {few[k]: float(drawn[few[k]]) for k in {seed % 5, seed // 2 % 5}}
+        if seed in MILD
+        else {}
+    )
 
 
 def is_as_designed(conditions: dict[str, Any]) -> bool:
@@ -99,7 +116,11 @@ def is_as_designed(conditions: dict[str, Any]) -> bool:
 
 def designs_of(seed: int) -> tuple[LandmarkDesign, ...]:
     """Designs of the landmarks in the basin of a seed."""
-    return load_designs(Path(__file__).with_name(OTHERS[seed])) if seed in OTHERS else DEFAULT_DESIGNS
+    return (
+        load_designs(Path(__file__).with_name(OTHERS[seed]))
+        if seed in OTHERS
+        else DEFAULT_DESIGNS
+    )
 
 
 def sightings_of(seed: int) -> LabelledSightings:
@@ -109,25 +130,43 @@ def sightings_of(seed: int) -> LabelledSightings:
         rate_hz = 1.5 if "window_m" in known else 3.0
         if seed in OTHERS:
             known["designs"] = str(Path(__file__).with_name(OTHERS[seed]))
-        image = ImageOptions.model_validate({"strangers": ["natural", "look-alikes"]} | known)
-        options = BasinOptions(duration_s=200.0, laps=1, seed=seed, frame_rate_hz=rate_hz, image=image)
+        image = ImageOptions.model_validate(
+            {"strangers": ["natural", "look-alikes"]} | known
+        )
+        options = BasinOptions(
+            duration_s=200.0, laps=1, seed=seed, frame_rate_hz=rate_hz, image=image
+        )
     else:
-        options = BasinOptions(duration_s=390.0, seed=seed, frame_rate_hz=5.0, image=ImageOptions())
+        options = BasinOptions(
+            duration_s=390.0, seed=seed, frame_rate_hz=5.0, image=ImageOptions()
+        )
     sequence, found = simulate_basin(options), LabelledSightings(IDS)
     recogniser = Recogniser(sequence.calibration, designs_of(seed))
     session = RecognitionSession(sequence, recogniser=recogniser, pictures=False)
     for block in simulate_basin_frames(options):
         truth, is_landmark = block.truth, block.truth.ids > 0
         columns = truth.range_m()[:, is_landmark], truth.azimuth_rad()[:, is_landmark]
-        for frame, *range_azimuth in zip(one_by_one(block.frames), *columns, strict=True):
+        for frame, *range_azimuth in zip(
+            one_by_one(block.frames), *columns, strict=True
+        ):
             session.take(frame)
             if recogniser.stamp_ns != int(frame.stamps_ns[0]):
                 continue
-            tracks = zip(recogniser.track_ids.tolist(), recogniser.news.tolist(), recogniser.sightings, strict=True)
+            tracks = zip(
+                recogniser.track_ids.tolist(),
+                recogniser.news.tolist(),
+                recogniser.sightings,
+                strict=True,
+            )
             for track, news, sighting in tracks:
                 if sighting is not None:
                     found.add(
-                        sighting, recogniser.stamp_ns, (seed, track), news, truth.ids[is_landmark], *range_azimuth
+                        sighting,
+                        recogniser.stamp_ns,
+                        (seed, track),
+                        news,
+                        truth.ids[is_landmark],
+                        *range_azimuth,
                     )
     return found
 
@@ -141,11 +180,15 @@ class Tally:
     others: int = 0
     accepted: int = 0
 
-    def count(self, found: LabelledSightings, weights: np.ndarray, looks: float, doubt: float) -> None:
+    def count(
+        self, found: LabelledSightings, weights: np.ndarray, looks: float, doubt: float
+    ) -> None:
         """Add the ends of all tracks."""
         sums, counted, label, _ = track_sums(found.fits())
         odds = np.pad(sums @ weights, ((0, 0), (0, 1)))
-        belief = bounded_evidence(IdentityParams().birth(len(IDS)), odds, counted, looks, doubt)
+        belief = bounded_evidence(
+            IdentityParams().birth(len(IDS)), odds, counted, looks, doubt
+        )
         best, is_known = np.argmax(belief, axis=1), label < len(IDS)
         is_accepted = (best < len(IDS)) & (belief.max(axis=1) >= ACCEPTED)
         self.landmarks += int(is_known.sum())
@@ -168,69 +211,127 @@ def nats_lost(fits: LabelledFits, fitted: float) -> dict[str, float]:
     once = 1.0 / np.bincount(fits.track)[fits.track]
 
     def loss(power: float) -> float:
-        usual, sigmas, _ = accuracy(error, fits.bound_m, fits.track, powers=(power, power))
+        usual, sigmas, _ = accuracy(
+            error, fits.bound_m, fits.track, powers=(power, power)
+        )
         variances = (sigmas * (fits.bound_m / usual) ** power) ** 2
         terms = 0.5 * (np.log(variances) + error**2 / variances).sum(axis=1)
         known = np.isfinite(terms)
         return float(np.average(terms[known], weights=once[known]))
 
-    return {name: loss(power) - loss(fitted) for name, power in (("power 0", 0.0), ("power 1", 1.0))}
+    return {
+        name: loss(power) - loss(fitted)
+        for name, power in (("power 0", 0.0), ("power 1", 1.0))
+    }
 
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("-o", "--output", type=Path, metavar="MODEL.json", help="write the model")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="only one in N of the basins")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="MODEL.json", help="write the model"
+    )
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="N", help="only one in N of the basins"
+    )
     arguments = parser.parse_args()
-    chosen = [*RANDOM, *WINDOWS_M, *MILD, *OTHERS][:: 30 if arguments.quick else arguments.every]
+    chosen = [*RANDOM, *WINDOWS_M, *MILD, *OTHERS][
+        :: 30 if arguments.quick else arguments.every
+    ]
     parts = in_parallel(sightings_of, chosen, arguments.workers, "basin")
     shipped = read_confusion(SHIPPED)
     anew, as_shipped = Tally(), Tally()
     for fold in range(FOLDS):
         weights, looks = fit_weights(
-            together([part for k, part in enumerate(parts) if k % FOLDS != fold]).fits(),
+            together(
+                [part for k, part in enumerate(parts) if k % FOLDS != fold]
+            ).fits(),
             np.array(shipped.weights),
             shipped.looks,
         )
         if left_out := parts[fold::FOLDS]:
             anew.count(together(left_out), weights, looks, shipped.doubt)
-            as_shipped.count(together(left_out), np.array(shipped.weights), shipped.looks, shipped.doubt)
+            as_shipped.count(
+                together(left_out),
+                np.array(shipped.weights),
+                shipped.looks,
+                shipped.doubt,
+            )
     provenance = {
         "origin": f"simulated basins of benchmarks/validation/{Path(__file__).name}",
         "basins": ", ".join(map(str, chosen)),
     }
-    ours = {seed: part for seed, part in zip(chosen, parts, strict=True) if seed not in OTHERS}
+    ours = {
+        seed: part
+        for seed, part in zip(chosen, parts, strict=True)
+        if seed not in OTHERS
+    }
     fits = together([*ours.values()]).fits()
     model = estimate_confusion(fits, IDS, provenance, DEFAULT_DESIGNS)
-    weights, looks = fit_weights(together(parts).fits(), np.array(shipped.weights), shipped.looks)
-    scores = soft_scores(np.pad(fits.evidence @ weights, ((0, 0), (0, 1))), looks)
-    matrix = tuple(map(tuple, confusion_rows(scores, fits.label, trials_of(fits)).tolist()))
-    doubt = 0.5 / len(np.unique(together(parts).fits().track))  # never seen in n tracks: one in 2 n
-    model = model.model_copy(
-        update={"weights": tuple(weights.tolist()), "looks": looks, "matrix": matrix, "doubt": doubt}
+    weights, looks = fit_weights(
+        together(parts).fits(), np.array(shipped.weights), shipped.looks
     )
-    plain = in_parallel(sightings_of, [] if arguments.quick else list(ACCURACY), arguments.workers, "accuracy")
-    near = [part for seed, part in ours.items() if is_as_designed(conditions_of(seed))] + plain
+    scores = soft_scores(np.pad(fits.evidence @ weights, ((0, 0), (0, 1))), looks)
+    matrix = tuple(
+        map(tuple, confusion_rows(scores, fits.label, trials_of(fits)).tolist())
+    )
+    # never seen in n tracks: one in 2 n
+    doubt = 0.5 / len(np.unique(together(parts).fits().track))
+    model = model.model_copy(
+        update={
+            "weights": tuple(weights.tolist()),
+            "looks": looks,
+            "matrix": matrix,
+            "doubt": doubt,
+        }
+    )
+    plain = in_parallel(
+        sightings_of,
+        [] if arguments.quick else list(ACCURACY),
+        arguments.workers,
+        "accuracy",
+    )
+    near = [
+        part for seed, part in ours.items() if is_as_designed(conditions_of(seed))
+    ] + plain
     fits_near = together(near).fits()
     of_near = estimate_confusion(fits_near, IDS, {}, DEFAULT_DESIGNS)
-    usual, sigmas, _ = accuracy(without_height(fits_near)[1], fits_near.bound_m, fits_near.track, powers=(1.0, 1.0))
+    usual, sigmas, _ = accuracy(
+        without_height(fits_near)[1],
+        fits_near.bound_m,
+        fits_near.track,
+        powers=(1.0, 1.0),
+    )
     of_accuracy = *sigmas.tolist(), *usual.tolist(), 1.0, of_near.report_interval_s, 0.0
     accurate = dict(zip(ACCURATE, of_accuracy, strict=True))
     model = model.model_copy(update=accurate)
     if arguments.output is not None:
-        arguments.output.write_text(model.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        arguments.output.write_text(
+            model.model_dump_json(indent=2) + "\n", encoding="utf-8"
+        )
     print_table(
         ("", "landmarks", "named", "others", "accepted"),
-        [(name, *vars(tally).values()) for name, tally in (("anew", anew), ("as shipped", as_shipped))],
+        [
+            (name, *vars(tally).values())
+            for name, tally in (("anew", anew), ("as shipped", as_shipped))
+        ],
     )
     values = [
         ("looks", model.looks, shipped.looks),
         *((n, getattr(model, n), getattr(shipped, n)) for n in accurate),
     ]
-    values += [(f"weight {k}", *pair) for k, pair in enumerate(zip(model.weights, shipped.weights, strict=True))]
-    print_table(("", "anew", "shipped"), [(name, *(f"{value:.5g}" for value in pair)) for name, *pair in values])
+    values += [
+        (f"weight {k}", *pair)
+        for k, pair in enumerate(zip(model.weights, shipped.weights, strict=True))
+    ]
+    print_table(
+        ("", "anew", "shipped"),
+        [(name, *(f"{value:.5g}" for value in pair)) for name, *pair in values],
+    )
     lost = nats_lost(fits_near, of_near.bound_power)
-    print_table(("sigma grows with the bound", "nats"), [(name, f"{nats:.2f}") for name, nats in lost.items()])
+    print_table(
+        ("sigma grows with the bound", "nats"),
+        [(name, f"{nats:.2f}") for name, nats in lost.items()],
+    )
     figures = {
         "basins": len(parts),
         "fitted_power": of_near.bound_power,
@@ -238,7 +339,10 @@ def main() -> None:
         "anew": vars(anew),
         "as_shipped": vars(as_shipped),
     }
-    conclude(figures | {"passed": anew.accepted <= MOST_ACCEPTED * anew.others}, is_quick=arguments.quick)
+    conclude(
+        figures | {"passed": anew.accepted <= MOST_ACCEPTED * anew.others},
+        is_quick=arguments.quick,
+    )
 
 
 if __name__ == "__main__":

@@ -63,7 +63,9 @@ class Passes:
 
     def during(self, row: int, stamp_s: np.ndarray) -> np.ndarray:
         """Mask of the instants of a pass."""
-        return (stamp_s >= self.begin_s[row] - MARGIN_S) & (stamp_s <= self.end_s[row] + MARGIN_S)
+        return (stamp_s >= self.begin_s[row] - MARGIN_S) & (
+            stamp_s <= self.end_s[row] + MARGIN_S
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,10 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
     sessions = {
         rule: RecognitionSession(
             sequence,
-            params=RecogniserParams(identity=IdentityParams.model_validate({"rule": rule}), independent=False),
+            params=RecogniserParams(
+                identity=IdentityParams.model_validate({"rule": rule}),
+                independent=False,
+            ),
             pictures=False,
         )
         for rule in rules
@@ -96,24 +101,36 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
         for row, frame in enumerate(one_by_one(block.frames)):
             for rule, session in sessions.items():
                 if (reported := session.take(frame)) is not None:
-                    found[rule].append(_judged(reported, float(block_s[row]), block.truth, row))
+                    found[rule].append(
+                        _judged(reported, float(block_s[row]), block.truth, row)
+                    )
     passes = passes_of(np.concatenate(seconds), np.concatenate(in_view), ids, kinds)
     return Run(passes, {rule: _stacked(parts) for rule, parts in found.items()})
 
 
-def passes_of(seconds: np.ndarray, in_view: np.ndarray, ids: np.ndarray, kinds: Sequence[str]) -> Passes:
+def passes_of(
+    seconds: np.ndarray, in_view: np.ndarray, ids: np.ndarray, kinds: Sequence[str]
+) -> Passes:
     """From which objects, m of them, are in view in which frames, shape (n, m)."""
     rows = []
     for column, object_id in enumerate(ids.tolist()):
         seen_s = seconds[in_view[:, column]]
         stretches = np.split(seen_s, np.flatnonzero(np.diff(seen_s) > GAP_S) + 1)
-        rows += [(object_id, column, s[0], s[-1], len(s)) for s in stretches if len(s) >= LEAST_FRAMES]
+        rows += [
+            (object_id, column, s[0], s[-1], len(s))
+            for s in stretches
+            if len(s) >= LEAST_FRAMES
+        ]
     columns = np.array(rows, dtype=float).reshape(-1, 5).T
     kind = np.array(kinds)[columns[1].astype(int)]
-    return Passes(columns[0].astype(int), kind, columns[2], columns[3], columns[4].astype(int))
+    return Passes(
+        columns[0].astype(int), kind, columns[2], columns[3], columns[4].astype(int)
+    )
 
 
-def _judged(found: LandmarkDetections, stamp_s: float, truth: FrameTruth, row: int) -> Detections:
+def _judged(
+    found: LandmarkDetections, stamp_s: float, truth: FrameTruth, row: int
+) -> Detections:
     """The detections of one frame beside what truly lies there."""
     range_m, azimuth_rad = truth.range_m()[row], truth.azimuth_rad()[row]
     error_r = found.range_m[:, None] - range_m
@@ -122,7 +139,9 @@ def _judged(found: LandmarkDetections, stamp_s: float, truth: FrameTruth, row: i
     nearest = off_m.argmin(axis=1)
     each = np.arange(len(found))
     least = off_m[each, nearest]
-    label = np.where(least <= SAME_M, truth.ids[nearest], np.where(least > APART_M, NONE, UNJUDGED))
+    label = np.where(
+        least <= SAME_M, truth.ids[nearest], np.where(least > APART_M, NONE, UNJUDGED)
+    )
     error = np.column_stack([error_r[each, nearest], error_a[each, nearest]])
     named, probability = found.most_probable()
     confidence, most_probable = confidences(found)
@@ -143,7 +162,12 @@ def _stacked(parts: list[Detections]) -> Detections:
     names = Detections.__dataclass_fields__
     shapes = {"error": (0, 2), "covariance": (0, 2, 2)}
     return Detections(
-        **{n: np.concatenate([getattr(p, n) for p in parts]) if parts else np.empty(shapes.get(n, 0)) for n in names}
+        **{
+            n: np.concatenate([getattr(p, n) for p in parts])
+            if parts
+            else np.empty(shapes.get(n, 0))
+            for n in names
+        }
     )
 
 
@@ -157,9 +181,13 @@ def kept_run(path: Path | None, options: BasinOptions, rules: Sequence[str]) -> 
 
 
 def _write(run: Run, path: Path) -> None:
-    columns = {f"passes.{n}": getattr(run.passes, n) for n in Passes.__dataclass_fields__}
+    columns = {
+        f"passes.{n}": getattr(run.passes, n) for n in Passes.__dataclass_fields__
+    }
     for rule, found in run.detections.items():
-        columns |= {f"{rule}.{n}": getattr(found, n) for n in Detections.__dataclass_fields__}
+        columns |= {
+            f"{rule}.{n}": getattr(found, n) for n in Detections.__dataclass_fields__
+        }
     partial = path.with_suffix(".part.npz")
     np.savez_compressed(partial, **columns)
     partial.rename(path)
@@ -168,5 +196,10 @@ def _write(run: Run, path: Path) -> None:
 def _read(path: Path, rules: Sequence[str]) -> Run:
     with np.load(path) as file:
         passes = Passes(**{n: file[f"passes.{n}"] for n in Passes.__dataclass_fields__})
-        found = {r: Detections(**{n: file[f"{r}.{n}"] for n in Detections.__dataclass_fields__}) for r in rules}
+        found = {
+            r: Detections(
+                **{n: file[f"{r}.{n}"] for n in Detections.__dataclass_fields__}
+            )
+            for r in rules
+        }
     return Run(passes, found)

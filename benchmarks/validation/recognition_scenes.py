@@ -42,7 +42,10 @@ from sonar_graph.sonar import SHIPPED, read_confusion
 STRANGERS = {"strangers": ["natural", "look-alikes"]}
 CASES: dict[str, dict[str, Any]] = {
     **{f"{c:g} dB": {"contrast_db": c} for c in (0.0, -3.0, -4.5, -6.0)},
-    **{f"{c:g} dB, a quarter covered": {"contrast_db": c, "sediment": 0.25} for c in (0.0, -3.0, -4.5, -6.0)},
+    **{
+        f"{c:g} dB, a quarter covered": {"contrast_db": c, "sediment": 0.25}
+        for c in (0.0, -3.0, -4.5, -6.0)
+    },
     "plate as bright as the floor": {"plate_db": 0.0},
     **{scene: {"scene": scene} for scene in ("murky", "worn", "hard")},
     **{f"window of {length} m": {"window_m": float(length)} for length in (7, 10)},
@@ -67,7 +70,9 @@ class Case:
         image = ImageOptions.model_validate(STRANGERS | CASES[self.name])
         options = BasinOptions(duration_s=200.0, laps=1, seed=seed, image=image)
         name = f"scene-{self.name.replace(' ', '_')}-{seed}-{digest()}.npz"
-        return kept_run(None if self.work is None else self.work / name, options, (OURS, LITERAL))
+        return kept_run(
+            None if self.work is None else self.work / name, options, (OURS, LITERAL)
+        )
 
 
 def wilson(hits: int, total: int) -> tuple[float, float]:
@@ -75,14 +80,25 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     if total == 0:
         return 0.0, 1.0
     z, share = 1.96, hits / total
-    middle, half = share + z**2 / (2 * total), z * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
+    middle, half = (
+        share + z**2 / (2 * total),
+        z * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2)),
+    )
     scale = 1 + z**2 / total
-    return max(0.0, float(middle - half) / scale), min(1.0, float(middle + half) / scale)
+    return max(0.0, float(middle - half) / scale), min(
+        1.0, float(middle + half) / scale
+    )
 
 
-def summary(runs: list[Run], rule: str, accepted_from: float = ACCEPTED) -> dict[str, Any]:
+def summary(
+    runs: list[Run], rule: str, accepted_from: float = ACCEPTED
+) -> dict[str, Any]:
     """Figures of one rule over all seeds, of detections that are accepted from this posterior on."""
-    outcomes: dict[str, list[bool]] = {"recognised": [], "natural": [], "look_alikes": []}
+    outcomes: dict[str, list[bool]] = {
+        "recognised": [],
+        "natural": [],
+        "look_alikes": [],
+    }
     accepted, right, bias, ends, nis, nis_of_reports = 0, 0, [], [], [], []
     interval_s = read_confusion(SHIPPED).report_interval_s
     for run in runs:
@@ -101,19 +117,29 @@ def summary(runs: list[Run], rule: str, accepted_from: float = ACCEPTED) -> dict
                     nis.append(float(normalised(found, rows).mean()))
                     reports = [rows[0]]
                     for later in rows:
-                        if found.stamp_s[later] - found.stamp_s[reports[-1]] >= interval_s:
+                        if (
+                            found.stamp_s[later] - found.stamp_s[reports[-1]]
+                            >= interval_s
+                        ):
                             reports.append(later)
                     nis_of_reports.append(normalised_mean(found, np.array(reports)))
             else:
                 looks_alike = run.passes.kind[row] in GROUPS["look-alikes"]
-                outcomes["look_alikes" if looks_alike else "natural"].append(bool((is_accepted & of_it).any()))
+                outcomes["look_alikes" if looks_alike else "natural"].append(
+                    bool((is_accepted & of_it).any())
+                )
         ends.append(last_of_tracks(found))
-    confidence, is_correct = (np.concatenate(column) for column in zip(*ends, strict=True))
+    confidence, is_correct = (
+        np.concatenate(column) for column in zip(*ends, strict=True)
+    )
     sure = confidence > SURE
     mean_bias = np.mean(bias, axis=0) if bias else np.full(2, np.nan)
     counts = {name: (sum(hits), len(hits)) for name, hits in outcomes.items()}
     return {
-        **{name: {"hits": k, "passes": n, "interval": wilson(k, n)} for name, (k, n) in counts.items()},
+        **{
+            name: {"hits": k, "passes": n, "interval": wilson(k, n)}
+            for name, (k, n) in counts.items()
+        },
         "accepted": accepted,
         "right": right / accepted if accepted else None,
         "tracks": len(confidence),
@@ -132,12 +158,17 @@ def last_of_tracks(found: Detections) -> tuple[np.ndarray, np.ndarray]:
     last = np.array([*rows.values()], dtype=int)
     last = last[found.label[last] != UNJUDGED]
     said = np.where(found.is_named, found.named, NONE)[last]
-    return found.confidence[last], (said == np.maximum(found.label[last], NONE)).astype(float)
+    return found.confidence[last], (said == np.maximum(found.label[last], NONE)).astype(
+        float
+    )
 
 
 def reaches(name: str, figures: dict[str, Any]) -> bool:
     """Whether one case is as good as it must be."""
-    share = {n: figures[n]["hits"] / max(figures[n]["passes"], 1) for n in ("recognised", "natural", "look_alikes")}
+    share = {
+        n: figures[n]["hits"] / max(figures[n]["passes"], 1)
+        for n in ("recognised", "natural", "look_alikes")
+    }
     share["ece_of_tracks"] = figures["ece_of_tracks"]
     is_found = share["recognised"] >= LEAST_RECOGNISED.get(name, 0.0)
     return is_found and all(share[n] <= most for n, most in MOST.items())
@@ -148,13 +179,20 @@ def show(summaries: dict[str, dict[str, dict[str, Any]]]) -> None:
     rows = []
     for name, rules in summaries.items():
         for rule, s in rules.items():
-            shares = [f"{s[n]['hits']}/{s[n]['passes']}" for n in ("recognised", "natural", "look_alikes")]
+            shares = [
+                f"{s[n]['hits']}/{s[n]['passes']}"
+                for n in ("recognised", "natural", "look_alikes")
+            ]
             wrong, sure = s["wrong_above_99"]
             right = "" if s["right"] is None else f"{s['right']:.4f}"
             bias = "" if s["range_bias_m"] is None else f"{s['range_bias_m'] * 1e3:.1f}"
-            nis = ["" if s[n] is None else f"{s[n]:.2f}" for n in ("nis", "nis_of_reports")]
+            nis = [
+                "" if s[n] is None else f"{s[n]:.2f}" for n in ("nis", "nis_of_reports")
+            ]
             ece, wrong_share = f"{s['ece_of_tracks']:.3f}", f"{wrong}/{sure}"
-            rows.append((name, rule, *shares, right, s["tracks"], ece, wrong_share, bias, *nis))
+            rows.append(
+                (name, rule, *shares, right, s["tracks"], ece, wrong_share, bias, *nis)
+            )
     headers = (
         "",
         "rule",
@@ -174,21 +212,44 @@ def show(summaries: dict[str, dict[str, dict[str, Any]]]) -> None:
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
-    parser.add_argument("--seeds", type=int, help="number of basins of each case (default: 10; with --quick 1)")
-    parser.add_argument("--first-seed", type=int, default=0, help="seed of the first basin (default: %(default)s)")
-    parser.add_argument("--cases", help=f"of {', '.join(CASES)}; separated by semicolons (default: all)")
-    parser.add_argument("--work", type=Path, help="keep what came of each basin in this folder, and go on from it")
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        help="number of basins of each case (default: 10; with --quick 1)",
+    )
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=0,
+        help="seed of the first basin (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--cases", help=f"of {', '.join(CASES)}; separated by semicolons (default: all)"
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        help="keep what came of each basin in this folder, and go on from it",
+    )
     arguments = parser.parse_args()
-    chosen = [*CASES] if arguments.cases is None else [name.strip() for name in arguments.cases.split(";")]
+    chosen = (
+        [*CASES]
+        if arguments.cases is None
+        else [name.strip() for name in arguments.cases.split(";")]
+    )
     if unknown := [name for name in chosen if name not in CASES]:
-        parser.error(f"--cases: there is no {unknown[0]}; there are: {'; '.join(CASES)}")
+        parser.error(
+            f"--cases: there is no {unknown[0]}; there are: {'; '.join(CASES)}"
+        )
     if arguments.work is not None:
         arguments.work.mkdir(parents=True, exist_ok=True)
     first = arguments.first_seed
     seeds = range(first, first + (arguments.seeds or (1 if arguments.quick else 10)))
     summaries = {}
     for name in chosen:
-        runs = in_parallel(Case(name, arguments.work).run, seeds, arguments.workers, name)
+        runs = in_parallel(
+            Case(name, arguments.work).run, seeds, arguments.workers, name
+        )
         summaries[name] = {
             OURS: summary(runs, OURS),
             f"{OURS}, {MINIMUM_PROBABILITY}": summary(runs, OURS, MINIMUM_PROBABILITY),
@@ -196,7 +257,15 @@ def main() -> None:
         }
     show(summaries)
     passed = all(reaches(name, rules[OURS]) for name, rules in summaries.items())
-    conclude({"first_seed": first, "seeds": len(seeds), "cases": summaries, "passed": passed}, is_quick=arguments.quick)
+    conclude(
+        {
+            "first_seed": first,
+            "seeds": len(seeds),
+            "cases": summaries,
+            "passed": passed,
+        },
+        is_quick=arguments.quick,
+    )
 
 
 if __name__ == "__main__":

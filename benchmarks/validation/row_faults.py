@@ -55,7 +55,9 @@ FAULTS: list[Fault] = []
 SEA, VEHICLES, ALL = ("mission",), ("mission", "akit"), ("mission", "akit", "mrclam")
 
 
-def fault(sensor: str, named: str, bases: tuple[str, ...] = VEHICLES) -> Callable[[Change], Change]:
+def fault(
+    sensor: str, named: str, bases: tuple[str, ...] = VEHICLES
+) -> Callable[[Change], Change]:
     """Decorator: list a fault."""
 
     def add(change: Change) -> Change:
@@ -107,7 +109,9 @@ def interval_s(rows: SimpleNamespace) -> float:
 
 def turned(rows: SimpleNamespace, before: NDArray[np.float64]) -> float:
     """Turn by which the rates differ from what they were, at most, rad."""
-    return float(np.linalg.norm(rows.angular_velocity - before, axis=1).sum()) * interval_s(rows)
+    return float(
+        np.linalg.norm(rows.angular_velocity - before, axis=1).sum()
+    ) * interval_s(rows)
 
 
 # --------------------------------------------------------------------------------------------------------- IMU
@@ -118,9 +122,13 @@ def imu_one_rate_of_1e9(rows: SimpleNamespace, _: Generator) -> Effect:
 
 
 @fault("imu", "imu.*no gyro or accelerometer measures", ALL)
-def imu_one_percent_of_rates_beyond_scale(rows: SimpleNamespace, rng: Generator) -> Effect:
+def imu_one_percent_of_rates_beyond_scale(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.01)
-    rows.angular_velocity[chosen] = 100.0 * rng.standard_normal((chosen.sum(), 3)) + 200.0
+    rows.angular_velocity[chosen] = (
+        100.0 * rng.standard_normal((chosen.sum(), 3)) + 200.0
+    )
     return Effect(chosen)
 
 
@@ -242,7 +250,9 @@ def imu_force_infinite_in_5_percent(rows: SimpleNamespace, rng: Generator) -> Ef
 @fault("imu", "imu: no sample")
 def imu_gap_of_3_s(rows: SimpleNamespace, _: Generator) -> Effect:
     gone = stretch(rows, 3.0)
-    turn = float(np.linalg.norm(rows.angular_velocity[gone], axis=1).sum()) * interval_s(rows)
+    turn = float(
+        np.linalg.norm(rows.angular_velocity[gone], axis=1).sum()
+    ) * interval_s(rows)
     kept(rows, ~gone)
     return Effect(turn_rad=turn)
 
@@ -250,7 +260,9 @@ def imu_gap_of_3_s(rows: SimpleNamespace, _: Generator) -> Effect:
 @fault("imu", "imu: no sample")
 def imu_gap_of_20_s(rows: SimpleNamespace, _: Generator) -> Effect:
     gone = stretch(rows, 20.0)
-    turn = float(np.linalg.norm(rows.angular_velocity[gone], axis=1).sum()) * interval_s(rows)
+    turn = float(
+        np.linalg.norm(rows.angular_velocity[gone], axis=1).sum()
+    ) * interval_s(rows)
     kept(rows, ~gone)
     return Effect(turn_rad=turn)
 
@@ -293,7 +305,10 @@ def imu_first_second_in_1970(rows: SimpleNamespace, _: Generator) -> Effect:
 def imu_clock_jumps_an_hour(rows: SimpleNamespace, _: Generator) -> Effect:
     half = np.arange(len(rows.stamps_ns)) > len(rows.stamps_ns) // 2
     rows.stamps_ns[half] += 3600 * NS
-    return Effect(turn_rad=float(np.linalg.norm(rows.angular_velocity[half], axis=1).sum()) * interval_s(rows))
+    return Effect(
+        turn_rad=float(np.linalg.norm(rows.angular_velocity[half], axis=1).sum())
+        * interval_s(rows)
+    )
 
 
 @fault("imu", "imu.*(backwards|drift apart|clock)")
@@ -306,8 +321,14 @@ def imu_clock_jumps_back_2_s(rows: SimpleNamespace, _: Generator) -> Effect:
 def late_by(rows: SimpleNamespace, seconds: float) -> Effect:
     """Turn and way of those seconds: what a sensor is taken for that was somewhere else."""
     if hasattr(rows, "angular_velocity"):
-        return Effect(turn_rad=float(np.linalg.norm(rows.angular_velocity, axis=1).max()) * seconds)
-    return Effect(shift_m=float(np.linalg.norm(rows.velocity, axis=1).max()) * seconds, turn_rad=1.0 * seconds)
+        return Effect(
+            turn_rad=float(np.linalg.norm(rows.angular_velocity, axis=1).max())
+            * seconds
+        )
+    return Effect(
+        shift_m=float(np.linalg.norm(rows.velocity, axis=1).max()) * seconds,
+        turn_rad=1.0 * seconds,
+    )
 
 
 @fault("imu", "imu.*drift apart|DVL against IMU")
@@ -344,7 +365,9 @@ def dvl_5_percent_at_5_m_s(rows: SimpleNamespace, rng: Generator) -> Effect:
 @fault("dvl", "dvl.*no vehicle")
 def dvl_20_percent_outliers(rows: SimpleNamespace, rng: Generator) -> Effect:
     chosen = some(rows, rng, 0.2)
-    rows.velocity[chosen] += rng.uniform(4.0, 8.0, (chosen.sum(), 3)) * rng.choice([-1.0, 1.0], (chosen.sum(), 3))
+    rows.velocity[chosen] += rng.uniform(4.0, 8.0, (chosen.sum(), 3)) * rng.choice(
+        [-1.0, 1.0], (chosen.sum(), 3)
+    )
     return Effect(chosen)
 
 
@@ -375,7 +398,10 @@ def moved_by(rows: SimpleNamespace, change: Callable[[], None]) -> Effect:
     """Apply a change; way by which the velocities differ from what they were, at most."""
     before = rows.velocity.copy()
     change()
-    return Effect(shift_m=float(np.linalg.norm(rows.velocity - before, axis=1).sum()) * interval_s(rows))
+    return Effect(
+        shift_m=float(np.linalg.norm(rows.velocity - before, axis=1).sum())
+        * interval_s(rows)
+    )
 
 
 @fault("dvl", "DVL.*mm/s", ALL)
@@ -392,7 +418,10 @@ def dvl_in_cm_s(rows: SimpleNamespace, _: Generator) -> Effect:
 
 @fault("dvl", "DVL mounting yaw")
 def dvl_axes_swapped(rows: SimpleNamespace, _: Generator) -> Effect:
-    return moved_by(rows, lambda: rows.velocity.__setitem__(slice(None), rows.velocity[:, [1, 0, 2]]))
+    return moved_by(
+        rows,
+        lambda: rows.velocity.__setitem__(slice(None), rows.velocity[:, [1, 0, 2]]),
+    )
 
 
 @fault("dvl", "DVL mounting yaw")
@@ -406,9 +435,13 @@ def dvl_forward_right_down(rows: SimpleNamespace, _: Generator) -> Effect:
 
 
 @fault("dvl", "dvl.*covariance", ALL)
-def dvl_10_percent_indefinite_covariances(rows: SimpleNamespace, rng: Generator) -> Effect:
+def dvl_10_percent_indefinite_covariances(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.1)
-    rows.velocity_cov[chosen] = 1e-4 * np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    rows.velocity_cov[chosen] = 1e-4 * np.array(
+        [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    )
     return Effect(chosen)
 
 
@@ -564,7 +597,9 @@ def depth_with_the_air_s_pressure(rows: SimpleNamespace, _: Generator) -> Effect
 
 
 @fault("depth", "depth.*covariance", SEA)
-def depth_10_percent_negative_variances(rows: SimpleNamespace, rng: Generator) -> Effect:
+def depth_10_percent_negative_variances(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.1)
     rows.variance_m2[chosen] = -1e-4
     return Effect(chosen)
@@ -596,14 +631,18 @@ def detections_one_indefinite_covariance(rows: SimpleNamespace, _: Generator) ->
 
 
 @fault("detections", "detections.*positive definite", ALL)
-def detections_10_percent_zero_covariances(rows: SimpleNamespace, rng: Generator) -> Effect:
+def detections_10_percent_zero_covariances(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.1)
     rows.range_azimuth_cov[chosen] = 0.0
     return Effect(chosen)
 
 
 @fault("detections", "detections.*(range|number)", ALL)
-def detections_5_percent_negative_ranges(rows: SimpleNamespace, rng: Generator) -> Effect:
+def detections_5_percent_negative_ranges(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.05)
     rows.range_m[chosen] *= -1.0
     return Effect(chosen)
@@ -642,7 +681,9 @@ def detections_10_percent_wrong_ranges(rows: SimpleNamespace, rng: Generator) ->
 
 
 @fault("detections", "(contradict|far outside|lost its way|identit)", ALL)
-def detections_20_percent_wrong_identities(rows: SimpleNamespace, rng: Generator) -> Effect:
+def detections_20_percent_wrong_identities(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.2)
     best = rows.id_probability.argmax(axis=1)
     known = np.unique(rows.candidate_ids[rows.candidate_ids >= 0])
@@ -652,7 +693,9 @@ def detections_20_percent_wrong_identities(rows: SimpleNamespace, rng: Generator
 
 @fault("detections", "(contradict|far outside|lost its way|identit)", ALL)
 def detections_all_of_one_identity(rows: SimpleNamespace, _: Generator) -> Effect:
-    rows.candidate_ids[:] = np.where(rows.candidate_ids >= 0, rows.candidate_ids.max(), -1)
+    rows.candidate_ids[:] = np.where(
+        rows.candidate_ids >= 0, rows.candidate_ids.max(), -1
+    )
     rows.id_probability[:, 1:] = 0.0
     return NOBODY_CAN
 
@@ -663,14 +706,20 @@ def detections_clock_2_s_late(rows: SimpleNamespace, _: Generator) -> Effect:
     return NOBODY_CAN
 
 
-@fault("detections", "(detections|landmarks).*(without a stamp|clock|before the first)", ALL)
+@fault(
+    "detections",
+    "(detections|landmarks).*(without a stamp|clock|before the first)",
+    ALL,
+)
 def detections_first_10_stamps_unset(rows: SimpleNamespace, _: Generator) -> Effect:
     rows.stamps_ns[:10] = 0
     return Effect()
 
 
 @fault("detections", "detections.*(probabilit|posterior)", ALL)
-def detections_5_percent_probabilities_of_97(rows: SimpleNamespace, rng: Generator) -> Effect:
+def detections_5_percent_probabilities_of_97(
+    rows: SimpleNamespace, rng: Generator
+) -> Effect:
     chosen = some(rows, rng, 0.05)
     rows.id_probability[chosen] = 97.0
     return Effect(chosen)

@@ -61,7 +61,12 @@ from sonar_graph.logs.writing import (
 )
 from sonar_graph.report import summary
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import LandmarkOptions, MissionOptions, add_landmarks, simulate_mission
+from sonar_graph.simulation import (
+    LandmarkOptions,
+    MissionOptions,
+    add_landmarks,
+    simulate_mission,
+)
 
 ESTIMATORS = ["ekf-slam", "invariant-ekf", "isam2", "dead-reckoning"]
 SENSORS = ("imu", "dvl", "depth", "detections")
@@ -69,7 +74,9 @@ FACTOR, ROUNDING_M = 1.25, 0.05
 SLOW, SLOW_S, HUNG_S = 5.0, 5.0, 60.0
 DURATION_S = 90.0
 EPOCH_NS = 1_400_000_000 * NS
-SOUND_LANDMARKS = LandmarkOptions(spacing_m=10.0, wrong_id_rate=0.0, false_detections_per_frame=0.0)
+SOUND_LANDMARKS = LandmarkOptions(
+    spacing_m=10.0, wrong_id_rate=0.0, false_detections_per_frame=0.0
+)
 QUICK = 12
 """Every so many of the cases."""
 
@@ -77,7 +84,9 @@ QUICK = 12
 def log_of(data: Path, base: str) -> Sequence:
     """One of the sound logs."""
     if base == "mission":
-        return simulate_mission(MissionOptions(duration_s=DURATION_S, frame_rate_hz=1.0))
+        return simulate_mission(
+            MissionOptions(duration_s=DURATION_S, frame_rate_hz=1.0)
+        )
     archive, folder, read = {
         "akit": ("akit_1-7.tar.xz", "akit", read_akit),
         "mrclam": ("mrclam_ds6.tar.xz", "MRCLAM_Dataset6", read_mrclam),
@@ -85,15 +94,27 @@ def log_of(data: Path, base: str) -> Sequence:
     with recording(data, archive, folder) as where:
         whole = read(where, 1)
     ends = whole.start_ns - NS, whole.start_ns + round(DURATION_S * NS)
-    blocks: dict[str, Any] = {name: block.between(*ends) for name in SENSORS if (block := getattr(whole, name))}
+    blocks: dict[str, Any] = {
+        name: block.between(*ends)
+        for name in SENSORS
+        if (block := getattr(whole, name))
+    }
     blocks["truth"] = whole.truth
-    if base == "akit":  # whose stamps begin at 0, which in a log means that there is none
-        blocks = {name: replace(block, stamps_ns=block.stamps_ns + EPOCH_NS) for name, block in blocks.items()}
+    if (
+        base == "akit"
+    ):  # whose stamps begin at 0, which in a log means that there is none
+        blocks = {
+            name: replace(block, stamps_ns=block.stamps_ns + EPOCH_NS)
+            for name, block in blocks.items()
+        }
     short = replace(whole, **blocks)
     if base != "akit":
         return short
-    seen = add_landmarks(short, SOUND_LANDMARKS)  # along the reference, whose positions are not the sum of velocities
-    dvl = seen.calibration.dvl.model_copy(update={"velocity_sigma_m_s": SIGMA_AGAINST_REFERENCE_M_S})
+    # along the reference, whose positions are not the sum of velocities
+    seen = add_landmarks(short, SOUND_LANDMARKS)
+    dvl = seen.calibration.dvl.model_copy(
+        update={"velocity_sigma_m_s": SIGMA_AGAINST_REFERENCE_M_S}
+    )
     return replace(seen, calibration=seen.calibration.model_copy(update={"dvl": dvl}))
 
 
@@ -109,37 +130,68 @@ class Rows:
         found = {}
         for name in SENSORS:
             if (block := getattr(sequence, name)) is not None:
-                columns = {column.name: getattr(block, column.name).copy() for column in fields(block)}
-                found[name] = SimpleNamespace(**columns, recorded_ns=block.stamps_ns.copy())
+                columns = {
+                    column.name: getattr(block, column.name).copy()
+                    for column in fields(block)
+                }
+                found[name] = SimpleNamespace(
+                    **columns, recorded_ns=block.stamps_ns.copy()
+                )
         return cls(sequence, found)
 
     def write(self, path: Path) -> None:
         """Write the log; headers have the stamps, which may be wrong, messages the instants of recording."""
         sequence, first_ns = self.sequence, self.sequence.start_ns
-        messages = [static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
+        messages = [
+            static_message(
+                "/tf_static", TF, first_ns, encode_mountings(sequence.calibration)
+            )
+        ]
         if sequence.true_landmarks is not None:
-            messages.append(landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
+            messages.append(
+                landmark_map_message(
+                    "/ground_truth/landmarks", sequence.true_landmarks, first_ns
+                )
+            )
         if sequence.truth is not None:
             messages.append(odometry_messages("/ground_truth/odometry", sequence.truth))
-        for name, topic in {"imu": "/imu/data", "dvl": "/dvl/data", "depth": "/depth/pose"}.items():
+        for name, topic in {
+            "imu": "/imu/data",
+            "dvl": "/dvl/data",
+            "depth": "/depth/pose",
+        }.items():
             if name in self.sensors:
-                make: Any = {"imu": imu_messages, "dvl": dvl_messages, "depth": depth_messages}[name]
+                make: Any = {
+                    "imu": imu_messages,
+                    "dvl": dvl_messages,
+                    "depth": depth_messages,
+                }[name]
                 messages.append(self._stamped(name, make(topic, self._recorded(name))))
         if "detections" in self.sensors:
-            frames = detection_messages("/sonar/landmarks", self._recorded("detections"))
+            frames = detection_messages(
+                "/sonar/landmarks", self._recorded("detections")
+            )
             messages += [self._stamped("detections", entry) for entry in frames]
-        record = {"name": path.stem, "calibration": sequence.calibration.model_dump_json(), "notes": "{}"}
+        record = {
+            "name": path.stem,
+            "calibration": sequence.calibration.model_dump_json(),
+            "notes": "{}",
+        }
         write_recording(path, messages, {METADATA: record})
 
     def _recorded(self, name: str) -> Any:
         """Rows as if stamped when recorded."""
-        return Columns(**{**vars(self.sensors[name]), "stamps_ns": self.sensors[name].recorded_ns})
+        return Columns(
+            **{**vars(self.sensors[name]), "stamps_ns": self.sensors[name].recorded_ns}
+        )
 
     def _stamped(self, name: str, entry: Outgoing) -> Outgoing:
         """Messages with the sensor's stamps in their headers."""
         rows = self.sensors[name]
         if name == "detections":  # one message a frame
-            stamps_ns = rows.stamps_ns[np.searchsorted(rows.recorded_ns, entry.log_times_ns)]
+            stamps_ns = rows.stamps_ns[
+                np.searchsorted(rows.recorded_ns, entry.log_times_ns)
+            ]
         else:
             stamps_ns = rows.stamps_ns
         stamp = np.column_stack(np.divmod(stamps_ns, NS)).astype("<u4")
@@ -181,8 +233,12 @@ def inspected(path: Path) -> str:
 def outcome(path: Path) -> Outcome:
     """Compare estimators on a log."""
     try:
-        with patch("time.perf_counter", time.process_time):  # other processes do not count
-            comparison = compare_log(path, ESTIMATORS, {}, ReadingOptions(), RecogniserOptions(), 2.0)
+        with patch(
+            "time.perf_counter", time.process_time
+        ):  # other processes do not count
+            comparison = compare_log(
+                path, ESTIMATORS, {}, ReadingOptions(), RecogniserOptions(), 2.0
+            )
     except SonarGraphError as error:
         return Outcome(str(error), {}, {}, {}, str(error))
     console = Console(file=StringIO(), width=10_000)
@@ -190,7 +246,9 @@ def outcome(path: Path) -> Outcome:
     errors, seconds, failed = {}, {}, {}
     for run in comparison.runs:
         scores = comparison.scores[run.estimator]
-        errors[run.estimator] = scores["causal.ate_raw_m"].value if "causal.ate_raw_m" in scores else inf
+        errors[run.estimator] = (
+            scores["causal.ate_raw_m"].value if "causal.ate_raw_m" in scores else inf
+        )
         seconds[run.estimator] = float(run.update_s.sum() + run.finish_s)
         if run.status == "failed":
             failed[run.estimator] = run.reason
@@ -234,7 +292,9 @@ def judged(data: Path, case: Case) -> dict[str, Any]:
     fault, rows = case.fault, Rows.of(sequence)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{case.base}.mcap"
-        effect = fault.change(rows.sensors[fault.sensor], np.random.default_rng(case.number))
+        effect = fault.change(
+            rows.sensors[fault.sensor], np.random.default_rng(case.number)
+        )
         rows.write(path)
         signal.signal(signal.SIGVTALRM, hung)
         signal.setitimer(signal.ITIMER_VIRTUAL, HUNG_S)
@@ -251,15 +311,24 @@ def judged(data: Path, case: Case) -> dict[str, Any]:
                 setattr(chosen, name, column[~effect.rows])
             without.write(path)
             measure = outcome(path)
-    note(f"{case}: {by}, {found.failed or {n: round(e, 2) for n, e in found.error_m.items()}} {found.refused}")
+    note(
+        f"{case}: {by}, {found.failed or {n: round(e, 2) for n, e in found.error_m.items()}} {found.refused}"
+    )
     return {
         "case": str(case),
         "named": by,
         "refused": found.refused,
         "failed": found.failed,
         "errors": found.error_m,
-        "bounds": {name: bound(sequence, effect, error) for name, error in measure.error_m.items()},
-        "slow": {n: s for n, s in found.seconds.items() if s > max(SLOW_S, SLOW * clean.seconds[n])},
+        "bounds": {
+            name: bound(sequence, effect, error)
+            for name, error in measure.error_m.items()
+        },
+        "slow": {
+            n: s
+            for n, s in found.seconds.items()
+            if s > max(SLOW_S, SLOW * clean.seconds[n])
+        },
         "said": found.said,
     }
 
@@ -267,7 +336,9 @@ def judged(data: Path, case: Case) -> dict[str, Any]:
 def names(fault: Fault, text: str, clean: str) -> bool:
     """True where lines that the sound log does not have name the fault."""
     known = set(clean.splitlines())
-    return any(re.search(fault.named, line) for line in text.splitlines() if line not in known)
+    return any(
+        re.search(fault.named, line) for line in text.splitlines() if line not in known
+    )
 
 
 def bound(sequence: Sequence, effect: Effect, error_m: float) -> float:
@@ -275,28 +346,68 @@ def bound(sequence: Sequence, effect: Effect, error_m: float) -> float:
     assert sequence.truth is not None
     positions = sequence.truth.positions[sequence.truth.stamps_ns <= sequence.end_ns]
     distance_m = float(np.linalg.norm(positions - positions[0], axis=1).max())
-    return FACTOR * error_m + ROUNDING_M + effect.shift_m + min(effect.turn_rad, 2.0) * distance_m
+    return (
+        FACTOR * error_m
+        + ROUNDING_M
+        + effect.shift_m
+        + min(effect.turn_rad, 2.0) * distance_m
+    )
 
 
 def main() -> None:
     parser = make_parser(__doc__, data=True, workers=True)
-    parser.add_argument("--only", default="", help="cases whose name this regular expression finds")
-    parser.add_argument("--says", action="store_true", help="print what compare said of faults that it does not name")
+    parser.add_argument(
+        "--only", default="", help="cases whose name this regular expression finds"
+    )
+    parser.add_argument(
+        "--says",
+        action="store_true",
+        help="print what compare said of faults that it does not name",
+    )
     arguments = parser.parse_args()
-    cases = [Case(base, k) for base in ("mission", "akit", "mrclam") for k, f in enumerate(FAULTS) if base in f.bases]
-    cases = [case for case in cases if re.search(arguments.only, str(case))][:: QUICK if arguments.quick else 1]
-    cases = [case for k in range(arguments.workers) for case in cases[k :: arguments.workers]]
-    found = in_parallel(partial(judged, arguments.data), cases, arguments.workers, "case")
+    cases = [
+        Case(base, k)
+        for base in ("mission", "akit", "mrclam")
+        for k, f in enumerate(FAULTS)
+        if base in f.bases
+    ]
+    cases = [case for case in cases if re.search(arguments.only, str(case))][
+        :: QUICK if arguments.quick else 1
+    ]
+    cases = [
+        case for k in range(arguments.workers) for case in cases[k :: arguments.workers]
+    ]
+    found = in_parallel(
+        partial(judged, arguments.data), cases, arguments.workers, "case"
+    )
     rows, unnamed, failed, beyond, slow = [], [], [], [], []
     for one in sorted(found, key=lambda one: one["case"]):
-        over = {n: e for n, e in one["errors"].items() if not e <= one["bounds"].get(n, inf)}
-        cells = [f"{one['errors'].get(n, inf):.2f}{'!' if n in over else ''}" for n in ESTIMATORS]
+        over = {
+            n: e for n, e in one["errors"].items() if not e <= one["bounds"].get(n, inf)
+        }
+        cells = [
+            f"{one['errors'].get(n, inf):.2f}{'!' if n in over else ''}"
+            for n in ESTIMATORS
+        ]
         limit = max(one["bounds"].values(), default=inf)
-        rows.append([one["case"], one["named"], *cells, f"{limit:.2f}", ", ".join([*one["failed"], *one["slow"]])])
+        rows.append(
+            [
+                one["case"],
+                one["named"],
+                *cells,
+                f"{limit:.2f}",
+                ", ".join([*one["failed"], *one["slow"]]),
+            ]
+        )
         unnamed += [one["case"]] * (one["named"] == "-")
-        failed += [f"{one['case']}: {n}: {reason}" for n, reason in one["failed"].items()]
+        failed += [
+            f"{one['case']}: {n}: {reason}" for n, reason in one["failed"].items()
+        ]
         failed += [f"{one['case']}: {one['refused']}"] * bool(one["refused"])
-        beyond += [f"{one['case']}: {n} {e:.2f} > {one['bounds'][n]:.2f}" for n, e in over.items()]
+        beyond += [
+            f"{one['case']}: {n} {e:.2f} > {one['bounds'][n]:.2f}"
+            for n, e in over.items()
+        ]
         slow += [f"{one['case']}: {n} {s:.1f} s" for n, s in one["slow"].items()]
         if arguments.says and one["named"] == "-":
             note(f"--- {one['case']}\n{one['said']}")

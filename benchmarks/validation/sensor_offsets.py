@@ -23,7 +23,12 @@ sys.path.append(str(Path(__file__).resolve().parent))
 from common import conclude, in_parallel, make_parser, print_table
 from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, make_vehicle
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.alignment import match_dvl_to_imu, match_reference_to_imu
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -41,7 +46,9 @@ Recorded = tuple[Imu, Dvl, Trajectory, Calibration]
 SPLINE_RPY = tuple(BODY_R_DVL.as_euler("ZYX")[::-1].tolist())
 SPLINE_CALIBRATION = Calibration(
     imu=ImuCalibration(mounting=Mounting(translation_m=tuple(BODY_P_IMU.tolist()))),
-    dvl=DvlCalibration(mounting=Mounting(translation_m=tuple(BODY_P_DVL.tolist()), rpy_rad=SPLINE_RPY)),
+    dvl=DvlCalibration(
+        mounting=Mounting(translation_m=tuple(BODY_P_DVL.tolist()), rpy_rad=SPLINE_RPY)
+    ),
 )
 
 
@@ -55,32 +62,61 @@ class Held:
 
 def spline_run(dvl_hz: float, seed: int) -> Recorded:
     """A vehicle on splines, its IMU and Doppler log with noise, its true attitude with noise; gyros without bias."""
-    vehicle, rng = make_vehicle(seed, DURATION_S + 2), np.random.default_rng([seed, round(dvl_hz)])
-    t, dvl_t, truth_t = (np.arange(0, DURATION_S, 1 / hz) for hz in (IMU_HZ, dvl_hz, 1.0))
+    vehicle, rng = (
+        make_vehicle(seed, DURATION_S + 2),
+        np.random.default_rng([seed, round(dvl_hz)]),
+    )
+    t, dvl_t, truth_t = (
+        np.arange(0, DURATION_S, 1 / hz) for hz in (IMU_HZ, dvl_hz, 1.0)
+    )
     white = rng.standard_normal((2, len(t), 3)) * np.sqrt(IMU_HZ)
     rate = vehicle.rate(t + 1) + GYRO_DENSITY * white[0]
-    force = vehicle.specific_force(t + 1) + ACCEL_DENSITY * white[1] + ACCEL_BIAS * rng.standard_normal(3)
-    velocity = vehicle.doppler(dvl_t + 1) + DVL_SIGMA * rng.standard_normal((len(dvl_t), 3))
+    force = (
+        vehicle.specific_force(t + 1)
+        + ACCEL_DENSITY * white[1]
+        + ACCEL_BIAS * rng.standard_normal(3)
+    )
+    velocity = vehicle.doppler(dvl_t + 1) + DVL_SIGMA * rng.standard_normal(
+        (len(dvl_t), 3)
+    )
     truth = noisy(vehicle.attitude(truth_t + 1), rng)
-    imu_ns, dvl_ns, truth_ns = (np.round(times * NS).astype(np.int64) for times in (t, dvl_t, truth_t))
+    imu_ns, dvl_ns, truth_ns = (
+        np.round(times * NS).astype(np.int64) for times in (t, dvl_t, truth_t)
+    )
     unknown = np.full((len(dvl_t), 3, 3), np.nan)
-    reference = Trajectory.without_covariances(truth_ns, vehicle.position(truth_t + 1), truth.as_quat())
-    return Imu(imu_ns, rate, force), Dvl(dvl_ns, velocity, unknown), reference, SPLINE_CALIBRATION
+    reference = Trajectory.without_covariances(
+        truth_ns, vehicle.position(truth_t + 1), truth.as_quat()
+    )
+    return (
+        Imu(imu_ns, rate, force),
+        Dvl(dvl_ns, velocity, unknown),
+        reference,
+        SPLINE_CALIBRATION,
+    )
 
 
 def basin_run(seed: int) -> Recorded:
     """The nominal basin, one lap, gyros without bias."""
-    run = simulate_basin(BasinOptions(seed=seed, duration_s=DURATION_S, laps=1, gyro_bias_scale=0.0))
+    run = simulate_basin(
+        BasinOptions(seed=seed, duration_s=DURATION_S, laps=1, gyro_bias_scale=0.0)
+    )
     assert run.truth is not None
     every = slice(None, None, 50)
-    attitude = noisy(Rotation.from_quat(run.truth.quaternions_xyzw[every]), np.random.default_rng([seed, 3]))
+    attitude = noisy(
+        Rotation.from_quat(run.truth.quaternions_xyzw[every]),
+        np.random.default_rng([seed, 3]),
+    )
     places = run.truth.positions[every]
-    reference = Trajectory.without_covariances(run.truth.stamps_ns[every], places, attitude.as_quat())
+    reference = Trajectory.without_covariances(
+        run.truth.stamps_ns[every], places, attitude.as_quat()
+    )
     return run.imu, run.dvl, reference, run.calibration
 
 
 def noisy(attitude: Rotation, rng: np.random.Generator) -> Rotation:
-    return attitude * Rotation.from_rotvec(REFERENCE_SIGMA * rng.standard_normal((len(attitude), 3)))
+    return attitude * Rotation.from_rotvec(
+        REFERENCE_SIGMA * rng.standard_normal((len(attitude), 3))
+    )
 
 
 CASES: dict[str, Callable[[int], Recorded]] = {
@@ -94,28 +130,53 @@ def one(case: str, seed: int) -> list[Held]:
     """By quantity."""
     imu, dvl, reference, calibration = CASES[case](seed)
     rng = np.random.default_rng([seed, 5])
-    offset_s, reference_s, yaw, scale = rng.uniform([-0.6, -0.6, -0.07, 0.98], [0.6, 0.6, 0.07, 1.02])
+    offset_s, reference_s, yaw, scale = rng.uniform(
+        [-0.6, -0.6, -0.07, 0.98], [0.6, 0.6, 0.07, 1.02]
+    )
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     turned = Rotation.from_euler("z", -yaw).apply(dvl.velocity @ body_R_dvl.T) / scale
-    early = Dvl(dvl.stamps_ns - round(offset_s * NS), turned @ body_R_dvl, dvl.velocity_cov)
-    shifted = Trajectory.without_covariances(
-        reference.stamps_ns - round(reference_s * NS), reference.positions, reference.quaternions_xyzw
+    early = Dvl(
+        dvl.stamps_ns - round(offset_s * NS), turned @ body_R_dvl, dvl.velocity_cov
     )
-    arm = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
+    shifted = Trajectory.without_covariances(
+        reference.stamps_ns - round(reference_s * NS),
+        reference.positions,
+        reference.quaternions_xyzw,
+    )
+    arm = np.subtract(
+        calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m
+    )
     bias = GYRO_BIAS * rng.standard_normal(3)
     biased = Imu(imu.stamps_ns, imu.angular_velocity + bias, imu.specific_force)
-    found = match_dvl_to_imu(biased, early, with_imu_moved(calibration, rng.uniform(-FARTHEST_M, FARTHEST_M, 3)))
+    found = match_dvl_to_imu(
+        biased,
+        early,
+        with_imu_moved(calibration, rng.uniform(-FARTHEST_M, FARTHEST_M, 3)),
+    )
     other = match_reference_to_imu(biased, shifted, calibration).offset
-    estimates = (found.offset, found.yaw, found.scale, other, *found.lever, *found.gyro_bias)
-    pairs = zip(estimates, (offset_s, yaw, scale, reference_s, *arm, *bias), strict=True)
+    estimates = (
+        found.offset,
+        found.yaw,
+        found.scale,
+        other,
+        *found.lever,
+        *found.gyro_bias,
+    )
+    pairs = zip(
+        estimates, (offset_s, yaw, scale, reference_s, *arm, *bias), strict=True
+    )
     return [Held(e.is_known, (e.value - true) / e.sigma) for e, true in pairs]
 
 
 def with_imu_moved(calibration: Calibration, by_m: np.ndarray) -> Calibration:
     """The IMU is said to be elsewhere on the body, turned as it is."""
     mounting = calibration.imu.mounting
-    moved = mounting.model_copy(update={"translation_m": tuple(np.add(mounting.translation_m, by_m).tolist())})
-    return calibration.model_copy(update={"imu": calibration.imu.model_copy(update={"mounting": moved})})
+    moved = mounting.model_copy(
+        update={"translation_m": tuple(np.add(mounting.translation_m, by_m).tolist())}
+    )
+    return calibration.model_copy(
+        update={"imu": calibration.imu.model_copy(update={"mounting": moved})}
+    )
 
 
 def band(runs: int) -> tuple[float, float]:
@@ -133,24 +194,62 @@ def spread_band(runs: int) -> tuple[float, float]:
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
     parser.add_argument("--runs", type=int, default=100, help="runs of each case")
-    parser.add_argument("--first-seed", type=int, default=1000, help="the others follow it")
+    parser.add_argument(
+        "--first-seed", type=int, default=1000, help="the others follow it"
+    )
     arguments = parser.parse_args()
     runs = 3 if arguments.quick else arguments.runs
     seeds = range(arguments.first_seed, arguments.first_seed + runs)
     rows, figures, passed = [], {}, True
     for case in CASES:
-        results = in_parallel(partial(one, case), seeds, arguments.workers, f"{case}: seed")
-        for quantity, trials in zip(QUANTITIES, zip(*results, strict=True), strict=True):
+        results = in_parallel(
+            partial(one, case), seeds, arguments.workers, f"{case}: seed"
+        )
+        for quantity, trials in zip(
+            QUANTITIES, zip(*results, strict=True), strict=True
+        ):
             errors = np.array([trial.error_sigmas for trial in trials if trial.known])
-            share, inner = (float(np.mean(np.abs(errors) < k)) if len(errors) else 0.0 for k in (1.96, 1.0))
+            share, inner = (
+                float(np.mean(np.abs(errors) < k)) if len(errors) else 0.0
+                for k in (1.96, 1.0)
+            )
             low, high = band(max(len(errors), 1))
             least, most = spread_band(max(len(errors), 1))
-            spread, mean = (float(np.sqrt(np.mean(errors**2))), float(errors.mean())) if len(errors) else (0.0, 0.0)
+            spread, mean = (
+                (float(np.sqrt(np.mean(errors**2))), float(errors.mean()))
+                if len(errors)
+                else (0.0, 0.0)
+            )
             passed &= len(errors) > 0 and share >= low and least <= spread <= most
-            rows.append((f"{case}: {quantity}", len(errors), share, low, high, inner, spread, mean))
+            rows.append(
+                (
+                    f"{case}: {quantity}",
+                    len(errors),
+                    share,
+                    low,
+                    high,
+                    inner,
+                    spread,
+                    mean,
+                )
+            )
             figures[f"{case}: {quantity}"] = share
-    print_table(("", "told", "95 % held", "band from", "to", "68 % held", "rms error / sigma", "mean"), rows)
-    conclude({"runs": runs, "coverage": figures, "passed": passed}, is_quick=arguments.quick)
+    print_table(
+        (
+            "",
+            "told",
+            "95 % held",
+            "band from",
+            "to",
+            "68 % held",
+            "rms error / sigma",
+            "mean",
+        ),
+        rows,
+    )
+    conclude(
+        {"runs": runs, "coverage": figures, "passed": passed}, is_quick=arguments.quick
+    )
 
 
 if __name__ == "__main__":

@@ -61,7 +61,11 @@ def without(content: bytes, at: int, count: int) -> bytes:
 
 
 def with_noise(content: bytes, at: int, count: int, rng: np.random.Generator) -> bytes:
-    return content[:at] + rng.integers(0, 256, count, dtype=np.uint8).tobytes() + content[at:]
+    return (
+        content[:at]
+        + rng.integers(0, 256, count, dtype=np.uint8).tobytes()
+        + content[at:]
+    )
 
 
 def flips(_: Source, content: bytes, rng: np.random.Generator) -> bytes:
@@ -73,7 +77,9 @@ def flips(_: Source, content: bytes, rng: np.random.Generator) -> bytes:
 
 def header_flip(source: Source, content: bytes, rng: np.random.Generator) -> bytes:
     """One bit in the header of one frame, where most of what counts is."""
-    at = frame_starts(source)[int(rng.integers(len(source.frames)))] + int(rng.integers(900))
+    at = frame_starts(source)[int(rng.integers(len(source.frames)))] + int(
+        rng.integers(900)
+    )
     changed = bytearray(content)
     if at < len(changed):
         changed[at] ^= 1 << int(rng.integers(8))
@@ -85,7 +91,17 @@ def zeros(source: Source, content: bytes, rng: np.random.Generator) -> bytes:
     return content[:at] + bytes(min(count, len(content) - at)) + content[at + count :]
 
 
-_ALL = (cut, loss, gain, doubling, loss_by_a_frame, gain_by_a_frame, flips, header_flip, zeros)
+_ALL = (
+    cut,
+    loss,
+    gain,
+    doubling,
+    loss_by_a_frame,
+    gain_by_a_frame,
+    flips,
+    header_flip,
+    zeros,
+)
 DAMAGES = {damage.__name__.replace("_", " "): damage for damage in _ALL}
 BY_A_FRAME = {"loss by a frame", "gain by a frame"}
 """They move what follows to where a frame should be, so that nothing can be noticed."""
@@ -94,7 +110,11 @@ BY_A_FRAME = {"loss by a frame", "gain by a frame"}
 def place(source: Source, content: bytes, rng: np.random.Generator) -> int:
     """Anywhere, or exactly where a frame begins."""
     starts = frame_starts(source)
-    at = starts[int(rng.integers(len(starts)))] if rng.random() < 0.2 else int(rng.integers(len(content)))
+    at = (
+        starts[int(rng.integers(len(starts)))]
+        if rng.random() < 0.2
+        else int(rng.integers(len(content)))
+    )
     return min(at, len(content))
 
 

@@ -48,9 +48,13 @@ def source_logs(folder: Path) -> list[Path]:
     paths = []
     for name, settings in SETTINGS.items():
         paths.append(folder / f"{name}.mcap")
-        write_mission(paths[-1], DURATION_S, FRAMES, chunk_bytes=CHUNK_BYTES, **settings)
+        write_mission(
+            paths[-1], DURATION_S, FRAMES, chunk_bytes=CHUNK_BYTES, **settings
+        )
     paths.append(folder / "own.mcap")
-    write_log(paths[-1], simulate_mission(MissionOptions(duration_s=120.0, landmarks=5)))
+    write_log(
+        paths[-1], simulate_mission(MissionOptions(duration_s=120.0, landmarks=5))
+    )
     return paths
 
 
@@ -63,7 +67,9 @@ def killed_logs(folder: Path, count: int) -> list[tuple[Path, Truth]]:
         path = folder / f"killed{number}.mcap"
         writer = subprocess.Popen([sys.executable, "-c", WRITING, str(path)])
         size = whole.stat().st_size * (number + 1) // (count + 1)
-        while writer.poll() is None and (not path.exists() or path.stat().st_size < size):
+        while writer.poll() is None and (
+            not path.exists() or path.stat().st_size < size
+        ):
             time.sleep(1e-4)
         writer.kill()
         writer.wait()

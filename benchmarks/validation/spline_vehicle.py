@@ -31,7 +31,10 @@ class Vehicle:
 
     def rate(self, t: np.ndarray) -> np.ndarray:
         """Angular rate in body axes, from the rates of the Euler angles."""
-        (roll, pitch, _), (d_roll, d_pitch, d_yaw) = self.angles(t).T, self.angles(t, 1).T
+        (roll, pitch, _), (d_roll, d_pitch, d_yaw) = (
+            self.angles(t).T,
+            self.angles(t, 1).T,
+        )
         return np.column_stack(
             [
                 d_roll - d_yaw * np.sin(pitch),
@@ -43,7 +46,9 @@ class Vehicle:
     def point(self, arm: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity of a point of the body in the world."""
         R = self.attitude(t)
-        return self.position(t) + R.apply(arm), self.velocity(t) + R.apply(np.cross(self.rate(t), arm))
+        return self.position(t) + R.apply(arm), self.velocity(t) + R.apply(
+            np.cross(self.rate(t), arm)
+        )
 
     def specific_force(self, t: np.ndarray) -> np.ndarray:
         """At the IMU, body axes; the angular acceleration by a difference of 0.2 ms."""
@@ -54,7 +59,9 @@ class Vehicle:
 
     def doppler(self, t: np.ndarray) -> np.ndarray:
         """Velocity in the log's axes."""
-        return BODY_R_DVL.inv().apply(self.attitude(t).inv().apply(self.point(BODY_P_DVL, t)[1]))
+        return BODY_R_DVL.inv().apply(
+            self.attitude(t).inv().apply(self.point(BODY_P_DVL, t)[1])
+        )
 
 
 def make_vehicle(seed: int, duration_s: float, knot_s: float = 3.0) -> Vehicle:
@@ -63,9 +70,15 @@ def make_vehicle(seed: int, duration_s: float, knot_s: float = 3.0) -> Vehicle:
     knots = np.arange(-6.0, duration_s + 12.0, knot_s)
     n = len(knots)
     yaw = np.cumsum(knot_s * rng.uniform(-0.2, 0.2, n))
-    angles = make_interp_spline(knots, np.column_stack([*rng.uniform(-0.08, 0.08, (2, n)), yaw]), k=5)
+    angles = make_interp_spline(
+        knots, np.column_stack([*rng.uniform(-0.08, 0.08, (2, n)), yaw]), k=5
+    )
     surge = make_interp_spline(
-        knots, np.column_stack([rng.uniform(0.25, 0.75, n), *rng.uniform(-0.06, 0.06, (2, n))]), k=5
+        knots,
+        np.column_stack(
+            [rng.uniform(0.25, 0.75, n), *rng.uniform(-0.06, 0.06, (2, n))]
+        ),
+        k=5,
     )
     fine = np.arange(knots[0], knots[-1], 0.05)
     world = Rotation.from_euler("ZYX", angles(fine)[:, ::-1]).apply(surge(fine))

@@ -72,23 +72,33 @@ class Step:
     points: list[tuple[int, np.ndarray, np.ndarray]]
     """Landmark, point in the body frame (2,), covariance (2, 2)."""
 
-    def factors(self, index: int, reading: Reading, sighter: Sighter) -> gtsam.NonlinearFactorGraph:
+    def factors(
+        self, index: int, reading: Reading, sighter: Sighter
+    ) -> gtsam.NonlinearFactorGraph:
         """Key of the ``index``-th pose."""
         graph = gtsam.NonlinearFactorGraph()
         if self.edge is None:
             graph.push_back(
-                gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA))
+                gtsam.PriorFactorPose2(
+                    X(0),
+                    gtsam.Pose2(),
+                    gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA),
+                )
             )
         else:
             step, cov = self.edge
             noise = gtsam.noiseModel.Gaussian.Covariance(reading(step, cov), False)
-            graph.push_back(gtsam.BetweenFactorPose2(X(index - 1), X(index), step, noise))
+            graph.push_back(
+                gtsam.BetweenFactorPose2(X(index - 1), X(index), step, noise)
+            )
         for landmark, point, cov in self.points:
             for factor in sighter(X(index), L(landmark), point, cov):
                 graph.push_back(factor)
         return graph
 
-    def first_values(self, index: int, before: gtsam.Pose2, known: set[int]) -> tuple[gtsam.Pose2, gtsam.Values]:
+    def first_values(
+        self, index: int, before: gtsam.Pose2, known: set[int]
+    ) -> tuple[gtsam.Pose2, gtsam.Values]:
         """The pose, and values of what is new at it, carried on from the pose before; ``known`` gains new landmarks."""
         pose = before if self.edge is None else before.compose(self.edge[0])
         values = gtsam.Values()
@@ -107,9 +117,13 @@ def read_steps(lines: list[str]) -> list[Step]:
         kind, *words = line.split()
         numbers = [float(word) for word in words]
         if kind == "ODOMETRY":
-            steps.append(Step((gtsam.Pose2(*numbers[2:5]), upper_to_full(numbers[5:], 3)), []))
+            steps.append(
+                Step((gtsam.Pose2(*numbers[2:5]), upper_to_full(numbers[5:], 3)), [])
+            )
         else:
-            steps[-1].points.append((int(numbers[1]), np.array(numbers[2:4]), upper_to_full(numbers[4:], 2)))
+            steps[-1].points.append(
+                (int(numbers[1]), np.array(numbers[2:4]), upper_to_full(numbers[4:], 2))
+            )
     return steps
 
 
@@ -125,8 +139,17 @@ def all_along(step: gtsam.Pose2, cov: np.ndarray) -> np.ndarray:
     turn noise the displacement has the file's covariance.
     """
     twist = gtsam.Pose2.Logmap(step)
-    remaining = [gtsam.Pose2.Expmap(twist * (1 - (k + 0.5) / SLICES)).inverse().AdjointMap() for k in range(SLICES)]
-    V = np.mean([gtsam.Pose2.Expmap(twist * (k + 0.5) / SLICES).rotation().matrix() for k in range(SLICES)], axis=0)
+    remaining = [
+        gtsam.Pose2.Expmap(twist * (1 - (k + 0.5) / SLICES)).inverse().AdjointMap()
+        for k in range(SLICES)
+    ]
+    V = np.mean(
+        [
+            gtsam.Pose2.Expmap(twist * (k + 0.5) / SLICES).rotation().matrix()
+            for k in range(SLICES)
+        ],
+        axis=0,
+    )
     density = np.zeros((3, 3))
     density[:2, :2] = np.linalg.solve(V, np.linalg.solve(V, cov[:2, :2]).T)
     density[2, 2] = cov[2, 2]
@@ -140,22 +163,32 @@ def upper_to_full(entries: list[float], size: int) -> np.ndarray:
     return full + np.triu(full, 1).T
 
 
-def plain_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> list[gtsam.NonlinearFactor]:
+def plain_sighting(
+    pose: int, landmark: int, point: np.ndarray, cov: np.ndarray
+) -> list[gtsam.NonlinearFactor]:
     """Bearing and range, with the covariance that follows from the point's to first order."""
     bearing, distance, noise = bearing_and_range(point, cov)
     return [
         gtsam.BearingRangeFactor2D(
-            pose, landmark, bearing, distance, gtsam.noiseModel.Gaussian.Covariance(noise, False)
+            pose,
+            landmark,
+            bearing,
+            distance,
+            gtsam.noiseModel.Gaussian.Covariance(noise, False),
         )
     ]
 
 
-def robust_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> list[gtsam.NonlinearFactor]:
+def robust_sighting(
+    pose: int, landmark: int, point: np.ndarray, cov: np.ndarray
+) -> list[gtsam.NonlinearFactor]:
     """The same with a kernel on each of the two, which the file's covariances leave uncorrelated."""
     bearing, distance, noise = bearing_and_range(point, cov)
     kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(KERNEL_WIDTH)
     across, along = (
-        gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Variance(1, variance))
+        gtsam.noiseModel.Robust.Create(
+            kernel, gtsam.noiseModel.Isotropic.Variance(1, variance)
+        )
         for variance in np.diag(noise).tolist()
     )
     return [
@@ -164,11 +197,22 @@ def robust_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray
     ]
 
 
-def bearing_and_range(point: np.ndarray, cov: np.ndarray) -> tuple[gtsam.Rot2, float, np.ndarray]:
+def bearing_and_range(
+    point: np.ndarray, cov: np.ndarray
+) -> tuple[gtsam.Rot2, float, np.ndarray]:
     """Bearing and range of a point in the body frame, and their covariance (2, 2)."""
     distance = float(np.hypot(*point))
-    J = np.array([[-point[1] / distance**2, point[0] / distance**2], [point[0] / distance, point[1] / distance]])
-    return gtsam.Rot2.fromAngle(float(np.arctan2(point[1], point[0]))), distance, J @ cov @ J.T
+    J = np.array(
+        [
+            [-point[1] / distance**2, point[0] / distance**2],
+            [point[0] / distance, point[1] / distance],
+        ]
+    )
+    return (
+        gtsam.Rot2.fromAngle(float(np.arctan2(point[1], point[0]))),
+        distance,
+        J @ cov @ J.T,
+    )
 
 
 def solve(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
@@ -203,7 +247,9 @@ def incremental(steps: list[Step]) -> gtsam.Values:
     return isam.calculateBestEstimate()
 
 
-def joined(steps: list[Step], reading: Reading, sighter: Sighter = plain_sighting) -> gtsam.NonlinearFactorGraph:
+def joined(
+    steps: list[Step], reading: Reading, sighter: Sighter = plain_sighting
+) -> gtsam.NonlinearFactorGraph:
     """All factors."""
     graph = gtsam.NonlinearFactorGraph()
     for index, step in enumerate(steps):
@@ -223,16 +269,25 @@ def in_the_plane(run: RunResult) -> gtsam.Values:
     assert run.smoothed is not None
     assert run.landmarks is not None
     yaw = run.smoothed.rotations().as_euler("ZYX")[:, 0]
-    for index, (position, heading) in enumerate(zip(run.smoothed.positions, yaw.tolist(), strict=True), start=1):
+    for index, (position, heading) in enumerate(
+        zip(run.smoothed.positions, yaw.tolist(), strict=True), start=1
+    ):
         values.insert(X(index), gtsam.Pose2(position[0], position[1], heading))
-    for landmark, position in zip(run.landmarks.ids.tolist(), run.landmarks.positions, strict=True):
+    for landmark, position in zip(
+        run.landmarks.ids.tolist(), run.landmarks.positions, strict=True
+    ):
         values.insert(L(landmark), position[:2])
     return values
 
 
-def map_differences(ours: gtsam.Values, batch: gtsam.Values, ids: list[int]) -> dict[str, float]:
+def map_differences(
+    ours: gtsam.Values, batch: gtsam.Values, ids: list[int]
+) -> dict[str, float]:
     """Distances between the same landmarks: as they are (both begin at the first pose), and after SE(2) alignment."""
-    a, b = (np.array([[*values.atPoint2(L(i)), 0.0] for i in ids]) for values in (ours, batch))
+    a, b = (
+        np.array([[*values.atPoint2(L(i)), 0.0] for i in ids])
+        for values in (ours, batch)
+    )
     raw = np.linalg.norm(a - b, axis=1)
     aligned = np.linalg.norm(align_yaw(a, b).apply(a) - b, axis=1)
     return {
@@ -265,7 +320,8 @@ class Batch:
         ours = in_the_plane(run)
         return {
             "cost_ratio": self.graph.error(ours) / self.cost,
-            "restarted_cost_ratio": self.graph.error(solve(self.graph, ours)) / self.cost,
+            "restarted_cost_ratio": self.graph.error(solve(self.graph, ours))
+            / self.cost,
             **map_differences(ours, self.solution, run.landmarks.ids.tolist()),
             "max_difference_sigmas": self._sigmas(ours, run.landmarks.ids.tolist()),
         }
@@ -276,20 +332,31 @@ class Batch:
         squares = []
         for key in map(L, ids):
             difference = ours.atPoint2(key) - self.solution.atPoint2(key)
-            squares.append(difference @ np.linalg.solve(marginals.marginalCovariance(key), difference))
+            squares.append(
+                difference
+                @ np.linalg.solve(marginals.marginalCovariance(key), difference)
+            )
         return float(np.sqrt(max(squares)))
 
 
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
     arguments = parser.parse_args()
-    lines = Path(gtsam.findExampleDataFile("victoria_park.txt")).read_text().splitlines()
+    lines = (
+        Path(gtsam.findExampleDataFile("victoria_park.txt")).read_text().splitlines()
+    )
     lines = lines[:QUICK_LINES] if arguments.quick else lines
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "victoria_park.txt"
         path.write_text("\n".join(lines) + "\n")
         runs = dict(
-            zip(SETTINGS, in_parallel(partial(run_ours, path), list(SETTINGS), arguments.workers, "isam2"), strict=True)
+            zip(
+                SETTINGS,
+                in_parallel(
+                    partial(run_ours, path), list(SETTINGS), arguments.workers, "isam2"
+                ),
+                strict=True,
+            )
         )
     steps = read_steps(lines)
     start = incremental(steps)
@@ -304,7 +371,10 @@ def main() -> None:
         f"from dead reckoning {lost_cost:.3f}"
     )
     robust = joined(steps, all_along, robust_sighting)
-    starts = [plain["sensor noise"].solution, *([in_the_plane(runs["defaults"])] if runs["defaults"].landmarks else [])]
+    starts = [
+        plain["sensor noise"].solution,
+        *([in_the_plane(runs["defaults"])] if runs["defaults"].landmarks else []),
+    ]
     solutions = [Batch.solved(robust, values) for values in starts]
     print(
         "with a kernel, from the solution without and from ours: "
@@ -313,12 +383,18 @@ def main() -> None:
     )
     batches = {
         "like for like": plain,
-        "defaults": {"sensor noise and kernel": min(solutions, key=lambda solution: solution.cost)},
+        "defaults": {
+            "sensor noise and kernel": min(
+                solutions, key=lambda solution: solution.cost
+            )
+        },
     }
     conclude(report(runs, batches), is_quick=arguments.quick)
 
 
-def report(runs: dict[str, RunResult], batches: dict[str, dict[str, Batch]]) -> dict[str, Any]:
+def report(
+    runs: dict[str, RunResult], batches: dict[str, dict[str, Batch]]
+) -> dict[str, Any]:
     """Print the table; the figures by name."""
     rows, found = [], {}
     for name, run in runs.items():
@@ -327,25 +403,61 @@ def report(runs: dict[str, RunResult], batches: dict[str, dict[str, Batch]]) -> 
             continue
         for noise, batch in batches[name].items():
             found[name, noise] = batch.against(run)
-            rows.append((f"isam2 {name}, batch with {noise}", *found[name, noise].values()))
-    print_table(("", "cost ratio", "restarted", "rms m", "max m", "aligned rms m", "aligned max m", "max sigmas"), rows)
-    same, defaults = found.get(("like for like", "sensor noise")), found.get(("defaults", "sensor noise and kernel"))
-    figures = _named("", same) | _named("file_noise_", found.get(("like for like", "file noise")))
-    figures |= {key: value for key, value in _named("defaults_", defaults).items() if "cost" not in key}
-    figures["gated"] = {name: refused(run) for name, run in runs.items() if run.status == "ok"}
-    figures["failed"] = {name: run.reason for name, run in runs.items() if run.status == "failed"}
-    figures["passed"] = bool(same and defaults) and passed(same) and maps_agree(defaults)
+            rows.append(
+                (f"isam2 {name}, batch with {noise}", *found[name, noise].values())
+            )
+    print_table(
+        (
+            "",
+            "cost ratio",
+            "restarted",
+            "rms m",
+            "max m",
+            "aligned rms m",
+            "aligned max m",
+            "max sigmas",
+        ),
+        rows,
+    )
+    same, defaults = (
+        found.get(("like for like", "sensor noise")),
+        found.get(("defaults", "sensor noise and kernel")),
+    )
+    figures = _named("", same) | _named(
+        "file_noise_", found.get(("like for like", "file noise"))
+    )
+    figures |= {
+        key: value
+        for key, value in _named("defaults_", defaults).items()
+        if "cost" not in key
+    }
+    figures["gated"] = {
+        name: refused(run) for name, run in runs.items() if run.status == "ok"
+    }
+    figures["failed"] = {
+        name: run.reason for name, run in runs.items() if run.status == "failed"
+    }
+    figures["passed"] = (
+        bool(same and defaults) and passed(same) and maps_agree(defaults)
+    )
     return figures
 
 
 def _named(prefix: str, figures: dict[str, float] | None) -> dict[str, Any]:
     landmark = "" if prefix else "landmark_"
-    return {prefix + (landmark if "difference" in key else "") + key: value for key, value in (figures or {}).items()}
+    return {
+        prefix + (landmark if "difference" in key else "") + key: value
+        for key, value in (figures or {}).items()
+    }
 
 
 def refused(run: RunResult) -> int:
     """Detections outside the gate; in this file all are of the landmarks that it names."""
-    return sum(outcome is Outcome.GATED for outcome in run.detections.outcomes) if run.detections else 0
+    return (
+        sum(outcome is Outcome.GATED for outcome in run.detections.outcomes)
+        if run.detections
+        else 0
+    )
 
 
 def passed(same: dict[str, float]) -> bool:
@@ -360,7 +472,8 @@ def passed(same: dict[str, float]) -> bool:
 def maps_agree(differences: dict[str, float]) -> bool:
     """Check that landmarks are where the batch solution has them."""
     return (
-        differences["rms_difference_m"] <= RMS_AGREEMENT_M and differences["max_difference_sigmas"] <= SIGMAS_AGREEMENT
+        differences["rms_difference_m"] <= RMS_AGREEMENT_M
+        and differences["max_difference_sigmas"] <= SIGMAS_AGREEMENT
     )
 
 

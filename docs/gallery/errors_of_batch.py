@@ -13,11 +13,25 @@ import pyarrow.parquet as pq
 folder, score, picture = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3])
 groups: dict[tuple[str, str], list[float]] = {}
 for row in pq.read_table(folder / "results.parquet").to_pylist():
-    groups.setdefault((row["log"], row["estimator"]), []).extend([row[score]] if row[score] is not None else [])
-figure, axes = plt.subplots(figsize=(7.2, 0.55 * len(groups) + 1.0), layout="constrained")
+    groups.setdefault((row["log"], row["estimator"]), []).extend(
+        [row[score]] if row[score] is not None else []
+    )
+figure, axes = plt.subplots(
+    figsize=(7.2, 0.55 * len(groups) + 1.0), layout="constrained"
+)
 for height, values in enumerate(groups.values()):
-    axes.plot(values, [height] * len(values), "o", alpha=0.5, color="#0072b2", markeredgewidth=0)
-axes.set_yticks(range(len(groups)), [f"{log}\n{name} ({len(values)})" for (log, name), values in groups.items()])
+    axes.plot(
+        values,
+        [height] * len(values),
+        "o",
+        alpha=0.5,
+        color="#0072b2",
+        markeredgewidth=0,
+    )
+axes.set_yticks(
+    range(len(groups)),
+    [f"{log}\n{name} ({len(values)})" for (log, name), values in groups.items()],
+)
 axes.invert_yaxis()
 axes.set(xscale="log", xlabel=score)
 axes.grid(axis="x", color="#d5d9dd", linewidth=0.6)

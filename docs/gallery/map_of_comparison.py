@@ -30,17 +30,30 @@ comparison = read_comparison(folder)
 truth = comparison.sequence.truth
 figure, axes = plt.subplots(figsize=(7.2, 5.4), layout="constrained")
 if truth is not None:
-    axes.plot(*truth.positions[:, :2].T, color="#8b9198", linewidth=3.5, alpha=0.6, label="truth")
+    axes.plot(
+        *truth.positions[:, :2].T,
+        color="#8b9198",
+        linewidth=3.5,
+        alpha=0.6,
+        label="truth",
+    )
 for run in comparison.runs:
     path, colour = run.causal, COLOURS.get(run.estimator, "black")
     if path is None:
         continue
     R, t = np.eye(2), np.zeros(2)
     if truth is not None:
-        near = np.clip(np.searchsorted(truth.stamps_ns, path.stamps_ns), 0, len(truth) - 1)
+        near = np.clip(
+            np.searchsorted(truth.stamps_ns, path.stamps_ns), 0, len(truth) - 1
+        )
         both = np.abs(truth.stamps_ns[near] - path.stamps_ns) < SAME_NS
         R, t = motion_onto(path.positions[both, :2], truth.positions[near[both], :2])
-    axes.plot(*(R @ path.positions[:, :2].T + t[:, None]), color=colour, linewidth=1.2, label=run.estimator)
+    axes.plot(
+        *(R @ path.positions[:, :2].T + t[:, None]),
+        color=colour,
+        linewidth=1.2,
+        label=run.estimator,
+    )
     if run.landmarks is not None and len(run.landmarks):
         places = R @ run.landmarks.positions[:, :2].T + t[:, None]
         axes.plot(*places, ".", color=colour, markersize=5)

@@ -23,7 +23,11 @@ TABLES = (
 
 def name_of(row: dict) -> str:
     """Estimator, and its variant where it is not the default."""
-    return row["estimator"] if row["variant"] in (None, "", "default") else f"{row['estimator']}, {row['variant']}"
+    return (
+        row["estimator"]
+        if row["variant"] in (None, "", "default")
+        else f"{row['estimator']}, {row['variant']}"
+    )
 
 
 def cell(of_runs: list[dict], key: str, digits: int) -> str:
@@ -47,14 +51,39 @@ for title, key, digits in TABLES:
     lines = []
     for log, of_log in runs.items():
         count = max(map(len, of_log.values()))
-        cells = [cell(of_log[name], key, digits) if name in of_log else "" for name in names]
+        cells = [
+            cell(of_log[name], key, digits) if name in of_log else "" for name in names
+        ]
         if any(cells):
-            lines.append(" | ".join(["", f"{log}, {count} run{'s' * (count > 1)}", *cells, ""]).strip())
-    print(f"| {title} | {' | '.join(names)} |\n|---{'|---' * len(names)}|", *lines, "", sep="\n")
+            lines.append(
+                " | ".join(
+                    ["", f"{log}, {count} run{'s' * (count > 1)}", *cells, ""]
+                ).strip()
+            )
+    print(
+        f"| {title} | {' | '.join(names)} |\n|---{'|---' * len(names)}|",
+        *lines,
+        "",
+        sep="\n",
+    )
 failures = defaultdict(list)
 for row in rows:
     if row["status"] != "ok":
-        reason = row["reason"].split(": ", 1)[-1].split(".")[0].split(" near variable")[0]
+        reason = (
+            row["reason"].split(": ", 1)[-1].split(".")[0].split(" near variable")[0]
+        )
         failures[name_of(row), row["log"], reason].append(row["seed"])
-print(*(f"- {name} on {log}: {len(seeds)} run(s), {why}" for (name, log, why), seeds in failures.items()), sep="\n")
-print("\n" + ", ".join(f"{what} {rows[0][what]}" for what in ("sonar_graph", "gtsam", "numpy", "python", "machine")))
+print(
+    *(
+        f"- {name} on {log}: {len(seeds)} run(s), {why}"
+        for (name, log, why), seeds in failures.items()
+    ),
+    sep="\n",
+)
+print(
+    "\n"
+    + ", ".join(
+        f"{what} {rows[0][what]}"
+        for what in ("sonar_graph", "gtsam", "numpy", "python", "machine")
+    )
+)

@@ -14,7 +14,9 @@ from mkdocs.structure.pages import Page
 from tutorial_pages import page_of_script
 
 ROOT = Path(__file__).parents[2]
-LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
+LINK = re.compile(
+    r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)"
+)
 LANGUAGES = {".py": "python", ".toml": "toml", ".yml": "yaml", ".cff": "yaml"}
 places: dict[str, Path] = {}
 """Of each page, the file in the repository that its links start from."""
@@ -41,7 +43,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
+def on_page_markdown(
+    markdown: str,
+    page: Page,
+    config: MkDocsConfig,  # noqa: ARG001
+    files: Files,
+) -> str:
     """Turn links to the repository into links to the pages that hold its files."""
     here = page.file.src_uri
 
@@ -69,7 +76,11 @@ def _outside(place: Path, target: str, files: Files) -> Path | None:
     path = (place.parent / target).resolve()
     if not path.exists() or not path.is_relative_to(ROOT):
         return None
-    own = path.relative_to(ROOT / "docs").as_posix() if path.is_relative_to(ROOT / "docs") else None
+    own = (
+        path.relative_to(ROOT / "docs").as_posix()
+        if path.is_relative_to(ROOT / "docs")
+        else None
+    )
     page = None if own is None else files.get_file_from_path(own)
     return path if page is None or page.inclusion.is_excluded() else None
 
@@ -87,7 +98,15 @@ def _text_of(path: Path) -> str:
     name = path.relative_to(ROOT).as_posix()
     head = f"---\nsearch:\n  exclude: true\n---\n\n# {name}\n\n"
     if path.is_dir():
-        inside = (one for one in sorted(path.iterdir()) if not one.name.startswith(("__pycache__", ".")))
-        return head + "\n".join(f"- `{one.name}{'/' * one.is_dir()}`" for one in inside) + "\n"
+        inside = (
+            one
+            for one in sorted(path.iterdir())
+            if not one.name.startswith(("__pycache__", "."))
+        )
+        return (
+            head
+            + "\n".join(f"- `{one.name}{'/' * one.is_dir()}`" for one in inside)
+            + "\n"
+        )
     language = LANGUAGES.get(path.suffix, "text")
     return f'{head}~~~~~~ {{.{language} linenums="1"}}\n{path.read_text("utf-8").rstrip()}\n~~~~~~\n'

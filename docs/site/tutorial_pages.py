@@ -34,8 +34,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             try:
                 text, written = run_tutorial(script, Path(folder))
             except Exception as error:
-                raise PluginError(f"{script.name} ended with {type(error).__name__}: {error}") from error
-            files.append(File.generated(config, f"tutorials/{script.stem}.md", content=text))
+                raise PluginError(
+                    f"{script.name} ended with {type(error).__name__}: {error}"
+                ) from error
+            files.append(
+                File.generated(config, f"tutorials/{script.stem}.md", content=text)
+            )
             for path in written:
                 uri = f"tutorials/{script.stem}/{path.relative_to(folder).as_posix()}"
                 files.append(File.generated(config, uri, content=path.read_bytes()))
@@ -45,14 +49,24 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def run_tutorial(script: Path, folder: Path) -> tuple[str, list[Path]]:
     """Run a tutorial in a folder; its page as Markdown, and the files that the page shows."""
     source = script.read_text("utf-8")
-    title, _, about = (ast.get_docstring(ast.parse(source)) or script.stem).partition("\n\n")
-    parts = [f"# {title.rstrip('.').partition(':')[0]}", title, re.sub(r"::(?=\n)", ":", about)]
-    parts.append(f"The program is `docs/tutorials/{script.name}`; this page shows it with its output.")
+    title, _, about = (ast.get_docstring(ast.parse(source)) or script.stem).partition(
+        "\n\n"
+    )
+    parts = [
+        f"# {title.rstrip('.').partition(':')[0]}",
+        title,
+        re.sub(r"::(?=\n)", ":", about),
+    ]
+    parts.append(
+        f"The program is `docs/tutorials/{script.name}`; this page shows it with its output."
+    )
     shown: dict[Path, bytes] = {}
     names = {"__name__": "__main__", "__file__": str(script)}
     for line, prose, code in cells(source):
         if prose:
-            parts.append(HEADING.sub(lambda found: f"## {found['title']}\n\n", prose, count=1))
+            parts.append(
+                HEADING.sub(lambda found: f"## {found['title']}\n\n", prose, count=1)
+            )
         if not code.strip():
             continue
         parts.append(f"```python\n{code.strip()}\n```")
@@ -61,8 +75,16 @@ def run_tutorial(script: Path, folder: Path) -> tuple[str, list[Path]]:
             exec(compile("\n" * line + code, script, "exec"), names)
         if said.getvalue().strip():
             parts.append(f'```text title="Output"\n{said.getvalue().strip()}\n```')
-        now = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.suffix in SHOWN}
-        parts += [_shown(path, folder, script.stem) for path, content in now.items() if shown.get(path) != content]
+        now = {
+            path: path.read_bytes()
+            for path in sorted(folder.rglob("*"))
+            if path.suffix in SHOWN
+        }
+        parts += [
+            _shown(path, folder, script.stem)
+            for path, content in now.items()
+            if shown.get(path) != content
+        ]
         shown = now
     return "\n\n".join(parts) + "\n", list(shown)
 
@@ -71,7 +93,9 @@ def cells(source: str) -> Iterator[tuple[int, str, str]]:
     """Steps of a program after its docstring: number of lines before the code, prose, code."""
     lines = source.splitlines()
     inside = {
-        number for node in ast.parse(source).body for number in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+        number
+        for node in ast.parse(source).body
+        for number in range(node.lineno, (node.end_lineno or node.lineno) + 1)
     }
     docstring = ast.parse(source).body[0].end_lineno or 0
     prose: list[str] = []

@@ -22,7 +22,9 @@ write_log(log, simulated)
 
 # From here on nothing is known that is not in the file: measurements, calibration, and what is called truth in it.
 sequence = read_log(log)
-print(f"{log}: {sequence.duration_s:.0f} s, {len(sequence.imu)} IMU rows, {len(sequence.dvl)} DVL rows")
+print(
+    f"{log}: {sequence.duration_s:.0f} s, {len(sequence.imu)} IMU rows, {len(sequence.dvl)} DVL rows"
+)
 
 # Every estimator sees the same measurements, cut at the same instants, and is scored at the same instants.
 comparison = compare(sequence, ["isam2", "ekf-slam", "dead-reckoning"])
@@ -49,7 +51,9 @@ print("NEES: " + comparison.scores["isam2"]["causal.nees_position"].protocol)
 # The map: landmarks by identity, with covariances.
 landmarks = next(run.landmarks for run in comparison.runs if run.estimator == "isam2")
 print("\nlandmark      x (m)     y (m)   1 sigma (m)")
-for landmark, position, covariance in zip(landmarks.ids, landmarks.positions, landmarks.covariances, strict=True):
+for landmark, position, covariance in zip(
+    landmarks.ids, landmarks.positions, landmarks.covariances, strict=True
+):
     sigma = (covariance[0, 0] + covariance[1, 1]) ** 0.5
     print(f"{landmark:8} {position[0]:10.3f} {position[1]:9.3f} {sigma:13.3f}")
 

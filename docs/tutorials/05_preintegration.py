@@ -30,13 +30,22 @@ def surge(t):
 
 
 t = imu_ns / NS
-rate = np.column_stack([0 * t, 0 * t, YAW_RATE + 0 * t]) + BIAS + 1e-4 * np.sqrt(200) * rng.standard_normal((len(t), 3))
-force = np.column_stack([0.2 * SWELL * np.cos(SWELL * t), surge(t) * YAW_RATE, 9.81 + 0 * t])
+rate = (
+    np.column_stack([0 * t, 0 * t, YAW_RATE + 0 * t])
+    + BIAS
+    + 1e-4 * np.sqrt(200) * rng.standard_normal((len(t), 3))
+)
+force = np.column_stack(
+    [0.2 * SWELL * np.cos(SWELL * t), surge(t) * YAW_RATE, 9.81 + 0 * t]
+)
 force += 1e-3 * np.sqrt(200) * rng.standard_normal((len(t), 3))
-velocity = np.column_stack([surge(dvl_ns / NS), 0 * dvl_ns, 0 * dvl_ns]) + 0.005 * rng.standard_normal((len(dvl_ns), 3))
+velocity = np.column_stack(
+    [surge(dvl_ns / NS), 0 * dvl_ns, 0 * dvl_ns]
+) + 0.005 * rng.standard_normal((len(dvl_ns), 3))
 
 imu = Imu(imu_ns, rate, force)
-dvl = Dvl(dvl_ns, velocity, np.full((len(dvl_ns), 3, 3), np.nan))  # NaN: not measured, the calibration's sigma holds
+# NaN: not measured, the calibration's sigma holds
+dvl = Dvl(dvl_ns, velocity, np.full((len(dvl_ns), 3, 3), np.nan))
 
 # 2. Noise and mountings of the sensors. The Earth's rotation is left out, since no latitude is given.
 calibration = Calibration(
@@ -44,22 +53,31 @@ calibration = Calibration(
     dvl=DvlCalibration(velocity_sigma_m_s=(0.005, 0.005, 0.005)),
 )
 odometry = Odometry(calibration)
-odometry.add(imu, dvl)  # as often as rows come; outliers and late rows are listed in odometry.refused
+# as often as rows come; outliers and late rows are listed in odometry.refused
+odometry.add(imu, dvl)
 
 # 3. Motion between any two instants. The stamps of the Doppler log are epochs: between two epochs motion is final.
 no_bias = np.zeros(3)
 motion = odometry.motion(0, NS, no_bias, known_ns=2 * NS)
-print(f"in 1 s: {motion.i_T_j.translation().round(4)} m, turned by {motion.i_T_j.rotation().yaw():.4f} rad")
+print(
+    f"in 1 s: {motion.i_T_j.translation().round(4)} m, turned by {motion.i_T_j.rotation().yaw():.4f} rad"
+)
 print(f"1 sigma: {np.sqrt(np.diag(motion.covariance)[3:]).round(5)} m")
 again = odometry.motion(0, NS, BIAS, known_ns=2 * NS)
-print(f"another bias to first order: {np.abs(motion.corrected(BIAS).matrix() - again.i_T_j.matrix()).max():.1e} off")
+print(
+    f"another bias to first order: {np.abs(motion.corrected(BIAS).matrix() - again.i_T_j.matrix()).max():.1e} off"
+)
 
 # 4. The graph: a keyframe a second, one gyro bias. Without a bias to estimate, gtsam.BetweenFactorPose3 with
 #    motion.i_T_j and motion.covariance is faster.
 graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 pose = gtsam.Pose3()
-graph.push_back(gtsam.PriorFactorPose3(X(0), pose, gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
-graph.push_back(gtsam.PriorFactorVector(B(0), no_bias, gtsam.noiseModel.Isotropic.Sigma(3, 0.02)))
+graph.push_back(
+    gtsam.PriorFactorPose3(X(0), pose, gtsam.noiseModel.Isotropic.Sigma(6, 1e-4))
+)
+graph.push_back(
+    gtsam.PriorFactorVector(B(0), no_bias, gtsam.noiseModel.Isotropic.Sigma(3, 0.02))
+)
 values.insert(X(0), pose)
 values.insert(B(0), no_bias)
 for k in range(20):
@@ -70,7 +88,9 @@ for k in range(20):
 
 # Whatever else you have. Here: one compass reading, from which the gyro bias follows.
 heading = gtsam.Pose3(gtsam.Rot3.Yaw(YAW_RATE * 20), np.zeros(3))
-compass = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, 0.002, 100.0, 100.0, 100.0]))
+compass = gtsam.noiseModel.Diagonal.Sigmas(
+    np.array([1.0, 1.0, 0.002, 100.0, 100.0, 100.0])
+)
 graph.push_back(gtsam.PriorFactorPose3(X(20), heading, compass))
 
 solution = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
@@ -79,9 +99,13 @@ sigma = np.sqrt(gtsam.Marginals(graph, solution).marginalCovariance(B(0))[2, 2])
 print(f"\ngyro bias about z: {found:.5f} ± {sigma:.5f} rad/s, true {BIAS[2]:.5f}")
 
 fine = np.linspace(0, 20, 20001)
-path = surge(fine)[:, None] * np.column_stack([np.cos(YAW_RATE * fine), np.sin(YAW_RATE * fine)])
+path = surge(fine)[:, None] * np.column_stack(
+    [np.cos(YAW_RATE * fine), np.sin(YAW_RATE * fine)]
+)
 true = np.trapezoid(path, fine, axis=0)
-print(f"position error after 20 s: {np.linalg.norm(solution.atPose3(X(20)).translation()[:2] - true):.4f} m")
+print(
+    f"position error after 20 s: {np.linalg.norm(solution.atPose3(X(20)).translation()[:2] - true):.4f} m"
+)
 
 # 5. Five seconds without bottom lock: the accelerometers carry the velocity, between its last and its next sample.
 with_gap = Odometry(calibration)
@@ -90,4 +114,6 @@ whole = odometry.motion(5 * NS, 15 * NS, BIAS, known_ns=20 * NS)
 bridged = with_gap.motion(5 * NS, 15 * NS, BIAS, known_ns=20 * NS)
 off = np.linalg.norm(bridged.i_T_j.translation() - whole.i_T_j.translation())
 sigma = np.sqrt(bridged.covariance[3, 3])
-print(f"\nover a gap of 5 s: {off:.3f} m from the motion with all samples, 1 sigma {sigma:.3f} m")
+print(
+    f"\nover a gap of 5 s: {off:.3f} m from the motion with all samples, 1 sigma {sigma:.3f} m"
+)

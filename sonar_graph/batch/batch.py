@@ -17,7 +17,16 @@ from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
 from sonar_graph.batch.sources import LOG, read_source
-from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where
+from sonar_graph.batch.store import (
+    SUITE,
+    Limits,
+    PlannedRun,
+    Progress,
+    Row,
+    RunOutcome,
+    Store,
+    Where,
+)
 from sonar_graph.batch.suite import SuiteFile, read_suite
 from sonar_graph.errors import BatchError, SonarGraphError
 from sonar_graph.evaluation import expense
@@ -118,7 +127,9 @@ def run_suite(
     (2,)
     """
     if workers is not None and scheduler is not None:
-        raise BatchError("workers are processes on this machine, a scheduler is that of a cluster; give one of them")
+        raise BatchError(
+            "workers are processes on this machine, a scheduler is that of a cluster; give one of them"
+        )
     if lacking := [name for name in NEEDED_PACKAGES if find_spec(name) is None]:
         raise BatchError(f"bench needs {lacking[0]}, which is not installed: {INSTALL}")
     file, folder = read_suite(Path(path)), Path(folder)
@@ -127,11 +138,15 @@ def run_suite(
         if retry_failed:
             batch.discard_failed(chosen)
         rows = batch.rows()
-        statuses = Counter(str(rows[run.key]["status"]) for run in chosen if run.key in rows)
+        statuses = Counter(
+            str(rows[run.key]["status"]) for run in chosen if run.key in rows
+        )
 
         def report() -> None:
             if progress is not None:
-                progress(statuses.total(), len(chosen), statuses.total() - statuses["ok"])
+                progress(
+                    statuses.total(), len(chosen), statuses.total() - statuses["ok"]
+                )
 
         def count(_run: PlannedRun, outcome: RunOutcome) -> None:
             statuses[str(outcome.row["status"])] += 1
@@ -143,7 +158,9 @@ def run_suite(
             with terminations_as_interrupts():
                 if notice is not None:
                     for sentence in batch.large_logs():
-                        notice(f"{sentence}; a run is ended after {limits.timeout_s:g} s")
+                        notice(
+                            f"{sentence}; a run is ended after {limits.timeout_s:g} s"
+                        )
                 batch.run(Where(workers, scheduler), limits, count, chosen)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(batch.resuming()) from None
@@ -160,7 +177,9 @@ class Batch:
 
     @classmethod
     @contextlib.contextmanager
-    def opened(cls, file: SuiteFile, folder: Path, *, overwrite: bool = False) -> Iterator[Batch]:
+    def opened(
+        cls, file: SuiteFile, folder: Path, *, overwrite: bool = False
+    ) -> Iterator[Batch]:
         """Plan a suite, find its finished runs, and keep other batches out of the folder while the block runs.
 
         Raises
@@ -171,22 +190,36 @@ class Batch:
         """
         runs = plan_runs(file)
         store = Store(folder)
-        with result_folder(folder, BATCH, overwrite=overwrite, refusal=BatchError) as written:
-            with contextlib.suppress(OSError, ValueError):  # no suite here, or none that can be resumed
+        with result_folder(
+            folder, BATCH, overwrite=overwrite, refusal=BatchError
+        ) as written:
+            with contextlib.suppress(
+                OSError, ValueError
+            ):  # no suite here, or none that can be resumed
                 name = tomllib.loads(text_of(folder / SUITE)).get("name")
-                if name != file.suite.name and not overwrite:  # one that was edited but has its name goes on here
+                if (
+                    name != file.suite.name and not overwrite
+                ):  # one that was edited but has its name goes on here
                     raise BatchError(
                         f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; "
                         "choose another folder with -o, or, where it only has a new name, give --overwrite"
                     )
-            with result_written(folder, BATCH):  # from here on the folder is known as a batch's
-                written.require([RESULTS] if _is_same(folder / SUITE, file) else [SUITE, RESULTS])
+            with result_written(
+                folder, BATCH
+            ):  # from here on the folder is known as a batch's
+                written.require(
+                    [RESULTS] if _is_same(folder / SUITE, file) else [SUITE, RESULTS]
+                )
             store.remove_partial()
             yield cls(file, runs, store)
 
     def rows(self) -> dict[str, Row]:
         """Rows of the runs that are done, by key."""
-        return {run.key: row for run in self.runs if (row := self.store.row(run.key)) is not None}
+        return {
+            run.key: row
+            for run in self.runs
+            if (row := self.store.row(run.key)) is not None
+        }
 
     def large_logs(self) -> Iterator[str]:
         """Sentences with what the runs of large logs take, for runs that are not done.
@@ -194,10 +227,14 @@ class Batch:
         Data sets and simulations are not read: their size is known to whoever names them.
         """
         done = self.rows()
-        missing = {run.log: run for run in self.runs if run.kind == LOG and run.key not in done}
+        missing = {
+            run.log: run for run in self.runs if run.kind == LOG and run.key not in done
+        }
         for run in missing.values():
             with contextlib.suppress(SonarGraphError):  # the run fails with the reason
-                if said := expense(read_source(run.kind, run.options, run.seed, run.landmarks)):
+                if said := expense(
+                    read_source(run.kind, run.options, run.seed, run.landmarks)
+                ):
                     yield f"A large log, {run.log}, {said}"
 
     def chosen(self, keys: Collection[str]) -> list[PlannedRun]:
@@ -219,7 +256,13 @@ class Batch:
             if run.key in rows and rows[run.key]["status"] != "ok":
                 self.store.discard(run.key)
 
-    def run(self, where: Where, limits: Limits, progress: Progress, chosen: Sequence[PlannedRun] | None = None) -> None:
+    def run(
+        self,
+        where: Where,
+        limits: Limits,
+        progress: Progress,
+        chosen: Sequence[PlannedRun] | None = None,
+    ) -> None:
         """Do the runs that are not done, or those chosen of them, and write the table, also if the batch ends early.
 
         Suite and table in the folder are replaced as soon as the first run of this plan is done, and not before. The
@@ -233,7 +276,11 @@ class Batch:
         from sonar_graph.batch import cluster  # Dask is of the extra `bench`
 
         done = self.rows()
-        missing = [run for run in (self.runs if chosen is None else chosen) if run.key not in done]
+        missing = [
+            run
+            for run in (self.runs if chosen is None else chosen)
+            if run.key not in done
+        ]
         has_table = self._write_table_if_possible()
 
         def kept(run: PlannedRun, outcome: RunOutcome) -> None:

@@ -20,7 +20,14 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.client import FutureCancelledError
 from distributed.scheduler import KilledWorker
 
-from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
+from sonar_graph.batch.store import (
+    Limits,
+    PlannedRun,
+    Progress,
+    RunOutcome,
+    Store,
+    Where,
+)
 from sonar_graph.batch.supervision import perform_watched
 from sonar_graph.errors import BatchError, SonarGraphError
 
@@ -44,7 +51,13 @@ DASK_SETTINGS = {
 for many small tasks and is slowed down here, because it takes time from the runs."""
 
 
-def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: Where, progress: Progress) -> None:
+def run_batch(
+    runs: Iterable[PlannedRun],
+    store: Store,
+    limits: Limits,
+    where: Where,
+    progress: Progress,
+) -> None:
     """Do runs and keep each as soon as it is done; ``progress`` is called after that.
 
     Raises `BatchError` when there is no scheduler or no worker, workers cannot do any run, or nothing can be written.
@@ -59,9 +72,16 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
         else _remote_client(where.scheduler)
     )
     with dask.config.set(DASK_SETTINGS), _silent_dask(), connected as client:
-        this_batch = uuid.uuid4().hex  # equal keys are one task for a scheduler, which other batches use too
+        # equal keys are one task for a scheduler, which other batches use too
+        this_batch = uuid.uuid4().hex
         submitted = (
-            client.submit(perform_watched, run, limits, key=f"run-{run.key}-{this_batch}", pure=False)
+            client.submit(
+                perform_watched,
+                run,
+                limits,
+                key=f"run-{run.key}-{this_batch}",
+                pure=False,
+            )
             for run in planned
         )
         futures = dict(zip(submitted, planned, strict=True))
@@ -75,7 +95,9 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
             _within_seconds(lambda: client.cancel(list(futures)))
 
 
-def keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
+def keep(
+    run: PlannedRun, future: Future[Any], store: Store, progress: Progress
+) -> None:
     """Write the outcome of a finished task to the store; a run whose workers were killed has a row that says so.
 
     Raises `BatchError` when the worker could not do the run at all, or the store cannot be written.
@@ -93,7 +115,9 @@ def keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress)
     try:
         store.write(run.key, outcome)
     except OSError as error:
-        raise BatchError(f"{store.folder}: cannot be written: {error.strerror or error}") from error
+        raise BatchError(
+            f"{store.folder}: cannot be written: {error.strerror or error}"
+        ) from error
     progress(run, outcome)
 
 
@@ -111,7 +135,9 @@ def _remote_client(address: str) -> Iterator[Client]:
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError as error:
         client.close()
-        raise BatchError(f"the scheduler at {address} has no worker after {CONNECT_S:g} s; start some") from error
+        raise BatchError(
+            f"the scheduler at {address} has no worker after {CONNECT_S:g} s; start some"
+        ) from error
     try:
         yield client
     finally:
@@ -144,7 +170,9 @@ def _local_client(workers: int) -> Iterator[Client]:
     try:
         yield client
     finally:
-        pids = [nanny.pid for nanny in cluster.workers.values() if nanny.pid is not None]
+        pids = [
+            nanny.pid for nanny in cluster.workers.values() if nanny.pid is not None
+        ]
         workers_here = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
         _within_seconds(client.close)
         _within_seconds(cluster.close)
@@ -168,7 +196,11 @@ def _within_seconds(end: Callable[[], object]) -> None:
 @contextlib.contextmanager
 def _silent_dask() -> Iterator[None]:
     """Suppress Dask's own messages; rows report workers that were lost."""
-    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    names = [
+        name
+        for name in logging.root.manager.loggerDict
+        if name.partition(".")[0] == "distributed"
+    ]
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:
         logging.getLogger(name).setLevel(logging.CRITICAL)

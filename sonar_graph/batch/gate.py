@@ -17,7 +17,12 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.batch import permutation
-from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch, RecordedRun, require_complete
+from sonar_graph.batch.recorded import (
+    ALL_LOGS,
+    RecordedBatch,
+    RecordedRun,
+    require_complete,
+)
 from sonar_graph.batch.result_table import KINDS, is_timing, metrics_of
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import read_json, write_json
@@ -29,7 +34,9 @@ Name = tuple[str, str, int | None]
 TOLERANCE = 0.02
 """Relative worsening of an error that is accepted."""
 CONSISTENCY_TOLERANCE = 0.1
-CONSISTENCY_KEYS = tuple(f"{kind}.{name}" for kind in KINDS for name in ("nees_position", "nees_yaw"))
+CONSISTENCY_KEYS = tuple(
+    f"{kind}.{name}" for kind in KINDS for name in ("nees_position", "nees_yaw")
+)
 FAR = 2.0
 """An error stands out if it is so many times the worst of its contestant on its log in the reference."""
 ALONE = 0.25
@@ -84,7 +91,11 @@ class GateVerdict:
     @property
     def untested(self) -> list[str]:
         """Contestants with too few cases for a test."""
-        return [contestant for contestant, cases in self.cases.items() if cases < permutation.LEAST_CASES]
+        return [
+            contestant
+            for contestant, cases in self.cases.items()
+            if cases < permutation.LEAST_CASES
+        ]
 
     @property
     def has_test(self) -> bool:
@@ -94,7 +105,11 @@ class GateVerdict:
     @property
     def unmoved(self) -> list[str]:
         """Contestants that have a test and whose scores all lie within the tolerance."""
-        return [name for name in self.cases if name not in self.detectable and name not in self.untested]
+        return [
+            name
+            for name in self.cases
+            if name not in self.detectable and name not in self.untested
+        ]
 
 
 def bless(batch: RecordedBatch, path: Path) -> None:
@@ -110,7 +125,12 @@ def bless(batch: RecordedBatch, path: Path) -> None:
         raise EvaluationError(
             f"{batch.name}: none of its {len(batch.runs)} runs ended, so every batch would pass by it"
         )
-    errors = [key for metric in metrics_of(batch.metrics) if metric.is_error for key in metric.keys.values()]
+    errors = [
+        key
+        for metric in metrics_of(batch.metrics)
+        if metric.is_error
+        for key in metric.keys.values()
+    ]
     keys = [*errors, *CONSISTENCY_KEYS]
     entries = [
         {
@@ -119,11 +139,18 @@ def bless(batch: RecordedBatch, path: Path) -> None:
             "seed": run.seed,
             "asked": asked_of(run),
             "status": run.status,
-            "scores": {key: run.values[key] for key in keys if run.ended and key in run.values},
+            "scores": {
+                key: run.values[key] for key in keys if run.ended and key in run.values
+            },
         }
         for run in batch.runs
     ]
-    content = {"format": FORMAT, "suite": batch.name, "versions": batch.runs[0].texts, "metrics": keys}
+    content = {
+        "format": FORMAT,
+        "suite": batch.name,
+        "versions": batch.runs[0].texts,
+        "metrics": keys,
+    }
     write_json(path, content | {"runs": entries})
 
 
@@ -149,7 +176,8 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
             "from a batch run with the code that it stands for"
         )
     blessed: dict[Name, dict[str, Any]] = {
-        (entry["log"], entry["estimator"], entry["seed"]): entry for entry in content["runs"]
+        (entry["log"], entry["estimator"], entry["seed"]): entry
+        for entry in content["runs"]
     }
     runs = {name_of(run): run for run in batch.runs}
     missing = sorted(set(blessed) - set(runs), key=told)
@@ -168,10 +196,19 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
         run, scores = runs[name], entry["scores"]
         seed = "" if run.seed is None else f"seed {run.seed}: "
         if entry["status"] == "ok" and not run.ended:
-            worsenings.append(Worsening(run.log, run.contestant, "status", f"{seed}{run.status}, {run.reason}"))
+            worsenings.append(
+                Worsening(
+                    run.log,
+                    run.contestant,
+                    "status",
+                    f"{seed}{run.status}, {run.reason}",
+                )
+            )
         elif lost := [key for key in scores if key not in run.values and run.ended]:
             explanation = f"{seed}no value, the reference has one"
-            worsenings.append(Worsening(run.log, run.contestant, ", ".join(lost), explanation))
+            worsenings.append(
+                Worsening(run.log, run.contestant, ", ".join(lost), explanation)
+            )
         for column in columns:
             old, new = scores.get(column, math.inf), run.value(column)
             if math.isfinite(old) and math.isfinite(new):
@@ -181,7 +218,9 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
                 ratios.setdefault((run.log, run.contestant, column), {})[case] = ratio
     ratios = permutation.with_all_logs(ratios)
     tested = permutation.families(movable(ratios))
-    cases: dict[str, set[permutation.Case]] = {runs[name].contestant: set() for name in blessed}
+    cases: dict[str, set[permutation.Case]] = {
+        runs[name].contestant: set() for name in blessed
+    }
     for (_, contestant, _), values in ratios.items():
         cases[contestant].update(values)
     errors = [column for column in columns if column not in CONSISTENCY_KEYS]
@@ -260,7 +299,9 @@ def log_ratios(old: Floats, new: Floats, column: str) -> Floats:
 
 def limit_of(column: str) -> float:
     """Log ratio up to which a worsening is accepted."""
-    return math.log1p(CONSISTENCY_TOLERANCE if column in CONSISTENCY_KEYS else TOLERANCE)
+    return math.log1p(
+        CONSISTENCY_TOLERANCE if column in CONSISTENCY_KEYS else TOLERANCE
+    )
 
 
 def movable(ratios: permutation.Ratios) -> permutation.Ratios:
@@ -269,7 +310,10 @@ def movable(ratios: permutation.Ratios) -> permutation.Ratios:
     The mean is at most the root of the mean square. If that is within the limit there is nothing to test, and no test
     to correct for. The rule uses sizes alone, so old and new may still be exchanged.
     """
-    distinct = {(group[1], tuple(cases.items())): group for group, cases in reversed(ratios.items())}
+    distinct = {
+        (group[1], tuple(cases.items())): group
+        for group, cases in reversed(ratios.items())
+    }
     return {
         group: {case: ratio - limit_of(group[2]) for case, ratio in cases.items()}
         for group, cases in ratios.items()
@@ -278,7 +322,9 @@ def movable(ratios: permutation.Ratios) -> permutation.Ratios:
     }
 
 
-def worse_groups(ratios: permutation.Ratios, tested: list[permutation.Family]) -> list[Worsening]:
+def worse_groups(
+    ratios: permutation.Ratios, tested: list[permutation.Family]
+) -> list[Worsening]:
     """Groups significantly beyond the limit."""
     worse = []
     for family in tested:
@@ -287,9 +333,15 @@ def worse_groups(ratios: permutation.Ratios, tested: list[permutation.Family]) -
                 continue
             log, contestant, column = group
             own = ratios[group]
-            alike = [other for at, name, other in ratios if (at, name) == group[:2] and ratios[at, name, other] == own]
+            alike = [
+                other
+                for at, name, other in ratios
+                if (at, name) == group[:2] and ratios[at, name, other] == own
+            ]
             share = f"{np.expm1(np.mean(list(own.values()))):.1%}"
-            change = f"{share} farther from 1" if column in CONSISTENCY_KEYS else f"+{share}"
+            change = (
+                f"{share} farther from 1" if column in CONSISTENCY_KEYS else f"+{share}"
+            )
             explanation = f"{change} in the mean of {len(own)} cases, p = {p_value:.2g} (of the whole batch)"
             worse.append(Worsening(log, contestant, ", ".join(alike), explanation))
     return worse
@@ -302,24 +354,38 @@ def standing_out(pairs: list[Pair], ratios: permutation.Ratios) -> list[str]:
     for pair in errors:
         group = (pair.run.log, pair.run.contestant, pair.column)
         worst[group] = max(worst.get(group, 0.0), pair.old)
-    farthest: dict[Name, tuple[float, Pair]] = {}  # of each run, the column in which it is farthest
+    farthest: dict[
+        Name, tuple[float, Pair]
+    ] = {}  # of each run, the column in which it is farthest
     for pair in errors:
         base = worst[pair.run.log, pair.run.contestant, pair.column]
         if pair.new > FAR * base > 0:
             name = name_of(pair.run)
-            farthest[name] = max(farthest.get(name, (0.0, pair)), (pair.new / base, pair), key=lambda one: one[0])
+            farthest[name] = max(
+                farthest.get(name, (0.0, pair)),
+                (pair.new / base, pair),
+                key=lambda one: one[0],
+            )
     lines = [
         f"{told(name)}: {pair.column} is {pair.new:.3g}, before {pair.old:.3g}; more than {FAR:g} times the worst of "
         "the reference"
         for name, (_, pair) in sorted(farthest.items(), key=lambda one: -one[1][0])
     ]
     known, have_test = {name[:2] for name in farthest}, permutation.testable(ratios)
-    most: dict[tuple[str, str], tuple[float, int, str]] = {}  # the column that is up most
+    most: dict[
+        tuple[str, str], tuple[float, int, str]
+    ] = {}  # the column that is up most
     for (log, contestant, column), own in ratios.items():
-        is_told = log == ALL_LOGS or (log, contestant) in known or (log, contestant, column) in have_test
+        is_told = (
+            log == ALL_LOGS
+            or (log, contestant) in known
+            or (log, contestant, column) in have_test
+        )
         mean = float(np.mean(list(own.values())))
         if not is_told and mean > np.log1p(ALONE):
-            most[log, contestant] = max(most.get((log, contestant), (0.0, 0, "")), (mean, len(own), column))
+            most[log, contestant] = max(
+                most.get((log, contestant), (0.0, 0, "")), (mean, len(own), column)
+            )
     return lines + [
         f"{log}, {contestant}: {column} is {np.expm1(mean):.0%} worse; {cases} {'case' if cases == 1 else 'cases'} "
         "here, which no test judges"

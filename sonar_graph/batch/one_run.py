@@ -75,16 +75,30 @@ def perform(run: PlannedRun, folder: Path) -> Row:
             "install the same everywhere and start the workers anew"
         )
     target = run.versions["estimator_target"]
-    if target.partition(":")[0] not in sys.modules:  # imported between two looks at its source
+    if (
+        target.partition(":")[0] not in sys.modules
+    ):  # imported between two looks at its source
         with suppress(EstimatorError):  # it fails again in the run, with the reason
             load_estimator(run.estimator)
     clock, cpu_before_s = Clock(), time.process_time()
     try:
         with clock.on("read_s"):
-            sequence = _sequence(run.kind, _text(run.options), _text(run.content), run.seed, _text(run.landmarks))
+            sequence = _sequence(
+                run.kind,
+                _text(run.options),
+                _text(run.content),
+                run.seed,
+                _text(run.landmarks),
+            )
             instants_ns = sequence.instants(run.rate_hz)
         with clock.on("estimate_s"):
-            result = run_estimator(sequence, run.estimator, run.overrides, instants_ns=instants_ns, is_apart=True)
+            result = run_estimator(
+                sequence,
+                run.estimator,
+                run.overrides,
+                instants_ns=instants_ns,
+                is_apart=True,
+            )
         comparison = judge(sequence, instants_ns, [result])
         command = {"command": f"sonar-graph bench: run {run.key} of {run.suite}"}
         comparison = replace(comparison, environment=comparison.environment | command)
@@ -92,15 +106,25 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         raise
     except Exception as error:  # a log or a simulator may fail in any way, and the other runs still go on
         LOG.exception("run %s", run.key)
-        stage = "while judging" if "estimate_s" in clock.seconds else "while reading or simulating the log"
-        row: Row = {"status": "failed", "reason": f"{stage}: {one_line(error)}", "scored_instants": 0}
+        stage = (
+            "while judging"
+            if "estimate_s" in clock.seconds
+            else "while reading or simulating the log"
+        )
+        row: Row = {
+            "status": "failed",
+            "reason": f"{stage}: {one_line(error)}",
+            "scored_instants": 0,
+        }
         row |= _versions(describe_environment())
     else:
         write_comparison(comparison, folder)
         row = measured(comparison)
     row |= {**clock.seconds, "cpu_s": time.process_time() - cpu_before_s}
     now = sources_now(target)  # modules may be imported as late as during the run
-    if differing := [name for name in sorted(now) if now[name] != run.versions.get(name)]:
+    if differing := [
+        name for name in sorted(now) if now[name] != run.versions.get(name)
+    ]:
         raise BatchError(
             f"the code changed during a run: {_told(now, differing)}, planned with {_told(run.versions, differing)}; "
             "leave it alone while a batch runs, and start the workers anew"
@@ -113,14 +137,24 @@ def warm_up(run: PlannedRun) -> None:
 
     A failure here happens again in the run itself and is reported there.
     """
-    with suppress(Exception), tempfile.TemporaryDirectory(prefix="sonar-graph-warm-up-") as scratch:
+    with (
+        suppress(Exception),
+        tempfile.TemporaryDirectory(prefix="sonar-graph-warm-up-") as scratch,
+    ):
         kind, options = WARM_UP_LOG
         content = fingerprint(kind, options)
-        perform(replace(run, kind=kind, options=options, content=content, landmarks=None, seed=0), Path(scratch))
+        perform(
+            replace(
+                run, kind=kind, options=options, content=content, landmarks=None, seed=0
+            ),
+            Path(scratch),
+        )
 
 
 @lru_cache(KEPT_SEQUENCES)
-def _sequence(kind: str, options: str, content: str, seed: int | None, landmarks: str) -> Sequence:
+def _sequence(
+    kind: str, options: str, content: str, seed: int | None, landmarks: str
+) -> Sequence:
     """Sequence of a source; arguments are JSON texts. Equal arguments give the same object, which nobody changes.
 
     Raises `BatchError` when files are not, before or after they were read, what they were when the run was planned.
@@ -134,8 +168,12 @@ def _sequence(kind: str, options: str, content: str, seed: int | None, landmarks
 
 def _check_content(kind: str, options: dict[str, Any], content: str) -> None:
     if differing := _differing(fingerprint(kind, options), json.loads(content)):
-        names = ", ".join(f"{name} {options.get(name, '')}".rstrip() for name in differing)
-        raise BatchError(f"{platform.node()}: {names}: not what it was when the run was planned; start the batch anew")
+        names = ", ".join(
+            f"{name} {options.get(name, '')}".rstrip() for name in differing
+        )
+        raise BatchError(
+            f"{platform.node()}: {names}: not what it was when the run was planned; start the batch anew"
+        )
 
 
 def measured(comparison: Comparison) -> Row:
@@ -145,8 +183,14 @@ def measured(comparison: Comparison) -> Row:
     independent, so their average has a chi-square band; an average over the instants of one run has none.
     """
     (run,) = comparison.runs
-    row: Row = {key: score.value for key, score in comparison.scores[run.estimator].items()}
-    row |= {**_versions(comparison.environment), "status": run.status, "reason": run.reason}
+    row: Row = {
+        key: score.value for key, score in comparison.scores[run.estimator].items()
+    }
+    row |= {
+        **_versions(comparison.environment),
+        "status": run.status,
+        "reason": run.reason,
+    }
     if run.status == "failed":
         out_of_memory = "MemoryError" in run.reason or "bad_alloc" in run.reason
         row["status"] = "memory" if out_of_memory else "failed"
@@ -157,15 +201,28 @@ def measured(comparison: Comparison) -> Row:
     row["scored_instants"] = 0
     for kind, errors in comparison.errors.get(run.estimator, {}).items():
         row["scored_instants"] = len(errors.stamps_ns)
-        for key, nees, dof in (("position", errors.nees_position, errors.position_dof), ("yaw", errors.nees_yaw, 1)):
+        for key, nees, dof in (
+            ("position", errors.nees_position, errors.position_dof),
+            ("yaw", errors.nees_yaw, 1),
+        ):
             row[f"{kind}.nees_{key}_end"] = float(nees[-1] / dof)
             row |= {f"{kind}.nees_{key}_dof": dof, f"{kind}.nees_{key}_end_dof": dof}
-    row |= {f"{key}_dof": TWO_DIMENSIONS for key in ("landmarks.nees", "detections.nis") if key in row}
-    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
+    row |= {
+        f"{key}_dof": TWO_DIMENSIONS
+        for key in ("landmarks.nees", "detections.nis")
+        if key in row
+    }
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in row.items()
+    }
 
 
 def _versions(environment: dict[str, str]) -> Row:
-    return {key: environment[key] for key in ("sonar_graph", *LIBRARIES, "python", "machine")}
+    return {
+        key: environment[key]
+        for key in ("sonar_graph", *LIBRARIES, "python", "machine")
+    }
 
 
 def _text(values: dict[str, Any] | None) -> str:
@@ -173,7 +230,9 @@ def _text(values: dict[str, Any] | None) -> str:
 
 
 def _differing(here: dict[str, Any], planned: dict[str, Any]) -> list[str]:
-    return [name for name in sorted(here | planned) if here.get(name) != planned.get(name)]
+    return [
+        name for name in sorted(here | planned) if here.get(name) != planned.get(name)
+    ]
 
 
 def _told(versions: dict[str, str], names: list[str]) -> str:
@@ -188,8 +247,15 @@ def answer(request: PlannedRun | Preparation, _tell: Tell) -> object:
     with tempfile.TemporaryDirectory(prefix="sonar-graph-run-") as scratch:
         folder = Path(scratch)
         row = perform(request, folder)
-        paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in (MANIFEST, LOCK))
-        return RunOutcome(row, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
+        paths = sorted(
+            path
+            for path in folder.rglob("*")
+            if path.is_file() and path.name not in (MANIFEST, LOCK)
+        )
+        return RunOutcome(
+            row,
+            {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths},
+        )
 
 
 if __name__ == "__main__":

@@ -56,19 +56,30 @@ class Family:
     def weights(self) -> Floats:
         """Changes under which the data are equally likely, first the identity, shape (changes, cases)."""
         rng = np.random.default_rng(SEED)
-        if self.cases < LEAST_SIGNS:  # a rotation makes of the mean a sum along any direction as long as (1, ..., 1)
+        if (
+            self.cases < LEAST_SIGNS
+        ):  # a rotation makes of the mean a sum along any direction as long as (1, ..., 1)
             drawn = rng.normal(size=(DRAWN, self.cases))
-            directions = np.sqrt(self.cases) * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+            directions = (
+                np.sqrt(self.cases)
+                * drawn
+                / np.linalg.norm(drawn, axis=1, keepdims=True)
+            )
             return np.vstack([np.ones(self.cases), directions])
         if self.cases <= ALL_SIGNS:
             return np.array(list(itertools.product([1.0, -1.0], repeat=self.cases)))
-        return np.vstack([np.ones(self.cases), rng.choice([1.0, -1.0], size=(DRAWN, self.cases))])
+        return np.vstack(
+            [np.ones(self.cases), rng.choice([1.0, -1.0], size=(DRAWN, self.cases))]
+        )
 
     @cached_property
     def pools(self) -> list[Indices]:
         """Groups whose variances support each other: those of one column, on single logs or on all logs."""
         kinds = [(log == ALL_LOGS, column) for log, _, column in self.groups]
-        return [np.flatnonzero([kind == one for one in kinds]) for kind in dict.fromkeys(kinds)]
+        return [
+            np.flatnonzero([kind == one for one in kinds])
+            for kind in dict.fromkeys(kinds)
+        ]
 
     @cached_property
     def scored(self) -> Floats:
@@ -116,7 +127,9 @@ def families(ratios: Ratios) -> list[Family]:
     found = []
     for groups in members:
         cases = list(dict.fromkeys(case for group in groups for case in ratios[group]))
-        beyond = np.array([[ratios[group].get(case, np.nan) for group in groups] for case in cases])
+        beyond = np.array(
+            [[ratios[group].get(case, np.nan) for group in groups] for case in cases]
+        )
         found.append(Family(groups, beyond, 1 / len(members)))
     return found
 
@@ -165,16 +178,25 @@ def statistics(weights: Floats, scored: Floats, prior: Floats) -> Floats:
     values, n = np.where(present, scored, 0.0), present.sum(axis=0)
     mean = weights @ values / n
     rest = np.maximum(np.square(values).sum(axis=0) - n * np.square(mean), 0.0)
-    return np.asarray(np.sqrt(n) * mean / np.sqrt((PRIOR_WEIGHT * prior + rest) / (PRIOR_WEIGHT + n - 1)))
+    return np.asarray(
+        np.sqrt(n)
+        * mean
+        / np.sqrt((PRIOR_WEIGHT * prior + rest) / (PRIOR_WEIGHT + n - 1))
+    )
 
 
 POWER = 0.8
 DRAWN_EFFECTS = 100
-SHARES = np.array([2, 3, 4, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 900]) / 100
+SHARES = (
+    np.array([2, 3, 4, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 900])
+    / 100
+)
 """Relative worsenings that are tried, in ascending order."""
 
 
-def detectable(families: list[Family], columns: list[str], limit: float) -> dict[str, float]:
+def detectable(
+    families: list[Family], columns: list[str], limit: float
+) -> dict[str, float]:
     """For each contestant that has a test, the relative worsening of a typical column that is found with `POWER`.
 
     Noise is resampled from the scatter of a group about its mean, with random signs. A worsening is added, and the test
@@ -193,8 +215,14 @@ def detectable(families: list[Family], columns: list[str], limit: float) -> dict
             if column in columns and is_whole:
                 scatter = float(np.nanstd(family.beyond[:, number]))
                 typical.setdefault(contestant, []).append((scatter, family, number))
-    middle = {name: sorted(groups, key=lambda one: one[0])[len(groups) // 2] for name, groups in typical.items()}
-    return {name: detectable_in(family, number, limit) for name, (_, family, number) in middle.items()}
+    middle = {
+        name: sorted(groups, key=lambda one: one[0])[len(groups) // 2]
+        for name, groups in typical.items()
+    }
+    return {
+        name: detectable_in(family, number, limit)
+        for name, (_, family, number) in middle.items()
+    }
 
 
 def detectable_in(family: Family, number: int, limit: float) -> float:
@@ -203,19 +231,34 @@ def detectable_in(family: Family, number: int, limit: float) -> float:
     present = np.flatnonzero(~np.isnan(own))
     own, n, rng = own[present], len(present), np.random.default_rng(SEED)
     scatter = (own - own.mean()) * np.sqrt(n / (n - 1))
-    noise = rng.choice(scatter, size=(n, DRAWN_EFFECTS)) * rng.choice([1.0, -1.0], size=(n, DRAWN_EFFECTS))
-    elsewhere = np.array([other[1:] != family.groups[number][1:] for other in family.groups])
+    noise = rng.choice(scatter, size=(n, DRAWN_EFFECTS)) * rng.choice(
+        [1.0, -1.0], size=(n, DRAWN_EFFECTS)
+    )
+    elsewhere = np.array(
+        [other[1:] != family.groups[number][1:] for other in family.groups]
+    )
     others = family.statistics[:, elsewhere].max(axis=1, initial=-np.inf)
     (pool,) = [pool for pool in family.pools if number in pool]
-    squares = np.log(np.maximum(np.nanmean(np.square(family.scored[:, pool[pool != number]]), axis=0), 1e-300))
+    squares = np.log(
+        np.maximum(
+            np.nanmean(np.square(family.scored[:, pool[pool != number]]), axis=0),
+            1e-300,
+        )
+    )
     low, high = 0, len(SHARES)
     while low < high:  # by bisection, since power grows with the worsening
         middle = (low + high) // 2
         shifted = noise + np.log1p(SHARES[middle]) - limit
         scored = clipped(shifted) if family.cases >= LEAST_SIGNS else shifted
         log_square = np.log(np.square(scored).mean(axis=0))
-        drawn = statistics(family.weights[:, present], scored, np.exp((squares.sum() + log_square) / len(pool)))
-        reached = np.maximum(drawn, others[:, None]) >= drawn[0] - 1e-9 * np.abs(drawn[0])
+        drawn = statistics(
+            family.weights[:, present],
+            scored,
+            np.exp((squares.sum() + log_square) / len(pool)),
+        )
+        reached = np.maximum(drawn, others[:, None]) >= drawn[0] - 1e-9 * np.abs(
+            drawn[0]
+        )
         if (reached.mean(axis=0) <= SIGNIFICANT * family.share).mean() >= POWER:
             high = middle
         else:

@@ -34,7 +34,12 @@ from sonar_graph.batch.sources import (
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import LogEntry, Place, SuiteFile
 from sonar_graph.calibration import Section
-from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, UnknownEstimatorError
+from sonar_graph.errors import (
+    BatchError,
+    EstimatorError,
+    SonarGraphError,
+    UnknownEstimatorError,
+)
 from sonar_graph.estimator import installed_estimators, is_foreign, load_estimator
 from sonar_graph.evaluation import LIBRARIES, check_request
 from sonar_graph.settings import faults_in, field_place, flattened, nested
@@ -89,7 +94,9 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
     rate_hz = file.suite.rate_hz
     runs = []
     for source in sources_of(file):
-        for seed, contestant in itertools.product(source.entry.seed_list(), contestants):
+        for seed, contestant in itertools.product(
+            source.entry.seed_list(), contestants
+        ):
             versions = versions_of(contestant.name)
             decides = {
                 "content": source.content,
@@ -104,7 +111,11 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
             asked = {
                 "generator": source.entry.kind,
                 "options": source.stated,
-                "files": {name: hashed for name, hashed in source.content.items() if name in (*FILES, FILE)},
+                "files": {
+                    name: hashed
+                    for name, hashed in source.content.items()
+                    if name in (*FILES, FILE)
+                },
                 "landmarks": source.entry.landmarks,
                 "settings": contestant.overrides,
                 "rate_hz": rate_hz,
@@ -150,12 +161,16 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
             given = values = nested(chosen, entry.params)
             if model is not None:
                 table = _table_of(chosen, "params")
-                values = _validated(file, place, model, given, table).model_dump(mode="json")
+                values = _validated(file, place, model, given, table).model_dump(
+                    mode="json"
+                )
             elif foreign:
                 try:
                     values = check_request(entry.name, given) or given
                 except EstimatorError as error:
-                    file.refuse((*place, "params" if entry.params else "name"), str(error))
+                    file.refuse(
+                        (*place, "params" if entry.params else "name"), str(error)
+                    )
             variant = _label(entry.variant, chosen) or DEFAULT_VARIANT
             found.append(_Contestant(place, entry.name, variant, given, values))
     by_name: dict[str, _Contestant] = {}
@@ -163,14 +178,25 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
     for contestant in found:
         name = f"{contestant.name}/{contestant.variant}"
         if by_name.setdefault(name, contestant) is not contestant:
-            file.refuse(contestant.place, f"{name} is there twice; give variants names that differ, or leave one out")
-        settings = json.dumps([contestant.name, contestant.params], sort_keys=True, default=str)
+            file.refuse(
+                contestant.place,
+                f"{name} is there twice; give variants names that differ, or leave one out",
+            )
+        settings = json.dumps(
+            [contestant.name, contestant.params], sort_keys=True, default=str
+        )
         if (twin := by_settings.setdefault(settings, name)) != name:
-            file.refuse(contestant.place, f"{name} and {twin} have the same settings; leave one out")
+            file.refuse(
+                contestant.place,
+                f"{name} and {twin} have the same settings; leave one out",
+            )
     name, _, variant = file.suite.reference.partition("/")
     if f"{name}/{variant or DEFAULT_VARIANT}" not in by_name:
         known = ", ".join(one.removesuffix(f"/{DEFAULT_VARIANT}") for one in by_name)
-        file.refuse(("reference",), f"{file.suite.reference!r} does not run here; what does: {known}")
+        file.refuse(
+            ("reference",),
+            f"{file.suite.reference!r} does not run here; what does: {known}",
+        )
     return found
 
 
@@ -184,58 +210,117 @@ def sources_of(file: SuiteFile) -> list[_Source]:
     found: list[_Source] = []
     for number, entry in enumerate(file.suite.logs):
         place: Place = ("logs", number)
-        known = [name for name in KINDS if name != LOG and (name in GENERATORS) == (entry.generator is not None)]
+        known = [
+            name
+            for name in KINDS
+            if name != LOG and (name in GENERATORS) == (entry.generator is not None)
+        ]
         if entry.kind != LOG and entry.kind not in known:
             what = "generator" if entry.generator is not None else "dataset"
-            file.refuse((*place, what), f"there is no {what} {entry.kind!r}; there are: {', '.join(known)}")
+            file.refuse(
+                (*place, what),
+                f"there is no {what} {entry.kind!r}; there are: {', '.join(known)}",
+            )
         for name in {"seed", "image"} & {*entry.options, *entry.grid}:
             reason = (
-                "seeds are given as seeds = [...]" if name == "seed" else "recognise landmarks first, and give the log"
+                "seeds are given as seeds = [...]"
+                if name == "seed"
+                else "recognise landmarks first, and give the log"
             )
-            file.refuse((*place, "options", name), f"cannot be set in a suite: {reason}")
+            file.refuse(
+                (*place, "options", name), f"cannot be set in a suite: {reason}"
+            )
         if not entry.seed_list():
-            file.refuse((*place, "seeds"), "has no seeds; give a number from 1 on, or a list of them")
+            file.refuse(
+                (*place, "seeds"),
+                "has no seeds; give a number from 1 on, or a list of them",
+            )
         if entry.landmarks is not None:
             if "seed" in entry.landmarks:
-                file.refuse((*place, "landmarks", "seed"), "cannot be set in a suite: seeds are given as seeds = [...]")
+                file.refuse(
+                    (*place, "landmarks", "seed"),
+                    "cannot be set in a suite: seeds are given as seeds = [...]",
+                )
             _validated(file, (*place, "landmarks"), LandmarkOptions, entry.landmarks)
         for chosen in _combinations(file, place, entry.grid, entry.options, "options"):
-            values = ({} if entry.log is None else {"log": entry.log}) | entry.options | chosen
-            named = [values[name] for name in FILES if isinstance(values.get(name), str)]
+            values = (
+                ({} if entry.log is None else {"log": entry.log})
+                | entry.options
+                | chosen
+            )
+            named = [
+                values[name] for name in FILES if isinstance(values.get(name), str)
+            ]
             if entry.obtain and not all(map(file.holds, named)):
                 continue
             for name in FILES:
                 if isinstance(values.get(name), str):
-                    where = (*place, name) if name == "log" else (*place, "options", name)
+                    where = (
+                        (*place, name) if name == "log" else (*place, "options", name)
+                    )
                     values[name] = file.find(where, values[name])
-            options = _validated(file, place, KINDS[entry.kind].options, values, _table_of(chosen, "options"))
+            options = _validated(
+                file,
+                place,
+                KINDS[entry.kind].options,
+                values,
+                _table_of(chosen, "options"),
+            )
             try:
                 KINDS[entry.kind].check(options)
             except SonarGraphError as error:
-                file.refuse((*place, "log" if entry.log is not None else "options"), str(error))
+                file.refuse(
+                    (*place, "log" if entry.log is not None else "options"), str(error)
+                )
             plain = options.model_dump(mode="json", exclude={"seed"})
-            stated = {name: value for name, value in values.items() if name not in FILES}
+            stated = {
+                name: value for name, value in values.items() if name not in FILES
+            }
             label = _label(entry.name, chosen)
-            found.append(_Source(place, entry, label, plain, fingerprint(entry.kind, plain), stated))
+            found.append(
+                _Source(
+                    place, entry, label, plain, fingerprint(entry.kind, plain), stated
+                )
+            )
     if not found:
-        file.refuse(("logs",), f"no data of any log is here; get {'; '.join(e.obtain for e in file.suite.logs)}")
+        file.refuse(
+            ("logs",),
+            f"no data of any log is here; get {'; '.join(e.obtain for e in file.suite.logs)}",
+        )
     by_name: dict[str, _Source] = {}
     by_content: dict[str, str] = {}
     for source in found:
         if source.name == ALL_LOGS:
-            file.refuse((*source.place, "name"), f"{ALL_LOGS!r} stands for all logs together; give another name")
+            file.refuse(
+                (*source.place, "name"),
+                f"{ALL_LOGS!r} stands for all logs together; give another name",
+            )
         if by_name.setdefault(source.name, source) is not source:
-            file.refuse(source.place, f"two logs are called {source.name!r}; give them names that differ")
+            file.refuse(
+                source.place,
+                f"two logs are called {source.name!r}; give them names that differ",
+            )
         for seed in source.entry.seed_list():
-            content = json.dumps([source.content, source.entry.landmarks, seed], sort_keys=True, default=str)
+            content = json.dumps(
+                [source.content, source.entry.landmarks, seed],
+                sort_keys=True,
+                default=str,
+            )
             if (twin := by_content.setdefault(content, source.name)) != source.name:
                 which = "" if seed is None else f" with seed {seed}"
-                file.refuse(source.place, f"{source.name!r} and {twin!r} are the same{which}; leave one out")
+                file.refuse(
+                    source.place,
+                    f"{source.name!r} and {twin!r} are the same{which}; leave one out",
+                )
     return found
 
 
 def _combinations(
-    file: SuiteFile, place: Place, grid: dict[str, list[Any]], fixed: dict[str, Any], table: str
+    file: SuiteFile,
+    place: Place,
+    grid: dict[str, list[Any]],
+    fixed: dict[str, Any],
+    table: str,
 ) -> Iterator[dict[str, Any]]:
     """Every combination of a grid's values.
 
@@ -262,7 +347,11 @@ def _table_of(chosen: dict[str, Any], table: str) -> Callable[[str], str]:
 
 
 def _validated(
-    file: SuiteFile, place: Place, model: type[Section], values: Any, table: Callable[[str], str] | None = None
+    file: SuiteFile,
+    place: Place,
+    model: type[Section],
+    values: Any,
+    table: Callable[[str], str] | None = None,
 ) -> Section:
     """Values as their model; a fault is reported where the suite gives the value."""
     try:
@@ -275,7 +364,12 @@ def _validated(
 
 def _label(name: str, chosen: dict[str, Any]) -> str:
     """Name with the values that a grid chose."""
-    return ", ".join([*([name] if name else []), *(f"{key}={value}" for key, value in chosen.items())])
+    return ", ".join(
+        [
+            *([name] if name else []),
+            *(f"{key}={value}" for key, value in chosen.items()),
+        ]
+    )
 
 
 @lru_cache
@@ -286,7 +380,9 @@ def versions_of(estimator: str) -> dict[str, str]:
     """
     point = installed_estimators().get(estimator)
     if point is None:
-        raise BatchError(f"{platform.node()}: no estimator is called {estimator!r}; install what brings it")
+        raise BatchError(
+            f"{platform.node()}: no estimator is called {estimator!r}; install what brings it"
+        )
     brings = {} if point.dist is None else {point.dist.name: point.dist.version}
     return brings | {
         "sonar_graph": __version__,
@@ -330,10 +426,20 @@ def source_hash_now(package: str) -> str:
         return ""
     folders = list(spec.submodule_search_locations or ())
     files = [
-        (entry.path[len(folder) + 1 :].replace(os.sep, "/"), entry.path, stamp_of(entry))
+        (
+            entry.path[len(folder) + 1 :].replace(os.sep, "/"),
+            entry.path,
+            stamp_of(entry),
+        )
         for folder in folders
-        for entry in files_below(folder, lambda name: name == BYTECODE or name.startswith("."))
+        for entry in files_below(
+            folder, lambda name: name == BYTECODE or name.startswith(".")
+        )
     ]
-    if not folders and spec.origin is not None and (module := Path(spec.origin)).is_file():
+    if (
+        not folders
+        and spec.origin is not None
+        and (module := Path(spec.origin)).is_file()
+    ):
         files = [(module.name, spec.origin, stamp_of(module))]
     return content_hash(tuple(sorted(files)))[:DIGITS] if files else ""

@@ -24,12 +24,29 @@ from sonar_graph.measurements import Floats
 RESULTS = "results.parquet"
 SUITE_METADATA = b"sonar_graph.suite"
 DEFAULT_VARIANT = ("", "default")
-DEFAULT_METRICS = ("causal.ate_se2_m", "causal.ate_raw_m", "causal.rpe_10s_m", "causal.yaw_rmse_rad", "landmarks.se2_m")
+DEFAULT_METRICS = (
+    "causal.ate_se2_m",
+    "causal.ate_raw_m",
+    "causal.rpe_10s_m",
+    "causal.yaw_rmse_rad",
+    "landmarks.se2_m",
+)
 GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
 """Name for all logs of a batch taken together."""
 NEEDED = ("key", "log", "estimator", "status")
-WORDS = ("key", "suite", "log", "generator", "estimator", "variant", "status", "reason", "log_file", "machine")
+WORDS = (
+    "key",
+    "suite",
+    "log",
+    "generator",
+    "estimator",
+    "variant",
+    "status",
+    "reason",
+    "log_file",
+    "machine",
+)
 OBJECTS = ("options", "params", "versions")
 
 
@@ -56,7 +73,11 @@ class RecordedRun:
     @property
     def contestant(self) -> str:
         """Estimator, with the variant unless it is the default one."""
-        return self.estimator if self.variant in DEFAULT_VARIANT else f"{self.estimator}/{self.variant}"
+        return (
+            self.estimator
+            if self.variant in DEFAULT_VARIANT
+            else f"{self.estimator}/{self.variant}"
+        )
 
     @property
     def ended(self) -> bool:
@@ -92,7 +113,9 @@ class RecordedBatch:
         return groups
 
     @cached_property
-    def _known_scores(self) -> tuple[set[tuple[str, str]], set[tuple[str, str]], set[str]]:
+    def _known_scores(
+        self,
+    ) -> tuple[set[tuple[str, str]], set[tuple[str, str]], set[str]]:
         """Scores by log, scores by contestant, and contestants of which any run ended."""
         ended = [run for run in self.runs if run.ended]
         return (
@@ -114,7 +137,10 @@ class RecordedBatch:
             return {
                 entry["name"]: entry["obtain"]
                 for entry in entries
-                if entry.get("obtain") and not any(f"{log}, ".startswith(f"{entry['name']}, ") for log in self.logs)
+                if entry.get("obtain")
+                and not any(
+                    f"{log}, ".startswith(f"{entry['name']}, ") for log in self.logs
+                )
             }
         return {}
 
@@ -142,7 +168,9 @@ class RecordedBatch:
         """
         logs = self.logs if log == ALL_LOGS else [log]
         both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
-        values = np.array([(own.value(key), other.value(key)) for own, other in both]).reshape(-1, 2)
+        values = np.array(
+            [(own.value(key), other.value(key)) for own, other in both]
+        ).reshape(-1, 2)
         return values[:, 0], values[:, 1]
 
     def cases(self, log: str, contestant: str, key: str) -> list[str | int]:
@@ -154,11 +182,19 @@ class RecordedBatch:
         runs = [own for one in logs for own, _ in self._pairs_on(one, contestant, key)]
         return [run.log if run.seed is None else run.seed for run in runs]
 
-    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[RecordedRun, RecordedRun]]:
-        if not all(self.is_asked(log, name, key) for name in (contestant, self.reference)):
+    def _pairs_on(
+        self, log: str, contestant: str, key: str
+    ) -> list[tuple[RecordedRun, RecordedRun]]:
+        if not all(
+            self.is_asked(log, name, key) for name in (contestant, self.reference)
+        ):
             return []
         reference = {run.seed: run for run in self.group(log, self.reference)}
-        return [(run, reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
+        return [
+            (run, reference[run.seed])
+            for run in self.group(log, contestant)
+            if run.seed in reference
+        ]
 
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
         """True if a score can be expected: some contestant has it on this log, and this contestant on some log.
@@ -179,7 +215,9 @@ class RecordedBatch:
 
 def is_batch(folder: Path) -> bool:
     """True if a batch was begun in a folder."""
-    return kind_of(folder) == BATCH or any((folder / name).is_file() for name in (RESULTS, SUITE))
+    return kind_of(folder) == BATCH or any(
+        (folder / name).is_file() for name in (RESULTS, SUITE)
+    )
 
 
 def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
@@ -201,29 +239,49 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
             f"{folder}: no {RESULTS} in it: the batch was ended before any of its runs was done; {GOING_ON}"
         )
     if not path.is_file():
-        raise EvaluationError(f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to")
+        raise EvaluationError(
+            f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to"
+        )
     try:
         import pyarrow as pa  # of the extra `bench`
         import pyarrow.parquet as pq
     except ModuleNotFoundError as error:
-        raise EvaluationError(f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'") from error
+        raise EvaluationError(
+            f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'"
+        ) from error
     try:
         with path.open("rb") as stream:  # pyarrow takes names of files in UTF-8 alone
             table = pq.read_table(stream)
     except (pa.ArrowInvalid, OSError) as error:
-        raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
+        raise EvaluationError(
+            f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes"
+        ) from error
     if absent := [name for name in NEEDED if name not in table.column_names]:
-        raise EvaluationError(f"{path}: no column {', '.join(absent)}; expected results that bench wrote")
+        raise EvaluationError(
+            f"{path}: no column {', '.join(absent)}; expected results that bench wrote"
+        )
     if not table.num_rows:
         raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
-    if repeated := [key for key, count in Counter(table["key"].to_pylist()).items() if count > 1]:
-        raise EvaluationError(f"{path}: run {repeated[0]} has more than one row; run bench again, it resumes")
-    planned = [_recorded(row, place, folder) for place, row in enumerate(table.to_pylist())]
+    if repeated := [
+        key for key, count in Counter(table["key"].to_pylist()).items() if count > 1
+    ]:
+        raise EvaluationError(
+            f"{path}: run {repeated[0]} has more than one row; run bench again, it resumes"
+        )
+    planned = [
+        _recorded(row, place, folder) for place, row in enumerate(table.to_pylist())
+    ]
     runs = [run for run in planned if run.status != NOT_RUN]
     if not runs:
-        raise EvaluationError(f"{folder}: none of its {len(planned)} runs has been done yet; {GOING_ON}")
+        raise EvaluationError(
+            f"{folder}: none of its {len(planned)} runs has been done yet; {GOING_ON}"
+        )
     about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
-    chosen = reference or str(about.get("reference") or "").removesuffix("/default") or planned[0].contestant
+    chosen = (
+        reference
+        or str(about.get("reference") or "").removesuffix("/default")
+        or planned[0].contestant
+    )
     batch = RecordedBatch(
         name=about.get("name") or runs[0].texts.get("suite") or folder.name,
         runs=runs,
@@ -245,17 +303,33 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
     if row["status"] == NOT_RUN:
         kept = Path(RUNS) / str(row["key"])
         with contextlib.suppress(EvaluationError):
-            row = row | {"reason": None, "log_file": f"{kept.as_posix()}/{LOG}"} | read_json(folder / kept / ROW)
-    elif not (row.get("log_file") and (folder / row["log_file"]).is_file()):  # its folder was moved or removed
+            row = (
+                row
+                | {"reason": None, "log_file": f"{kept.as_posix()}/{LOG}"}
+                | read_json(folder / kept / ROW)
+            )
+    elif not (
+        row.get("log_file") and (folder / row["log_file"]).is_file()
+    ):  # its folder was moved or removed
         row = row | {"log_file": None}
     words = {name: str(row.pop(name, None) or "") for name in WORDS}
     seed = row.pop("seed", None)
     objects = {name: row.pop(name) for name in OBJECTS if row.get(name)}
-    texts = {name: words[name] for name in ("suite", "generator", "machine") if words[name]}
+    texts = {
+        name: words[name] for name in ("suite", "generator", "machine") if words[name]
+    }
     for name, value in objects.items():
-        texts[name] = value if isinstance(value, str) else json.dumps(value, sort_keys=True, default=str)
+        texts[name] = (
+            value
+            if isinstance(value, str)
+            else json.dumps(value, sort_keys=True, default=str)
+        )
     texts |= {name: value for name, value in row.items() if isinstance(value, str)}
-    numbers = {name: float(value) for name, value in row.items() if isinstance(value, int | float)}
+    numbers = {
+        name: float(value)
+        for name, value in row.items()
+        if isinstance(value, int | float)
+    }
     return RecordedRun(
         key=words["key"],
         log=words["log"],

@@ -81,7 +81,9 @@ class Metric:
             return "1 is consistent"
         if self.name in NO_BETTER:
             return ""
-        return "higher is better" if self.name in HIGHER_IS_BETTER else "lower is better"
+        return (
+            "higher is better" if self.name in HIGHER_IS_BETTER else "lower is better"
+        )
 
     @property
     def is_error(self) -> bool:
@@ -89,12 +91,16 @@ class Metric:
 
         Time and memory depend on the machine and its load: they are shown, and not tested.
         """
-        return self.direction == "lower is better" and not any(map(is_timing, self.keys.values()))
+        return self.direction == "lower is better" and not any(
+            map(is_timing, self.keys.values())
+        )
 
     @property
     def protocol(self) -> str:
         """Definition in a sentence."""
-        said = PROTOCOLS.get(self.name, f"As compare writes it: the run's comparison.json, {self.name}.")
+        said = PROTOCOLS.get(
+            self.name, f"As compare writes it: the run's comparison.json, {self.name}."
+        )
         if set(self.keys) <= {""}:
             return said
         return f"{said} Separately for the causal and the smoothed estimate."
@@ -111,7 +117,9 @@ def metrics_of(keys: list[str]) -> list[Metric]:
     for key in keys:
         prefix, _, name = key.partition(".")
         if prefix in KINDS:
-            found[f"trajectory.{name}"] = Metric(name, {kind.capitalize(): f"{kind}.{name}" for kind in KINDS})
+            found[f"trajectory.{name}"] = Metric(
+                name, {kind.capitalize(): f"{kind}.{name}" for kind in KINDS}
+            )
         else:
             found[key] = Metric(name, {"": key})
     return list(found.values())
@@ -119,7 +127,17 @@ def metrics_of(keys: list[str]) -> list[Metric]:
 
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
-VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "scipy", "numba", "python", "machine")
+VERSIONS = (
+    "sonar_graph",
+    "source",
+    "estimator_source",
+    "gtsam",
+    "numpy",
+    "scipy",
+    "numba",
+    "python",
+    "machine",
+)
 COLUMNS = {
     **dict.fromkeys(TEXTS, "string"),
     "seed": "int64",
@@ -138,7 +156,11 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
 
     rows: list[Row] = []
     for run in runs:
-        options = run.options if run.landmarks is None else run.options | {"landmarks": run.landmarks}
+        options = (
+            run.options
+            if run.landmarks is None
+            else run.options | {"landmarks": run.landmarks}
+        )
         described: Row = {
             "key": run.key,
             "suite": run.suite,
@@ -151,22 +173,37 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
             "params": json.dumps(run.params, sort_keys=True),
             "estimator": run.estimator,
             "rate_hz": run.rate_hz,
-            **{name: number for name, number in run.versions.items() if name in VERSIONS},
+            **{
+                name: number
+                for name, number in run.versions.items()
+                if name in VERSIONS
+            },
         }
         row = store.row(run.key)
         if row is None:
             row = {"status": NOT_RUN, "reason": "not done when this table was written"}
         else:
-            row = {"log_file": store.log_file(run.key), **row}  # versions are those that the run itself found
+            # versions are those that the run itself found
+            row = {
+                "log_file": store.log_file(run.key),
+                **row,
+            }
         rows.append(described | row)
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
-    types = COLUMNS | {name: "int64" if name.endswith("_dof") else "float64" for name in scores}
-    about = suite.model_dump(mode="json", include={"name", "description", "reference", "metrics", "rate_hz"})
+    types = COLUMNS | {
+        name: "int64" if name.endswith("_dof") else "float64" for name in scores
+    }
+    about = suite.model_dump(
+        mode="json", include={"name", "description", "reference", "metrics", "rate_hz"}
+    )
     schema = pa.schema(
         [pa.field(name, pa.type_for_alias(kind)) for name, kind in types.items()],
         metadata={SUITE_METADATA: json.dumps(about).encode()},
     )
     path = store.folder / RESULTS
-    with replacing(path) as partial, partial.open("wb") as stream:  # pyarrow takes names of files in UTF-8 alone
+    with (
+        replacing(path) as partial,
+        partial.open("wb") as stream,
+    ):  # pyarrow takes names of files in UTF-8 alone
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), stream)
     return path

@@ -19,7 +19,13 @@ from sonar_graph.calibration import Section
 from sonar_graph.files import regular
 from sonar_graph.logs import PartialCalibration, read_log
 from sonar_graph.logs.adapters import LogConfig, read_log_config
-from sonar_graph.logs.convert import read_akit, read_dlr, read_mrclam, read_stpere, read_victoria_park
+from sonar_graph.logs.convert import (
+    read_akit,
+    read_dlr,
+    read_mrclam,
+    read_stpere,
+    read_victoria_park,
+)
 from sonar_graph.logs.mcap import LogFile, TimeWindow, log_parts
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
@@ -84,10 +90,16 @@ class SourceKind:
     """Quick check that raises for options which are valid one by one but not together."""
 
 
-def _parsed(options: LogOptions) -> tuple[PartialCalibration | None, LogConfig | None, TimeWindow]:
+def _parsed(
+    options: LogOptions,
+) -> tuple[PartialCalibration | None, LogConfig | None, TimeWindow]:
     return (
-        None if options.calibration is None else PartialCalibration.read(Path(options.calibration)),
-        None if options.log_config is None else read_log_config(Path(options.log_config)),
+        None
+        if options.calibration is None
+        else PartialCalibration.read(Path(options.calibration)),
+        None
+        if options.log_config is None
+        else read_log_config(Path(options.log_config)),
         TimeWindow.parse(options.start, options.end),
     )
 
@@ -116,14 +128,26 @@ GENERATORS: dict[str, SourceKind] = {
     "mission": SourceKind(MissionOptions, simulate_mission),
 }
 DATASETS: dict[str, SourceKind] = {
-    "akit": SourceKind(AkitOptions, lambda options: read_akit(Path(options.folder), options.trajectory)),
+    "akit": SourceKind(
+        AkitOptions, lambda options: read_akit(Path(options.folder), options.trajectory)
+    ),
     "dlr": SourceKind(FolderOptions, lambda options: read_dlr(Path(options.folder))),
-    "mrclam": SourceKind(MrclamOptions, lambda options: read_mrclam(Path(options.folder), options.robot)),
-    "stpere": SourceKind(FolderOptions, lambda options: read_stpere(Path(options.folder))),
-    "victoria-park": SourceKind(VictoriaParkOptions, lambda _options: read_victoria_park()),
+    "mrclam": SourceKind(
+        MrclamOptions, lambda options: read_mrclam(Path(options.folder), options.robot)
+    ),
+    "stpere": SourceKind(
+        FolderOptions, lambda options: read_stpere(Path(options.folder))
+    ),
+    "victoria-park": SourceKind(
+        VictoriaParkOptions, lambda _options: read_victoria_park()
+    ),
 }
 LOG = "mcap"
-KINDS: dict[str, SourceKind] = {LOG: SourceKind(LogOptions, _read_log, _check_log), **DATASETS, **GENERATORS}
+KINDS: dict[str, SourceKind] = {
+    LOG: SourceKind(LogOptions, _read_log, _check_log),
+    **DATASETS,
+    **GENERATORS,
+}
 FILES = ("log", "folder", "calibration", "log_config")
 """Options that name files: their content counts, not their path."""
 FILE = "file"
@@ -131,7 +155,10 @@ FILE = "file"
 
 
 def read_source(
-    kind: str, options: dict[str, Any], seed: int | None, landmarks: dict[str, Any] | None = None
+    kind: str,
+    options: dict[str, Any],
+    seed: int | None,
+    landmarks: dict[str, Any] | None = None,
 ) -> Sequence:
     """Read or simulate the sequence of a source, with simulated landmarks where there are options for them.
 
@@ -140,12 +167,20 @@ def read_source(
     source = KINDS[kind]
     values = options | {"seed": seed} if kind in GENERATORS else options
     sequence = source.read(source.options.model_validate(values))
-    return sequence if landmarks is None else add_landmarks(sequence, LandmarkOptions(**(landmarks | {"seed": seed})))
+    return (
+        sequence
+        if landmarks is None
+        else add_landmarks(sequence, LandmarkOptions(**(landmarks | {"seed": seed})))
+    )
 
 
 def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
     """All options of a source, with hashes of the content in place of file names."""
-    content = {name: _hash(Path(options[name])) for name in FILES if options.get(name) is not None}
+    content = {
+        name: _hash(Path(options[name]))
+        for name in FILES
+        if options.get(name) is not None
+    }
     if kind == "victoria-park":
         content[FILE] = _hash(Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
     return {"kind": kind, **options, **content}
@@ -153,8 +188,17 @@ def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
 
 def _hash(path: Path) -> str:
     """SHA-256 of a file, or of all names and files below a folder; read again only if stamps changed."""
-    files = sorted(Path(entry.path) for entry in files_below(str(path))) if path.is_dir() else [path]
-    return content_hash(tuple((file.relative_to(path).as_posix(), str(file), stamp_of(file)) for file in files))
+    files = (
+        sorted(Path(entry.path) for entry in files_below(str(path)))
+        if path.is_dir()
+        else [path]
+    )
+    return content_hash(
+        tuple(
+            (file.relative_to(path).as_posix(), str(file), stamp_of(file))
+            for file in files
+        )
+    )
 
 
 @lru_cache
@@ -180,7 +224,9 @@ def stamp_of(path: Path | os.DirEntry[str]) -> Stamp:
 
 
 def files_below(
-    folder: str, is_ignored: Callable[[str], bool] = lambda _name: False, around: tuple[str, ...] = ()
+    folder: str,
+    is_ignored: Callable[[str], bool] = lambda _name: False,
+    around: tuple[str, ...] = (),
 ) -> Iterator[os.DirEntry[str]]:
     """Files below a folder, links followed as readers and imports do; a link to a folder around it is ignored.
 

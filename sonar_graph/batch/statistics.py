@@ -37,10 +37,15 @@ def signed_rank_p(differences: Floats) -> float:
         return 1.0
     doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)
     ranks = doubled // np.gcd.reduce(doubled[differences != 0])
-    positive, negative = int(ranks[differences > 0].sum()), int(ranks[differences < 0].sum())
+    positive, negative = (
+        int(ranks[differences > 0].sum()),
+        int(ranks[differences < 0].sum()),
+    )
     ranks, least = ranks[differences != 0], min(positive, negative)
     is_cheap = len(ranks) * (positive + negative) <= 2 * MOST_ADDITIONS
-    return min(1.0, 2 * (exact_tail(ranks, least) if is_cheap else near_tail(ranks, least)))
+    return min(
+        1.0, 2 * (exact_tail(ranks, least) if is_cheap else near_tail(ranks, least))
+    )
 
 
 def exact_tail(ranks: Ranks, most: int) -> float:
@@ -208,7 +213,11 @@ def quantile(values: Floats, share: float) -> float:
         return math.nan
     if below == above or not math.isfinite(above):
         return above
-    return below + (place - math.floor(place)) * (above - below) if math.isfinite(below) else below
+    return (
+        below + (place - math.floor(place)) * (above - below)
+        if math.isfinite(below)
+        else below
+    )
 
 
 def quantile_error(values: Floats, share: float) -> float:
@@ -223,7 +232,10 @@ def quantile_error(values: Floats, share: float) -> float:
     if n < 2 or not math.isfinite(middle):
         return math.nan
     places = math.sqrt(n * share * (1 - share)) / (n - 1)
-    below, above = quantile(values, max(0.0, share - places)), quantile(values, min(1.0, share + places))
+    below, above = (
+        quantile(values, max(0.0, share - places)),
+        quantile(values, min(1.0, share + places)),
+    )
     sides = [abs(side - middle) for side in (below, above) if math.isfinite(side)]
     error = sum(sides) / len(sides) if sides else math.nan
     return max(error, 0.01 * abs(middle)) if n < LEAST_PAIRS else error
@@ -250,7 +262,9 @@ def failure_rate(failed: int, runs: int) -> Rate:
     return Rate(failed / runs, float(interval.low), float(interval.high))
 
 
-def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = None) -> PairedDifference:
+def paired(
+    own: Floats, reference: Floats, cases: Sequence[str | int] | None = None
+) -> PairedDifference:
     """Compare paired values, each shape (n,), by their differences; infinity for a run without a value.
 
     A run without a value is worse than any run with one; two such runs are equal.
@@ -277,11 +291,17 @@ def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = N
     """
     lost = np.isinf(own) | np.isinf(reference)
     both = np.isinf(own) & np.isinf(reference)
-    differences = np.where(both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference))
+    differences = np.where(
+        both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference)
+    )
     each = "pair"
     if cases is not None:
-        members = [np.array([one == case for one in cases]) for case in dict.fromkeys(cases)]
-        differences = np.array([case_difference(differences[which]) for which in members])
+        members = [
+            np.array([one == case for one in cases]) for case in dict.fromkeys(cases)
+        ]
+        differences = np.array(
+            [case_difference(differences[which]) for which in members]
+        )
         lost = np.array([lost[which].any() for which in members], dtype=bool)
         kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
         each = kinds.pop() if len(kinds) == 1 else "case"
@@ -328,7 +348,9 @@ def mean_interval(values: Floats) -> tuple[float, float]:
         return mean, mean
     skewness = float((((values - mean) / values.std()) ** 3).mean())
     bound = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1)) / math.sqrt(n)
-    return mean - deviation * _unskewed(bound, skewness, n), mean - deviation * _unskewed(-bound, skewness, n)
+    return mean - deviation * _unskewed(
+        bound, skewness, n
+    ), mean - deviation * _unskewed(-bound, skewness, n)
 
 
 def _unskewed(bound: float, skewness: float, n: int) -> float:
@@ -375,5 +397,9 @@ def anees(nees: Floats, dof: float) -> Anees:
     """
     if not len(nees) or np.isinf(nees).any():
         return Anees(len(nees), math.nan, (math.nan, math.nan))
-    band = (math.nan, math.nan) if math.isnan(dof) else anees_interval(len(nees), int(dof), CONFIDENCE)
+    band = (
+        (math.nan, math.nan)
+        if math.isnan(dof)
+        else anees_interval(len(nees), int(dof), CONFIDENCE)
+    )
     return Anees(len(nees), float(nees.mean()), band)

@@ -127,12 +127,18 @@ class Store:
         try:
             (folder / RUNS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BatchError(f"{folder}: cannot be written: {error.strerror}; choose another folder with -o") from error
+            raise BatchError(
+                f"{folder}: cannot be written: {error.strerror}; choose another folder with -o"
+            ) from error
 
     def remove_partial(self) -> None:
         """Remove what a killed batch left half written or half removed; nothing else may be writing."""
         for path in (self.folder / RUNS).glob(f"{_PARTIAL}*"):
-            if _PARTIAL_NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+            if (
+                _PARTIAL_NAME.fullmatch(path.name)
+                and path.is_dir()
+                and not path.is_symlink()
+            ):
                 remove_written(path)
 
     def row(self, key: str) -> Row | None:
@@ -152,7 +158,10 @@ class Store:
         partial = self._partial_folder(key)
         row = strict_json({KEY: key, **outcome.row}) + "\n"
         contents = {**outcome.files, LOG: outcome.log.encode(), ROW: row.encode()}
-        digests = {name: [hashlib.blake2b(content).hexdigest()[:DIGEST_DIGITS]] for name, content in contents.items()}
+        digests = {
+            name: [hashlib.blake2b(content).hexdigest()[:DIGEST_DIGITS]]
+            for name, content in contents.items()
+        }
         partial.mkdir()
         try:
             write_manifest(partial, COMPARISON, digests)

@@ -32,7 +32,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
@@ -53,7 +60,9 @@ DEFAULT_METRICS = (
     "smoothed.ate_raw_m",
     "landmarks.se2_m",
 )
-METRICS = tuple(f"{block}.{name}" for block, labels in SCORES.items() for name in labels)
+METRICS = tuple(
+    f"{block}.{name}" for block, labels in SCORES.items() for name in labels
+)
 """Every key that a score can have."""
 MOST_SEEDS = 1_000_000
 LARGEST_SEED = 2**63 - 1
@@ -61,7 +70,10 @@ LARGEST_SEED = 2**63 - 1
 
 
 Grid = Annotated[
-    dict[str, list[Any]], BeforeValidator(lambda given: flattened(given) if isinstance(given, dict) else given)
+    dict[str, list[Any]],
+    BeforeValidator(
+        lambda given: flattened(given) if isinstance(given, dict) else given
+    ),
 ]
 """Values by name; names of nested settings are dotted."""
 
@@ -99,7 +111,9 @@ class LogEntry(Section):
     @field_validator("seeds", mode="before")
     @classmethod
     def _check_seeds(cls, value: Any) -> Any:
-        seeds = value if isinstance(value, list) else [value] if value is not None else []
+        seeds = (
+            value if isinstance(value, list) else [value] if value is not None else []
+        )
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
         if not are_numbers or len(set(seeds)) < len(seeds):
@@ -111,12 +125,22 @@ class LogEntry(Section):
 
     @model_validator(mode="after")
     def _check(self) -> LogEntry:
-        if sum(source is not None for source in (self.log, self.dataset, self.generator)) != 1:
+        if (
+            sum(
+                source is not None
+                for source in (self.log, self.dataset, self.generator)
+            )
+            != 1
+        ):
             raise ValueError("expected exactly one of log, dataset and generator")
         if self.landmarks is not None and self.generator is not None:
-            raise ValueError("landmarks are put on a log or dataset; a generator has its own")
+            raise ValueError(
+                "landmarks are put on a log or dataset; a generator has its own"
+            )
         if self.seeds is not None and self.generator is None and self.landmarks is None:
-            raise ValueError("seeds are for a generator, or for landmarks simulated on a log")
+            raise ValueError(
+                "seeds are for a generator, or for landmarks simulated on a log"
+            )
         return self
 
     @property
@@ -128,7 +152,13 @@ class LogEntry(Section):
         """Seeds to run; one None if nothing is random."""
         if self.generator is None and self.landmarks is None:
             return [None]
-        return list(range(self.seeds)) if isinstance(self.seeds, int) else [0] if self.seeds is None else [*self.seeds]
+        return (
+            list(range(self.seeds))
+            if isinstance(self.seeds, int)
+            else [0]
+            if self.seeds is None
+            else [*self.seeds]
+        )
 
 
 class EstimatorEntry(Section):
@@ -176,7 +206,9 @@ class SuiteFile:
 
         Raises `BatchError` with file, line and key.
         """
-        raise BatchError(f"{self.path}, line {line_of(self.text, place)}: {'.'.join(map(str, place))}: {fault}")
+        raise BatchError(
+            f"{self.path}, line {line_of(self.text, place)}: {'.'.join(map(str, place))}: {fault}"
+        )
 
     def holds(self, name: str) -> bool:
         """Tell whether a file or folder is where `find` looks for it."""
@@ -191,12 +223,23 @@ class SuiteFile:
         found = [root / name for root in roots if (root / name).exists()]
         if not found:
             looked = " or ".join(str(root.resolve()) for root in roots)
-            more = "" if len(roots) > 1 else f"; {DATA_VARIABLE} can name another folder to look in"
+            more = (
+                ""
+                if len(roots) > 1
+                else f"; {DATA_VARIABLE} can name another folder to look in"
+            )
             self.refuse(place, f"{name} is not in {looked}{more}")
         return str(found[0].resolve())
 
     def _roots(self) -> list[Path]:
-        return [self.path.parent, *([Path(os.environ[DATA_VARIABLE])] if os.environ.get(DATA_VARIABLE) else [])]
+        return [
+            self.path.parent,
+            *(
+                [Path(os.environ[DATA_VARIABLE])]
+                if os.environ.get(DATA_VARIABLE)
+                else []
+            ),
+        ]
 
 
 def read_suite(path: Path) -> SuiteFile:
@@ -240,7 +283,10 @@ def read_suite(path: Path) -> SuiteFile:
     found = SuiteFile(path, text, suite)
     for number, metric in enumerate(suite.metrics):
         if metric not in METRICS:
-            found.refuse(("metrics", number), f"there is no score {metric!r}{choice(metric, METRICS)}")
+            found.refuse(
+                ("metrics", number),
+                f"there is no score {metric!r}{choice(metric, METRICS)}",
+            )
     return found
 
 
@@ -275,7 +321,11 @@ def line_of(text: str, place: Place) -> int:
         for mark in _TEXT_MARKS:
             if open_mark in ("", mark) and line.count(mark) % 2:
                 open_mark = "" if open_mark else mark
-    return next(lines[place[:length]] for length in range(len(place), -1, -1) if place[:length] in lines)
+    return next(
+        lines[place[:length]]
+        for length in range(len(place), -1, -1)
+        if place[:length] in lines
+    )
 
 
 def _names(path: str) -> list[str]:

@@ -22,7 +22,12 @@ from sonar_graph.evaluation import describe_environment
 from sonar_graph.files import READY, KilledError, OwnProcess
 
 ONE_THREAD = (
-    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
+    *(
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+    ),
     *("VECLIB_MAXIMUM_THREADS", "TBB_NUM_THREADS"),
 )
 ONE_ORDER = {"PYTHONHASHSEED": "0"}
@@ -62,7 +67,10 @@ def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
                     _idle.append(runner)
             else:
                 runner.end()
-    return RunOutcome({**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
+    return RunOutcome(
+        {**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"},
+        log=log,
+    )
 
 
 def _here() -> Row:
@@ -84,18 +92,26 @@ class Runner:
     def __init__(self) -> None:
         self._log = tempfile.TemporaryFile(mode="a+b")  # noqa: SIM115  it is open as long as the process runs
         environment = dict.fromkeys(ONE_THREAD, "1") | ONE_ORDER
-        self._process = OwnProcess(("-m", "sonar_graph.batch.one_run"), environment, self._log)
+        self._process = OwnProcess(
+            ("-m", "sonar_graph.batch.one_run"), environment, self._log
+        )
         self._is_busy = True
         self._is_foreign = False
         self._warm: set[str] = set()
         try:
-            reason = "" if self._wait(Limits(START_S)) == READY else f"it was not ready after {START_S:g} s"
+            reason = (
+                ""
+                if self._wait(Limits(START_S)) == READY
+                else f"it was not ready after {START_S:g} s"
+            )
         except KilledError as error:
             reason = str(error)
         if reason:
             said = self.log()[-2000:]
             self.end()
-            raise BatchError(f"no process for runs on {platform.node()}: {reason}; {said}")
+            raise BatchError(
+                f"no process for runs on {platform.node()}: {reason}; {said}"
+            )
 
     @property
     def pid(self) -> int:
@@ -148,8 +164,16 @@ class Runner:
                 self._is_busy = False
                 return answer
             if time.monotonic() > deadline:
-                return RunOutcome({"status": "timeout", "reason": f"took longer than {limits.timeout_s:g} s"})
-            if limits.memory_mb is not None and resident_mb(self.pid) > limits.memory_mb:
+                return RunOutcome(
+                    {
+                        "status": "timeout",
+                        "reason": f"took longer than {limits.timeout_s:g} s",
+                    }
+                )
+            if (
+                limits.memory_mb is not None
+                and resident_mb(self.pid) > limits.memory_mb
+            ):
                 reason = f"its processes needed more than {limits.memory_mb:g} MB"
                 return RunOutcome({"status": "memory", "reason": reason})
 

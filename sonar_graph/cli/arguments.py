@@ -37,14 +37,25 @@ def existing_file(meaning: str, metavar: str = "FILE") -> Any:
 LogPath = Annotated[
     Path,
     typer.Argument(
-        metavar="LOG", exists=True, readable=True, help="MCAP log to read: a file, or the folder of a ROS 2 bag."
+        metavar="LOG",
+        exists=True,
+        readable=True,
+        help="MCAP log to read: a file, or the folder of a ROS 2 bag.",
     ),
 ]
-OutputLog = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files of these names even where sonar-graph did not write them.")
+OutputLog = Annotated[
+    Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")
 ]
-OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")]
+Overwrite = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite",
+        help="Replace files of these names even where sonar-graph did not write them.",
+    ),
+]
+OutputFolder = Annotated[
+    Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")
+]
 RateHz = Annotated[
     float | None,
     typer.Option(
@@ -56,7 +67,11 @@ RateHz = Annotated[
 ]
 EstimatorSettings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change a setting of an estimator; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="NAME.SETTING=VALUE",
+        help="Change a setting of an estimator; may be repeated.",
+    ),
 ]
 DesignsPath = Annotated[
     Path | None,
@@ -104,7 +119,10 @@ class ReadingOptions:
     ] = None
     end: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Leave out what was recorded then and later; written like --start."),
+        typer.Option(
+            metavar="TIME",
+            help="Leave out what was recorded then and later; written like --start.",
+        ),
     ] = None
     salvage: Annotated[
         bool,
@@ -122,7 +140,9 @@ class ReadingOptions:
         for text in self.topics or []:
             role, _, topic = text.partition("=")
             if not role or not topic:
-                raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
+                raise LogError(
+                    f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data"
+                )
             choices[role] = topic
         return choices
 
@@ -138,7 +158,11 @@ class ReadingOptions:
         """Fields of a calibration from a file, if one is given."""
         from sonar_graph.logs import PartialCalibration
 
-        return None if self.calibration is None else PartialCalibration.read(self.calibration)
+        return (
+            None
+            if self.calibration is None
+            else PartialCalibration.read(self.calibration)
+        )
 
     @property
     def window(self) -> TimeWindow:
@@ -147,7 +171,9 @@ class ReadingOptions:
 
         return TimeWindow.parse(self.start, self.end)
 
-    def read(self, log: Path, *, progress: Callable[[int, int], None] | None = None) -> Sequence:
+    def read(
+        self, log: Path, *, progress: Callable[[int, int], None] | None = None
+    ) -> Sequence:
         """Read a log as a sequence."""
         from sonar_graph.logs import read_log
 
@@ -162,7 +188,9 @@ class ReadingOptions:
         )
 
 
-def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_options(
+    *left_out: str,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Replace each dataclass among a command's parameters by its fields, which typer turns into options.
 
     The command does not offer the fields that are left out; they have their defaults.
@@ -170,13 +198,20 @@ def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[...
 
     def expand(command: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(command, include_extras=True)
-        groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
-        offered = {name: [f for f in fields(kind) if f.name not in left_out] for name, kind in groups.items()}
+        groups: dict[str, Any] = {
+            name: kind for name, kind in hints.items() if is_dataclass(kind)
+        }
+        offered = {
+            name: [f for f in fields(kind) if f.name not in left_out]
+            for name, kind in groups.items()
+        }
 
         @wraps(command)
         def run(**values: Any) -> None:
             for name, kind in groups.items():
-                values[name] = kind(**{f.name: values.pop(f.name) for f in offered[name]})
+                values[name] = kind(
+                    **{f.name: values.pop(f.name) for f in offered[name]}
+                )
             command(**values)
 
         parameters = []
@@ -186,9 +221,14 @@ def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[...
                 given = [(f.name, f.default, kinds[f.name]) for f in offered[name]]
             else:
                 given = [(name, parameter.default, hints[name])]
-            parameters += [Parameter(n, Parameter.KEYWORD_ONLY, default=d, annotation=kind) for n, d, kind in given]
+            parameters += [
+                Parameter(n, Parameter.KEYWORD_ONLY, default=d, annotation=kind)
+                for n, d, kind in given
+            ]
         run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        run.__annotations__ = {
+            parameter.name: parameter.annotation for parameter in parameters
+        }
         return run
 
     return expand
@@ -208,11 +248,17 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
             except tomllib.TOMLDecodeError:
                 parsed = value
         if name in settings and settings[name] != parsed:
-            raise EstimatorError(f"--set {text}: {name} is also set to {settings[name]}; give it once")
+            raise EstimatorError(
+                f"--set {text}: {name} is also set to {settings[name]}; give it once"
+            )
         if within := [
-            other for other in settings if f"{other}.".startswith(f"{name}.") != f"{name}.".startswith(f"{other}.")
+            other
+            for other in settings
+            if f"{other}.".startswith(f"{name}.") != f"{name}.".startswith(f"{other}.")
         ]:
-            raise EstimatorError(f"--set {text}: {within[0]} is set too, and one is inside the other; give one of them")
+            raise EstimatorError(
+                f"--set {text}: {within[0]} is set too, and one is inside the other; give one of them"
+            )
         settings[name] = parsed
     return settings
 
@@ -224,7 +270,9 @@ def nested_settings(texts: list[str] | None) -> dict[str, Any]:
     return nested(parse_settings(texts or []))
 
 
-def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, dict[str, Any]]:
+def estimator_settings(
+    texts: list[str] | None, names: list[str]
+) -> dict[str, dict[str, Any]]:
     """Settings by estimator, from texts such as ``isam2.smoother.lag_s=20``; dots go into nested settings."""
     from sonar_graph.estimator import installed_estimators
     from sonar_graph.settings import nested, suggestion
@@ -240,7 +288,9 @@ def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, d
                 f"--set {path}: {estimator} is not among the estimators that run: {', '.join(names)}{hint.rstrip(';')}"
             )
         if not dot or not all(setting.split(".")):
-            raise EstimatorError(f"--set {path}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
+            raise EstimatorError(
+                f"--set {path}: expected ESTIMATOR.setting=value with one of {', '.join(names)}"
+            )
     return nested(given)
 
 
@@ -260,7 +310,11 @@ def printable(text: str) -> str:
     """Text without what a terminal would obey: names in a log may hold escape sequences, which are spelt out."""
     if text.isprintable():
         return text
-    obeyed = {char for char in set(text) - {"\n", "\t"} if category(char) in ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")}
+    obeyed = {
+        char
+        for char in set(text) - {"\n", "\t"}
+        if category(char) in ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
+    }
     return text.translate({ord(char): f"\\u{ord(char):04x}" for char in obeyed})
 
 
@@ -272,7 +326,9 @@ def echo(text: str, *, err: bool = False, nl: bool = True) -> None:
 class PlainConsole(Console):
     """Console for texts that may hold names of a log."""
 
-    def render(self, renderable: Any, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+    def render(
+        self, renderable: Any, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
         """Pieces of a text, table or anything else, without what a terminal would obey in them."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else piece._replace(text=printable(piece.text))
@@ -281,4 +337,8 @@ class PlainConsole(Console):
 def answers() -> Console:
     """Console for results on stdout; if that is no terminal, it is `FILE_WIDTH` wide."""
     console = PlainConsole(highlight=False)
-    return console if console.is_terminal else PlainConsole(highlight=False, width=FILE_WIDTH)
+    return (
+        console
+        if console.is_terminal
+        else PlainConsole(highlight=False, width=FILE_WIDTH)
+    )

@@ -23,34 +23,63 @@ if TYPE_CHECKING:
 SHOWN = 10
 """Most lines about runs that stand out; the report lists every run."""
 BatchFolder = Annotated[
-    Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
+    Path,
+    typer.Argument(
+        metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote."
+    ),
 ]
 Strict = Annotated[
-    bool, typer.Option("--strict", help="Fail the gate by lines that say 'look at' too: these are no tests.")
+    bool,
+    typer.Option(
+        "--strict",
+        help="Fail the gate by lines that say 'look at' too: these are no tests.",
+    ),
 ]
 
 
 def bench(
     suite: Annotated[
         Path,
-        typer.Argument(metavar="SUITE.toml", exists=True, dir_okay=False, help="What is run: see benchmarks/suites."),
+        typer.Argument(
+            metavar="SUITE.toml",
+            exists=True,
+            dir_okay=False,
+            help="What is run: see benchmarks/suites.",
+        ),
     ],
     output: OutputFolder,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine. Default: one a core.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes on this machine. Default: one a core."),
+    ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead.",
+        ),
     ] = None,
     timeout_s: Annotated[
         float | None,
-        typer.Option("--timeout", metavar="S", min=1e-3, help="End a run after so long. Default: the suite's."),
+        typer.Option(
+            "--timeout",
+            metavar="S",
+            min=1e-3,
+            help="End a run after so long. Default: the suite's.",
+        ),
     ] = None,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Do runs anew that failed, timed out or were killed.")
+        bool,
+        typer.Option(
+            "--retry-failed", help="Do runs anew that failed, timed out or were killed."
+        ),
     ] = False,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY", help="Do only the run of this key, which the report lists; can be repeated."),
+        typer.Option(
+            metavar="KEY",
+            help="Do only the run of this key, which the report lists; can be repeated.",
+        ),
     ] = None,
     reference: Annotated[
         Path | None,
@@ -78,7 +107,12 @@ def bench(
         with progress_bars() as show:
 
             def progress(done: int, planned: int, failed: int) -> None:
-                show("runs", done, planned, f"{done}/{planned}{f', {failed} failed' if failed else ''}")
+                show(
+                    "runs",
+                    done,
+                    planned,
+                    f"{done}/{planned}{f', {failed} failed' if failed else ''}",
+                )
 
             batch = run_suite(
                 suite,
@@ -94,7 +128,8 @@ def bench(
             )
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
-        os._exit(INTERRUPTED)  # the ordinary way waits for threads, also for those of workers that are gone
+        # the ordinary way waits for threads, also for those of workers that are gone
+        os._exit(INTERRUPTED)
     counts = Counter(run.status for run in batch.runs if not only or run.key in only)
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
@@ -116,7 +151,13 @@ def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
     for line in verdict_lines(verdict):
         echo(line)
     is_passed = verdict.passed and not (is_strict and verdict.look_at)
-    outcome = "failed" if not is_passed else "passed" if verdict.has_test else "passed, without any test of errors"
+    outcome = (
+        "failed"
+        if not is_passed
+        else "passed"
+        if verdict.has_test
+        else "passed, without any test of errors"
+    )
     echo(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
     if not is_passed:
         raise typer.Exit(1)
@@ -127,21 +168,33 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
     lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
     lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
     if len(verdict.look_at) > SHOWN:
-        lines.append(f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown")
+        lines.append(
+            f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown"
+        )
     if verdict.new:
-        lines.append(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
+        lines.append(
+            f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}"
+        )
     if verdict.untested:
         told = ", ".join(f"{name} ({verdict.cases[name]})" for name in verdict.untested)
-        lines.append(f"No test of errors: {told}: it needs 3 cases, which are seeds, or logs without seeds")
+        lines.append(
+            f"No test of errors: {told}: it needs 3 cases, which are seeds, or logs without seeds"
+        )
     if verdict.unmoved:
-        lines.append(f"Hardly different from the reference: {', '.join(verdict.unmoved)}")
+        lines.append(
+            f"Hardly different from the reference: {', '.join(verdict.unmoved)}"
+        )
     if verdict.detectable:
         sizes = []
         for name, share in verdict.detectable.items():
-            size = f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
+            size = (
+                f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
+            )
             sizes.append(f"{size} ({name}, {verdict.cases[name]} cases)")
         told = ", ".join(sizes)
-        lines.append(f"Would have been found in four of five batches: one error larger on all logs by {told}")
+        lines.append(
+            f"Would have been found in four of five batches: one error larger on all logs by {told}"
+        )
     return lines
 
 
@@ -166,7 +219,9 @@ class SuiteFirst(TyperGroup):
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """Insert the name of the default command if none is given."""
-        is_named = not args or args[0] in self.commands or args[0] in ctx.help_option_names
+        is_named = (
+            not args or args[0] in self.commands or args[0] in ctx.help_option_names
+        )
         return super().parse_args(ctx, args if is_named else [DEFAULT_COMMAND, *args])
 
 
@@ -197,7 +252,11 @@ benches.command(
 def bless(
     folder: BatchFolder,
     reference: Annotated[
-        Path, typer.Argument(metavar="REFERENCE.json", help="File to write; replaces an earlier reference.")
+        Path,
+        typer.Argument(
+            metavar="REFERENCE.json",
+            help="File to write; replaces an earlier reference.",
+        ),
     ],
     overwrite: Overwrite = False,
 ) -> None:
@@ -206,16 +265,27 @@ def bless(
     from sonar_graph.batch import is_reference, read_batch
 
     batch = read_batch(folder)
-    write_reference(batch, writable_json(reference, "a reference", [], is_reference, overwrite=overwrite))
+    write_reference(
+        batch,
+        writable_json(reference, "a reference", [], is_reference, overwrite=overwrite),
+    )
     failed = sum(not run.ended for run in batch.runs)
-    echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
+    echo(
+        f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)"
+    )
 
 
 @benches.command(epilog=examples("sonar-graph bench gate results reference.json"))
 def gate(
     folder: BatchFolder,
     reference: Annotated[
-        Path, typer.Argument(metavar="REFERENCE.json", exists=True, dir_okay=False, help="What bless wrote.")
+        Path,
+        typer.Argument(
+            metavar="REFERENCE.json",
+            exists=True,
+            dir_okay=False,
+            help="What bless wrote.",
+        ),
     ],
     is_strict: Strict = False,
 ) -> None:

@@ -26,8 +26,17 @@ from sonar_graph.cli.arguments import (
     with_options,
 )
 from sonar_graph.cli.bench import write_report_of
-from sonar_graph.cli.outputs import progress_bars, working, writable_folder, writable_log
-from sonar_graph.cli.recognise import RecogniserOptions, recognise_log, warn_of_other_designs
+from sonar_graph.cli.outputs import (
+    progress_bars,
+    working,
+    writable_folder,
+    writable_log,
+)
+from sonar_graph.cli.recognise import (
+    RecogniserOptions,
+    recognise_log,
+    warn_of_other_designs,
+)
 from sonar_graph.cli.simulate import write_basin
 from sonar_graph.errors import EstimatorError, EvaluationError, LogError
 from sonar_graph.files import BATCH, COMPARISON, result_written
@@ -63,7 +72,9 @@ def run(
     log: LogPath,
     output: OutputFolder,
     reading: ReadingOptions,
-    estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
+    estimator: Annotated[
+        str, typer.Option("--estimator", help="Name of an installed estimator.")
+    ] = "isam2",
     rate_hz: RateHz = None,
     settings: EstimatorSettings = None,
     overwrite: Overwrite = False,
@@ -73,7 +84,16 @@ def run(
 
     names, recognition = [estimator], RecogniserOptions()
     with (
-        compared(log, output, names, reading, recognition, rate_hz, settings, overwrite=overwrite) as comparison,
+        compared(
+            log,
+            output,
+            names,
+            reading,
+            recognition,
+            rate_hz,
+            settings,
+            overwrite=overwrite,
+        ) as comparison,
         working("writing results"),
         result_written(output, COMPARISON),
     ):
@@ -88,7 +108,9 @@ def compare(
     output: OutputFolder,
     recognition: RecogniserOptions,
     reading: ReadingOptions,
-    estimators: Annotated[str, typer.Option(help="Names of installed estimators, with commas.")] = DEFAULT_ESTIMATORS,
+    estimators: Annotated[
+        str, typer.Option(help="Names of installed estimators, with commas.")
+    ] = DEFAULT_ESTIMATORS,
     rate_hz: RateHz = None,
     settings: EstimatorSettings = None,
     overwrite: Overwrite = False,
@@ -109,9 +131,20 @@ def compare(
             f"--estimators {estimators!r}: a name is empty; expected names such as {DEFAULT_ESTIMATORS}"
         )
     if again is not None:
-        raise EstimatorError(f"--estimators {estimators!r}: {again} is named twice; each runs once")
+        raise EstimatorError(
+            f"--estimators {estimators!r}: {again} is named twice; each runs once"
+        )
     with (
-        compared(log, output, names, reading, recognition, rate_hz, settings, overwrite=overwrite) as comparison,
+        compared(
+            log,
+            output,
+            names,
+            reading,
+            recognition,
+            rate_hz,
+            settings,
+            overwrite=overwrite,
+        ) as comparison,
         working("writing results"),
     ):
         page = write_report(comparison, output)
@@ -120,7 +153,13 @@ def compare(
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or bench wrote.")
+        Path,
+        typer.Argument(
+            metavar="DIR",
+            exists=True,
+            file_okay=False,
+            help="Folder that compare or bench wrote.",
+        ),
     ],
     overwrite: Overwrite = False,
 ) -> None:
@@ -153,13 +192,29 @@ def demo(output: OutputFolder = Path("demo"), overwrite: Overwrite = False) -> N
     with writable_folder(output, names_written(names), overwrite=overwrite):
         log = writable_log(output / LOG, overwrite=overwrite)
     options = BasinOptions.model_validate(DEMO)
-    echo(f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}")
+    echo(
+        f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}"
+    )
     write_basin(log, options)
     echo("Recognising landmarks in them, then running the estimators")
     reading, recognition = ReadingOptions(), RecogniserOptions()
-    with compared(log, output, names, reading, recognition, DEFAULT_RATE_HZ, None, overwrite=overwrite) as comparison:
-        experiments = {name: options.model_copy(update=changes) for name, changes in DEMO_EXPERIMENTS.items()}
-        echo(f"Running {len(experiments)} times {len(DEMO_SEEDS)} more of the same basin, without images")
+    with compared(
+        log,
+        output,
+        names,
+        reading,
+        recognition,
+        DEFAULT_RATE_HZ,
+        None,
+        overwrite=overwrite,
+    ) as comparison:
+        experiments = {
+            name: options.model_copy(update=changes)
+            for name, changes in DEMO_EXPERIMENTS.items()
+        }
+        echo(
+            f"Running {len(experiments)} times {len(DEMO_SEEDS)} more of the same basin, without images"
+        )
         with progress_bars() as progress:
             ensembles = run_ensembles(experiments, DEMO_SEEDS, names, progress=progress)
         comparison = replace(comparison, ensembles=ensembles)
@@ -182,10 +237,16 @@ def estimators() -> None:
             console.print(escape(str(error)), "", sep="\n", soft_wrap=True)
             failed = True
             continue
-        console.print(f"[bold]{escape(name)}[/] ({escape(point.value)})", soft_wrap=True)
+        console.print(
+            f"[bold]{escape(name)}[/] ({escape(point.value)})", soft_wrap=True
+        )
         table = Table("setting", "default", "meaning", box=None, pad_edge=True)
         for setting in settings_of(settings):
-            table.add_row(escape(setting.name), escape(str(setting.default)), escape(setting.meaning))
+            table.add_row(
+                escape(setting.name),
+                escape(str(setting.default)),
+                escape(setting.meaning),
+            )
         console.print(table if settings.model_fields else "  no settings")
         console.print()
     if failed:
@@ -217,9 +278,21 @@ def compared(
     """
     overrides = estimator_settings(settings, names)
     check_requests(names, overrides)
-    sources = (log, reading.calibration, reading.log_config, recognition.designs, recognition.model)
-    pictures = [path.relative_to(output).as_posix() for path in output.glob("recognised/*.jpg") if path.stem.isdigit()]
-    with writable_folder(output, [*names_written(names), *pictures], sources, overwrite=overwrite):
+    sources = (
+        log,
+        reading.calibration,
+        reading.log_config,
+        recognition.designs,
+        recognition.model,
+    )
+    pictures = [
+        path.relative_to(output).as_posix()
+        for path in output.glob("recognised/*.jpg")
+        if path.stem.isdigit()
+    ]
+    with writable_folder(
+        output, [*names_written(names), *pictures], sources, overwrite=overwrite
+    ):
         yield compare_log(log, names, overrides, reading, recognition, rate_hz)
 
 
@@ -254,11 +327,16 @@ def compare_log(
         said = "; ".join(f"{one.quantity}: {one.text()}" for one in doubted)
         sequence = replace(sequence, notes={**sequence.notes, "log.sensors": said})
     found = None
-    is_of_live_run = LIVE_RATE in sequence.notes  # what was recognised is in it: estimates are those of the live run
+    # what was recognised is in it: estimates are those of the live run
+    is_of_live_run = LIVE_RATE in sequence.notes
     if (sequence.detections is None and not is_of_live_run) or recognition.is_given:
-        found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration))
+        found = recognise_log(
+            log, sequence, reading, recognition.recogniser(sequence.calibration)
+        )
         if found is None and recognition.is_given:
-            raise LogError(f"{no_images(log)}; --designs, --model and --rule are for images")
+            raise LogError(
+                f"{no_images(log)}; --designs, --model and --rule are for images"
+            )
     if found is not None:
         if recognition.designs is None:
             warn_of_other_designs(sequence)
@@ -268,7 +346,9 @@ def compare_log(
     if said := expense(sequence):
         echo(f"A large log, {said}", err=True)
     with progress_bars() as progress:
-        comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
+        comparison = compare_runs(
+            sequence, names, overrides, rate_hz=rate_hz, progress=progress
+        )
     return replace(comparison, recognition=found)
 
 

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import OutputLog, Overwrite, echo, examples, existing_file
+from sonar_graph.cli.arguments import (
+    OutputLog,
+    Overwrite,
+    echo,
+    examples,
+    existing_file,
+)
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
 from sonar_graph.errors import LogError
 
@@ -44,16 +50,29 @@ _MOST_LOSSES_SHOWN = 10
 )
 def csv(
     tables: Annotated[
-        list[Path], typer.Argument(metavar="TABLES...", exists=True, help="Text files, or a folder that holds them.")
+        list[Path],
+        typer.Argument(
+            metavar="TABLES...",
+            exists=True,
+            help="Text files, or a folder that holds them.",
+        ),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write."),
     ] = None,
     config: Annotated[
-        Path | None, existing_file("Which columns of which tables are what; --toml begins one.", "FILE.toml")
+        Path | None,
+        existing_file(
+            "Which columns of which tables are what; --toml begins one.", "FILE.toml"
+        ),
     ] = None,
     toml: Annotated[
-        bool, typer.Option("--toml", help="Print only a guess at FILE.toml, by the names of the columns, to edit.")
+        bool,
+        typer.Option(
+            "--toml",
+            help="Print only a guess at FILE.toml, by the names of the columns, to edit.",
+        ),
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -67,25 +86,42 @@ def csv(
         return
     named = " ".join(map(str, tables))
     if config is None:
-        raise LogError(f"--config is missing; `sonar-graph convert csv {named} --toml > dive.toml` begins one")
+        raise LogError(
+            f"--config is missing; `sonar-graph convert csv {named} --toml > dive.toml` begins one"
+        )
     if output is None:
         raise LogError("-o is missing; give the log to write, such as -o dive.mcap")
-    sequence = _convert(lambda: read_csv(tables, config), [*tables, config], output, overwrite)
+    sequence = _convert(
+        lambda: read_csv(tables, config), [*tables, config], output, overwrite
+    )
     for subject, heading in (("csv.left_out", "left out"), ("csv.warnings", "warning")):
         if subject in sequence.notes:
             echo(f"{heading}: {sequence.notes[subject]}", err=True)
     for finding in doubts(sequence, LogConfig()):
         if finding.quantity.endswith(": unit"):
-            echo(f"warning: {finding.quantity}: {finding.text()} (or in {config}, and convert again)", err=True)
+            echo(
+                f"warning: {finding.quantity}: {finding.text()} (or in {config}, and convert again)",
+                err=True,
+            )
     echo(f"What is in it: sonar-graph inspect {output}")
 
 
 DatasetFolder = Annotated[
-    Path, typer.Argument(metavar="DATASET_DIR", exists=True, file_okay=False, help="Folder of the data set.")
+    Path,
+    typer.Argument(
+        metavar="DATASET_DIR",
+        exists=True,
+        file_okay=False,
+        help="Folder of the data set.",
+    ),
 ]
 
 
-@datasets.command(epilog=examples("sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap"))
+@datasets.command(
+    epilog=examples(
+        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap"
+    )
+)
 def mrclam(
     dataset: DatasetFolder,
     output: OutputLog,
@@ -98,12 +134,20 @@ def mrclam(
     _convert(lambda: read_mrclam(dataset, robot), [dataset], output, overwrite)
 
 
-@datasets.command("victoria-park", epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"))
+@datasets.command(
+    "victoria-park",
+    epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"),
+)
 def victoria_park(
     output: OutputLog,
     source: Annotated[
         Path | None,
-        typer.Option("--file", exists=True, dir_okay=False, help="Default: the one which the gtsam package brings."),
+        typer.Option(
+            "--file",
+            exists=True,
+            dir_okay=False,
+            help="Default: the one which the gtsam package brings.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -116,7 +160,12 @@ def victoria_park(
 @datasets.command(epilog=examples("sonar-graph convert dlr DLR -o dlr.mcap"))
 def dlr(
     dataset: Annotated[
-        Path, typer.Argument(metavar="PATH", exists=True, help="Folder of the data set, or its map.circles file.")
+        Path,
+        typer.Argument(
+            metavar="PATH",
+            exists=True,
+            help="Folder of the data set, or its map.circles file.",
+        ),
     ],
     output: OutputLog,
     overwrite: Overwrite = False,
@@ -127,7 +176,9 @@ def dlr(
     _convert(lambda: read_dlr(dataset), [dataset], output, overwrite)
 
 
-@datasets.command(epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap"))
+@datasets.command(
+    epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap")
+)
 def akit(
     dataset: DatasetFolder,
     output: OutputLog,
@@ -140,8 +191,12 @@ def akit(
     _convert(lambda: read_akit(dataset, trajectory), [dataset], output, overwrite)
 
 
-@datasets.command(epilog=examples("sonar-graph convert stpere StPereDataset -o stpere.mcap"))
-def stpere(dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = False) -> None:
+@datasets.command(
+    epilog=examples("sonar-graph convert stpere StPereDataset -o stpere.mcap")
+)
+def stpere(
+    dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = False
+) -> None:
     """St. Pere: an underwater vehicle in a marina, cheap IMU, compass and DVL, satellite positions as truth."""
     from sonar_graph.logs.convert import read_stpere
 
@@ -150,11 +205,17 @@ def stpere(dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = Fal
 
 @datasets.command(
     epilog=examples(
-        "sonar-graph convert rosbag dive.bag -o dive.mcap", "sonar-graph convert rosbag ros2_bag_folder -o dive.mcap"
+        "sonar-graph convert rosbag dive.bag -o dive.mcap",
+        "sonar-graph convert rosbag ros2_bag_folder -o dive.mcap",
     )
 )
 def rosbag(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", exists=True, help="ROS 1 .bag, or folder of a ROS 2 bag.")],
+    bag: Annotated[
+        Path,
+        typer.Argument(
+            metavar="BAG", exists=True, help="ROS 1 .bag, or folder of a ROS 2 bag."
+        ),
+    ],
     output: OutputLog,
     overwrite: Overwrite = False,
 ) -> None:
@@ -166,7 +227,12 @@ def rosbag(
 
 SonarRecording = Annotated[
     Path,
-    typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="Recording as the sonar's software wrote it."),
+    typer.Argument(
+        metavar="FILE",
+        exists=True,
+        dir_okay=False,
+        help="Recording as the sonar's software wrote it.",
+    ),
 ]
 
 
@@ -181,26 +247,43 @@ def didson(
     output: OutputLog,
     sound_speed: Annotated[
         float | None,
-        typer.Option(min=1350, max=1650, help="Of the water, m/s; default: ranges as the sonar names them (1465 m/s)."),
+        typer.Option(
+            min=1350,
+            max=1650,
+            help="Of the water, m/s; default: ranges as the sonar names them (1465 m/s).",
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Images of a DIDSON (.ddf, versions 3 and 4)."""
     from sonar_graph.logs.convert import convert_didson
 
-    _convert_file(partial(convert_didson, sound_speed_m_s=sound_speed), recording, output, overwrite)
+    _convert_file(
+        partial(convert_didson, sound_speed_m_s=sound_speed),
+        recording,
+        output,
+        overwrite,
+    )
 
 
-@datasets.command(epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap"))
-def aris(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False) -> None:
+@datasets.command(
+    epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap")
+)
+def aris(
+    recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False
+) -> None:
     """Images of an ARIS (.aris)."""
     from sonar_graph.logs.convert import convert_aris
 
     _convert_file(convert_aris, recording, output, overwrite)
 
 
-@datasets.command(epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap"))
-def oculus(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False) -> None:
+@datasets.command(
+    epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap")
+)
+def oculus(
+    recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False
+) -> None:
     """Images of an Oculus: its network messages, one after another in a file."""
     from sonar_graph.logs.convert import convert_oculus
 
@@ -215,13 +298,25 @@ def _convert_file(
 ) -> None:
     path = writable_log(output, source, overwrite=overwrite)
     with progress_bars() as progress:
-        done = convert(source, path, lambda at, total: progress(f"converting {source.name}", at, total))
-    for line in (f"{source.name}: {done.content}", *done.shortcomings(_MOST_LOSSES_SHOWN)):
+        done = convert(
+            source,
+            path,
+            lambda at, total: progress(f"converting {source.name}", at, total),
+        )
+    for line in (
+        f"{source.name}: {done.content}",
+        *done.shortcomings(_MOST_LOSSES_SHOWN),
+    ):
         echo(line)
     echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 
 
-def _convert(read: Callable[[], Sequence], sources: Iterable[Path | None], output: Path, overwrite: bool) -> Sequence:
+def _convert(
+    read: Callable[[], Sequence],
+    sources: Iterable[Path | None],
+    output: Path,
+    overwrite: bool,
+) -> Sequence:
     from sonar_graph.logs import write_log
 
     path = writable_log(output, *sources, overwrite=overwrite)
@@ -229,5 +324,7 @@ def _convert(read: Callable[[], Sequence], sources: Iterable[Path | None], outpu
         sequence = read()
         write_log(path, sequence)
     detections = len(sequence.detections) if sequence.detections else 0
-    echo(f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}")
+    echo(
+        f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}"
+    )
     return sequence

@@ -10,7 +10,13 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sonar_graph.cli.arguments import LogPath, ReadingOptions, answers, echo, with_options
+from sonar_graph.cli.arguments import (
+    LogPath,
+    ReadingOptions,
+    answers,
+    echo,
+    with_options,
+)
 from sonar_graph.cli.outputs import working
 from sonar_graph.errors import CalibrationError, SonarGraphError
 
@@ -33,7 +39,11 @@ def inspect(
     log: LogPath,
     reading: ReadingOptions,
     toml: Annotated[
-        bool, typer.Option("--toml", help="Print only the log configuration to start from, for --log-config.")
+        bool,
+        typer.Option(
+            "--toml",
+            help="Print only the log configuration to start from, for --log-config.",
+        ),
     ] = False,
     quick: Annotated[
         bool,
@@ -42,7 +52,9 @@ def inspect(
             help="Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise): seconds.",
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as one JSON object.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print everything as one JSON object.")
+    ] = False,
 ) -> None:
     """Say what is in a log: topics, rates, gaps, which topic would be used for what and why, what sensors disagree.
 
@@ -60,7 +72,11 @@ def inspect(
     findings: list[Finding] = []
     grave: set[str] = set()
     skipped = large = ""
-    is_usable = not ((summary.obstacles and not summary.has_images_alone) or summary.unusable or summary.damage)
+    is_usable = not (
+        (summary.obstacles and not summary.has_images_alone)
+        or summary.unusable
+        or summary.damage
+    )
     if quick:
         skipped = "not compared: --quick"
     elif summary.obstacles:
@@ -75,53 +91,106 @@ def inspect(
         try:
             with working("comparing sensors"):
                 sequence = read_log(
-                    log, calibration=given, config=config, topics=reading.choices, window=reading.window
+                    log,
+                    calibration=given,
+                    config=config,
+                    topics=reading.choices,
+                    window=reading.window,
                 )
                 is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
-                grave = {finding.quantity for finding in doubts(sequence, config or LogConfig())}
+                grave = {
+                    finding.quantity
+                    for finding in doubts(sequence, config or LogConfig())
+                }
         except SonarGraphError as error:
             skipped, is_usable = f"not compared: {error}", is_usable and is_read
     if as_json:
-        content = asdict(summary) | {"path": str(summary.path), "duration_s": summary.duration_s}
-        content |= {"obstacles": summary.obstacles, "sensors": [finding.plain() for finding in findings]}
+        content = asdict(summary) | {
+            "path": str(summary.path),
+            "duration_s": summary.duration_s,
+        }
+        content |= {
+            "obstacles": summary.obstacles,
+            "sensors": [finding.plain() for finding in findings],
+        }
         echo(strict_json(content | {"sensors_skipped": skipped, "large": large}))
     else:
         print_summary(summary, findings, grave, skipped, large)
     if not is_usable:
         raise typer.Exit(UNUSABLE)
-    if summary.has_images_alone or summary.warnings or any(finding.acts for finding in findings):
+    if (
+        summary.has_images_alone
+        or summary.warnings
+        or any(finding.acts for finding in findings)
+    ):
         raise typer.Exit(DOUBTFUL)
 
 
-def print_summary(summary: LogSummary, findings: list[Finding], grave: set[str], skipped: str, large: str = "") -> None:
+def print_summary(
+    summary: LogSummary,
+    findings: list[Finding],
+    grave: set[str],
+    skipped: str,
+    large: str = "",
+) -> None:
     """Print the tables of a log, and a line for each note, finding and warning, as which ``grave`` quantities count."""
     console = answers()
 
     def say(heading: str, text: str, style: str = "bold") -> None:
         console.print(f"[{style}]{escape(heading)}[/] {escape(text)}", soft_wrap=True)
 
-    console.print(f"[bold]{escape(summary.name or summary.path.name)}[/], {summary.duration_s:.1f} s\n", soft_wrap=True)
+    console.print(
+        f"[bold]{escape(summary.name or summary.path.name)}[/], {summary.duration_s:.1f} s\n",
+        soft_wrap=True,
+    )
     topics = Table(box=None, pad_edge=False)
     for heading in ("topic", "type"):
         topics.add_column(heading, overflow="fold")
-    for heading in ("messages", "rate (Hz)", "span (s)", "max gap (s)", "jitter (ms)", "recorded after (s)"):
+    for heading in (
+        "messages",
+        "rate (Hz)",
+        "span (s)",
+        "max gap (s)",
+        "jitter (ms)",
+        "recorded after (s)",
+    ):
         topics.add_column(heading, justify="right")
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
     shown = summary.topics[:MOST_TOPICS]
     for topic in shown:
-        kind = topic.type_name + (f" ({topic.encoding})" if topic.encoding != "cdr" else "")
-        first_s, last_s = ((stamp_ns - origin_ns) * 1e-9 for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns))
-        cells = [topic.name, kind, str(topic.messages), f"{topic.rate_hz:.2f}", f"{first_s:.1f} to {last_s:.1f}"]
+        kind = topic.type_name + (
+            f" ({topic.encoding})" if topic.encoding != "cdr" else ""
+        )
+        first_s, last_s = (
+            (stamp_ns - origin_ns) * 1e-9
+            for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns)
+        )
+        cells = [
+            topic.name,
+            kind,
+            str(topic.messages),
+            f"{topic.rate_hz:.2f}",
+            f"{first_s:.1f} to {last_s:.1f}",
+        ]
         cells += [f"{topic.largest_gap_s:.2f}", f"{1e3 * topic.jitter_s:.2g}"]
-        topics.add_row(*map(escape, [*cells, "-" if topic.lag_s is None else f"{topic.lag_s:.3f}"]))
+        topics.add_row(
+            *map(escape, [*cells, "-" if topic.lag_s is None else f"{topic.lag_s:.3f}"])
+        )
     roles = Table("used for", "topic", "because", box=None, pad_edge=False)
     for role in summary.roles:
-        roles.add_row(escape(role.role.replace("_", " ")), escape(role.topic or "-"), escape(role.reason))
+        roles.add_row(
+            escape(role.role.replace("_", " ")),
+            escape(role.topic or "-"),
+            escape(role.reason),
+        )
     console.print(topics, "", roles, "", sep="\n")
     if len(summary.topics) > len(shown):
-        say("not shown", f"{len(summary.topics) - len(shown)} more topics; --json gives all")
+        say(
+            "not shown",
+            f"{len(summary.topics) - len(shown)} more topics; --json gives all",
+        )
     say("calibration", summary.calibration)
     for subject, note in summary.notes.items():
         say(subject, note)
@@ -133,7 +202,11 @@ def print_summary(summary: LogSummary, findings: list[Finding], grave: set[str],
         console.print("\n[bold]sensors against each other[/] (± 95 %)")
         for finding in findings:
             warned = "warning: " if finding.quantity in grave else ""
-            say(warned + finding.quantity, finding.text(), "bold yellow" if finding.acts else "bold")
+            say(
+                warned + finding.quantity,
+                finding.text(),
+                "bold yellow" if finding.acts else "bold",
+            )
         console.print()
     if large:
         say("large", large, "bold yellow")
@@ -162,8 +235,13 @@ def print_summary(summary: LogSummary, findings: list[Finding], grave: set[str],
                 soft_wrap=True,
             )
         hint = escape(f"sonar-graph inspect {summary.path} --toml > log.toml")
-        say_it = "If it has IMU and Doppler log, say" if summary.has_images_alone else "Say"
-        console.print(f"{say_it} what its topics are: {hint}, edit it, and give --log-config log.toml", soft_wrap=True)
+        say_it = (
+            "If it has IMU and Doppler log, say" if summary.has_images_alone else "Say"
+        )
+        console.print(
+            f"{say_it} what its topics are: {hint}, edit it, and give --log-config log.toml",
+            soft_wrap=True,
+        )
 
 
 @with_options("salvage")
@@ -171,9 +249,16 @@ def calibration(
     reading: ReadingOptions,
     log: Annotated[
         Path | None,
-        typer.Argument(metavar="[LOG]", exists=True, help="MCAP log whose calibration and mountings count."),
+        typer.Argument(
+            metavar="[LOG]",
+            exists=True,
+            help="MCAP log whose calibration and mountings count.",
+        ),
     ] = None,
-    template: Annotated[bool, typer.Option("--template", help="Print all fields with units and defaults.")] = False,
+    template: Annotated[
+        bool,
+        typer.Option("--template", help="Print all fields with units and defaults."),
+    ] = False,
 ) -> None:
     """Print a calibration file to edit: all fields with units, meaning and defaults, and what a log already says."""
     from sonar_graph.calibration import Calibration
@@ -181,14 +266,26 @@ def calibration(
     from sonar_graph.settings import toml_template
 
     if not template:
-        raise CalibrationError("give --template: `sonar-graph calibration --template dive.mcap > vehicle.toml`")
+        raise CalibrationError(
+            "give --template: `sonar-graph calibration --template dive.mcap > vehicle.toml`"
+        )
     stated, source = Calibration(), ""
     if log is not None:
         window = reading.window
         sequence = read_log(
-            log, calibration=reading.given, topics=reading.choices, config=reading.config, window=window
+            log,
+            calibration=reading.given,
+            topics=reading.choices,
+            config=reading.config,
+            window=window,
         )
-        stated, source = sequence.calibration, f"# {log.name}: {sequence.notes['log.calibration']}\n"
+        stated, source = (
+            sequence.calibration,
+            f"# {log.name}: {sequence.notes['log.calibration']}\n",
+        )
     elif reading.given is not None:
         raise CalibrationError("--calibration: give a log too, for which it counts")
-    echo(f"{HEAD}{source}\n{toml_template(Calibration, stated, f'by {log.name}' if log else '')}", nl=False)
+    echo(
+        f"{HEAD}{source}\n{toml_template(Calibration, stated, f'by {log.name}' if log else '')}",
+        nl=False,
+    )

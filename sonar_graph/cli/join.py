@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sonar_graph.cli.arguments import OutputLog, Overwrite, ReadingOptions, echo, with_options
+from sonar_graph.cli.arguments import (
+    OutputLog,
+    Overwrite,
+    ReadingOptions,
+    echo,
+    with_options,
+)
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
 from sonar_graph.errors import LogError
 
@@ -41,7 +47,10 @@ class Seen:
 
     def count_within(self, sequence: Sequence, shift_ns: int) -> int:
         """Number of frames with IMU and Doppler log, once their stamps are moved."""
-        return sum(sequence.start_ns <= stamp_ns + shift_ns <= sequence.end_ns for stamp_ns in self.stamps_ns)
+        return sum(
+            sequence.start_ns <= stamp_ns + shift_ns <= sequence.end_ns
+            for stamp_ns in self.stamps_ns
+        )
 
 
 @with_options("start", "end")
@@ -49,10 +58,18 @@ def join(
     images: Annotated[
         Path,
         typer.Argument(
-            metavar="IMAGES", exists=True, dir_okay=False, help="Log with sonar images, or an .aris or .ddf file."
+            metavar="IMAGES",
+            exists=True,
+            dir_okay=False,
+            help="Log with sonar images, or an .aris or .ddf file.",
         ),
     ],
-    navigation: Annotated[Path, typer.Argument(metavar="NAV", exists=True, help="MCAP log with IMU and Doppler log.")],
+    navigation: Annotated[
+        Path,
+        typer.Argument(
+            metavar="NAV", exists=True, help="MCAP log with IMU and Doppler log."
+        ),
+    ],
     output: OutputLog,
     reading: ReadingOptions,
     offset: Annotated[
@@ -93,25 +110,49 @@ def join(
         alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
         seen = look(log, topic, alone.calibration, salvage=reading.salvage)
         is_stated, around_s = offset is not None and search is None, offset or 0.0
-        require_overlap(images, navigation, sequence, seen, around_s, 0.0 if is_stated else search or SEARCH_S)
-        seconds, said = offset_of(seen, sequence, around_s, search or SEARCH_S, is_stated=is_stated)
+        require_overlap(
+            images,
+            navigation,
+            sequence,
+            seen,
+            around_s,
+            0.0 if is_stated else search or SEARCH_S,
+        )
+        seconds, said = offset_of(
+            seen, sequence, around_s, search or SEARCH_S, is_stated=is_stated
+        )
         shift_ns = round(seconds * NS_PER_S)
-        notes = {f"images.{key}": note for key, note in alone.notes.items() if key != "log.skipped"}
-        record = with_notes(navigation, notes | {"images.file": images.name, "images.clock_offset": said})
-        record |= {"calibration": joined_calibration(log, navigation, topic, reading.given)}
+        notes = {
+            f"images.{key}": note
+            for key, note in alone.notes.items()
+            if key != "log.skipped"
+        }
+        record = with_notes(
+            navigation,
+            notes | {"images.file": images.name, "images.clock_offset": said},
+        )
+        record |= {
+            "calibration": joined_calibration(log, navigation, topic, reading.given)
+        }
         with progress_bars() as progress:
-            blocks = read_sonar_frames(log, topic, salvage=reading.salvage, refused=lambda *_: None)
+            blocks = read_sonar_frames(
+                log, topic, salvage=reading.salvage, refused=lambda *_: None
+            )
             amended = write_amended(
                 navigation,
                 path,
                 [],
-                more=on_the_clock(blocks, shift_ns, lambda done: progress("writing (frames)", done, 0)),
+                more=on_the_clock(
+                    blocks, shift_ns, lambda done: progress("writing (frames)", done, 0)
+                ),
                 metadata={METADATA: record},
                 salvage=reading.salvage,
             )
     echo(f"Clock offset, to be added to the stamps of {images.name}: {said}")
     within = seen.count_within(sequence, shift_ns)
-    echo(f"{len(seen.stamps_ns)} frames, {within} of them while IMU and Doppler log measure")
+    echo(
+        f"{len(seen.stamps_ns)} frames, {within} of them while IMU and Doppler log measure"
+    )
     for note in amended.notes.values():
         echo(f"Not copied: {note}")
     echo(f"Log: {path}\nNext: sonar-graph recognise {path} -o recognised.mcap")
@@ -122,7 +163,9 @@ def refuse_images(navigation: Path) -> None:
     from sonar_graph.logs.mcap import Keep, scan
 
     if TOPIC in scan(navigation, lambda _: Keep.NONE).topics:
-        raise LogError(f"{navigation}: has {TOPIC} already; recognise it as it is, or give a log without images")
+        raise LogError(
+            f"{navigation}: has {TOPIC} already; recognise it as it is, or give a log without images"
+        )
 
 
 @contextmanager
@@ -130,7 +173,10 @@ def as_log(images: Path) -> Iterator[Path]:
     """The file with sonar images as an MCAP log, converted if its suffix is that of a sonar."""
     from sonar_graph.logs.convert import convert_aris, convert_didson
 
-    converters: dict[str, Callable[..., Any]] = {".aris": convert_aris, ".ddf": convert_didson}
+    converters: dict[str, Callable[..., Any]] = {
+        ".aris": convert_aris,
+        ".ddf": convert_didson,
+    }
     convert = converters.get(images.suffix.lower())
     if convert is None and images.suffix.lower() != ".mcap":
         raise LogError(
@@ -142,13 +188,19 @@ def as_log(images: Path) -> Iterator[Path]:
         return
     with TemporaryDirectory() as folder, progress_bars() as progress:
         log = Path(folder) / f"{images.stem}.mcap"
-        done = convert(images, log, progress=lambda at, total: progress(f"converting {images.name}", at, total))
+        done = convert(
+            images,
+            log,
+            progress=lambda at, total: progress(f"converting {images.name}", at, total),
+        )
         for line in done.shortcomings(3):
             echo(line)
         yield log
 
 
-def look(log: Path, topic: str | None, calibration: Calibration, *, salvage: bool) -> Seen:
+def look(
+    log: Path, topic: str | None, calibration: Calibration, *, salvage: bool
+) -> Seen:
     """Motion between all frames of a log, in the plane of the image."""
     from sonar_graph.logs import read_sonar_frames
     from sonar_graph.recognition import ImageMotions, one_by_one
@@ -156,8 +208,14 @@ def look(log: Path, topic: str | None, calibration: Calibration, *, salvage: boo
     motions = ImageMotions(calibration.model_copy(update={"floor": None}))
     seen = Seen([], [], 0.0)
     with progress_bars() as progress:
-        for block in read_sonar_frames(log, topic, salvage=salvage, refused=lambda *_: None):
-            seen = seen if seen.range_m else replace(seen, range_m=float(block.ranges_m.mean()))
+        for block in read_sonar_frames(
+            log, topic, salvage=salvage, refused=lambda *_: None
+        ):
+            seen = (
+                seen
+                if seen.range_m
+                else replace(seen, range_m=float(block.ranges_m.mean()))
+            )
             for frame in one_by_one(block):
                 step = motions.look(frame)
                 seen.stamps_ns.append(int(frame.stamps_ns[0]))
@@ -167,11 +225,18 @@ def look(log: Path, topic: str | None, calibration: Calibration, *, salvage: boo
 
 
 def require_overlap(
-    images: Path, navigation: Path, sequence: Sequence, seen: Seen, around_s: float, search_s: float
+    images: Path,
+    navigation: Path,
+    sequence: Sequence,
+    seen: Seen,
+    around_s: float,
+    search_s: float,
 ) -> None:
     """Refuse images and navigation without common time for any offset within the search."""
     first_ns, last_ns = min(seen.stamps_ns), max(seen.stamps_ns)
-    low_ns, high_ns = (round((around_s + side * search_s) * NS_PER_S) for side in (-1, 1))
+    low_ns, high_ns = (
+        round((around_s + side * search_s) * NS_PER_S) for side in (-1, 1)
+    )
     if first_ns + low_ns <= sequence.end_ns and last_ns + high_ns >= sequence.start_ns:
         return
     apart_s = (sequence.start_ns - first_ns) * 1e-9
@@ -186,7 +251,11 @@ def stretch(start_ns: int, end_ns: int) -> str:
     """Begin and length of a recording; the begin as a date where the clock counts since 1970."""
     seconds = start_ns * 1e-9
     is_dated = 1e8 < seconds < 1e11
-    begin = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC" if is_dated else f"{seconds:.3f} s"
+    begin = (
+        f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
+        if is_dated
+        else f"{seconds:.3f} s"
+    )
     return f"{(end_ns - start_ns) * 1e-9:.0f} s from {begin} on"
 
 
@@ -199,19 +268,30 @@ def offset_of(
     estimate: ClockOffset | None = None
     try:
         with working("estimating the clock offset"):
-            estimate = estimate_offset(seen.steps, sequence, seen.range_m, around_s, search_s)
+            estimate = estimate_offset(
+                seen.steps, sequence, seen.range_m, around_s, search_s
+            )
     except LogError as error:
         if not is_stated:
             raise
-        return around_s, f"{around_s:+.3f} s, as stated; {str(error).rpartition('; ')[0]}"
+        return (
+            around_s,
+            f"{around_s:+.3f} s, as stated; {str(error).rpartition('; ')[0]}",
+        )
     if not is_stated:
         return estimate.seconds, f"{estimate}"
     is_doubted = abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s
-    warning = "; Warning: they do not agree, leave --offset out to take the images' own" if is_doubted else ""
+    warning = (
+        "; Warning: they do not agree, leave --offset out to take the images' own"
+        if is_doubted
+        else ""
+    )
     return around_s, f"{around_s:+.3f} s, as stated; by the images {estimate}{warning}"
 
 
-def on_the_clock(blocks: Iterator[SonarFrames], shift_ns: int, progress: Callable[[int], None]) -> Iterator[Outgoing]:
+def on_the_clock(
+    blocks: Iterator[SonarFrames], shift_ns: int, progress: Callable[[int], None]
+) -> Iterator[Outgoing]:
     """Messages of blocks of frames with their stamps moved, in the order of time; a frame that is late is left out."""
     from sonar_graph.logs import sonar_image_messages
 
@@ -220,6 +300,10 @@ def on_the_clock(blocks: Iterator[SonarFrames], shift_ns: int, progress: Callabl
         late = block.stamps_ns <= latest_ns
         if not late.all():
             latest_ns, done = int(block.stamps_ns[-1]), done + len(block)
-            kept = replace(block, stamps_ns=block.stamps_ns[~late] + shift_ns, intensity=block.intensity[~late])
+            kept = replace(
+                block,
+                stamps_ns=block.stamps_ns[~late] + shift_ns,
+                intensity=block.intensity[~late],
+            )
             yield sonar_image_messages(TOPIC, kept)
         progress(done)

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import DesignsPath, LogPath, Overwrite, ReadingOptions, echo, with_options
+from sonar_graph.cli.arguments import (
+    DesignsPath,
+    LogPath,
+    Overwrite,
+    ReadingOptions,
+    echo,
+    with_options,
+)
 from sonar_graph.cli.outputs import progress_bars, writable_json
 from sonar_graph.errors import LogError
 from sonar_graph.files import interrupt_event
@@ -26,14 +33,29 @@ NONE_TEXT = "none of them"
 @with_options()
 def label(
     log: LogPath,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="LABELS.json", help="File of the labels.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="LABELS.json", help="File of the labels."
+        ),
+    ],
     reading: ReadingOptions,
     designs: DesignsPath = None,
     period: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="Shortest time between the frames that are shown.")
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Shortest time between the frames that are shown.",
+        ),
     ] = 0.5,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free.")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free."),
+    ] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Only print the address.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Click landmarks in a log's sonar images, on a page in the browser; labels are saved after every click.
@@ -43,10 +65,20 @@ def label(
     from sonar_graph.devices import DEFAULT_DESIGNS, load_designs
     from sonar_graph.files import spelt
     from sonar_graph.logs import no_images, read_images_alone, read_sonar_frames
-    from sonar_graph.recognition import LabelDesk, Labels, LabelServer, read_labels, shown_frames
+    from sonar_graph.recognition import (
+        LabelDesk,
+        Labels,
+        LabelServer,
+        read_labels,
+        shown_frames,
+    )
 
     path = writable_json(
-        output, "labels", [log], lambda content: content.keys() == {"log", "labels"}, overwrite=overwrite
+        output,
+        "labels",
+        [log],
+        lambda content: content.keys() == {"log", "labels"},
+        overwrite=overwrite,
     )
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
     is_continued = path.exists() and path.stat().st_size and not overwrite
@@ -61,7 +93,12 @@ def label(
         salvage=reading.salvage,
     )
     blocks = read_sonar_frames(
-        log, topic, reading.config, window=reading.window, salvage=reading.salvage, refused=lambda *_: None
+        log,
+        topic,
+        reading.config,
+        window=reading.window,
+        salvage=reading.salvage,
+        refused=lambda *_: None,
     )
     with progress_bars() as progress:
         frames = shown_frames(
@@ -74,11 +111,22 @@ def label(
         raise LogError(no_images(log, reading.window))
     desk = LabelDesk(frames, labels, path)
     with LabelServer(
-        desk, lambda nonce: page_of(log, path, known, desk, nonce), [one.id for one in known], port
+        desk,
+        lambda nonce: page_of(log, path, known, desk, nonce),
+        [one.id for one in known],
+        port,
     ) as server:
         serve(server, path, labels, is_shown=not no_browser)
-    options = {"--designs": designs, "--calibration": reading.calibration, "--log-config": reading.log_config}
-    given = [f"{name} {shlex.quote(str(value))}" for name, value in options.items() if value is not None]
+    options = {
+        "--designs": designs,
+        "--calibration": reading.calibration,
+        "--log-config": reading.log_config,
+    }
+    given = [
+        f"{name} {shlex.quote(str(value))}"
+        for name, value in options.items()
+        if value is not None
+    ]
     given += [f"--topic {shlex.quote(text)}" for text in reading.topics or []]
     names = f"{shlex.quote(str(log))} --labels {shlex.quote(str(path))}"
     echo(" ".join(["Next: sonar-graph calibrate", names, *given, "-o model.json"]))
@@ -86,7 +134,9 @@ def label(
 
 def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) -> None:
     """Serve until Ctrl-C, then say what there is."""
-    echo(f"{len(server.desk.frames)} frames, {len(labels.labels)} labels so far. The page: {server.address}")
+    echo(
+        f"{len(server.desk.frames)} frames, {len(labels.labels)} labels so far. The page: {server.address}"
+    )
     echo("Ctrl-C ends.")
     if is_shown:
         webbrowser.open(server.address)
@@ -99,7 +149,13 @@ def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) ->
     echo(f"\nLabels: {path} ({len(server.desk.labels)})")
 
 
-def page_of(log: Path, path: Path, designs: tuple[LandmarkDesign, ...], desk: LabelDesk, nonce: str) -> str:
+def page_of(
+    log: Path,
+    path: Path,
+    designs: tuple[LandmarkDesign, ...],
+    desk: LabelDesk,
+    nonce: str,
+) -> str:
     """The page as text."""
     from sonar_graph.report import render
 
@@ -115,6 +171,9 @@ def page_of(log: Path, path: Path, designs: tuple[LandmarkDesign, ...], desk: La
         "none_text": NONE_TEXT,
         "nonce": nonce,
         "choices": [*choices, ("0", NONE, NONE_TEXT)],
-        "seconds": [round((frame.stamp_ns - desk.frames[0].stamp_ns) * 1e-9, 3) for frame in desk.frames],
+        "seconds": [
+            round((frame.stamp_ns - desk.frames[0].stamp_ns) * 1e-9, 3)
+            for frame in desk.frames
+        ],
     }
     return render("label.html", content)

@@ -41,28 +41,54 @@ def live(
         ),
     ] = None,
     domain: DOMAIN = 0,
-    estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
-    rate_hz: Annotated[float, typer.Option(min=0.1, max=100.0, help="Estimates a second.")] = 10.0,
+    estimator: Annotated[
+        str, typer.Option("--estimator", help="Name of an installed estimator.")
+    ] = "isam2",
+    rate_hz: Annotated[
+        float, typer.Option(min=0.1, max=100.0, help="Estimates a second.")
+    ] = 10.0,
     lateness: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="How long an estimate waits for a sensor that is late.")
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="How long an estimate waits for a sensor that is late.",
+        ),
     ] = 0.25,
     settings: EstimatorSettings = None,
     topics: Annotated[
-        list[str] | None, typer.Option("--topic", metavar="ROLE=TOPIC", help="Topic for a role; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            "--topic", metavar="ROLE=TOPIC", help="Topic for a role; may be repeated."
+        ),
     ] = None,
-    log_config: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")] = None,
-    calibration: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")] = None,
+    log_config: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
+    ] = None,
     foxglove: Annotated[
         int | None,
-        typer.Option(metavar="PORT", min=1, max=65535, help="Also serve Foxglove and Lichtblick on 127.0.0.1 (8765)."),
+        typer.Option(
+            metavar="PORT",
+            min=1,
+            max=65535,
+            help="Also serve Foxglove and Lichtblick on 127.0.0.1 (8765).",
+        ),
     ] = None,
     resume: Annotated[
         Path | None,
         typer.Option(
-            metavar="RECORD", exists=True, dir_okay=False, help="Go on after a crash, from its record and calibration."
+            metavar="RECORD",
+            exists=True,
+            dir_okay=False,
+            help="Go on after a crash, from its record and calibration.",
         ),
     ] = None,
-    duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="End after so long.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="End after so long.")
+    ] = None,
 ) -> None:
     """Estimate while the robot moves: topics of ROS 2 over zenoh in, poses and landmarks out, and a record.
 
@@ -71,7 +97,13 @@ def live(
     """
     import numpy as np
 
-    from sonar_graph.evaluation import RunResult, check_request, judge, write_comparison, write_viewer_files
+    from sonar_graph.evaluation import (
+        RunResult,
+        check_request,
+        judge,
+        write_comparison,
+        write_viewer_files,
+    )
     from sonar_graph.live import (
         DEFAULT_ROUTER,
         LiveOptions,
@@ -86,25 +118,47 @@ def live(
     reading = ReadingOptions(calibration, topics, log_config)
     record = output / RECORD
     if record.exists():
-        advice = f"continue it with --resume {record} and another folder" if resume is None else "name another folder"
+        advice = (
+            f"continue it with --resume {record} and another folder"
+            if resume is None
+            else "name another folder"
+        )
         raise LogError(f"{record}: a record is there already: {advice}")
     overrides = estimator_settings(settings, [estimator]).get(estimator, {})
     params = check_request(estimator, overrides)
-    given = reading.given if resume is None else LiveRecord.resumed_calibration(resume, reading.given)
-    options = LiveOptions(estimator, overrides, rate_hz, lateness, reading.choices, reading.config, given)
-    with open_link(connect or [DEFAULT_ROUTER], domain) as link, interrupt_event() as ended:
+    given = (
+        reading.given
+        if resume is None
+        else LiveRecord.resumed_calibration(resume, reading.given)
+    )
+    options = LiveOptions(
+        estimator, overrides, rate_hz, lateness, reading.choices, reading.config, given
+    )
+    with (
+        open_link(connect or [DEFAULT_ROUTER], domain) as link,
+        interrupt_event() as ended,
+    ):
         output.mkdir(parents=True, exist_ok=True)
         outlets = open_outlets(link, foxglove)
         echo("compiling what the estimator needs")
-        with LiveRecord(record) as written, LiveRun(written, link.definition_of, options, outlets, echo) as run:
+        with (
+            LiveRecord(record) as written,
+            LiveRun(written, link.definition_of, options, outlets, echo) as run,
+        ):
             if resume is not None:
-                last_ns = run.catch_up(recorded_messages(resume), dropped_messages(resume))
-                echo(f"resumed from {resume}: blind for {(time.time_ns() - last_ns) * 1e-9:.1f} s")
+                last_ns = run.catch_up(
+                    recorded_messages(resume), dropped_messages(resume)
+                )
+                echo(
+                    f"resumed from {resume}: blind for {(time.time_ns() - last_ns) * 1e-9:.1f} s"
+                )
             else:  # after a crash nobody waits for it
                 run.wait_for_recogniser()
             gc.freeze()  # what was loaded is never looked at again, which would delay a pose
             link.listen(run.accept, run.wants)
-            echo(f"listening to {', '.join(connect or [DEFAULT_ROUTER])}, domain {domain}; the record is {record}")
+            echo(
+                f"listening to {', '.join(connect or [DEFAULT_ROUTER])}, domain {domain}; the record is {record}"
+            )
             last_s = time.monotonic() + (float("inf") if duration is None else duration)
             while not ended.is_set() and time.monotonic() < last_s:
                 run.turn()
@@ -114,7 +168,9 @@ def live(
         record.unlink()
         raise LogError(f"nothing was estimated: {run.lacking()}")
     if outcome is None:
-        raise LogError(f"nothing was estimated: {run.lacking()}; what came is in {record}")
+        raise LogError(
+            f"nothing was estimated: {run.lacking()}; what came is in {record}"
+        )
     counts = run.counts()
     write_json(output / COUNTS, {"estimator": estimator, "messages": counts})
     result = RunResult(
@@ -134,33 +190,60 @@ def live(
         with result_written(output, COMPARISON):
             write_comparison(comparison, output)
             write_viewer_files(comparison, output)
-    echo(f"{sum(counts['received'].values())} messages, {sum(counts['lost'].values())} lost")
+    echo(
+        f"{sum(counts['received'].values())} messages, {sum(counts['lost'].values())} lost"
+    )
     for what in ("lost", "dropped"):
         for name, number in counts[what].items():
             echo(f"{what}: {number} of {name}")
-    echo(f"Results: {output}; the same estimates from the record: sonar-graph run {record} -o DIR")
+    echo(
+        f"Results: {output}; the same estimates from the record: sonar-graph run {record} -o DIR"
+    )
 
 
 def play(
     log: LogPath,
-    rate: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Speed: 2 is twice as fast as recorded.")] = 1.0,
+    rate: Annotated[
+        float,
+        typer.Option(min=1e-3, max=1e3, help="Speed: 2 is twice as fast as recorded."),
+    ] = 1.0,
     listen: Annotated[
-        str, typer.Option(metavar="ENDPOINT", help="Where to listen as a zenoh router; loopback unless named.")
+        str,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Where to listen as a zenoh router; loopback unless named.",
+        ),
     ] = "tcp/127.0.0.1:7447",
     connect: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="Router to send to, instead of listening.")
+        list[str] | None,
+        typer.Option(
+            metavar="ENDPOINT", help="Router to send to, instead of listening."
+        ),
     ] = None,
     domain: DOMAIN = 0,
     wait: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="Longest time to wait for somebody who listens.")
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Longest time to wait for somebody who listens.",
+        ),
     ] = 30.0,
     after: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Wait until this file is there, such as one that a script makes."),
+        typer.Option(
+            metavar="FILE",
+            help="Wait until this file is there, such as one that a script makes.",
+        ),
     ] = None,
 ) -> None:
     """Send the messages of a log over zenoh as a robot would, for rehearsals and tests of `live`."""
-    from sonar_graph.live import Publisher, open_session, play_messages, recorded_messages
+    from sonar_graph.live import (
+        Publisher,
+        open_session,
+        play_messages,
+        recorded_messages,
+    )
 
     session = open_session(connect or (), () if connect else [listen])
     publishers: dict[str, Publisher] = {}
@@ -175,20 +258,32 @@ def play(
         last_s = time.monotonic() + wait
         if wait:
             echo(f"waiting up to {wait:g} s for somebody who listens")
-        while not any(one.is_heard for one in publishers.values()) and time.monotonic() < last_s:
+        while (
+            not any(one.is_heard for one in publishers.values())
+            and time.monotonic() < last_s
+        ):
             if ended.wait(0.05):
                 break
         ended.wait(SETTLE_S)
         while after is not None and not after.exists() and not ended.wait(0.05):
             pass
         echo(f"playing {log} to {', '.join(connect or [listen])}; Ctrl-C ends")
-        wanted = (message for message in recorded_messages(log) if message.topic not in unknown)
+        wanted = (
+            message
+            for message in recorded_messages(log)
+            if message.topic not in unknown
+        )
         count, latest_s = play_messages(
-            wanted, rate, lambda message: publishers[message.topic].put(message.payload), ended.is_set
+            wanted,
+            rate,
+            lambda message: publishers[message.topic].put(message.payload),
+            ended.is_set,
         )
         ended.wait(SETTLE_S)
     session.close()
-    echo(f"{count} messages of {len(publishers)} topics, the latest {latest_s * 1e3:.0f} ms behind its time")
+    echo(
+        f"{count} messages of {len(publishers)} topics, the latest {latest_s * 1e3:.0f} ms behind its time"
+    )
 
 
 def topics_of(log: Path) -> dict[str, str]:
@@ -196,4 +291,8 @@ def topics_of(log: Path) -> dict[str, str]:
     from sonar_graph.logs.mcap import Keep, scan
 
     recording = scan(log, lambda _: Keep.NONE)
-    return {name: topic.type_name for name, topic in recording.topics.items() if topic.encoding == "cdr"}
+    return {
+        name: topic.type_name
+        for name, topic in recording.topics.items()
+        if topic.encoding == "cdr"
+    }

@@ -26,7 +26,12 @@ from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.show import figures, view
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
-from sonar_graph.files import INTERRUPTED, end_at_once, noticed_interrupts, terminations_as_interrupts
+from sonar_graph.files import (
+    INTERRUPTED,
+    end_at_once,
+    noticed_interrupts,
+    terminations_as_interrupts,
+)
 from sonar_graph.version import __version__
 
 MISTAKE = 2
@@ -34,7 +39,9 @@ app = typer.Typer(
     name="sonar-graph",
     help="Landmark SLAM for underwater vehicles: estimators compared on the same log.",
     epilog=examples(
-        "sonar-graph demo -o demo", "sonar-graph inspect dive.mcap", "sonar-graph compare dive.mcap -o comparison"
+        "sonar-graph demo -o demo",
+        "sonar-graph inspect dive.mcap",
+        "sonar-graph compare dive.mcap -o comparison",
     ),
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -42,7 +49,11 @@ app = typer.Typer(
 app.add_typer(worlds)
 app.add_typer(datasets)
 app.add_typer(benches)
-app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"))(inspect)
+app.command(
+    epilog=examples(
+        "sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"
+    )
+)(inspect)
 app.command(
     epilog=examples(
         "sonar-graph calibration --template > vehicle.toml",
@@ -82,12 +93,25 @@ app.command(
     )
 )(calibrate)
 app.command(
-    epilog=examples("sonar-graph live -o dive", "sonar-graph live -o dive --calibration vehicle.toml --foxglove 8765")
+    epilog=examples(
+        "sonar-graph live -o dive",
+        "sonar-graph live -o dive --calibration vehicle.toml --foxglove 8765",
+    )
 )(live)
-app.command(epilog=examples("sonar-graph play dive.mcap", "sonar-graph play dive.mcap --rate 3"))(play)
+app.command(
+    epilog=examples("sonar-graph play dive.mcap", "sonar-graph play dive.mcap --rate 3")
+)(play)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
-app.command(epilog=examples("sonar-graph figures comparison", "sonar-graph figures comparison -o paper"))(figures)
-app.command(epilog=examples("sonar-graph view comparison", "sonar-graph view comparison --viewer browser"))(view)
+app.command(
+    epilog=examples(
+        "sonar-graph figures comparison", "sonar-graph figures comparison -o paper"
+    )
+)(figures)
+app.command(
+    epilog=examples(
+        "sonar-graph view comparison", "sonar-graph view comparison --viewer browser"
+    )
+)(view)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 
@@ -102,7 +126,13 @@ def show_version(wanted: bool) -> None:
 @app.callback()
 def of_all_commands(
     version: Annotated[
-        bool, typer.Option("--version", callback=show_version, is_eager=True, help="Show the version and exit.")
+        bool,
+        typer.Option(
+            "--version",
+            callback=show_version,
+            is_eager=True,
+            help="Show the version and exit.",
+        ),
     ] = False,
 ) -> None:
     """Landmark SLAM for underwater vehicles: estimators compared on the same log."""
@@ -126,7 +156,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is None and sys.getprofile() is sys.gettrace() is None:
         with contextlib.suppress(OSError):  # nobody reads it any more
             sys.stdout.flush()
-        os._exit(int(code or 0))  # the ordinary end takes a while, in which a Ctrl-C would have the last word
+        # the ordinary end takes a while, in which a Ctrl-C would have the last word
+        os._exit(int(code or 0))
     sys.exit(int(code or 0))
 
 
@@ -140,7 +171,9 @@ def _run(given: list[str]) -> int | None:
             raise
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "sonar-graph"
-        return _complain(f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE)
+        return _complain(
+            f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE
+        )
 
 
 def _complain(message: str, code: int) -> int:

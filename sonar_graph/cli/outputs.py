@@ -29,13 +29,19 @@ def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> 
     package did not write, or its folder cannot be written to.
     """
     if path.is_dir():
-        raise LogError(f"{path}: is a folder; give the name of a file such as {path / 'log.mcap'}")
+        raise LogError(
+            f"{path}: is a folder; give the name of a file such as {path / 'log.mcap'}"
+        )
     if path.suffix != ".mcap":
         raise LogError(f"{path}: logs are MCAP files; give a name that ends in .mcap")
     if any(source is not None and _is_part_of(path, source) for source in sources):
-        raise LogError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
+        raise LogError(
+            f"{path}: is what is read, and would be overwritten; choose another name with -o"
+        )
     if not (overwrite or _is_replaceable(path)):
-        raise LogError(f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite")
+        raise LogError(
+            f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
+        )
     _require_writing_in(path.parent, path, LogError)
     if path.exists() and path.stat().st_size:
         echo(f"Replaces {path}", err=True)
@@ -43,7 +49,12 @@ def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> 
 
 
 def writable_json(
-    path: Path, what: str, sources: Iterable[Path], is_own: Callable[[dict[str, Any]], bool], *, overwrite: bool = False
+    path: Path,
+    what: str,
+    sources: Iterable[Path],
+    is_own: Callable[[dict[str, Any]], bool],
+    *,
+    overwrite: bool = False,
 ) -> Path:
     """Check that a JSON file of ``what`` can be written, and return ``path``.
 
@@ -52,7 +63,9 @@ def writable_json(
     if path.is_dir() or path.suffix != ".json":
         raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
     if any(_is_part_of(path, source) for source in sources):
-        raise EvaluationError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
+        raise EvaluationError(
+            f"{path}: is what is read, and would be overwritten; choose another name with -o"
+        )
     if not overwrite and path.exists() and (not path.is_file() or path.stat().st_size):
         content: dict[str, Any] = {}
         with suppress(EvaluationError):
@@ -73,7 +86,11 @@ def writable_page(path: Path, *, overwrite: bool = False) -> Path:
     """
     if path.is_dir() or path.suffix != ".html":
         raise EvaluationError(f"{path}: expected the name of a file that ends in .html")
-    if not overwrite and path.exists() and OWN_PAGE not in path.read_text("utf-8", errors="replace"):
+    if (
+        not overwrite
+        and path.exists()
+        and OWN_PAGE not in path.read_text("utf-8", errors="replace")
+    ):
         raise EvaluationError(
             f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
         )
@@ -112,26 +129,40 @@ def _is_part_of(path: Path, source: Path) -> bool:
     """True if a file is the source, also through links, or lies in the folder that is the source."""
     if not path.exists():
         return False
-    return path.samefile(source) or (source.is_dir() and path.resolve().is_relative_to(source.resolve()))
+    return path.samefile(source) or (
+        source.is_dir() and path.resolve().is_relative_to(source.resolve())
+    )
 
 
 def _is_replaceable(path: Path) -> bool:
     """True if there is no file, an empty one, or a log that this package wrote."""
     from sonar_graph.logs.mcap import is_own_log
 
-    return not path.exists() or (path.is_file() and (path.stat().st_size == 0 or is_own_log(path)))
+    return not path.exists() or (
+        path.is_file() and (path.stat().st_size == 0 or is_own_log(path))
+    )
 
 
-def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]) -> None:
+def _require_writing_in(
+    folder: Path, path: Path, refusal: type[SonarGraphError]
+) -> None:
     """Try to write to a folder, or where it would be made; an error names the path that was asked for.
 
     Nothing is made for that: another command may be about to write there.
     """
     try:
-        with TemporaryFile(dir=next(one for one in (folder, *folder.parents) if one.exists() or one.is_symlink())):
+        with TemporaryFile(
+            dir=next(
+                one
+                for one in (folder, *folder.parents)
+                if one.exists() or one.is_symlink()
+            )
+        ):
             pass
     except OSError as error:
-        raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
+        raise refusal(
+            f"{path}: cannot be written: {error.strerror}; choose another place with -o"
+        ) from error
 
 
 Report = Callable[..., None]
@@ -142,9 +173,15 @@ Report = Callable[..., None]
 def progress_bars() -> Iterator[Report]:
     """Progress bars, one for each name of work, while the context is open."""
     console = Console(stderr=True)
-    bar = (BarColumn(), TextColumn("{task.fields[remark]}"), TimeRemainingColumn(elapsed_when_finished=True))
+    bar = (
+        BarColumn(),
+        TextColumn("{task.fields[remark]}"),
+        TimeRemainingColumn(elapsed_when_finished=True),
+    )
     columns = (TextColumn("{task.description}"), *bar)
-    bars = Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
+    bars = Progress(
+        *columns, console=console, disable=not console.is_terminal, transient=True
+    )
     tasks = {}
 
     def show(what: str, done: int, total: int, remark: str = "") -> None:

@@ -23,7 +23,13 @@ from sonar_graph.cli.arguments import (
     validated,
     with_options,
 )
-from sonar_graph.cli.outputs import progress_bars, working, writable_json, writable_log, writable_page
+from sonar_graph.cli.outputs import (
+    progress_bars,
+    working,
+    writable_json,
+    writable_log,
+    writable_page,
+)
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing
 
@@ -32,7 +38,12 @@ if TYPE_CHECKING:
     from sonar_graph.devices import LandmarkDesign
     from sonar_graph.images import SonarFrames
     from sonar_graph.logs import ImagesAlone
-    from sonar_graph.recognition import LandmarkRecogniser, MotionFrom, Recognition, TrackStories
+    from sonar_graph.recognition import (
+        LandmarkRecogniser,
+        MotionFrom,
+        Recognition,
+        TrackStories,
+    )
     from sonar_graph.sequence import Sequence
     from sonar_graph.sonar import RecogniserParams
 
@@ -47,7 +58,8 @@ FEW_TRACKS = 10
 RecogniserName = Annotated[
     Literal["designs", "actag"],
     typer.Option(
-        "--recogniser", help="designs: ours; actag: AcTag's own detector, which sees AcTags only (extra actag)."
+        "--recogniser",
+        help="designs: ours; actag: AcTag's own detector, which sees AcTags only (extra actag).",
     ),
 ]
 Motion = Annotated[
@@ -78,7 +90,10 @@ class RecogniserOptions:
     designs: DesignsPath = None
     model: Annotated[
         Path | None,
-        existing_file("How often landmarks look like which, as calibrate measured it.", "MODEL.json"),
+        existing_file(
+            "How often landmarks look like which, as calibrate measured it.",
+            "MODEL.json",
+        ),
     ] = None
     rule: Annotated[
         str | None,
@@ -112,11 +127,16 @@ class RecogniserOptions:
             identity["rule"] = self.rule
         if self.model is not None:
             values["confusion"] = confusion = read_confusion(self.model)
-            confusion.check_designs(self.read_designs() or DEFAULT_DESIGNS, str(self.model))
+            confusion.check_designs(
+                self.read_designs() or DEFAULT_DESIGNS, str(self.model)
+            )
         return validated(RecogniserParams, values, "recogniser")
 
     def recogniser(
-        self, calibration: Calibration, settings: list[str] | None = None, name: str = "designs"
+        self,
+        calibration: Calibration,
+        settings: list[str] | None = None,
+        name: str = "designs",
     ) -> LandmarkRecogniser:
         """The recogniser of that name."""
         from sonar_graph.sonar import AcTagRecogniser, AcTagSettings, Recogniser
@@ -127,7 +147,9 @@ class RecogniserOptions:
             raise typer.BadParameter(
                 "--designs, --model and --rule are not for actag, which knows its own tags: use --set"
             )
-        return AcTagRecogniser(calibration, validated(AcTagSettings, nested_settings(settings), "actag"))
+        return AcTagRecogniser(
+            calibration, validated(AcTagSettings, nested_settings(settings), "actag")
+        )
 
 
 @with_options("start", "end")
@@ -141,7 +163,10 @@ def recognise(
     settings: Settings = None,
     report: Annotated[
         Path | None,
-        typer.Option(metavar="PAGE.html", help="Page to write: every track with picture, probabilities and fate."),
+        typer.Option(
+            metavar="PAGE.html",
+            help="Page to write: every track with picture, probabilities and fate.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -169,13 +194,19 @@ def recognise(
     made = recognition.recogniser(sequence.calibration, settings, recogniser)
     stories = TrackStories(sequence.calibration.sonar.image) if page else None
     if stories is not None and not isinstance(made, Recogniser):
-        raise typer.BadParameter("--report shows the tracks of the recogniser of designs; actag has none")
+        raise typer.BadParameter(
+            "--report shows the tracks of the recogniser of designs; actag has none"
+        )
     found = recognise_log(log, sequence, reading, made, motion, stories)
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
         notes = sequence.notes
-        losses = {f"copied.{k}": f"{log.name}: {notes[k]}" for k in ("log.ending", "log.damage") if k in notes}
+        losses = {
+            f"copied.{k}": f"{log.name}: {notes[k]}"
+            for k in ("log.ending", "log.damage")
+            if k in notes
+        }
         amended = write_amended(
             log,
             path,
@@ -188,20 +219,28 @@ def recognise(
             salvage=reading.salvage,
         )
     out = answers()
-    out.print(f"{found.frames} frames, {0 if found.detections is None else len(found.detections)} detections")
+    out.print(
+        f"{found.frames} frames, {0 if found.detections is None else len(found.detections)} detections"
+    )
     for outcome, count in found.outcomes.most_common():
         out.print(f"  {count:6d}  {outcome}")
     for line in found.naming(getattr(sequence, "true_landmarks", None)):
         if page is None or line != SEE_TRACKS:
             out.print(line, markup=False)
     if motion != "navigation":
-        has_navigation = not lacking_navigation(log, reading.choices, reading.config, reading.window)
-        for line in without_navigation(found, f"as --motion {motion} asks" if has_navigation else ""):
+        has_navigation = not lacking_navigation(
+            log, reading.choices, reading.config, reading.window
+        )
+        for line in without_navigation(
+            found, f"as --motion {motion} asks" if has_navigation else ""
+        ):
             echo(f"Without navigation: {line}")
     for stamp_ns, reason in found.warnings[:MOST_WARNINGS_SHOWN]:
         out.print(f"Warning: {(stamp_ns - sequence.start_ns) * 1e-9:.3f} s: {reason}")
     if (more := sum(found.warned().values()) - MOST_WARNINGS_SHOWN) > 0:
-        out.print(f"Warning: {more} more such rows; with their stamps in the log's metadata record {RECORD}")
+        out.print(
+            f"Warning: {more} more such rows; with their stamps in the log's metadata record {RECORD}"
+        )
     if recognition.designs is None and recogniser == "designs":
         warn_of_other_designs(sequence)
     for topic, count in amended.replaced.items():
@@ -217,8 +256,16 @@ def recognise(
 
 @with_options("start", "end")
 def calibrate(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, help="Logs with images and truth.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="MODEL.json", help="File to write.")],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG...", exists=True, help="Logs with images and truth."
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="MODEL.json", help="File to write."),
+    ],
     reading: ReadingOptions,
     labels: Annotated[
         list[Path] | None,
@@ -240,26 +287,40 @@ def calibrate(
 
     sources = [*logs, *(labels or [])]
     path = writable_json(
-        output, "a model", sources, lambda content: "ids" in content and "matrix" in content, overwrite=overwrite
+        output,
+        "a model",
+        sources,
+        lambda content: "ids" in content and "matrix" in content,
+        overwrite=overwrite,
     )
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
-            raise LogError(f"{log}: is named twice, and its frames would count twice; name each log once")
+            raise LogError(
+                f"{log}: is named twice, and its frames would count twice; name each log once"
+            )
     if labels and len(labels) != len(logs):
-        raise LogError(f"{len(logs)} logs and {len(labels)} files for --labels; give one for each log, in their order")
+        raise LogError(
+            f"{len(logs)} logs and {len(labels)} files for --labels; give one for each log, in their order"
+        )
     if motion is not None and not labels:
-        raise typer.BadParameter("--motion is for --labels: a log with truth has IMU and Doppler log")
+        raise typer.BadParameter(
+            "--motion is for --labels: a log with truth has IMU and Doppler log"
+        )
     recognition = RecogniserOptions(designs)
     params, known = recognition.params(settings), recognition.read_designs()
     topic, salvage = reading.choices.get("sonar"), reading.salvage
     with working("calibrating"):
         if labels:
-            given = [read_labels(file, log) for log, file in zip(logs, labels, strict=True)]
+            given = [
+                read_labels(file, log) for log, file in zip(logs, labels, strict=True)
+            ]
             runs = [with_motion(log, reading, motion) for log in logs]
             measured = calibrate_by_labels(
                 [
                     LabelledLog(log, run, own, file, how)
-                    for log, file, own, (run, how) in zip(logs, labels, given, runs, strict=True)
+                    for log, file, own, (run, how) in zip(
+                        logs, labels, given, runs, strict=True
+                    )
                 ],
                 topic=topic,
                 config=reading.config,
@@ -282,8 +343,12 @@ def calibrate(
         answers().print(measured.provenance[f"labels {number}"])
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
-        frames, tracks = (measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks"))
-        answers().print(f"  {name}: {frames} frame{'s'[frames == '1' :]}, {tracks} track{'s'[tracks == '1' :]}")
+        frames, tracks = (
+            measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks")
+        )
+        answers().print(
+            f"  {name}: {frames} frame{'s'[frames == '1' :]}, {tracks} track{'s'[tracks == '1' :]}"
+        )
         few += [name] if int(tracks) < FEW_TRACKS else []
     answers().print(
         f"  range sigma {1e3 * measured.range_sigma_m:.1f} mm, across {1e3 * measured.across_sigma_m:.1f} mm, "
@@ -295,11 +360,15 @@ def calibrate(
             "give more logs before the model is relied on"
         )
     if assumed := measured.provenance.get("confusion matrix"):
-        answers().print(f"Confusion matrix, which the rule of 2014 alone uses: {assumed}")
+        answers().print(
+            f"Confusion matrix, which the rule of 2014 alone uses: {assumed}"
+        )
     echo(f"Model: {path}")
 
 
-def with_motion(log: Path, reading: ReadingOptions, motion: MotionFrom | None) -> tuple[Run, MotionFrom]:
+def with_motion(
+    log: Path, reading: ReadingOptions, motion: MotionFrom | None
+) -> tuple[Run, MotionFrom]:
     """Read what goes with a log's images, and say how the sonar's motion will be known."""
     from sonar_graph.logs import lacking_navigation, read_images_alone
 
@@ -329,9 +398,13 @@ def without_navigation(found: Recognition, asked: str = "") -> list[str]:
     motion, lines = found.notes["detections.motion"], []
     lines.append(f"motion {motion}")
     if motion.startswith("none"):
-        lines.append("frames of a sonar at rest repeat their speckle, so that each track counts once")
+        lines.append(
+            "frames of a sonar at rest repeat their speckle, so that each track counts once"
+        )
     if NO_FLOOR not in found.outcomes:
-        lines.append("height and tilt are taken to stay those of the calibration's start")
+        lines.append(
+            "height and tilt are taken to stay those of the calibration's start"
+        )
     if asked:
         lines.append(f"the log's IMU and Doppler log are not used, {asked}")
     else:
@@ -376,4 +449,6 @@ def warn_of_other_designs(sequence: Run) -> None:
     """Print a warning if a log's notes name designs of its own, which were not looked for."""
     named = re.search(r'"designs":"([^"]+)"', sequence.notes.get("options", ""))
     if named is not None:
-        answers().print(f"Warning: the log was made with the designs of {named[1]}; give them with --designs")
+        answers().print(
+            f"Warning: the log was made with the designs of {named[1]}; give them with --designs"
+        )

@@ -36,18 +36,35 @@ class Viewer:
 
 VIEWERS = {
     "lichtblick": Viewer(
-        ("lichtblick", "Lichtblick"), "Lichtblick", True, "https://github.com/lichtblick-suite/lichtblick"
+        ("lichtblick", "Lichtblick"),
+        "Lichtblick",
+        True,
+        "https://github.com/lichtblick-suite/lichtblick",
     ),
-    "foxglove": Viewer(("foxglove", "foxglove-studio"), "Foxglove", True, "https://foxglove.dev/download"),
+    "foxglove": Viewer(
+        ("foxglove", "foxglove-studio"),
+        "Foxglove",
+        True,
+        "https://foxglove.dev/download",
+    ),
     "rerun": Viewer(("rerun",), "Rerun", False, "pip install rerun-sdk"),
 }
 """In the order in which they are tried."""
 
 
 def figures(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help=f"{RESULT}.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", exists=True, file_okay=False, help=f"{RESULT}."),
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to. Default: DIR/paper.")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder to write to. Default: DIR/paper.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -60,33 +77,57 @@ def figures(
     from sonar_graph.report import write_paper
 
     target = folder / "paper" if output is None else output
-    with working("drawing"), writable_folder(target, [], kind=PAPER, overwrite=overwrite):
+    with (
+        working("drawing"),
+        writable_folder(target, [], kind=PAPER, overwrite=overwrite),
+    ):
         document = write_paper(
-            read_batch(folder) if is_batch(folder) else read_comparison(folder), target, overwrite=overwrite
+            read_batch(folder) if is_batch(folder) else read_comparison(folder),
+            target,
+            overwrite=overwrite,
         )
     echo(f"Figures and tables: {document}")
 
 
 def view(
-    result: Annotated[Path, typer.Argument(metavar="RESULT", exists=True, help=f"{RESULT}, or its result.mcap.")],
+    result: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULT", exists=True, help=f"{RESULT}, or its result.mcap."
+        ),
+    ],
     viewer: Annotated[
         str | None,
-        typer.Option("--viewer", metavar="NAME", help=f"{', '.join(VIEWERS)} or browser. Default: the first found."),
+        typer.Option(
+            "--viewer",
+            metavar="NAME",
+            help=f"{', '.join(VIEWERS)} or browser. Default: the first found.",
+        ),
     ] = None,
 ) -> None:
     """Open a result in Lichtblick, Foxglove or rerun, whichever is there; else its report in the browser."""
     log, page = files_of(result)
     if viewer not in (None, "browser", *VIEWERS):
-        raise EvaluationError(f"--viewer {viewer}: expected {', '.join(VIEWERS)} or browser")
-    found = {name: command for name, one in VIEWERS.items() if (command := command_of(one))}
+        raise EvaluationError(
+            f"--viewer {viewer}: expected {', '.join(VIEWERS)} or browser"
+        )
+    found = {
+        name: command for name, one in VIEWERS.items() if (command := command_of(one))
+    }
     asked = viewer if viewer is not None else next(iter(found), "browser")
     if asked in VIEWERS and asked not in found:
-        raise EvaluationError(f"--viewer {asked}: is not installed: {VIEWERS[asked].install}")
+        raise EvaluationError(
+            f"--viewer {asked}: is not installed: {VIEWERS[asked].install}"
+        )
     if asked in VIEWERS and log is None:
-        raise EvaluationError(f"{result}: has no {RESULT_LOG} for {asked}; compare and run write one")
+        raise EvaluationError(
+            f"{result}: has no {RESULT_LOG} for {asked}; compare and run write one"
+        )
     if log is None or asked == "browser":
         if asked == "browser" and viewer is None:
-            advice = "; ".join(f"{name}: {one.install}" for name, one in VIEWERS.items())
+            advice = "; ".join(
+                f"{name}: {one.install}" for name, one in VIEWERS.items()
+            )
             echo(f"No viewer for {RESULT_LOG} is installed ({advice})", err=True)
         if page is None:
             if result.is_file() and result.name != RESULT_LOG:
@@ -95,12 +136,17 @@ def view(
                     f"`sonar-graph compare {result} -o DIR` makes a result of it"
                 )
             folder = result if result.is_dir() else result.parent
-            raise EvaluationError(f"{result}: has no {PAGE}; sonar-graph report {folder} writes it")
+            raise EvaluationError(
+                f"{result}: has no {PAGE}; sonar-graph report {folder} writes it"
+            )
         is_open = has_screen() and webbrowser.open(page.absolute().as_uri())
         echo(f"{'Opened' if is_open else 'No screen here; open'} {page}")
         return
     if not has_screen():
-        echo(f"No screen here; open {log} with {asked}" + (f", or {page} in a browser" if page else ""))
+        echo(
+            f"No screen here; open {log} with {asked}"
+            + (f", or {page} in a browser" if page else "")
+        )
         return
     subprocess.Popen(
         [*found[asked], str(log.absolute())],
@@ -110,7 +156,11 @@ def view(
         start_new_session=True,
     )
     layout = log.parent / LAYOUT
-    told = f"; import {layout} as its layout" if VIEWERS[asked].takes_layout and layout.is_file() else ""
+    told = (
+        f"; import {layout} as its layout"
+        if VIEWERS[asked].takes_layout and layout.is_file()
+        else ""
+    )
     echo(f"Opened {log} with {asked}{told}")
 
 
@@ -121,11 +171,15 @@ def files_of(result: Path) -> tuple[Path | None, Path | None]:
     """
     folder = result if result.is_dir() else result.parent
     if result.is_file() and result.suffix != ".mcap":
-        raise EvaluationError(f"{result}: expected the folder of a result, or its {RESULT_LOG}")
+        raise EvaluationError(
+            f"{result}: expected the folder of a result, or its {RESULT_LOG}"
+        )
     log = folder / RESULT_LOG if result.is_dir() else result
     page = folder / PAGE
     if not log.is_file() and not page.is_file():
-        raise EvaluationError(f"{result}: holds neither {RESULT_LOG} nor {PAGE}; give the folder that compare wrote")
+        raise EvaluationError(
+            f"{result}: holds neither {RESULT_LOG} nor {PAGE}; give the folder that compare wrote"
+        )
     return (log if log.is_file() else None), (page if page.is_file() else None)
 
 
@@ -134,11 +188,16 @@ def command_of(viewer: Viewer) -> list[str]:
     for name in viewer.commands:
         if path := shutil.which(name):
             return [path]
-    if sys.platform == "darwin" and Path(f"/Applications/{viewer.application}.app").is_dir():
+    if (
+        sys.platform == "darwin"
+        and Path(f"/Applications/{viewer.application}.app").is_dir()
+    ):
         return ["open", "-a", viewer.application]
     return []
 
 
 def has_screen() -> bool:
     """True where windows can be shown."""
-    return sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.platform in ("darwin", "win32") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )

@@ -29,14 +29,25 @@ if TYPE_CHECKING:
 def landmarks(
     log: Annotated[
         Path,
-        typer.Option("--on", metavar="LOG", exists=True, help="MCAP log with a reference trajectory."),
+        typer.Option(
+            "--on",
+            metavar="LOG",
+            exists=True,
+            help="MCAP log with a reference trajectory.",
+        ),
     ],
     output: OutputLog,
     reading: ReadingOptions,
-    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
+    ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any other option of the landmarks; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any other option of the landmarks; may be repeated.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -51,7 +62,9 @@ def landmarks(
         sequence = add_landmarks(reading.read(log), options)
         write_log(path, sequence)
     detections, placed = sequence.detections, sequence.true_landmarks
-    echo(f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}")
+    echo(
+        f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}"
+    )
 
 
 _OTHERS = (
@@ -96,32 +109,65 @@ worlds.command(
 )
 def basin(
     output: OutputLog,
-    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")] = None,
-    duration_s: Annotated[float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")] = None,
-    laps: Annotated[int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")] = None,
-    imu: Annotated[str | None, typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1.")] = None,
-    dvl: Annotated[str | None, typer.Option(help="Preset of the Doppler log: workhorse (default) or explorer.")] = None,
-    no_bias: Annotated[bool, typer.Option("--no-bias", help="Gyros without bias.")] = False,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
+    ] = None,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")
+    ] = None,
+    laps: Annotated[
+        int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")
+    ] = None,
+    imu: Annotated[
+        str | None,
+        typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1."),
+    ] = None,
+    dvl: Annotated[
+        str | None,
+        typer.Option(
+            help="Preset of the Doppler log: workhorse (default) or explorer."
+        ),
+    ] = None,
+    no_bias: Annotated[
+        bool, typer.Option("--no-bias", help="Gyros without bias.")
+    ] = False,
     images: Annotated[
         bool,
-        typer.Option("--images", help="Record sonar images, in which landmarks are still to be found, not detections."),
+        typer.Option(
+            "--images",
+            help="Record sonar images, in which landmarks are still to be found, not detections.",
+        ),
     ] = False,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help=f"Any other option of the basin; may be repeated: {_OTHERS}."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help=f"Any other option of the basin; may be repeated: {_OTHERS}.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections or images."""
     from sonar_graph.simulation import LANDMARKS_XY_M, BasinOptions, designs_laid
 
-    flags = {"seed": seed, "duration_s": duration_s, "laps": laps, "imu": imu, "dvl": dvl}
-    values: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
+    flags = {
+        "seed": seed,
+        "duration_s": duration_s,
+        "laps": laps,
+        "imu": imu,
+        "dvl": dvl,
+    }
+    values: dict[str, Any] = {
+        name: value for name, value in flags.items() if value is not None
+    }
     if no_bias:
         values["gyro_bias_scale"] = 0.0
     given = nested_settings(settings)
     if "image" in given and not images:
-        raise typer.BadParameter("--set image.NAME=VALUE is for sonar images: give --images too, or leave it out")
+        raise typer.BadParameter(
+            "--set image.NAME=VALUE is for sonar images: give --images too, or leave it out"
+        )
     if images:
         values["image"] = {}
     options = validated(BasinOptions, values | given, "basin")
@@ -129,7 +175,9 @@ def basin(
     write_basin(path, options)
     if options.image is not None:
         placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
-        laid = ", ".join(f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed)
+        laid = ", ".join(
+            f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed
+        )
         echo(f"Landmarks: {laid}")
     echo(f"Log: {path}")
 

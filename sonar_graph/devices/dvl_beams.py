@@ -63,7 +63,13 @@ def velocity_of_beams(
         is_measured = geometry > max(_LEAST_SHARE * geometry[-1], np.finfo(float).tiny)
         per_geometry = 1.0 / np.where(is_measured, geometry, 1.0)
         inverse = (axes * (per_geometry * is_measured)) @ axes.T @ beams.T
-        variances = np.where(is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2)
-        along = along_m_s[rows][:, pattern, None]  # each ping by itself: its bits do not depend on the others
-        velocity[rows], covariance[rows] = (inverse @ along)[:, :, 0], (axes * variances) @ axes.T
+        variances = np.where(
+            is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2
+        )
+        # each ping by itself: its bits do not depend on the others
+        along = along_m_s[rows][:, pattern, None]
+        velocity[rows], covariance[rows] = (
+            (inverse @ along)[:, :, 0],
+            (axes * variances) @ axes.T,
+        )
     return velocity, covariance

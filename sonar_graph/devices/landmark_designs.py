@@ -88,7 +88,11 @@ class LandmarkDesign:
     @property
     def standing_m(self) -> float:
         """Height by which its bright parts stand over what is around them, at most its own."""
-        return self.height_m if self.relief_m is None else min(self.relief_m, self.height_m)
+        return (
+            self.height_m
+            if self.relief_m is None
+            else min(self.relief_m, self.height_m)
+        )
 
     @cached_property
     def figure_m(self) -> tuple[float, float]:
@@ -99,35 +103,51 @@ class LandmarkDesign:
         """
         pixel_m = self.size_m / len(self.mask)
         is_bright = (np.nan_to_num(self.mask) >= LEAST_BRIGHT_DB).astype(np.uint8)
-        joined = cv2.morphologyEx(is_bright, cv2.MORPH_CLOSE, np.ones(2 * [round(JOINED_M / pixel_m) // 2 * 2 + 1]))
+        joined = cv2.morphologyEx(
+            is_bright,
+            cv2.MORPH_CLOSE,
+            np.ones(2 * [round(JOINED_M / pixel_m) // 2 * 2 + 1]),
+        )
         _, _, stats, centres = cv2.connectedComponentsWithStats(joined, connectivity=8)
         areas = stats[1:, cv2.CC_STAT_AREA]
         places_m = pixel_m * (centres[1:] - (len(self.mask) - 1) / 2) * [1.0, -1.0]
         away_m = np.hypot(*places_m.T)
-        if not len(areas) or away_m[best := np.lexsort((away_m, -areas))[0]] < CENTRED_M:
+        if (
+            not len(areas)
+            or away_m[best := np.lexsort((away_m, -areas))[0]] < CENTRED_M
+        ):
             return 0.0, 0.0
         return float(places_m[best, 0]), float(places_m[best, 1])
 
     def level_db(self, x_m: Floats, y_m: Floats) -> Floats:
         """Level over the floor at points of the design's frame (origin at its centre); NaN outside."""
         pixels = len(self.mask)
-        column = np.floor((np.asarray(x_m) / self.size_m + 0.5) * pixels).astype(np.int64)
+        column = np.floor((np.asarray(x_m) / self.size_m + 0.5) * pixels).astype(
+            np.int64
+        )
         row = np.floor((0.5 - np.asarray(y_m) / self.size_m) * pixels).astype(np.int64)
         inside = (column >= 0) & (column < pixels) & (row >= 0) & (row < pixels)
         last = pixels - 1
-        return np.where(inside, self.mask[np.clip(row, 0, last), np.clip(column, 0, last)], np.nan)
+        return np.where(
+            inside, self.mask[np.clip(row, 0, last), np.clip(column, 0, last)], np.nan
+        )
 
     def digest(self) -> str:
         """16 hexadecimal digits that change with name, size, height, relief or mask (from 0.01 dB on)."""
-        counts = np.where(np.isnan(self.mask), -(2**31), np.round(100 * np.nan_to_num(self.mask)))
+        counts = np.where(
+            np.isnan(self.mask), -(2**31), np.round(100 * np.nan_to_num(self.mask))
+        )
         relief = "" if self.relief_m is None else f"{self.relief_m:.6f}\n"
         text = f"{self.name}\n{self.size_m:.6f}\n{self.height_m:.6f}\n{relief}{self.mask.shape}\n"
-        return hashlib.sha256(text.encode() + counts.astype("<i4").tobytes()).hexdigest()[:16]
+        return hashlib.sha256(
+            text.encode() + counts.astype("<i4").tobytes()
+        ).hexdigest()[:16]
 
     def looks_like(self, other: LandmarkDesign) -> bool:
         """True for a design with the same size and mask, turned by quarters or not."""
         return self.size_m == other.size_m and any(
-            np.array_equal(np.rot90(self.mask, quarters), other.mask, equal_nan=True) for quarters in range(4)
+            np.array_equal(np.rot90(self.mask, quarters), other.mask, equal_nan=True)
+            for quarters in range(4)
         )
 
 
@@ -141,7 +161,9 @@ class _Shape(Section):
     @model_validator(mode="after")
     def _is_one_shape(self) -> _Shape:
         if (self.circle_m is None) == (self.polygon_m is None):
-            raise ValueError("give either circle_m = [x, y, radius] or polygon_m = [[x, y], ...]")
+            raise ValueError(
+                "give either circle_m = [x, y, radius] or polygon_m = [[x, y], ...]"
+            )
         return self
 
     def covers(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
@@ -150,7 +172,9 @@ class _Shape(Section):
             centre_x, centre_y, radius = self.circle_m
             return np.asarray(np.hypot(x_m - centre_x, y_m - centre_y) <= radius)
         vertices, inside = np.array(self.polygon_m), np.zeros(np.shape(x_m), dtype=bool)
-        for (x1, y1), (x2, y2) in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
+        for (x1, y1), (x2, y2) in zip(
+            vertices, np.roll(vertices, -1, axis=0), strict=True
+        ):
             if y1 != y2:  # a ray to the right crosses the edges an odd number of times
                 crossing = x1 + (y_m - y1) * (x2 - x1) / (y2 - y1)
                 inside ^= ((y1 > y_m) != (y2 > y_m)) & (x_m < crossing)
@@ -198,14 +222,18 @@ class _Entry(Section):
                     )
                 mask[covered] = shape.level_db
         if np.isnan(mask).all():
-            raise ValueError("its picture is wholly transparent; give it material, pixels that are opaque")
+            raise ValueError(
+                "its picture is wholly transparent; give it material, pixels that are opaque"
+            )
         brightest_db = float(np.nanmax(mask))
         if brightest_db < LEAST_BRIGHT_DB:
             raise ValueError(
                 f"nowhere more than {brightest_db:g} dB over the floor, it would never stand out of it; "
                 f"give a part of it at least {LEAST_BRIGHT_DB:g} dB"
             )
-        return LandmarkDesign(self.id, self.name, self.size_m, mask, self.height_m, self.relief_m)
+        return LandmarkDesign(
+            self.id, self.name, self.size_m, mask, self.height_m, self.relief_m
+        )
 
 
 def read_picture(path: Path, black_db: float, white_db: float) -> Floats:
@@ -214,19 +242,33 @@ def read_picture(path: Path, black_db: float, white_db: float) -> Floats:
     Raises `ValueError` when the file is not a square picture of 8 or 16 bits.
     """
     try:
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+        picture = (
+            cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+        )
     except cv2.error:
         picture = None
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{path} is not a picture; give a PNG file of 8 or 16 bits beside the TOML")
+        raise ValueError(
+            f"{path} is not a picture; give a PNG file of 8 or 16 bits beside the TOML"
+        )
     height, width = picture.shape[:2]
     if height != width:
         raise ValueError(f"{path} is {width} x {height}, not square")
     if width > MOST_PIXELS:
-        raise ValueError(f"{path} is {width} x {height}; make it {MOST_PIXELS} x {MOST_PIXELS} or smaller")
+        raise ValueError(
+            f"{path} is {width} x {height}; make it {MOST_PIXELS} x {MOST_PIXELS} or smaller"
+        )
     full = 255.0 if picture.dtype == np.uint8 else 65535.0
-    transparent = picture[..., 3] < full / 2 if picture.ndim == 3 and picture.shape[2] == 4 else False
-    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
+    transparent = (
+        picture[..., 3] < full / 2
+        if picture.ndim == 3 and picture.shape[2] == 4
+        else False
+    )
+    grey = (
+        picture
+        if picture.ndim == 2
+        else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
+    )
     return np.where(transparent, np.nan, black_db + grey / full * (white_db - black_db))
 
 
@@ -260,12 +302,20 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
     """
     path = Path(path)
     files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
-    designs = [_design(file, number, table) for file in files for number, table in enumerate(_landmark_tables(file), 1)]
+    designs = [
+        _design(file, number, table)
+        for file in files
+        for number, table in enumerate(_landmark_tables(file), 1)
+    ]
     if not designs:
-        raise CalibrationError(f"{path}: no landmark designs; give a TOML file with [[landmark]] tables")
+        raise CalibrationError(
+            f"{path}: no landmark designs; give a TOML file with [[landmark]] tables"
+        )
     for one, other in combinations(designs, 2):
         if one.id == other.id:
-            raise CalibrationError(f"{path}: {one.name} and {other.name} both have the id {one.id}; change one")
+            raise CalibrationError(
+                f"{path}: {one.name} and {other.name} both have the id {one.id}; change one"
+            )
         if one.looks_like(other):
             raise CalibrationError(
                 f"{path}: {one.name} (id {one.id}) and {other.name} (id {other.id}) look the same, so that nothing "
@@ -283,22 +333,40 @@ def _landmark_tables(file: Path) -> list[dict[str, Any]]:
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{file} is not TOML: {error}") from error
     if unknown := sorted(values.keys() - {"landmark"}):
-        meant = "; did you mean [[landmark]]?" if unknown[0].lower().startswith("landmark") else ";"
-        raise CalibrationError(f"{file}: {unknown[0]}: unknown{meant} a designs file has [[landmark]] tables only")
+        meant = (
+            "; did you mean [[landmark]]?"
+            if unknown[0].lower().startswith("landmark")
+            else ";"
+        )
+        raise CalibrationError(
+            f"{file}: {unknown[0]}: unknown{meant} a designs file has [[landmark]] tables only"
+        )
     tables = values.get("landmark", [])
-    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-        raise CalibrationError(f"{file}: landmark: write [[landmark]] with two brackets above each landmark")
+    if not isinstance(tables, list) or not all(
+        isinstance(table, dict) for table in tables
+    ):
+        raise CalibrationError(
+            f"{file}: landmark: write [[landmark]] with two brackets above each landmark"
+        )
     return tables
 
 
 def _design(file: Path, number: int, table: dict[str, Any]) -> LandmarkDesign:
     """Design of a table; errors name the file, the landmark and the field."""
     name = table.get("name")
-    place = f"{file}: landmark {name!r}" if name and isinstance(name, str) else f"{file}: [[landmark]] number {number}"
+    place = (
+        f"{file}: landmark {name!r}"
+        if name and isinstance(name, str)
+        else f"{file}: [[landmark]] number {number}"
+    )
     try:
         return _Entry.model_validate(table).design(file.parent)
     except ValidationError as error:
-        faults = re.sub(r"\bshapes\.(\d+)", lambda row: f"shape {int(row[1]) + 1}", faults_in(error, _Entry))
+        faults = re.sub(
+            r"\bshapes\.(\d+)",
+            lambda row: f"shape {int(row[1]) + 1}",
+            faults_in(error, _Entry),
+        )
         raise CalibrationError(f"{place}: {faults}") from error
     except ValueError as error:
         raise CalibrationError(f"{place}: {error}") from error

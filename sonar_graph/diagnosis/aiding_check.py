@@ -29,7 +29,10 @@ from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 
-HEADING_SENSE, HEADING_TURN = "heading: turn over that of the gyros", "heading: turn towards the positions"
+HEADING_SENSE, HEADING_TURN = (
+    "heading: turn over that of the gyros",
+    "heading: turn towards the positions",
+)
 WINDOW_NS = 10 * NS_PER_S
 FEWEST_WINDOWS = 6
 LARGEST_HEADING_SIGMA_RAD = 0.25
@@ -64,7 +67,9 @@ def turned_about_up(imu: Imu, body_R_imu: Floats, at_ns: Ints) -> Floats:
 def heading_sense(sequence: Sequence, heading: Heading, config: LogConfig) -> Finding:
     """Sense in which the heading turns, by the gyros."""
     ends = np.arange(
-        max(sequence.start_ns, heading.stamps_ns[0]), min(sequence.end_ns, heading.stamps_ns[-1]) + 1, WINDOW_NS
+        max(sequence.start_ns, heading.stamps_ns[0]),
+        min(sequence.end_ns, heading.stamps_ns[-1]) + 1,
+        WINDOW_NS,
     )
     body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
     x = np.diff(turned_about_up(sequence.imu, body_R_imu, ends))
@@ -74,14 +79,17 @@ def heading_sense(sequence: Sequence, heading: Heading, config: LogConfig) -> Fi
         x, y = x - float(x.mean()), y - float(y.mean())
         k = float(x @ y / (x @ x))
         scatter_rad2 = float(np.sum((y - k * x) ** 2)) / (len(x) - 2)
-        sense = Estimate1D(k, float(np.sqrt(scatter_rad2 / (x @ x)))).limited(LARGEST_TURN_SIGMA, "too little turning")
+        sense = Estimate1D(k, float(np.sqrt(scatter_rad2 / (x @ x)))).limited(
+            LARGEST_TURN_SIGMA, "too little turning"
+        )
     if sense.is_known and matters(sense, 0.0) and sense.value < 0:
         world = "enu" if config.table("heading").get("world") == "ned" else "ned"
         advice = f'it turns against the gyros, clockwise: `world = "{world}"` under [heading] {IN_LOG_CONFIG}'
         return Finding(HEADING_SENSE, sense, "", advice, acts=True)
     is_stuck = sense.is_known and sense.value + INTERVAL_SIGMAS * sense.sigma < 0.5
     advice = (
-        "it hardly turns where the gyros do: stuck, or not of the body; `use = false` under [heading] " + IN_LOG_CONFIG
+        "it hardly turns where the gyros do: stuck, or not of the body; `use = false` under [heading] "
+        + IN_LOG_CONFIG
     )
     return Finding(HEADING_SENSE, sense, "", advice if is_stuck else NO_NEED, is_stuck)
 
@@ -96,23 +104,35 @@ def vertical_bias(sequence: Sequence) -> Finding | None:
         stamps_ns, yaw_rad = heading.stamps_ns, np.unwrap(heading.yaw_rad)
     elif (truth := sequence.true_poses) is not None and len(truth) > 1:
         source = "the true orientations"
-        stamps_ns, yaw_rad = truth.stamps_ns, np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
+        stamps_ns, yaw_rad = (
+            truth.stamps_ns,
+            np.unwrap(truth.rotations().as_euler("ZYX")[:, 0]),
+        )
     else:
         return None
-    ends = np.arange(max(sequence.start_ns, stamps_ns[0]), min(sequence.end_ns, stamps_ns[-1]) + 1, WINDOW_NS)
+    ends = np.arange(
+        max(sequence.start_ns, stamps_ns[0]),
+        min(sequence.end_ns, stamps_ns[-1]) + 1,
+        WINDOW_NS,
+    )
     imu, known = sequence.imu, np.array(sequence.calibration.imu.gyro_bias_rad_s)
     body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
     up = upwards(imu, body_R_imu)
-    rate = (np.diff(turned_about_up(imu, body_R_imu, ends)) - np.diff(np.interp(ends, stamps_ns, yaw_rad))) / (
-        WINDOW_NS / NS_PER_S
-    )
+    rate = (
+        np.diff(turned_about_up(imu, body_R_imu, ends))
+        - np.diff(np.interp(ends, stamps_ns, yaw_rad))
+    ) / (WINDOW_NS / NS_PER_S)
     bias = Estimate1D(np.nan, np.inf, f"too little time beside {source}")
     if len(rate) >= FEWEST_WINDOWS:
         sigma = float(np.std(rate)) / float(np.sqrt(len(rate)))
         bias = Estimate1D(float(np.mean(rate)) - float(up @ known), max(sigma, 1e-9))
     allowed = sequence.calibration.imu.gyro_bias_sigma
-    acts = matters(replace(bias, sigma=float(np.hypot(bias.sigma, allowed))), LEAST_BIAS_RAD_S)
-    advice = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+    acts = matters(
+        replace(bias, sigma=float(np.hypot(bias.sigma, allowed))), LEAST_BIAS_RAD_S
+    )
+    advice = (
+        f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+    )
     if acts:
         whole = known + bias.value * up
         advice = (
@@ -132,15 +152,21 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     if sense.acts or known is None:
         return
     places = known.position_m if isinstance(known, PositionFixes) else known.positions
-    yaw_rad = np.interp(right.dvl.stamps_ns, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad))
+    yaw_rad = np.interp(
+        right.dvl.stamps_ns, right.heading.stamps_ns, np.unwrap(right.heading.yaw_rad)
+    )
     seen, reckoned = displacements(right, known.stamps_ns, places, yaw_rad)
     moved = float(np.vdot(reckoned, reckoned).real)
     angle = Estimate1D(np.nan, np.inf, "too little motion beside positions")
     if len(seen) >= FEWEST_WINDOWS and moved > 0:
         c = np.vdot(reckoned, seen) / moved
         scatter_m2 = float(np.mean(np.abs(seen - c * reckoned) ** 2)) / 2
-        found = Estimate1D(float(np.angle(c)), float(np.sqrt(scatter_m2 / moved) / max(abs(c), 1e-9)))
-        angle = found.limited(LARGEST_HEADING_SIGMA_RAD, "too little motion beside positions")
+        found = Estimate1D(
+            float(np.angle(c)), float(np.sqrt(scatter_m2 / moved) / max(abs(c), 1e-9))
+        )
+        angle = found.limited(
+            LARGEST_HEADING_SIGMA_RAD, "too little motion beside positions"
+        )
     allowed = right.calibration.heading.bias_sigma_rad
     acts = matters(replace(angle, sigma=float(np.hypot(angle.sigma, allowed))), 0.0)
     advice = f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}"
@@ -148,7 +174,11 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
         offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
         rpy = numbers(turned_mounting(right.calibration.dvl, angle.value), 4)
         vertical = vertical_bias(right)
-        first = "once the gyro bias is put right, which comes first, " if vertical is not None and vertical.acts else ""
+        first = (
+            "once the gyro bias is put right, which comes first, "
+            if vertical is not None and vertical.acts
+            else ""
+        )
         advice = (
             f"{first}either its world, north or mounting is another: `yaw_offset_rad = {offset:.3f}` under [heading] "
             f"{IN_LOG_CONFIG}; or the Doppler log is turned on the vehicle: `dvl.mounting.rpy_rad = {rpy}` "
@@ -157,18 +187,28 @@ def heading_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     yield Finding(HEADING_TURN, in_degrees(angle), "°", advice, acts)
 
 
-def displacements(right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Floats) -> tuple[Floats, Floats]:
+def displacements(
+    right: Sequence, stamps_ns: Ints, places: Floats, yaw_rad: Floats
+) -> tuple[Floats, Floats]:
     """Level displacements over windows as complex numbers: of places, shape (n, 3), and by the Doppler log.
 
     ``yaw_rad``: of the body at the rows of the Doppler log.
     """
-    x, y, _ = right.calibration.dvl.mounting.pose().rotation().matrix() @ right.dvl.velocity.T
+    x, y, _ = (
+        right.calibration.dvl.mounting.pose().rotation().matrix() @ right.dvl.velocity.T
+    )
     velocity = (x + 1j * y) * np.exp(1j * yaw_rad)
     steps = (velocity[1:] + velocity[:-1]) / 2 * np.diff(right.dvl.stamps_ns) * 1e-9
     path = np.concatenate([[0.0], np.cumsum(steps)])
-    ends = np.arange(max(stamps_ns[0], right.start_ns), min(stamps_ns[-1], right.end_ns) + 1, WINDOW_NS)
+    ends = np.arange(
+        max(stamps_ns[0], right.start_ns),
+        min(stamps_ns[-1], right.end_ns) + 1,
+        WINDOW_NS,
+    )
     reckoned = np.diff(np.interp(ends, right.dvl.stamps_ns, path))
-    return np.diff(np.interp(ends, stamps_ns, places[:, 0] + 1j * places[:, 1])), reckoned
+    return np.diff(
+        np.interp(ends, stamps_ns, places[:, 0] + 1j * places[:, 1])
+    ), reckoned
 
 
 def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
@@ -179,13 +219,20 @@ def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
     """
     fixes = fixes.rows(np.flatnonzero(fixes.are_sound()))
     is_measured = np.isfinite(right.dvl.velocity).all(axis=1)
-    stamps_ns, speed = right.dvl.stamps_ns[is_measured], np.linalg.norm(right.dvl.velocity[is_measured], axis=1)
+    stamps_ns, speed = (
+        right.dvl.stamps_ns[is_measured],
+        np.linalg.norm(right.dvl.velocity[is_measured], axis=1),
+    )
     steps_s = np.diff(stamps_ns) * 1e-9
     mean_speed = np.where(
-        steps_s > right.calibration.dvl.gap_s, np.percentile(speed, HIGH_PERCENTILE), (speed[1:] + speed[:-1]) / 2
+        steps_s > right.calibration.dvl.gap_s,
+        np.percentile(speed, HIGH_PERCENTILE),
+        (speed[1:] + speed[:-1]) / 2,
     )
     t = fixes.stamps_ns
-    way_m = np.interp(t, stamps_ns, np.concatenate([[0.0], np.cumsum(mean_speed * steps_s)]))
+    way_m = np.interp(
+        t, stamps_ns, np.concatenate([[0.0], np.cumsum(mean_speed * steps_s)])
+    )
     later = np.searchsorted(t, t + JUMP_NS)
     i = np.flatnonzero((later < len(t)) & (t >= stamps_ns[0]))
     i = i[t[later[i]] <= stamps_ns[-1]]
@@ -197,7 +244,11 @@ def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
     beyond = moved * np.maximum(0.0, 1 - (way_m[j] - way_m[i]) / length)[:, None]
     noise = np.diag(np.square(right.calibration.positions.sigma_m))
     cov_m2 = np.where(np.isnan(fixes.covariance_m2), noise, fixes.covariance_m2)
-    squares = np.einsum("ka,ka->k", beyond, np.linalg.solve(cov_m2[i] + cov_m2[j], beyond[:, :, None])[:, :, 0])
+    squares = np.einsum(
+        "ka,ka->k",
+        beyond,
+        np.linalg.solve(cov_m2[i] + cov_m2[j], beyond[:, :, None])[:, :, 0],
+    )
     return float(np.mean(squares > JUMP_GATE)), len(i)
 
 
@@ -209,7 +260,10 @@ def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
     fixes, calibration = right.positions, right.calibration
     if fixes is None:
         return
-    table, unknown = config.table("positions"), Estimate1D(np.nan, np.inf, "too few fixes beside the Doppler log")
+    table, unknown = (
+        config.table("positions"),
+        Estimate1D(np.nan, np.inf, "too few fixes beside the Doppler log"),
+    )
     body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
     yaw_rad = turned_about_up(right.imu, body_R_imu, right.dvl.stamps_ns)
     seen, reckoned = displacements(right, fixes.stamps_ns, fixes.position_m, yaw_rad)
@@ -217,20 +271,43 @@ def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
         yield Finding("position fixes: unit", unknown, "", "")
         return
     noise_m = float(np.hypot(*calibration.positions.sigma_m[:2]))
-    seen_m, reckoned_m = float(np.median(np.abs(seen))), float(np.median(np.abs(reckoned)))
-    if seen_m > LARGEST_RATIO * max(reckoned_m, noise_m) or reckoned_m > LARGEST_RATIO**2 * seen_m > 0:
-        unit = min(UNITS_M, key=lambda unit: abs(np.log(seen_m / max(reckoned_m, 1e-9) * UNITS_M[unit])))
+    seen_m, reckoned_m = (
+        float(np.median(np.abs(seen))),
+        float(np.median(np.abs(reckoned))),
+    )
+    if (
+        seen_m > LARGEST_RATIO * max(reckoned_m, noise_m)
+        or reckoned_m > LARGEST_RATIO**2 * seen_m > 0
+    ):
+        unit = min(
+            UNITS_M,
+            key=lambda unit: abs(
+                np.log(seen_m / max(reckoned_m, 1e-9) * UNITS_M[unit])
+            ),
+        )
         line = f"`scale = {float(table.get('scale', 1.0)) * UNITS_M[unit]:.4g}`"
-        line = "`geodetic`, with the fields of latitude and longitude," if unit == "degrees" else line
+        line = (
+            "`geodetic`, with the fields of latitude and longitude,"
+            if unit == "degrees"
+            else line
+        )
         advice = (
             f"in {WINDOW_NS / NS_PER_S:.0f} s they move by {seen_m:.3g} m, the Doppler log by {reckoned_m:.3g} m: "
             f"{unit}? {line} under [positions] {IN_LOG_CONFIG}"
         )
-        yield Finding("position fixes: unit", replace(unknown, reason="wrong unit"), "", advice, acts=True)
+        yield Finding(
+            "position fixes: unit",
+            replace(unknown, reason="wrong unit"),
+            "",
+            advice,
+            acts=True,
+        )
         return
     share, count = jumping_share(right, fixes)
     if share > LARGEST_JUMPING_SHARE and share * count >= FEWEST_WINDOWS:
-        of_all = Estimate1D(100 * share, 100 * float(np.sqrt(share * (1 - share) / count)))
+        of_all = Estimate1D(
+            100 * share, 100 * float(np.sqrt(share * (1 - share) / count))
+        )
         advice = (
             f"fixes {JUMP_NS / NS_PER_S:.0f} s apart are farther from each other than the vehicle moves by its Doppler "
             f"log and their noise allows: angles, or of another thing? `use = false` under [positions] {IN_LOG_CONFIG} "
@@ -238,12 +315,32 @@ def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
         )
         yield Finding("position fixes: jumps", of_all, "%", advice, acts=True)
         return
-    near = np.median(fixes.position_m[np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:FEWEST_WINDOWS]], axis=0)
+    near = np.median(
+        fixes.position_m[
+            np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:FEWEST_WINDOWS]
+        ],
+        axis=0,
+    )
     start = np.array(calibration.start.position_m)
-    path_m = float(np.sum(np.linalg.norm(right.dvl.velocity[1:], axis=1) * np.diff(right.dvl.stamps_ns)) * 1e-9)
-    allowed_m = 5.0 * float(np.hypot(noise_m, np.hypot(*calibration.start.position_sigma_m[:2]))) + path_m
-    from_start_m, from_origin_m = (float(np.linalg.norm((near - place)[:2])) for place in (start, 0.0 * start))
-    advice, acts = NO_NEED, from_start_m > allowed_m or from_origin_m > FARTHEST_ORIGIN_M
+    path_m = float(
+        np.sum(
+            np.linalg.norm(right.dvl.velocity[1:], axis=1)
+            * np.diff(right.dvl.stamps_ns)
+        )
+        * 1e-9
+    )
+    allowed_m = (
+        5.0
+        * float(np.hypot(noise_m, np.hypot(*calibration.start.position_sigma_m[:2])))
+        + path_m
+    )
+    from_start_m, from_origin_m = (
+        float(np.linalg.norm((near - place)[:2])) for place in (start, 0.0 * start)
+    )
+    advice, acts = (
+        NO_NEED,
+        from_start_m > allowed_m or from_origin_m > FARTHEST_ORIGIN_M,
+    )
     distance = Estimate1D(from_start_m, noise_m)
     if acts:
         place = "the start" if from_start_m > allowed_m else "the origin of the world"
@@ -254,4 +351,6 @@ def position_findings(right: Sequence, config: LogConfig) -> Iterator[Finding]:
             f"they begin {far_m:.3g} m from {place}, the whole way is {path_m:.3g} m: a map grid (UTM)? "
             f"{line} moves the origin to the first; or state the start there"
         )
-    yield Finding("position fixes: distance from the start", distance, "m", advice, acts)
+    yield Finding(
+        "position fixes: distance from the start", distance, "m", advice, acts
+    )

@@ -66,14 +66,26 @@ class Finding:
     def text(self) -> str:
         """Value with its 95 % interval and the advice; or the reason why it is not known."""
         if not self.estimate.is_known:
-            return self.advice if self.acts else f"cannot be told: {self.estimate.reason}"
+            return (
+                self.advice if self.acts else f"cannot be told: {self.estimate.reason}"
+            )
         return f"{with_interval(self.estimate, self.unit)}: {self.advice}"
 
     def plain(self) -> dict[str, Any]:
         """Content for JSON."""
         known, e = self.estimate.is_known, self.estimate
-        numbers = {"value": e.value if known else None, "sigma": e.sigma if known else None, "unit": self.unit}
-        return {"quantity": self.quantity, **numbers, "reason": e.reason, "act": bool(self.acts), "advice": self.advice}
+        numbers = {
+            "value": e.value if known else None,
+            "sigma": e.sigma if known else None,
+            "unit": self.unit,
+        }
+        return {
+            "quantity": self.quantity,
+            **numbers,
+            "reason": e.reason,
+            "act": bool(self.acts),
+            "advice": self.advice,
+        }
 
 
 def with_interval(estimate: Estimate1D, unit: str) -> str:
@@ -88,18 +100,28 @@ def with_interval(estimate: Estimate1D, unit: str) -> str:
 
 def in_degrees(angle: Estimate1D) -> Estimate1D:
     """An angle converted from radians."""
-    return replace(angle, value=float(np.degrees(angle.value)), sigma=float(np.degrees(angle.sigma)))
+    return replace(
+        angle,
+        value=float(np.degrees(angle.value)),
+        sigma=float(np.degrees(angle.sigma)),
+    )
 
 
 def matters(estimate: Estimate1D, least: float) -> bool:
     """True for an estimate above a threshold whose interval excludes zero."""
-    return bool(estimate.is_known and abs(estimate.value) > max(least, INTERVAL_SIGMAS * estimate.sigma))
+    return bool(
+        estimate.is_known
+        and abs(estimate.value) > max(least, INTERVAL_SIGMAS * estimate.sigma)
+    )
 
 
 def said_once(findings: Iterable[Finding]) -> list[Finding]:
     """Findings that share one line of advice: it stands in the first that acts, the others refer to it."""
     acting = [number for number, finding in enumerate(findings) if finding.acts]
-    return [replace(f, advice=ALSO) if number in acting[1:] else f for number, f in enumerate(findings)]
+    return [
+        replace(f, advice=ALSO) if number in acting[1:] else f
+        for number, f in enumerate(findings)
+    ]
 
 
 LEAST_LEVER_M = 0.05
@@ -118,13 +140,18 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
     if not any(estimate.is_known for estimate in found.lever):
         return [Finding(ARM, found.lever[0], "m", "")]
     given, wrong = _arm_and_error(found, calibration)
-    imu, dvl = calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m
+    imu, dvl = (
+        calibration.imu.mounting.translation_m,
+        calibration.dvl.mounting.translation_m,
+    )
     line = (
         f"`imu.mounting.translation_m = {numbers(np.subtract(imu, wrong), 3)}` {IN_CALIBRATION} or, if that place "
         f"is sure, `dvl.mounting.translation_m = {numbers(np.add(dvl, wrong), 3)}`"
     )
     rows = []
-    for axis, estimate, of_calibration, error in zip(AXES, found.lever, given, wrong, strict=True):
+    for axis, estimate, of_calibration, error in zip(
+        AXES, found.lever, given, wrong, strict=True
+    ):
         advice = f"the calibration's {of_calibration:+.2f} m fits, {NO_NEED}"
         if error:
             advice = f"not the calibration's {of_calibration:+.2f} m: {line}"
@@ -135,21 +162,31 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
 def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
     """Calibration with the changes that the findings advise: place of the IMU, sigma of the gyro bias."""
     imu = calibration.imu
-    place = np.subtract(imu.mounting.translation_m, _arm_and_error(found, calibration)[1])
+    place = np.subtract(
+        imu.mounting.translation_m, _arm_and_error(found, calibration)[1]
+    )
     moved = imu.mounting.model_copy(update={"translation_m": tuple(place.tolist())})
-    sigma = _largest(found.gyro_bias) if any(_is_beyond(e, imu) for e in found.gyro_bias) else imu.gyro_bias_sigma
+    sigma = (
+        _largest(found.gyro_bias)
+        if any(_is_beyond(e, imu) for e in found.gyro_bias)
+        else imu.gyro_bias_sigma
+    )
     changed = imu.model_copy(update={"mounting": moved, "gyro_bias_sigma": sigma})
     return calibration.model_copy(update={"imu": changed})
 
 
-def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration) -> list[Finding]:
+def bias_findings(
+    bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration
+) -> list[Finding]:
     """One row for each body axis with its source, such as "from 12 s of rest"; a single row where no axis is known."""
     if not any(estimate.is_known for estimate in bias):
         return [Finding(BIAS, bias[0], "rad/s", "")]
     rows, allowed = [], imu.gyro_bias_sigma
     for axis, estimate, source in zip(AXES, bias, sources, strict=True):
         acts = _is_beyond(estimate, imu)
-        advice = f"{source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+        advice = (
+            f"{source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+        )
         if acts:
             advice = (
                 f"{source}, beyond the calibration's sigma of {allowed:.2g}: "
@@ -160,24 +197,38 @@ def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCali
 
 
 def _is_beyond(bias: Estimate1D, imu: ImuCalibration) -> bool:
-    return matters(replace(bias, sigma=float(np.hypot(bias.sigma, imu.gyro_bias_sigma))), LEAST_BIAS_RAD_S)
+    return matters(
+        replace(bias, sigma=float(np.hypot(bias.sigma, imu.gyro_bias_sigma))),
+        LEAST_BIAS_RAD_S,
+    )
 
 
 def _largest(bias: Estimates3D) -> float:
-    return max((abs(estimate.value) for estimate in bias if estimate.is_known), default=0.0)
+    return max(
+        (abs(estimate.value) for estimate in bias if estimate.is_known), default=0.0
+    )
 
 
 def _arm_and_error(found: DvlMatch, calibration: Calibration) -> tuple[Floats, Floats]:
     """The calibration's arm and its error, shapes (3,), m; error 0 along an axis on which nothing need be done."""
-    given = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
-    errors = [replace(e, value=e.value - g) for e, g in zip(found.lever, given.tolist(), strict=True)]
-    return given, np.array([error.value if matters(error, LEAST_LEVER_M) else 0.0 for error in errors])
+    given = np.subtract(
+        calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m
+    )
+    errors = [
+        replace(e, value=e.value - g)
+        for e, g in zip(found.lever, given.tolist(), strict=True)
+    ]
+    return given, np.array(
+        [error.value if matters(error, LEAST_LEVER_M) else 0.0 for error in errors]
+    )
 
 
 def turned_mounting(dvl: DvlCalibration, yaw_rad: float) -> tuple[float, float, float]:
     """Roll, pitch and yaw of the mounting after a turn about the body's z axis."""
     before = Rotation.from_euler("ZYX", dvl.mounting.rpy_rad[::-1])
-    yaw, pitch, roll = (Rotation.from_euler("z", yaw_rad) * before).as_euler("ZYX").tolist()
+    yaw, pitch, roll = (
+        (Rotation.from_euler("z", yaw_rad) * before).as_euler("ZYX").tolist()
+    )
     return roll, pitch, yaw
 
 
@@ -233,12 +284,18 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
         try:
             tilt = align_at_rest(imu, sequence.calibration, dvl)
         except AlignmentError as error:
-            found = found if found.tilt is not None else StartTilt(None, _without_advice(error))
+            found = (
+                found
+                if found.tilt is not None
+                else StartTilt(None, _without_advice(error))
+            )
             break
         lasted_s = (imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S
         found = StartTilt(tilt, f"from {lasted_s:.0f} s of rest", is_rest=True)
         if (turned := turn_by_heading(sequence.heading, imu, tilt)) is not None:
-            found = StartTilt(turned, f"{found.said}, less the turn of the heading", is_rest=True)
+            found = StartTilt(
+                turned, f"{found.said}, less the turn of the heading", is_rest=True
+            )
     if found.tilt is not None:
         return found
     imu, dvl = _beginning(sequence, LONGEST_S)
@@ -248,20 +305,33 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     try:
         tilt = align_in_motion(imu, dvl, sequence.calibration)
     except AlignmentError as error:
-        return StartTilt(None, f"at rest: {found.said}; in motion: {_without_advice(error)}")
+        return StartTilt(
+            None, f"at rest: {found.said}; in motion: {_without_advice(error)}"
+        )
     except np.linalg.LinAlgError:
-        return StartTilt(None, f"at rest: {found.said}; in motion: the calibration's noise is zero")
-    return StartTilt(tilt, f"from {(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S:.0f} s in motion")
+        return StartTilt(
+            None, f"at rest: {found.said}; in motion: the calibration's noise is zero"
+        )
+    return StartTilt(
+        tilt,
+        f"from {(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S:.0f} s in motion",
+    )
 
 
-def turn_by_heading(heading: Heading | None, imu: Imu, tilt: InitialTilt) -> InitialTilt | None:
+def turn_by_heading(
+    heading: Heading | None, imu: Imu, tilt: InitialTilt
+) -> InitialTilt | None:
     """Alignment at rest whose gyro bias is without a turn that the heading confirms; None where it confirms none.
 
     A vehicle that turns slowly and steadily looks like one at rest whose gyros have a bias. The heading's rate, by
     least squares over the rest, counts where it is most of that of the gyros about the vertical, and four of its sigmas
     (as if all of its scatter were one slow wave).
     """
-    rows = None if heading is None else heading.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    rows = (
+        None
+        if heading is None
+        else heading.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    )
     if rows is None or len(rows) < FEWEST_HEADINGS:
         return None
     t = (rows.stamps_ns - rows.stamps_ns.mean()) * 1e-9
@@ -269,7 +339,9 @@ def turn_by_heading(heading: Heading | None, imu: Imu, tilt: InitialTilt) -> Ini
     rate = float(t @ yaw_rad / (t @ t))
     sigma = 2.0 * float(np.std(yaw_rad - rate * t)) / float(np.ptp(t))
     roll, pitch = tilt.roll_rad, tilt.pitch_rad
-    up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    up = np.array(
+        [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
+    )
     by_gyros = float(up @ tilt.gyro_bias)
     rate = float(np.copysign(rate, by_gyros))  # also of a compass that runs mirrored
     if abs(rate) < 4.0 * sigma or abs(rate - by_gyros) > 0.5 * abs(by_gyros):
@@ -290,13 +362,23 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
     )
     rows = []
     for axis, name in enumerate(("roll", "pitch")):
-        told, of_calibration = found.angle(axis), f"the calibration's {np.degrees(given[axis]):+.2f}°"
-        sigma = float(np.hypot(told.sigma, start.rpy_sigma_rad[axis]))
-        acts = matters(replace(told, value=wrap_angle(told.value - given[axis]), sigma=sigma), LEAST_TILT_RAD)
-        advice = (
-            f"{found.said}, not {of_calibration}: {line}" if acts else f"{found.said}; {of_calibration} fits, {NO_NEED}"
+        told, of_calibration = (
+            found.angle(axis),
+            f"the calibration's {np.degrees(given[axis]):+.2f}°",
         )
-        rows.append(Finding(f"start {name}: value", in_degrees(told), "°", advice, acts))
+        sigma = float(np.hypot(told.sigma, start.rpy_sigma_rad[axis]))
+        acts = matters(
+            replace(told, value=wrap_angle(told.value - given[axis]), sigma=sigma),
+            LEAST_TILT_RAD,
+        )
+        advice = (
+            f"{found.said}, not {of_calibration}: {line}"
+            if acts
+            else f"{found.said}; {of_calibration} fits, {NO_NEED}"
+        )
+        rows.append(
+            Finding(f"start {name}: value", in_degrees(told), "°", advice, acts)
+        )
     return said_once(rows)
 
 
@@ -318,29 +400,44 @@ class StartHeading:
         """The row, with roll and pitch of the alignment if known, so that rows agree; else those of the reference."""
         advice = NO_NEED
         if self.acts:
-            rpy = (tilt.angle(0).value, tilt.angle(1).value, self.rpy_rad[2]) if tilt.tilt else self.rpy_rad
+            rpy = (
+                (tilt.angle(0).value, tilt.angle(1).value, self.rpy_rad[2])
+                if tilt.tilt
+                else self.rpy_rad
+            )
             of_tilt = f", with roll and pitch {tilt.said}" if tilt.tilt else ""
             advice = (
                 f"the calibration's start heading is wrong; by the reference, its stamps put right{of_tilt}: "
                 f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` "
                 f"{IN_CALIBRATION}; the position too is the reference's, so that both are of one pose"
             )
-        return Finding("start heading: error", in_degrees(self.error), "°", advice, self.acts)
+        return Finding(
+            "start heading: error", in_degrees(self.error), "°", advice, self.acts
+        )
 
 
-def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estimate1D) -> StartHeading:
+def find_start_heading(
+    sequence: Sequence, reference: Trajectory, offset: Estimate1D
+) -> StartHeading:
     """Compare the calibration's start with the reference at that instant, its stamps corrected by an offset in s."""
     first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
-    at_ns = min(max(sequence.start_ns - round(offset.value * NS_PER_S), first_ns), last_ns)
+    at_ns = min(
+        max(sequence.start_ns - round(offset.value * NS_PER_S), first_ns), last_ns
+    )
     pose = reference.at(np.array([at_ns]))
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
     x, y, z = pose.positions[0].tolist()
     error = wrap_angle(sequence.calibration.start.rpy_rad[2] - yaw)
-    begin_ns, end_ns = max(at_ns - TURN_OVER_NS // 2, first_ns), min(at_ns + TURN_OVER_NS // 2, last_ns)
+    begin_ns, end_ns = (
+        max(at_ns - TURN_OVER_NS // 2, first_ns),
+        min(at_ns + TURN_OVER_NS // 2, last_ns),
+    )
     turn_rate = 0.0
     if end_ns > begin_ns:
         begin, end = reference.at(np.array([begin_ns, end_ns])).rotations()
-        turn_rate = float((begin.inv() * end).magnitude()) * NS_PER_S / (end_ns - begin_ns)
+        turn_rate = (
+            float((begin.inv() * end).magnitude()) * NS_PER_S / (end_ns - begin_ns)
+        )
     spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
     return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
 
@@ -348,7 +445,9 @@ def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estima
 def _beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | None]:
     before_ns = sequence.start_ns - 1
     until_ns = sequence.start_ns + round(seconds * NS_PER_S)
-    return sequence.imu.between(before_ns, until_ns), sequence.dvl.between(before_ns, until_ns)
+    return sequence.imu.between(before_ns, until_ns), sequence.dvl.between(
+        before_ns, until_ns
+    )
 
 
 def _without_advice(error: AlignmentError) -> str:

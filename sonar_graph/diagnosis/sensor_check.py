@@ -77,31 +77,60 @@ LARGEST_TILT_RATIO = 10.0
 def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Velocities, rates and specific forces in an implausible unit; the configured scales enter the advice."""
     advice: dict[str, str] = {}
-    speed_m_s, changes_m = _exceeded_by_few(sequence.dvl.velocity), range_changes(sequence)
+    speed_m_s, changes_m = (
+        _exceeded_by_few(sequence.dvl.velocity),
+        range_changes(sequence),
+    )
     is_far = changes_m is not None and changes_m[1] > LARGEST_RANGE_RATIO * changes_m[0]
     if speed_m_s > FASTEST_M_S or is_far:
-        unit = next((unit for unit, factor in SPEEDS.items() if speed_m_s * factor <= USUAL_SPEED_M_S), "mm/s")
+        unit = next(
+            (
+                unit
+                for unit, factor in SPEEDS.items()
+                if speed_m_s * factor <= USUAL_SPEED_M_S
+            ),
+            "mm/s",
+        )
         scale = config.number("dvl", "scale", 1.0) * SPEEDS[unit]
         why = f"up to {speed_m_s:.3g} m/s"
         if is_far and changes_m is not None:
-            why += "; ranges to landmarks change by {:.3g} m, by them by {:.3g} m".format(*changes_m)
+            why += (
+                "; ranges to landmarks change by {:.3g} m, by them by {:.3g} m".format(
+                    *changes_m
+                )
+            )
         advice["DVL: unit"] = (
             f"velocities look {1 / SPEEDS[unit]:.0f} times too large ({why}): {unit}? "
             f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
         )
         if speed_m_s > FASTEST_M_S and unit != "mm/s":
-            advice["DVL: unit"] += f"; mm/s if the vehicle moves at {speed_m_s * SPEEDS['mm/s']:.2g} m/s"
+            advice["DVL: unit"] += (
+                f"; mm/s if the vehicle moves at {speed_m_s * SPEEDS['mm/s']:.2g} m/s"
+            )
     rate_rad_s = _exceeded_by_few(sequence.imu.angular_velocity)
     tilting = tilt_rates(sequence.imu)
-    doubt = f"57 times too large (up to {rate_rad_s:.3g} rad/s)" if rate_rad_s > FASTEST_TURN_RAD_S else ""
-    if not doubt and tilting and tilting[0] > max(LEAST_TILTING_RAD_S, LARGEST_TILT_RATIO * tilting[1]):
-        doubt = "too large (they tilt the vehicle by {:.2g} rad/s, gravity by {:.2g})".format(*tilting)
+    doubt = (
+        f"57 times too large (up to {rate_rad_s:.3g} rad/s)"
+        if rate_rad_s > FASTEST_TURN_RAD_S
+        else ""
+    )
+    if (
+        not doubt
+        and tilting
+        and tilting[0] > max(LEAST_TILTING_RAD_S, LARGEST_TILT_RATIO * tilting[1])
+    ):
+        doubt = "too large (they tilt the vehicle by {:.2g} rad/s, gravity by {:.2g})".format(
+            *tilting
+        )
     if doubt:
         scale = config.number("imu", "angular_velocity_scale", 1.0) * np.radians(1.0)
         advice["gyro: unit"] = (
             f"rates look {doubt}: degrees a second? `angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}"
         )
-    forces, gravity = _lengths(sequence.imu.specific_force), sequence.calibration.gravity_m_s2
+    forces, gravity = (
+        _lengths(sequence.imu.specific_force),
+        sequence.calibration.gravity_m_s2,
+    )
     typical = float(np.median(forces)) if len(forces) else 0.0
     unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
     if len(forces) and not abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
@@ -111,7 +140,10 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
             f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}"
         )
     unknown = Estimate1D(np.nan, np.inf, "wrong unit")
-    return [Finding(quantity, unknown, "", line, acts=True) for quantity, line in advice.items()]
+    return [
+        Finding(quantity, unknown, "", line, acts=True)
+        for quantity, line in advice.items()
+    ]
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -124,10 +156,18 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
         return faults
     senses = list(heading_findings(sequence, config))
     large = np.degrees(LARGE_TURN_RAD)
-    senses = [f for f in senses if f.quantity != HEADING_TURN or abs(f.estimate.value) > large]
-    if not any(f.quantity == HEADING_SENSE and f.acts for f in senses) and (vertical := vertical_bias(sequence)):
+    senses = [
+        f for f in senses if f.quantity != HEADING_TURN or abs(f.estimate.value) > large
+    ]
+    if not any(f.quantity == HEADING_SENSE and f.acts for f in senses) and (
+        vertical := vertical_bias(sequence)
+    ):
         senses = [vertical, *senses]
-    return [finding for finding in (*senses, *position_findings(sequence, config)) if finding.acts]
+    return [
+        finding
+        for finding in (*senses, *position_findings(sequence, config))
+        if finding.acts
+    ]
 
 
 def tilt_rates(imu: Imu) -> tuple[float, float] | None:
@@ -136,10 +176,16 @@ def tilt_rates(imu: Imu) -> tuple[float, float] | None:
     From second to second gravity turns in the sensor by ``u_k+1 - u_k = -θ x u_k``, and the force also by what
     accelerates the vehicle: the accelerometers' rate is too large, never too small.
     """
-    names, first, count = np.unique((imu.stamps_ns - imu.stamps_ns[0]) // NS_PER_S, True, False, True)
+    names, first, count = np.unique(
+        (imu.stamps_ns - imu.stamps_ns[0]) // NS_PER_S, True, False, True
+    )
     force = np.add.reduceat(imu.specific_force, first, axis=0)
     is_next = np.diff(names) == 1
-    if np.count_nonzero(is_next) < LEAST_SECONDS or not np.isfinite(force).all() or not force.any(axis=1).all():
+    if (
+        np.count_nonzero(is_next) < LEAST_SECONDS
+        or not np.isfinite(force).all()
+        or not force.any(axis=1).all()
+    ):
         return None
     up = force / np.linalg.norm(force, axis=1)[:, None]
     rate = np.add.reduceat(imu.angular_velocity, first, axis=0) / count[:, None]
@@ -158,26 +204,40 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
     rows = np.flatnonzero(np.isfinite(dvl.velocity).all(axis=1))
     if seen is None or len(rows) < MEDIAN_ROWS:
         return None
-    dvl_s, t = ((stamps_ns - dvl.stamps_ns[rows[0]]) * 1e-9 for stamps_ns in (dvl.stamps_ns[rows], seen.stamps_ns))
+    dvl_s, t = (
+        (stamps_ns - dvl.stamps_ns[rows[0]]) * 1e-9
+        for stamps_ns in (dvl.stamps_ns[rows], seen.stamps_ns)
+    )
     body_v = dvl.velocity[rows] @ calibration.dvl.mounting.pose().rotation().matrix().T
     body_v = median_filter(body_v, size=(MEDIAN_ROWS, 1))  # outliers would add up
     steps = (body_v[1:] + body_v[:-1]) / 2 * np.diff(dvl_s)[:, None]
     path = np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    ids, is_sound = seen.most_probable()[0], seen.are_sound() & (t >= 0) & (t <= dvl_s[-1])
-    ahead = np.column_stack([np.cos(seen.azimuth_rad), np.sin(seen.azimuth_rad), np.zeros(len(seen))])
+    ids, is_sound = (
+        seen.most_probable()[0],
+        seen.are_sound() & (t >= 0) & (t <= dvl_s[-1]),
+    )
+    ahead = np.column_stack(
+        [np.cos(seen.azimuth_rad), np.sin(seen.azimuth_rad), np.zeros(len(seen))]
+    )
     u = ahead @ calibration.sonar.mounting.pose().rotation().matrix().T
     measured, by_dvl = [], []
     for landmark_id in np.unique(ids[is_sound & (ids >= 0)]).tolist():
         rows = np.flatnonzero(is_sound & (ids == landmark_id))
-        later = rows[np.minimum(np.searchsorted(t[rows], t[rows] + PAIR_S), len(rows) - 1)]
+        later = rows[
+            np.minimum(np.searchsorted(t[rows], t[rows] + PAIR_S), len(rows) - 1)
+        ]
         pairs = (t[later] - t[rows] >= PAIR_S) & (t[later] - t[rows] <= LONGEST_PAIR_S)
         i, j = rows[pairs], later[pairs]
-        moved = np.column_stack([np.interp(t[j], dvl_s, p) - np.interp(t[i], dvl_s, p) for p in path.T])
+        moved = np.column_stack(
+            [np.interp(t[j], dvl_s, p) - np.interp(t[i], dvl_s, p) for p in path.T]
+        )
         measured += np.abs(seen.range_m[j] - seen.range_m[i]).tolist()
         by_dvl += np.abs(np.einsum("ka,ka->k", moved, (u[i] + u[j]) / 2)).tolist()
     if len(measured) < FEWEST_PAIRS:
         return None
-    return max(float(np.median(measured)), calibration.sonar.range_sigma_m), float(np.median(by_dvl))
+    return max(float(np.median(measured)), calibration.sonar.range_sigma_m), float(
+        np.median(by_dvl)
+    )
 
 
 def _exceeded_by_few(vectors: Floats) -> float:
@@ -227,7 +287,10 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     if faults := wrong_units(sequence, config):
         return faults
     imu, dvl = sequence.imu, sequence.dvl
-    first_ns, last_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0]), min(imu.stamps_ns[-1], dvl.stamps_ns[-1])
+    first_ns, last_ns = (
+        max(imu.stamps_ns[0], dvl.stamps_ns[0]),
+        min(imu.stamps_ns[-1], dvl.stamps_ns[-1]),
+    )
     spare_ns = (int(last_ns - first_ns) - round(LONGEST_S * NS_PER_S)) // 2
     if spare_ns > 0:
         ends = int(first_ns) + spare_ns, int(last_ns) - spare_ns
@@ -242,20 +305,33 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
     aiding = [*heading_findings(right, config), *position_findings(right, config)]
     vertical = vertical_bias(sequence)
-    is_mirrored = any(finding.quantity == HEADING_SENSE and finding.acts for finding in aiding)
+    is_mirrored = any(
+        finding.quantity == HEADING_SENSE and finding.acts for finding in aiding
+    )
     if vertical is not None and vertical.estimate.is_known and not is_mirrored:
         bias = [*(f for f in bias if f.estimate.is_known or f.acts), vertical]
-    return [*of_dvl, *lever, *bias, *aiding, *reference_findings(right, config, tilt), *noise_findings(sequence)]
+    return [
+        *of_dvl,
+        *lever,
+        *bias,
+        *aiding,
+        *reference_findings(right, config, tilt),
+        *noise_findings(sequence),
+    ]
 
 
-def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list[Finding]:
+def dvl_findings(
+    found: DvlMatch, sequence: Sequence, config: LogConfig
+) -> list[Finding]:
     """Time offset, mounting yaw and scale of the DVL."""
     turns = matters(found.yaw, LEAST_YAW_RAD)
     scales = matters(replace(found.scale, value=found.scale.value - 1), LEAST_SCALE)
     yaw_advice = scale_advice = NO_NEED
     if turns:
         rpy = numbers(turned_mounting(sequence.calibration.dvl, found.yaw.value), 4)
-        yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}"
+        yaw_advice = (
+            f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}"
+        )
     if scales:
         scale = config.number("dvl", "scale", 1.0) * found.scale.value
         scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] {IN_LOG_CONFIG}"
@@ -266,7 +342,9 @@ def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list
     ]
 
 
-def corrected_sequence(sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]) -> Sequence:
+def corrected_sequence(
+    sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]
+) -> Sequence:
     """Sequence with the advised changes: stamps, yaw and scale of the DVL, lever arm, sigma of the gyro bias."""
     late, turned, scaled = (finding.acts for finding in of_dvl)
     dvl, calibration = sequence.dvl, with_fitted(match, sequence.calibration)
@@ -281,18 +359,24 @@ def corrected_sequence(sequence: Sequence, match: DvlMatch, of_dvl: list[Finding
     return replace(sequence, dvl=moved, calibration=calibration)
 
 
-def surest_bias(match: DvlMatch, tilt: StartTilt) -> tuple[Estimates3D, tuple[str, str, str]]:
+def surest_bias(
+    match: DvlMatch, tilt: StartTilt
+) -> tuple[Estimates3D, tuple[str, str, str]]:
     """Gyro bias of the whole drive or of a rest, whichever is more certain on each axis, and its source."""
     still = tilt.gyro_bias() or match.gyro_bias
     pairs = [
-        (a, tilt.said) if tilt.is_rest and (not b.is_known or a.sigma < b.sigma) else (b, FROM_DRIVE)
+        (a, tilt.said)
+        if tilt.is_rest and (not b.is_known or a.sigma < b.sigma)
+        else (b, FROM_DRIVE)
         for a, b in zip(still, match.gyro_bias, strict=True)
     ]
     (x, of_x), (y, of_y), (z, of_z) = pairs
     return (x, y, z), (of_x, of_y, of_z)
 
 
-def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterator[Finding]:
+def reference_findings(
+    right: Sequence, config: LogConfig, tilt: StartTilt
+) -> Iterator[Finding]:
     """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
     reference = right.true_poses
@@ -300,15 +384,25 @@ def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> I
         yield from tilt_findings(tilt, start, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, reference, right.calibration)
-    row, offset = _offset("reference against IMU", found.offset, right.imu, "truth", config)
+    row, offset = _offset(
+        "reference against IMU", found.offset, right.imu, "truth", config
+    )
     yield row
     jump = in_degrees(found.start_heading)
     acts = matters(found.start_heading, LEAST_HEADING_RAD)
-    advice = "the reference begins with a wrong heading: leave its beginning out with `--start`" if acts else NO_NEED
+    advice = (
+        "the reference begins with a wrong heading: leave its beginning out with `--start`"
+        if acts
+        else NO_NEED
+    )
     yield Finding("first headings of the reference: error", jump, "°", advice, acts)
     is_compared = offset.is_known and start != Start()
     heading = find_start_heading(right, reference, offset) if is_compared else None
-    yield from tilt_findings(tilt, start, heading.rpy_rad[2] if heading and heading.acts else start.rpy_rad[2])
+    yield from tilt_findings(
+        tilt,
+        start,
+        heading.rpy_rad[2] if heading and heading.acts else start.rpy_rad[2],
+    )
     if heading:
         yield heading.finding(tilt)
 
@@ -317,29 +411,65 @@ def noise_findings(sequence: Sequence) -> Iterator[Finding]:
     """Noise densities of gyro and accelerometer, where the DVL confirms the rest: a steady drive can be as quiet."""
     found, imu = noise_densities(sequence.imu), sequence.calibration.imu
     stamps_ns = sequence.imu.stamps_ns[longest_rest(sequence.imu)]
-    during = sequence.dvl.between(int(stamps_ns[0]), int(stamps_ns[-1])) if len(stamps_ns) else None
-    speed = 0.0 if during is None else float(np.median(np.linalg.norm(during.velocity, axis=1)))
+    during = (
+        sequence.dvl.between(int(stamps_ns[0]), int(stamps_ns[-1]))
+        if len(stamps_ns)
+        else None
+    )
+    speed = (
+        0.0
+        if during is None
+        else float(np.median(np.linalg.norm(during.velocity, axis=1)))
+    )
     rest = f"from {found.still_s:.0f} s of rest"
     known = {
-        "gyro noise density": ("gyro_noise_density", found.gyro, imu.gyro_noise_density, "rad/s/√Hz"),
-        "accelerometer noise density": ("accel_noise_density", found.accel, imu.accel_noise_density, "m/s²/√Hz"),
+        "gyro noise density": (
+            "gyro_noise_density",
+            found.gyro,
+            imu.gyro_noise_density,
+            "rad/s/√Hz",
+        ),
+        "accelerometer noise density": (
+            "accel_noise_density",
+            found.accel,
+            imu.accel_noise_density,
+            "m/s²/√Hz",
+        ),
     }
     for quantity, (field, estimate, given, unit) in known.items():
         if estimate.is_known and speed > LARGEST_RESTING_M_S:
-            estimate = replace(estimate, reason=f"{found.still_s:.0f} s are steady, but at {speed:.1f} m/s")
-        ratio = max(estimate.value / given, given / estimate.value) if estimate.value > 0 and given > 0 else np.inf
-        acts = matters(replace(estimate, value=estimate.value - given), 0.0) and ratio > LARGEST_DENSITY_RATIO
+            estimate = replace(
+                estimate,
+                reason=f"{found.still_s:.0f} s are steady, but at {speed:.1f} m/s",
+            )
+        ratio = (
+            max(estimate.value / given, given / estimate.value)
+            if estimate.value > 0 and given > 0
+            else np.inf
+        )
+        acts = (
+            matters(replace(estimate, value=estimate.value - given), 0.0)
+            and ratio > LARGEST_DENSITY_RATIO
+        )
         advice = f"{rest}; the calibration's {given:.2g} fits, no need to act"
         if acts:
             advice = f"{rest}, not the calibration's {given:.2g}: `imu.{field} = {estimate.value:.2g}` {IN_CALIBRATION}"
         yield Finding(quantity, estimate, unit, advice, acts)
 
 
-def _offset(quantity: str, offset: Estimate1D, imu: Imu, role: str, config: LogConfig) -> tuple[Finding, Estimate1D]:
+def _offset(
+    quantity: str, offset: Estimate1D, imu: Imu, role: str, config: LogConfig
+) -> tuple[Finding, Estimate1D]:
     """Row for a time offset, and the offset with the uncertainty of the instant that an IMU sample stands for."""
-    interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S if len(imu) > 1 else 0.0
-    offset = replace(offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12))))
+    interval_s = (
+        float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S if len(imu) > 1 else 0.0
+    )
+    offset = replace(
+        offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12)))
+    )
     total_s = config.number(role, "stamp_offset_s", 0.0) + offset.value
     acts = matters(offset, LEAST_OFFSET_S)
     advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] {IN_LOG_CONFIG}"
-    return Finding(f"{quantity}: time offset", offset, "s", advice if acts else NO_NEED, acts), offset
+    return Finding(
+        f"{quantity}: time offset", offset, "s", advice if acts else NO_NEED, acts
+    ), offset

@@ -18,7 +18,13 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.free_start import with_fitted_truth
 from sonar_graph.evaluation.own_map import shared_map_instants
-from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
+from sonar_graph.evaluation.results import (
+    Comparison,
+    ErrorSeries,
+    Kind,
+    RunResult,
+    Score,
+)
 from sonar_graph.evaluation.run import check_request, run_estimator
 from sonar_graph.evaluation.scored_instants import rows_at, scored_instants
 from sonar_graph.evaluation.scores import (
@@ -116,7 +122,9 @@ def compare(
         raise EvaluationError("no estimator to compare; name at least one")
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise EvaluationError(f"named more than once: {', '.join(twice)}; each estimator runs once in a comparison")
+        raise EvaluationError(
+            f"named more than once: {', '.join(twice)}; each estimator runs once in a comparison"
+        )
     idle = sorted(set(settings) - set(names))
     if idle:
         raise EvaluationError(
@@ -129,7 +137,15 @@ def compare(
     runs = []
     for name in names:
         told = None if progress is None else partial(progress, name)
-        runs.append(run_estimator(sequence, name, settings.get(name), instants_ns=instants_ns, progress=told))
+        runs.append(
+            run_estimator(
+                sequence,
+                name,
+                settings.get(name),
+                instants_ns=instants_ns,
+                progress=told,
+            )
+        )
     return judge(sequence, instants_ns, runs)
 
 
@@ -141,7 +157,11 @@ def expense(sequence: Sequence) -> str:
     map, some `SOLVED_DETECTION_S` for each.
     """
     rows, detections = len(sequence.imu), sequence.detections
-    said = [f"{rows} IMU rows, about {rows * IMU_ROW_S / 60:.0f} min"] if rows * IMU_ROW_S > LONG_S else []
+    said = (
+        [f"{rows} IMU rows, about {rows * IMU_ROW_S / 60:.0f} min"]
+        if rows * IMU_ROW_S > LONG_S
+        else []
+    )
     if detections is not None and len(detections):
         ids = detections.candidate_ids
         count = len(np.unique(ids[ids >= 0]))
@@ -164,8 +184,14 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
     """Score runs that were all asked for estimates at these instants, shape (n,)."""
     environment = describe_environment()
     sequence = with_fitted_truth(sequence, instants_ns, runs)
-    true = sequence.truth  # heights that nobody measured are all alike; true poses of a dive may be as well
-    is_flat = true is not None and len(true) > 1 and not true.has_orientation and not np.ptp(true.positions[:, 2])
+    # heights that nobody measured are all alike; true poses of a dive may be as well
+    true = sequence.truth
+    is_flat = (
+        true is not None
+        and len(true) > 1
+        and not true.has_orientation
+        and not np.ptp(true.positions[:, 2])
+    )
     if is_flat:
         sequence = replace(sequence, notes={**sequence.notes, HEIGHTS: NO_HEIGHTS})
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
@@ -179,7 +205,9 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             own |= detection_scores(run.detections)
     comparison = Comparison(sequence, instants_ns, runs, scores, errors, environment)
     if sequence.truth is None or not len(sequence.truth):
-        environment["scored instants"] = "none: the log has no truth, so no trajectory error can be given"
+        environment["scored instants"] = (
+            "none: the log has no truth, so no trajectory error can be given"
+        )
         return comparison
     scored = scored_instants(instants_ns, sequence.truth, runs)
     fitted = f"; {unaligned(sequence)}" if FITTED in sequence.notes else ""
@@ -198,10 +226,21 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             estimate = rows_at(trajectory, scored.stamps_ns)
             if is_flat:
                 z_m = truth.positions[:, 2]
-                estimate = replace(estimate, positions=np.column_stack([estimate.positions[:, :2], z_m]))
-            series = errors[run.estimator][kind] = error_series(estimate, truth, position_dof)
+                estimate = replace(
+                    estimate,
+                    positions=np.column_stack([estimate.positions[:, :2], z_m]),
+                )
+            series = errors[run.estimator][kind] = error_series(
+                estimate, truth, position_dof
+            )
             scores[run.estimator] |= trajectory_scores(
-                kind, estimate, truth, series, str(scored), unaligned(sequence), has_height=not is_flat
+                kind,
+                estimate,
+                truth,
+                series,
+                str(scored),
+                unaligned(sequence),
+                has_height=not is_flat,
             )
     map_instants_ns = shared_map_instants(ended, sequence, scored.stamps_ns)
     for run in ended:

@@ -31,7 +31,9 @@ NONE, UNJUDGED = -1, -2
 """True class of a detection that is of no landmark, and of one that is left out."""
 
 
-def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> ErrorSeries:
+def error_series(
+    estimate: Trajectory, truth: Trajectory, position_dof: int
+) -> ErrorSeries:
     """Errors, their reported standard deviations and their NEES; estimate and truth have the same instants.
 
     The NEES of position takes x and y (``position_dof`` 2, planar motion), or also z (3).
@@ -42,7 +44,8 @@ def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> 
     axes = slice(0, position_dof)
 
     def sigma(variances: Floats) -> Floats:
-        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))  # rounding below zero counts as zero
+        # rounding below zero counts as zero
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     return ErrorSeries(
         stamps_ns=estimate.stamps_ns,
@@ -50,11 +53,17 @@ def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> 
         position_sigma_m=sigma(np.diagonal(position_cov, axis1=1, axis2=2)),
         yaw_rad=yaw_error,
         yaw_sigma_rad=sigma(yaw_var),
-        nees_position=normalised_squares(position_error[:, axes], position_cov[:, axes, axes]),
+        nees_position=normalised_squares(
+            position_error[:, axes], position_cov[:, axes, axes]
+        ),
         nees_yaw=normalised_squares(yaw_error[:, None], yaw_var[:, None, None]),
         position_dof=position_dof,
-        position_samples=effective_samples(normalised(position_error[:, axes], position_cov[:, axes, axes])),
-        yaw_samples=effective_samples(normalised(yaw_error[:, None], yaw_var[:, None, None])),
+        position_samples=effective_samples(
+            normalised(position_error[:, axes], position_cov[:, axes, axes])
+        ),
+        yaw_samples=effective_samples(
+            normalised(yaw_error[:, None], yaw_var[:, None, None])
+        ),
     )
 
 
@@ -77,7 +86,11 @@ def yaw_variances(trajectory: Trajectory) -> Floats:
     jacobian = np.zeros((len(trajectory), 3))
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian[:, 1:] = R[:, 2, 1:] / (R[:, 0, 0] ** 2 + R[:, 1, 0] ** 2)[:, None]
-        return np.asarray(np.einsum("ni,nij,nj->n", jacobian, trajectory.covariances[:, :3, :3], jacobian))
+        return np.asarray(
+            np.einsum(
+                "ni,nij,nj->n", jacobian, trajectory.covariances[:, :3, :3], jacobian
+            )
+        )
 
 
 def normalised_squares(errors: Floats, covs: Floats) -> Floats:
@@ -101,7 +114,9 @@ def normalised(errors: Floats, covs: Floats) -> Floats:
     along = np.einsum("nji,nj->ni", axes, errors[known])
     definite = variances[:, 0] > 0 if len(variances) else np.zeros(0, dtype=bool)
     scaled = along[definite] / np.sqrt(variances[definite])
-    unit[np.flatnonzero(known)[definite]] = np.einsum("nij,nj->ni", axes[definite], scaled)
+    unit[np.flatnonzero(known)[definite]] = np.einsum(
+        "nij,nj->ni", axes[definite], scaled
+    )
     return unit
 
 
@@ -120,7 +135,9 @@ def effective_samples(unit: Floats) -> int:
     if not n or not u.any():
         return min(n, 1)
     spectrum = np.fft.rfft(u, 2 * n, axis=0)
-    sums = np.fft.irfft(np.einsum("fi,fj->fij", spectrum.conj(), spectrum), 2 * n, axis=0)[:n]
+    sums = np.fft.irfft(
+        np.einsum("fi,fj->fij", spectrum.conj(), spectrum), 2 * n, axis=0
+    )[:n]
     lag = np.arange(n)
     C = sums / (n - lag)[:, None, None] / (np.mean(u**2))
     shared = np.minimum((C**2).sum(axis=(1, 2)) / d, 1.0)
@@ -177,7 +194,9 @@ def anees_over_runs(nees: Floats, dof: int) -> Floats:
     return np.asarray(nees.mean(axis=0) / dof)
 
 
-def anees_interval(runs: int, dof: int, probability: float = 0.95) -> tuple[float, float]:
+def anees_interval(
+    runs: int, dof: int, probability: float = 0.95
+) -> tuple[float, float]:
     """Two-sided bounds of the ANEES of a consistent estimator, per degree of freedom.
 
     The sum of the NEES of ``runs`` independent runs is chi-square with ``runs * dof`` degrees of freedom. Instants of
@@ -194,7 +213,9 @@ def anees_interval(runs: int, dof: int, probability: float = 0.95) -> tuple[floa
     """
     total = runs * dof
     tail = (1 - probability) / 2
-    return chi_square_quantile(tail, total) / total, chi_square_quantile(1 - tail, total) / total
+    return chi_square_quantile(tail, total) / total, chi_square_quantile(
+        1 - tail, total
+    ) / total
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +232,10 @@ class Reliability:
     @property
     def expected_error(self) -> float:
         """The expected calibration error."""
-        return float(np.nansum(self.count * np.abs(self.confidence - self.right)) / max(self.count.sum(), 1))
+        return float(
+            np.nansum(self.count * np.abs(self.confidence - self.right))
+            / max(self.count.sum(), 1)
+        )
 
 
 def reliability(confidence: Floats, right: Floats) -> Reliability:
@@ -219,13 +243,20 @@ def reliability(confidence: Floats, right: Floats) -> Reliability:
     row = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
     count = np.bincount(row, minlength=BINS)
     some = np.maximum(count, 1)
-    means = [np.where(count > 0, np.bincount(row, v, BINS) / some, np.nan) for v in (confidence, right)]
+    means = [
+        np.where(count > 0, np.bincount(row, v, BINS) / some, np.nan)
+        for v in (confidence, right)
+    ]
     return Reliability(count, *means)
 
 
 def reliability_of(sequence: Sequence) -> Reliability | None:
     """Reliability of a sequence's detections; None without them, without true poses, or if none can be judged."""
-    if sequence.detections is None or sequence.true_poses is None or sequence.true_landmarks is None:
+    if (
+        sequence.detections is None
+        or sequence.true_poses is None
+        or sequence.true_landmarks is None
+    ):
         return None
     labels = true_identities(sequence, sequence.detections)
     judged = labels != UNJUDGED
@@ -248,7 +279,9 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     assert truth is not None
     assert landmarks is not None
     labels = np.full(len(detections), UNJUDGED)
-    within = (detections.stamps_ns >= truth.stamps_ns[0]) & (detections.stamps_ns <= truth.stamps_ns[-1])
+    within = (detections.stamps_ns >= truth.stamps_ns[0]) & (
+        detections.stamps_ns <= truth.stamps_ns[-1]
+    )
     stamps_ns, frame = np.unique(detections.stamps_ns[within], return_inverse=True)
     if not len(stamps_ns):
         return labels
@@ -256,10 +289,16 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     world_R_body, mounting = poses.matrices, sequence.calibration.sonar.mounting.pose()
     origin = poses.positions + world_R_body @ mounting.translation()
     from_sonar = landmarks.positions[None] - origin[:, None]
-    q = np.einsum("nji,nmj->nmi", world_R_body @ mounting.rotation().matrix(), from_sonar)[frame]
-    off_azimuth = np.arctan2(q[..., 1], q[..., 0]) - detections.azimuth_rad[within, None]
+    q = np.einsum(
+        "nji,nmj->nmi", world_R_body @ mounting.rotation().matrix(), from_sonar
+    )[frame]
+    off_azimuth = (
+        np.arctan2(q[..., 1], q[..., 0]) - detections.azimuth_rad[within, None]
+    )
     off_range = np.linalg.norm(q, axis=2) - detections.range_m[within, None]
-    off = np.hypot(off_range, detections.range_m[within, None] * 2 * np.sin(off_azimuth / 2))
+    off = np.hypot(
+        off_range, detections.range_m[within, None] * 2 * np.sin(off_azimuth / 2)
+    )
     nearest = off.min(axis=1)
     found = np.where(nearest <= SAME_M, landmarks.ids[off.argmin(axis=1)], UNJUDGED)
     labels[within] = np.where(nearest > APART_M, NONE, found)

@@ -76,7 +76,11 @@ def run_ensembles(
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context) as pool:
         jobs = {
-            pool.submit(run_member, options.model_copy(update={"seed": seed, "image": None}), names): (condition, seed)
+            pool.submit(
+                run_member,
+                options.model_copy(update={"seed": seed, "image": None}),
+                names,
+            ): (condition, seed)
             for condition, options in experiments.items()
             for seed in seeds
         }
@@ -88,7 +92,9 @@ def run_ensembles(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return [_gathered(condition, list(seeds), members, names) for condition in experiments]
+    return [
+        _gathered(condition, list(seeds), members, names) for condition in experiments
+    ]
 
 
 def run_member(options: BasinOptions, names: list[str]) -> _Member:
@@ -104,28 +110,47 @@ def run_member(options: BasinOptions, names: list[str]) -> _Member:
     nees: dict[str, dict[str, list[float] | None]] = {}
     for name in names:
         scores = {key: comparison.score_of(name, key) for key in KEPT}
-        values[name] = {key: None if score is None else score.value for key, score in scores.items()}
+        values[name] = {
+            key: None if score is None else score.value for key, score in scores.items()
+        }
         errors = comparison.errors.get(name, {}).get("causal")
         errors_m[name], nees[name] = None, {"position": None, "yaw": None}
         if errors is not None:
             place = np.searchsorted(instants_ns, errors.stamps_ns)
             columns = np.full((3, len(instants_ns)), np.nan)
             columns[0, place] = np.linalg.norm(errors.position_m[:, :2], axis=1)
-            columns[1:, place] = errors.nees_position / errors.position_dof, errors.nees_yaw
+            columns[1:, place] = (
+                errors.nees_position / errors.position_dof,
+                errors.nees_yaw,
+            )
             errors_m[name] = columns[0].tolist()
             nees[name] = {"position": columns[1].tolist(), "yaw": columns[2].tolist()}
     seconds = ((instants_ns - sequence.start_ns) * 1e-9).tolist()
     return _Member(seconds, values, errors_m, nees)
 
 
-def _gathered(condition: str, seeds: list[int], members: dict[tuple[str, int], _Member], names: list[str]) -> Ensemble:
+def _gathered(
+    condition: str,
+    seeds: list[int],
+    members: dict[tuple[str, int], _Member],
+    names: list[str],
+) -> Ensemble:
     """All runs of one experiment."""
     runs = [members[condition, seed] for seed in seeds]
     return Ensemble(
         condition,
         seeds,
         runs[0].seconds,
-        {name: {key: [run.values[name][key] for run in runs] for key in KEPT} for name in names},
+        {
+            name: {key: [run.values[name][key] for run in runs] for key in KEPT}
+            for name in names
+        },
         {name: [run.errors_m[name] for run in runs] for name in names},
-        {name: {what: [run.nees[name][what] for run in runs] for what in ("position", "yaw")} for name in names},
+        {
+            name: {
+                what: [run.nees[name][what] for run in runs]
+                for what in ("position", "yaw")
+            }
+            for name in names
+        },
     )

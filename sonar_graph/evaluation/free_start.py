@@ -39,7 +39,9 @@ def free_start(calibration: Calibration) -> tuple[bool, bool]:
     return False, "rpy_rad" in said and "position_m" not in said
 
 
-def with_fitted_truth(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Sequence:
+def with_fitted_truth(
+    sequence: Sequence, instants_ns: Ints, runs: list[RunResult]
+) -> Sequence:
     """Bring the truth into the world of the estimates, where the start is free; else the same sequence.
 
     The note `FITTED` says by how much, and by whose path.
@@ -57,7 +59,13 @@ def with_fitted_truth(sequence: Sequence, instants_ns: Ints, runs: list[RunResul
         if run.smoothed is not None:
             path = rows_at(run.smoothed, at_ns).positions
             fit = fit_from_beginning(true, path, is_turned=is_turned)
-            fits.append((float(np.median(np.linalg.norm(fit.apply(true) - path, axis=1))), run.estimator, fit))
+            fits.append(
+                (
+                    float(np.median(np.linalg.norm(fit.apply(true) - path, axis=1))),
+                    run.estimator,
+                    fit,
+                )
+            )
     if not fits:
         return sequence
     _, name, fit = min(fits, key=lambda one: one[0])
@@ -93,4 +101,6 @@ def moved_path(path: Trajectory, fit: Alignment) -> Trajectory:
     turned = path.quaternions_xyzw
     if path.has_orientation:
         turned = (Rotation.from_matrix(fit.rotation) * path.rotations()).as_quat()
-    return Trajectory(path.stamps_ns, fit.apply(path.positions), turned, path.covariances)
+    return Trajectory(
+        path.stamps_ns, fit.apply(path.positions), turned, path.covariances
+    )

@@ -47,7 +47,11 @@ class Alignment:
     def map(self, landmarks: LandmarkMap) -> LandmarkMap:
         """Landmarks moved into the truth's world, with their covariances."""
         R = self.rotation
-        return LandmarkMap(landmarks.ids, self.apply(landmarks.positions), R @ landmarks.covariances @ R.T)
+        return LandmarkMap(
+            landmarks.ids,
+            self.apply(landmarks.positions),
+            R @ landmarks.covariances @ R.T,
+        )
 
     def inverse(self) -> Alignment:
         """The motion of the truth's world into the estimate's."""
@@ -80,12 +84,15 @@ def umeyama(points: Floats, targets: Floats) -> tuple[Floats, Floats]:
     on Pattern Analysis and Machine Intelligence 13(4), 1991. Equation numbers below are his.
     """
     if points.shape != targets.shape or not len(points):
-        raise EvaluationError(f"alignment needs paired points, at least one; got {points.shape} and {targets.shape}")
+        raise EvaluationError(
+            f"alignment needs paired points, at least one; got {points.shape} and {targets.shape}"
+        )
     mean_x, mean_y = points.mean(axis=0), targets.mean(axis=0)  # (34), (35)
     covariance = (targets - mean_y).T @ (points - mean_x) / len(points)  # (38)
     U, _, Vt = np.linalg.svd(covariance)
     S = np.ones(points.shape[1])
-    S[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # (43), which (39) equals at full rank
+    # (43), which (39) equals at full rank
+    S[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     R = (U * S) @ Vt  # (40)
     return R, mean_y - R @ mean_x  # (41) with c = 1
 
@@ -141,7 +148,10 @@ def ate_raw_m(estimate: Trajectory, truth: Trajectory) -> float:
 def ate_yaw_m(estimate: Trajectory, truth: Trajectory) -> float:
     """Position rmse in three dimensions after the best rotation about the vertical and translation."""
     check_paired(estimate, truth)
-    return rmse(align_yaw(estimate.positions, truth.positions).apply(estimate.positions) - truth.positions)
+    return rmse(
+        align_yaw(estimate.positions, truth.positions).apply(estimate.positions)
+        - truth.positions
+    )
 
 
 def ate_se2_m(estimate: Trajectory, truth: Trajectory) -> float:
@@ -153,7 +163,10 @@ def ate_se2_m(estimate: Trajectory, truth: Trajectory) -> float:
 def ate_se3_m(estimate: Trajectory, truth: Trajectory) -> float:
     """Position rmse in three dimensions after the best SE(3) alignment, without scale."""
     check_paired(estimate, truth)
-    return rmse(align_se3(estimate.positions, truth.positions).apply(estimate.positions) - truth.positions)
+    return rmse(
+        align_se3(estimate.positions, truth.positions).apply(estimate.positions)
+        - truth.positions
+    )
 
 
 def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
@@ -182,7 +195,9 @@ class RelativeErrors:
         return len(self.yaw_rad)
 
 
-def relative_errors(estimate: Trajectory, truth: Trajectory, delta_s: float) -> RelativeErrors:
+def relative_errors(
+    estimate: Trajectory, truth: Trajectory, delta_s: float
+) -> RelativeErrors:
     """Errors of the motion over ``delta_s`` from every instant that has a partner that much later.
 
     The translation of a motion is the displacement in the body frame at the pair's first instant: an error of heading
@@ -197,7 +212,10 @@ def relative_errors(estimate: Trajectory, truth: Trajectory, delta_s: float) -> 
 
     error_m = body_displacement(estimate) - body_displacement(truth)
     yaw_error = yaw_errors_rad(estimate, truth)
-    return RelativeErrors(np.linalg.norm(error_m, axis=1), wrap_angle(yaw_error[second] - yaw_error[first]))
+    return RelativeErrors(
+        np.linalg.norm(error_m, axis=1),
+        wrap_angle(yaw_error[second] - yaw_error[first]),
+    )
 
 
 def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:
@@ -244,8 +262,12 @@ def landmark_errors(estimated: LandmarkMap, true: LandmarkMap) -> LandmarkErrors
     """
     ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
     points, targets = estimated.positions[rows], true.positions[true_rows]
-    aligned = horizontal_aligned_rmse(points, targets) if len(ids) >= 2 else float("nan")
-    return LandmarkErrors(ids, (points - targets)[:, :2], estimated.covariances[rows][:, :2, :2], aligned)
+    aligned = (
+        horizontal_aligned_rmse(points, targets) if len(ids) >= 2 else float("nan")
+    )
+    return LandmarkErrors(
+        ids, (points - targets)[:, :2], estimated.covariances[rows][:, :2, :2], aligned
+    )
 
 
 def horizontal_aligned_rmse(points: Floats, targets: Floats) -> float:
@@ -292,7 +314,9 @@ def scored_map(estimated: LandmarkMap, sequence: Sequence) -> ScoredMap | None:
     return ScoredMap(named_by_place(estimated, true, FARTHEST_M), alignment)
 
 
-def align_map(estimated: LandmarkMap, true: LandmarkMap, *, is_level: bool = True) -> Alignment | None:
+def align_map(
+    estimated: LandmarkMap, true: LandmarkMap, *, is_level: bool = True
+) -> Alignment | None:
     """The alignment of a map to the true one by the landmarks that both name; None for fewer than needed.
 
     By yaw and translation where the estimate is level (two landmarks), else by SE(3) (three). Landmarks that lie far
@@ -309,23 +333,31 @@ def align_map(estimated: LandmarkMap, true: LandmarkMap, *, is_level: bool = Tru
         return alignment
 
     def residuals(found: Alignment) -> Floats:
-        return np.asarray(np.linalg.norm((found.apply(points) - targets)[:, :2], axis=1))
+        return np.asarray(
+            np.linalg.norm((found.apply(points) - targets)[:, :2], axis=1)
+        )
 
     for _ in range(CONCENTRATIONS):
-        better = np.argsort(residuals(alignment), kind="stable")[: (len(points) + 3) // 2]
+        better = np.argsort(residuals(alignment), kind="stable")[
+            : (len(points) + 3) // 2
+        ]
         alignment = fit(points[better], targets[better])
     near = residuals(alignment) <= OUTLYING * np.median(residuals(alignment))
     return fit(points[near], targets[near])
 
 
-def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float) -> LandmarkMap:
+def named_by_place(
+    estimated: LandmarkMap, true: LandmarkMap, farthest_m: float
+) -> LandmarkMap:
     """The estimated map, in which landmarks of unknown identity get that of the true landmark at their place.
 
     The assignment is one to one, between landmarks of unknown identity and true ones that the map does not name. It has
     the most pairs within ``farthest_m`` (horizontal distance, not aligned), and among such assignments the least sum of
     squared distances (Kuhn, Naval Research Logistics 2, 1955). Landmarks without a partner keep their identity.
     """
-    unknown = np.flatnonzero((estimated.ids >= FIRST_ANONYMOUS_ID) & ~np.isin(estimated.ids, true.ids))
+    unknown = np.flatnonzero(
+        (estimated.ids >= FIRST_ANONYMOUS_ID) & ~np.isin(estimated.ids, true.ids)
+    )
     if not len(unknown):
         return estimated
     from scipy.optimize import linear_sum_assignment  # takes most of a second to load
@@ -340,4 +372,6 @@ def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float)
     ids = estimated.ids.copy()
     ids[unknown[rows[matched]]] = true.ids[free[columns[matched]]]
     order = np.argsort(ids)
-    return LandmarkMap(ids[order], estimated.positions[order], estimated.covariances[order])
+    return LandmarkMap(
+        ids[order], estimated.positions[order], estimated.covariances[order]
+    )

@@ -19,7 +19,9 @@ LEAST_LANDMARKS = 3
 """True landmarks that a map must name: of two, the errors alone would turn it."""
 
 
-def own_map_errors(run: RunResult, sequence: Sequence, scored_ns: Ints) -> tuple[Ints, Floats]:
+def own_map_errors(
+    run: RunResult, sequence: Sequence, scored_ns: Ints
+) -> tuple[Ints, Floats]:
     """Stamps and horizontal errors, shapes (k,), at those scored instants at which the run's map was kept.
 
     Instants at which the map names fewer than `LEAST_LANDMARKS` true landmarks are left out.
@@ -29,9 +31,14 @@ def own_map_errors(run: RunResult, sequence: Sequence, scored_ns: Ints) -> tuple
     errors: list[float] = []
     if truth is None or true is None or path is None:
         return np.array(stamps, dtype=np.int64), np.array(errors)
-    is_level = sequence.calibration.planar is not None or sequence.calibration.use_gravity
+    is_level = (
+        sequence.calibration.planar is not None or sequence.calibration.use_gravity
+    )
     for known in run.maps:
-        if known.stamp_ns not in scored_ns or np.isin(known.landmarks.ids, true.ids).sum() < LEAST_LANDMARKS:
+        if (
+            known.stamp_ns not in scored_ns
+            or np.isin(known.landmarks.ids, true.ids).sum() < LEAST_LANDMARKS
+        ):
             continue
         alignment = align_map(known.landmarks, true, is_level=is_level)
         assert alignment is not None
@@ -42,7 +49,9 @@ def own_map_errors(run: RunResult, sequence: Sequence, scored_ns: Ints) -> tuple
     return np.array(stamps, dtype=np.int64), np.array(errors)
 
 
-def shared_map_instants(runs: Many[RunResult], sequence: Sequence, scored_ns: Ints) -> Ints:
+def shared_map_instants(
+    runs: Many[RunResult], sequence: Sequence, scored_ns: Ints
+) -> Ints:
     """Stamps at which every run that can be scored on its map at all can be, shape (k,)."""
     shared = scored_ns
     for stamps_ns in (own_map_errors(run, sequence, scored_ns)[0] for run in runs):

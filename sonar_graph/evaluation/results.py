@@ -15,7 +15,13 @@ from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import DetectionLog, LandmarkMap, Refusal, RefusedRow, Trajectory
+from sonar_graph.states import (
+    DetectionLog,
+    LandmarkMap,
+    Refusal,
+    RefusedRow,
+    Trajectory,
+)
 from sonar_graph.table import as_html
 
 if TYPE_CHECKING:
@@ -77,7 +83,10 @@ class RunResult:
     """Highest resident memory of the process while it ran, less what it was before."""
 
     def __repr__(self) -> str:
-        end = self.reason or f"{len(self.causal or ())} estimates, {len(self.landmarks or ())} landmarks"
+        end = (
+            self.reason
+            or f"{len(self.causal or ())} estimates, {len(self.landmarks or ())} landmarks"
+        )
         return f"RunResult({self.estimator!r}: {self.status}, {end})"
 
 
@@ -199,7 +208,12 @@ class Ensemble:
 
     def of(self, estimator: str, key: str) -> Floats:
         """Values of one score by run, shape (runs,); infinite for a run without one."""
-        return np.array([np.inf if value is None else value for value in self.values[estimator][key]])
+        return np.array(
+            [
+                np.inf if value is None else value
+                for value in self.values[estimator][key]
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -246,7 +260,10 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         """The scores that are read first, for a notebook; folded below them all others, and why runs failed."""
-        failed = (f"<p>{escape(run.estimator)} failed: {escape(run.reason)}</p>" for run in self.failed_runs)
+        failed = (
+            f"<p>{escape(run.estimator)} failed: {escape(run.reason)}</p>"
+            for run in self.failed_runs
+        )
         every = f"<details><summary>All scores</summary>\n{as_html(score_table(self))}\n</details>"
         name = f"<p><strong>{escape(self.sequence.name)}</strong></p>"
         return "\n".join([name, *failed, as_html(compact_table(self)), every])
@@ -270,15 +287,28 @@ class RefusedRows:
         stamps_ns = [row.stamp_ns for row in rows]
         distances = [row.distance for row in rows if not math.isnan(row.distance)]
         ends = (min(distances), max(distances)) if distances else None
-        return cls(rows[0].sensor, rows[0].reason, len(rows), min(stamps_ns), max(stamps_ns), ends)
+        return cls(
+            rows[0].sensor,
+            rows[0].reason,
+            len(rows),
+            min(stamps_ns),
+            max(stamps_ns),
+            ends,
+        )
 
     def times(self, start_ns: int) -> str:
         """First and last stamp in seconds after the start."""
-        return " to ".join(f"{(stamp_ns - start_ns) * 1e-9:.3f}" for stamp_ns in sorted({self.first_ns, self.last_ns}))
+        return " to ".join(
+            f"{(stamp_ns - start_ns) * 1e-9:.3f}"
+            for stamp_ns in sorted({self.first_ns, self.last_ns})
+        )
 
     def distances(self) -> str:
         """Least and largest squared distance; empty where the reason has none."""
-        return " to ".join(format_value(distance) for distance in sorted(set(self.least_and_largest_distance or ())))
+        return " to ".join(
+            format_value(distance)
+            for distance in sorted(set(self.least_and_largest_distance or ()))
+        )
 
 
 def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
@@ -287,6 +317,8 @@ def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
     found: list[RefusedRows] = []
     for _, alike in groupby(ordered, key=lambda row: (row.sensor, row.reason)):
         several = list(alike)
-        together = [several] if len(several) > MOST_ROWS_NAMED else [[row] for row in several]
+        together = (
+            [several] if len(several) > MOST_ROWS_NAMED else [[row] for row in several]
+        )
         found += map(RefusedRows.of, together)
     return found

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
-from sonar_graph.estimator import Estimator, is_foreign, load_estimator, make_params, refused_rows_of, withheld_of
+from sonar_graph.estimator import (
+    Estimator,
+    is_foreign,
+    load_estimator,
+    make_params,
+    refused_rows_of,
+    withheld_of,
+)
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import kept_map_instants
 from sonar_graph.files import KilledError, OwnProcess, Tell, noticed_interrupts, serve
@@ -61,7 +68,11 @@ class PeakMemory:
 
     def rise_mb(self) -> float:
         """Megabytes (10⁶ bytes) at the peak above the start; NaN where the system does not tell."""
-        return max(_status_mb("VmHWM") - self._start_mb, 0.0) if self._start_mb == self._start_mb else float("nan")
+        return (
+            max(_status_mb("VmHWM") - self._start_mb, 0.0)
+            if self._start_mb == self._start_mb
+            else float("nan")
+        )
 
 
 def _status_mb(field: str) -> float:
@@ -72,7 +83,9 @@ def _status_mb(field: str) -> float:
     return float("nan")
 
 
-def check_outcome(causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkMap) -> None:
+def check_outcome(
+    causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkMap
+) -> None:
     """Refuse results that cannot be scored.
 
     Raises `EvaluationError` when there is no estimate; the smoothed trajectory is not at the causal one's instants; a
@@ -86,17 +99,36 @@ def check_outcome(causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkM
         )
     for kind, trajectory in (("causal", causal), ("smoothed", smoothed)):
         rows = np.column_stack([trajectory.positions, trajectory.quaternions_xyzw])
-        _refuse(_not_finite(rows), f"{kind} pose is not finite", trajectory.stamps_ns, "ns")
-        _refuse(_impossible(trajectory.covariances), f"{kind} covariance is impossible", trajectory.stamps_ns, "ns")
-    _refuse(_not_finite(landmarks.positions), "position is not finite", landmarks.ids, "landmark")
-    _refuse(_impossible(landmarks.covariances), "covariance is impossible", landmarks.ids, "landmark")
+        _refuse(
+            _not_finite(rows), f"{kind} pose is not finite", trajectory.stamps_ns, "ns"
+        )
+        _refuse(
+            _impossible(trajectory.covariances),
+            f"{kind} covariance is impossible",
+            trajectory.stamps_ns,
+            "ns",
+        )
+    _refuse(
+        _not_finite(landmarks.positions),
+        "position is not finite",
+        landmarks.ids,
+        "landmark",
+    )
+    _refuse(
+        _impossible(landmarks.covariances),
+        "covariance is impossible",
+        landmarks.ids,
+        "landmark",
+    )
 
 
 def _refuse(bad: Flags, fault: str, labels: Ints, unit: str) -> None:
     """Raise for the first bad row, naming it and how many there are."""
     rows = np.flatnonzero(bad)
     if rows.size:
-        raise EvaluationError(f"{fault} in {rows.size} of {len(bad)} rows, first at {unit} {labels[rows[0]]}")
+        raise EvaluationError(
+            f"{fault} in {rows.size} of {len(bad)} rows, first at {unit} {labels[rows[0]]}"
+        )
 
 
 def _not_finite(rows: Floats) -> Flags:
@@ -112,7 +144,9 @@ def _impossible(covs: Floats) -> Flags:
     size = np.abs(filled).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     smallest = np.linalg.eigvalsh(filled)[:, 0] if n else np.zeros(0)
-    sound = finite & (asymmetry <= 1e-6 * size) & (smallest >= -NEGATIVE_TOLERANCE * size)
+    sound = (
+        finite & (asymmetry <= 1e-6 * size) & (smallest >= -NEGATIVE_TOLERANCE * size)
+    )
     return np.asarray(~(unknown | sound))
 
 
@@ -173,7 +207,9 @@ def run_estimator(
     require_sequence(sequence, "run_estimator(sequence, name)")
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
     if not is_apart and is_foreign(name):
-        return _run_apart(_Request(name, overrides or {}, sequence, instants, interim_maps), progress)
+        return _run_apart(
+            _Request(name, overrides or {}, sequence, instants, interim_maps), progress
+        )
     try:
         kind = load_estimator(name)
     except UnknownEstimatorError:
@@ -182,7 +218,9 @@ def run_estimator(
         return RunResult(name, dict(overrides or {}), "failed", one_line(error))
     params = make_params(kind, overrides or {}, name)
     own = copy.deepcopy(sequence)
-    replay = _Replay(sequence, list(own.replay(instants)), name, params, interim_maps=interim_maps)
+    replay = _Replay(
+        sequence, list(own.replay(instants)), name, params, interim_maps=interim_maps
+    )
     return replay.run(kind, progress)
 
 
@@ -222,14 +260,18 @@ class _Request:
 
 @contextlib.contextmanager
 def _process() -> Iterator[OwnProcess]:
-    process = OwnProcess(("-c", "from sonar_graph.evaluation.run import serve_runs; serve_runs()"))
+    process = OwnProcess(
+        ("-c", "from sonar_graph.evaluation.run import serve_runs; serve_runs()")
+    )
     try:
         yield process
     finally:
         process.end()
 
 
-def _asked(process: OwnProcess, request: _Request, progress: Callable[[int, int], None] | None) -> Any:
+def _asked(
+    process: OwnProcess, request: _Request, progress: Callable[[int, int], None] | None
+) -> Any:
     process.answer()  # that it is ready
     process.send(request)
     while isinstance(answer := process.answer(), _StepsDone):
@@ -238,12 +280,16 @@ def _asked(process: OwnProcess, request: _Request, progress: Callable[[int, int]
     return None if answer == NOTHING else answer
 
 
-def _run_apart(request: _Request, progress: Callable[[int, int], None] | None) -> RunResult:
+def _run_apart(
+    request: _Request, progress: Callable[[int, int], None] | None
+) -> RunResult:
     with _process() as process:
         try:
             result: RunResult = _asked(process, request, progress)
         except KilledError as error:
-            return RunResult(request.name, dict(request.overrides), "failed", str(error))
+            return RunResult(
+                request.name, dict(request.overrides), "failed", str(error)
+            )
         return result
 
 
@@ -300,7 +346,13 @@ class _Replay:
     """A run in progress: estimates and maps until now, and the duration of each call."""
 
     def __init__(
-        self, sequence: Sequence, steps: list[Measurements], name: str, params: Section, *, interim_maps: bool
+        self,
+        sequence: Sequence,
+        steps: list[Measurements],
+        name: str,
+        params: Section,
+        *,
+        interim_maps: bool,
     ) -> None:
         self._sequence = sequence
         self._steps = steps
@@ -316,14 +368,18 @@ class _Replay:
         self._stage = "at the start"
         self._check_interrupt: Callable[[], None]
 
-    def run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
+    def run(
+        self, kind: type[Estimator], progress: Callable[[int, int], None] | None
+    ) -> RunResult:
         """Everything from construction to the final map."""
         with noticed_interrupts() as self._check_interrupt:
             result = self._run(kind, progress)
             self._check_interrupt()
             return result
 
-    def _run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
+    def _run(
+        self, kind: type[Estimator], progress: Callable[[int, int], None] | None
+    ) -> RunResult:
         self._warm_up(kind)
         self._check_interrupt()
         memory, estimator = PeakMemory(), None
@@ -331,7 +387,10 @@ class _Replay:
             estimator = self._fresh(kind)
             self._process(estimator, progress)
             return self._finish(estimator, memory)
-        except (Exception, SystemExit) as error:  # an estimator may fail in any way, and the others still run
+        except (
+            Exception,
+            SystemExit,
+        ) as error:  # an estimator may fail in any way, and the others still run
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
             told: dict[str, Any] = {}  # rows refused before are often why it failed
             if estimator is not None:
@@ -340,11 +399,16 @@ class _Replay:
                 with contextlib.suppress(Exception):
                     told["withheld"] = withheld_of(estimator)
             reason = f"{self._stage}: {one_line(error)}"
-            return self._result("failed", reason, **told, peak_memory_mb=memory.rise_mb())
+            return self._result(
+                "failed", reason, **told, peak_memory_mb=memory.rise_mb()
+            )
 
     def _fresh(self, kind: type[Estimator]) -> Estimator:
         """The estimator, with an odometry of its own."""
-        from sonar_graph.navigation import Odometry  # loads numba, which a result does not need
+        # loads numba, which a result does not need
+        from sonar_graph.navigation import (
+            Odometry,
+        )
 
         calibration = self._sequence.calibration
         return kind(calibration, Odometry(calibration), self._params)
@@ -352,23 +416,39 @@ class _Replay:
     def _warm_up(self, kind: type[Estimator]) -> None:
         """Let an estimator that is thrown away compile its code, until landmarks were seen again."""
 
-        def is_named(detections: LandmarkDetections | None) -> bool:  # others are refused, and nothing is compiled
-            return bool(detections is not None and len(detections) and detections.most_probable()[1].max() > 0.5)
+        def is_named(
+            detections: LandmarkDetections | None,
+        ) -> bool:  # others are refused, and nothing is compiled
+            return bool(
+                detections is not None
+                and len(detections)
+                and detections.most_probable()[1].max() > 0.5
+            )
 
         named = [i for i, step in enumerate(self._steps) if is_named(step.detections)]
         last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
-        with contextlib.suppress(Exception, SystemExit):  # what fails here fails again below, where it is reported
+        with contextlib.suppress(
+            Exception, SystemExit
+        ):  # what fails here fails again below, where it is reported
             estimator = self._fresh(kind)
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
                 estimator.process(copy.deepcopy(step))
                 self._check_interrupt()
 
-    def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
-        from sonar_graph.numerics import compiling_s  # loads numba, which an estimator needs and a result does not
+    def _process(
+        self, estimator: Estimator, progress: Callable[[int, int], None] | None
+    ) -> None:
+        # loads numba, which an estimator needs and a result does not
+        from sonar_graph.numerics import (
+            compiling_s,
+        )
 
         is_aided = any(name in self._sequence.blocks() for name in AIDING)
         for done, step in enumerate(self._steps, start=1):
-            end_ns, given = step.end_ns, _Watched.of(step, self._asked) if is_aided else step
+            end_ns, given = (
+                step.end_ns,
+                _Watched.of(step, self._asked) if is_aided else step,
+            )
             self._stage = f"{(end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({end_ns} ns)"
             before = time.perf_counter() - compiling_s()
             estimate = estimator.process(given)
@@ -425,11 +505,20 @@ class _Replay:
 
     def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
         params = self._params.model_dump(mode="json")
-        return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
+        return RunResult(
+            self._name,
+            params,
+            status,
+            reason,
+            update_s=np.array(self._update_s),
+            **outcome,
+        )
 
 
 def one_line(error: BaseException) -> str:
     """The exception's type and message without line breaks."""
     if isinstance(error, SystemExit):
         return f"it called sys.exit({error})"
-    return textwrap.shorten(f"{type(error).__name__}: {error}", REASON_WIDTH, placeholder=" ...")
+    return textwrap.shorten(
+        f"{type(error).__name__}: {error}", REASON_WIDTH, placeholder=" ..."
+    )

@@ -39,7 +39,10 @@ def published_maps() -> tuple[LandmarkMap, LandmarkMap]:
     """Table I as maps: estimated and true. Heights and covariances are not published: 0 and NaN."""
     unknown = np.full((len(IDS), 3, 3), np.nan)
     on_floor = np.zeros((len(IDS), 1))
-    estimated, true = (LandmarkMap(IDS, np.hstack([xy, on_floor]), unknown) for xy in (ESTIMATED_XY_M, TRUE_XY_M))
+    estimated, true = (
+        LandmarkMap(IDS, np.hstack([xy, on_floor]), unknown)
+        for xy in (ESTIMATED_XY_M, TRUE_XY_M)
+    )
     return estimated, true
 
 
@@ -49,7 +52,11 @@ def repeats_published(sequence: Sequence) -> bool:
     Landmarks of other designs in the same places are another experiment.
     """
     true = sequence.true_landmarks
-    if true is None or OWN_DESIGNS in sequence.notes or not np.array_equal(true.ids, IDS):
+    if (
+        true is None
+        or OWN_DESIGNS in sequence.notes
+        or not np.array_equal(true.ids, IDS)
+    ):
         return False
     return bool(np.abs(true.positions[:, :2] - TRUE_XY_M).max() < SAME_PLACE_M)
 
@@ -80,15 +87,23 @@ class ScoredInstants:
             (self.not_estimated, "without an estimate from every estimator"),
         )
         reasons = ", ".join(f"{count} {why}" for count, why in left_out if count)
-        return f"{len(self)} of {self.asked} instants" + (f" (left out: {reasons})" if reasons else "")
+        return f"{len(self)} of {self.asked} instants" + (
+            f" (left out: {reasons})" if reasons else ""
+        )
 
 
-def scored_instants(asked_ns: Ints, truth: Trajectory, runs: list[RunResult]) -> ScoredInstants:
+def scored_instants(
+    asked_ns: Ints, truth: Trajectory, runs: list[RunResult]
+) -> ScoredInstants:
     """The instants with truth nearby and an estimate from each run that did not fail."""
     inside = (asked_ns >= truth.stamps_ns[0]) & (asked_ns <= truth.stamps_ns[-1])
     gap_s = gap_limit_s(truth)
-    after = np.clip(np.searchsorted(truth.stamps_ns, asked_ns, side="left"), 0, len(truth) - 1)
-    before = np.clip(np.searchsorted(truth.stamps_ns, asked_ns, side="right") - 1, 0, len(truth) - 1)
+    after = np.clip(
+        np.searchsorted(truth.stamps_ns, asked_ns, side="left"), 0, len(truth) - 1
+    )
+    before = np.clip(
+        np.searchsorted(truth.stamps_ns, asked_ns, side="right") - 1, 0, len(truth) - 1
+    )
     in_gap = (truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9 > gap_s
     covered = inside & ~in_gap
     estimated = np.ones(len(asked_ns), dtype=bool)
@@ -109,8 +124,12 @@ def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
     """The instants nearest to the published times, scaled to the run's length; the last one included."""
     if not len(asked_ns):
         return asked_ns
-    wanted_ns = start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
-    return np.unique(asked_ns[np.abs(asked_ns[None, :] - wanted_ns[:, None]).argmin(axis=1)])
+    wanted_ns = (
+        start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
+    )
+    return np.unique(
+        asked_ns[np.abs(asked_ns[None, :] - wanted_ns[:, None]).argmin(axis=1)]
+    )
 
 
 def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
@@ -122,7 +141,11 @@ def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
 def gap_limit_s(truth: Trajectory) -> float:
     """The distance between truth samples beyond which nothing is interpolated, seconds."""
     spacing_s = np.diff(truth.stamps_ns) * 1e-9
-    return max(TRUTH_GAP_S, GAP_TO_SPACING * float(np.median(spacing_s))) if spacing_s.size else TRUTH_GAP_S
+    return (
+        max(TRUTH_GAP_S, GAP_TO_SPACING * float(np.median(spacing_s)))
+        if spacing_s.size
+        else TRUTH_GAP_S
+    )
 
 
 def rows_at(trajectory: Trajectory, stamps_ns: Ints) -> Trajectory:

@@ -44,9 +44,7 @@ USED = {
     *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
 }
 """Outcomes of detections that are in the estimate."""
-IN_TIME = (
-    "errors of successive instants are correlated: their mean is worth {} independent samples, for which the band is"
-)
+IN_TIME = "errors of successive instants are correlated: their mean is worth {} independent samples, for which the band is"
 
 
 def trajectory_scores(
@@ -65,7 +63,10 @@ def trajectory_scores(
     ``world`` is `unaligned`. Scores that need true orientations are left out where the truth has positions only.
     Without ``has_height`` the estimate has the truth's, and its errors are of x and y.
     """
-    which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
+    which, over = (
+        ESTIMATES[kind],
+        f"over {instants}, to which the truth is interpolated",
+    )
     space = f"{'3-D' if has_height else 'horizontal'} position error"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
     rules = [
@@ -77,21 +78,36 @@ def trajectory_scores(
         ("return_error_m", return_error_m(estimate, truth), "m",
          f"{world}: norm of estimated minus true displacement from the first to the last,"),
     ]  # fmt: skip
-    scores = _finite({key: Score(value, unit, f"{which}, {rule} {over}.") for key, value, unit, rule in rules})
+    scores = _finite(
+        {
+            key: Score(value, unit, f"{which}, {rule} {over}.")
+            for key, value, unit, rule in rules
+        }
+    )
     for delta_s in RELATIVE_DELTAS_S:
         relative = relative_errors(estimate, truth, delta_s)
         if not len(relative) or not truth.has_orientation:
             continue
         pairs = f"over {len(relative)} overlapping pairs {delta_s} s apart, {over}"
         scores[f"rpe_{delta_s}s_m"] = Score(
-            rmse(relative.translation_m), "m", f"{which}: rms of the error of body-frame displacement {pairs}."
+            rmse(relative.translation_m),
+            "m",
+            f"{which}: rms of the error of body-frame displacement {pairs}.",
         )
         scores[f"rpe_{delta_s}s_rad"] = Score(
-            rmse(relative.yaw_rad), "rad", f"{which}: rms of the error of heading change {pairs}."
+            rmse(relative.yaw_rad),
+            "rad",
+            f"{which}: rms of the error of heading change {pairs}.",
         )
     axes = "x and y" if errors.position_dof == 2 else "x, y and z"
     parts = (
-        ("nees_position", errors.nees_position, errors.position_dof, errors.position_samples, f"position ({axes})"),
+        (
+            "nees_position",
+            errors.nees_position,
+            errors.position_dof,
+            errors.position_samples,
+            f"position ({axes})",
+        ),
         ("nees_yaw", errors.nees_yaw, 1, errors.yaw_samples, "heading"),
     )
     for key, nees, dof, samples, what in parts:
@@ -102,13 +118,17 @@ def trajectory_scores(
             f"{which}, {world}: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
             f"have a covariance; 1 is consistent; {IN_TIME.format(samples)}."
         )
-        scores[key] = Score(mean, "1", protocol, time_average_interval(samples, dof), better="inside")
+        scores[key] = Score(
+            mean, "1", protocol, time_average_interval(samples, dof), better="inside"
+        )
     return {f"{kind}.{key}": score for key, score in scores.items()}
 
 
 def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Score]:
     """The final map against the true one, where there is one."""
-    count = Score(float(len(estimated)), "1", "Landmarks in the map at the end.", better="none")
+    count = Score(
+        float(len(estimated)), "1", "Landmarks in the map at the end.", better="none"
+    )
     true, scored = sequence.true_landmarks, scored_map(estimated, sequence)
     if true is None or scored is None:
         return {"landmarks.count": count}
@@ -117,7 +137,11 @@ def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Sco
     if not len(errors):
         return {"landmarks.count": count}
     by_place = len(np.setdiff1d(named.ids, estimated.ids))
-    how = f"by identity, {by_place} of them by place within {FARTHEST_M:g} m" if by_place else "by identity"
+    how = (
+        f"by identity, {by_place} of them by place within {FARTHEST_M:g} m"
+        if by_place
+        else "by identity"
+    )
     which = f"Map at the end, {len(errors)} landmarks matched {how} ({len(true)} true, {len(estimated)} estimated)"
     nees = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
     se2 = "aligned by SE(2) without scale fitted to the landmarks: rms of horizontal error"
@@ -139,12 +163,18 @@ def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Sco
         ),
     }
     if not is_aligned:
-        raw = Score(rmse(errors.horizontal_m), "m", f"{which}, {where}: rms of horizontal error.")
+        raw = Score(
+            rmse(errors.horizontal_m),
+            "m",
+            f"{which}, {where}: rms of horizontal error.",
+        )
         scores = {"landmarks.raw_m": raw, **scores}
     return _finite(scores)
 
 
-def own_map_scores(run: RunResult, sequence: Sequence, instants_ns: Ints) -> dict[str, Score]:
+def own_map_scores(
+    run: RunResult, sequence: Sequence, instants_ns: Ints
+) -> dict[str, Score]:
     """The causal position on the run's own map at instants that all runs with a map share."""
     stamps_ns, errors_m = own_map_errors(run, sequence, instants_ns)
     if not len(stamps_ns):
@@ -162,9 +192,15 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     counts = Counter(log.outcomes)
     new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
     used = sum(counts[outcome] for outcome in USED)
-    unnamed = counts[Outcome.NO_IDENTITY] + counts[Outcome.WAITING] + counts[Outcome.FORGOTTEN]
+    unnamed = (
+        counts[Outcome.NO_IDENTITY]
+        + counts[Outcome.WAITING]
+        + counts[Outcome.FORGOTTEN]
+    )
     refused = len(log) - used - ignored - unnamed
-    of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")
+    of_all = f"of {len(log)}" + (
+        f", {ignored} of which this estimator has no use for" if ignored else ""
+    )
     rules = (
         ("used", used, f"Detections used, {of_all}; {new} of those used began a landmark."),
         ("refused", refused, f"Detections of a landmark refused, {of_all}: outside the gate, repeated, too late, taken "
@@ -172,7 +208,10 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
         ("unnamed", unnamed, f"Detections in which no landmark is probable enough for this estimator, {of_all}; the "
          "recogniser mostly took these for no landmark."),
     )  # fmt: skip
-    scores = {f"detections.{key}": Score(float(n), "1", rule, better="none") for key, n, rule in rules}
+    scores = {
+        f"detections.{key}": Score(float(n), "1", rule, better="none")
+        for key, n, rule in rules
+    }
     squares = nis(log)
     is_gated_much = counts[Outcome.GATED] > GATED_SHARE * len(log)
     if squares.size:
@@ -200,8 +239,12 @@ def resource_scores(run: RunResult, log_s: float) -> dict[str, Score]:
     )
     scores = {
         "time.update_median_ms": Score(float(np.median(ms)), "ms", f"Median {calls}."),
-        "time.update_p99_ms": Score(float(np.quantile(ms, 0.99)), "ms", f"99th percentile of {calls}."),
-        "time.update_max_ms": Score(float(ms.max()), "ms", f"Longest {calls}; compiling is not counted."),
+        "time.update_p99_ms": Score(
+            float(np.quantile(ms, 0.99)), "ms", f"99th percentile of {calls}."
+        ),
+        "time.update_max_ms": Score(
+            float(ms.max()), "ms", f"Longest {calls}; compiling is not counted."
+        ),
         "time.total_s": Score(total_s, "s", f"Wall-clock time of {whole}."),
         "time.real_time_factor": Score(log_s / total_s, "1", speed, better="higher"),
         "memory.peak_mb": Score(run.peak_memory_mb, "MB", memory),

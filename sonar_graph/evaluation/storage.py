@@ -31,14 +31,37 @@ from pydantic import TypeAdapter
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
-from sonar_graph.evaluation.results import Comparison, Ensemble, ErrorSeries, Kind, MapSoFar, RunResult, Score, gathered
-from sonar_graph.files import COMPARISON, read_json, regular, replacing, result_written, write_json
+from sonar_graph.evaluation.results import (
+    Comparison,
+    Ensemble,
+    ErrorSeries,
+    Kind,
+    MapSoFar,
+    RunResult,
+    Score,
+    gathered,
+)
+from sonar_graph.files import (
+    COMPARISON,
+    read_json,
+    regular,
+    replacing,
+    result_written,
+    write_json,
+)
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
-from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
+from sonar_graph.states import (
+    DetectionLog,
+    LandmarkMap,
+    Outcome,
+    Refusal,
+    RefusedRow,
+    Trajectory,
+)
 
 Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
@@ -50,15 +73,32 @@ ENSEMBLES, PAGE = "ensembles.json", "report.html"
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
 """As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
-_SCORE, _TEXTS, _STATUS = TypeAdapter(Score), TypeAdapter(dict[str, str]), TypeAdapter(Literal["ok", "failed"])
+_SCORE, _TEXTS, _STATUS = (
+    TypeAdapter(Score),
+    TypeAdapter(dict[str, str]),
+    TypeAdapter(Literal["ok", "failed"]),
+)
 """Types of what people may have edited in ``comparison.json``."""
 
 
 def result_names(estimators: Iterable[str]) -> list[str]:
     """Names that a comparison of these estimators may write; pictures are named by their stamps."""
-    of_runs = [f"{RUNS}/{name}/{file}" for name in estimators for file in (*ESTIMATES, SERIES, RESULT)]
+    of_runs = [
+        f"{RUNS}/{name}/{file}"
+        for name in estimators
+        for file in (*ESTIMATES, SERIES, RESULT)
+    ]
     layouts = ("result.foxglove.json", "result.rviz")
-    return [INDEX, SEQUENCE, ENSEMBLES, RECOGNITION, f"{PICTURE_FOLDER}/0.jpg", RESULT_LOG, *layouts, *of_runs]
+    return [
+        INDEX,
+        SEQUENCE,
+        ENSEMBLES,
+        RECOGNITION,
+        f"{PICTURE_FOLDER}/0.jpg",
+        RESULT_LOG,
+        *layouts,
+        *of_runs,
+    ]
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> None:
@@ -86,37 +126,62 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     """
     names = [run.estimator for run in comparison.runs]
     for name in names:
-        if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
-            raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
+        if name in ("", ".", "..") or any(
+            character in name for character in '/\\:*?"<>|'
+        ):
+            raise EvaluationError(
+                f"estimator name {name!r} cannot name a folder; install it under another name"
+            )
     with result_written(folder, COMPARISON) as written:
-        earlier = (name for name in written.names if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/")))
+        earlier = (
+            name
+            for name in written.names
+            if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/"))
+        )
         written.remove([INDEX, ENSEMBLES, PAGE, RECOGNITION, *earlier])
         _write(comparison, folder)
 
 
 def _write(comparison: Comparison, folder: Path) -> None:
-    sequence, ends = comparison.sequence, np.array([0, -1])  # all other rows of IMU and Doppler log are in the log
-    arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
-    arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
+    # all other rows of IMU and Doppler log are in the log
+    sequence, ends = (
+        comparison.sequence,
+        np.array([0, -1]),
+    )
+    arrays = _pack("imu", sequence.imu.rows(ends)) | _pack(
+        "dvl", sequence.dvl.rows(ends)
+    )
+    arrays |= _pack("truth", sequence.truth) | _pack(
+        "true_landmarks", sequence.true_landmarks
+    )
     if sequence.truth is not None and np.isnan(sequence.truth.covariances).all():
         del arrays["truth.covariances"]  # they would be most of the file
-    arrays |= _pack("detections", sequence.detections) | {"instants_ns": comparison.instants_ns}
+    arrays |= _pack("detections", sequence.detections) | {
+        "instants_ns": comparison.instants_ns
+    }
     _write_arrays(folder / SEQUENCE, arrays)
     entries = {}
     for run in comparison.runs:
         _write_run(run, comparison, folder / RUNS / run.estimator)
         scores = comparison.scores.get(run.estimator, {})
-        entry = _state(run) | {"scores": {key: asdict(score) for key, score in scores.items()}}
+        entry = _state(run) | {
+            "scores": {key: asdict(score) for key, score in scores.items()}
+        }
         if run.estimator in comparison.errors:
             errors = comparison.errors[run.estimator]
-            entry["errors"] = {kind: _error_summary(series) for kind, series in errors.items()}
+            entry["errors"] = {
+                kind: _error_summary(series) for kind, series in errors.items()
+            }
         entries[run.estimator] = entry
     if comparison.recognition is not None:
         from sonar_graph.recognition import write_recognition
 
         write_recognition(comparison.recognition, folder)
     if comparison.ensembles:
-        write_json(folder / ENSEMBLES, {"ensembles": [asdict(one) for one in comparison.ensembles]})
+        write_json(
+            folder / ENSEMBLES,
+            {"ensembles": [asdict(one) for one in comparison.ensembles]},
+        )
     sequence, instants = comparison.sequence, comparison.instants_ns
     index = {
         "format": FORMAT,
@@ -126,7 +191,11 @@ def _write(comparison: Comparison, folder: Path) -> None:
             "notes": sequence.notes,
             "calibration": sequence.calibration.model_dump(mode="json"),
         },
-        "instants": {"count": len(instants), "first_ns": int(instants[0]), "last_ns": int(instants[-1])},
+        "instants": {
+            "count": len(instants),
+            "first_ns": int(instants[0]),
+            "last_ns": int(instants[-1]),
+        },
         "environment": comparison.environment,
         "runs": entries,
     }
@@ -135,13 +204,23 @@ def _write(comparison: Comparison, folder: Path) -> None:
 
 def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
     """The files of one run: trajectories and map, all arrays, and ``result.json``."""
-    if run.smoothed is not None and run.causal is not None and run.landmarks is not None:
+    if (
+        run.smoothed is not None
+        and run.causal is not None
+        and run.landmarks is not None
+    ):
         write_tum(folder / "trajectory.tum", run.smoothed)
         write_tum(folder / "causal.tum", run.causal)
         write_landmarks_csv(folder / "landmarks.csv", run.landmarks)
-    _write_arrays(folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {})))
+    _write_arrays(
+        folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {}))
+    )
     scores = comparison.scores.get(run.estimator, {})
-    timings = {key.removeprefix("time."): score.value for key, score in scores.items() if key.startswith("time.")}
+    timings = {
+        key.removeprefix("time."): score.value
+        for key, score in scores.items()
+        if key.startswith("time.")
+    }
     result = {
         "estimator": run.estimator,
         "sequence": comparison.sequence.name,
@@ -174,7 +253,10 @@ def _error_summary(series: ErrorSeries) -> dict[str, Any]:
     }
     if np.isnan(series.yaw_rad).any():  # the truth has positions only
         return summary
-    return summary | {"rms_yaw_rad": rmse(series.yaw_rad), "max_yaw_rad": float(np.abs(series.yaw_rad).max())}
+    return summary | {
+        "rms_yaw_rad": rmse(series.yaw_rad),
+        "max_yaw_rad": float(np.abs(series.yaw_rad).max()),
+    }
 
 
 def write_viewer_files(comparison: Comparison, folder: Path) -> None:
@@ -191,10 +273,14 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
     estimates = {
         run.estimator: (run.causal, run.smoothed, run.landmarks)
         for run in comparison.runs
-        if run.causal is not None and run.smoothed is not None and run.landmarks is not None
+        if run.causal is not None
+        and run.smoothed is not None
+        and run.landmarks is not None
     }
     settings = {
-        f"settings of {run.estimator}": json.dumps(run.params, default=str, ensure_ascii=False)
+        f"settings of {run.estimator}": json.dumps(
+            run.params, default=str, ensure_ascii=False
+        )
         for run in comparison.runs
     }
     names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
@@ -203,8 +289,18 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
     about = comparison.environment | settings
     with result_written(folder, COMPARISON) as written:
         contents = {name: written.as_written(name).read_bytes() for name in names}
-        attachments = [Attachment(name, "application/json", content) for name, content in contents.items()]
-        write_result(folder / RESULT_LOG, comparison.sequence, estimates, about, attachments, pictures)
+        attachments = [
+            Attachment(name, "application/json", content)
+            for name, content in contents.items()
+        ]
+        write_result(
+            folder / RESULT_LOG,
+            comparison.sequence,
+            estimates,
+            about,
+            attachments,
+            pictures,
+        )
 
 
 def read_comparison(folder: Path) -> Comparison:
@@ -228,14 +324,20 @@ def read_comparison(folder: Path) -> Comparison:
     ['dead-reckoning']
     """
     if not (folder / INDEX).is_file():
-        raise EvaluationError(f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to")
+        raise EvaluationError(
+            f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to"
+        )
     index = read_json(folder / INDEX)
     if index.get("format") != FORMAT:
-        raise EvaluationError(f"{folder / INDEX}: format is {index.get('format')!r}, expected {FORMAT!r}; compare anew")
+        raise EvaluationError(
+            f"{folder / INDEX}: format is {index.get('format')!r}, expected {FORMAT!r}; compare anew"
+        )
     try:
         return _restore(index, folder)
     except (KeyError, TypeError, ValueError) as error:
-        raise EvaluationError(f"{folder}: incomplete, {error} is missing or not as written; compare anew") from error
+        raise EvaluationError(
+            f"{folder}: incomplete, {error} is missing or not as written; compare anew"
+        ) from error
 
 
 def _restore(index: dict[str, Any], folder: Path) -> Comparison:
@@ -247,22 +349,34 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         arrays = _read_arrays(folder / RUNS / name / SERIES)
         runs.append(_restore_run(name, entry, arrays))
         scores[name] = {
-            key: _SCORE.validate_python(score | ({"value": np.nan} if score["value"] is None else {}))
+            key: _SCORE.validate_python(
+                score | ({"value": np.nan} if score["value"] is None else {})
+            )
             for key, score in entry["scores"].items()
         }
         if "errors" in entry:
-            series = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
-            errors[name] = {kind: known for kind, known in series.items() if known is not None}
+            series = {
+                kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS
+            }
+            errors[name] = {
+                kind: known for kind, known in series.items() if known is not None
+            }
     recognition = None
     if (folder / RECOGNITION).is_file():
         from sonar_graph.recognition import read_recognition
 
         recognition = read_recognition(folder)
     arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
-    several = read_json(folder / ENSEMBLES) if (folder / ENSEMBLES).is_file() else {"ensembles": []}
+    several = (
+        read_json(folder / ENSEMBLES)
+        if (folder / ENSEMBLES).is_file()
+        else {"ensembles": []}
+    )
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
-        sequence=_restore_sequence(entry["name"], calibration, _TEXTS.validate_python(entry["notes"]), arrays),
+        sequence=_restore_sequence(
+            entry["name"], calibration, _TEXTS.validate_python(entry["notes"]), arrays
+        ),
         instants_ns=arrays["instants_ns"],
         runs=runs,
         scores=scores,
@@ -293,19 +407,30 @@ def _read_arrays(path: Path) -> Arrays:
     Raises `EvaluationError` when the file is missing or damaged.
     """
     try:
-        with regular(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with (
+            regular(path).open("rb") as file,
+            np.load(file, allow_pickle=False) as archive,
+        ):
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise EvaluationError(f"{path}: cannot be read as arrays ({error}); write the comparison anew") from error
+        raise EvaluationError(
+            f"{path}: cannot be read as arrays ({error}); write the comparison anew"
+        ) from error
 
 
-def _restore_sequence(name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays) -> Sequence:
+def _restore_sequence(
+    name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays
+) -> Sequence:
     """A sequence with its start, end, detections and truth, but without its motion's measurements."""
     imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
-        raise EvaluationError("sequence.npz: the first and last rows of imu and dvl are missing")
+        raise EvaluationError(
+            "sequence.npz: the first and last rows of imu and dvl are missing"
+        )
     if "truth.stamps_ns" in arrays and "truth.covariances" not in arrays:
-        arrays = arrays | {"truth.covariances": np.full((len(arrays["truth.stamps_ns"]), 6, 6), np.nan)}
+        arrays = arrays | {
+            "truth.covariances": np.full((len(arrays["truth.stamps_ns"]), 6, 6), np.nan)
+        }
     return Sequence(
         name,
         calibration,
@@ -322,11 +447,20 @@ def _run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
     """All arrays of one run, and its errors."""
     arrays = {"update_s": run.update_s}
     for kind in KINDS:
-        arrays |= _pack(kind, getattr(run, kind)) | _pack(f"errors.{kind}", errors.get(kind))
+        arrays |= _pack(kind, getattr(run, kind)) | _pack(
+            f"errors.{kind}", errors.get(kind)
+        )
     for number, known in enumerate(run.maps):
-        arrays |= {f"maps.{number}.stamp_ns": np.asarray(known.stamp_ns)} | _pack(f"maps.{number}", known.landmarks)
-    arrays |= {f"refused.{name}": np.array([getattr(row, name) for row in run.refused]) for name in RefusedRow._fields}
-    return arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
+        arrays |= {f"maps.{number}.stamp_ns": np.asarray(known.stamp_ns)} | _pack(
+            f"maps.{number}", known.landmarks
+        )
+    arrays |= {
+        f"refused.{name}": np.array([getattr(row, name) for row in run.refused])
+        for name in RefusedRow._fields
+    }
+    return (
+        arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
+    )
 
 
 def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
@@ -334,7 +468,10 @@ def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
     maps: list[MapSoFar] = []
     while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
         maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
-    refused = zip(*(arrays[f"refused.{field}"].tolist() for field in RefusedRow._fields), strict=True)
+    refused = zip(
+        *(arrays[f"refused.{field}"].tolist() for field in RefusedRow._fields),
+        strict=True,
+    )
     memory = entry["peak_memory_mb"]
     return RunResult(
         name,
@@ -345,7 +482,10 @@ def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
         smoothed=_unpack("smoothed", Trajectory, arrays),
         landmarks=_unpack("landmarks", LandmarkMap, arrays),
         detections=_unpack("detections", DetectionLog, arrays),
-        refused=[RefusedRow(sensor, at_ns, Refusal(reason), distance) for sensor, at_ns, reason, distance in refused],
+        refused=[
+            RefusedRow(sensor, at_ns, Refusal(reason), distance)
+            for sensor, at_ns, reason, distance in refused
+        ],
         withheld=entry.get("withheld", []),
         maps=maps,
         update_s=arrays["update_s"],
@@ -358,7 +498,10 @@ def _pack(prefix: str, record: Any) -> Arrays:
     """The fields of a dataclass as arrays; nothing for None."""
     if record is None:
         return {}
-    return {f"{prefix}.{field.name}": np.asarray(getattr(record, field.name)) for field in fields(record)}
+    return {
+        f"{prefix}.{field.name}": np.asarray(getattr(record, field.name))
+        for field in fields(record)
+    }
 
 
 def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
@@ -367,13 +510,24 @@ def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
     Raises `EvaluationError` naming the field that is missing.
     """
     columns = fields(kind)  # type: ignore[arg-type]  # every kind here is a dataclass
-    stored = {column.name: arrays[key] for column in columns if (key := f"{prefix}.{column.name}") in arrays}
+    stored = {
+        column.name: arrays[key]
+        for column in columns
+        if (key := f"{prefix}.{column.name}") in arrays
+    }
     if not stored:
         return None
-    missing = [c.name for c in columns if c.name not in stored and c.default_factory is MISSING]
+    missing = [
+        c.name for c in columns if c.name not in stored and c.default_factory is MISSING
+    ]
     if missing:
-        raise EvaluationError(f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew")
-    values: dict[str, Any] = {name: array.item() if array.ndim == 0 else array for name, array in stored.items()}
+        raise EvaluationError(
+            f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew"
+        )
+    values: dict[str, Any] = {
+        name: array.item() if array.ndim == 0 else array
+        for name, array in stored.items()
+    }
     if "outcomes" in values:
         values["outcomes"] = [Outcome(text) for text in values["outcomes"].tolist()]
     return kind(**values)

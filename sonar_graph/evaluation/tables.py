@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 FITTED = "truth.world"
 """Note of a sequence whose truth was brought into the world of the estimates."""
-HEIGHTS, NO_HEIGHTS = "truth.height", "its heights are all alike, so not measured: errors and NEES are of x and y"
+HEIGHTS, NO_HEIGHTS = (
+    "truth.height",
+    "its heights are all alike, so not measured: errors and NEES are of x and y",
+)
 """Note of a sequence whose truth has positions without heights."""
 NOT_ALIGNED = "not aligned"
 
@@ -31,7 +34,8 @@ TRAJECTORY_LABELS = {
     "nees_yaw": "Yaw NEES",
 }
 SCORES = {
-    "causal": TRAJECTORY_LABELS | {"own_map_m": "Horizontal position error on its own map as it was then (RMS)"},
+    "causal": TRAJECTORY_LABELS
+    | {"own_map_m": "Horizontal position error on its own map as it was then (RMS)"},
     "smoothed": TRAJECTORY_LABELS,
     "landmarks": {
         "raw_m": "Horizontal landmark error, not aligned (RMS)",
@@ -71,7 +75,11 @@ HEADLINES = {
     "ate_raw_m": "RMS, not aligned",
 }
 """Position errors that can stand in the headline, best suited first, with their names there."""
-PAIRED = {"yaw_rmse_rad": "Yaw error", "nees_position": "Position NEES", "nees_yaw": "Yaw NEES"}
+PAIRED = {
+    "yaw_rmse_rad": "Yaw error",
+    "nees_position": "Position NEES",
+    "nees_yaw": "Yaw NEES",
+}
 """Scores that the compact table has causal and smoothed, after the position error."""
 SINGLE = {
     "causal.own_map_m": "On its own map",
@@ -80,12 +88,21 @@ SINGLE = {
     "time.update_max_ms": "Update, longest",
 }
 """Scores that the compact table has once."""
-DIRECTIONS = {"lower": "lower is better", "higher": "higher is better", "inside": "1 is consistent", "none": ""}
+DIRECTIONS = {
+    "lower": "lower is better",
+    "higher": "higher is better",
+    "inside": "1 is consistent",
+    "none": "",
+}
 
 
 def unaligned(sequence: Sequence) -> str:
     """Words for scores and pictures in which no run is aligned; the truth may have been, once for all runs."""
-    return "the truth brought into the estimates' world" if FITTED in sequence.notes else NOT_ALIGNED
+    return (
+        "the truth brought into the estimates' world"
+        if FITTED in sequence.notes
+        else NOT_ALIGNED
+    )
 
 
 def label(metric: str, comparison: Comparison, labels: dict[str, str] = LABELS) -> str:
@@ -102,14 +119,22 @@ def score_keys(comparison: Comparison) -> list[str]:
     keys = {key for scores in comparison.scores.values() for key in scores}
     blocks, metrics = list(BLOCKS), list(LABELS)
     return sorted(
-        keys, key=lambda key: (place(blocks, key.partition(".")[0]), place(metrics, key.partition(".")[2]), key)
+        keys,
+        key=lambda key: (
+            place(blocks, key.partition(".")[0]),
+            place(metrics, key.partition(".")[2]),
+            key,
+        ),
     )
 
 
 def headline_metric(comparison: Comparison) -> str | None:
     """The position error that most runs have, without its ``causal.`` or ``smoothed.``; None where no run has one."""
     counts = {
-        metric: sum(comparison.score_of(run.estimator, f"causal.{metric}") is not None for run in comparison.runs)
+        metric: sum(
+            comparison.score_of(run.estimator, f"causal.{metric}") is not None
+            for run in comparison.runs
+        )
         for metric in HEADLINES
     }
     best = max(counts, key=lambda metric: counts[metric])
@@ -123,31 +148,62 @@ def compact_table(comparison: Comparison) -> Table:
     """
     metric = headline_metric(comparison)
     paired = ({metric: "Position error"} if metric else {}) | PAIRED
-    keys = {f"{kind}.{key}": (kind, label) for key, label in paired.items() for kind in ("causal", "smoothed")}
+    keys = {
+        f"{kind}.{key}": (kind, label)
+        for key, label in paired.items()
+        for kind in ("causal", "smoothed")
+    }
     keys |= {key: (label, "") for key, label in SINGLE.items()}
     columns, shown = [Column("estimator", "Estimator", is_number=False)], []
     for key, (heading, over) in keys.items():
-        scores = [score for run in comparison.runs if (score := comparison.score_of(run.estimator, key))]
+        scores = [
+            score
+            for run in comparison.runs
+            if (score := comparison.score_of(run.estimator, key))
+        ]
         if scores:
             unit = f" ({scores[0].shown_unit})" if scores[0].shown_unit else ""
-            columns.append(Column(key, heading if over else heading + unit, over + unit if over else ""))
+            columns.append(
+                Column(
+                    key,
+                    heading if over else heading + unit,
+                    over + unit if over else "",
+                )
+            )
             shown.append(key)
     rows = []
     for index, run in enumerate(comparison.runs):
         cells = [words(run.estimator, run=index)]
         for key in shown:
             found = comparison.score_of(run.estimator, key)
-            note = found.verdict if found is not None and found.verdict != "consistent" else ""
-            cells.append(absent() if found is None else number(found.value, found.text(), note=note))
+            note = (
+                found.verdict
+                if found is not None and found.verdict != "consistent"
+                else ""
+            )
+            cells.append(
+                absent()
+                if found is None
+                else number(found.value, found.text(), note=note)
+            )
         rows.append(cells)
-    caption = f"Position error: {label(metric, comparison)}. NEES of a fitting covariance: 1." if metric else ""
+    caption = (
+        f"Position error: {label(metric, comparison)}. NEES of a fitting covariance: 1."
+        if metric
+        else ""
+    )
     return Table("compact", "Scores at a glance", caption, columns, rows)
 
 
 def run_columns(comparison: Comparison) -> list[Column]:
     """A column for each run, in its colour, with a word where it failed."""
     return [
-        Column(run.estimator, run.estimator, run=index, warning="failed" if run.status == "failed" else "")
+        Column(
+            run.estimator,
+            run.estimator,
+            run=index,
+            warning="failed" if run.status == "failed" else "",
+        )
         for index, run in enumerate(comparison.runs)
     ]
 
@@ -158,7 +214,10 @@ def score_table(comparison: Comparison) -> Table:
     Beside the numbers stands what a covariance is judged to be, and at the end of the row the interval in which the
     value of a consistent estimator lies, where it is the same for all runs.
     """
-    columns = [Column("metric", "Metric", is_number=False), Column("unit", "Unit", is_number=False)]
+    columns = [
+        Column("metric", "Metric", is_number=False),
+        Column("unit", "Unit", is_number=False),
+    ]
     columns += [*run_columns(comparison), Column("reading", "Reading", is_number=False)]
     rows: list[list[Cell]] = []
     sections: dict[int, str] = {}
@@ -167,7 +226,9 @@ def score_table(comparison: Comparison) -> Table:
         block = BLOCKS.get(prefix, prefix)
         if block not in sections.values():
             sections[len(rows)] = block
-        scores = [comparison.scores.get(run.estimator, {}).get(key) for run in comparison.runs]
+        scores = [
+            comparison.scores.get(run.estimator, {}).get(key) for run in comparison.runs
+        ]
         known = [score for score in scores if score is not None]
         intervals = {_expected(score) for score in known}
         common = intervals.pop() if len(intervals) == 1 else ""
@@ -177,9 +238,17 @@ def score_table(comparison: Comparison) -> Table:
                 cells.append(Cell(ABSENT))
                 continue
             own = "" if common else _expected(score)
-            cells.append(Cell(score.text(), (score.value,), note="; ".join(filter(None, [score.verdict, own]))))
+            cells.append(
+                Cell(
+                    score.text(),
+                    (score.value,),
+                    note="; ".join(filter(None, [score.verdict, own])),
+                )
+            )
         direction = DIRECTIONS[known[0].better]
-        reading = f"{direction}; {common}" if direction and common else direction + common
+        reading = (
+            f"{direction}; {common}" if direction and common else direction + common
+        )
         rows.append(
             [
                 words(label(metric, comparison) if metric in LABELS else key),
@@ -188,7 +257,9 @@ def score_table(comparison: Comparison) -> Table:
                 words(reading),
             ]
         )
-    return Table("scores", "Scores by metric and estimator", "", columns, rows, sections)
+    return Table(
+        "scores", "Scores by metric and estimator", "", columns, rows, sections
+    )
 
 
 def _expected(score: Score) -> str:

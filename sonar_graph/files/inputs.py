@@ -15,7 +15,9 @@ LARGEST_TEXT = 1 << 27
 def as_path(value: object, call: str) -> Path:
     """An argument as a path; a TypeError that names the expected ``call`` where it is none."""
     if not isinstance(value, str | Path):
-        raise TypeError(f"{call}: expected a path, a str or Path, not {type(value).__name__}")
+        raise TypeError(
+            f"{call}: expected a path, a str or Path, not {type(value).__name__}"
+        )
     return Path(value)
 
 
@@ -53,9 +55,13 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(text_of(path))
     except (OSError, ValueError, RecursionError) as error:
-        raise EvaluationError(f"{path}: cannot be read as JSON ({error}); write the comparison anew") from error
+        raise EvaluationError(
+            f"{path}: cannot be read as JSON ({error}); write the comparison anew"
+        ) from error
     if not isinstance(content, dict):
-        raise EvaluationError(f"{path}: expected a JSON object, found {type(content).__name__}")
+        raise EvaluationError(
+            f"{path}: expected a JSON object, found {type(content).__name__}"
+        )
     return content
 
 

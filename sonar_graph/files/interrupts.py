@@ -15,17 +15,24 @@ _Signal = tuple[int, FrameType | None]
 
 
 @contextmanager
-def _handling(handle: Callable[[_Signal, Callable[[], object]], object]) -> Iterator[bool]:
+def _handling(
+    handle: Callable[[_Signal, Callable[[], object]], object],
+) -> Iterator[bool]:
     """Give each Ctrl-C of the block to ``handle``, with what would have been done; False where that is not possible.
 
     Only the main thread has handlers, and one of another program's C code stays.
     """
     before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    if threading.current_thread() is not threading.main_thread() or not callable(
+        before
+    ):
         yield False
         return
     usual: Callable[[int, FrameType | None], object] = before
-    signal.signal(signal.SIGINT, lambda number, frame: handle((number, frame), lambda: usual(number, frame)))
+    signal.signal(
+        signal.SIGINT,
+        lambda number, frame: handle((number, frame), lambda: usual(number, frame)),
+    )
     try:
         yield True
     finally:
@@ -61,7 +68,9 @@ def interrupt_event() -> Iterator[threading.Event]:
     ended = threading.Event()
     is_main = threading.current_thread() is threading.main_thread()
     signals = (signal.SIGINT, signal.SIGTERM) if is_main else ()
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in signals}
+    before = {
+        number: signal.signal(number, lambda *_: ended.set()) for number in signals
+    }
     try:
         yield ended
     finally:

@@ -57,7 +57,9 @@ class OwnProcess:
         assert self._process.stdout is not None
         self._requests: IO[bytes] = self._process.stdin
         self._answers: SimpleQueue[Any] = SimpleQueue()
-        self._collector = threading.Thread(target=self._collect, args=(self._process.stdout,), daemon=True)
+        self._collector = threading.Thread(
+            target=self._collect, args=(self._process.stdout,), daemon=True
+        )
         self._collector.start()
 
     def _collect(self, source: BinaryIO) -> None:
@@ -135,7 +137,9 @@ class _Answers(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if module not in sys.modules and not module.startswith(OWN):
-            raise pickle.UnpicklingError(f"it has a {module}.{name}; expected a class of sonar_graph")
+            raise pickle.UnpicklingError(
+                f"it has a {module}.{name}; expected a class of sonar_graph"
+            )
         return super().find_class(module, name)
 
 
@@ -143,7 +147,9 @@ class _Plain(pickle.Pickler):
     """Writer of answers, in which what has a class derived from one of sonar_graph has that one."""
 
     def reducer_override(self, value: object) -> Any:
-        kind = next((one for one in type(value).__mro__ if one.__module__.startswith(OWN)), None)
+        kind = next(
+            (one for one in type(value).__mro__ if one.__module__.startswith(OWN)), None
+        )
         if kind in (None, type(value)) or not is_dataclass(kind):
             return NotImplemented
         return kind, tuple(getattr(value, column.name) for column in fields(kind))
@@ -167,7 +173,9 @@ def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
         try:
             _Plain(packed).dump(content)
         except Exception:
-            packed = io.BytesIO(pickle.dumps(RuntimeError(f"{type(content).__name__}: {content}")))
+            packed = io.BytesIO(
+                pickle.dumps(RuntimeError(f"{type(content).__name__}: {content}"))
+            )
         answers.write(packed.getvalue())
         answers.flush()
 
@@ -179,6 +187,8 @@ def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
             answer = handle(request, tell)
         except Exception as error:  # for the process that waits for the answer
             answer = error
-        except BaseException as error:  # of an estimator that calls sys.exit or raises such things itself
+        except (
+            BaseException
+        ) as error:  # of an estimator that calls sys.exit or raises such things itself
             answer = KilledError(f"{type(error).__name__}: {error}")
         tell(answer)

@@ -40,8 +40,15 @@ class ResultFolder:
     Raises ``refusal`` when the manifest cannot be read, or is of another kind of result.
     """
 
-    def __init__(self, path: Path, kind: str, refusal: type[SonarGraphError], *, overwrite: bool) -> None:
-        self.path, self.kind, self._refusal, self._overwrite = path, kind, refusal, overwrite
+    def __init__(
+        self, path: Path, kind: str, refusal: type[SonarGraphError], *, overwrite: bool
+    ) -> None:
+        self.path, self.kind, self._refusal, self._overwrite = (
+            path,
+            kind,
+            refusal,
+            overwrite,
+        )
         self.is_writing = False
         self._digests: dict[str, list[str]] = {}
         self._staged: dict[str, Path] = {}
@@ -55,15 +62,34 @@ class ResultFolder:
                 raise ValueError("it is a link")
             content = json.loads(text_of(manifest))
             found, self._digests = content["kind"], content["files"]
-            is_sound = all(isinstance(digests, list) and _is_below(name) for name, digests in self._digests.items())
-            is_sound &= _TOKEN.fullmatch(left := content.get("unfinished", "")) is not None
+            is_sound = all(
+                isinstance(digests, list) and _is_below(name)
+                for name, digests in self._digests.items()
+            )
+            is_sound &= (
+                _TOKEN.fullmatch(left := content.get("unfinished", "")) is not None
+            )
             if content["format"] != FORMAT or not is_sound:
                 raise ValueError(f"expected the format {FORMAT!r}")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise refusal(f"{manifest}: is not as sonar-graph writes it ({error}); choose another folder") from error
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+        ) as error:
+            raise refusal(
+                f"{manifest}: is not as sonar-graph writes it ({error}); choose another folder"
+            ) from error
         if found != kind:
-            raise refusal(f"{path}: holds a {found}, and would become a {kind}; choose another folder with -o")
-        for partial in [*path.glob(f".{MANIFEST}.*.partial*"), *(path.glob(f".*.{left}*.partial*") if left else ())]:
+            raise refusal(
+                f"{path}: holds a {found}, and would become a {kind}; choose another folder with -o"
+            )
+        for partial in [
+            *path.glob(f".{MANIFEST}.*.partial*"),
+            *(path.glob(f".*.{left}*.partial*") if left else ()),
+        ]:
             partial.unlink(missing_ok=True)
 
     @property
@@ -74,10 +100,16 @@ class ResultFolder:
     def require(self, names: Iterable[str]) -> None:
         """Raise for files under these names that are others', unless they are to be overwritten."""
         links = [name for name in names if self._is_linked(name)]
-        others = links or [name for name in names if not self._overwrite and not self._is_own(name)]
+        others = links or [
+            name for name in names if not self._overwrite and not self._is_own(name)
+        ]
         if others:
-            told = ", ".join(others[:_NAMED]) + (f" and {len(others) - _NAMED} more" if len(others) > _NAMED else "")
-            advice = "choose another folder with -o" + ("" if links else ", or give --overwrite to replace this")
+            told = ", ".join(others[:_NAMED]) + (
+                f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+            )
+            advice = "choose another folder with -o" + (
+                "" if links else ", or give --overwrite to replace this"
+            )
             raise self._refusal(
                 f"{self.path}: holds {told}, which sonar-graph did not write or others changed since; {advice}"
             )
@@ -92,7 +124,11 @@ class ResultFolder:
         path = self.path / name
         if not os.path.lexists(path):
             return True
-        return path.is_file() and not path.is_symlink() and digest_of(path) in self._digests.get(name, [])
+        return (
+            path.is_file()
+            and not path.is_symlink()
+            and digest_of(path) in self._digests.get(name, [])
+        )
 
     def stage(self, name: str, partial: Path) -> None:
         """Keep a temporary file that replaces ``name`` when all is written."""
@@ -123,7 +159,9 @@ class ResultFolder:
             self._staged.clear()
             self._gone.clear()
             self.is_writing, self.token = False, ""
-            with contextlib.suppress(OSError):  # then the next command removes what is no longer there
+            with contextlib.suppress(
+                OSError
+            ):  # then the next command removes what is no longer there
                 if is_kept or self._digests:
                     self._write_manifest()
                 else:
@@ -133,8 +171,15 @@ class ResultFolder:
         """Remove and replace; killed in between, the manifest names both contents of each file."""
         with deferred_interrupt():
             new = {name: digest_of(partial) for name, partial in self._staged.items()}
-            gone = [name for name in self._gone if self._is_own(name) and not self._is_linked(name)]
-            self._digests |= {name: [*self._digests.get(name, [])[-1:], digest] for name, digest in new.items()}
+            gone = [
+                name
+                for name in self._gone
+                if self._is_own(name) and not self._is_linked(name)
+            ]
+            self._digests |= {
+                name: [*self._digests.get(name, [])[-1:], digest]
+                for name, digest in new.items()
+            }
             self._write_manifest()
             for name in gone:
                 (self.path / name).unlink(missing_ok=True)
@@ -144,7 +189,11 @@ class ResultFolder:
             for name, partial in self._staged.items():
                 (self.path / name).parent.mkdir(parents=True, exist_ok=True)
                 partial.replace(self.path / name)
-            kept = {name: digests for name, digests in self._digests.items() if name not in self._gone}
+            kept = {
+                name: digests
+                for name, digests in self._digests.items()
+                if name not in self._gone
+            }
             self._digests = kept | {name: [digest] for name, digest in new.items()}
 
     def _write_manifest(self) -> None:
@@ -156,7 +205,11 @@ _held: dict[tuple[Path, int], ResultFolder] = {}
 
 @contextmanager
 def result_folder(
-    path: Path, kind: str, *, overwrite: bool = False, refusal: type[SonarGraphError] = EvaluationError
+    path: Path,
+    kind: str,
+    *,
+    overwrite: bool = False,
+    refusal: type[SonarGraphError] = EvaluationError,
 ) -> Iterator[ResultFolder]:
     """Make a folder and keep every other command out of it while the block runs; unused, it is removed again.
 
@@ -170,7 +223,10 @@ def result_folder(
     OSError
         When the folder cannot be made.
     """
-    with folder_for_use(path), _locked(path, kind, refusal, overwrite=overwrite) as folder:
+    with (
+        folder_for_use(path),
+        _locked(path, kind, refusal, overwrite=overwrite) as folder,
+    ):
         yield folder
 
 
@@ -188,10 +244,17 @@ def folder_for_use(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _locked(path: Path, kind: str, refusal: type[SonarGraphError], *, overwrite: bool) -> Iterator[ResultFolder]:
+def _locked(
+    path: Path, kind: str, refusal: type[SonarGraphError], *, overwrite: bool
+) -> Iterator[ResultFolder]:
     place = path.absolute(), threading.get_ident()
     is_new = not os.path.lexists(path / LOCK)
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    flags = (
+        os.O_RDWR
+        | os.O_CREAT
+        | getattr(os, "O_NOFOLLOW", 0)
+        | getattr(os, "O_NONBLOCK", 0)
+    )
     try:
         descriptor = os.open(path / LOCK, flags, 0o666)
     except OSError as error:
@@ -235,14 +298,20 @@ def _lock(descriptor: int) -> None:
 
 
 @contextmanager
-def result_written(path: Path, kind: str, *, overwrite: bool = False) -> Iterator[ResultFolder]:
+def result_written(
+    path: Path, kind: str, *, overwrite: bool = False
+) -> Iterator[ResultFolder]:
     """Replace and remove the files of a result all together, when the block ends without an error.
 
     A block within another of the same folder is part of it. Errors are those of `result_folder`; a file that is not
     this package's is one as soon as it would be replaced.
     """
     held = _held.get((path.absolute(), threading.get_ident()))
-    with result_folder(path, kind, overwrite=overwrite) if held is None else contextlib.nullcontext(held) as folder:
+    with (
+        result_folder(path, kind, overwrite=overwrite)
+        if held is None
+        else contextlib.nullcontext(held) as folder
+    ):
         if folder.is_writing:
             yield folder
             return
@@ -260,13 +329,17 @@ def replacing(path: Path) -> Iterator[Path]:
         (
             (one, path.absolute().relative_to(root).as_posix())
             for (root, thread), one in _held.items()
-            if thread == threading.get_ident() and one.is_writing and path.absolute().is_relative_to(root)
+            if thread == threading.get_ident()
+            and one.is_writing
+            and path.absolute().is_relative_to(root)
         ),
         (None, ""),
     )
     if folder is not None:
         folder.require([name])
-    place, token = (path, "") if folder is None else (folder.path / path.name, folder.token)
+    place, token = (
+        (path, "") if folder is None else (folder.path / path.name, folder.token)
+    )
     use = folder_for_use(path.parent) if folder is None else contextlib.nullcontext()
     with use, _new_file(place, token) as partial:
         yield partial
@@ -279,7 +352,9 @@ def replacing(path: Path) -> Iterator[Path]:
 @contextmanager
 def _new_file(path: Path, token: str = "") -> Iterator[Path]:
     """Make an empty file beside a path, which nothing else has or links to; removed when the block fails."""
-    partial = path.with_name(f".{path.name[:_LONGEST_NAME]}.{token}{secrets.token_hex(6)}.partial{path.suffix}")
+    partial = path.with_name(
+        f".{path.name[:_LONGEST_NAME]}.{token}{secrets.token_hex(6)}.partial{path.suffix}"
+    )
     with contextlib.ExitStack() as failure:
         with deferred_interrupt():
             os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -288,12 +363,16 @@ def _new_file(path: Path, token: str = "") -> Iterator[Path]:
         failure.pop_all()
 
 
-def write_manifest(folder: Path, kind: str, digests: dict[str, list[str]], unfinished: str = "") -> None:
+def write_manifest(
+    folder: Path, kind: str, digests: dict[str, list[str]], unfinished: str = ""
+) -> None:
     """Write the manifest of a folder: the digests of each file that is this package's.
 
     ``unfinished`` is in the names of temporary files, as long as there may be some.
     """
-    content = {"format": FORMAT, "kind": kind, "files": digests} | ({"unfinished": unfinished} if unfinished else {})
+    content = {"format": FORMAT, "kind": kind, "files": digests} | (
+        {"unfinished": unfinished} if unfinished else {}
+    )
     with _new_file(folder / MANIFEST) as partial:
         partial.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         partial.replace(folder / MANIFEST)
@@ -320,32 +399,57 @@ def _manifest_of(folder: Path) -> dict[str, Any]:
 def _written_in(folder: Path) -> set[Path]:
     """Files that a folder's manifest names, with manifest and lock, and a manifest that was half written."""
     lock = folder / LOCK
-    has_lock = lock.is_file() and not lock.is_symlink() and not lock.stat().st_size  # one with content is others'
-    named = {MANIFEST, *([LOCK] if has_lock else []), *(path.name for path in folder.glob(f".{MANIFEST}.*.partial*"))}
+    # one with content is others'
+    has_lock = lock.is_file() and not lock.is_symlink() and not lock.stat().st_size
+    named = {
+        MANIFEST,
+        *([LOCK] if has_lock else []),
+        *(path.name for path in folder.glob(f".{MANIFEST}.*.partial*")),
+    }
     named |= {name for name in _manifest_of(folder).get("files", ()) if _is_below(name)}
     return {folder / name for name in named}
 
 
 def others_in(folder: Path) -> list[str]:
     """Names of the files in a folder that its manifest does not name."""
-    there = {path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()}
-    return sorted(path.relative_to(folder).as_posix() for path in there - _written_in(folder))
+    there = {
+        path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()
+    }
+    return sorted(
+        path.relative_to(folder).as_posix() for path in there - _written_in(folder)
+    )
 
 
 def changed_in(folder: Path) -> list[str]:
     """Names of the files in a folder that somebody changed since they were written; an empty one holds nothing."""
-    named = {folder / name: name for name in _manifest_of(folder).get("files", ()) if _is_below(name)}
-    whole = {path: name for path, name in named.items() if path.is_file() and path.stat().st_size}
-    return [name for path, name in whole.items() if digest_of(path) not in _manifest_of(folder)["files"][name]]
+    named = {
+        folder / name: name
+        for name in _manifest_of(folder).get("files", ())
+        if _is_below(name)
+    }
+    whole = {
+        path: name
+        for path, name in named.items()
+        if path.is_file() and path.stat().st_size
+    }
+    return [
+        name
+        for path, name in whole.items()
+        if digest_of(path) not in _manifest_of(folder)["files"][name]
+    ]
 
 
 def remove_written(folder: Path) -> None:
     """Remove a folder with the files that its manifest names; others' files stay, and the folder with them."""
     links = {path for path in folder.rglob("*") if path.is_symlink() and path.is_dir()}
-    for path in sorted(_written_in(folder), key=lambda path: path.name == MANIFEST):  # the manifest last
+    for path in sorted(
+        _written_in(folder), key=lambda path: path.name == MANIFEST
+    ):  # the manifest last
         if not links & set(path.parents):
             path.unlink(missing_ok=True)
-    for path in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
+    for path in sorted(
+        (path for path in folder.rglob("*") if path.is_dir()), reverse=True
+    ):
         with contextlib.suppress(OSError):
             path.rmdir()
     with contextlib.suppress(OSError):

@@ -74,7 +74,9 @@ class Arrivals:
         if not 0 < rate_hz <= NS_PER_S:
             raise MeasurementError(f"{rate_hz} Hz is no rate; expected more than 0")
         if not 0 <= lateness_s < float("inf"):
-            raise MeasurementError(f"a lateness budget of {lateness_s} s is none; expected 0 or more")
+            raise MeasurementError(
+                f"a lateness budget of {lateness_s} s is none; expected 0 or more"
+            )
         self.step_ns = round(NS_PER_S / rate_hz)
         self.lateness_ns = round(lateness_s * NS_PER_S)
         self.newest_ns: dict[str, int] = {}
@@ -91,7 +93,13 @@ class Arrivals:
         """Say what stamp is usual at a time of arrival, before the first message, whose own may be wrong."""
         self._clock_ns = stamp_ns, arrival_ns
 
-    def add(self, sensor: str, stamp_ns: int, block: Block | None, arrival_ns: int | None = None) -> str | None:
+    def add(
+        self,
+        sensor: str,
+        stamp_ns: int,
+        block: Block | None,
+        arrival_ns: int | None = None,
+    ) -> str | None:
         """Take in a message of a sensor, by its name in `Measurements`; the reason why it is refused, or None.
 
         ``block``: its rows, all of this stamp; None of a sonar frame in which nothing was detected, which says that
@@ -99,8 +107,13 @@ class Arrivals:
         """
         if arrival_ns is not None and self._clock_ns is not None:
             newest_ns, last_arrival_ns = self._clock_ns
-            ahead_ns, since_ns = stamp_ns - newest_ns, max(arrival_ns - last_arrival_ns, 0)
-            if ahead_ns > FARTHEST_NS or (ahead_ns > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS):
+            ahead_ns, since_ns = (
+                stamp_ns - newest_ns,
+                max(arrival_ns - last_arrival_ns, 0),
+            )
+            if ahead_ns > FARTHEST_NS or (
+                ahead_ns > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS
+            ):
                 return AHEAD
             if self.done_ns is None and ahead_ns < -FARTHEST_NS:
                 return BEHIND
@@ -116,7 +129,9 @@ class Arrivals:
             self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
         self.newest_ns[sensor] = max(stamp_ns, self.newest_ns.get(sensor, stamp_ns))
         if arrival_ns is not None:
-            newest_ns = stamp_ns if self._clock_ns is None else max(stamp_ns, self._clock_ns[0])
+            newest_ns = (
+                stamp_ns if self._clock_ns is None else max(stamp_ns, self._clock_ns[0])
+            )
             self._clock_ns = newest_ns, arrival_ns
         return None
 
@@ -132,7 +147,10 @@ class Arrivals:
         if begun_ns is None:
             return
         end_ns = begun_ns + self.step_ns
-        while min(self.newest_ns.values()) >= end_ns or max(self.newest_ns.values()) >= end_ns + self.lateness_ns:
+        while (
+            min(self.newest_ns.values()) >= end_ns
+            or max(self.newest_ns.values()) >= end_ns + self.lateness_ns
+        ):
             yield self._step(end_ns)
             end_ns += self.step_ns
 
@@ -156,7 +174,9 @@ class Arrivals:
                 rows[name] = block.between(after_ns, end_ns)
                 left = block.between(end_ns, int(block.stamps_ns[-1]))
                 self._waiting[name] = [] if left is None else [left]
-                self._stamps_ns[name] = set() if left is None else set(left.stamps_ns.tolist())
+                self._stamps_ns[name] = (
+                    set() if left is None else set(left.stamps_ns.tolist())
+                )
         self.done_ns = end_ns
         return Measurements(end_ns, **rows)
 
@@ -167,7 +187,10 @@ def joined(parts: list[Any]) -> Any:
         return parts[0]
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])
     order = np.argsort(stamps_ns, kind="stable")
-    columns = {name: _stacked(name, [getattr(part, name) for part in parts])[order] for name in vars(parts[0])}
+    columns = {
+        name: _stacked(name, [getattr(part, name) for part in parts])[order]
+        for name in vars(parts[0])
+    }
     return type(parts[0])(**columns)
 
 
@@ -176,6 +199,11 @@ def _stacked(name: str, columns: list[Any]) -> Any:
     if name in PADDING:
         most = max(column.shape[1] for column in columns)
         columns = [
-            np.pad(column, ((0, 0), (0, most - column.shape[1])), constant_values=PADDING[name]) for column in columns
+            np.pad(
+                column,
+                ((0, 0), (0, most - column.shape[1])),
+                constant_values=PADDING[name],
+            )
+            for column in columns
         ]
     return np.concatenate(columns)

@@ -140,8 +140,15 @@ class Engine:
         self.generation = 0
         """Number of times that all steps began anew, since a topic of a further sensor came late."""
         self._rate_hz, self._lateness_s = rate_hz, lateness_s
-        self._said = {LIVE_RATE: repr(float(rate_hz)), LATENESS: repr(float(lateness_s))}
-        self._wanted, self._config, self._given = dict(wanted or {}), config or LogConfig(), calibration
+        self._said = {
+            LIVE_RATE: repr(float(rate_hz)),
+            LATENESS: repr(float(lateness_s)),
+        }
+        self._wanted, self._config, self._given = (
+            dict(wanted or {}),
+            config or LogConfig(),
+            calibration,
+        )
         self.topics: dict[str, Topic] = {}
         """Topics that have sent."""
         self.remarks: list[str] = []
@@ -177,7 +184,9 @@ class Engine:
         if message.sequence:
             place = name, message.sender
             if place in self._sequence:
-                self.counts.lost[name] += max(message.sequence - self._sequence[place] - 1, 0)
+                self.counts.lost[name] += max(
+                    message.sequence - self._sequence[place] - 1, 0
+                )
             self._sequence[place] = max(message.sequence, self._sequence.get(place, 0))
         log_time_ns = self.log_time_ns = self._record.write(
             name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
@@ -189,10 +198,20 @@ class Engine:
             return []
         if self._reader is None:
             self._first.append((message, log_time_ns))
-            return self._all_parts(self._first) if self._is_time(message) and self._set_up(self._first) else []
-        if name in self._places and self._brings_rows(message, log_time_ns) and (held := self._begin_anew(name)):
+            return (
+                self._all_parts(self._first)
+                if self._is_time(message) and self._set_up(self._first)
+                else []
+            )
+        if (
+            name in self._places
+            and self._brings_rows(message, log_time_ns)
+            and (held := self._begin_anew(name))
+        ):
             return self._all_parts(held)
-        return self._parts(message, log_time_ns, self._reader.read(name, message.payload, log_time_ns))
+        return self._parts(
+            message, log_time_ns, self._reader.read(name, message.payload, log_time_ns)
+        )
 
     def steps(self) -> Iterator[Measurements]:
         """Steps that are complete by now."""
@@ -216,13 +235,24 @@ class Engine:
         is_latched = message.topic.endswith("_static")
         text = self._definition_of(message.type_name)
         kind = message.type_name
-        topic = Topic(self.record_path, message.topic, kind, "cdr", "ros2msg", text, Keep.ALL, is_latched=is_latched)
+        topic = Topic(
+            self.record_path,
+            message.topic,
+            kind,
+            "cdr",
+            "ros2msg",
+            text,
+            Keep.ALL,
+            is_latched=is_latched,
+        )
         self.topics[message.topic] = topic
         self._record.add_topic(topic)
 
     def _find_places(self) -> None:
         """Find topics that are not in use and may be of a sensor that has none, such as detections that begin late."""
-        choices = choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
+        choices = choose_each(
+            Recording(self.record_path, self.topics), self._wanted, self._config
+        )
         self._places = {
             choice.topic: choice
             for role, choice in choices.items()
@@ -236,9 +266,16 @@ class Engine:
         assert self.calibration is not None
         choice = self._places[message.topic]
         try:
-            block = _rows_in(choice, self.topics[message.topic], [(message, log_time_ns)], self.calibration)
+            block = _rows_in(
+                choice,
+                self.topics[message.topic],
+                [(message, log_time_ns)],
+                self.calibration,
+            )
         except Exception as error:  # whatever a sender sends
-            self.drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
+            self.drop(
+                message.topic, log_time_ns, _unreadable(error), message.arrival_ns
+            )
             return False
         return block is not None
 
@@ -248,7 +285,10 @@ class Engine:
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
         self._record.flush()
-        dropped, needed = dropped_messages(self.record_path), {*self.in_use.values(), *self._places}
+        dropped, needed = (
+            dropped_messages(self.record_path),
+            {*self.in_use.values(), *self._places},
+        )
         held = [  # without images, which would not fit into memory
             (message, message.arrival_ns)
             for message in recorded_messages(self.record_path)
@@ -267,8 +307,12 @@ class Engine:
     def _is_time(self, message: Message) -> bool:
         """Tell whether it is time to choose topics and calibration: some seconds of both sensors of the motion."""
         if self._first_motion_ns is None:
-            choices = choose_each(Recording(self.record_path, self.topics), self._wanted, self._config)
-            if not all(choices[role].topic or choices[role].candidates for role in MOTION):
+            choices = choose_each(
+                Recording(self.record_path, self.topics), self._wanted, self._config
+            )
+            if not all(
+                choices[role].topic or choices[role].candidates for role in MOTION
+            ):
                 return False
             self._first_motion_ns = self._set_up_ns = message.arrival_ns
         since_ns = message.arrival_ns - self._set_up_ns
@@ -299,16 +343,27 @@ class Engine:
             held[:] = [one for one in held if one not in unreadable]
             recording = self._recording(held)
         try:
-            self._sonar = sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
+            self._sonar = (
+                sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
+            )
             assembly = Assembly(recording, choices, self._given, self._sonar)
             choices = {
-                role: choice if _is_of_use(assembly, role) else replace(choice, topic=None, adapter=None)
+                role: choice
+                if _is_of_use(assembly, role)
+                else replace(choice, topic=None, adapter=None)
                 for role, choice in choices.items()
             }
             assembly = Assembly(recording, choices, self._given, self._sonar)
             tables = pinned(self._config, choices, assembly)
-            config = LogConfig.parse(json.loads(json.dumps(tables)), self._config.source)
-            assembly = Assembly(recording, choose_topics(recording, {}, config), self._given, self._sonar)
+            config = LogConfig.parse(
+                json.loads(json.dumps(tables)), self._config.source
+            )
+            assembly = Assembly(
+                recording,
+                choose_topics(recording, {}, config),
+                self._given,
+                self._sonar,
+            )
             sequence = assembly.sequence("live")
             reader = MessageReader(assembly)
         except SonarGraphError as error:
@@ -317,12 +372,25 @@ class Engine:
             self.waits_for = str(error)
             return False
         self.waits_for = ""
-        frames_ns = max((at_ns for message, at_ns in held if message.topic.endswith("tf_static")), default=0)
-        self.sequence, self.calibration, self.notes = sequence, sequence.calibration, sequence.notes
+        frames_ns = max(
+            (at_ns for message, at_ns in held if message.topic.endswith("tf_static")),
+            default=0,
+        )
+        self.sequence, self.calibration, self.notes = (
+            sequence,
+            sequence.calibration,
+            sequence.notes,
+        )
         self._reader = reader
-        self._record.describe(self.record_path.stem, self.calibration, tables, self._said, frames_ns)
+        self._record.describe(
+            self.record_path.stem, self.calibration, tables, self._said, frames_ns
+        )
         self._arrivals = Arrivals(self._rate_hz, self._lateness_s)
-        self.in_use = {role: choice.topic for role, choice in choices.items() if choice.topic is not None}
+        self.in_use = {
+            role: choice.topic
+            for role, choice in choices.items()
+            if choice.topic is not None
+        }
         self._find_places()
         return True
 
@@ -338,16 +406,29 @@ class Engine:
         for message, log_time_ns in held:
             if message.topic == choice.topic:
                 try:
-                    _rows_in(choice, self.topics[message.topic], [(message, log_time_ns)], Calibration())
+                    _rows_in(
+                        choice,
+                        self.topics[message.topic],
+                        [(message, log_time_ns)],
+                        Calibration(),
+                    )
                 except Exception as error:  # whatever a sender sends
                     found.append((message, log_time_ns))
-                    self.drop(message.topic, log_time_ns, _unreadable(error), message.arrival_ns)
+                    self.drop(
+                        message.topic,
+                        log_time_ns,
+                        _unreadable(error),
+                        message.arrival_ns,
+                    )
         return found
 
     def _all_parts(self, held: Held) -> list[Part]:
         """Parts of all messages until now, after the usual difference of their stamps from their arrival is known."""
         assert self._reader is not None
-        found = [(m, at_ns, self._reader.read(m.topic, m.payload, at_ns)) for m, at_ns in held]
+        found = [
+            (m, at_ns, self._reader.read(m.topic, m.payload, at_ns))
+            for m, at_ns in held
+        ]
         first_ns = found[0][0].arrival_ns if found else 0
         offsets_ns = sorted(
             part.stamp_ns - message.arrival_ns
@@ -358,26 +439,39 @@ class Engine:
         if offsets_ns:
             self._arrivals.expect(first_ns + offsets_ns[len(offsets_ns) // 2], first_ns)
         self._first = []
-        return [part for m, at_ns, parts in found for part in self._parts(m, at_ns, parts)]
+        return [
+            part for m, at_ns, parts in found for part in self._parts(m, at_ns, parts)
+        ]
 
-    def _parts(self, message: Message, log_time_ns: int, found: list[Part]) -> list[Part]:
+    def _parts(
+        self, message: Message, log_time_ns: int, found: list[Part]
+    ) -> list[Part]:
         parts, reasons = [], []
         for part in found:
-            fault = part.fault if part.block is None else ""  # of some rows only: these are left out of a log too
-            reason = fault or self._arrivals.add(part.role, part.stamp_ns, part.block, message.arrival_ns)
+            # of some rows only: these are left out of a log too
+            fault = part.fault if part.block is None else ""
+            reason = fault or self._arrivals.add(
+                part.role, part.stamp_ns, part.block, message.arrival_ns
+            )
             if reason:
                 reasons.append(reason)
                 continue
             parts.append(part)
             if part.role == "detections" and part.block is not None:
-                self._detections.setdefault(part.stamp_ns, []).append((message.topic, log_time_ns))
+                self._detections.setdefault(part.stamp_ns, []).append(
+                    (message.topic, log_time_ns)
+                )
         if reasons and not parts:
             self.drop(message.topic, log_time_ns, reasons[0], message.arrival_ns)
         return parts
 
     def _counted(self, step: Measurements) -> Measurements:
         """A step, after which its messages are no longer waited for."""
-        for stamp_ns in [stamp_ns for stamp_ns in self._detections if stamp_ns <= step.end_ns - 60 * NS_PER_S]:
+        for stamp_ns in [
+            stamp_ns
+            for stamp_ns in self._detections
+            if stamp_ns <= step.end_ns - 60 * NS_PER_S
+        ]:
             del self._detections[stamp_ns]
         return step
 
@@ -388,7 +482,12 @@ class Engine:
 
 
 def _gather(topic: Topic, message: Message, log_time_ns: int) -> None:
-    topic.gather(message.payload, np.zeros(1, np.int64), np.array([len(message.payload)]), np.array([log_time_ns]))
+    topic.gather(
+        message.payload,
+        np.zeros(1, np.int64),
+        np.array([len(message.payload)]),
+        np.array([log_time_ns]),
+    )
 
 
 def _rows_in(choice: Choice, topic: Topic, held: Held, calibration: Calibration) -> Any:
@@ -412,7 +511,10 @@ def _is_of_use(assembly: Assembly, role: str) -> bool:
     if not topic.messages():
         return False
     adapter = assembly.adapters[role]
-    return getattr(adapter, "geodetic", None) is None or assembly.axes_and_origin(role)[1] is not None
+    return (
+        getattr(adapter, "geodetic", None) is None
+        or assembly.axes_and_origin(role)[1] is not None
+    )
 
 
 def _unreadable(error: Exception) -> str:

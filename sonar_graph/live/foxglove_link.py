@@ -56,9 +56,13 @@ class FoxgloveLink:
         """Definition that the bridge advertised for a type, or that of ROS 2."""
         return self._definitions.get(type_name) or definition_of(type_name)
 
-    def listen(self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]) -> None:
+    def listen(
+        self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]
+    ) -> None:
         """Begin to give messages of the topics that are wanted, by name and type, to a function of a thread."""
-        self._thread = threading.Thread(target=self._work, args=(received, is_wanted), daemon=True)
+        self._thread = threading.Thread(
+            target=self._work, args=(received, is_wanted), daemon=True
+        )
         self._thread.start()
 
     def stop(self) -> None:
@@ -73,14 +77,24 @@ class FoxgloveLink:
             from websockets.exceptions import WebSocketException
             from websockets.sync.client import connect
         except ImportError as error:
-            raise LogError("ws:// needs websockets: pip install 'sonar-graph[live]'") from error
+            raise LogError(
+                "ws:// needs websockets: pip install 'sonar-graph[live]'"
+            ) from error
         try:
-            options: dict[str, Any] = {"subprotocols": SUBPROTOCOLS, "max_size": MOST_BYTES, "compression": None}
+            options: dict[str, Any] = {
+                "subprotocols": SUBPROTOCOLS,
+                "max_size": MOST_BYTES,
+                "compression": None,
+            }
             return self._open.enter_context(connect(self._url, **options))
         except (OSError, WebSocketException, ValueError) as error:
-            raise LogError(f"{self._url}: cannot connect: is a foxglove_bridge there? {error}") from error
+            raise LogError(
+                f"{self._url}: cannot connect: is a foxglove_bridge there? {error}"
+            ) from error
 
-    def _work(self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]) -> None:
+    def _work(
+        self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]
+    ) -> None:
         from websockets.exceptions import ConnectionClosed
 
         while not self._is_ended.is_set():
@@ -95,25 +109,43 @@ class FoxgloveLink:
                 except LogError:
                     continue
 
-    def _pass_on(self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]) -> None:
+    def _pass_on(
+        self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]
+    ) -> None:
         topics: dict[int, tuple[str, str]] = {}
         for data in self._socket:
             if isinstance(data, str):
                 said = json.loads(data)
-                channels = said.get("channels", []) if said.get("op") == "advertise" else []
+                channels = (
+                    said.get("channels", []) if said.get("op") == "advertise" else []
+                )
                 wanted = [
                     channel
                     for channel in channels
-                    if channel["encoding"] == "cdr" and is_wanted(channel["topic"], channel["schemaName"])
+                    if channel["encoding"] == "cdr"
+                    and is_wanted(channel["topic"], channel["schemaName"])
                 ]
                 for channel in wanted:
                     topics[channel["id"]] = channel["topic"], channel["schemaName"]
                     if channel.get("schemaEncoding") in (None, "ros2msg"):
                         self._definitions[channel["schemaName"]] = channel["schema"]
                 if wanted:
-                    subscriptions = [{"id": channel["id"], "channelId": channel["id"]} for channel in wanted]
-                    self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+                    subscriptions = [
+                        {"id": channel["id"], "channelId": channel["id"]}
+                        for channel in wanted
+                    ]
+                    self._socket.send(
+                        json.dumps({"op": "subscribe", "subscriptions": subscriptions})
+                    )
             elif len(data) >= HEAD.size and data[0] == MESSAGE_DATA:
                 _, number, sent_ns = HEAD.unpack_from(data)
                 if number in topics:
-                    received(Message(*topics[number], data[HEAD.size :], time.time_ns(), 0, sent_ns))
+                    received(
+                        Message(
+                            *topics[number],
+                            data[HEAD.size :],
+                            time.time_ns(),
+                            0,
+                            sent_ns,
+                        )
+                    )

@@ -83,11 +83,17 @@ class Silence:
         for topic, after_s in self._ended.items():
             yield f"{topic} comes again, after {after_s:.0f} s"
         self._ended.clear()
-        known = {topic: at_s - heard_s for topic, heard_s in self._heard_s.items() if topic in topics}
+        known = {
+            topic: at_s - heard_s
+            for topic, heard_s in self._heard_s.items()
+            if topic in topics
+        }
         silent = {topic: for_s for topic, for_s in known.items() if for_s > SILENT_S}
         new = silent.keys() - self._said
         if new and all(at_s - heard_s > SILENT_S for heard_s in self._heard_s.values()):
             yield f"nothing comes any more since {min(silent.values()):.0f} s: does the sender run?"
         else:
-            yield from (f"{topic}: nothing since {silent[topic]:.0f} s" for topic in sorted(new))
+            yield from (
+                f"{topic}: nothing since {silent[topic]:.0f} s" for topic in sorted(new)
+            )
         self._said |= new

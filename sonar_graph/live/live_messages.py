@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sonar_graph.logs import DROPPED_TOPIC, dropped_in
-from sonar_graph.logs.mcap import ChunkPart, Keep, LogFile, Passage, Recording, log_parts, scan
+from sonar_graph.logs.mcap import (
+    ChunkPart,
+    Keep,
+    LogFile,
+    Passage,
+    Recording,
+    log_parts,
+    scan,
+)
 
 LONGEST_SLEEP_S = 0.05
 HEAD = struct.Struct("<IQQ")
@@ -56,12 +64,21 @@ def _in_order(parts: list[ChunkPart]) -> Iterator[Message]:
     rows = []
     for topic, _, found in parts:
         if topic.name != DROPPED_TOPIC and topic.encoding == "cdr":
-            columns = (found.offsets.tolist(), found.sizes.tolist(), found.log_times_ns.tolist())
-            rows += [(at, size, log_time_ns, topic) for at, size, log_time_ns in zip(*columns, strict=True)]
+            columns = (
+                found.offsets.tolist(),
+                found.sizes.tolist(),
+                found.log_times_ns.tolist(),
+            )
+            rows += [
+                (at, size, log_time_ns, topic)
+                for at, size, log_time_ns in zip(*columns, strict=True)
+            ]
     for at, size, log_time_ns, topic in sorted(rows, key=lambda row: row[0]):
         sequence, _, sent_ns = HEAD.unpack_from(parts[0].data, at - HEAD.size)
         payload = bytes(parts[0].data[at : at + size])
-        yield Message(topic.name, topic.type_name, payload, log_time_ns, sequence, sent_ns)
+        yield Message(
+            topic.name, topic.type_name, payload, log_time_ns, sequence, sent_ns
+        )
 
 
 def dropped_messages(path: Path) -> dict[tuple[str, int], str]:
@@ -70,7 +87,10 @@ def dropped_messages(path: Path) -> dict[tuple[str, int], str]:
 
 
 def play_messages(
-    messages: Iterator[Message], rate: float, put: Callable[[Message], None], is_ended: Callable[[], bool]
+    messages: Iterator[Message],
+    rate: float,
+    put: Callable[[Message], None],
+    is_ended: Callable[[], bool],
 ) -> tuple[int, float]:
     """Give messages to ``put`` at ``rate`` times their pace; their number, and the longest delay in seconds."""
     first_ns, begun_s, count, latest_s = None, time.monotonic(), 0, 0.0

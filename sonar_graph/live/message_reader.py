@@ -57,7 +57,11 @@ class MessageReader:
     def __init__(self, assembly: Assembly) -> None:
         self.calibration = assembly.calibration
         self._adapters = assembly.adapters
-        self._axes_and_origin = {role: assembly.axes_and_origin(role) for role in assembly.topics if role in BLOCKS}
+        self._axes_and_origin = {
+            role: assembly.axes_and_origin(role)
+            for role in assembly.topics
+            if role in BLOCKS
+        }
         self._topics: dict[str, Topic] = {}
         self._roles: dict[str, list[str]] = {}
         for role in self._axes_and_origin:
@@ -81,27 +85,45 @@ class MessageReader:
                 parts.append(Part(role, int(row.stamps_ns[0]), row, ""))
                 continue
             topic = self._topics[name].empty()
-            topic.gather(payload, ONE, np.array([len(payload)]), np.array([log_time_ns]))
+            topic.gather(
+                payload, ONE, np.array([len(payload)]), np.array([log_time_ns])
+            )
             try:
                 parts.append(self._part(role, topic))
             except Exception as error:  # whatever a sender sends
                 fault = str(error).removeprefix(f"{topic.file}: topic {name}: ")
-                parts.append(Part(role, log_time_ns, None, f"cannot be read: {fault or type(error).__name__}"))
+                parts.append(
+                    Part(
+                        role,
+                        log_time_ns,
+                        None,
+                        f"cannot be read: {fault or type(error).__name__}",
+                    )
+                )
         return parts
 
     def _part(self, role: str, topic: Topic) -> Part:
         adapter = self._adapters[role]
         if not adapter.reads_table:
             groups = topic.messages()
-            block, dropped = rows_of(adapter, topic, self.calibration, *self._axes_and_origin[role])
+            block, dropped = rows_of(
+                adapter, topic, self.calibration, *self._axes_and_origin[role]
+            )
             faults = ", ".join(topic.unsound | dropped)
             if not groups:
                 raise LogError(faults)
-            return Part(role, int(header_stamps_ns(groups[0], topic.log_times_ns)[0]), block, faults)
+            return Part(
+                role,
+                int(header_stamps_ns(groups[0], topic.log_times_ns)[0]),
+                block,
+                faults,
+            )
         table = adapter.table(topic)
         if _sizes(adapter, table.groups[0]) != self._sizes[role]:
             raise LogError("has arrays of another length than the first messages")
-        block, dropped = rows_of(adapter, table, self.calibration, *self._axes_and_origin[role])
+        block, dropped = rows_of(
+            adapter, table, self.calibration, *self._axes_and_origin[role]
+        )
         faults = ", ".join(topic.unsound | dropped)
         place = topic.name, table.groups[0].payloads.shape[1]
         if isinstance(adapter, ImuAdapter) and not faults and place not in self._plain:
@@ -148,15 +170,29 @@ class PlainImu:
         scales = adapter.angular_velocity_scale, adapter.linear_acceleration_scale
         self._scales = np.repeat(scales, 3).tolist()
         self._offset_ns = round(adapter.stamp_offset_s * NS_PER_S)
-        self._axes = None if adapter.rotation == "flu" else axes_matrix(adapter.rotation)
+        self._axes = (
+            None if adapter.rotation == "flu" else axes_matrix(adapter.rotation)
+        )
 
     @classmethod
     def like(cls, adapter: ImuAdapter, messages: Messages) -> PlainImu | None:
         """Form of a message that was read without faults; None where it takes more than numbers to read it."""
         stamp = f"{adapter.stamp}.sec", f"{adapter.stamp}.nanosec"
-        status = [path for path in (adapter.angular_velocity_status, adapter.linear_acceleration_status) if path]
+        status = [
+            path
+            for path in (
+                adapter.angular_velocity_status,
+                adapter.linear_acceleration_status,
+            )
+            if path
+        ]
         numbers = []
-        for path in (*stamp, *adapter.angular_velocity, *adapter.linear_acceleration, *status):
+        for path in (
+            *stamp,
+            *adapter.angular_velocity,
+            *adapter.linear_acceleration,
+            *status,
+        ):
             name, index = field_of(path)
             if name not in messages.layout.columns:
                 return None
@@ -164,7 +200,9 @@ class PlainImu:
             kind = KINDS.get(f"{column.dtype.kind}{column.dtype.itemsize}")
             if kind is None or (kind == "d") == (path in stamp):
                 return None  # of single precision, scaling would round otherwise
-            numbers.append((kind, column.starts[0] + (index or 0) * column.dtype.itemsize))
+            numbers.append(
+                (kind, column.starts[0] + (index or 0) * column.dtype.itemsize)
+            )
         payload = messages.payloads[0].tobytes()
         same = [(a, b, payload[a:b]) for a, b in _runs_that_stay(messages)]
         return cls(adapter, len(payload), same, numbers, messages.layout.byte_order)
@@ -175,8 +213,16 @@ class PlainImu:
             return None
         seconds, nanoseconds, *numbers = self._wanted(self._unpack_numbers(payload))
         stamp_ns = seconds * NS_PER_S + nanoseconds
-        values = [value * scale for value, scale in zip(numbers[:6], self._scales, strict=True)]
-        if not (stamp_ns and -1 not in numbers[6:] and any(values[3:]) and sum(map(abs, values)) < LARGEST):
+        values = [
+            value * scale
+            for value, scale in zip(numbers[:6], self._scales, strict=True)
+        ]
+        if not (
+            stamp_ns
+            and -1 not in numbers[6:]
+            and any(values[3:])
+            and sum(map(abs, values)) < LARGEST
+        ):
             return None
         rate, force = np.array(values).reshape(2, 1, 3)
         if self._axes is not None:
@@ -184,7 +230,9 @@ class PlainImu:
         return Imu.of_valid(np.array([stamp_ns + self._offset_ns]), rate, force)
 
 
-def _unpacking(size: int, fields: list[tuple[str, int]], byte_order: str = "<") -> Callable[[bytes], tuple[Any, ...]]:
+def _unpacking(
+    size: int, fields: list[tuple[str, int]], byte_order: str = "<"
+) -> Callable[[bytes], tuple[Any, ...]]:
     """Function that unpacks fields, their kinds and places in order, of so many bytes."""
     kinds, end = byte_order, 0
     for kind, at in fields:

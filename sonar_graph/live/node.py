@@ -59,7 +59,9 @@ MOST_WAITING_S = 2.0
 
 MOST_STEPS_AT_ONCE = 50
 MOST_DURATIONS = 20_000
-WARM_UP = MissionOptions(duration_s=80.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=240.0, dvl_dropout_s=3.0)
+WARM_UP = MissionOptions(
+    duration_s=80.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=240.0, dvl_dropout_s=3.0
+)
 """Run on which all is compiled, with frames in gaps of the Doppler log."""
 
 
@@ -100,13 +102,19 @@ class LiveRun:
         """Durations of the newest predictions, by the wall clock."""
         self.predict_cpu_s: list[float] = []
         """The same by this thread's own time: what other threads and processes take meanwhile does not count."""
-        self._record, self._options, self._outlets, self._said = record, options, outlets, said
+        self._record, self._options, self._outlets, self._said = (
+            record,
+            options,
+            outlets,
+            said,
+        )
         self._types = wanted_types(options.config or LogConfig(), ROLES)
         self._unused: set[str] = set()
         self._faulty: set[str] = set()
         self._forms = PoseForms()
         self._answers: deque[Answer] = deque()
-        self._images = LiveImages(self.engine, options)  # compiles in its process meanwhile
+        # compiles in its process meanwhile
+        self._images = LiveImages(self.engine, options)
         warm_up = simulate_mission(WARM_UP)
         self._worker = Worker(
             options.estimator,
@@ -146,7 +154,9 @@ class LiveRun:
         if self.wants(message.topic, message.type_name):
             self.inbox.put(message)
 
-    def catch_up(self, messages: Iterator[Message], dropped: Mapping[tuple[str, int], str]) -> int:
+    def catch_up(
+        self, messages: Iterator[Message], dropped: Mapping[tuple[str, int], str]
+    ) -> int:
         """Take the messages of an earlier record, with what was dropped then; the time of arrival of the last."""
         last_ns, self._is_quiet = 0, True
         for message in messages:
@@ -154,7 +164,9 @@ class LiveRun:
             self._take(message, dropped.get((message.topic, message.arrival_ns)))
             for step in self.engine.steps():
                 self._worker.add(step)
-            while (self._worker.waiting or self._worker.is_busy) and self._worker.error is None:
+            while (
+                self._worker.waiting or self._worker.is_busy
+            ) and self._worker.error is None:
                 time.sleep(1e-4)
             while self._answers:
                 self._use(self._answers.popleft())
@@ -165,7 +177,10 @@ class LiveRun:
     def counts(self) -> dict[str, dict[str, int]]:
         """Numbers of messages received, lost and dropped, by topic, and by topic and reason."""
         counts = self.engine.counts
-        dropped = {f"{name}: {why}": number for (name, why), number in sorted(counts.dropped.items())}
+        dropped = {
+            f"{name}: {why}": number
+            for (name, why), number in sorted(counts.dropped.items())
+        }
         lost = +(counts.lost + self.inbox.dropped)
         return {
             "received": dict(sorted(counts.received.items())),
@@ -179,7 +194,9 @@ class LiveRun:
             return self.engine.waits_for
         if not self.engine.topics:
             return "no message came; is the domain right, and does anything send?"
-        came = ", ".join(f"{name} ({topic.type_name})" for name, topic in self.engine.topics.items())
+        came = ", ".join(
+            f"{name} ({topic.type_name})" for name, topic in self.engine.topics.items()
+        )
         return f"an estimate needs two seconds of an IMU and a Doppler log; there came {came}"
 
     def turn(self, timeout_s: float = 0.05) -> None:
@@ -208,7 +225,9 @@ class LiveRun:
         if now_s > self._stated_s + STATE_S and self._predictor is not None:
             self._state()
             self._stated_s = now_s
-            motion = {topic for role, topic in self.engine.in_use.items() if role in MOTION}
+            motion = {
+                topic for role, topic in self.engine.in_use.items() if role in MOTION
+            }
             if self.inbox.is_empty:  # messages that wait were not silent
                 for line in self._silence.lines(motion, now_s):
                     self._said(line)
@@ -259,7 +278,10 @@ class LiveRun:
         for remark in self.engine.remarks:
             self._said(remark)
         self.engine.remarks.clear()
-        if self.engine.calibration is not None and self._generation != self.engine.generation:
+        if (
+            self.engine.calibration is not None
+            and self._generation != self.engine.generation
+        ):
             self._begin()
         if not self._is_quiet:
             self._images.take(message, parts)
@@ -276,10 +298,16 @@ class LiveRun:
 
     def _move_on(self, parts: list[Part], arrival_ns: int) -> None:
         for part in parts:
-            if self._predictor is None or part.role not in ("imu", "dvl") or part.block is None:
+            if (
+                self._predictor is None
+                or part.role not in ("imu", "dvl")
+                or part.block is None
+            ):
                 continue
             is_imu = part.role == "imu"
-            self._predictor.add(part.block if is_imu else None, None if is_imu else part.block)
+            self._predictor.add(
+                part.block if is_imu else None, None if is_imu else part.block
+            )
             if is_imu and part is parts[-1] and not self._is_quiet:
                 self._predict(arrival_ns)
 
@@ -287,19 +315,30 @@ class LiveRun:
         """Say once what went wrong with a topic, and go on."""
         if what not in self._faulty:
             self._faulty.add(what)
-            self._said(f"{what}: {type(error).__name__}: {error}; everything is still recorded")
+            self._said(
+                f"{what}: {type(error).__name__}: {error}; everything is still recorded"
+            )
 
     def _begin(self) -> None:
         assert self.engine.calibration is not None
         options, calibration = self._options, self.engine.calibration
         self._generation = self.engine.generation
         if self._generation:
-            self._said("a further sensor has come: estimating anew from the beginning of the record")
+            self._said(
+                "a further sensor has come: estimating anew from the beginning of the record"
+            )
         for subject in ("log.topics", "log.calibration", "log.start"):
             if subject in self.engine.notes:
-                self._said(shorten(f"{subject.removeprefix('log.')}: {self.engine.notes[subject]}", LINE_WIDTH))
+                self._said(
+                    shorten(
+                        f"{subject.removeprefix('log.')}: {self.engine.notes[subject]}",
+                        LINE_WIDTH,
+                    )
+                )
         for warning in self.engine.notes.get("log.warnings", "").split("; "):
-            if warning and not warning.startswith("detections:"):  # the odometry after the newest has not come yet
+            if warning and not warning.startswith(
+                "detections:"
+            ):  # the odometry after the newest has not come yet
                 self._said(f"warning: {warning}")
         self._worker.begin(calibration)
         self._predictor = Predictor(calibration)
@@ -331,7 +370,10 @@ class LiveRun:
         if answer.estimates:
             newest = answer.estimates[-1]
             self._predictor.correct(newest)
-            self._put("/tf", self._forms.correction(newest.stamp_ns, self._predictor.map_T_odom))
+            self._put(
+                "/tf",
+                self._forms.correction(newest.stamp_ns, self._predictor.map_T_odom),
+            )
             if answer.landmarks is not None and len(answer.landmarks):
                 landmarks, markers = payloads_of_map(answer.landmarks, newest.stamp_ns)
                 self._put("/sonar_graph/landmarks", landmarks)
@@ -348,13 +390,20 @@ class LiveRun:
             "steps_waiting": str(self._worker.waiting),
             "images_waiting": str(self.images_waiting),
             "estimates": str(self._estimates),
-            "lost": ", ".join(f"{name} {n}" for name, n in sorted(lost.items())) or "none",
-            "dropped": ", ".join(f"{name} {n} {why}" for (name, why), n in sorted(counts.dropped.items())) or "none",
+            "lost": ", ".join(f"{name} {n}" for name, n in sorted(lost.items()))
+            or "none",
+            "dropped": ", ".join(
+                f"{name} {n} {why}" for (name, why), n in sorted(counts.dropped.items())
+            )
+            or "none",
             "withheld": "; ".join(self._withheld) or "none",
         }
         is_well = not (lost or counts.dropped or self._withheld)
         summary = "running" if is_well else "messages are lost, dropped or withheld"
-        self._put("/sonar_graph/state", payload_of_state(self._newest_ns, is_well, summary, values))
+        self._put(
+            "/sonar_graph/state",
+            payload_of_state(self._newest_ns, is_well, summary, values),
+        )
         self._latency_ns, self._longest_update_s = 0, 0.0
         del self.predict_s[:-MOST_DURATIONS], self.predict_cpu_s[:-MOST_DURATIONS]
 

@@ -61,7 +61,12 @@ class Outlet(Protocol):
 class Form:
     """A message of fixed layout whose numbers are replaced in place, since encoding anew takes ten times as long."""
 
-    def __init__(self, type_name: str, values: Mapping[str, Any], lengths: Mapping[str, int] | None = None) -> None:
+    def __init__(
+        self,
+        type_name: str,
+        values: Mapping[str, Any],
+        lengths: Mapping[str, int] | None = None,
+    ) -> None:
         struct = parse_definition(type_name, definition(type_name))
         encoded = encode(struct, 1, values, lengths)
         (messages,) = Decoder(struct).decode([(np.zeros(1, np.int64), encoded)]).groups
@@ -69,11 +74,15 @@ class Form:
 
     def stamp(self, path: str) -> Callable[[int, int], None]:
         """Function that writes seconds and nanoseconds of the stamp that is there."""
-        return partial(Struct("<iI").pack_into, self._bytes, self._layout.column(path).starts[0])
+        return partial(
+            Struct("<iI").pack_into, self._bytes, self._layout.column(path).starts[0]
+        )
 
     def numbers(self, path: str, count: int) -> Floats:
         """Successive numbers from a field on, in place, shape (count,)."""
-        return np.frombuffer(self._bytes, "<f8", count, self._layout.column(path).starts[0])
+        return np.frombuffer(
+            self._bytes, "<f8", count, self._layout.column(path).starts[0]
+        )
 
     def payload(self) -> bytes:
         """The message as it is now."""
@@ -85,8 +94,17 @@ def write_pose(world_T_body: Floats, place: Floats) -> None:
     """Fill in position and quaternion, scalar last, shape (7,)."""
     v, w = quaternion(mat(world_T_body))
     scale = 1.0 / math.sqrt(v @ v + w * w)
-    place[0], place[1], place[2] = world_T_body[0, 3], world_T_body[1, 3], world_T_body[2, 3]
-    place[3], place[4], place[5], place[6] = scale * v.x, scale * v.y, scale * v.z, scale * w
+    place[0], place[1], place[2] = (
+        world_T_body[0, 3],
+        world_T_body[1, 3],
+        world_T_body[2, 3],
+    )
+    place[3], place[4], place[5], place[6] = (
+        scale * v.x,
+        scale * v.y,
+        scale * v.z,
+        scale * w,
+    )
 
 
 @compiled
@@ -96,19 +114,25 @@ def write_covariance(world_T_body: Floats, covariance: Floats, out: Floats) -> N
     store6(Mat6(R @ P.d @ R.T, R @ P.c @ R.T, R @ P.b @ R.T, R @ P.a @ R.T), out)
 
 
-def payload_of_detections(detections: LandmarkDetections | None, stamp_ns: int) -> bytes:
+def payload_of_detections(
+    detections: LandmarkDetections | None, stamp_ns: int
+) -> bytes:
     """``LandmarkDetections`` of a sonar image, also of one without any."""
     if detections is not None:
         return detection_messages("", detections)[0].payloads[0].tobytes()
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     struct = parse_definition(TOPICS[DETECTED], definition(TOPICS[DETECTED]))
-    return encode(struct, 1, {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds})[0].tobytes()
+    return encode(
+        struct, 1, {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds}
+    )[0].tobytes()
 
 
 def payloads_of_map(landmarks: LandmarkMap, stamp_ns: int) -> tuple[bytes, bytes]:
     """``LandmarkMap`` and ``MarkerArray`` of a map."""
     markers = landmark_markers("", landmarks, stamp_ns, COLOUR, TEXT_HEIGHT_M)
-    return landmark_map_message("", landmarks, stamp_ns).payloads[0].tobytes(), markers.payloads[0].tobytes()
+    return landmark_map_message("", landmarks, stamp_ns).payloads[
+        0
+    ].tobytes(), markers.payloads[0].tobytes()
 
 
 class PoseForm(Form):
@@ -117,25 +141,38 @@ class PoseForm(Form):
     def __init__(self, type_name: str, values: Mapping[str, Any]) -> None:
         super().__init__(type_name, {"header.frame_id": WORLD_FRAME, **values})
         self._stamp = self.stamp("header.stamp.sec")
-        self._in_message, self._numbers = self.numbers("pose.pose.position.x", 43), np.empty(43)
-        self._place, self._covariance = self._numbers[:7], self._numbers[7:].reshape(6, 6)
+        self._in_message, self._numbers = (
+            self.numbers("pose.pose.position.x", 43),
+            np.empty(43),
+        )
+        self._place, self._covariance = (
+            self._numbers[:7],
+            self._numbers[7:].reshape(6, 6),
+        )
 
     def write(self, stamp_ns: int, world_T_body: Floats, covariance: Floats) -> None:
         """Write them; the covariance is known."""
         write_pose(world_T_body, self._place)
         write_covariance(world_T_body, covariance, self._covariance)
         self._stamp(*divmod(stamp_ns, NS_PER_S))
-        self._in_message[:] = self._numbers  # which numbers of a message are not aligned for
+        # which numbers of a message are not aligned for
+        self._in_message[:] = self._numbers
 
 
 class FrameForm(Form):
     """``tf2_msgs/TFMessage`` of one frame in another."""
 
     def __init__(self, parent: str, child: str) -> None:
-        names = {"transforms.header.frame_id": parent, "transforms.child_frame_id": child}
+        names = {
+            "transforms.header.frame_id": parent,
+            "transforms.child_frame_id": child,
+        }
         super().__init__(TF, names, {"transforms": 1})
         self._stamp = self.stamp("transforms.header.stamp.sec")
-        self._in_message, self._place = self.numbers("transforms.transform.translation.x", 7), np.empty(7)
+        self._in_message, self._place = (
+            self.numbers("transforms.transform.translation.x", 7),
+            np.empty(7),
+        )
 
     def of(self, stamp_ns: int, pose: Floats) -> bytes:
         """The message at a stamp."""
@@ -152,7 +189,10 @@ class PoseForms:
         self._odometry = PoseForm(ODOMETRY, {"child_frame_id": BODY_FRAME})
         self._velocity = self._odometry.numbers("twist.twist.linear.x", 3)
         self._estimate = PoseForm(TOPICS["/sonar_graph/pose"], {})
-        self._correction, self._body = FrameForm(WORLD_FRAME, ODOM_FRAME), FrameForm(ODOM_FRAME, BODY_FRAME)
+        self._correction, self._body = (
+            FrameForm(WORLD_FRAME, ODOM_FRAME),
+            FrameForm(ODOM_FRAME, BODY_FRAME),
+        )
 
     def odometry(self, at: Prediction) -> bytes:
         """``nav_msgs/Odometry``."""
@@ -163,7 +203,9 @@ class PoseForms:
     def estimate(self, at: Estimate) -> bytes:
         """``PoseWithCovarianceStamped``; zeros in place of a covariance that is not known."""
         covariance = np.ascontiguousarray(np.nan_to_num(at.covariance, nan=0.0))
-        self._estimate.write(at.stamp_ns, np.ascontiguousarray(at.world_T_body.matrix()), covariance)
+        self._estimate.write(
+            at.stamp_ns, np.ascontiguousarray(at.world_T_body.matrix()), covariance
+        )
         return self._estimate.payload()
 
     def correction(self, stamp_ns: int, map_T_odom: Floats) -> bytes:
@@ -175,14 +217,28 @@ class PoseForms:
         return self._body.of(at.stamp_ns, at.odom_T_body)
 
 
-def payload_of_state(stamp_ns: int, is_well: bool, summary: str, values: Mapping[str, str]) -> bytes:
+def payload_of_state(
+    stamp_ns: int, is_well: bool, summary: str, values: Mapping[str, str]
+) -> bytes:
     """``DiagnosticArray`` with one status."""
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    said: dict[str, Any] = {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds}
-    said |= {"status.level": 0 if is_well else 1, "status.name": "sonar_graph", "status.message": summary}
-    said |= {"status.values.key": list(values), "status.values.value": list(values.values())}
+    said: dict[str, Any] = {
+        "header.stamp.sec": seconds,
+        "header.stamp.nanosec": nanoseconds,
+    }
+    said |= {
+        "status.level": 0 if is_well else 1,
+        "status.name": "sonar_graph",
+        "status.message": summary,
+    }
+    said |= {
+        "status.values.key": list(values),
+        "status.values.value": list(values.values()),
+    }
     struct = parse_definition(STATE, definition(STATE))
-    return encode(struct, 1, said, {"status": 1, "status.values": len(values)})[0].tobytes()
+    return encode(struct, 1, said, {"status": 1, "status.values": len(values)})[
+        0
+    ].tobytes()
 
 
 class ZenohOutlet:
@@ -190,7 +246,8 @@ class ZenohOutlet:
 
     def __init__(self, session: Any, domain: int) -> None:
         self._publishers = {
-            topic: Publisher(session, domain, topic, kind, may_drop=True) for topic, kind in TOPICS.items()
+            topic: Publisher(session, domain, topic, kind, may_drop=True)
+            for topic, kind in TOPICS.items()
         }
 
     def put(self, topic: str, payload: bytes) -> None:
@@ -205,17 +262,25 @@ class FoxgloveOutlet:
         try:
             import foxglove
         except ImportError as error:
-            raise LogError("--foxglove needs foxglove-sdk: pip install 'sonar-graph[live]'") from error
+            raise LogError(
+                "--foxglove needs foxglove-sdk: pip install 'sonar-graph[live]'"
+            ) from error
         try:
-            self._server = foxglove.start_server(name="sonar-graph", host="127.0.0.1", port=port)
+            self._server = foxglove.start_server(
+                name="sonar-graph", host="127.0.0.1", port=port
+            )
         except RuntimeError as error:
             raise LogError(
                 f"--foxglove {port}: cannot listen on 127.0.0.1:{port}: {error}; name another port"
             ) from error
         self._channels = {}
         for topic, kind in TOPICS.items():
-            schema = foxglove.Schema(name=kind, encoding="ros2msg", data=definition(kind).encode())
-            self._channels[topic] = foxglove.Channel(topic, schema=schema, message_encoding="cdr")
+            schema = foxglove.Schema(
+                name=kind, encoding="ros2msg", data=definition(kind).encode()
+            )
+            self._channels[topic] = foxglove.Channel(
+                topic, schema=schema, message_encoding="cdr"
+            )
 
     def put(self, topic: str, payload: bytes) -> None:
         """Send one message."""
@@ -229,13 +294,17 @@ def open_link(endpoints: list[str], domain: int) -> Link:
     """Link to a foxglove_bridge (``ws://...``), or to zenoh routers; a LogError where none is there."""
     bridges = [one for one in endpoints if one.startswith(("ws://", "wss://"))]
     if bridges and len(endpoints) > 1:
-        raise LogError(f"{bridges[0]}: a foxglove_bridge is connected to alone; name one endpoint")
+        raise LogError(
+            f"{bridges[0]}: a foxglove_bridge is connected to alone; name one endpoint"
+        )
     return FoxgloveLink(bridges[0]) if bridges else ZenohLink(endpoints, domain)
 
 
 def open_outlets(link: Link, foxglove_port: int | None) -> list[Outlet]:
     """Outlets over zenoh, if that is the link, and, with a port, for viewers."""
-    outlets: list[Outlet] = [ZenohOutlet(link.session, link.domain)] if isinstance(link, ZenohLink) else []
+    outlets: list[Outlet] = (
+        [ZenohOutlet(link.session, link.domain)] if isinstance(link, ZenohLink) else []
+    )
     if foxglove_port is not None:
         outlets.append(FoxgloveOutlet(foxglove_port))
     return outlets

@@ -82,7 +82,9 @@ class Predictor:
         if before is not None and estimate.stamp_ns <= before.stamp_ns:
             return
         if before is not None:
-            step = self._odometry.motion(before.stamp_ns, estimate.stamp_ns, BIAS, known_ns=self._newest_ns)
+            step = self._odometry.motion(
+                before.stamp_ns, estimate.stamp_ns, BIAS, known_ns=self._newest_ns
+            )
             self._odom_T_estimate = self._odom_T_estimate.compose(step.i_T_j)
         self._estimate = estimate
         self._odometry.forget_before(estimate.stamp_ns)
@@ -91,7 +93,9 @@ class Predictor:
     def map_T_odom(self) -> Floats:
         """Correction of the smooth frame by the newest estimate, shape (4, 4)."""
         assert self._estimate is not None
-        correction = self._estimate.world_T_body.compose(self._odom_T_estimate.inverse())
+        correction = self._estimate.world_T_body.compose(
+            self._odom_T_estimate.inverse()
+        )
         return np.ascontiguousarray(correction.matrix())
 
     def predict(self) -> Prediction | None:

@@ -69,13 +69,18 @@ def warm_recogniser() -> None:
     """Compile what a recogniser needs, on images of noise with a bright spot that moves."""
     from sonar_graph.recognition import RecognitionSession
 
-    world, noise = simulate_mission(MissionOptions(duration_s=6.0)), np.random.default_rng(0)
+    world, noise = (
+        simulate_mission(MissionOptions(duration_s=6.0)),
+        np.random.default_rng(0),
+    )
     session = RecognitionSession(world, pictures=False)
     ranges_m, azimuths_rad = np.linspace(0.5, 10.0, BINS), np.linspace(1.0, -1.0, BEAMS)
     for k, stamp_ns in enumerate(world.instants(4.0)[2:]):
         intensity = noise.integers(0, 40, (1, BEAMS, BINS)).astype(np.uint8)
         intensity[0, 40 + k : 46 + k, 200:220] = 250
-        session.take(SonarFrames(np.array([stamp_ns]), intensity, ranges_m, azimuths_rad))
+        session.take(
+            SonarFrames(np.array([stamp_ns]), intensity, ranges_m, azimuths_rad)
+        )
 
 
 def serve_recogniser() -> None:
@@ -93,7 +98,9 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
 
         recogniser = Recogniser(request.sequence.calibration)
         recogniser.prepare(request.frame)
-        _Recogniser.session = RecognitionSession(request.sequence, recogniser=recogniser, pictures=False)
+        _Recogniser.session = RecognitionSession(
+            request.sequence, recogniser=recogniser, pictures=False
+        )
         gc.freeze()  # templates are never looked at again, which would delay an image
         return READY
     session = _Recogniser.session
@@ -117,7 +124,10 @@ class SonarWorker:
 
     def __init__(self, seen: Callable[[SonarAnswer], None]) -> None:
         self._process = OwnProcess(
-            ("-c", "from sonar_graph.live.sonar_worker import serve_recogniser; serve_recogniser()")
+            (
+                "-c",
+                "from sonar_graph.live.sonar_worker import serve_recogniser; serve_recogniser()",
+            )
         )
         self._seen = seen
         self._waiting: list[Waiting] = []
@@ -142,12 +152,16 @@ class SonarWorker:
         """Queue an image with the rows before it; those that are dropped, whose rows go with the next."""
         with self._changed:
             self._waiting.append(waiting)
-            images = [i for i, one in enumerate(self._waiting) if one.rows.frame is not None]
+            images = [
+                i for i, one in enumerate(self._waiting) if one.rows.frame is not None
+            ]
             dropped = []
             for i in images[: max(len(images) - MOST_FRAMES, 0)]:
                 dropped.append(self._waiting[i])
                 rows = self._waiting[i].rows
-                self._waiting[i] = self._waiting[i]._replace(rows=SonarRows(rows.imu, rows.dvl, rows.depth, None))
+                self._waiting[i] = self._waiting[i]._replace(
+                    rows=SonarRows(rows.imu, rows.dvl, rows.depth, None)
+                )
             self._changed.notify()
         return dropped
 

@@ -92,7 +92,9 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
 
         kind = load_estimator(request.name)
         params = make_params(kind, request.overrides, request.name)
-        _Served.estimator = kind(request.calibration, Odometry(request.calibration), params)
+        _Served.estimator = kind(
+            request.calibration, Odometry(request.calibration), params
+        )
         _Served.estimates, _Served.update_s, _Served.next_map_s = [], [], 0.0
         return READY
     estimator = _Served.estimator
@@ -100,8 +102,19 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
         before_s = time.perf_counter()
         smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
         finish_s = time.perf_counter() - before_s
-        causal, refused = Trajectory.from_estimates(_Served.estimates), refused_rows_of(estimator)
-        return LiveOutcome(causal, smoothed, landmarks, refused, withheld_of(estimator), _Served.update_s, finish_s)
+        causal, refused = (
+            Trajectory.from_estimates(_Served.estimates),
+            refused_rows_of(estimator),
+        )
+        return LiveOutcome(
+            causal,
+            smoothed,
+            landmarks,
+            refused,
+            withheld_of(estimator),
+            _Served.update_s,
+            finish_s,
+        )
     found, longest_s, landmarks_now = [], 0.0, None
     for step in request:
         before_s = time.perf_counter()
@@ -115,7 +128,9 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     if found and before_s >= _Served.next_map_s:
         landmarks_now = newest_landmarks_of(estimator)
         after_s = time.perf_counter()
-        _Served.next_map_s = after_s + max(LEAST_MAP_S, MAP_SHARE * (after_s - before_s))
+        _Served.next_map_s = after_s + max(
+            LEAST_MAP_S, MAP_SHARE * (after_s - before_s)
+        )
     return Answer(found, landmarks_now, withheld_of(estimator), longest_s)
 
 
@@ -146,7 +161,12 @@ class Worker:
         most_waiting: int,
         without_detections: Callable[[Measurements], Measurements],
     ) -> None:
-        self._process = OwnProcess(("-c", "from sonar_graph.live.worker import serve_estimator; serve_estimator()"))
+        self._process = OwnProcess(
+            (
+                "-c",
+                "from sonar_graph.live.worker import serve_estimator; serve_estimator()",
+            )
+        )
         self._name, self._overrides = name, overrides
         self._answered, self._without_detections = answered, without_detections
         self._most_waiting = most_waiting
@@ -166,7 +186,10 @@ class Worker:
     def begin(self, calibration: Calibration) -> None:
         """Begin the run, also anew: steps that wait are forgotten, and those that follow may be many for a while."""
         with self._changed:
-            self._begins, self._is_catching_up = Begin(self._name, self._overrides, calibration), True
+            self._begins, self._is_catching_up = (
+                Begin(self._name, self._overrides, calibration),
+                True,
+            )
             self._waiting.clear()
             self._changed.notify()
         if not self._thread.ident:
@@ -188,8 +211,14 @@ class Worker:
         with self._changed:
             self._waiting.append(step)
             late = len(self._waiting) - self._most_waiting
-            if late > 0 and not self._is_catching_up and self._waiting[late - 1].detections is not None:
-                self._waiting[late - 1] = self._without_detections(self._waiting[late - 1])
+            if (
+                late > 0
+                and not self._is_catching_up
+                and self._waiting[late - 1].detections is not None
+            ):
+                self._waiting[late - 1] = self._without_detections(
+                    self._waiting[late - 1]
+                )
             self._changed.notify()
 
     def finish(self) -> LiveOutcome:
@@ -215,7 +244,10 @@ class Worker:
                     while not (self._waiting or self._begins or self._is_done):
                         self._changed.wait()
                     begin, self._begins = self._begins, None
-                    steps, self._waiting = self._waiting[:MOST_AT_ONCE], self._waiting[MOST_AT_ONCE:]
+                    steps, self._waiting = (
+                        self._waiting[:MOST_AT_ONCE],
+                        self._waiting[MOST_AT_ONCE:],
+                    )
                     self.is_busy = True
                 if begin is not None:
                     self._ask(begin)

@@ -101,14 +101,20 @@ def open_session(connect: Iterable[str] = (), listen: Iterable[str] = ()) -> Any
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         where = ", ".join([*connect, *listen])
-        raise LogError(f"{where}: no endpoint of zenoh; expected one such as {DEFAULT_ROUTER}") from error
+        raise LogError(
+            f"{where}: no endpoint of zenoh; expected one such as {DEFAULT_ROUTER}"
+        ) from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = ", ".join([*connect, *listen])
         raise LogError(
             f"{where}: zenoh cannot {'listen' if listen else 'connect'}: "
-            + ("is the port taken? name another" if listen else "is a router (rmw_zenohd) or `sonar-graph play` there?")
+            + (
+                "is the port taken? name another"
+                if listen
+                else "is a router (rmw_zenohd) or `sonar-graph play` there?"
+            )
         ) from error
 
 
@@ -130,13 +136,22 @@ def subscribe(
         if found is None or not is_wanted(*found):
             return
         sequence, sent_ns, sender = 0, 0, b""
-        if sample.attachment is not None and len(data := sample.attachment.to_bytes()) >= ATTACHMENT.size:
+        if (
+            sample.attachment is not None
+            and len(data := sample.attachment.to_bytes()) >= ATTACHMENT.size
+        ):
             sequence, sent_ns, _, sender = ATTACHMENT.unpack_from(data)
-        received(Message(*found, sample.payload.to_bytes(), arrival_ns, sequence, sent_ns, sender))
+        received(
+            Message(
+                *found, sample.payload.to_bytes(), arrival_ns, sequence, sent_ns, sender
+            )
+        )
 
     def take_latched(sample: Any) -> None:
         content = str(sample.key_expr), sample.payload.to_bytes()
-        if content not in latched:  # what was kept by several senders comes several times
+        if (
+            content not in latched
+        ):  # what was kept by several senders comes several times
             latched.add(content)
             take(sample)
 
@@ -150,7 +165,9 @@ def subscribe(
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
     )
     others = session.declare_subscriber(
-        f"{domain}/**", lambda s: None if "/tf_static/" in str(s.key_expr) else take(s), allowed_origin=remote
+        f"{domain}/**",
+        lambda s: None if "/tf_static/" in str(s.key_expr) else take(s),
+        allowed_origin=remote,
     )
     return kept, others
 
@@ -161,11 +178,21 @@ class Publisher:
     ``may_drop``: a subscriber that stalls misses messages, instead of holding up everybody.
     """
 
-    def __init__(self, session: Any, domain: int, topic: str, type_name: str, *, may_drop: bool = False) -> None:
+    def __init__(
+        self,
+        session: Any,
+        domain: int,
+        topic: str,
+        type_name: str,
+        *,
+        may_drop: bool = False,
+    ) -> None:
         import zenoh.ext
 
         key = topic_key(domain, topic, type_name, type_hash(type_name))
-        control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
+        control = (
+            zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
+        )
         if topic.endswith("_static"):  # for subscribers that come later
             self._publisher: Any = zenoh.ext.declare_advanced_publisher(
                 session,
@@ -175,7 +202,9 @@ class Publisher:
                 publisher_detection=True,
             )
         else:
-            self._publisher = session.declare_publisher(key, congestion_control=control, express=True)
+            self._publisher = session.declare_publisher(
+                key, congestion_control=control, express=True
+            )
         self._sender = os.urandom(16)
         self._sequence = 0
 
@@ -188,7 +217,12 @@ class Publisher:
     def put(self, payload: bytes) -> None:
         """Send one message."""
         self._sequence += 1
-        self._publisher.put(payload, attachment=ATTACHMENT.pack(self._sequence, time.time_ns(), 16, self._sender))
+        self._publisher.put(
+            payload,
+            attachment=ATTACHMENT.pack(
+                self._sequence, time.time_ns(), 16, self._sender
+            ),
+        )
 
 
 class ZenohLink:
@@ -209,7 +243,9 @@ class ZenohLink:
         """Definition of a type."""
         return definition_of(type_name)
 
-    def listen(self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]) -> None:
+    def listen(
+        self, received: Callable[[Message], None], is_wanted: Callable[[str, str], bool]
+    ) -> None:
         """Begin to give messages of the topics that are wanted, by name and type, to a function of zenoh's thread."""
         self._subscriptions = subscribe(self.session, self.domain, received, is_wanted)
 

@@ -93,7 +93,9 @@ def write_amended(
     with ExitStack() as opened:
         logs = [opened.enter_context(LogFile(part)) for part in log_parts(source)]
         out = opened.enter_context(written_whole(target))
-        copy = _AmendedCopy(source, logs, out, anew or {}, {entry.topic for entry in added})
+        copy = _AmendedCopy(
+            source, logs, out, anew or {}, {entry.topic for entry in added}
+        )
         return copy.run(added, more, metadata or {}, salvage)
 
 
@@ -101,10 +103,17 @@ class _AmendedCopy:
     """A log on its way into another file."""
 
     def __init__(
-        self, source: Path, logs: list[LogFile], out: BinaryIO, anew: Mapping[str, str], added: Set[str]
+        self,
+        source: Path,
+        logs: list[LogFile],
+        out: BinaryIO,
+        anew: Mapping[str, str],
+        added: Set[str],
     ) -> None:
         self._source, self._anew, self._taken = source, anew, set(added - anew.keys())
-        self._passages = [(log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs]
+        self._passages = [
+            (log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs
+        ]
         self._writer = Writer(out, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         self._schemas: dict[tuple[str, str, bytes], int] = {("", "", b""): 0}
         self._channels: dict[str, int] = {}
@@ -124,31 +133,61 @@ class _AmendedCopy:
                 head = next(iter(StreamReader(stream).records), None)
             except McapError:
                 head = None
-        writer.start(profile=head.profile if isinstance(head, Header) else "", library=LIBRARY)
+        writer.start(
+            profile=head.profile if isinstance(head, Header) else "", library=LIBRARY
+        )
         # those of ``more`` are asked first: their topic is taken before the log's are copied
-        merged = heapq.merge(self._streamed(more), self._recorded(), self._added(added), key=lambda message: message[0])
+        merged = heapq.merge(
+            self._streamed(more),
+            self._recorded(),
+            self._added(added),
+            key=lambda message: message[0],
+        )
         for log_time, publish_time, topic, payload, number in merged:
-            writer.add_message(self._channels[topic], log_time, payload, publish_time, number)
+            writer.add_message(
+                self._channels[topic], log_time, payload, publish_time, number
+            )
         for log, passage in self._passages:
-            damage.extend(passage.damage, log.path.name if len(self._passages) > 1 else "")
-        recording = Recording(self._source, damage=damage, beginning_ns=self._beginning_ns)
+            damage.extend(
+                passage.damage, log.path.name if len(self._passages) > 1 else ""
+            )
+        recording = Recording(
+            self._source, damage=damage, beginning_ns=self._beginning_ns
+        )
         if not salvage:
             recording.require_sound()
-        for log, record in ((log, record) for log, passage in self._passages for record in passage.others):
+        for log, record in (
+            (log, record)
+            for log, passage in self._passages
+            for record in passage.others
+        ):
             content = log.content(record)
             if record.opcode == Opcode.METADATA:
                 found = parse(Metadata.read, content)
                 writer.add_metadata(found.name, found.metadata)
-            elif content[-4:] in (bytes(4), zlib.crc32(content[:-4]).to_bytes(4, "little")):
+            elif content[-4:] in (
+                bytes(4),
+                zlib.crc32(content[:-4]).to_bytes(4, "little"),
+            ):
                 file = parse(Attachment.read, content)
-                writer.add_attachment(file.create_time, file.log_time, file.name, file.media_type, file.data)
+                writer.add_attachment(
+                    file.create_time,
+                    file.log_time,
+                    file.name,
+                    file.media_type,
+                    file.data,
+                )
             else:
-                amended.notes["log.attachments"] = f"one at byte {record.at} is damaged and left out"
+                amended.notes["log.attachments"] = (
+                    f"one at byte {record.at} is damaged and left out"
+                )
         for name, values in metadata.items():
             writer.add_metadata(name, seal(values))
         writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
         notes = recording.notes()
-        amended.notes |= {name: notes[name] for name in ("log.ending", "log.damage") if name in notes}
+        amended.notes |= {
+            name: notes[name] for name in ("log.ending", "log.damage") if name in notes
+        }
         return amended
 
     def _recorded(self) -> Iterator[_Message]:
@@ -164,23 +203,32 @@ class _AmendedCopy:
             data = pieces[0].data
             columns = zip(*(piece.found for piece in pieces), strict=True)
             at, size, time_ns = (np.concatenate(column) for column in columns)
-            of = np.repeat(np.arange(len(pieces)), [len(piece.found.sizes) for piece in pieces])
+            of = np.repeat(
+                np.arange(len(pieces)), [len(piece.found.sizes) for piece in pieces]
+            )
             for row in np.lexsort((at, time_ns)).tolist():
                 begin, topic = int(at[row]), pieces[of[row]].topic.name
                 payload = bytes(data[begin : begin + int(size[row])])
                 # before each payload is the head of its record
                 number, published_ns = (
-                    int.from_bytes(data[begin - first : begin - end], "little") for first, end in ((20, 16), (8, 0))
+                    int.from_bytes(data[begin - first : begin - end], "little")
+                    for first, end in ((20, 16), (8, 0))
                 )
                 yield int(time_ns[row]), published_ns, topic, payload, number
 
     def _is_copied(self, piece: ChunkPart, passage: Passage) -> bool:
         """Tell whether messages of a topic are copied; if so, the topic is made known to the writer."""
         first_ns = int(piece.found.log_times_ns.min())
-        self._beginning_ns = first_ns if self._beginning_ns is None else min(first_ns, self._beginning_ns)
+        self._beginning_ns = (
+            first_ns
+            if self._beginning_ns is None
+            else min(first_ns, self._beginning_ns)
+        )
         topic = piece.topic
         wanted = self._anew.get(topic.name)
-        if topic.name in self._taken or (wanted is not None and short_name(topic.type_name) != short_name(wanted)):
+        if topic.name in self._taken or (
+            wanted is not None and short_name(topic.type_name) != short_name(wanted)
+        ):
             raise LogError(
                 f"{self._source}: {topic.name} ({topic.type_name}) is in the log already; "
                 "leave it out where the log is made"
@@ -189,12 +237,19 @@ class _AmendedCopy:
             self._amended.replaced[topic.name] += len(piece.found.sizes)
             return False
         channel, schema = passage.as_written[topic.name]
-        self._offer(topic.name, (schema.name, schema.encoding, schema.data), topic.encoding, channel.metadata)
+        self._offer(
+            topic.name,
+            (schema.name, schema.encoding, schema.data),
+            topic.encoding,
+            channel.metadata,
+        )
         return True
 
     def _added(self, added: Sequence[Outgoing]) -> Iterator[_Message]:
         rows = sorted(
-            (at_ns, of, row) for of, entry in enumerate(added) for row, at_ns in enumerate(entry.log_times_ns.tolist())
+            (at_ns, of, row)
+            for of, entry in enumerate(added)
+            for row, at_ns in enumerate(entry.log_times_ns.tolist())
         )
         for time_ns, of, row in rows:
             entry = added[of]
@@ -207,10 +262,18 @@ class _AmendedCopy:
             self._taken.add(entry.topic)
             yield from self._added([entry])
 
-    def _offer(self, topic: str, schema: tuple[str, str, bytes], encoding: str, metadata: Mapping[str, str]) -> None:
+    def _offer(
+        self,
+        topic: str,
+        schema: tuple[str, str, bytes],
+        encoding: str,
+        metadata: Mapping[str, str],
+    ) -> None:
         """Make a topic known to the writer, once; a schema is name, encoding and text."""
         if topic in self._channels:
             return
         if schema not in self._schemas:
             self._schemas[schema] = self._writer.register_schema(*schema)
-        self._channels[topic] = self._writer.register_channel(topic, encoding, self._schemas[schema], dict(metadata))
+        self._channels[topic] = self._writer.register_channel(
+            topic, encoding, self._schemas[schema], dict(metadata)
+        )

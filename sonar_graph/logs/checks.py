@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, Calibration, Mounting
+from sonar_graph.calibration import (
+    HOLE_INTERVALS,
+    ROWS_BEFORE,
+    SHORTEST_HOLE_S,
+    UNTYPICAL_S,
+    Calibration,
+    Mounting,
+)
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
@@ -25,7 +32,11 @@ MOST_OFF_GRAVITY = 0.2
 """Relative difference between specific force and gravity above which units are in doubt."""
 SPIKES = {
     "angular rate": (1.0, "rad/s", "heading is wrong from there on"),
-    "specific force": (30.0, "m/s2", "gravity and gaps of the Doppler log are wrong there"),
+    "specific force": (
+        30.0,
+        "m/s2",
+        "gravity and gaps of the Doppler log are wrong there",
+    ),
 }
 """Least spike of a quantity, its unit, and what it does; 3 g of a single sample, without a trace in the next, is no
 blow."""
@@ -42,7 +53,12 @@ FARTHEST_FROM_START_M = 2.0
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
-_ROTATIONS = {(0, False): "[0, -90, 0]", (0, True): "[0, 90, 0]", (1, False): "[90, 0, 0]", (1, True): "[-90, 0, 0]"}
+_ROTATIONS = {
+    (0, False): "[0, -90, 0]",
+    (0, True): "[0, 90, 0]",
+    (1, False): "[90, 0, 0]",
+    (1, True): "[-90, 0, 0]",
+}
 """Rotation to give, by the axis along which gravity is felt, and whether against it."""
 
 
@@ -51,7 +67,8 @@ DAY_S = 86_400.0
 
 def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     """Faults of header stamps, shape (n,): missing, backwards, repeated, far from times of recording, or drifting."""
-    unset = (stamps_ns == 0) & (log_times_ns != 0)  # data sets begin at 0: recorded at 0, a stamp of 0 is right
+    # data sets begin at 0: recorded at 0, a stamp of 0 is right
+    unset = (stamps_ns == 0) & (log_times_ns != 0)
     if unset.any():
         yield f"{_count(int(unset.sum()), 'message')} without a stamp: the time of recording is used"
     stamps_ns, log_times_ns = stamps_ns[~unset], log_times_ns[~unset]
@@ -73,7 +90,9 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     elif abs(typical_s) > LARGEST_LAG_S:
         side = "before" if typical_s > 0 else "after"
         yield f"stamped {abs(typical_s):.4g} s {side} recording: another clock, or a delay"
-    first_s, last_s = (float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:]))
+    first_s, last_s = (
+        float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:])
+    )
     if abs(last_s - first_s) > LARGEST_LAG_CHANGE_S:
         yield f"stamps and recording drift apart by {abs(last_s - first_s):.3g} s: a clock jumped or runs wrong"
 
@@ -86,7 +105,9 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     time before them leave no gap. A sensor that begins or ends more than ``dvl.gap_s`` apart from the other is named
     first.
     """
-    begin_s, end_s = ((int(imu.stamps_ns[row]) - int(dvl.stamps_ns[row])) * 1e-9 for row in (0, -1))
+    begin_s, end_s = (
+        (int(imu.stamps_ns[row]) - int(dvl.stamps_ns[row])) * 1e-9 for row in (0, -1)
+    )
     if abs(begin_s) > calibration.dvl.gap_s:
         late, early = ("IMU", "Doppler log") if begin_s > 0 else ("Doppler log", "IMU")
         yield f"{late} begins {abs(begin_s):.1f} s after the {early}; not estimated until then"
@@ -97,7 +118,10 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
         return
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     holes = imu_holes(imu.stamps_ns)
-    holes = holes[(holes[:, 0] < min(imu.stamps_ns[-1], dvl.stamps_ns[-1])) & (holes[:, 1] > start_ns)]
+    holes = holes[
+        (holes[:, 0] < min(imu.stamps_ns[-1], dvl.stamps_ns[-1]))
+        & (holes[:, 1] > start_ns)
+    ]
     if len(holes):
         holes[:, 0] = np.maximum(holes[:, 0], start_ns)
         turns = (
@@ -110,7 +134,9 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     yield from _dvl_gap_warnings(imu, dvl, round(calibration.dvl.gap_s * 1e9), start_ns)
 
 
-def _dvl_gap_warnings(imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int) -> Iterator[str]:
+def _dvl_gap_warnings(
+    imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int
+) -> Iterator[str]:
     """Gaps of the Doppler log, grouped by how estimators bridge them."""
     partial = is_partial(dvl)
     whole_ns, partial_ns = dvl.stamps_ns[~partial], dvl.stamps_ns[partial]
@@ -132,7 +158,9 @@ def _dvl_gap_warnings(imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int) -> Ite
         yield f"dvl: no velocity {_gap_times(by_force, start_ns)}: bridged by the IMU, with an error that grows fast"
     if by_walk:
         times = _gap_times(by_walk, start_ns)
-        yield (f"dvl: no velocity {times}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)")
+        yield (
+            f"dvl: no velocity {times}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)"
+        )
 
 
 def is_partial(dvl: Dvl) -> NDArray[np.bool_]:
@@ -147,7 +175,10 @@ def imu_holes(stamps_ns: Ints) -> Ints:
     An interval is a hole when it is longer than the median of the intervals before it by a factor.
     """
     intervals = np.diff(stamps_ns)
-    shorter, before = np.zeros(len(intervals)), np.minimum(np.arange(len(intervals)), ROWS_BEFORE)
+    shorter, before = (
+        np.zeros(len(intervals)),
+        np.minimum(np.arange(len(intervals)), ROWS_BEFORE),
+    )
     for lag in range(1, min(ROWS_BEFORE + 1, len(intervals))):
         shorter[lag:] += HOLE_INTERVALS * intervals[:-lag] < intervals[lag:]
     is_hole = (intervals > SHORTEST_HOLE_S * 1e9) & (2 * shorter >= before)
@@ -171,14 +202,19 @@ def _gap_times(gaps: Ints | list[list[int]], start_ns: int) -> str:
 def _longest(first_ns: Ints, last_ns: Ints, size: Ints, origin_ns: int) -> str:
     """Times of the `MOST_NAMED` largest spans in their order: ``1.000 to 2.500, 4.000 to 4.200``."""
     named = np.sort(np.argsort(-size, kind="stable")[:MOST_NAMED])
-    return ", ".join(f"{(first_ns[k] - origin_ns) * 1e-9:.3f} to {(last_ns[k] - origin_ns) * 1e-9:.3f}" for k in named)
+    return ", ".join(
+        f"{(first_ns[k] - origin_ns) * 1e-9:.3f} to {(last_ns[k] - origin_ns) * 1e-9:.3f}"
+        for k in named
+    )
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def gravity_warning(specific_force: Floats, mounting: Mounting, gravity_m_s2: float) -> str | None:
+def gravity_warning(
+    specific_force: Floats, mounting: Mounting, gravity_m_s2: float
+) -> str | None:
     """Warning when the median specific force, shape (n, 3), is not gravity upwards in the body; None: nothing is wrong.
 
     Vehicles that can be navigated at all are near level most of the time. A force that differs from gravity by more
@@ -198,7 +234,10 @@ def gravity_warning(specific_force: Floats, mounting: Mounting, gravity_m_s2: fl
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None
     axis = int(np.argmax(np.abs(typical)))
-    sign, rotation = ("-" if typical[axis] < 0 else "+"), _ROTATIONS.get((axis, bool(typical[axis] < 0)))
+    sign, rotation = (
+        ("-" if typical[axis] < 0 else "+"),
+        _ROTATIONS.get((axis, bool(typical[axis] < 0))),
+    )
     advice = 'give rotation = "frd", or linear_acceleration_scale = -1 where only the sign is wrong'
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
@@ -212,29 +251,46 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     is ``u = f - dv / T - w x v``, normalised, and ``u_j = Exp(-w T) u_i`` from one second to the next. Compared is the
     median of the squared differences, over all permutations and signs of the rates. docs/theory/sensor_check.md.
     """
-    spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]  # a clock may have been set meanwhile
-    first_ns, last_ns = max(first for first, _ in spans_ns), min(last for _, last in spans_ns)
+    # a clock may have been set meanwhile
+    spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]
+    first_ns, last_ns = (
+        max(first for first, _ in spans_ns),
+        min(last for _, last in spans_ns),
+    )
     if (last_ns - first_ns) * 1e-9 > len(imu):
         return None
     edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)
     if len(edges_s) < FEWEST_SECONDS or np.isnan(imu.specific_force).any():
         return None
-    imu_s, dvl_s = (np.asarray((rows.stamps_ns - first_ns) * 1e-9, np.float64) for rows in (imu, dvl))
-    body_R_imu, body_R_dvl = (part.mounting.pose().rotation().matrix() for part in (calibration.imu, calibration.dvl))
+    imu_s, dvl_s = (
+        np.asarray((rows.stamps_ns - first_ns) * 1e-9, np.float64)
+        for rows in (imu, dvl)
+    )
+    body_R_imu, body_R_dvl = (
+        part.mounting.pose().rotation().matrix()
+        for part in (calibration.imu, calibration.dvl)
+    )
     means = []
     for values in (imu.angular_velocity, imu.specific_force):
-        steps = 0.5 * (values[1:] + values[:-1]) @ body_R_imu.T * np.diff(imu_s)[:, None]
+        steps = (
+            0.5 * (values[1:] + values[:-1]) @ body_R_imu.T * np.diff(imu_s)[:, None]
+        )
         total = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
         means.append(np.diff(_between(edges_s, imu_s, total), axis=0))
     (w, f), v = means, _between(edges_s, dvl_s, dvl.velocity @ body_R_dvl.T)
     apart = {}
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        axes = ", ".join("-"[: sign < 0] + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+        axes = ", ".join(
+            "-"[: sign < 0] + "xyz"[axis]
+            for axis, sign in zip(order, signs, strict=True)
+        )
         turn = w[:, order] * signs
         up = f - np.diff(v, axis=0) - np.cross(turn, 0.5 * (v[1:] + v[:-1]))
         up /= np.linalg.norm(up, axis=1)[:, None]
         carried = Rotation.from_rotvec(-0.5 * (turn[1:] + turn[:-1])).apply(up[:-1])
-        apart[axes] = 1e3 * float(np.sqrt(np.median(np.sum((up[1:] - carried) ** 2, axis=1))))
+        apart[axes] = 1e3 * float(
+            np.sqrt(np.median(np.sum((up[1:] - carried) ** 2, axis=1)))
+        )
     best, as_is_mrad = min(apart, key=apart.__getitem__), apart["x, y, z"]
     if not apart[best] < as_is_mrad / MOST_IMPROVED:
         return None
@@ -259,7 +315,9 @@ def axes_warning(adapter: Adapter) -> str | None:
     )
 
 
-def start_depth_warning(depth: Depth, start_ns: int, calibration: Calibration) -> str | None:
+def start_depth_warning(
+    depth: Depth, start_ns: int, calibration: Calibration
+) -> str | None:
     """Warning where the heights about the start, whose instant is given, are not that of the start's pose."""
     start, port_m = calibration.start, np.array(calibration.depth.port_m)
     if "position_m" not in start.model_fields_set:
@@ -267,7 +325,10 @@ def start_depth_warning(depth: Depth, start_ns: int, calibration: Calibration) -
     first = max(int(np.searchsorted(depth.stamps_ns, start_ns)) - 1, 0)
     height_m = float(np.median(depth.z_m[first : first + 5]))
     stated_m = float(start.pose().transformFrom(port_m)[2])
-    if abs(height_m - stated_m) <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]:
+    if (
+        abs(height_m - stated_m)
+        <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]
+    ):
         return None
     return (
         f"the height begins at {height_m:.2f} m, the start of the calibration is at {stated_m:.2f} m: another sign, "
@@ -287,7 +348,12 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
     off = np.linalg.norm(values[1:-1] - (values[:-2] + values[2:]) / 2, axis=1)
     off[np.isnan(off)] = 0.0
     agree = np.linalg.norm(values[2:] - values[:-2], axis=1) < off / 2
-    spikes = np.flatnonzero(agree & (off > max(least, SPIKE_RATIO * float(np.quantile(off, 0.99))))) + 1
+    spikes = (
+        np.flatnonzero(
+            agree & (off > max(least, SPIKE_RATIO * float(np.quantile(off, 0.99))))
+        )
+        + 1
+    )
     if not spikes.size:
         return None
     largest = int(spikes[np.argmax(off[spikes - 1])])
@@ -298,7 +364,9 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
     )
 
 
-def stuck_warning(stamps_ns: Ints, values: Floats, quantity: str, *, is_coarse: bool = False) -> str | None:
+def stuck_warning(
+    stamps_ns: Ints, values: Floats, quantity: str, *, is_coarse: bool = False
+) -> str | None:
     """Warning about stretches of rows, shape (n, k), that are equal to the bit, zeros or not; None: there are none.
 
     Such rows are used as they are. A vehicle at rest in a simulator or a coarse sensor may look the same: of a sensor
@@ -308,18 +376,25 @@ def stuck_warning(stamps_ns: Ints, values: Floats, quantity: str, *, is_coarse: 
     differs = np.any(values[1:] != values[:-1], axis=1)
     first = np.concatenate([[0], np.flatnonzero(differs) + 1])
     last = np.concatenate([first[1:] - 1, [len(values) - 1]])
-    is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (last - first + 1 >= STUCK_ROWS)
+    is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
+        last - first + 1 >= STUCK_ROWS
+    )
     if is_coarse and differs.any():
         is_long &= len(values) * (1.0 - differs.mean()) ** (last - first) < 1e-3
     is_zero = ~np.any(values[first], axis=1)
     texts = []
-    for chosen, what in ((is_long & is_zero, "exactly zero"), (is_long & ~is_zero, "the same to the last bit")):
+    for chosen, what in (
+        (is_long & is_zero, "exactly zero"),
+        (is_long & ~is_zero, "the same to the last bit"),
+    ):
         if not chosen.any():
             continue
         begin, end = first[chosen], last[chosen]
         rows = end - begin + 1
         times = f"{_longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))} s after the first"
-        more = f" of {len(rows)} stretches, the longest" if len(rows) > MOST_NAMED else ","
+        more = (
+            f" of {len(rows)} stretches, the longest" if len(rows) > MOST_NAMED else ","
+        )
         texts.append(f"{what} in {rows.sum()} rows{more} {times}")
     if not texts:
         return None

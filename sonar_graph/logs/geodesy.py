@@ -17,24 +17,34 @@ FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 
 
-def earth_centred(latitude_rad: Floats, longitude_rad: Floats, height_m: Floats) -> Floats:
+def earth_centred(
+    latitude_rad: Floats, longitude_rad: Floats, height_m: Floats
+) -> Floats:
     """Earth-centred, Earth-fixed coordinates, shape (n, 3), metres."""
     sin, cos = np.sin(latitude_rad), np.cos(latitude_rad)
     N = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin**2)
     across = (N + height_m) * cos
     along = (N * (1.0 - ECCENTRICITY_SQUARED) + height_m) * sin
-    return np.column_stack([across * np.cos(longitude_rad), across * np.sin(longitude_rad), along])
+    return np.column_stack(
+        [across * np.cos(longitude_rad), across * np.sin(longitude_rad), along]
+    )
 
 
-def east_north_up(latitude_rad: Floats, longitude_rad: Floats, height_m: Floats, origin: Origin) -> Floats:
+def east_north_up(
+    latitude_rad: Floats, longitude_rad: Floats, height_m: Floats, origin: Origin
+) -> Floats:
     """Metres east, north and up of an origin, shape (n, 3)."""
     origin_latitude_rad, origin_longitude_rad, _ = origin
     sin_lat, cos_lat = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
     sin_lon, cos_lon = np.sin(origin_longitude_rad), np.cos(origin_longitude_rad)
     centre = earth_centred(*(np.array([value]) for value in origin))
-    east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
-    enu_R_earth = np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])
+    east, north = (
+        [-sin_lon, cos_lon, 0.0],
+        [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+    )
+    enu_R_earth = np.array(
+        [east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]]
+    )
     from_centre = earth_centred(latitude_rad, longitude_rad, height_m) - centre
-    return np.asarray(
-        (enu_R_earth @ from_centre[:, :, None])[:, :, 0]
-    )  # row by row: a message alone gives the same bits
+    # row by row: a message alone gives the same bits
+    return np.asarray((enu_R_earth @ from_centre[:, :, None])[:, :, 0])

@@ -12,14 +12,44 @@ import numpy as np
 
 from sonar_graph.errors import CalibrationError, LogError, SonarGraphError
 from sonar_graph.files import as_path
-from sonar_graph.logs.adapters import LogConfig, leaf_fields, plain_lines, shipped_like, table_text
-from sonar_graph.logs.cdr import Struct, decode, definition, parse_definition, short_name
+from sonar_graph.logs.adapters import (
+    LogConfig,
+    leaf_fields,
+    plain_lines,
+    shipped_like,
+    table_text,
+)
+from sonar_graph.logs.cdr import (
+    Struct,
+    decode,
+    definition,
+    parse_definition,
+    short_name,
+)
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topic, scan
 from sonar_graph.logs.reading import Assembly
-from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_each, refusal, wanted_types
-from sonar_graph.logs.sonar_images import describe_frames, read_sonar_frames, sonar_frame
-from sonar_graph.logs.vehicle_setup import read_calibration, read_notes, recorded_name, static_frames
+from sonar_graph.logs.roles import (
+    ROLES,
+    SEQUENCE_ROLES,
+    SONAR,
+    TF,
+    Choice,
+    choose_each,
+    refusal,
+    wanted_types,
+)
+from sonar_graph.logs.sonar_images import (
+    describe_frames,
+    read_sonar_frames,
+    sonar_frame,
+)
+from sonar_graph.logs.vehicle_setup import (
+    read_calibration,
+    read_notes,
+    recorded_name,
+    static_frames,
+)
 from sonar_graph.measurements import NS_PER_S, Ints
 
 _MOST_FIELDS = 24
@@ -109,7 +139,11 @@ class LogSummary:
     @property
     def obstacles(self) -> tuple[str, ...]:
         """Needed roles that no topic plays, or several could, so that no estimator can run; such as ``no IMU``."""
-        needed = [role for role in self.roles if ROLES[role.role].is_required and role.topic is None]
+        needed = [
+            role
+            for role in self.roles
+            if ROLES[role.role].is_required and role.topic is None
+        ]
         return tuple(
             f"{len(role.candidates)} topics for {role.role} (choose: --topic {role.role}={role.candidates[0]})"
             if role.candidates
@@ -132,11 +166,18 @@ class LogSummary:
     def duration_s(self) -> float:
         """Seconds between the first and the last stamp of the topics that play a role, or of all where none does."""
         used = {role.topic for role in self.roles}
-        by_header = [topic for topic in self.topics if topic.stamps_from == "header"]  # not the recorder's clock
-        topics = [topic for topic in self.topics if topic.name in used] or by_header or self.topics
+        # not the recorder's clock
+        by_header = [topic for topic in self.topics if topic.stamps_from == "header"]
+        topics = (
+            [topic for topic in self.topics if topic.name in used]
+            or by_header
+            or self.topics
+        )
         if not topics:
             return 0.0
-        return (max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)) * 1e-9
+        return (
+            max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)
+        ) * 1e-9
 
 
 def inspect_log(
@@ -190,9 +231,15 @@ def inspect_log(
     config = config or LogConfig()
     types = wanted_types(config)
     recording = scan(
-        as_path(path, "inspect_log(path)"), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP, window
+        as_path(path, "inspect_log(path)"),
+        lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP,
+        window,
     )
-    damage = [*recording.corrupt, *([recording.ending] if recording.ending else []), *recording.damage.remarks]
+    damage = [
+        *recording.corrupt,
+        *([recording.ending] if recording.ending else []),
+        *recording.damage.remarks,
+    ]
     choices = choose_each(recording, topics or {}, config, ROLES)
     mounted: dict[str, str] = {}
     try:
@@ -204,7 +251,9 @@ def inspect_log(
     left_out, warnings, unusable = list[str](), list[str](), list[str]()
     try:
         frame = sonar_frame(recording, choices[SONAR].topic, config)
-        assembly = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}, sonar=frame)
+        assembly = Assembly(
+            recording, {name: choices[name] for name in SEQUENCE_ROLES}, sonar=frame
+        )
         mounted = assembly.mounted
         left_out, warnings = assembly.survey()
     except CalibrationError:
@@ -222,7 +271,10 @@ def inspect_log(
         path=recording.path,
         name=recorded_name(recording),
         topics=summaries,
-        roles=tuple(RoleSummary(c.role.name, c.topic, c.reason, c.candidates) for c in choices.values()),
+        roles=tuple(
+            RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
+            for c in choices.values()
+        ),
         calibration=_calibration_source(recording, mounted),
         notes=notes,
         damage=tuple(damage),
@@ -238,13 +290,30 @@ def inspect_log(
 def _summarise(topic: Topic) -> TopicSummary:
     header_ns, log_times_ns = _header_stamps(topic), topic.log_times_ns
     if not len(topic):  # none of its messages is what its definition says
-        faults = "has " + ", ".join(f"{count} messages {fault}" for fault, count in topic.unsound.items())
-        return TopicSummary(topic.name, topic.type_name, topic.encoding, 0, 0, 0, 0.0, 0.0, "log", refusal=faults)
+        faults = "has " + ", ".join(
+            f"{count} messages {fault}" for fault, count in topic.unsound.items()
+        )
+        return TopicSummary(
+            topic.name,
+            topic.type_name,
+            topic.encoding,
+            0,
+            0,
+            0,
+            0.0,
+            0.0,
+            "log",
+            refusal=faults,
+        )
     stamps_ns, lag_s = np.sort(log_times_ns), None
     if header_ns is not None:
         stamps_ns = np.sort(np.where(header_ns == 0, log_times_ns, header_ns))
         stamped = (header_ns != 0) | (log_times_ns == 0)
-        lag_s = float(np.median((log_times_ns - header_ns)[stamped])) * 1e-9 if stamped.any() else None
+        lag_s = (
+            float(np.median((log_times_ns - header_ns)[stamped])) * 1e-9
+            if stamped.any()
+            else None
+        )
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     steps_s = np.diff(stamps_ns) * 1e-9
     low, high = np.quantile(steps_s, [0.16, 0.84]) if len(steps_s) else (0.0, 0.0)
@@ -260,7 +329,9 @@ def _summarise(topic: Topic) -> TopicSummary:
         stamps_from="log" if header_ns is None else "header",
         jitter_s=float(high - low) / 2,
         lag_s=lag_s,
-        stamp_faults=() if header_ns is None else tuple(stamp_faults(header_ns, log_times_ns)),
+        stamp_faults=()
+        if header_ns is None
+        else tuple(stamp_faults(header_ns, log_times_ns)),
         refusal=refusal(topic),
     )
 
@@ -273,16 +344,27 @@ def _header_stamps(topic: Topic) -> Ints | None:
         return None
     if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
         return None
-    if first[0].kind.name != "std_msgs/Header" or min(topic.stacks, default=0) < STAMP_BYTES:
+    if (
+        first[0].kind.name != "std_msgs/Header"
+        or min(topic.stacks, default=0) < STAMP_BYTES
+    ):
         return None
-    time = parse_definition("builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time"))
-    parts = [(rows, payloads[:, :STAMP_BYTES]) for stack in topic.stacks.values() for rows, payloads in stack]
+    time = parse_definition(
+        "builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time")
+    )
+    parts = [
+        (rows, payloads[:, :STAMP_BYTES])
+        for stack in topic.stacks.values()
+        for rows, payloads in stack
+    ]
     decoded = decode(time, parts)
     if decoded.unsound:
         return None
     stamps_ns = np.empty(len(topic), np.int64)
     for group in decoded.groups:
-        stamps_ns[group.rows] = group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
+        stamps_ns[group.rows] = (
+            group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
+        )
     return stamps_ns
 
 
@@ -293,8 +375,14 @@ def _calibration_source(recording: Recording, mounted: Mapping[str, str]) -> str
         has_frames = bool(static_frames(recording))
     except SonarGraphError as error:
         return f"unusable: {error}"
-    of_sensors = ", ".join(name if name == frame else f"{name}: {frame}" for name, frame in mounted.items())
-    mountings = f"mountings of /tf_static ({of_sensors})" if mounted else "no sensor's mounting in /tf_static"
+    of_sensors = ", ".join(
+        name if name == frame else f"{name}: {frame}" for name, frame in mounted.items()
+    )
+    mountings = (
+        f"mountings of /tf_static ({of_sensors})"
+        if mounted
+        else "no sensor's mounting in /tf_static"
+    )
     if recorded is not None:
         return f"in the log; {mountings}" if mounted else "in the log"
     if has_frames:
@@ -305,9 +393,13 @@ def _calibration_source(recording: Recording, mounted: Mapping[str, str]) -> str
     )
 
 
-def starting_config(recording: Recording, choices: list[Choice], config: LogConfig) -> str:
+def starting_config(
+    recording: Recording, choices: list[Choice], config: LogConfig
+) -> str:
     """TOML that makes the same choices when it is read back unchanged; comments name other possible topics."""
-    parts = [f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."]
+    parts = [
+        f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."
+    ]
     for choice in choices:
         role, table = choice.role.name, config.table(choice.role.name)
         named = choice.candidates or choice.could_be
@@ -316,26 +408,59 @@ def starting_config(recording: Recording, choices: list[Choice], config: LogConf
             base = shipped_like(role, topic.type_name, topic.definition())
             parts.append(table_text(role, choice.topic, choice.adapter, base))
         elif table:  # kept as it is, also where nothing in this log fits it
-            parts.append("\n".join([_comment(choice.reason), f"[{role}]", *plain_lines(table)]))
+            parts.append(
+                "\n".join([_comment(choice.reason), f"[{role}]", *plain_lines(table)])
+            )
         elif named:
-            parts.append(_comment("\n".join([f"[{role}]  # one of", *(f'topic = "{name}"' for name in named)])))
-        elif choice.role.is_required:  # a table to fill in, for a topic whose name contains the role
-            lines = [f"[{role}]  # no topic of a known type; the fields of other topics are listed below"]
-            likely = [topic for topic in recording.topics.values() if role in topic.name.lower() and topic.is_ros2]
-            name, kind = (likely[0].name, likely[0].type_name) if likely else ("/...", "package/msg/Type")
+            parts.append(
+                _comment(
+                    "\n".join(
+                        [
+                            f"[{role}]  # one of",
+                            *(f'topic = "{name}"' for name in named),
+                        ]
+                    )
+                )
+            )
+        elif (
+            choice.role.is_required
+        ):  # a table to fill in, for a topic whose name contains the role
+            lines = [
+                f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
+            ]
+            likely = [
+                topic
+                for topic in recording.topics.values()
+                if role in topic.name.lower() and topic.is_ros2
+            ]
+            name, kind = (
+                (likely[0].name, likely[0].type_name)
+                if likely
+                else ("/...", "package/msg/Type")
+            )
             lines += [f'topic = "{name}"', f'type = "{kind}"']
             if likely and "header.stamp.sec" not in _leaves(likely[0]):
-                lines.append('stamp = "log"  # messages without a header: when they were recorded')
+                lines.append(
+                    'stamp = "log"  # messages without a header: when they were recorded'
+                )
             parts.append(_comment("\n".join([*lines, _EXAMPLES[role]])))
         else:
             parts.append(_comment(f"[{role}]  # nothing found"))
     if any(choice.topic is None and choice.role.is_required for choice in choices):
         used = {choice.topic for choice in choices}
         for topic in recording.topics.values():
-            if topic.name in used or not topic.is_ros2 or short_name(topic.type_name) == short_name(TF):
+            if (
+                topic.name in used
+                or not topic.is_ros2
+                or short_name(topic.type_name) == short_name(TF)
+            ):
                 continue
             fields = [f"  {path}{size}" for path, size in _leaves(topic).items()]
-            more = [f"  and {len(fields) - _MOST_FIELDS} more"] if len(fields) > _MOST_FIELDS else []
+            more = (
+                [f"  and {len(fields) - _MOST_FIELDS} more"]
+                if len(fields) > _MOST_FIELDS
+                else []
+            )
             head = f"{topic.name} is a {topic.type_name} with the fields"
             parts.append(_comment("\n".join([head, *fields[:_MOST_FIELDS], *more])))
     return "\n\n".join(parts) + "\n"

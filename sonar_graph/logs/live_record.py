@@ -21,9 +21,23 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
-from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Keep, Recording, Topic, scan, seal
+from sonar_graph.logs.mcap import (
+    LIBRARY,
+    ROSBAG2_METADATA,
+    TRANSIENT_LOCAL,
+    Keep,
+    Recording,
+    Topic,
+    scan,
+    seal,
+)
 from sonar_graph.logs.roles import DROPPED, TF, Choice
-from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, read_calibration, read_notes
+from sonar_graph.logs.vehicle_setup import (
+    METADATA,
+    PartialCalibration,
+    read_calibration,
+    read_notes,
+)
 
 if TYPE_CHECKING:
     from sonar_graph.logs.reading import Assembly
@@ -43,8 +57,15 @@ def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
         return {}
     found = dict[tuple[str, int], str]()
     for group in topic.messages():
-        columns = zip(group.strings("topic"), group["log_time"].tolist(), group.strings("reason"), strict=True)
-        found |= {(name, log_time_ns): reason for (name,), log_time_ns, (reason,) in columns}
+        columns = zip(
+            group.strings("topic"),
+            group["log_time"].tolist(),
+            group.strings("reason"),
+            strict=True,
+        )
+        found |= {
+            (name, log_time_ns): reason for (name,), log_time_ns, (reason,) in columns
+        }
     return found
 
 
@@ -53,15 +74,29 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
     dropped = dropped_in(recording)
     newest_ns = read_notes(recording).get(NEWEST_FRAMES, "")
     for topic in recording.topics.values():
-        if newest_ns.isdecimal() and topic.name.endswith("tf_static") and short_name(topic.type_name) == short_name(TF):
+        if (
+            newest_ns.isdecimal()
+            and topic.name.endswith("tf_static")
+            and short_name(topic.type_name) == short_name(TF)
+        ):
             topic.leave_out(topic.log_times_ns[topic.log_times_ns > int(newest_ns)])
     for name in {name for name, _ in dropped}:
         if name in recording.topics:
             times_ns = [log_time_ns for topic, log_time_ns in dropped if topic == name]
             recording.topics[name].leave_out(np.array(times_ns, np.int64))
     counts = Counter((name, reason) for (name, _), reason in dropped.items())
-    texts = [f"{count} of {name}: {reason}" for (name, reason), count in sorted(counts.items())]
-    return {"log.live": "not given to the estimator live, so left out: " + "; ".join(texts)} if texts else {}
+    texts = [
+        f"{count} of {name}: {reason}"
+        for (name, reason), count in sorted(counts.items())
+    ]
+    return (
+        {
+            "log.live": "not given to the estimator live, so left out: "
+            + "; ".join(texts)
+        }
+        if texts
+        else {}
+    )
 
 
 def recorded_config(recording: Recording) -> LogConfig | None:
@@ -76,13 +111,17 @@ def recorded_config(recording: Recording) -> LogConfig | None:
         raise LogError(f"{source} is no JSON object: {error}") from error
 
 
-def pinned(config: LogConfig, choices: Mapping[str, Choice], assembly: Assembly) -> dict[str, Any]:
+def pinned(
+    config: LogConfig, choices: Mapping[str, Choice], assembly: Assembly
+) -> dict[str, Any]:
     """Tables of a configuration with which a log gets the same topics in the same roles, read in the same way.
 
     What a log decides by all its messages is decided by those of an assembly: whether a driver fills the acceleration
     and counts beams, and the origin of the world.
     """
-    tables: dict[str, Any] = {role: dict(table) for role, table in config.tables.items()}
+    tables: dict[str, Any] = {
+        role: dict(table) for role, table in config.tables.items()
+    }
     for role, choice in choices.items():
         if choice.topic is None:
             tables[role] = {"use": False}
@@ -92,12 +131,19 @@ def pinned(config: LogConfig, choices: Mapping[str, Choice], assembly: Assembly)
     has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
     tables["imu"] |= {"are_zeros_measured": True} if has_force else {"unfilled": "each"}
     if dvl.good_beams is not None:
-        are_counted = bool(dvl.table(assembly.topics["dvl"]).column(dvl.good_beams).any())
-        tables["dvl"] |= {"are_beams_counted": True} if are_counted else {"good_beams": False}
+        are_counted = bool(
+            dvl.table(assembly.topics["dvl"]).column(dvl.good_beams).any()
+        )
+        tables["dvl"] |= (
+            {"are_beams_counted": True} if are_counted else {"good_beams": False}
+        )
     for role in ("positions", "truth"):
         if role in assembly.topics and assembly.adapters[role].geodetic is not None:
             _, origin = assembly.axes_and_origin(role)
-            tables[role]["geodetic"] = {**tables[role].get("geodetic", {}), "origin_deg_m": origin}
+            tables[role]["geodetic"] = {
+                **tables[role].get("geodetic", {}),
+                "origin_deg_m": origin,
+            }
     return tables
 
 
@@ -115,10 +161,14 @@ class LiveRecord:
         try:
             self._stream = path.open("xb")
         except FileExistsError as error:
-            raise LogError(f"{path}: a record is there already; name another folder") from error
+            raise LogError(
+                f"{path}: a record is there already; name another folder"
+            ) from error
         except OSError as error:
             raise LogError(f"{path}: cannot be written: {error.strerror}") from error
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        self._writer = Writer(
+            self._stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True
+        )
         self._writer.start(profile="ros2", library=LIBRARY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -126,7 +176,9 @@ class LiveRecord:
         self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
 
     @staticmethod
-    def resumed_calibration(path: Path, given: PartialCalibration | None) -> PartialCalibration | None:
+    def resumed_calibration(
+        path: Path, given: PartialCalibration | None
+    ) -> PartialCalibration | None:
         """Fields with which a live run goes on: those of its record, and before them what the user gives now.
 
         Sensors that it did not use are left out: their mountings may still come. None without either.
@@ -140,7 +192,11 @@ class LiveRecord:
         recorded, config = read_calibration(recording), recorded_config(recording)
         if recorded is None or config is None:
             return given
-        values = {name: value for name, value in recorded.model_dump(mode="json").items() if value is not None}
+        values = {
+            name: value
+            for name, value in recorded.model_dump(mode="json").items()
+            if value is not None
+        }
         for role, table in config.tables.items():
             if table.get("use") is False:
                 values.pop(role, None)
@@ -151,7 +207,10 @@ class LiveRecord:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
         self._stream.close()
@@ -191,21 +250,44 @@ class LiveRecord:
             topic.name, topic.encoding, self._schemas[key], offers
         )
 
-    def write(self, topic: str, payload: bytes, arrival_ns: int, sequence: int = 0, sent_ns: int = 0) -> int:
+    def write(
+        self,
+        topic: str,
+        payload: bytes,
+        arrival_ns: int,
+        sequence: int = 0,
+        sent_ns: int = 0,
+    ) -> int:
         """Write a message as it came; its log time, by which it is named: of arrival, and unlike any other's."""
         log_time_ns = max(arrival_ns, self._newest_ns.get(topic, 0) + 1)
         self._newest_ns[topic] = log_time_ns
         sent_ns = sent_ns if 0 < sent_ns < 2**63 else log_time_ns
-        self._writer.add_message(self._channels[topic], log_time_ns, payload, sent_ns, sequence % 2**32)
+        self._writer.add_message(
+            self._channels[topic], log_time_ns, payload, sent_ns, sequence % 2**32
+        )
         return log_time_ns
 
     def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
         """Name a message that the estimator is not given."""
         if DROPPED_TOPIC not in self._channels:
-            own = Topic(self.path, DROPPED_TOPIC, DROPPED, "cdr", "ros2msg", definition(DROPPED), Keep.ALL)
+            own = Topic(
+                self.path,
+                DROPPED_TOPIC,
+                DROPPED,
+                "cdr",
+                "ros2msg",
+                definition(DROPPED),
+                Keep.ALL,
+            )
             self.add_topic(own)
-        values: dict[str, Value] = {"topic": topic, "log_time": log_time_ns, "reason": reason}
-        self.write(DROPPED_TOPIC, encode(self._of_dropped, 1, values)[0].tobytes(), arrival_ns)
+        values: dict[str, Value] = {
+            "topic": topic,
+            "log_time": log_time_ns,
+            "reason": reason,
+        }
+        self.write(
+            DROPPED_TOPIC, encode(self._of_dropped, 1, values)[0].tobytes(), arrival_ns
+        )
 
     def flush(self) -> None:
         """Give all that was written to the operating system, where the end of this process loses nothing of it."""

@@ -44,7 +44,14 @@ from sonar_graph.logs.checks import (
 from sonar_graph.logs.geodesy import Origin
 from sonar_graph.logs.live_record import leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
-from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
+from sonar_graph.logs.roles import (
+    ROLES,
+    SEQUENCE_ROLES,
+    SONAR,
+    Choice,
+    choose_topics,
+    wanted_types,
+)
 from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
@@ -149,7 +156,9 @@ def read_log(
     """
     path = as_path(path, "read_log(path)")
     if not isinstance(calibration, Calibration | PartialCalibration | None):
-        calibration = PartialCalibration.read(as_path(calibration, "read_log(path, calibration=FILE or Calibration)"))
+        calibration = PartialCalibration.read(
+            as_path(calibration, "read_log(path, calibration=FILE or Calibration)")
+        )
     recording, config = _scanned(path, config, window, progress)
     if not salvage:
         recording.require_sound()
@@ -158,11 +167,26 @@ def read_log(
     frame = sonar_frame(recording, (topics or {}).get(SONAR), config)
     sequence = Assembly(recording, choices, calibration, frame).sequence(name)
     sequence.notes.update(left_out)
-    if window is not None and window.start is not None and recording.beginning_ns is not None:
+    if (
+        window is not None
+        and window.start is not None
+        and recording.beginning_ns is not None
+    ):
         late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
-        given = calibration.values if isinstance(calibration, PartialCalibration) else {}
-        recorded = None if isinstance(calibration, Calibration) else read_calibration(recording)
-        if late_ns > 0 and "start" not in given and recorded is not None and "start" in recorded.model_fields_set:
+        given = (
+            calibration.values if isinstance(calibration, PartialCalibration) else {}
+        )
+        recorded = (
+            None
+            if isinstance(calibration, Calibration)
+            else read_calibration(recording)
+        )
+        if (
+            late_ns > 0
+            and "start" not in given
+            and recorded is not None
+            and "start" in recorded.model_fields_set
+        ):
             sequence.notes["log.start_pose"] = (
                 f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was "
                 "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
@@ -171,16 +195,29 @@ def read_log(
 
 
 def _scanned(
-    path: Path, config: LogConfig | None, window: TimeWindow | None, progress: Progress | None
+    path: Path,
+    config: LogConfig | None,
+    window: TimeWindow | None,
+    progress: Progress | None,
 ) -> tuple[Recording, LogConfig]:
     """The messages of a log that may be needed, and the description of its topics: the given one, or its own."""
     types = wanted_types(config or LogConfig())
-    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress)
+    recording = scan(
+        path,
+        lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE,
+        window,
+        progress,
+    )
     own = recorded_config(recording) if config is None else None
     if own is None or wanted_types(own) <= types:
         return recording, config or own or LogConfig()
     types = wanted_types(own)
-    return scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress), own
+    return scan(
+        path,
+        lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE,
+        window,
+        progress,
+    ), own
 
 
 class Assembly:
@@ -200,8 +237,14 @@ class Assembly:
         sonar: str | None = None,
     ) -> None:
         self._recording, self._sonar = recording, sonar
-        self.topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
-        self.adapters: dict[str, Any] = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
+        self.topics = {
+            role: recording.topics[c.topic]
+            for role, c in choices.items()
+            if c.topic is not None
+        }
+        self.adapters: dict[str, Any] = {
+            role: c.adapter for role, c in choices.items() if c.adapter is not None
+        }
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
         self._tables: dict[str, MessageTable] = {}
@@ -213,13 +256,24 @@ class Assembly:
                     if len(topic) or ROLES[role].is_required:
                         raise
                     self._dropped[role] = topic.unsound
-        self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
-        self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self.topics.items())
+        self._notes = {
+            key: note
+            for key, note in read_notes(recording).items()
+            if key not in FOUND_ANEW
+        }
+        self._notes["log.topics"] = "; ".join(
+            f"{role}: {topic.name}" for role, topic in self.topics.items()
+        )
         changes = {
-            role: changes_text(self.adapters[role], shipped_like(role, topic.type_name, topic.definition()))
+            role: changes_text(
+                self.adapters[role],
+                shipped_like(role, topic.type_name, topic.definition()),
+            )
             for role, topic in self.topics.items()
         }
-        if text := "; ".join(f"{role}: {change}" for role, change in changes.items() if change):
+        if text := "; ".join(
+            f"{role}: {change}" for role, change in changes.items() if change
+        ):
             self._notes["log.adapters"] = text
         if "truth" in choices and choices["truth"].topic is None:
             self._notes["log.truth"] = choices["truth"].reason
@@ -227,7 +281,11 @@ class Assembly:
         self._is_mounting_known = self._is_start_stated = True
         self.mounted: dict[str, str] = {}
         """Frame in ``/tf_static`` of each sensor whose mounting is from there."""
-        self.calibration = calibration if isinstance(calibration, Calibration) else self._gathered(calibration)
+        self.calibration = (
+            calibration
+            if isinstance(calibration, Calibration)
+            else self._gathered(calibration)
+        )
         if isinstance(calibration, Calibration):
             self._notes["log.calibration"] = "given by the caller"
 
@@ -235,9 +293,14 @@ class Assembly:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
         said = set() if recorded is None else recorded.model_fields_set
-        is_recorded = said | {"start"} == Calibration.model_fields.keys()  # not only what images and `join` bring
-        self._is_start_stated = is_recorded or "start" in said or bool(given and given.values.get("start"))
-        in_record = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
+        # not only what images and `join` bring
+        is_recorded = said | {"start"} == Calibration.model_fields.keys()
+        self._is_start_stated = (
+            is_recorded or "start" in said or bool(given and given.values.get("start"))
+        )
+        in_record = (
+            mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
+        )
         stated = in_record | (mounted_by(given.values) if given else set())
         frames = {
             role: self.adapters[role].frame_in(table.groups)
@@ -247,7 +310,9 @@ class Assembly:
         for role in ("depth", "positions"):
             if not frames.get(role, role):
                 del frames[role]  # in the world: there is no port or antenna to mount
-        if "detections" in self.topics and (messages := self.topics["detections"].messages()):
+        if "detections" in self.topics and (
+            messages := self.topics["detections"].messages()
+        ):
             frames["sonar"] = self.adapters["detections"].frame_in(messages)
         elif self._sonar is not None:
             frames["sonar"] = self._sonar
@@ -258,19 +323,37 @@ class Assembly:
                 found = mounting_of(frame, tree)
             except LogError as error:
                 if name not in stated:
-                    raise LogError(f"{self._recording.path}: {name}: {error}") from error
+                    raise LogError(
+                        f"{self._recording.path}: {name}: {error}"
+                    ) from error
                 found = None
             if found is not None:
                 mountings[name] = found
-        self.mounted = {name: frames[name] for name in mountings if name not in in_record}
+        self.mounted = {
+            name: frames[name] for name in mountings if name not in in_record
+        }
         mounted = mountings.keys() | stated
         self._is_mounting_known = "dvl" in mounted
         source = "from the log"
         if not is_recorded:
-            source = f"{', '.join(sorted(said))} from the log; else defaults" if said else "defaults"
-            source += f"; mountings from /tf_static: {', '.join(self.mounted) or 'none'}"
-            missing = [f"{name} ({frame or 'unnamed'})" for name, frame in frames.items() if name not in mounted]
-            source += f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
+            source = (
+                f"{', '.join(sorted(said))} from the log; else defaults"
+                if said
+                else "defaults"
+            )
+            source += (
+                f"; mountings from /tf_static: {', '.join(self.mounted) or 'none'}"
+            )
+            missing = [
+                f"{name} ({frame or 'unnamed'})"
+                for name, frame in frames.items()
+                if name not in mounted
+            ]
+            source += (
+                f"; not in the tree, taken as base_link: {', '.join(missing)}"
+                if missing
+                else ""
+            )
         if given:
             source = f"from {given.source}: {', '.join(given.fields()) or 'nothing'}; else {source}"
         self._notes["log.calibration"] = source
@@ -286,16 +369,24 @@ class Assembly:
         if source is None:
             self._blocks[role] = None
         else:
-            if isinstance(adapter, DepthAdapter) and (said := adapter.assumption(self.calibration.gravity_m_s2)):
+            if isinstance(adapter, DepthAdapter) and (
+                said := adapter.assumption(self.calibration.gravity_m_s2)
+            ):
                 self._notes["log.depth"] = said
-            self._blocks[role], dropped = rows_of(adapter, source, self.calibration, *self.axes_and_origin(role))
+            self._blocks[role], dropped = rows_of(
+                adapter, source, self.calibration, *self.axes_and_origin(role)
+            )
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
         return self._blocks[role]
 
     def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
         """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
-        R = self._heading_mounting().pose().rotation().matrix() if role == "heading" else np.eye(3)
+        R = (
+            self._heading_mounting().pose().rotation().matrix()
+            if role == "heading"
+            else np.eye(3)
+        )
         return R, self._origin() if role in ("positions", "truth") else None
 
     def _heading_mounting(self) -> Mounting:
@@ -323,7 +414,9 @@ class Assembly:
         for role in ("imu", "dvl"):
             if self.block(role) is None:
                 topic, faults = self.topics[role], _counts(self._dropped.get(role, {}))
-                raise topic.error(f"none of its {len(topic)} messages can be used: {faults}")
+                raise topic.error(
+                    f"none of its {len(topic)} messages can be used: {faults}"
+                )
         require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
         stamps = [
@@ -332,58 +425,115 @@ class Assembly:
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
         if not self._is_start_stated:
-            self.calibration, self._notes["log.start"] = with_measured_start(self.calibration, blocks)
+            self.calibration, self._notes["log.start"] = with_measured_start(
+                self.calibration, blocks
+            )
         findings = {
             "log.dropped": self.left_out(),
             "log.stamps": stamps,
             "log.warnings": list(self.warnings()),
-            "log.gaps": list(gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)),
+            "log.gaps": list(
+                gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)
+            ),
             "log.noise": list(unsaid_noise(blocks)),
         }
-        self._notes |= {subject: "; ".join(texts) for subject, texts in findings.items() if texts}
-        name = name or recorded_name(self._recording) or spelt(self._recording.path.stem)
-        return Sequence(name=name, calibration=self.calibration, notes=self._notes, **blocks)
+        self._notes |= {
+            subject: "; ".join(texts) for subject, texts in findings.items() if texts
+        }
+        name = (
+            name or recorded_name(self._recording) or spelt(self._recording.path.stem)
+        )
+        return Sequence(
+            name=name, calibration=self.calibration, notes=self._notes, **blocks
+        )
 
     def survey(self) -> tuple[list[str], list[str]]:
         """Rows left out and warnings of everything that was chosen, whether or not it is enough for a sequence."""
         imu, dvl, *_ = (self.block(role) for role in SEQUENCE_ROLES)
-        gaps = gap_warnings(imu, dvl, self.calibration) if imu is not None and dvl is not None else ()
+        gaps = (
+            gap_warnings(imu, dvl, self.calibration)
+            if imu is not None and dvl is not None
+            else ()
+        )
         return self.left_out(), [*self.warnings(), *gaps]
 
     def left_out(self) -> list[str]:
         """Numbers of rows that were left out of the blocks read so far, by role and reason."""
-        return [f"{role}: {_counts(dropped)}" for role, dropped in self._dropped.items()]
+        return [
+            f"{role}: {_counts(dropped)}" for role, dropped in self._dropped.items()
+        ]
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
         for role, table in self._tables.items():
-            yield from (f"{role}: {text}" for text in self.adapters[role].warnings(table))
-        imu, dvl, depth, detections = (self.block(role) for role in ("imu", "dvl", "depth", "detections"))
-        mounting, gravity_m_s2 = self.calibration.imu.mounting, self.calibration.gravity_m_s2
-        is_linear = self.calibration.odometry_interpolation == "linear"  # otherwise rates jump, and wheels turn evenly
+            yield from (
+                f"{role}: {text}" for text in self.adapters[role].warnings(table)
+            )
+        imu, dvl, depth, detections = (
+            self.block(role) for role in ("imu", "dvl", "depth", "detections")
+        )
+        mounting, gravity_m_s2 = (
+            self.calibration.imu.mounting,
+            self.calibration.gravity_m_s2,
+        )
+        # otherwise rates jump, and wheels turn evenly
+        is_linear = self.calibration.odometry_interpolation == "linear"
         found: list[tuple[str, str | None]] = []
         if imu is not None:
-            found.append(("imu", gravity_warning(imu.specific_force, mounting, gravity_m_s2)))
+            found.append(
+                ("imu", gravity_warning(imu.specific_force, mounting, gravity_m_s2))
+            )
         if imu is not None and is_linear:
-            columns = (("angular rate", imu.angular_velocity), ("specific force", imu.specific_force))
-            found += [("imu", spike_warning(imu.stamps_ns, values, quantity)) for quantity, values in columns]
-            found += [("imu", stuck_warning(imu.stamps_ns, values, quantity)) for quantity, values in columns]
-        if imu is not None and dvl is not None and is_linear and not found[0][1]:  # gravity is upwards
+            columns = (
+                ("angular rate", imu.angular_velocity),
+                ("specific force", imu.specific_force),
+            )
+            found += [
+                ("imu", spike_warning(imu.stamps_ns, values, quantity))
+                for quantity, values in columns
+            ]
+            found += [
+                ("imu", stuck_warning(imu.stamps_ns, values, quantity))
+                for quantity, values in columns
+            ]
+        if (
+            imu is not None and dvl is not None and is_linear and not found[0][1]
+        ):  # gravity is upwards
             found.append(("imu", gyro_warning(imu, dvl, self.calibration)))
         if dvl is not None and is_linear:
-            found.append(("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")))
+            found.append(
+                ("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity"))
+            )
         if depth is not None:
-            found.append(("depth", stuck_warning(depth.stamps_ns, depth.z_m[:, None], "height", is_coarse=True)))
+            found.append(
+                (
+                    "depth",
+                    stuck_warning(
+                        depth.stamps_ns, depth.z_m[:, None], "height", is_coarse=True
+                    ),
+                )
+            )
         if imu is not None and dvl is not None and depth is not None:
             start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
-            found.append(("depth", start_depth_warning(depth, int(start_ns), self.calibration)))
+            found.append(
+                ("depth", start_depth_warning(depth, int(start_ns), self.calibration))
+            )
         if "dvl" in self._tables and not self._is_mounting_known:
             found.append(("dvl", axes_warning(self.adapters["dvl"])))
         yield from (f"{role}: {text}" for role, text in found if text)
-        yield from unsaid_noise({role: self.block(role) for role in NOISE_FIELDS}, only_partly=True)
-        stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
+        yield from unsaid_noise(
+            {role: self.block(role) for role in NOISE_FIELDS}, only_partly=True
+        )
+        stamps = [
+            self._tables[role].stamps_ns
+            for role in ("imu", "dvl")
+            if role in self._tables
+        ]
         if detections is not None and len(stamps) == 2:
-            first_ns, last_ns = max(ns.min() for ns in stamps), min(ns.max() for ns in stamps)
+            first_ns, last_ns = (
+                max(ns.min() for ns in stamps),
+                min(ns.max() for ns in stamps),
+            )
             texts = detection_warnings(detections, int(first_ns), int(last_ns))
             yield from (f"detections: {text}" for text in texts)
 
@@ -398,10 +548,22 @@ def common_origin(
     of_earth: dict[str, GeodeticFields] = {}
     for role in ("positions", "truth"):
         adapter = adapters.get(role)
-        if role in tables and isinstance(adapter, PositionAdapter | TruthAdapter) and adapter.geodetic is not None:
+        if (
+            role in tables
+            and isinstance(adapter, PositionAdapter | TruthAdapter)
+            and adapter.geodetic is not None
+        ):
             of_earth[role] = adapter.geodetic
-    said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m is not None]
-    found = [fix for role, fields in of_earth.items() if (fix := fields.first_fix(tables[role])) is not None]
+    said = [
+        fields.origin_deg_m
+        for fields in of_earth.values()
+        if fields.origin_deg_m is not None
+    ]
+    found = [
+        fix
+        for role, fields in of_earth.items()
+        if (fix := fields.first_fix(tables[role])) is not None
+    ]
     if not said and not found:
         return None, None
     latitude_deg, longitude_deg, height_m = origin = (said or found)[0]
@@ -412,7 +574,11 @@ def common_origin(
 
 
 def rows_of(
-    adapter: Any, source: Any, calibration: Calibration, body_R_sensor: Floats, origin: Origin | None
+    adapter: Any,
+    source: Any,
+    calibration: Calibration,
+    body_R_sensor: Floats,
+    origin: Origin | None,
 ) -> tuple[Any, Dropped]:
     """Rows of a table of messages, or of a topic where the adapter reads that, and the numbers left out by reason.
 
@@ -436,7 +602,9 @@ def _counts(dropped: Dropped) -> str:
 
 def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
     """Refuse an IMU and a Doppler log without common time, or without a row of velocity in all directions."""
-    if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(imu.stamps_ns[-1], dvl.stamps_ns[-1]):
+    if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(
+        imu.stamps_ns[-1], dvl.stamps_ns[-1]
+    ):
         raise LogError(
             f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "
             f"See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
@@ -452,7 +620,9 @@ def _span(rows: Block) -> str:
     return f"from {rows.stamps_ns[0] * 1e-9:.3f} to {rows.stamps_ns[-1] * 1e-9:.3f} s"
 
 
-def unsaid_noise(blocks: Mapping[str, Any], *, only_partly: bool = False) -> Iterator[str]:
+def unsaid_noise(
+    blocks: Mapping[str, Any], *, only_partly: bool = False
+) -> Iterator[str]:
     """Sensors with rows of unknown covariance, for which the noise of the calibration counts; blocks by role.
 
     With ``only_partly`` those of which other rows say one: a sensor that mostly knows its noise and here does not.
@@ -460,6 +630,8 @@ def unsaid_noise(blocks: Mapping[str, Any], *, only_partly: bool = False) -> Ite
     for role, (column, fields) in NOISE_FIELDS.items():
         if (block := blocks.get(role)) is not None:
             covariances = getattr(block, column)
-            count = np.count_nonzero(np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1))
+            count = np.count_nonzero(
+                np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1)
+            )
             if count and not (only_partly and count == len(covariances)):
                 yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"

@@ -53,7 +53,12 @@ _CAUSAL_PATH_STEP_NS = 10**9
 _MOST_CAUSAL_POSES = 1000
 _PATH_STEP_NS = 10**8
 _MOST_POSES = 5000
-_COLOURS: tuple[viewer.Colour, ...] = (viewer.BLUE, viewer.ORANGE, viewer.PURPLE, viewer.GREEN)
+_COLOURS: tuple[viewer.Colour, ...] = (
+    viewer.BLUE,
+    viewer.ORANGE,
+    viewer.PURPLE,
+    viewer.GREEN,
+)
 Estimates = tuple[Trajectory, Trajectory, LandmarkMap]
 """Causal trajectory, smoothed trajectory, landmarks; any of them may be empty."""
 
@@ -93,11 +98,19 @@ def write_result(
     drawn = [block.positions for estimate in estimates.values() for block in estimate]
     drawn += [block.positions for block in (truth, landmarks) if block is not None]
     scene = viewer.Scene.around(drawn)
-    colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {TRUTH: viewer.GREY}
-    messages = [static_message("/tf_static", TF, sequence.start_ns, encode_mountings(sequence.calibration))]
+    colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {
+        TRUTH: viewer.GREY
+    }
+    messages = [
+        static_message(
+            "/tf_static", TF, sequence.start_ns, encode_mountings(sequence.calibration)
+        )
+    ]
     if truth is not None and len(truth):
         if truth.has_orientation:
-            messages.append(odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/{BODY_FRAME}"))
+            messages.append(
+                odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/{BODY_FRAME}")
+            )
         else:
             messages.append(point_messages(f"/{TRUTH}/point", truth))
         messages.append(_path(f"/{TRUTH}/path", _drawable(truth), sequence.start_ns))
@@ -108,10 +121,21 @@ def write_result(
     messages += viewer.picture_messages(viewer.PICTURES, pictures)
     messages += body_transforms("/tf", _bodies(sequence, sources))
     messages = [entry for entry in messages if len(entry.log_times_ns)]
-    record = {"sequence": sequence.name, "estimators": ",".join(estimates), "topics": ",".join(sources)}
-    write_recording(Path(path), messages, {RESULT_RECORD: record | dict(about or {})}, attachments)
+    record = {
+        "sequence": sequence.name,
+        "estimators": ",".join(estimates),
+        "topics": ",".join(sources),
+    }
+    write_recording(
+        Path(path), messages, {RESULT_RECORD: record | dict(about or {})}, attachments
+    )
     layers = [
-        viewer.Layer(topic, entry.type_name, colours.get(topic.split("/")[1], viewer.GREY), is_latched=entry.is_latched)
+        viewer.Layer(
+            topic,
+            entry.type_name,
+            colours.get(topic.split("/")[1], viewer.GREY),
+            is_latched=entry.is_latched,
+        )
         for topic, entry in {entry.topic: entry for entry in messages}.items()
     ]
     viewer.write_layouts(Path(path), layers, scene)
@@ -127,24 +151,35 @@ def source_names(estimators: Iterable[str]) -> list[str]:
     for estimator in estimators:
         plain = re.sub(r"[^0-9A-Za-z]+", "_", estimator).strip("_")
         plain = plain if plain[:1].isalpha() else f"estimator_{plain}".rstrip("_")
-        candidates = (plain if i == 1 else f"{plain}_{i}" for i in range(1, len(taken) + 2))
+        candidates = (
+            plain if i == 1 else f"{plain}_{i}" for i in range(1, len(taken) + 2)
+        )
         names.append(next(name for name in candidates if name not in taken))
         taken.add(names[-1])
     return names
 
 
-def _estimator(name: str, estimate: Estimates, colour: viewer.Colour, scene: viewer.Scene) -> list[Outgoing]:
+def _estimator(
+    name: str, estimate: Estimates, colour: viewer.Colour, scene: viewer.Scene
+) -> list[Outgoing]:
     """Messages of one estimator; an empty estimate has none."""
     causal, smoothed, landmarks = estimate
     messages = []
     if len(causal):
-        messages.append(odometry_messages(f"/{name}/odometry", causal, f"{name}/{BODY_FRAME}"))
+        messages.append(
+            odometry_messages(f"/{name}/odometry", causal, f"{name}/{BODY_FRAME}")
+        )
         messages.append(pose_messages(f"/{name}/pose", causal))
-        messages.append(viewer.position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour))
+        messages.append(
+            viewer.position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour)
+        )
         first_ns, last_ns = int(causal.stamps_ns[0]), int(causal.stamps_ns[-1])
         # the path so far, now and then, and thinned: all of them together would grow with the square of time
         period_ns = max(_PATH_PERIOD_NS, (last_ns - first_ns) // _MOST_CAUSAL_PATHS)
-        thinned = _thinned(causal, max(_CAUSAL_PATH_STEP_NS, (last_ns - first_ns) // _MOST_CAUSAL_POSES))
+        thinned = _thinned(
+            causal,
+            max(_CAUSAL_PATH_STEP_NS, (last_ns - first_ns) // _MOST_CAUSAL_POSES),
+        )
         ends_ns = np.arange(first_ns + period_ns, last_ns, period_ns)
         counts = np.searchsorted(thinned.stamps_ns, ends_ns, side="right")
         for count, end_ns in zip(counts.tolist(), ends_ns.tolist(), strict=True):
@@ -153,16 +188,27 @@ def _estimator(name: str, estimate: Estimates, colour: viewer.Colour, scene: vie
     if len(smoothed):
         messages.append(pose_messages(f"/{name}/smoothed", smoothed))
         messages.append(_path(f"/{name}/path", _drawable(smoothed), max(ends)))
-    return messages + (_landmarks(name, landmarks, max(ends), colour, scene) if ends else [])
+    return messages + (
+        _landmarks(name, landmarks, max(ends), colour, scene) if ends else []
+    )
 
 
 def _landmarks(
-    name: str, landmarks: LandmarkMap, stamp_ns: int, colour: viewer.Colour, scene: viewer.Scene
+    name: str,
+    landmarks: LandmarkMap,
+    stamp_ns: int,
+    colour: viewer.Colour,
+    scene: viewer.Scene,
 ) -> list[Outgoing]:
     if not len(landmarks):
         return []
-    markers = viewer.landmark_markers(f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m)
-    return [markers, viewer.landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns)]
+    markers = viewer.landmark_markers(
+        f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m
+    )
+    return [
+        markers,
+        viewer.landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns),
+    ]
 
 
 def _drawable(trajectory: Trajectory) -> Trajectory:
@@ -182,21 +228,45 @@ def _path(topic: str, trajectory: Trajectory, stamp_ns: int) -> Outgoing:
     at_ns = np.array([stamp_ns])
     poses = header(trajectory.stamps_ns, WORLD_FRAME, "poses.header")
     poses |= fields("poses.pose.position", "xyz", trajectory.positions)
-    quaternions = trajectory.quaternions_xyzw if trajectory.has_orientation else np.array([[0.0, 0.0, 0.0, 1.0]])
-    poses |= fields("poses.pose.orientation", "xyzw", np.broadcast_to(quaternions, (len(trajectory), 4)))
+    quaternions = (
+        trajectory.quaternions_xyzw
+        if trajectory.has_orientation
+        else np.array([[0.0, 0.0, 0.0, 1.0]])
+    )
+    poses |= fields(
+        "poses.pose.orientation",
+        "xyzw",
+        np.broadcast_to(quaternions, (len(trajectory), 4)),
+    )
     values = header(at_ns, WORLD_FRAME) | poses
-    return outgoing(topic, viewer.PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True)
+    return outgoing(
+        topic, viewer.PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True
+    )
 
 
-def _bodies(sequence: Sequence, sources: Mapping[str, Estimates]) -> dict[str, Trajectory]:
+def _bodies(
+    sequence: Sequence, sources: Mapping[str, Estimates]
+) -> dict[str, Trajectory]:
     """Trajectories of body frames: the sensors', each causal estimate's, and the truth's at the estimates' instants."""
-    bodies = {f"{name}/{BODY_FRAME}": causal for name, (causal, _, _) in sources.items() if len(causal)}
+    bodies = {
+        f"{name}/{BODY_FRAME}": causal
+        for name, (causal, _, _) in sources.items()
+        if len(causal)
+    }
     truth = sequence.true_poses
     owner = next(iter(bodies.values()), truth)
     if truth is not None and len(truth):
-        instants_ns = np.unique(np.concatenate([b.stamps_ns for b in bodies.values()] or [_drawable(truth).stamps_ns]))
-        within = (instants_ns >= truth.stamps_ns[0]) & (instants_ns <= truth.stamps_ns[-1])
-        bodies[f"{TRUTH}/{BODY_FRAME}"] = truth.at(instants_ns[within]) if len(truth) > 1 else truth
+        instants_ns = np.unique(
+            np.concatenate(
+                [b.stamps_ns for b in bodies.values()] or [_drawable(truth).stamps_ns]
+            )
+        )
+        within = (instants_ns >= truth.stamps_ns[0]) & (
+            instants_ns <= truth.stamps_ns[-1]
+        )
+        bodies[f"{TRUTH}/{BODY_FRAME}"] = (
+            truth.at(instants_ns[within]) if len(truth) > 1 else truth
+        )
     return {BODY_FRAME: owner, **bodies} if owner is not None and len(owner) else bodies
 
 
@@ -205,15 +275,36 @@ def body_transforms(topic: str, bodies: Mapping[str, Trajectory]) -> list[Outgoi
     if not bodies:
         return []
     stamps_ns = np.unique(np.concatenate([body.stamps_ns for body in bodies.values()]))
-    present = np.column_stack([np.isin(stamps_ns, body.stamps_ns) for body in bodies.values()])
+    present = np.column_stack(
+        [np.isin(stamps_ns, body.stamps_ns) for body in bodies.values()]
+    )
     entries = []
-    for pattern in np.unique(present, axis=0):  # one layout of messages for each set of bodies
+    for pattern in np.unique(
+        present, axis=0
+    ):  # one layout of messages for each set of bodies
         at_ns = stamps_ns[(present == pattern).all(axis=1)]
-        chosen = {name: body for (name, body), is_there in zip(bodies.items(), pattern, strict=True) if is_there}
-        rows = [body.rows(np.searchsorted(body.stamps_ns, at_ns)) for body in chosen.values()]
-        values = header(np.tile(at_ns[:, None], len(rows)), WORLD_FRAME, "transforms.header")
-        values |= fields("transforms.transform.translation", "xyz", np.stack([r.positions for r in rows], 1))
-        values |= fields("transforms.transform.rotation", "xyzw", np.stack([r.quaternions_xyzw for r in rows], 1))
+        chosen = {
+            name: body
+            for (name, body), is_there in zip(bodies.items(), pattern, strict=True)
+            if is_there
+        }
+        rows = [
+            body.rows(np.searchsorted(body.stamps_ns, at_ns))
+            for body in chosen.values()
+        ]
+        values = header(
+            np.tile(at_ns[:, None], len(rows)), WORLD_FRAME, "transforms.header"
+        )
+        values |= fields(
+            "transforms.transform.translation",
+            "xyz",
+            np.stack([r.positions for r in rows], 1),
+        )
+        values |= fields(
+            "transforms.transform.rotation",
+            "xyzw",
+            np.stack([r.quaternions_xyzw for r in rows], 1),
+        )
         values["transforms.child_frame_id"] = list(chosen)
         entries.append(outgoing(topic, TF, at_ns, values, {"transforms": len(rows)}))
     return entries

@@ -8,7 +8,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import SHIPPED, TRUTH_WORDS, Adapter, LogConfig, Shipped, shipped_for
+from sonar_graph.logs.adapters import (
+    SHIPPED,
+    TRUTH_WORDS,
+    Adapter,
+    LogConfig,
+    Shipped,
+    shipped_for,
+)
 from sonar_graph.logs.cdr import parse_definition, short_name
 from sonar_graph.logs.mcap import Recording, Topic
 
@@ -42,25 +49,38 @@ class Role:
         for offer in self.shipped:
             by_words.setdefault(offer.words, {})[offer.adapter.type] = None
         return ", or ".join(
-            ", ".join(names) + (f" on a topic with {' or '.join(map(repr, words))} in its name" if words else "")
+            ", ".join(names)
+            + (
+                f" on a topic with {' or '.join(map(repr, words))} in its name"
+                if words
+                else ""
+            )
             for words, names in by_words.items()
         )
 
     def may_play(self, topic: Topic) -> bool:
         """Tell whether a topic's name allows the role: what is called truth is no measurement."""
-        return self.name in ("truth", "true_landmarks") or not any(word in topic.name.lower() for word in TRUTH_WORDS)
+        return self.name in ("truth", "true_landmarks") or not any(
+            word in topic.name.lower() for word in TRUTH_WORDS
+        )
 
     def fits(self, topic: Topic, *, general: bool) -> bool:
         """Tell whether a topic fits one of the shipped adapters, of those that are general or of the others."""
         return self.may_play(topic) and any(
             short_name(offer.adapter.type) == short_name(topic.type_name)
-            and (not offer.words or any(word in topic.name.lower() for word in offer.words))
+            and (
+                not offer.words
+                or any(word in topic.name.lower() for word in offer.words)
+            )
             for offer in self.shipped
             if offer.is_general == general
         )
 
 
-ROLES = {name: Role(name, shipped, is_required=name in ("imu", "dvl")) for name, shipped in SHIPPED.items()}
+ROLES = {
+    name: Role(name, shipped, is_required=name in ("imu", "dvl"))
+    for name, shipped in SHIPPED.items()
+}
 SEQUENCE_ROLES = tuple(name for name in ROLES if name != SONAR)
 """Roles that make a `Sequence`, called like its fields; sonar images are read by themselves."""
 
@@ -84,14 +104,18 @@ class Choice:
     def advice(self) -> str:
         """Advice to choose one of several topics, on the command line, in Python and in a log configuration."""
         role, topic = self.role.name, self.candidates[0]
-        return (
-            f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
-        )
+        return f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
 
 
-def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES) -> frozenset[str]:
+def wanted_types(
+    config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES
+) -> frozenset[str]:
     """Types whose messages may be needed, without the ``msg``."""
-    shipped = {short_name(offer.adapter.type) for name in roles for offer in ROLES[name].shipped}
+    shipped = {
+        short_name(offer.adapter.type)
+        for name in roles
+        for offer in ROLES[name].shipped
+    }
     return config.types() | shipped | {short_name(TF), short_name(DROPPED)}
 
 
@@ -135,7 +159,12 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
     return f"is a {topic.type_name}, for which no adapter is shipped: name type and fields in --log-config"
 
 
-def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS, wanted: str | None = None) -> Choice:
+def choose_topic(
+    role: Role,
+    recording: Recording,
+    config: LogConfig = _DEFAULTS,
+    wanted: str | None = None,
+) -> Choice:
     """Choose the topic for a role and its adapter; where there is none, the choice has a reason instead of an error.
 
     A topic that the user ``wanted`` goes before that of the configuration, and this before a search by type. A
@@ -151,20 +180,42 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
         if isinstance(adapter, str):
             choice = Choice(role, None, f"{named} was chosen but {adapter}")
         else:
-            choice = Choice(role, named, f"chosen {'by name' if wanted else f'in {config.source}'}", adapter)
+            choice = Choice(
+                role,
+                named,
+                f"chosen {'by name' if wanted else f'in {config.source}'}",
+                adapter,
+            )
     elif asked:
-        meant = [topic for topic in topics.values() if short_name(topic.type_name) == short_name(asked)]
+        meant = [
+            topic
+            for topic in topics.values()
+            if short_name(topic.type_name) == short_name(asked)
+        ]
         choice = _only(role, recording, config, meant) or Choice(
             role, None, f"no {asked}, which {config.source} asks for"
         )
     else:
-        telling, general = ([t for t in topics.values() if role.fits(t, general=of)] for of in (False, True))
+        telling, general = (
+            [t for t in topics.values() if role.fits(t, general=of)]
+            for of in (False, True)
+        )
         meant = telling + general
-        found = _only(role, recording, config, telling) or _only(role, recording, config, general)
+        found = _only(role, recording, config, telling) or _only(
+            role, recording, config, general
+        )
         if found is None:
             allowed = [topic for topic in topics.values() if role.may_play(topic)]
-            others = tuple(t.name for t in allowed if not isinstance(adapter_for(role, t, config), str))
-            hint = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
+            others = tuple(
+                t.name
+                for t in allowed
+                if not isinstance(adapter_for(role, t, config), str)
+            )
+            hint = (
+                f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}"
+                if others
+                else ""
+            )
             found = Choice(role, None, f"no {role.describe()}{hint}", could_be=others)
         choice = found
     if table and not choice.candidates:
@@ -174,20 +225,43 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
     return choice
 
 
-def _only(role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]) -> Choice | None:
+def _only(
+    role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]
+) -> Choice | None:
     """Choose the only usable topic of those that fit; None where none fits."""
     adapters = {topic.name: adapter_for(role, topic, config) for topic in fitting}
-    usable = {name: adapter for name, adapter in adapters.items() if not isinstance(adapter, str)}
+    usable = {
+        name: adapter
+        for name, adapter in adapters.items()
+        if not isinstance(adapter, str)
+    }
     if len(usable) > 1:
-        return Choice(role, None, f"{len(usable)} topics fit: {', '.join(usable)}", candidates=tuple(usable))
+        return Choice(
+            role,
+            None,
+            f"{len(usable)} topics fit: {', '.join(usable)}",
+            candidates=tuple(usable),
+        )
     for name, adapter in usable.items():
         as_told = f", read as {config.source} says" if config.table(role.name) else ""
-        return Choice(role, name, f"the only {recording.topics[name].type_name} that fits{as_told}", adapter)
+        return Choice(
+            role,
+            name,
+            f"the only {recording.topics[name].type_name} that fits{as_told}",
+            adapter,
+        )
     reasons = [f"{name} {reason}" for name, reason in adapters.items()]
     return Choice(role, None, "; ".join(reasons)) if reasons else None
 
 
-_OF_THE_DRIVER = ("stamp", "stamp_unit_s", "stamp_offset_s", "frame_id_field", "frame_id", "rotation")
+_OF_THE_DRIVER = (
+    "stamp",
+    "stamp_unit_s",
+    "stamp_offset_s",
+    "frame_id_field",
+    "frame_id",
+    "rotation",
+)
 """Settings of an adapter that hold for all that one message brings."""
 
 
@@ -201,17 +275,27 @@ def choose_each(
 
     Of several orientations that of the topic in use as IMU is the heading, with the stamps and axes said of the IMU.
     """
-    choices = {name: choose_topic(ROLES[name], recording, config, wanted.get(name)) for name in roles}
+    choices = {
+        name: choose_topic(ROLES[name], recording, config, wanted.get(name))
+        for name in roles
+    }
     imu, heading = choices.get("imu"), choices.get("heading")
     if imu is None or imu.topic is None or heading is None:
         return choices
     if imu.topic in heading.candidates:
         adapter = adapter_for(heading.role, recording.topics[imu.topic], config)
         if not isinstance(adapter, str):
-            heading = Choice(heading.role, imu.topic, "the orientation of the topic in use as IMU", adapter)
+            heading = Choice(
+                heading.role,
+                imu.topic,
+                "the orientation of the topic in use as IMU",
+                adapter,
+            )
     if heading.topic == imu.topic and heading.adapter is not None:
         unsaid = [key for key in _OF_THE_DRIVER if key not in config.table("heading")]
-        adapter = heading.adapter.model_copy(update={key: getattr(imu.adapter, key) for key in unsaid})
+        adapter = heading.adapter.model_copy(
+            update={key: getattr(imu.adapter, key) for key in unsaid}
+        )
         heading = replace(heading, adapter=adapter)
     return choices | {"heading": heading}
 
@@ -229,18 +313,24 @@ def choose_topics(
     """
     path, unknown = recording.path, wanted.keys() - ROLES.keys()
     if unknown:
-        raise LogError(f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}")
+        raise LogError(
+            f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}"
+        )
     choices = choose_each(recording, wanted, config, roles)
     for name, choice in choices.items():
         is_required = choice.role.is_required
         if choice.candidates:
-            raise LogError(f"{path}: for {name}, {choice.reason}; choose one: {choice.advice()}")
+            raise LogError(
+                f"{path}: for {name}, {choice.reason}; choose one: {choice.advice()}"
+            )
         if is_required and not recording.topics:
             raise MissingTopicError(
                 f"{path}: has no messages: {recording.ending or 'see whether the recorder wrote any'}"
             )
         is_asked_for = name in wanted or {"topic", "type"} & config.table(name).keys()
-        if choice.topic is None and (is_required or (is_asked_for and not choice.is_off)):
+        if choice.topic is None and (
+            is_required or (is_asked_for and not choice.is_off)
+        ):
             listed = [
                 f"{t.name} ({t.type_name or 'no type'}{f', {reason}' if (reason := refusal(t)) else ''})"
                 for t in recording.topics.values()

@@ -44,7 +44,10 @@ class ImagesAlone:
 
 
 def lacking_navigation(
-    path: Path, topics: Mapping[str, str], config: LogConfig | None = None, window: TimeWindow | None = None
+    path: Path,
+    topics: Mapping[str, str],
+    config: LogConfig | None = None,
+    window: TimeWindow | None = None,
 ) -> list[str]:
     """Roles of `NAVIGATION` that no topic of a log plays, where the user did not ask for one.
 
@@ -54,8 +57,14 @@ def lacking_navigation(
     recording = scan(path, lambda _: Keep.NONE, window)
     wanted = {role: topic for role, topic in topics.items() if role in NAVIGATION}
     choices = choose_each(recording, wanted, config, NAVIGATION)
-    asked = wanted.keys() | {role for role in NAVIGATION if {"topic", "type"} & config.table(role).keys()}
-    return [role for role, choice in choices.items() if not (choice.topic or choice.candidates or role in asked)]
+    asked = wanted.keys() | {
+        role for role in NAVIGATION if {"topic", "type"} & config.table(role).keys()
+    }
+    return [
+        role
+        for role, choice in choices.items()
+        if not (choice.topic or choice.candidates or role in asked)
+    ]
 
 
 def read_images_alone(
@@ -82,11 +91,18 @@ def read_images_alone(
     recording = scan(path, lambda _: Keep.NONE)
     if not salvage:
         recording.require_sound()
-    first = next(read_sonar_frames(path, topic, config, window=window, salvage=salvage, refused=_passed_over), None)
+    first = next(
+        read_sonar_frames(
+            path, topic, config, window=window, salvage=salvage, refused=_passed_over
+        ),
+        None,
+    )
     if first is None:
         raise LogError(no_images(path, window))
     recorded = read_calibration(recording)
-    is_stated = SONAR in mounted_by(recorded.model_dump(exclude_unset=True) if recorded else {})
+    is_stated = SONAR in mounted_by(
+        recorded.model_dump(exclude_unset=True) if recorded else {}
+    )
     is_stated |= calibration is not None and SONAR in mounted_by(calibration.values)
     frame = None if is_stated else sonar_frame(recording, topic, config)
     mounting = None if frame is None else static_mounting(path, frame)
@@ -98,7 +114,9 @@ def read_images_alone(
     )
 
 
-def sonar_frame(recording: Recording, topic: str | None = None, config: LogConfig | None = None) -> str | None:
+def sonar_frame(
+    recording: Recording, topic: str | None = None, config: LogConfig | None = None
+) -> str | None:
     """Frame of the sonar in ``/tf_static`` as its first image names it; None without images, or where several could be.
 
     Parameters
@@ -108,11 +126,17 @@ def sonar_frame(recording: Recording, topic: str | None = None, config: LogConfi
     topic, config
         As for `read_sonar_frames`.
     """
-    choice = choose_each(recording, {SONAR: topic} if topic else {}, config or LogConfig(), (SONAR,))[SONAR]
+    choice = choose_each(
+        recording, {SONAR: topic} if topic else {}, config or LogConfig(), (SONAR,)
+    )[SONAR]
     if choice.topic is None or choice.adapter is None:
         return None
     images = recording.topics[choice.topic]
-    pieces = [images] if images.keep is Keep.ALL else stream(recording.path, _keeping(images.type_name), salvage=True)
+    pieces = (
+        [images]
+        if images.keep is Keep.ALL
+        else stream(recording.path, _keeping(images.type_name), salvage=True)
+    )
     found = (piece.messages() for piece in pieces if piece.name == choice.topic)
     messages = next((groups for groups in found if groups), None)
     return choice.adapter.frame_in(messages) if messages else None
@@ -124,7 +148,10 @@ def _keeping(type_name: str) -> Callable[[str], Keep]:
 
 
 def joined_calibration(
-    images: Path, navigation: Path, topic: str | None = None, given: PartialCalibration | None = None
+    images: Path,
+    navigation: Path,
+    topic: str | None = None,
+    given: PartialCalibration | None = None,
 ) -> str:
     """JSON of the calibration of a navigation, with what images of another log know of their sonar.
 
@@ -138,7 +165,9 @@ def joined_calibration(
     if found is None and frame is not None and "mounting" not in own:
         found = static_mounting(images, frame)
     mounting = {} if found is None else {"mounting": found.model_dump(mode="json")}
-    return with_fields({SONAR: own | mounting}, known, {SONAR: better}, given.values if given else {})
+    return with_fields(
+        {SONAR: own | mounting}, known, {SONAR: better}, given.values if given else {}
+    )
 
 
 def _passed_over(_stamp_ns: int, _reason: str) -> None:
@@ -191,10 +220,17 @@ def read_sonar_frames(
     """
     config, path = config or LogConfig(), Path(path)
     recording = scan(path, lambda _: Keep.NONE)
-    choice = choose_topics(recording, {SONAR: topic} if topic else {}, config, (SONAR,))[SONAR]
+    choice = choose_topics(
+        recording, {SONAR: topic} if topic else {}, config, (SONAR,)
+    )[SONAR]
     if choice.topic is None or not isinstance(choice.adapter, SonarAdapter):
         return
-    for piece in stream(path, _keeping(recording.topics[choice.topic].type_name), window, salvage=salvage):
+    for piece in stream(
+        path,
+        _keeping(recording.topics[choice.topic].type_name),
+        window,
+        salvage=salvage,
+    ):
         if piece.name == choice.topic:
             yield from choice.adapter.read(piece, refused)
 

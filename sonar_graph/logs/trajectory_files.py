@@ -15,7 +15,18 @@ from sonar_graph.files import regular, replacing, text_of
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.states import LandmarkMap, Trajectory
 
-LANDMARK_COLUMNS = ("id", "x_m", "y_m", "z_m", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+LANDMARK_COLUMNS = (
+    "id",
+    "x_m",
+    "y_m",
+    "z_m",
+    "cov_xx",
+    "cov_xy",
+    "cov_xz",
+    "cov_yy",
+    "cov_yz",
+    "cov_zz",
+)
 _UPPER = np.triu_indices(3)
 _VALUES = 8
 _LINE = "%s" + " %.17g" * (_VALUES - 1) + "\n"
@@ -76,17 +87,23 @@ def read_tum(path: Path) -> Trajectory:
             continue
         stamp, *pose = line.split()
         if len(pose) != _VALUES - 1:
-            raise LogError(f"{path}, line {number}: {len(pose) + 1} values; a pose has {_VALUES}: t x y z qx qy qz qw")
+            raise LogError(
+                f"{path}, line {number}: {len(pose) + 1} values; a pose has {_VALUES}: t x y z qx qy qz qw"
+            )
         try:
             stamps.append(decimal_ns(stamp))
             poses.append([float(value) for value in pose])
         except ValueError as error:
-            raise LogError(f"{path}, line {number}: {line!r} has something that is no number") from error
+            raise LogError(
+                f"{path}, line {number}: {line!r} has something that is no number"
+            ) from error
     stamps_ns = np.array(stamps, np.int64)
     values = np.array(poses).reshape(-1, _VALUES - 1)
     backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if backwards.size:
-        raise LogError(f"{path}: pose {backwards[0] + 2} is not later than the one before; sort the lines by time")
+        raise LogError(
+            f"{path}: pose {backwards[0] + 2} is not later than the one before; sort the lines by time"
+        )
     return Trajectory.without_covariances(stamps_ns, values[:, :3], values[:, 3:])
 
 
@@ -110,7 +127,10 @@ def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
     lines = [",".join(LANDMARK_COLUMNS)]
     triangles = landmarks.covariances[:, _UPPER[0], _UPPER[1]]
     numbers = np.hstack([landmarks.positions, triangles]).tolist()
-    lines += [f"{i},{','.join(map(repr, row))}" for i, row in zip(landmarks.ids.tolist(), numbers, strict=True)]
+    lines += [
+        f"{i},{','.join(map(repr, row))}"
+        for i, row in zip(landmarks.ids.tolist(), numbers, strict=True)
+    ]
     _write(path, "\n".join(lines) + "\n")
 
 
@@ -121,14 +141,23 @@ def read_landmarks_csv(path: Path) -> LandmarkMap:
     """
     try:
         with regular(Path(path)).open(encoding="utf-8", newline="") as stream:
-            rows = [[float(row[name]) for name in LANDMARK_COLUMNS] for row in csv.DictReader(stream)]
+            rows = [
+                [float(row[name]) for name in LANDMARK_COLUMNS]
+                for row in csv.DictReader(stream)
+            ]
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise LogError(f"{path} is not a landmark table with columns {','.join(LANDMARK_COLUMNS)}: {error}") from error
+        raise LogError(
+            f"{path} is not a landmark table with columns {','.join(LANDMARK_COLUMNS)}: {error}"
+        ) from error
     table = np.array(rows).reshape(-1, len(LANDMARK_COLUMNS))
     covariances = np.empty((len(table), 3, 3))
-    covariances[:, _UPPER[0], _UPPER[1]] = covariances[:, _UPPER[1], _UPPER[0]] = table[:, 4:]
+    covariances[:, _UPPER[0], _UPPER[1]] = covariances[:, _UPPER[1], _UPPER[0]] = table[
+        :, 4:
+    ]
     order = np.argsort(table[:, 0])
-    return LandmarkMap(table[order, 0].astype(np.int64), table[order, 1:4], covariances[order])
+    return LandmarkMap(
+        table[order, 0].astype(np.int64), table[order, 1:4], covariances[order]
+    )
 
 
 def _write(path: Path, text: str) -> None:

@@ -23,7 +23,14 @@ from sonar_graph.calibration import Calibration, Mounting, Start
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.logs.adapters import plain_lines
-from sonar_graph.logs.cdr import Bytes, Value, definition, encode, parse_definition, short_name
+from sonar_graph.logs.cdr import (
+    Bytes,
+    Value,
+    definition,
+    encode,
+    parse_definition,
+    short_name,
+)
 from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
 from sonar_graph.measurements import Dvl, Floats, Ints
@@ -53,16 +60,30 @@ def static_frames(recording: Recording) -> FrameTree:
     """Frames of ``/tf_static``; of several transforms to one frame the last holds."""
     frames: FrameTree = {}
     for topic in recording.topics.values():
-        if not topic.name.endswith("tf_static") or short_name(topic.type_name) != short_name(TF) or not topic.is_ros2:
+        if (
+            not topic.name.endswith("tf_static")
+            or short_name(topic.type_name) != short_name(TF)
+            or not topic.is_ros2
+        ):
             continue
         for group in topic.messages():
-            translations = np.stack([group[f"transforms.transform.translation.{axis}"] for axis in "xyz"], axis=-1)
-            rotations = np.stack([group[f"transforms.transform.rotation.{axis}"] for axis in "wxyz"], axis=-1)
+            translations = np.stack(
+                [group[f"transforms.transform.translation.{axis}"] for axis in "xyz"],
+                axis=-1,
+            )
+            rotations = np.stack(
+                [group[f"transforms.transform.rotation.{axis}"] for axis in "wxyz"],
+                axis=-1,
+            )
             names = zip(
-                group.strings("transforms.child_frame_id"), group.strings("transforms.header.frame_id"), strict=True
+                group.strings("transforms.child_frame_id"),
+                group.strings("transforms.header.frame_id"),
+                strict=True,
             )
             for message, (children, parents) in enumerate(names):
-                for i, (child, parent) in enumerate(zip(children, parents, strict=True)):
+                for i, (child, parent) in enumerate(
+                    zip(children, parents, strict=True)
+                ):
                     pose = _pose(translations[message, i], rotations[message, i])
                     frames[child.lstrip("/")] = parent.lstrip("/"), pose
     return frames
@@ -88,7 +109,10 @@ def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
     body_T_sensor, name = gtsam.Pose3(), frame.lstrip("/")
     for _ in range(len(frames) + 1):
         if name == BODY_FRAME:
-            if not (lever_m := math.hypot(*body_T_sensor.translation())) < LARGEST_LEVER_M:
+            if (
+                not (lever_m := math.hypot(*body_T_sensor.translation()))
+                < LARGEST_LEVER_M
+            ):
                 raise _unusable(frame, f"is {lever_m:g} m from {BODY_FRAME}")
             x_m, y_m, z_m = body_T_sensor.translation().tolist()
             roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
@@ -97,13 +121,17 @@ def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
             break
         child, (name, parent_T_frame) = name, frames[name]
         if isinstance(parent_T_frame, str):
-            raise _unusable(frame, f"the transform from {name} to {child} {parent_T_frame}")
+            raise _unusable(
+                frame, f"the transform from {name} to {child} {parent_T_frame}"
+            )
         body_T_sensor = parent_T_frame * body_T_sensor
     return None
 
 
 def _unusable(frame: str, fault: str) -> LogError:
-    return LogError(f"/tf_static: {frame}: {fault}; state the sensor's mounting in a file for --calibration")
+    return LogError(
+        f"/tf_static: {frame}: {fault}; state the sensor's mounting in a file for --calibration"
+    )
 
 
 def encode_mountings(calibration: Calibration) -> Bytes:
@@ -115,12 +143,25 @@ def encode_mountings(calibration: Calibration) -> Bytes:
         "sonar": calibration.sonar.mounting,
         "positions": Mounting(translation_m=calibration.positions.antenna_m),
     }
-    quaternions = Rotation.from_matrix([m.pose().rotation().matrix() for m in mountings.values()]).as_quat()
+    quaternions = Rotation.from_matrix(
+        [m.pose().rotation().matrix() for m in mountings.values()]
+    ).as_quat()
     translations = np.array([m.translation_m for m in mountings.values()])
-    values: dict[str, Value] = {"transforms.header.frame_id": BODY_FRAME, "transforms.child_frame_id": list(mountings)}
-    values |= {f"transforms.transform.translation.{axis}": translations[None, :, i] for i, axis in enumerate("xyz")}
-    values |= {f"transforms.transform.rotation.{axis}": quaternions[None, :, i] for i, axis in enumerate("xyzw")}
-    return encode(parse_definition(TF, definition(TF)), 1, values, {"transforms": len(mountings)})
+    values: dict[str, Value] = {
+        "transforms.header.frame_id": BODY_FRAME,
+        "transforms.child_frame_id": list(mountings),
+    }
+    values |= {
+        f"transforms.transform.translation.{axis}": translations[None, :, i]
+        for i, axis in enumerate("xyz")
+    }
+    values |= {
+        f"transforms.transform.rotation.{axis}": quaternions[None, :, i]
+        for i, axis in enumerate("xyzw")
+    }
+    return encode(
+        parse_definition(TF, definition(TF)), 1, values, {"transforms": len(mountings)}
+    )
 
 
 OTHER_FILES = (
@@ -148,13 +189,23 @@ class PartialCalibration:
         try:
             Calibration.model_validate(_over(Calibration().model_dump(), values))
         except ValidationError as error:
-            absent = [fault["type"] == "missing" and isinstance(fault["loc"][-1], str) for fault in error.errors()]
+            absent = [
+                fault["type"] == "missing" and isinstance(fault["loc"][-1], str)
+                for fault in error.errors()
+            ]
             if not all(absent):
-                unused = [role for role in ("depth", "heading", "positions") if values.get(role) is False]
+                unused = [
+                    role
+                    for role in ("depth", "heading", "positions")
+                    if values.get(role) is False
+                ]
                 advice = "".join(
-                    f"; to leave {r} unused: use = false under [{r}] in the log configuration" for r in unused
+                    f"; to leave {r} unused: use = false under [{r}] in the log configuration"
+                    for r in unused
                 )
-                raise CalibrationError(f"{source}: {faults_in(error, Calibration)}{advice}") from error
+                raise CalibrationError(
+                    f"{source}: {faults_in(error, Calibration)}{advice}"
+                ) from error
         return cls(values, source)
 
     @classmethod
@@ -169,14 +220,18 @@ class PartialCalibration:
             except LogError as error:
                 raise CalibrationError(str(error)) from error
             if recorded is None:
-                raise CalibrationError(f"{path}: the log has no calibration; give one that was written by sonar-graph")
+                raise CalibrationError(
+                    f"{path}: the log has no calibration; give one that was written by sonar-graph"
+                )
             return cls(recorded.model_dump(mode="json", exclude_unset=True), str(path))
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
             text = text_of(path)
             values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
         except OSError as error:
-            raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
+            raise CalibrationError(
+                f"{path}: cannot be read: {error.strerror}"
+            ) from error
         except (ValueError, RecursionError) as error:
             raise CalibrationError(f"{path}: not {kind}: {error}") from error
         if not isinstance(values, dict):
@@ -184,12 +239,16 @@ class PartialCalibration:
             raise CalibrationError(f"{path}: {what}, not {json.dumps(values):.40}")
         for fields, what, option in OTHER_FILES:
             if fields <= values.keys():
-                raise CalibrationError(f"{path}: is {what}, not a calibration; give it with {option}")
+                raise CalibrationError(
+                    f"{path}: is {what}, not a calibration; give it with {option}"
+                )
         return cls.parse(values, str(path))
 
     def over(self, other: PartialCalibration) -> PartialCalibration:
         """These fields, and those of another where these say nothing."""
-        return PartialCalibration(_over(other.values, self.values), f"{self.source}, else {other.source}")
+        return PartialCalibration(
+            _over(other.values, self.values), f"{self.source}, else {other.source}"
+        )
 
     def fields(self) -> list[str]:
         """Paths of the fields that are given, such as ``dvl.mounting.translation_m``."""
@@ -197,17 +256,22 @@ class PartialCalibration:
 
 
 def gathered(
-    given: PartialCalibration | None, recorded: Calibration | None, mountings: Mapping[str, Mounting]
+    given: PartialCalibration | None,
+    recorded: Calibration | None,
+    mountings: Mapping[str, Mounting],
 ) -> Calibration:
     """Gather a calibration, field by field: what the user gives, what the record set, ``/tf_static``, and defaults.
 
     Mountings of ``/tf_static`` are by sensor; of ``depth`` and ``positions`` only the translation counts.
     Fields that together are no calibration are a CalibrationError, which names the user's source.
     """
-    values = Calibration().model_dump(exclude={"start"})  # a start that nobody states is not set
+    # a start that nobody states is not set
+    values = Calibration().model_dump(exclude={"start"})
     for sensor, mounting in mountings.items():
         is_place = MOUNTING_FIELDS[sensor] != "mounting"
-        values[sensor][MOUNTING_FIELDS[sensor]] = mounting.translation_m if is_place else mounting.model_dump()
+        values[sensor][MOUNTING_FIELDS[sensor]] = (
+            mounting.translation_m if is_place else mounting.model_dump()
+        )
     if recorded is not None:
         values = _over(values, recorded.model_dump(exclude_unset=True))
     if given is None:
@@ -229,12 +293,16 @@ def recorded_calibration(calibration: Calibration) -> str:
 def recorded_fields(path: Path) -> dict[str, Any]:
     """Fields of a calibration that a log's record states, as JSON has them."""
     recorded = read_calibration(scan(path, lambda _: Keep.NONE))
-    return {} if recorded is None else recorded.model_dump(mode="json", exclude_unset=True)
+    return (
+        {} if recorded is None else recorded.model_dump(mode="json", exclude_unset=True)
+    )
 
 
 def static_mounting(path: Path, frame: str) -> Mounting | None:
     """Mounting of a sensor's frame by a log's ``/tf_static``, or None; errors as of `mounting_of`."""
-    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.NONE)
+    recording = scan(
+        path, lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.NONE
+    )
     return mounting_of(frame, static_frames(recording))
 
 
@@ -257,7 +325,9 @@ NO_START = (
 )
 
 
-def with_measured_start(calibration: Calibration, blocks: Mapping[str, Any]) -> tuple[Calibration, str]:
+def with_measured_start(
+    calibration: Calibration, blocks: Mapping[str, Any]
+) -> tuple[Calibration, str]:
     """Calibration with the start by the first headings and fixes, where there are any, and a note about it."""
     start_ns = int(max(blocks["imu"].stamps_ns[0], blocks["dvl"].stamps_ns[0]))
     start = measured_start(calibration, start_ns, blocks["dvl"], blocks)
@@ -270,7 +340,9 @@ def with_measured_start(calibration: Calibration, blocks: Mapping[str, Any]) -> 
     )
 
 
-def measured_start(calibration: Calibration, start_ns: int, dvl: Dvl, blocks: Mapping[str, Any]) -> Start | None:
+def measured_start(
+    calibration: Calibration, start_ns: int, dvl: Dvl, blocks: Mapping[str, Any]
+) -> Start | None:
     """Start by the first headings and position fixes, for a log that states none; None without either.
 
     Roll and pitch, and what is not measured, are the calibration's.
@@ -281,20 +353,31 @@ def measured_start(calibration: Calibration, start_ns: int, dvl: Dvl, blocks: Ma
         near = _nearest(heading.stamps_ns, start_ns)
         yaws = np.unwrap(heading.yaw_rad[near])
         yaw = float(np.angle(np.exp(1j * np.median(yaws))))
-        sigma = np.hypot(calibration.heading.bias_sigma_rad, calibration.heading.sigma_rad)
+        sigma = np.hypot(
+            calibration.heading.bias_sigma_rad, calibration.heading.sigma_rad
+        )
         changes["rpy_rad"] = (roll, pitch, yaw)
         changes["rpy_sigma_rad"] = (*start.rpy_sigma_rad[:2], WIDER * sigma)
     if (fixes := blocks.get("positions")) is not None:
         near = _nearest(fixes.stamps_ns, start_ns)
-        antenna = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ np.array(calibration.positions.antenna_m)
+        antenna = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ np.array(
+            calibration.positions.antenna_m
+        )
         variances = np.median(np.einsum("nii->ni", fixes.covariance_m2[near]), axis=0)
-        variances = np.where(np.isnan(variances), np.square(calibration.positions.sigma_m), variances)
+        variances = np.where(
+            np.isnan(variances), np.square(calibration.positions.sigma_m), variances
+        )
         moved_m = float(
-            np.median(np.linalg.norm(dvl.velocity, axis=1)) * np.ptp([*fixes.stamps_ns[near], start_ns]) * 1e-9
+            np.median(np.linalg.norm(dvl.velocity, axis=1))
+            * np.ptp([*fixes.stamps_ns[near], start_ns])
+            * 1e-9
         )
         changes["position_m"] = np.median(fixes.position_m[near], axis=0) - antenna
         changes["position_sigma_m"] = WIDER * np.sqrt(variances + moved_m**2)
-    rounded = {name: tuple(round(float(value), 4) for value in values) for name, values in changes.items()}
+    rounded = {
+        name: tuple(round(float(value), 4) for value in values)
+        for name, values in changes.items()
+    }
     return start.model_copy(update=rounded) if changes else None
 
 
@@ -305,8 +388,16 @@ def _nearest(stamps_ns: Ints, at_ns: int) -> Ints:
 
 def mounted_by(values: Values) -> set[str]:
     """Sensors whose mounting is given."""
-    sections = {sensor: values[sensor] for sensor in MOUNTING_FIELDS if isinstance(values.get(sensor), Mapping)}
-    return {sensor for sensor, section in sections.items() if MOUNTING_FIELDS[sensor] in section}
+    sections = {
+        sensor: values[sensor]
+        for sensor in MOUNTING_FIELDS
+        if isinstance(values.get(sensor), Mapping)
+    }
+    return {
+        sensor
+        for sensor, section in sections.items()
+        if MOUNTING_FIELDS[sensor] in section
+    }
 
 
 def _over(values: Values, changes: Values) -> dict[str, Any]:
@@ -341,14 +432,22 @@ def read_calibration(recording: Recording) -> Calibration | None:
     text = recording.metadata.get(METADATA, {}).get("calibration")
     if text is None:
         return None
-    return parse(Calibration, _json(recording, "calibration", text), f"{recording.path}: metadata record {METADATA!r}")
+    return parse(
+        Calibration,
+        _json(recording, "calibration", text),
+        f"{recording.path}: metadata record {METADATA!r}",
+    )
 
 
 def read_notes(recording: Recording) -> dict[str, str]:
     """Notes in the log's record, which must be a JSON object."""
-    notes = _json(recording, "notes", recording.metadata.get(METADATA, {}).get("notes", "{}"))
+    notes = _json(
+        recording, "notes", recording.metadata.get(METADATA, {}).get("notes", "{}")
+    )
     if not isinstance(notes, dict):
-        raise LogError(f"{recording.path}: metadata record {METADATA!r}: notes must be a JSON object")
+        raise LogError(
+            f"{recording.path}: metadata record {METADATA!r}: notes must be a JSON object"
+        )
     return {str(subject): str(note) for subject, note in notes.items()}
 
 
@@ -358,11 +457,15 @@ def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
     A log that cannot be read, or whose notes are no JSON object, is a LogError.
     """
     recording = scan(path, lambda _: Keep.NONE)
-    return recording.metadata.get(METADATA, {}) | {"notes": json.dumps(read_notes(recording) | dict(notes))}
+    return recording.metadata.get(METADATA, {}) | {
+        "notes": json.dumps(read_notes(recording) | dict(notes))
+    }
 
 
 def _json(recording: Recording, key: str, text: str) -> object:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise LogError(f"{recording.path}: metadata record {METADATA!r}: {key} is not JSON: {error}") from error
+        raise LogError(
+            f"{recording.path}: metadata record {METADATA!r}: {key} is not JSON: {error}"
+        ) from error

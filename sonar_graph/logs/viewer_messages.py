@@ -59,11 +59,15 @@ def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
     axes, shape (m, 3), m, and quaternions x, y, z, w from these axes to the world, shape (m, 4).
     """
     covariances = covariances.copy()
-    covariances[_unknown(covariances)] = np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
+    covariances[_unknown(covariances)] = (
+        np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
+    )
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
     diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
-    return np.maximum(diameters, _SMALLEST_DIAMETER_M), Rotation.from_matrix(axes).as_quat()
+    return np.maximum(diameters, _SMALLEST_DIAMETER_M), Rotation.from_matrix(
+        axes
+    ).as_quat()
 
 
 def _unknown(covariances: Floats) -> NDArray[np.bool_]:
@@ -71,7 +75,11 @@ def _unknown(covariances: Floats) -> NDArray[np.bool_]:
 
 
 def landmark_markers(
-    topic: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour, text_height_m: float
+    topic: str,
+    landmarks: LandmarkMap,
+    stamp_ns: int,
+    colour: Colour,
+    text_height_m: float,
 ) -> Outgoing:
     """``visualization_msgs/MarkerArray``: for each landmark an ellipsoid, with its identity as text above it."""
     count = len(landmarks)
@@ -80,32 +88,60 @@ def landmark_markers(
     above = landmarks.positions + np.array([0, 0, text_height_m])
     stamps_ns = np.full(2 * count, stamp_ns)
     values = header(stamps_ns, WORLD_FRAME, "markers.header")
-    values |= fields("markers.pose.position", "xyz", np.vstack([landmarks.positions, above]))
-    values |= fields("markers.pose.orientation", "xyzw", np.vstack([quaternions, upright]))
-    values |= fields("markers.scale", "xyz", np.vstack([diameters, np.full((count, 3), text_height_m)]))
+    values |= fields(
+        "markers.pose.position", "xyz", np.vstack([landmarks.positions, above])
+    )
+    values |= fields(
+        "markers.pose.orientation", "xyzw", np.vstack([quaternions, upright])
+    )
+    values |= fields(
+        "markers.scale",
+        "xyz",
+        np.vstack([diameters, np.full((count, 3), text_height_m)]),
+    )
     values |= fields("markers.color", "rgba", np.tile(colour, (2 * count, 1)))
     values |= {
-        "markers.ns": [UNKNOWN if unknown else ELLIPSOID for unknown in _unknown(landmarks.covariances)]
+        "markers.ns": [
+            UNKNOWN if unknown else ELLIPSOID
+            for unknown in _unknown(landmarks.covariances)
+        ]
         + [IDENTITY] * count,
         "markers.id": np.tile(np.arange(count), 2),
         "markers.type": np.repeat([SPHERE, TEXT_VIEW_FACING], count),
-        "markers.text": [""] * count + [str(identity) for identity in landmarks.ids.tolist()],
+        "markers.text": [""] * count
+        + [str(identity) for identity in landmarks.ids.tolist()],
     }
-    return outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count}, is_latched=True)
+    return outgoing(
+        topic,
+        MARKER_ARRAY,
+        np.array([stamp_ns]),
+        values,
+        {"markers": 2 * count},
+        is_latched=True,
+    )
 
 
 def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
     """``visualization_msgs/MarkerArray`` for each pose with a known covariance: the ellipsoid of its position."""
-    known = trajectory.rows(np.flatnonzero(~_unknown(trajectory.covariances[:, 3:, 3:])))
-    world_axes = body_to_ros(known.covariances, known.matrices) if len(known) else known.covariances
+    known = trajectory.rows(
+        np.flatnonzero(~_unknown(trajectory.covariances[:, 3:, 3:]))
+    )
+    world_axes = (
+        body_to_ros(known.covariances, known.matrices)
+        if len(known)
+        else known.covariances
+    )
     diameters, quaternions = ellipsoids(world_axes[:, :3, :3])
     columns = header(known.stamps_ns, WORLD_FRAME, "markers.header")
     columns |= fields("markers.pose.position", "xyz", known.positions)
     columns |= fields("markers.pose.orientation", "xyzw", quaternions)
     columns |= fields("markers.scale", "xyz", diameters)
-    columns |= fields("markers.color", "rgba", np.tile((*colour[:3], _FAINT), (len(known), 1)))
+    columns |= fields(
+        "markers.color", "rgba", np.tile((*colour[:3], _FAINT), (len(known), 1))
+    )
     values: dict[str, Value] = {
-        path: value[:, None] if isinstance(value, np.ndarray) else value for path, value in columns.items()
+        path: value[:, None] if isinstance(value, np.ndarray) else value
+        for path, value in columns.items()
     }
     values |= {"markers.ns": ELLIPSOID, "markers.type": SPHERE}
     return outgoing(topic, MARKER_ARRAY, known.stamps_ns, values, {"markers": 1})
@@ -142,7 +178,14 @@ def landmark_cloud(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoin
         "data": np.frombuffer(points.tobytes(), np.uint8)[None, :],
         "is_dense": 1,
     }
-    return outgoing(topic, POINT_CLOUD, stamps_ns, values, {"fields": 3 + len(_NUMBERS)}, is_latched=True)
+    return outgoing(
+        topic,
+        POINT_CLOUD,
+        stamps_ns,
+        values,
+        {"fields": 3 + len(_NUMBERS)},
+        is_latched=True,
+    )
 
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -164,7 +207,11 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
         stamps_ns = np.array([picture.stamp_ns])
         content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
         values = header(stamps_ns, "sonar") | {"format": "jpeg", "data": content}
-        messages.append(outgoing(topic, COMPRESSED_IMAGE, stamps_ns, values, {"data": content.shape[1]}))
+        messages.append(
+            outgoing(
+                topic, COMPRESSED_IMAGE, stamps_ns, values, {"data": content.shape[1]}
+            )
+        )
     return messages
 
 
@@ -248,13 +295,20 @@ class Layer:
 
     def css(self, opacity: float) -> str:
         """Colour in Foxglove's notation."""
-        return "#" + "".join(f"{round(255 * part):02x}" for part in (*self.colour[:3], opacity))
+        return "#" + "".join(
+            f"{round(255 * part):02x}" for part in (*self.colour[:3], opacity)
+        )
 
 
 def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
     """Write ``NAME.foxglove.json`` and ``NAME.rviz`` beside ``NAME.mcap``; a LogError where one cannot be written."""
-    layout = json.dumps(foxglove_layout(layers, scene), indent=2, ensure_ascii=False) + "\n"
-    for suffix, text in ((FOXGLOVE_SUFFIX, layout), (RVIZ_SUFFIX, rviz_config(layers, scene))):
+    layout = (
+        json.dumps(foxglove_layout(layers, scene), indent=2, ensure_ascii=False) + "\n"
+    )
+    for suffix, text in (
+        (FOXGLOVE_SUFFIX, layout),
+        (RVIZ_SUFFIX, rviz_config(layers, scene)),
+    ):
         path = result.with_suffix(suffix)
         try:
             with replacing(path) as partial:
@@ -273,18 +327,38 @@ def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     for layer in layers:  # the 3D panel does not draw Odometry
         colour = layer.css(1)
         settings: dict[str, dict[str, Any]] = {
-            PATH: {"type": "line", "lineWidth": scene.line_m, "gradient": [colour, colour]},
+            PATH: {
+                "type": "line",
+                "lineWidth": scene.line_m,
+                "gradient": [colour, colour],
+            },
             MARKER_ARRAY: {},
-            POSE_WITH_COVARIANCE: {"type": "axis", "axisScale": scene.axis_m, "showCovariance": False},
+            POSE_WITH_COVARIANCE: {
+                "type": "axis",
+                "axisScale": scene.axis_m,
+                "showCovariance": False,
+            },
             POINT_CLOUD: {"pointSize": 6, "colorMode": "flat", "flatColor": colour},
         }
         if layer.type_name in settings:
-            view["topics"][layer.topic] = {"visible": layer.is_shown} | settings[layer.type_name]
+            view["topics"][layer.topic] = {"visible": layer.is_shown} | settings[
+                layer.type_name
+            ]
     view["cameraState"] |= {"distance": scene.camera_m, "targetOffset": scene.centre_m}
-    view["cameraState"] |= {"near": round(scene.size_m / 1000, 4), "far": 100 * scene.size_m}
-    view["scene"]["transforms"] |= {"axisScale": scene.axis_m, "labelSize": round(scene.text_height_m / 2, 3)}
+    view["cameraState"] |= {
+        "near": round(scene.size_m / 1000, 4),
+        "far": 100 * scene.size_m,
+    }
+    view["scene"]["transforms"] |= {
+        "axisScale": scene.axis_m,
+        "labelSize": round(scene.text_height_m / 2, 3),
+    }
     x_m, y_m, _ = scene.centre_m
-    grid = {"size": scene.cells * scene.cell_m, "divisions": scene.cells, "position": [x_m, y_m, 0]}
+    grid = {
+        "size": scene.cells * scene.cell_m,
+        "divisions": scene.cells,
+        "position": [x_m, y_m, 0],
+    }
     view["layers"]["grid"] |= grid
     for panel, (field, endings) in _PLOTS.items():
         panels[panel]["paths"] = [
@@ -300,11 +374,18 @@ def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
             for layer in layers
             if layer.topic.endswith(endings)
         ]
-    if pictures := [layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE]:
+    if pictures := [
+        layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE
+    ]:
         panel, beside = "Image!pictures", layout["layout"]
         panels[panel] = {"imageMode": {"imageTopic": pictures[0]}}
         plots = beside["second"]
-        beside["second"] = {"direction": "column", "splitPercentage": 40, "first": panel, "second": plots}
+        beside["second"] = {
+            "direction": "column",
+            "splitPercentage": 40,
+            "first": panel,
+            "second": plots,
+        }
     return layout
 
 
@@ -326,4 +407,6 @@ def rviz_config(layers: Sequence[Layer], scene: Scene) -> str:
         "POINT_CLOUD": POINT_CLOUD,
         "COMPRESSED_IMAGE": COMPRESSED_IMAGE,
     }
-    return environment.get_template("rviz.jinja").render(layers=layers, scene=scene, **types)
+    return environment.get_template("rviz.jinja").render(
+        layers=layers, scene=scene, **types
+    )

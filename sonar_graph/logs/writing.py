@@ -16,7 +16,14 @@ from sonar_graph.errors import LogError
 from sonar_graph.files import as_path
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
-from sonar_graph.logs.cdr import Bytes, Struct, Value, definition, encode, parse_definition
+from sonar_graph.logs.cdr import (
+    Bytes,
+    Struct,
+    Value,
+    definition,
+    encode,
+    parse_definition,
+)
 from sonar_graph.logs.mcap import Outgoing, recording
 from sonar_graph.logs.roles import (
     DETECTIONS,
@@ -30,7 +37,12 @@ from sonar_graph.logs.roles import (
     SONAR_IMAGE,
     TF,
 )
-from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings, recorded_calibration
+from sonar_graph.logs.vehicle_setup import (
+    BODY_FRAME,
+    METADATA,
+    encode_mountings,
+    recorded_calibration,
+)
 from sonar_graph.measurements import (
     NO_TRACK,
     NS_PER_S,
@@ -52,7 +64,9 @@ _Z_VARIANCE = 14
 _SECONDS = np.iinfo(np.int32)
 
 
-def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
+def write_log(
+    path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = ()
+) -> None:
     """Write a log of ROS 2 messages from which `read_log` gives the same sequence.
 
     Parameters
@@ -91,9 +105,17 @@ def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = (
     path = as_path(path, "write_log(path, sequence)")
     require_sequence(sequence, "write_log(path, sequence)")
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
-    messages = [static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
+    messages = [
+        static_message(
+            "/tf_static", TF, first_ns, encode_mountings(sequence.calibration)
+        )
+    ]
     if sequence.true_landmarks is not None:
-        messages.append(landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
+        messages.append(
+            landmark_map_message(
+                "/ground_truth/landmarks", sequence.true_landmarks, first_ns
+            )
+        )
     messages.append(imu_messages("/imu/data", sequence.imu))
     messages.append(dvl_messages("/dvl/data", sequence.dvl))
     if sequence.depth is not None:
@@ -105,7 +127,11 @@ def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = (
     if sequence.detections is not None:
         messages += detection_messages("/sonar/landmarks", sequence.detections)
     if sequence.truth is not None:
-        of_truth = ("odometry", odometry_messages) if sequence.truth.has_orientation else ("point", point_messages)
+        of_truth = (
+            ("odometry", odometry_messages)
+            if sequence.truth.has_orientation
+            else ("point", point_messages)
+        )
         messages.append(of_truth[1](f"/ground_truth/{of_truth[0]}", sequence.truth))
     record = {
         "name": sequence.name,
@@ -116,14 +142,23 @@ def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = (
         begins = [0] * len(messages)
         for entry in more:  # with each, what comes up to its end
             until_ns = int(entry.log_times_ns[-1])
-            ends = [int(np.searchsorted(m.log_times_ns, until_ns, side="right")) for m in messages]
+            ends = [
+                int(np.searchsorted(m.log_times_ns, until_ns, side="right"))
+                for m in messages
+            ]
             out.write([*map(_rows, messages, begins, ends), entry])
             begins = ends
-        out.write(list(map(_rows, messages, begins, [len(m.log_times_ns) for m in messages])))
+        out.write(
+            list(map(_rows, messages, begins, [len(m.log_times_ns) for m in messages]))
+        )
 
 
 def _rows(entry: Outgoing, first: int, end: int) -> Outgoing:
-    return replace(entry, log_times_ns=entry.log_times_ns[first:end], payloads=entry.payloads[first:end])
+    return replace(
+        entry,
+        log_times_ns=entry.log_times_ns[first:end],
+        payloads=entry.payloads[first:end],
+    )
 
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:
@@ -144,22 +179,32 @@ def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
     covariances[np.isnan(covariances).any(axis=1)] = [-1.0] + [0.0] * 8
     values = header(dvl.stamps_ns, "dvl") | fields("velocity", "xyz", dvl.velocity)
     values |= {"velocity_mode": 1, "velocity_covar": covariances, "num_good_beams": 4}
-    values |= {"sound_speed": np.nan}  # not known; 0 is what drivers leave that do not fill it
+    # not known; 0 is what drivers leave that do not fill it
+    values |= {"sound_speed": np.nan}
     return outgoing(topic, DVL, dvl.stamps_ns, values)
 
 
 def depth_messages(topic: str, depth: Depth) -> Outgoing:
     """``PoseWithCovarianceStamped`` of which only z counts; it keeps every bit of a height, a pressure does not."""
     covariances = np.zeros((len(depth), 36))
-    covariances[:, _Z_VARIANCE] = np.where(np.isnan(depth.variance_m2), 0.0, depth.variance_m2)
+    covariances[:, _Z_VARIANCE] = np.where(
+        np.isnan(depth.variance_m2), 0.0, depth.variance_m2
+    )
     values = header(depth.stamps_ns, WORLD_FRAME)
-    values |= {"pose.pose.position.z": depth.z_m, "pose.pose.orientation.w": 1.0, "pose.covariance": covariances}
+    values |= {
+        "pose.pose.position.z": depth.z_m,
+        "pose.pose.orientation.w": 1.0,
+        "pose.covariance": covariances,
+    }
     return outgoing(topic, POSE_WITH_COVARIANCE, depth.stamps_ns, values)
 
 
 def heading_messages(topic: str, heading: Heading) -> Outgoing:
     """``sonar_graph_msgs/Heading``; it keeps every bit of an angle, a quaternion does not."""
-    values = header(heading.stamps_ns, WORLD_FRAME) | {"yaw_rad": heading.yaw_rad, "sigma_rad": heading.sigma_rad}
+    values = header(heading.stamps_ns, WORLD_FRAME) | {
+        "yaw_rad": heading.yaw_rad,
+        "sigma_rad": heading.sigma_rad,
+    }
     return outgoing(topic, HEADING, heading.stamps_ns, values)
 
 
@@ -167,15 +212,24 @@ def fix_messages(topic: str, fixes: PositionFixes) -> Outgoing:
     """``PoseWithCovarianceStamped`` of which the position counts, and the upper left of the covariance."""
     is_unknown = np.asarray(np.isnan(fixes.covariance_m2).any(axis=(1, 2)))
     covariances = np.zeros((len(fixes), 6, 6))
-    covariances[:, :3, :3] = np.where(is_unknown[:, None, None], 0.0, fixes.covariance_m2)
-    values = header(fixes.stamps_ns, WORLD_FRAME) | fields("pose.pose.position", "xyz", fixes.position_m)
-    values |= {"pose.pose.orientation.w": 1.0, "pose.covariance": covariances.reshape(-1, 36)}
+    covariances[:, :3, :3] = np.where(
+        is_unknown[:, None, None], 0.0, fixes.covariance_m2
+    )
+    values = header(fixes.stamps_ns, WORLD_FRAME) | fields(
+        "pose.pose.position", "xyz", fixes.position_m
+    )
+    values |= {
+        "pose.pose.orientation.w": 1.0,
+        "pose.covariance": covariances.reshape(-1, 36),
+    }
     return outgoing(topic, POSE_WITH_COVARIANCE, fixes.stamps_ns, values)
 
 
 def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
     """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
-    stamps_ns, first, counts = np.unique(detections.stamps_ns, return_index=True, return_counts=True)
+    stamps_ns, first, counts = np.unique(
+        detections.stamps_ns, return_index=True, return_counts=True
+    )
     is_tracked = bool(np.any(detections.track != NO_TRACK))
     columns = {
         "range_m": detections.range_m,
@@ -183,14 +237,19 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
         "covariance": detections.range_azimuth_cov,
         "candidate_ids": detections.candidate_ids,
         "id_probability": detections.id_probability,
-        "track": detections.track[:, None] if is_tracked else np.empty((len(detections), 0), np.int64),
+        "track": detections.track[:, None]
+        if is_tracked
+        else np.empty((len(detections), 0), np.int64),
     }
     entries = []
     for count in np.unique(counts).tolist():
         frames = counts == count
         rows = first[frames][:, None] + np.arange(count)
         values = header(stamps_ns[frames], "sonar")
-        values |= {name: column[rows].reshape(len(rows), -1) for name, column in columns.items()}
+        values |= {
+            name: column[rows].reshape(len(rows), -1)
+            for name, column in columns.items()
+        }
         entries.append(outgoing(topic, DETECTIONS, stamps_ns[frames], values))
     return entries
 
@@ -203,15 +262,23 @@ def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
     return values | {"pose.covariance": covariances.reshape(-1, 36)}
 
 
-def odometry_messages(topic: str, trajectory: Trajectory, body_frame: str = BODY_FRAME) -> Outgoing:
+def odometry_messages(
+    topic: str, trajectory: Trajectory, body_frame: str = BODY_FRAME
+) -> Outgoing:
     """``nav_msgs/Odometry`` without a twist."""
-    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory) | {"child_frame_id": body_frame}
+    values = (
+        header(trajectory.stamps_ns, WORLD_FRAME)
+        | pose_columns(trajectory)
+        | {"child_frame_id": body_frame}
+    )
     return outgoing(topic, ODOMETRY, trajectory.stamps_ns, values)
 
 
 def point_messages(topic: str, trajectory: Trajectory) -> Outgoing:
     """``geometry_msgs/PointStamped``, of a trajectory whose orientations are not known."""
-    values = header(trajectory.stamps_ns, WORLD_FRAME) | fields("point", "xyz", trajectory.positions)
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | fields(
+        "point", "xyz", trajectory.positions
+    )
     return outgoing(topic, POINT, trajectory.stamps_ns, values)
 
 
@@ -232,13 +299,19 @@ def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> O
     return outgoing(topic, LANDMARK_MAP, stamps_ns, values)
 
 
-def static_message(topic: str, type_name: str, stamp_ns: int, payload: Bytes) -> Outgoing:
+def static_message(
+    topic: str, type_name: str, stamp_ns: int, payload: Bytes
+) -> Outgoing:
     """One latched message that is encoded already."""
     return Outgoing(topic, type_name, np.array([stamp_ns]), payload, is_latched=True)
 
 
 def sonar_image_messages(
-    topic: str, frames: SonarFrames, *, frequency_hz: float = 0.0, sound_speed_m_s: float = 0.0
+    topic: str,
+    frames: SonarFrames,
+    *,
+    frequency_hz: float = 0.0,
+    sound_speed_m_s: float = 0.0,
 ) -> Outgoing:
     """``marine_acoustic_msgs/ProjectedSonarImage``, one a frame, which `read_sonar_frames` reads back.
 
@@ -262,8 +335,12 @@ def sonar_image_messages(
     count, beams, _ = frames.intensity.shape
     kind = f"{frames.intensity.dtype.kind}{frames.intensity.dtype.itemsize}"
     if kind not in SAMPLE_TYPES:
-        raise LogError(f"{topic}: samples of type {frames.intensity.dtype} cannot be written; give {SAMPLE_TYPES}")
-    samples = np.ascontiguousarray(frames.intensity.transpose(0, 2, 1), dtype=f"<{kind}")
+        raise LogError(
+            f"{topic}: samples of type {frames.intensity.dtype} cannot be written; give {SAMPLE_TYPES}"
+        )
+    samples = np.ascontiguousarray(
+        frames.intensity.transpose(0, 2, 1), dtype=f"<{kind}"
+    )
     values = header(frames.stamps_ns, "sonar") | {
         "ping_info.frequency": frequency_hz,
         "ping_info.sound_speed": sound_speed_m_s,
@@ -274,7 +351,9 @@ def sonar_image_messages(
         "image.beam_count": beams,
         "image.data": samples.reshape(count, -1).view(np.uint8),
     }
-    return outgoing(topic, SONAR_IMAGE, frames.stamps_ns, values, {"beam_directions": beams})
+    return outgoing(
+        topic, SONAR_IMAGE, frames.stamps_ns, values, {"beam_directions": beams}
+    )
 
 
 @lru_cache
@@ -289,9 +368,17 @@ def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, 
     Raises `LogError` when a stamp lies outside what ROS 2 can express (years 1901 to 2038).
     """
     seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
-    if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):
-        raise LogError(f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch")
-    return {f"{prefix}.stamp.sec": seconds, f"{prefix}.stamp.nanosec": nanoseconds, f"{prefix}.frame_id": frame_id}
+    if len(seconds) and not (
+        _SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max
+    ):
+        raise LogError(
+            f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch"
+        )
+    return {
+        f"{prefix}.stamp.sec": seconds,
+        f"{prefix}.stamp.nanosec": nanoseconds,
+        f"{prefix}.frame_id": frame_id,
+    }
 
 
 def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:

@@ -70,13 +70,23 @@ def gravity_direction(
     where the specific force was not measured.
     """
     i_R_j = np.ascontiguousarray(motion.i_T_j.rotation().matrix())
-    up_j = up_direction(motion.mean_specific_force, i_R_j, velocity_i, velocity_j, motion.duration_s)
+    up_j = up_direction(
+        motion.mean_specific_force, i_R_j, velocity_i, velocity_j, motion.duration_s
+    )
     if not np.isfinite(up_j).all():
         return None
-    return up_j, tilt_sigma(motion.duration_s, sigma_m_s, calibration, has_bias=has_bias)
+    return up_j, tilt_sigma(
+        motion.duration_s, sigma_m_s, calibration, has_bias=has_bias
+    )
 
 
-def up_direction(force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float) -> Floats:
+def up_direction(
+    force: Floats,
+    i_R_j: Floats,
+    velocity_i: Floats,
+    velocity_j: Floats,
+    duration_s: float,
+) -> Floats:
     """up_j of the mean specific force in frame i, shape (3,); NaN where the force is not measured."""
     # the force that holds the vehicle against gravity: what is left without its acceleration
     g_i = force - (i_R_j @ velocity_j - velocity_i) / duration_s  # (3,)
@@ -84,14 +94,24 @@ def up_direction(force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: F
 
 
 def tilt_sigma(
-    duration_s: float, velocity_sigma_m_s: float, calibration: Calibration, *, has_bias: bool = True
+    duration_s: float,
+    velocity_sigma_m_s: float,
+    calibration: Calibration,
+    *,
+    has_bias: bool = True,
 ) -> float:
     """Standard deviation of the direction's tilt, rad; with the bias of the accelerometers, or without it."""
     imu = calibration.imu
     g = calibration.gravity_m_s2
-    noise = (imu.accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2) / g**2
+    noise = (
+        imu.accel_noise_density**2 / duration_s
+        + 2.0 * (velocity_sigma_m_s / duration_s) ** 2
+    ) / g**2
     # the frame in which the force is averaged turns with the gyros' own error
-    noise += imu.gyro_noise_density**2 * duration_s / 3.0 + (imu.gyro_bias_sigma * duration_s) ** 2 / 4.0
+    noise += (
+        imu.gyro_noise_density**2 * duration_s / 3.0
+        + (imu.gyro_bias_sigma * duration_s) ** 2 / 4.0
+    )
     # where the bias is a state of the estimator, it must not count as noise too
     beta = imu.accel_bias_sigma / g if has_bias else 0.0
     tau_s = (beta / max(imu.gyro_noise_density, LEAST_GYRO_NOISE_DENSITY)) ** 2
@@ -110,7 +130,9 @@ def yaw_and_derivative(R: Floats) -> tuple[float, Floats]:
     x, a, c = R[0]
     y, b, d = R[1]
     level2 = x * x + y * y
-    return math.atan2(y, x), np.array([0.0, (y * c - x * d) / level2, (x * b - y * a) / level2])
+    return math.atan2(y, x), np.array(
+        [0.0, (y * c - x * d) / level2, (x * b - y * a) / level2]
+    )
 
 
 def up_and_derivative(R: Floats) -> tuple[Floats, Floats]:
@@ -152,7 +174,9 @@ class Contradictions:
 
     def judge(self, sensor: str, distances: Floats | float) -> None:
         """Count distances in sigmas, of one row or several."""
-        self._far[sensor] += int(np.count_nonzero(np.asarray(distances) > CONTRADICTING_SIGMAS))
+        self._far[sensor] += int(
+            np.count_nonzero(np.asarray(distances) > CONTRADICTING_SIGMAS)
+        )
         self._judged[sensor] += np.size(distances)
 
     def messages(self) -> list[str]:
@@ -161,7 +185,8 @@ class Contradictions:
             f"{self._far[sensor]} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
             for sensor, judged in self._judged.items()
             # a share of a few rows may be chance
-            if judged >= FEWEST_JUDGED and self._far[sensor] > CONTRADICTING_SHARE * judged
+            if judged >= FEWEST_JUDGED
+            and self._far[sensor] > CONTRADICTING_SHARE * judged
         ]
 
 
@@ -202,13 +227,17 @@ def gyro_bias_of(b: Floats, up: Floats) -> Floats:
 
 
 @compiled
-def by_biases(D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats) -> Floats:
+def by_biases(
+    D: Floats, dR: Floats, dp: Floats, up: Floats, vertical: Floats, body_p_dvl: Floats
+) -> Floats:
     """`bias_jacobian` of arrays."""
     return bias_jacobian(D, mat(dR), vec(dp), vec(up), vec(vertical), vec(body_p_dvl))
 
 
 @inlined
-def bias_jacobian(D: Floats, dR: Mat3, dp: Vec3, up: Vec3, vertical: Vec3, body_p_dvl: Vec3) -> Floats:
+def bias_jacobian(
+    D: Floats, dR: Mat3, dp: Vec3, up: Vec3, vertical: Vec3, body_p_dvl: Vec3
+) -> Floats:
     """Derivative of a motion's [theta, rho] by b, shape (6, 11), from that by the gyro bias, ``D``, shape (6, 3).
 
     By b_heading the body turns about the world's vertical alone, whatever its tilt meanwhile: ``u_j u_j^T D_theta``,

@@ -30,7 +30,11 @@ class Kernel(Section):
     def robust(self) -> Robust:
         """Function that gives a noise model this loss."""
         estimator = self.estimator()
-        return (lambda noise: noise) if estimator is None else partial(gtsam.noiseModel.Robust.Create, estimator)
+        return (
+            (lambda noise: noise)
+            if estimator is None
+            else partial(gtsam.noiseModel.Robust.Create, estimator)
+        )
 
     @property
     def log_normaliser(self) -> float:
@@ -38,7 +42,9 @@ class Kernel(Section):
         from scipy.integrate import quad  # takes most of a second to load
 
         # a numeric integral serves kernels of any shape
-        area, _ = quad(lambda e: math.exp(-float(self.loss(np.array(e)))), -math.inf, math.inf)
+        area, _ = quad(
+            lambda e: math.exp(-float(self.loss(np.array(e)))), -math.inf, math.inf
+        )
         return -math.log(area)
 
 
@@ -86,7 +92,9 @@ class RobustKernel(Kernel):
     def estimator(self) -> gtsam.noiseModel.mEstimator.Base:
         """The loss as GTSAM has it."""
         estimators = gtsam.noiseModel.mEstimator
-        return (estimators.Huber if self.shape == "huber" else estimators.Cauchy).Create(self.width)
+        return (
+            estimators.Huber if self.shape == "huber" else estimators.Cauchy
+        ).Create(self.width)
 
 
 KernelParams = Annotated[GaussianKernel | RobustKernel, *tagged("shape", "cauchy")]

@@ -173,7 +173,9 @@ def views_from_body(R: Floats, X: Floats, mount: Mount, points: Floats) -> Point
     by_pose = np.empty((m, 2, 6))
     by_point = np.empty((m, 2, 3))
     for k in range(m):
-        sight = sight_of(mat(R), vec(X), mount, Vec3(points[k, 0], points[k, 1], points[k, 2]))
+        sight = sight_of(
+            mat(R), vec(X), mount, Vec3(points[k, 0], points[k, 1], points[k, 2])
+        )
         z[k, 0] = sight.range_m
         z[k, 1] = sight.azimuth_rad
         store_row6(sight.range_by_body, by_pose[k], 0, 0)
@@ -188,7 +190,9 @@ AT_SONAR = Mount(np.eye(3), np.zeros(3))
 
 def view_points(world_T_sonar: gtsam.Pose3, points: Floats) -> PointViews:
     """Expected range and azimuth of points of the world, shape (m, 3), and derivatives, by the sonar's own pose."""
-    return views_from_body(*_as_arrays(world_T_sonar), AT_SONAR, np.ascontiguousarray(points))
+    return views_from_body(
+        *_as_arrays(world_T_sonar), AT_SONAR, np.ascontiguousarray(points)
+    )
 
 
 def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
@@ -204,7 +208,9 @@ def range_azimuth_jacobians(
     These are by the right perturbation [theta, rho] of the body's pose, shape (2, 6), and by the point, shape (2, 3).
     """
     mount = Mount(*_as_arrays(body_T_sonar))
-    view = views_from_body(*_as_arrays(world_T_body), mount, np.ascontiguousarray(p_world)[None])
+    view = views_from_body(
+        *_as_arrays(world_T_body), mount, np.ascontiguousarray(p_world)[None]
+    )
     return view.z[0], view.by_pose[0], view.by_point[0]
 
 
@@ -228,13 +234,17 @@ def locate_from_body(
     """
     world_R_body = mat(R)
     body_R_sonar = mat(mount.body_R_sonar)
-    q = vec(mount.body_p_sonar) + body_R_sonar @ _point_at(z[0], z[1], elevation_rad)  # in body axes
+    # in body axes
+    q = vec(mount.body_p_sonar) + body_R_sonar @ _point_at(z[0], z[1], elevation_rad)
     p = vec(X) + world_R_body @ q
     by_body = np.empty((3, 6))  # R [-[q]x  I]
     store(-1.0 * (world_R_body @ skew(q)), by_body)
     store(world_R_body, by_body, UPPER_RIGHT)
     by_polar = np.empty((3, 3))
-    store(world_R_body @ body_R_sonar @ _point_jacobian(z[0], z[1], elevation_rad), by_polar)
+    store(
+        world_R_body @ body_R_sonar @ _point_jacobian(z[0], z[1], elevation_rad),
+        by_polar,
+    )
     return np.array([p.x, p.y, p.z]), by_body, by_polar
 
 
@@ -242,7 +252,11 @@ def locate_from_body(
 def _point_at(range_m: float, azimuth_rad: float, elevation_rad: float) -> Vec3:
     """The point in the sonar frame with these spherical coordinates."""
     level_m = range_m * math.cos(elevation_rad)
-    return Vec3(level_m * math.cos(azimuth_rad), level_m * math.sin(azimuth_rad), range_m * math.sin(elevation_rad))
+    return Vec3(
+        level_m * math.cos(azimuth_rad),
+        level_m * math.sin(azimuth_rad),
+        range_m * math.sin(elevation_rad),
+    )
 
 
 @inlined
@@ -265,21 +279,39 @@ def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Flo
     return np.array(_point_at(range_m, azimuth_rad, elevation_rad))
 
 
-def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
+def locate(
+    world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
+) -> Floats:
     """The point of the world at these spherical coordinates of the sonar, shape (3,), m."""
-    return np.asarray(world_T_sonar.transformFrom(sonar_point(range_m, azimuth_rad, elevation_rad)))
+    return np.asarray(
+        world_T_sonar.transformFrom(sonar_point(range_m, azimuth_rad, elevation_rad))
+    )
 
 
 def locate_jacobians(
-    world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
+    world_T_body: gtsam.Pose3,
+    body_T_sonar: gtsam.Pose3,
+    range_m: float,
+    azimuth_rad: float,
+    elevation_rad: float,
 ) -> tuple[Floats, Floats, Floats]:
     """A located point with derivatives, as `locate_from_body`."""
     R, X = _as_arrays(world_T_body)
-    return locate_from_body(R, X, Mount(*_as_arrays(body_T_sonar)), np.array([range_m, azimuth_rad]), elevation_rad)
+    return locate_from_body(
+        R,
+        X,
+        Mount(*_as_arrays(body_T_sonar)),
+        np.array([range_m, azimuth_rad]),
+        elevation_rad,
+    )
 
 
 def elevation_on_floor(
-    world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, floor_z_m: float, aperture_rad: float
+    world_T_sonar: gtsam.Pose3,
+    range_m: float,
+    azimuth_rad: float,
+    floor_z_m: float,
+    aperture_rad: float,
 ) -> float | None:
     """Elevation (rad) at which a detected point lies on the floor.
 
@@ -291,12 +323,16 @@ def elevation_on_floor(
     floor, at a height ``floor_z_m`` in the world, is not within the full vertical aperture.
     """
     up = np.ascontiguousarray(world_T_sonar.rotation().matrix()[2])
-    elevation_rad = floor_elevation(up, floor_z_m - world_T_sonar.z(), range_m, azimuth_rad)
+    elevation_rad = floor_elevation(
+        up, floor_z_m - world_T_sonar.z(), range_m, azimuth_rad
+    )
     return elevation_rad if abs(elevation_rad) <= 0.5 * aperture_rad else None
 
 
 @compiled
-def floor_elevation(up: Floats, height_m: float, range_m: float, azimuth_rad: float) -> float:
+def floor_elevation(
+    up: Floats, height_m: float, range_m: float, azimuth_rad: float
+) -> float:
     """Elevation (rad) of `elevation_on_floor` in any aperture; NaN where the floor is out of reach.
 
     Parameters
@@ -308,7 +344,8 @@ def floor_elevation(up: Floats, height_m: float, range_m: float, azimuth_rad: fl
     """
     level = up[0] * math.cos(azimuth_rad) + up[1] * math.sin(azimuth_rad)
     reach_m = range_m * math.hypot(level, up[2])
-    is_reached = reach_m > 0.0 and abs(height_m) <= reach_m  # False for a NaN height: the floor is not known
+    # False for a NaN height: the floor is not known
+    is_reached = reach_m > 0.0 and abs(height_m) <= reach_m
     if not is_reached:
         return math.nan
     # the solutions are e0 - half and e0 + half, where the ray of elevation e0 climbs most steeply
@@ -328,7 +365,9 @@ REPEATED = OUTCOME_NUMBERS[Outcome.REPEATED]
 UNSOUND = OUTCOME_NUMBERS[Outcome.UNSOUND]
 
 
-def identify(detections: LandmarkDetections, minimum_probability: float) -> tuple[Ints, NDArray[np.int8]]:
+def identify(
+    detections: LandmarkDetections, minimum_probability: float
+) -> tuple[Ints, NDArray[np.int8]]:
     """Most probable identity of each row, shape (n,), and `ACCEPTED` or the `OUTCOME_NUMBERS` of its refusal, (n,).
 
     Refused is an unsound row, and a posterior that is too low or NaN, or of no identity (-1). A landmark is in one
@@ -344,7 +383,12 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> tupl
 
 @compiled
 def _write_identities(
-    stamps_ns: Ints, candidates: Ints, posterior: Floats, minimum: float, ids: Ints, outcomes: NDArray[np.int8]
+    stamps_ns: Ints,
+    candidates: Ints,
+    posterior: Floats,
+    minimum: float,
+    ids: Ints,
+    outcomes: NDArray[np.int8],
 ) -> None:
     """Fill what `identify` returns; outcomes other than `ACCEPTED` stay."""
     p = np.empty(len(ids))
@@ -361,6 +405,10 @@ def _write_identities(
         # rows of one frame follow each other
         other = row - 1
         while other >= 0 and stamps_ns[other] == stamps_ns[row]:
-            if ids[other] == ids[row] and outcomes[other] == ACCEPTED and outcomes[row] == ACCEPTED:
+            if (
+                ids[other] == ids[row]
+                and outcomes[other] == ACCEPTED
+                and outcomes[row] == ACCEPTED
+            ):
                 outcomes[row if p[row] <= p[other] else other] = REPEATED
             other -= 1

@@ -56,7 +56,20 @@ from sonar_graph.navigation.preintegration import (
     value_at,
 )
 from sonar_graph.navigation.samples import WINDOW_NS
-from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, cross, exp_and_mean, mat, outer, skew, store, vec
+from sonar_graph.numerics import (
+    O3,
+    ZERO,
+    Mat3,
+    Vec3,
+    compiled,
+    cross,
+    exp_and_mean,
+    mat,
+    outer,
+    skew,
+    store,
+    vec,
+)
 
 FEWEST = 4
 """Fewest samples of a line."""
@@ -64,7 +77,9 @@ SHORTEST_S = 1.0
 """Shortest time that they span."""
 
 
-def closed_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
+def closed_bridge(
+    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int
+) -> PreintegratedMotion:
     """Motion over a gap from an epoch to the next one."""
     k = int(rows.dvl_ns.searchsorted(start_ns))
     T = (end_ns - start_ns) * 1e-9
@@ -85,10 +100,13 @@ def closed_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int,
     return _corrected(steady, walked_m2, line, sensors.gyro_bias_sigma)
 
 
-def open_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
+def open_bridge(
+    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int
+) -> PreintegratedMotion:
     """Motion from an epoch to an instant in the gap after it, by rows that are known at that instant."""
     k = int(rows.dvl_ns.searchsorted(start_ns))
-    rows = rows.known(max(end_ns, int(rows.known_ns[k])))  # the epoch may be known later than the instant
+    # the epoch may be known later than the instant
+    rows = rows.known(max(end_ns, int(rows.known_ns[k])))
     dvl_ns = rows.dvl_ns
     if (dvl_ns[k + 1 : k + 2] - start_ns <= sensors.longest_ns).any():
         # Velocities go on, inertial rows are missing: by velocities as far as they go.
@@ -96,7 +114,9 @@ def open_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, e
         sampled = motion_over(rows, sensors, removed, start_ns, last_ns)
         if last_ns == end_ns:
             return sampled
-        return sampled.then(_open(rows, sensors, removed.after(sampled), last_ns, end_ns))
+        return sampled.then(
+            _open(rows, sensors, removed.after(sampled), last_ns, end_ns)
+        )
     line = None
     first = int(dvl_ns.searchsorted(max(start_ns - WINDOW_NS, rows.imu_ns[0])))
     samples = np.arange(first, k + 1)
@@ -106,7 +126,9 @@ def open_bridge(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, e
         off = t - t.mean()
         slope = (0.5 * T - t.mean()) * off / (off @ off)
         weights_s = T * (1.0 / len(t) + slope)
-        line = _by_accelerometers(rows, sensors, removed, LineFit(samples, weights_s, weights_s**2), end_ns)
+        line = _by_accelerometers(
+            rows, sensors, removed, LineFit(samples, weights_s, weights_s**2), end_ns
+        )
     return _open(rows, sensors, removed, start_ns, end_ns, line)
 
 
@@ -130,8 +152,11 @@ def _by_accelerometers(
     weights_s = fit.weights_s
     lever = sensors.body_p_dvl - sensors.body_p_imu
     # (n, 3), the same numbers however many rows come before and after
-    rate = np.column_stack([np.interp(cuts_ns, rows.imu_ns, column) for column in rows.rate.T])
-    velocity = rows.velocity[fit.samples] - np.cross(rate - removed.bias, lever)  # of the IMU's point, (n, 3)
+    rate = np.column_stack(
+        [np.interp(cuts_ns, rows.imu_ns, column) for column in rows.rate.T]
+    )
+    # of the IMU's point, (n, 3)
+    velocity = rows.velocity[fit.samples] - np.cross(rate - removed.bias, lever)
     turned = weights_s[:, None] * velocity
     if is_closed:
         start_ns = int(cuts_ns[0])
@@ -143,7 +168,9 @@ def _by_accelerometers(
         turn = _turn_until(rows, sensors, removed, int(cuts_ns[0]), start_ns)
         jumps = np.vstack([turned, np.zeros(3)])
         i_R_first = np.ascontiguousarray(turn.T)
-        line = Line(np.append(cuts_ns, end_ns), np.cumsum(weights_s), jumps, start_ns, i_R_first)
+        line = Line(
+            np.append(cuts_ns, end_ns), np.cumsum(weights_s), jumps, start_ns, i_R_first
+        )
     sums = sum_along(rows, imu_rows, line, removed)
     if not math.isfinite(sum(sums.s)):
         return None
@@ -155,7 +182,8 @@ def _by_accelerometers(
     swung_s = np.tensordot(weights_s, R_k, 1)
     # the Earth's rate turns the log about the IMU as well
     s = np.array(sums.s) + np.cross(removed.earth, swung_s @ lever)
-    way = s - R @ sensors.body_p_imu  # of the body's origin, but for the constant l of the IMU
+    # of the body's origin, but for the constant l of the IMU
+    way = s - R @ sensors.body_p_imu
 
     # x = y - way after the epoch, y before it
     y = np.array(sums.y)
@@ -178,16 +206,24 @@ def _by_accelerometers(
     C = to_j @ C_i @ to_j.T
     i_T_j = gtsam.Pose3(gtsam.Rot3(R), way + sensors.body_p_imu)
     mean_force = np.array(sums.v) / T
-    return PreintegratedMotion(i_T_j, 0.5 * (C + C.T), to_j @ D_i, removed.bias, T, mean_force)
+    return PreintegratedMotion(
+        i_T_j, 0.5 * (C + C.T), to_j @ D_i, removed.bias, T, mean_force
+    )
 
 
-def _turn_until(rows: Rows, sensors: Sensors, removed: Removed, first_ns: int, epoch_ns: int) -> Floats:
+def _turn_until(
+    rows: Rows, sensors: Sensors, removed: Removed, first_ns: int, epoch_ns: int
+) -> Floats:
     """Rotation from an earlier instant to the epoch, in whose frame the Earth's rotation is known, shape (3, 3)."""
     turn = np.eye(3)
     # the Earth's rate in the earlier frame depends on the turn: twice more is exact to rounding
     for _ in range(3 if removed.earth.any() else 1):
         earlier = Removed(removed.bias, turn @ removed.earth)
-        turn = motion_over(rows, sensors, earlier, first_ns, epoch_ns).i_T_j.rotation().matrix()
+        turn = (
+            motion_over(rows, sensors, earlier, first_ns, epoch_ns)
+            .i_T_j.rotation()
+            .matrix()
+        )
     return turn
 
 
@@ -258,7 +294,10 @@ def sum_along(rows: Rows, imu_rows: int, line: Line, removed: Removed) -> LineSu
             dt = (until - t) * 1e-9
             w_k = value_at(imu_ns, rows.rate, imu_rows, i, middle, False) - b - R.T @ E
             f = value_at(imu_ns, rows.force, imu_rows, i, middle, False)
-            if rows.turns.is_modelled and hole_ns(imu_ns, imu_rows, i, until) > UNFELT_NS:
+            if (
+                rows.turns.is_modelled
+                and hole_ns(imu_ns, imu_rows, i, until) > UNFELT_NS
+            ):
                 f = NOWHERE
             turn, mean = exp_and_mean(dt * w_k)
             R_k = R @ mean
@@ -297,7 +336,9 @@ def _open(
     k = int(rows.dvl_ns.searchsorted(start_ns))
     T = (end_ns - start_ns) * 1e-9
     # noise of this density, a second apart, has the variance of T times the last velocity
-    prior = _prior(rows, (k, k), np.array([start_ns - NS_PER_S, start_ns]), T * rows.cov[k])
+    prior = _prior(
+        rows, (k, k), np.array([start_ns - NS_PER_S, start_ns]), T * rows.cov[k]
+    )
     steady = motion_over(prior, sensors, removed, start_ns, end_ns)
     walked_m2 = sensors.velocity_walk_density**2 * T**3 / 3.0
     return _corrected(steady, walked_m2, line, sensors.gyro_bias_sigma)
@@ -306,11 +347,16 @@ def _open(
 def _prior(rows: Rows, ends: tuple[int, int], dvl_ns: Ints, cov: Floats) -> Rows:
     """Rows with a Doppler log of two samples, which measure the velocities of two rows with one covariance."""
     velocity = rows.velocity[list(ends)]
-    return rows._replace(dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns)
+    return rows._replace(
+        dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns
+    )
 
 
 def _corrected(
-    steady: PreintegratedMotion, walked_m2: float, line: PreintegratedMotion | None, gyro_bias_sigma: float
+    steady: PreintegratedMotion,
+    walked_m2: float,
+    line: PreintegratedMotion | None,
+    gyro_bias_sigma: float,
 ) -> PreintegratedMotion:
     """Steady motion whose velocity walks, corrected by the line: (4) and (5)."""
     W = walked_m2 * np.eye(3)
@@ -319,15 +365,24 @@ def _corrected(
     if line is None:
         line = steady
     else:
-        by_bias = gyro_bias_sigma * (line.D_bias - steady.D_bias)[3:]  # b (D - D_0), (3, 3)
-        bent_m2 = 2.0 * float(gyro_bias_sigma * line.duration_s * np.linalg.norm(by_bias, 2)) ** 2
+        # b (D - D_0), (3, 3)
+        by_bias = gyro_bias_sigma * (line.D_bias - steady.D_bias)[3:]
+        bent_m2 = (
+            2.0
+            * float(gyro_bias_sigma * line.duration_s * np.linalg.norm(by_bias, 2)) ** 2
+        )
         # a line fitted to many samples may have less Doppler noise than the last sample
         variances, axes = np.linalg.eigh((line.covariance - steady.covariance)[3:, 3:])
-        V = (axes * np.maximum(variances, 0.0)) @ axes.T + by_bias @ by_bias.T + bent_m2 * np.eye(3)
+        V = (
+            (axes * np.maximum(variances, 0.0)) @ axes.T
+            + by_bias @ by_bias.T
+            + bent_m2 * np.eye(3)
+        )
         K = walked_m2 * np.linalg.inv(W + V)
     i_R_j = steady.i_T_j.rotation()
     steady_p = steady.i_T_j.translation()
-    off = i_R_j.unrotate(line.i_T_j.translation() - steady_p)  # s - s_0 in the last frame
+    # s - s_0 in the last frame
+    off = i_R_j.unrotate(line.i_T_j.translation() - steady_p)
     i_T_j = gtsam.Pose3(i_R_j, steady_p + i_R_j.rotate(K @ off))
     G = np.eye(6)  # both have the same turn
     G[3:, 3:] = K
@@ -335,10 +390,14 @@ def _corrected(
     covariance = steady.covariance + G @ (line.covariance - steady.covariance) @ G.T
     covariance[3:, 3:] += rest @ W @ rest.T + bent_m2 * K @ K.T
     D_bias = steady.D_bias + G @ (line.D_bias - steady.D_bias)
-    return replace(line, i_T_j=i_T_j, covariance=0.5 * (covariance + covariance.T), D_bias=D_bias)
+    return replace(
+        line, i_T_j=i_T_j, covariance=0.5 * (covariance + covariance.T), D_bias=D_bias
+    )
 
 
-def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) -> PreintegratedMotion:
+def remaining_motion(
+    before: PreintegratedMotion, whole: PreintegratedMotion
+) -> PreintegratedMotion:
     """The rest of a whole motion after a first part of it, with the growth of its error."""
     motion = before.i_T_j.between(whole.i_T_j)
     A = motion.inverse().AdjointMap()

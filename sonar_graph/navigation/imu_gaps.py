@@ -20,7 +20,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
+from sonar_graph.calibration import (
+    HOLE_INTERVALS,
+    ROWS_BEFORE,
+    SHORTEST_HOLE_S,
+    UNTYPICAL_S,
+    ImuCalibration,
+)
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import Vec3, compiled
 
@@ -48,7 +54,12 @@ class Turns(NamedTuple):
 def turns_of(imu: ImuCalibration) -> Turns:
     """The numbers of a calibration."""
     sigma = np.array(imu.turn_sigma_rad_s)
-    return Turns(bool((sigma > 0).any()), sigma, np.array(imu.turn_time_s), imu.gyro_noise_density)
+    return Turns(
+        bool((sigma > 0).any()),
+        sigma,
+        np.array(imu.turn_time_s),
+        imu.gyro_noise_density,
+    )
 
 
 UNTURNED = Turns(False, np.ones(3), np.ones(3), 0.0)
@@ -101,7 +112,9 @@ def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
 
 
 @compiled
-def error_in_hole(turns: Turns, stamps: Ints, rows: int, row: int, t: int, until_ns: int) -> Vec3:
+def error_in_hole(
+    turns: Turns, stamps: Ints, rows: int, row: int, t: int, until_ns: int
+) -> Vec3:
     """Spectral density of the rates' error: the mean over a closed hole, the growth of an open one since t; rad²/s."""
     last = min(row, rows) - 1
     typical_s = typical_ns(stamps, last) * 1e-9
@@ -148,5 +161,7 @@ def open_variance(sigma: float, time_s: float, length_s: float) -> float:
 @compiled
 def open_growth(sigma: float, time_s: float, before_s: float, until_s: float) -> float:
     """Growth of `open_variance` from one length of the hole to another, over the time between them, rad²/s."""
-    grown = open_variance(sigma, time_s, until_s) - open_variance(sigma, time_s, before_s)
+    grown = open_variance(sigma, time_s, until_s) - open_variance(
+        sigma, time_s, before_s
+    )
     return grown / (until_s - before_s)

@@ -38,7 +38,12 @@ from sonar_graph.navigation.preintegration import (
     motions_over,
     rows_until,
 )
-from sonar_graph.navigation.samples import EARLIEST_NS, WINDOW_NS, finite_vector, no_doppler_stamp
+from sonar_graph.navigation.samples import (
+    EARLIEST_NS,
+    WINDOW_NS,
+    finite_vector,
+    no_doppler_stamp,
+)
 from sonar_graph.numerics import compiled
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import RefusedRow
@@ -120,7 +125,9 @@ class Odometry:
             When the blocks are of another kind.
         """
         if not (isinstance(imu, (Imu, NoneType)) and isinstance(dvl, (Dvl, NoneType))):
-            raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
+            raise MeasurementError(
+                f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}"
+            )
         placed_imu = imu is not None and self._intake.add_imu(imu)
         placed_dvl = dvl is not None and self._intake.add_dvl(dvl)
         if placed_imu or placed_dvl:
@@ -179,14 +186,24 @@ class Odometry:
         imu_ns = self._imu.stamps_ns
         dvl_ns = self._dvl.stamps_ns
         known_ns = self._dvl.values[2]
-        return int(max(imu_ns[imu_ns.searchsorted(epoch_ns)], known_ns[dvl_ns.searchsorted(epoch_ns)]))
+        return int(
+            max(
+                imu_ns[imu_ns.searchsorted(epoch_ns)],
+                known_ns[dvl_ns.searchsorted(epoch_ns)],
+            )
+        )
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
         """True for a time without Doppler rows that is too long for a linear velocity."""
         return end_ns - start_ns > self._sensors.longest_ns
 
     def motion(
-        self, start_ns: int, end_ns: int, bias: Floats, world_R_i: Floats | None = None, known_ns: int | None = None
+        self,
+        start_ns: int,
+        end_ns: int,
+        bias: Floats,
+        world_R_i: Floats | None = None,
+        known_ns: int | None = None,
     ) -> PreintegratedMotion:
         """Motion from one instant to another, over gaps too, from rows known at ``known_ns``, by default the second.
 
@@ -204,17 +221,27 @@ class Odometry:
         if known_ns is None:
             known_ns = end_ns
         # without an attitude the Earth's rotation in frame i is not known
-        earth = ZERO if self._earth is None or world_R_i is None else world_R_i.T @ self._earth
+        earth = (
+            ZERO
+            if self._earth is None or world_R_i is None
+            else world_R_i.T @ self._earth
+        )
         removed = Removed(bias, earth)
         lost_ns = self._newest_epoch(min(end_ns, known_ns))
-        if lost_ns is not None and lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
+        if (
+            lost_ns is not None
+            and lost_ns < start_ns < end_ns
+            and self.is_gap(lost_ns, end_ns)
+        ):
             # both instants lie in one open gap
             before = self._motion_since(lost_ns, start_ns, known_ns, removed)
             whole = self._motion_since(lost_ns, end_ns, known_ns, removed)
             return remaining_motion(before, whole)
         return self._motion_since(start_ns, end_ns, known_ns, removed)
 
-    def motions(self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats) -> Motions:
+    def motions(
+        self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats
+    ) -> Motions:
         """Motions over intervals, each from rows known at its ``known_ns``."""
         intervals = Intervals(start_ns, end_ns, known_ns, self._sensors.longest_ns)
         return motions_over(self.rows(), intervals, self._sensors, Removed(bias, ZERO))
@@ -228,7 +255,12 @@ class Odometry:
             raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
         x, y, z = self._rate_at(epoch_ns)
         a, b, c = self._dvl_p_imu
-        swing = y * c - z * b, z * a - x * c, x * b - y * a  # w x (imu - dvl); np.cross takes ten times as long
+        # w x (imu - dvl); np.cross takes ten times as long
+        swing = (
+            y * c - z * b,
+            z * a - x * c,
+            x * b - y * a,
+        )
         xx, yy, zz = cov[k].diagonal().tolist()
         return velocity[k] + swing, (xx + yy + zz) / 3.0
 
@@ -241,7 +273,10 @@ class Odometry:
         if self._hold_past or not 0 < i < len(rate):
             return after
         share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
-        return [w_0 + share * (w - w_0) for w_0, w in zip(rate[i - 1].tolist(), after, strict=True)]
+        return [
+            w_0 + share * (w - w_0)
+            for w_0, w in zip(rate[i - 1].tolist(), after, strict=True)
+        ]
 
     def rows(self) -> Rows:
         """Rows of both sensors that are still needed."""
@@ -249,11 +284,27 @@ class Odometry:
         velocity, cov, known_ns = self._dvl.values
         imu_ns = self._imu.stamps_ns
         dvl_ns = self._dvl.stamps_ns
-        return Rows(imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, self._hold_past, self._turns)
+        return Rows(
+            imu_ns,
+            rate,
+            force,
+            dvl_ns,
+            velocity,
+            cov,
+            known_ns,
+            self._hold_past,
+            self._turns,
+        )
 
     def _epochs_between(self, after_ns: int, until_ns: int) -> tuple[int, int]:
         """First and last row (exclusive) of the epochs after one instant that are reached at another."""
-        return _epochs_between(after_ns, until_ns, self._imu.stamps_ns, self._dvl.stamps_ns, self._dvl.values[2])
+        return _epochs_between(
+            after_ns,
+            until_ns,
+            self._imu.stamps_ns,
+            self._dvl.stamps_ns,
+            self._dvl.values[2],
+        )
 
     def _newest_epoch(self, until_ns: int) -> int | None:
         """The newest epoch that is reached at an instant; None before the first."""
@@ -265,19 +316,27 @@ class Odometry:
         imu_ns = self._imu.stamps_ns
         dvl_ns = self._dvl.stamps_ns
         if not (len(imu_ns) and len(dvl_ns)):
-            raise MeasurementError("motion: needs rows of IMU and Doppler log; add them first")
+            raise MeasurementError(
+                "motion: needs rows of IMU and Doppler log; add them first"
+            )
         for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
             if not isinstance(instant, int | np.integer):
                 raise MeasurementError(
                     f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row"
                 )
         if end_ns < start_ns:
-            raise MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
+            raise MeasurementError(
+                f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first"
+            )
         first_ns = max(imu_ns[0], dvl_ns[0])
         if start_ns < first_ns:
-            raise MeasurementError(f"start_ns: {start_ns} lies before the rows; begin at {first_ns} or later")
+            raise MeasurementError(
+                f"start_ns: {start_ns} lies before the rows; begin at {first_ns} or later"
+            )
 
-    def _motion_since(self, start_ns: int, end_ns: int, known_ns: int, removed: Removed) -> PreintegratedMotion:
+    def _motion_since(
+        self, start_ns: int, end_ns: int, known_ns: int, removed: Removed
+    ) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 
         Gaps between epochs are bridged; between gaps the motion is one sum of steps.
@@ -298,8 +357,16 @@ class Odometry:
             for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
-                before = stretch.continued(rows, sensors, removed, lost_ns, known_ns).motion
-                over_gap = closed_bridge(rows.known(known_ns), sensors, removed.after(before), lost_ns, found_ns)
+                before = stretch.continued(
+                    rows, sensors, removed, lost_ns, known_ns
+                ).motion
+                over_gap = closed_bridge(
+                    rows.known(known_ns),
+                    sensors,
+                    removed.after(before),
+                    lost_ns,
+                    found_ns,
+                )
                 stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
             stretch = stretch.continued(rows, sensors, removed, newest_ns, known_ns)
         self._kept = Kept(key, stretch)
@@ -308,13 +375,17 @@ class Odometry:
         if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
             before = stretch.motion
             here = removed.after(before)
-            since_lost = open_bridge(rows.known(known_ns), sensors, here, newest_ns, end_ns)
+            since_lost = open_bridge(
+                rows.known(known_ns), sensors, here, newest_ns, end_ns
+            )
             return before.then(since_lost)
         return stretch.continued(rows, sensors, removed, end_ns, known_ns).motion
 
 
 @compiled
-def _epochs_between(after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints) -> tuple[int, int]:
+def _epochs_between(
+    after_ns: int, until_ns: int, imu_ns: Ints, dvl_ns: Ints, known_ns: Ints
+) -> tuple[int, int]:
     """First and last row (exclusive) of `Odometry.epochs`."""
     # an epoch needs an IMU row at or after it, and a velocity that is known
     seen = rows_until(imu_ns, until_ns)

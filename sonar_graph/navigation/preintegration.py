@@ -30,7 +30,13 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.motion import Motions, PreintegratedMotion
-from sonar_graph.navigation.imu_gaps import SHORTEST_NS, UNFELT_NS, Turns, error_in_hole, hole_ns
+from sonar_graph.navigation.imu_gaps import (
+    SHORTEST_NS,
+    UNFELT_NS,
+    Turns,
+    error_in_hole,
+    hole_ns,
+)
 from sonar_graph.navigation.samples import LATEST_NS, longest_interval_ns
 from sonar_graph.numerics import (
     I3,
@@ -180,7 +186,9 @@ def no_steps(n: int) -> Floats:
 START = no_steps(1)
 
 
-def motions_over(rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed) -> Motions:
+def motions_over(
+    rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
+) -> Motions:
     """Motions over intervals, each from its own known rows."""
     sums = no_steps(len(intervals.start_ns))
     C, D = add_steps(rows, intervals, sensors, removed, sums.reshape(-1, 3))
@@ -208,12 +216,21 @@ class Stretch(NamedTuple):
     """Derivative by the bias over the sums, shape (6, 3)."""
 
     @classmethod
-    def begin(cls, start_ns: int, bias: Floats, before: PreintegratedMotion | None = None) -> Stretch:
+    def begin(
+        cls, start_ns: int, bias: Floats, before: PreintegratedMotion | None = None
+    ) -> Stretch:
         """A stretch without steps."""
-        return cls(start_ns, start_ns, bias, before, START, np.zeros((6, 6)), np.zeros((6, 3)))
+        return cls(
+            start_ns, start_ns, bias, before, START, np.zeros((6, 6)), np.zeros((6, 3))
+        )
 
     def continued(
-        self, rows: Rows, sensors: Sensors, removed: Removed, end_ns: int, known_ns: int = LATEST_NS
+        self,
+        rows: Rows,
+        sensors: Sensors,
+        removed: Removed,
+        end_ns: int,
+        known_ns: int = LATEST_NS,
     ) -> Stretch:
         """The stretch until a later instant, by rows that are known at an instant.
 
@@ -221,7 +238,12 @@ class Stretch(NamedTuple):
         """
         if end_ns == self.until_ns:
             return self
-        intervals = Intervals(np.array([self.until_ns]), np.array([end_ns]), np.array([known_ns]), LATEST_NS)
+        intervals = Intervals(
+            np.array([self.until_ns]),
+            np.array([end_ns]),
+            np.array([known_ns]),
+            LATEST_NS,
+        )
         sums = self.sums.copy()
         # the Earth's rotation is known in the frame where the motion begins
         here = removed.after(self.before)
@@ -240,9 +262,15 @@ class Stretch(NamedTuple):
         return motion if self.before is None else self.before.then(motion)
 
 
-def motion_over(rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int) -> PreintegratedMotion:
+def motion_over(
+    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int
+) -> PreintegratedMotion:
     """Motion between two instants by linear or held velocities, however far apart the samples are."""
-    return Stretch.begin(start_ns, removed.bias).continued(rows, sensors, removed, end_ns).motion
+    return (
+        Stretch.begin(start_ns, removed.bias)
+        .continued(rows, sensors, removed, end_ns)
+        .motion
+    )
 
 
 class Step(NamedTuple):
@@ -355,7 +383,9 @@ def add_steps(
 
 
 @inlined
-def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int) -> Step:
+def step_from(
+    rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int
+) -> Step:
     """Step from t to the next stamp or the end, by the first rows of each sensor; rows i and k follow t."""
     # cut at the next stamp of either sensor
     until = end_ns
@@ -379,7 +409,9 @@ def step_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
 
 
 @inlined
-def value_at(stamps: Ints, values: Floats, n: int, i: int, t: int, hold_past: bool) -> Vec3:
+def value_at(
+    stamps: Ints, values: Floats, n: int, i: int, t: int, hold_past: bool
+) -> Vec3:
     """Value at t from the first n rows, where ``stamps[i - 1] < t <= stamps[i]``; outside them the nearest row's."""
     if i >= n:
         return row_of(values, n - 1)
@@ -391,7 +423,9 @@ def value_at(stamps: Ints, values: Floats, n: int, i: int, t: int, hold_past: bo
 
 
 @compiled
-def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int) -> ImuHole:
+def hole_from(
+    rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int
+) -> ImuHole:
     """The hole at t until its end (an open one: until the next stamp), or the stretch until the next hole.
 
     i and k are the first rows after t.
@@ -408,15 +442,23 @@ def hole_from(rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, 
     length_ns = hole_ns(imu_ns, imu_rows, i, until)
     if length_ns > 0:
         unfelt = NOWHERE if length_ns > UNFELT_NS else ZERO
-        return ImuHole(until, error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until), unfelt)
+        return ImuHole(
+            until, error_in_hole(rows.turns, imu_ns, imu_rows, i, t, until), unfelt
+        )
     # no hole before the next interval that is long enough to be one
-    while i + 1 < imu_rows and imu_ns[i] < end_ns and imu_ns[i + 1] - imu_ns[i] <= SHORTEST_NS:
+    while (
+        i + 1 < imu_rows
+        and imu_ns[i] < end_ns
+        and imu_ns[i + 1] - imu_ns[i] <= SHORTEST_NS
+    ):
         i += 1
     return ImuHole(min(end_ns, imu_ns[i]) if i < imu_rows else until, ZERO, ZERO)
 
 
 @inlined
-def has_gap(dvl_ns: Ints, n: int, k: int, start_ns: int, end_ns: int, longest_ns: int) -> bool:
+def has_gap(
+    dvl_ns: Ints, n: int, k: int, start_ns: int, end_ns: int, longest_ns: int
+) -> bool:
     """True where an interval has a longer time without any of the first n DVL rows; row k is its first."""
     while k < n and dvl_ns[k] < end_ns:
         if dvl_ns[k] - start_ns > longest_ns:

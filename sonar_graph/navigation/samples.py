@@ -54,7 +54,9 @@ class VelocityRows(NamedTuple):
 
     def where(self, is_kept: NDArray[np.bool_]) -> VelocityRows:
         """Some of the rows."""
-        return VelocityRows(self.stamps_ns[is_kept], self.velocity[is_kept], self.cov[is_kept])
+        return VelocityRows(
+            self.stamps_ns[is_kept], self.velocity[is_kept], self.cov[is_kept]
+        )
 
 
 class StampedRows:
@@ -95,7 +97,9 @@ class StampedRows:
     def forget_before(self, stamp_ns: int, more: int = 0) -> None:
         """Drop rows that no value from a stamp on needs, but keep ``more`` of them."""
         first = max(int(self.stamps_ns.searchsorted(stamp_ns)) - 1 - more, 0)
-        self._show(len(self.stamps_ns) - first, *(column[first:] for column in self._columns))
+        self._show(
+            len(self.stamps_ns) - first, *(column[first:] for column in self._columns)
+        )
 
     def _show(self, n: int, *columns: NDArray[Any]) -> None:
         """Set the columns, whose first n rows are filled."""
@@ -140,7 +144,9 @@ def in_numbers(velocity_cov: Floats, unknown: Floats) -> Floats:
 
 def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
     """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
-    return np.asarray(velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > PARTIAL_M2_S2)
+    return np.asarray(
+        velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > PARTIAL_M2_S2
+    )
 
 
 def finite_vector(name: str, values: ArrayLike, size: int) -> Floats:
@@ -156,7 +162,9 @@ def finite_vector(name: str, values: ArrayLike, size: int) -> Floats:
 def no_doppler_stamp(name: str, instant_ns: int, stamps_ns: Ints) -> MeasurementError:
     """Error for an epoch that is not the stamp of a Doppler row; names the nearest stamp."""
     if not len(stamps_ns):
-        return MeasurementError(f"{name}: {instant_ns} is no Doppler stamp: there are no Doppler rows; add them first")
+        return MeasurementError(
+            f"{name}: {instant_ns} is no Doppler stamp: there are no Doppler rows; add them first"
+        )
     nearest = stamps_ns[np.argmin(np.abs(stamps_ns - instant_ns))]
     return MeasurementError(
         f"{name}: {instant_ns} is none of the {len(stamps_ns)} Doppler stamps from {stamps_ns[0]} to {stamps_ns[-1]}"

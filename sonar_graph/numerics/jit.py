@@ -24,7 +24,9 @@ def compiled(function: Compiled, *, forceinline: bool = False) -> Compiled:
     """
     assert isinstance(function, FunctionType)
     COMPILED_IN[function.__module__] += 1
-    made = numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function)
+    made = numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(
+        function
+    )
     if isinstance(made, Dispatcher):  # a plain function with NUMBA_DISABLE_JIT
         # numba's own stamp is of the function's file alone, and in its older versions of the file's time
         cached = cast(Any, made)._cache._cache_file
@@ -65,14 +67,26 @@ def _digest(module: dict[str, Any]) -> str:
         names = waiting.pop()
         if names["__name__"] in parts:  # modules may name each other in a circle
             continue
-        numbers = sorted((name, repr(value)) for name, value in names.items() if isinstance(value, int | float))
+        numbers = sorted(
+            (name, repr(value))
+            for name, value in names.items()
+            if isinstance(value, int | float)
+        )
         status = Path(names["__file__"]).stat()
-        parts[names["__name__"]] = repr((_contents(names["__file__"], status.st_mtime_ns, status.st_size), numbers))
+        parts[names["__name__"]] = repr(
+            (_contents(names["__file__"], status.st_mtime_ns, status.st_size), numbers)
+        )
         for value in names.values():
-            of = value if isinstance(value, ModuleType) else sys.modules.get(getattr(value, "__module__", None) or "")
+            of = (
+                value
+                if isinstance(value, ModuleType)
+                else sys.modules.get(getattr(value, "__module__", None) or "")
+            )
             if of is not None and of.__name__ in COMPILED_IN:
                 waiting.append(vars(of))
-    return hashlib.sha256("".join(parts[name] for name in sorted(parts)).encode()).hexdigest()
+    return hashlib.sha256(
+        "".join(parts[name] for name in sorted(parts)).encode()
+    ).hexdigest()
 
 
 @cache

@@ -60,7 +60,9 @@ class Vec6(Operators, NamedTuple("Vec6", [("a", Vec3), ("b", Vec3)])):
     """Vector of two halves."""
 
 
-class Mat6(Operators, NamedTuple("Mat6", [("a", Mat3), ("b", Mat3), ("c", Mat3), ("d", Mat3)])):
+class Mat6(
+    Operators, NamedTuple("Mat6", [("a", Mat3), ("b", Mat3), ("c", Mat3), ("d", Mat3)])
+):
     """Matrix of four blocks, ``[[a, b], [c, d]]``."""
 
 
@@ -85,18 +87,27 @@ RULES: dict[str, dict[tuple[type, type], Callable[[Any, Any], Any]]] = {
         (Vec3, Vec3): lambda a, b: a.x * b.x + a.y * b.y + a.z * b.z,
         (Mat3, Vec3): lambda a, b: Vec3(a.x @ b, a.y @ b, a.z @ b),
         (Mat3, Mat3): lambda a, b: Mat3(b.T @ a.x, b.T @ a.y, b.T @ a.z),
-        (Mat3, Skew): lambda a, b: Mat3(cross(a.x, b.v), cross(a.y, b.v), cross(a.z, b.v)),
-        (Skew, Mat3): lambda a, b: Mat3(cross(a.v, b.T.x), cross(a.v, b.T.y), cross(a.v, b.T.z)).T,
+        (Mat3, Skew): lambda a, b: Mat3(
+            cross(a.x, b.v), cross(a.y, b.v), cross(a.z, b.v)
+        ),
+        (Skew, Mat3): lambda a, b: (
+            Mat3(cross(a.v, b.T.x), cross(a.v, b.T.y), cross(a.v, b.T.z)).T
+        ),
         (Vec6, Vec6): lambda a, b: a.a @ b.a + a.b @ b.b,
         (Mat6, Vec6): lambda a, b: Vec6(a.a @ b.a + a.b @ b.b, a.c @ b.a + a.d @ b.b),
         (Mat6, Mat6): lambda a, b: Mat6(
-            a.a @ b.a + a.b @ b.c, a.a @ b.b + a.b @ b.d, a.c @ b.a + a.d @ b.c, a.c @ b.b + a.d @ b.d
+            a.a @ b.a + a.b @ b.c,
+            a.a @ b.b + a.b @ b.d,
+            a.c @ b.a + a.d @ b.c,
+            a.c @ b.b + a.d @ b.d,
         ),
     },
 }
 """Operators by the kinds of both operands."""
 TRANSPOSES: dict[type, Callable[[Any], Any]] = {
-    Mat3: lambda a: Mat3(Vec3(a.x.x, a.y.x, a.z.x), Vec3(a.x.y, a.y.y, a.z.y), Vec3(a.x.z, a.y.z, a.z.z)),
+    Mat3: lambda a: Mat3(
+        Vec3(a.x.x, a.y.x, a.z.x), Vec3(a.x.y, a.y.y, a.z.y), Vec3(a.x.z, a.y.z, a.z.z)
+    ),
     Mat6: lambda a: Mat6(a.a.T, a.c.T, a.b.T, a.d.T),
 }
 
@@ -108,22 +119,42 @@ def _applied(name: str, a: Any, b: Any) -> Any:
 
 
 def _compiled_kind(t: types.Type) -> Any:
-    return float if isinstance(t, types.Float | types.Integer) else getattr(t, "instance_class", None)
+    return (
+        float
+        if isinstance(t, types.Float | types.Integer)
+        else getattr(t, "instance_class", None)
+    )
 
 
 # the same for compiled code, inlined: tuples stay in registers only within one function
-INLINE: Any = {"jit_options": {"forceinline": True, "error_model": "numpy"}, "strict": False}
-for _op in (operator.add, operator.iadd, operator.sub, operator.isub, operator.mul, operator.matmul):
+INLINE: Any = {
+    "jit_options": {"forceinline": True, "error_model": "numpy"},
+    "strict": False,
+}
+for _op in (
+    operator.add,
+    operator.iadd,
+    operator.sub,
+    operator.isub,
+    operator.mul,
+    operator.matmul,
+):
     _rules = RULES[_op.__name__.lstrip("i")]
-    extending.overload(_op, **INLINE)(lambda a, b, r=_rules: r.get((_compiled_kind(a), _compiled_kind(b))))
-extending.overload_attribute(types.NamedUniTuple, "T", **INLINE)(lambda a: TRANSPOSES.get(_compiled_kind(a)))
+    extending.overload(_op, **INLINE)(
+        lambda a, b, r=_rules: r.get((_compiled_kind(a), _compiled_kind(b)))
+    )
+extending.overload_attribute(types.NamedUniTuple, "T", **INLINE)(
+    lambda a: TRANSPOSES.get(_compiled_kind(a))
+)
 
 ZERO = Vec3(0.0, 0.0, 0.0)
 O3 = Mat3(ZERO, ZERO, ZERO)
 I3 = Mat3(Vec3(1.0, 0.0, 0.0), Vec3(0.0, 1.0, 0.0), Vec3(0.0, 0.0, 1.0))
 Place = int | np.integer[Any]
 Index = tuple[Place, ...]
-UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = itertools.product(np.arange(0, 6, 3), repeat=2)
+UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = itertools.product(
+    np.arange(0, 6, 3), repeat=2
+)
 """First elements of the blocks of a 6 by 6 array; not literals, for each of which numba would compile anew."""
 
 SERIES_RAD2 = 1e-2
@@ -174,7 +205,9 @@ def mat(A: Floats, at: Index = UPPER_LEFT) -> Mat3:
 @inlined
 def mat6(A: Floats) -> Mat6:
     """Matrix from the first six rows and columns of an array."""
-    return Mat6(mat(A, UPPER_LEFT), mat(A, UPPER_RIGHT), mat(A, LOWER_LEFT), mat(A, LOWER_RIGHT))
+    return Mat6(
+        mat(A, UPPER_LEFT), mat(A, UPPER_RIGHT), mat(A, LOWER_LEFT), mat(A, LOWER_RIGHT)
+    )
 
 
 @inlined
@@ -298,7 +331,9 @@ def rotation_log(R: Mat3) -> Vec3:
 def curvature(x: float) -> tuple[float, float]:
     """``a = (1 - y cot y) / x``, y half the angle of the square x, and its derivative by the angle, over the angle."""
     if x < SERIES_RAD2:  # the differences below cancel, the second to the fourth order
-        return 1.0 / 12.0 + x * (1.0 / 720.0 + x / 30240.0), 1.0 / 360.0 + x * (1.0 / 7560.0 + x / 201600.0)
+        return 1.0 / 12.0 + x * (1.0 / 720.0 + x / 30240.0), 1.0 / 360.0 + x * (
+            1.0 / 7560.0 + x / 201600.0
+        )
     half = 0.5 * math.sqrt(x)
     g = half / math.tan(half)
     return (1.0 - g) / x, ((half / math.sin(half)) ** 2 + g - 2.0) / (x * x)
@@ -325,7 +360,9 @@ def cross_matrix(v: Floats) -> Floats:
 
 def running_rotations(turns: Floats) -> Floats:
     """``I, Exp(turns[0]), Exp(turns[0]) Exp(turns[1]), ...`` of n rotation vectors, (n + 1, 3, 3), by doubling."""
-    products = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turns])).as_matrix()
+    products = Rotation.from_rotvec(
+        np.concatenate([np.zeros((1, 3)), turns])
+    ).as_matrix()
     span = 1
     while span <= len(turns):  # each product spans so many turns, or all before it
         products[span:] = products[:-span] @ products[span:]

@@ -78,9 +78,14 @@ class NavigationMotion:
 
     def __init__(self, sequence: Run, first_ns: int, last_ns: int) -> None:
         motions = SonarMotions(sequence)
-        stamps = np.arange(max(first_ns, sequence.start_ns), min(last_ns, sequence.end_ns) + 1, GRID_NS)
+        stamps = np.arange(
+            max(first_ns, sequence.start_ns), min(last_ns, sequence.end_ns) + 1, GRID_NS
+        )
         steps = [motions.at(stamp_ns)[0] for stamp_ns in stamps.tolist()]
-        tangents = [np.zeros(6) if step is None else gtsam.Pose3.Logmap(step.previous_T_sonar) for step in steps]
+        tangents = [
+            np.zeros(6) if step is None else gtsam.Pose3.Logmap(step.previous_T_sonar)
+            for step in steps
+        ]
         self.epoch_ns = int(stamps[0]) if len(stamps) else first_ns
         self._sums = np.cumsum(tangents, axis=0)
 
@@ -94,13 +99,19 @@ class NavigationMotion:
         """Sums until instants, linear between those of the grid."""
         place = np.asarray(seconds) * (NS_PER_S / GRID_NS)
         before = np.clip(place.astype(np.intp), 0, len(self._sums) - 2)
-        sums = self._sums[before] + (place - before)[:, None] * (self._sums[before + 1] - self._sums[before])
+        sums = self._sums[before] + (place - before)[:, None] * (
+            self._sums[before + 1] - self._sums[before]
+        )
         sums[(place < 0) | (place > len(self._sums) - 1)] = np.nan
         return np.asarray(sums)
 
 
 def estimate_offset(
-    steps: Sequence[PlanarStep], sequence: Run, range_m: float, around_s: float = 0.0, search_s: float = 10.0
+    steps: Sequence[PlanarStep],
+    sequence: Run,
+    range_m: float,
+    around_s: float = 0.0,
+    search_s: float = 10.0,
 ) -> ClockOffset:
     """Offset of the images' clock within ``search_s`` of ``around_s``.
 
@@ -125,14 +136,18 @@ def estimate_offset(
             f"needed; {AS_STATED}"
         )
     margin_ns = round((abs(around_s) + search_s + 1.0) * NS_PER_S)
-    navigation = NavigationMotion(sequence, known[0].start_ns - margin_ns, known[-1].end_ns + margin_ns)
+    navigation = NavigationMotion(
+        sequence, known[0].start_ns - margin_ns, known[-1].end_ns + margin_ns
+    )
     start_s, end_s = (
         (np.array([getattr(step, name) for step in known]) - navigation.epoch_ns) * 1e-9
         for name in ("start_ns", "end_ns")
     )
     yaw, x, y = np.array([step.motion for step in known]).T
     z = np.column_stack([x, y + range_m * yaw])
-    offsets_s = around_s + np.arange(-search_s, search_s + 0.5 * OFFSET_STEP_S, OFFSET_STEP_S)
+    offsets_s = around_s + np.arange(
+        -search_s, search_s + 0.5 * OFFSET_STEP_S, OFFSET_STEP_S
+    )
 
     def moved(offset_s: float) -> Floats:
         return navigation.over(start_s + offset_s, end_s + offset_s)
@@ -151,7 +166,9 @@ def estimate_offset(
     residuals = z - _fitted(z, at_rough)
     spread = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
     z = np.where(np.abs(residuals) > OUTLYING * spread, np.nan, z)
-    repetition = np.array([_repetition(column) for column in (z - _fitted(z, at_rough)).T])
+    repetition = np.array(
+        [_repetition(column) for column in (z - _fitted(z, at_rough)).T]
+    )
     found = _profile(z, moved, offsets_s, likely, repetition)
     best = int(np.argmax(found))
     if best in (0, len(found) - 1):
@@ -159,9 +176,14 @@ def estimate_offset(
             f"{CANNOT_TELL}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; give a longer "
             f"--search SECONDS, or {AS_STATED}"
         )
-    seconds, near = _top(offsets_s, found), np.abs(offsets_s - offsets_s[best]) <= APART_S
+    seconds, near = (
+        _top(offsets_s, found),
+        np.abs(offsets_s - offsets_s[best]) <= APART_S,
+    )
     sigma_s = _jackknife(z, moved, offsets_s[near])
-    nats = float(found[best]) - float(found[np.abs(offsets_s - seconds) > APART_S].max(initial=0.0))
+    nats = float(found[best]) - float(
+        found[np.abs(offsets_s - seconds) > APART_S].max(initial=0.0)
+    )
     if nats < LEAST_NATS or sigma_s > LARGEST_SIGMA_S:
         raise LogError(
             f"{CANNOT_TELL}: {seconds:+.2f} s ± {sigma_s:.2f} s is only exp({nats:.1f}) times as likely as others "
@@ -169,11 +191,17 @@ def estimate_offset(
         )
     fitted = _fitted(z, f := moved(seconds))
     ahead, across = (_correlation(z[:, c], fitted[:, c]) for c in range(2))
-    return ClockOffset(seconds, sigma_s, int(np.isfinite(f[:, 0]).sum()), (ahead, across), nats)
+    return ClockOffset(
+        seconds, sigma_s, int(np.isfinite(f[:, 0]).sum()), (ahead, across), nats
+    )
 
 
 def _profile(
-    z: Floats, moved: Callable[[float], Floats], offsets_s: Floats, likely: Floats, repetition: Floats
+    z: Floats,
+    moved: Callable[[float], Floats],
+    offsets_s: Floats,
+    likely: Floats,
+    repetition: Floats,
 ) -> Floats:
     """Likelihood of each offset in nats over no relation, -inf where it is not covered, shape as ``likely``.
 
@@ -184,7 +212,11 @@ def _profile(
         fitted = _fitted(z, moved(float(offsets_s[at])))
         for c in range(2):
             n = np.isfinite(z[:, c] + fitted[:, c]).sum() / repetition[c]
-            profile[at] -= 0.5 * n * np.log1p(-(min(_correlation(z[:, c], fitted[:, c]), 0.99999) ** 2))
+            profile[at] -= (
+                0.5
+                * n
+                * np.log1p(-(min(_correlation(z[:, c], fitted[:, c]), 0.99999) ** 2))
+            )
     return np.asarray(profile)
 
 
@@ -195,7 +227,10 @@ def _top(offsets_s: Floats, profile: Floats) -> float:
         return float(offsets_s[at])
     before, here, after = profile[at - 1 : at + 2].tolist()
     bend = before - 2 * here + after
-    return float(offsets_s[at] + (0.5 * OFFSET_STEP_S * (before - after) / bend if -np.inf < bend < 0 else 0.0))
+    return float(
+        offsets_s[at]
+        + (0.5 * OFFSET_STEP_S * (before - after) / bend if -np.inf < bend < 0 else 0.0)
+    )
 
 
 def _jackknife(z: Floats, moved: Callable[[float], Floats], offsets_s: Floats) -> float:
@@ -204,7 +239,12 @@ def _jackknife(z: Floats, moved: Callable[[float], Floats], offsets_s: Floats) -
     for left_out in np.array_split(np.arange(len(z)), STRETCHES):
         rest = z.copy()
         rest[left_out] = np.nan
-        tops.append(_top(offsets_s, _profile(rest, moved, offsets_s, np.zeros(len(offsets_s)), np.ones(2))))
+        tops.append(
+            _top(
+                offsets_s,
+                _profile(rest, moved, offsets_s, np.zeros(len(offsets_s)), np.ones(2)),
+            )
+        )
     return float(np.sqrt((STRETCHES - 1) * np.var(tops)))
 
 

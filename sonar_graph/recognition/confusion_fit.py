@@ -88,7 +88,11 @@ class Accuracy(NamedTuple):
     def of(cls, model: Confusion) -> Accuracy:
         """Accuracy of a measured model."""
         usual_m = np.array([model.range_bound_m, model.across_bound_m])
-        return cls(usual_m, np.array([model.range_sigma_m, model.across_sigma_m]), model.bound_power)
+        return cls(
+            usual_m,
+            np.array([model.range_sigma_m, model.across_sigma_m]),
+            model.bound_power,
+        )
 
     def sigmas_m(self, bound_m: Floats) -> Floats:
         """Standard deviations at bounds, shape (..., 2)."""
@@ -116,26 +120,61 @@ class LabelledSightings:
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
         known, fit = label != NONE, sighting.fit
         place = sighting.bound_m, sighting.moved_m
-        if fit is None or place[0] is None or label == NO_LABEL or (known and label not in self.ids):
+        if (
+            fit is None
+            or place[0] is None
+            or label == NO_LABEL
+            or (known and label not in self.ids)
+        ):
             return
         error = np.nan, np.nan
         if known:
-            error = sighting.range_m - range_m[at], range_m[at] * (sighting.azimuth_rad - azimuth_rad[at])
+            error = (
+                sighting.range_m - range_m[at],
+                range_m[at] * (sighting.azimuth_rad - azimuth_rad[at]),
+            )
         row = self.ids.index(label) if known else len(self.ids)
-        self._rows.append((fit.evidence, *place, row, track, news, error, sighting.range_per_height, stamp_ns))
+        self._rows.append(
+            (
+                fit.evidence,
+                *place,
+                row,
+                track,
+                news,
+                error,
+                sighting.range_per_height,
+                stamp_ns,
+            )
+        )
 
     def add_frame(self, recogniser: Recogniser, run: Run, log: int) -> None:
         """Add what a recogniser saw in its last frame, of a log with truth; nothing at times that the truth lacks."""
         stamp_ns, truth = recogniser.stamp_ns, run.true_poses
         assert truth is not None
         assert run.true_landmarks is not None
-        if stamp_ns is None or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
+        if (
+            stamp_ns is None
+            or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]
+        ):
             return
         range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-        tracks = zip(recogniser.track_ids.tolist(), recogniser.news.tolist(), recogniser.sightings, strict=True)
+        tracks = zip(
+            recogniser.track_ids.tolist(),
+            recogniser.news.tolist(),
+            recogniser.sightings,
+            strict=True,
+        )
         for track, news, sighting in tracks:
             if sighting is not None:
-                self.add(sighting, stamp_ns, (log, track), news, run.true_landmarks.ids, range_m, azimuth_rad)
+                self.add(
+                    sighting,
+                    stamp_ns,
+                    (log, track),
+                    news,
+                    run.true_landmarks.ids,
+                    range_m,
+                    azimuth_rad,
+                )
 
     def extend(self, other: LabelledSightings) -> None:
         """Add all sightings of other logs, with the same designs."""
@@ -150,7 +189,9 @@ class LabelledSightings:
             np.array(bound, float).reshape(-1, 2),
             np.array(moved, float).reshape(-1, 2),
             np.array(label, np.int64),
-            np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
+            np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[
+                1
+            ].ravel(),
             np.array(news, float),
             np.array(error, float).reshape(-1, 2),
             np.array(rise, float),
@@ -158,9 +199,13 @@ class LabelledSightings:
         )
 
 
-def label_of(sighting: ObjectSighting, ids: Ints, range_m: Floats, azimuth_rad: Floats) -> tuple[int, int]:
+def label_of(
+    sighting: ObjectSighting, ids: Ints, range_m: Floats, azimuth_rad: Floats
+) -> tuple[int, int]:
     """Identity of the landmark that was seen, `NONE` or `NO_LABEL`, and its row."""
-    off = np.hypot(range_m - sighting.range_m, range_m * np.sin(azimuth_rad - sighting.azimuth_rad))
+    off = np.hypot(
+        range_m - sighting.range_m, range_m * np.sin(azimuth_rad - sighting.azimuth_rad)
+    )
     off = np.where(np.abs(azimuth_rad - sighting.azimuth_rad) < np.pi / 2, off, np.inf)
     at = int(np.argmin(off))
     if off[at] <= SAME_M:
@@ -176,7 +221,9 @@ def true_ranges_azimuths(run: Run, stamp_ns: int) -> tuple[Floats, Floats]:
     mounting = run.calibration.sonar.mounting.pose()
     world_R_body = pose.matrices[0]
     origin = pose.positions[0] + world_R_body @ mounting.translation()
-    q = (run.true_landmarks.positions - origin) @ (world_R_body @ mounting.rotation().matrix())
+    q = (run.true_landmarks.positions - origin) @ (
+        world_R_body @ mounting.rotation().matrix()
+    )
     return np.linalg.norm(q, axis=1), np.arctan2(q[:, 1], q[:, 0])
 
 
@@ -221,25 +268,36 @@ def calibrate(
             )
         in_log = run.true_landmarks.ids.tolist()
         if not set(gathered.ids) & set(in_log):
-            true, known = (", ".join(map(str, sorted(ids))) for ids in (in_log, gathered.ids))
+            true, known = (
+                ", ".join(map(str, sorted(ids))) for ids in (in_log, gathered.ids)
+            )
             raise CalibrationError(
                 f"{path}: its true landmarks are {true}, the designs are {known}: none can be measured; "
                 "give the designs of the log's landmarks with --designs (designs in Python)"
             )
         recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
-        for stamp_ns in session.run(read_sonar_frames(path, topic, config, salvage=salvage)):
+        for stamp_ns in session.run(
+            read_sonar_frames(path, topic, config, salvage=salvage)
+        ):
             if recogniser.stamp_ns == stamp_ns:
                 gathered.add_frame(recogniser, run, log)
         if not session.result.frames:
             raise LogError(no_images(path))
     names = spelt(", ".join(path.name for path, _ in logs))
-    kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
-    return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs)
+    kinds = "; ".join(
+        dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs)
+    )
+    return estimate_confusion(
+        gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs
+    )
 
 
 def estimate_confusion(
-    fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str], designs: Sequence[LandmarkDesign] = ()
+    fits: LabelledFits,
+    ids: tuple[int, ...],
+    provenance: dict[str, str],
+    designs: Sequence[LandmarkDesign] = (),
 ) -> Confusion:
     """Fit the model to labelled frames, all classes weighing the same, for designs with these ids in their order.
 
@@ -251,7 +309,11 @@ def estimate_confusion(
     counts = np.bincount(fits.label, minlength=len(ids) + 1)
     names = [*(f"landmark {i}" for i in ids), "no landmark"]
     is_known = counts >= LEAST_FRAMES
-    poor = [f"{name}: {count}" for name, count in zip(names, counts.tolist(), strict=True) if count < LEAST_FRAMES]
+    poor = [
+        f"{name}: {count}"
+        for name, count in zip(names, counts.tolist(), strict=True)
+        if count < LEAST_FRAMES
+    ]
     if not is_known[-1] or not is_known[:-1].any() or (poor and not designs):
         needed = f"{LEAST_FRAMES} of a landmark, and of what is none"
         raise CalibrationError(
@@ -266,7 +328,8 @@ def estimate_confusion(
     height_bias_m, error = without_height(fits)
     is_moved = fits.moved_m.any(axis=1) & np.isfinite(error).all(axis=1)
     is_left_out = is_moved & (is_moved.sum() < np.isfinite(error).all(axis=1).sum())
-    counted = np.where(is_left_out[:, None], np.nan, error)  # these err by what moved them, too
+    # these err by what moved them, too
+    counted = np.where(is_left_out[:, None], np.nan, error)
     found = accuracy(counted, fits.bound_m, fits.track, Accuracy.of(shipped))
     sigmas_m = np.hypot(found.sigmas_m(fits.bound_m), fits.moved_m)
     return Confusion(
@@ -283,17 +346,36 @@ def estimate_confusion(
         bound_power=found.power,
         height_bias_m=height_bias_m,
         roughness=roughness_of_tracks(fits, shipped.roughness),
-        report_interval_s=report_interval_s(error / sigmas_m, fits.track, fits.stamp_ns, shipped.report_interval_s),
+        report_interval_s=report_interval_s(
+            error / sigmas_m, fits.track, fits.stamp_ns, shipped.report_interval_s
+        ),
         provenance=provenance
-        | ({"confusion matrix": f"too few frames, so as without calibration: {', '.join(poor)}"} if poor else {})
-        | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
-        | {f"tracks of {n}": str(c) for n, c in zip(names, tracks_of(fits).tolist(), strict=True)},
+        | (
+            {
+                "confusion matrix": f"too few frames, so as without calibration: {', '.join(poor)}"
+            }
+            if poor
+            else {}
+        )
+        | {
+            f"frames of {n}": str(c)
+            for n, c in zip(names, counts.tolist(), strict=True)
+        }
+        | {
+            f"tracks of {n}": str(c)
+            for n, c in zip(names, tracks_of(fits).tolist(), strict=True)
+        },
     )
 
 
 def tracks_of(fits: LabelledFits) -> Ints:
     """Number of tracks of each class."""
-    return np.array([len(np.unique(fits.track[fits.label == k])) for k in range(fits.evidence.shape[1] + 1)])
+    return np.array(
+        [
+            len(np.unique(fits.track[fits.label == k]))
+            for k in range(fits.evidence.shape[1] + 1)
+        ]
+    )
 
 
 def trials_of(fits: LabelledFits) -> Ints:
@@ -302,7 +384,9 @@ def trials_of(fits: LabelledFits) -> Ints:
     return np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
 
 
-def roughness_of_tracks(fits: LabelledFits, before: tuple[float, float] | None = None) -> tuple[float, float]:
+def roughness_of_tracks(
+    fits: LabelledFits, before: tuple[float, float] | None = None
+) -> tuple[float, float]:
     """`Confusion.roughness`: the range of all but one in twenty tracks; of fewer than forty the given one is in it."""
     beyond = fits.evidence[:, :, EVIDENCE.index("beyond")].mean(axis=1)
     means = [beyond[fits.track == track].mean() for track in np.unique(fits.track)]
@@ -323,7 +407,9 @@ def without_height(fits: LabelledFits) -> tuple[float, Floats]:
     if not known.any():
         return 0.0, error
     once = 1.0 / np.bincount(fits.track)[fits.track]
-    bias_m = -float(np.sum((once * rise * error[:, 0])[known]) / np.sum((once * rise**2)[known]))
+    bias_m = -float(
+        np.sum((once * rise * error[:, 0])[known]) / np.sum((once * rise**2)[known])
+    )
     error[:, 0] += bias_m * rise
     return bias_m, error
 
@@ -343,27 +429,41 @@ def accuracy(
     count as ``1 / (2 PRIOR_SHARE^2)`` further ones, from which a sigma is known to `PRIOR_SHARE` of itself.
     """
     known = np.isfinite(error).all(axis=1) & np.isfinite(bound).all(axis=1)
-    error, bound, (_, track) = error[known], bound[known], np.unique(track_of[known], return_inverse=True)
+    error, bound, (_, track) = (
+        error[known],
+        bound[known],
+        np.unique(track_of[known], return_inverse=True),
+    )
     once, tracks = 1.0 / np.bincount(track)[track], int(track.max()) + 1
     usual = np.exp(np.average(np.log(bound), axis=0, weights=once))
     growth, tiny = np.log(bound / usual), np.finfo(float).tiny
 
     def variances(power: float) -> Floats:
-        return np.asarray(np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once))
+        return np.asarray(
+            np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once)
+        )
 
     def loss(power: float) -> float:
         off = (power - prior.power) / (PRIOR_SHARE * prior.power) if prior else 0.0
-        return float(0.5 * off**2 + 0.5 * tracks * np.log(np.maximum(variances(power), tiny)).sum())
+        return float(
+            0.5 * off**2
+            + 0.5 * tracks * np.log(np.maximum(variances(power), tiny)).sum()
+        )
 
     power = float(minimize_scalar(loss, bounds=powers, method="bounded").x)
     squares, samples = tracks * variances(power), np.array([tracks - 1.0, tracks])
     if prior:
         before = 1 / (2 * PRIOR_SHARE**2)
-        squares, samples = squares + before * prior.sigmas_m(usual) ** 2, samples + before
+        squares, samples = (
+            squares + before * prior.sigmas_m(usual) ** 2,
+            samples + before,
+        )
     return Accuracy(usual, np.sqrt(squares / np.maximum(samples, 1.0)), power)
 
 
-def report_interval_s(error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: float) -> float:
+def report_interval_s(
+    error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: float
+) -> float:
     """Time in which a track tells as much of a place as one independent frame (`Confusion.report_interval_s`).
 
     Of errors in sigmas. The mean of a track has the variance c, the mean product of the errors of different frames; 1 /
@@ -373,11 +473,17 @@ def report_interval_s(error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: fl
     known = np.isfinite(error).all(axis=1)
     seconds, tracks = prior_s / PRIOR_SHARE**2, 1 / PRIOR_SHARE**2
     for track in np.unique(track_of[known]):
-        own, stamps = error[known & (track_of == track)], stamp_ns[known & (track_of == track)]
+        own, stamps = (
+            error[known & (track_of == track)],
+            stamp_ns[known & (track_of == track)],
+        )
         n = len(own)
         if n > 1:
             common = (own.sum(axis=0) ** 2 - (own**2).sum(axis=0)) / (n * (n - 1))
-            seconds, tracks = seconds + float(common.mean() * np.ptp(stamps) * 1e-9), tracks + 1
+            seconds, tracks = (
+                seconds + float(common.mean() * np.ptp(stamps) * 1e-9),
+                tracks + 1,
+            )
     return max(seconds / tracks, 0.0)
 
 
@@ -391,7 +497,9 @@ def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:
     return posterior_mean_rows(means, trials)
 
 
-def fit_weights(fits: LabelledFits, prior: Floats, prior_looks: float) -> tuple[Floats, float]:
+def fit_weights(
+    fits: LabelledFits, prior: Floats, prior_looks: float
+) -> tuple[Floats, float]:
     """Weights of the evidence and number of looks with which the posteriors of tracks fit their classes.
 
     Conditional logit (McFadden 1974) of whole tracks. Landmarks and none of them begin with the prior of a recogniser,
@@ -404,13 +512,21 @@ def fit_weights(fits: LabelledFits, prior: Floats, prior_looks: float) -> tuple[
     scale = PRIOR_SHARE * np.abs(prior)
 
     def loss(unbounded: Floats) -> float:
-        weights, looks = prior + scale * unbounded[:-1], prior_looks * np.exp(PRIOR_SHARE * unbounded[-1])
+        weights, looks = (
+            prior + scale * unbounded[:-1],
+            prior_looks * np.exp(PRIOR_SHARE * unbounded[-1]),
+        )
         odds = np.pad(sums @ weights, ((0, 0), (0, 1))) / (counted + looks)[:, None]
         log_posterior = log_softmax(odds + log_birth, axis=1)
-        return float(0.5 * unbounded @ unbounded - share @ log_posterior[np.arange(len(label)), label])
+        return float(
+            0.5 * unbounded @ unbounded
+            - share @ log_posterior[np.arange(len(label)), label]
+        )
 
     best = minimize(loss, np.zeros(len(prior) + 1), method="L-BFGS-B").x
-    return prior + scale * best[:-1], float(prior_looks * np.exp(PRIOR_SHARE * best[-1]))
+    return prior + scale * best[:-1], float(
+        prior_looks * np.exp(PRIOR_SHARE * best[-1])
+    )
 
 
 def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
@@ -420,7 +536,9 @@ def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
     """
     sums, counted, label = [], [], []
     for track, k in np.unique(np.stack([fits.track, fits.label]), axis=1).T.tolist():
-        rows = np.flatnonzero((fits.track == track) & (fits.label == k) & (fits.news > 0))
+        rows = np.flatnonzero(
+            (fits.track == track) & (fits.label == k) & (fits.news > 0)
+        )
         if len(rows):
             sums.append(np.einsum("n,nke->ke", fits.news[rows], fits.evidence[rows]))
             counted.append(fits.news[rows].sum())
@@ -428,5 +546,9 @@ def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
     labels = np.array(label)
     of_none = labels == fits.evidence.shape[1]
     unknown = IdentityParams().unknown_prior
-    shares = np.where(of_none, unknown / max(of_none.sum(), 1), (1 - unknown) / max((~of_none).sum(), 1)) * len(labels)
+    shares = np.where(
+        of_none,
+        unknown / max(of_none.sum(), 1),
+        (1 - unknown) / max((~of_none).sum(), 1),
+    ) * len(labels)
     return np.array(sums), np.array(counted), labels, shares

@@ -68,7 +68,12 @@ class FloorPicture:
     """Raster of the floor, or of the image's plane, for frames of one sonar with some beams and bins."""
 
     def __init__(self, ranges_m: Floats, azimuths_rad: Floats, view: FloorView) -> None:
-        seen = view.floor_points(*(grid.ravel() for grid in np.meshgrid(ranges_m, azimuths_rad))) @ view.level_R_sonar.T
+        seen = (
+            view.floor_points(
+                *(grid.ravel() for grid in np.meshgrid(ranges_m, azimuths_rad))
+            )
+            @ view.level_R_sonar.T
+        )
         if np.isnan(seen).all():
             raise CalibrationError(
                 f"the sonar is {view.height_m:.4g} m above the floor and sees nothing of it up to its range of "
@@ -79,51 +84,89 @@ class FloorPicture:
         self.corner_m = low
         """Level (x, y) of the first pixel."""
         x, y = (np.arange(a, b, self.pixel_m) for a, b in zip(low, high, strict=True))
-        q = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), -view.height_m)], axis=-1)
+        q = np.stack(
+            [
+                *np.meshgrid(x, y, indexing="ij"),
+                np.full((len(x), len(y)), -view.height_m),
+            ],
+            axis=-1,
+        )
         q = q @ view.level_R_sonar
         order = np.argsort(azimuths_rad)
         azimuth, beams = np.arctan2(q[..., 1], q[..., 0]), order.astype(float)
-        self._beam = np.interp(azimuth, azimuths_rad[order], beams, -1, -1).astype(np.float32)
+        self._beam = np.interp(azimuth, azimuths_rad[order], beams, -1, -1).astype(
+            np.float32
+        )
         bins = (np.linalg.norm(q, axis=-1) - ranges_m[0]) / (ranges_m[1] - ranges_m[0])
         self._bin = bins.astype(np.float32)
-        self.seen = (self._beam >= 0) & (self._bin >= 0) & (self._bin <= len(ranges_m) - 1)
+        self.seen = (
+            (self._beam >= 0) & (self._bin >= 0) & (self._bin <= len(ranges_m) - 1)
+        )
         """Pixels in the image, shape (height, width): x by y."""
-        self._share = np.maximum(_blurred(self.seen.astype(np.float32)), np.float32(1e-3))
+        self._share = np.maximum(
+            _blurred(self.seen.astype(np.float32)), np.float32(1e-3)
+        )
         rows, columns = np.meshgrid(x, y, indexing="ij")
         self._xy = np.stack([rows, columns])
 
     def of(self, image_db: Picture) -> Picture:
         """Picture of a frame of levels, shape (beams, bins)."""
         levels = image_db - np.median(image_db, axis=0, keepdims=True)
-        levels = np.clip(levels - np.median(levels, axis=1, keepdims=True), LOWEST_DB, HIGHEST_DB)
-        picture = cv2.remap(levels.astype(np.float32), self._bin, self._beam, cv2.INTER_LINEAR)
-        return np.where(self.seen, _blurred(np.where(self.seen, picture, 0)) / self._share, 0).astype(np.float32)
+        levels = np.clip(
+            levels - np.median(levels, axis=1, keepdims=True), LOWEST_DB, HIGHEST_DB
+        )
+        picture = cv2.remap(
+            levels.astype(np.float32), self._bin, self._beam, cv2.INTER_LINEAR
+        )
+        return np.where(
+            self.seen, _blurred(np.where(self.seen, picture, 0)) / self._share, 0
+        ).astype(np.float32)
 
-    def motion(self, before: Picture, now: Picture, guess: Floats) -> tuple[Floats, Floats] | None:
+    def motion(
+        self, before: Picture, now: Picture, guess: Floats
+    ) -> tuple[Floats, Floats] | None:
         """Motion (yaw, x, y) between two pictures and its covariance; None where they do not agree."""
         mask = self.seen.astype(np.uint8)
-        ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, MOST_ROUNDS, LEAST_CHANGE)
+        ends = (
+            cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
+            MOST_ROUNDS,
+            LEAST_CHANGE,
+        )
         best, correlation = None, LEAST_CORRELATION
         for start in (guess, np.zeros(3)):
             try:
                 rho, warp = cv2.findTransformECC(
-                    before, now, self._warp(start), cv2.MOTION_EUCLIDEAN, ends, mask, gaussFiltSize=1
+                    before,
+                    now,
+                    self._warp(start),
+                    cv2.MOTION_EUCLIDEAN,
+                    ends,
+                    mask,
+                    gaussFiltSize=1,
                 )
-            except cv2.error:  # it did not converge, or there is nothing in the pictures
+            except (
+                cv2.error
+            ):  # it did not converge, or there is nothing in the pictures
                 continue
             if rho > correlation:
                 best, correlation = self._motion(np.asarray(warp, float)), float(rho)
         if best is None:
             return None
-        information = self._information(now) / (4 * math.pi * BLUR_PIXELS**2 * (1 / min(correlation, 0.999) ** 2 - 1))
+        information = self._information(now) / (
+            4 * math.pi * BLUR_PIXELS**2 * (1 / min(correlation, 0.999) ** 2 - 1)
+        )
         if np.linalg.cond(information) > 1e12:
             return None
         return best, np.asarray(np.linalg.inv(information))
 
     def _information(self, picture: Picture) -> Floats:
         """Sum of J^T J over the pixels of a picture scaled to variance 1, shape (3, 3)."""
-        by_x, by_y = np.gradient(picture / max(float(picture[self.seen].std()), 1e-6), self.pixel_m)
-        inner = cv2.erode(self.seen.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+        by_x, by_y = np.gradient(
+            picture / max(float(picture[self.seen].std()), 1e-6), self.pixel_m
+        )
+        inner = cv2.erode(self.seen.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(
+            bool
+        )
         x, y = self._xy
         J = np.stack([by_y * x - by_x * y, by_x, by_y], axis=-1)[inner]
         return np.asarray(J.T @ J, float)
@@ -134,7 +177,9 @@ class FloorPicture:
         c, s = math.cos(yaw), math.sin(yaw)
         R = np.array([[c, -s], [s, c]]).T
         shift = (R @ (self.corner_m - place) - self.corner_m) / self.pixel_m
-        return np.ascontiguousarray(np.column_stack([R[::-1, ::-1], shift[::-1]]), np.float32)
+        return np.ascontiguousarray(
+            np.column_stack([R[::-1, ::-1], shift[::-1]]), np.float32
+        )
 
     def _motion(self, warp: Floats) -> Floats:
         R, shift = warp[::-1, 1::-1], warp[::-1, 2]
@@ -162,7 +207,9 @@ class ImageMotions:
         self.view: FloorView | None = None
         """Height and tilt, which are taken to stay; None: not stated."""
         if calibration.floor is not None and "start" in calibration.model_fields_set:
-            world_T_sonar = calibration.start.pose().compose(calibration.sonar.mounting.pose())
+            world_T_sonar = calibration.start.pose().compose(
+                calibration.sonar.mounting.pose()
+            )
             if world_T_sonar.z() > calibration.floor.z_m:
                 self.view = FloorView.from_pose(world_T_sonar, calibration.floor.z_m)
         self._floor: tuple[SonarFrames, FloorPicture] | None = None
@@ -192,9 +239,16 @@ class ImageMotions:
         frame = with_lens(frame, self._calibration.sonar.lens)
         if self._floor is None or not is_alike(self._floor[0], frame):
             view = self.view or SLANT_PLANE
-            self._floor, self._before = (frame, FloorPicture(frame.ranges_m, frame.azimuths_rad, view)), None
+            self._floor, self._before = (
+                (frame, FloorPicture(frame.ranges_m, frame.azimuths_rad, view)),
+                None,
+            )
         raster = self._floor[1]
-        picture = raster.of(decibels(np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image))
+        picture = raster.of(
+            decibels(
+                np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image
+            )
+        )
         before, self._before = self._before, (stamp_ns, picture)
         if before is None or stamp_ns <= before[0]:
             return None
@@ -209,7 +263,9 @@ class ImageMotions:
             self._last = motion / seconds
         else:
             motion = self._last * min(seconds, LONGEST_STEP_NS * 1e-9)
-            covariance = np.diag(np.square(seconds * np.array([UNKNOWN_RAD_S, UNKNOWN_M_S, UNKNOWN_M_S])))
+            covariance = np.diag(
+                np.square(seconds * np.array([UNKNOWN_RAD_S, UNKNOWN_M_S, UNKNOWN_M_S]))
+            )
         self.steps, self.measured = self.steps + 1, self.measured + is_measured
         self.step = PlanarStep(before[0], stamp_ns, motion, covariance, is_measured)
         return self.step
@@ -217,12 +273,16 @@ class ImageMotions:
     def at(self, stamp_ns: int) -> tuple[SonarStep | None, FloorView | None]:
         """Motion to the frame that was looked at last, and view of the floor, if height and tilt are stated."""
         assert stamp_ns == self._stamp_ns
-        return (SonarStep.none() if self.step is None else self._sonar_step(self.step)), self.view
+        return (
+            SonarStep.none() if self.step is None else self._sonar_step(self.step)
+        ), self.view
 
     def _sonar_step(self, step: PlanarStep) -> SonarStep:
         """Step in the sonar's axes, with what a plane does not show."""
         yaw, x, y = step.motion.tolist()
-        level_T_sonar = gtsam.Pose3(gtsam.Rot3((self.view or SLANT_PLANE).level_R_sonar), np.zeros(3))
+        level_T_sonar = gtsam.Pose3(
+            gtsam.Rot3((self.view or SLANT_PLANE).level_R_sonar), np.zeros(3)
+        )
         planar = gtsam.Pose3(gtsam.Rot3.Rz(yaw), np.array([x, y, 0.0]))
         turn, place = (step.duration_s * sigma for sigma in (UNSEEN_RAD_S, UNSEEN_M_S))
         covariance = np.diag(np.square([turn, turn, 0.0, 0.0, 0.0, place]))
@@ -238,7 +298,9 @@ class ImageMotions:
         """What the motion is from, for the notes of a log."""
         if self._is_fixed:
             return {"detections.motion": "none: the sonar is taken to be at rest"}
-        return {"detections.motion": f"from the images: {self.measured} of {self.steps} steps measured"}
+        return {
+            "detections.motion": f"from the images: {self.measured} of {self.steps} steps measured"
+        }
 
 
 def is_alike(one: SonarFrames, other: SonarFrames) -> bool:

@@ -44,7 +44,10 @@ class ShownFrame:
     def range_azimuth(self, column: float, row: float) -> tuple[float, float] | None:
         """Range and azimuth of a pixel; None outside of the fan."""
         height, width = self.fan.beam.shape
-        if not (0 <= column < width and 0 <= row < height) or self.fan.beam[int(row), int(column)] < 0:
+        if (
+            not (0 <= column < width and 0 <= row < height)
+            or self.fan.beam[int(row), int(column)] < 0
+        ):
             return None
         ahead = self.fan.lowest_m + (height - row) / self.fan.pixels_per_m
         across = self.fan.half_width_m - column / self.fan.pixels_per_m
@@ -52,12 +55,17 @@ class ShownFrame:
 
 
 def shown_frames(
-    blocks: Iterable[SonarFrames], sonar: SonarCalibration, period_ns: int, progress: Callable[[int], None]
+    blocks: Iterable[SonarFrames],
+    sonar: SonarCalibration,
+    period_ns: int,
+    progress: Callable[[int], None],
 ) -> list[ShownFrame]:
     """Pictures of frames, at least a period apart and at most `MOST_FRAMES`, evenly over the log."""
     shown: list[ShownFrame] = []
     fan: tuple[SonarFrames, Fan] | None = None
-    for frame in (frame for block in blocks for frame in one_by_one(with_lens(block, sonar.lens))):
+    for frame in (
+        frame for block in blocks for frame in one_by_one(with_lens(block, sonar.lens))
+    ):
         stamp_ns = int(frame.stamps_ns[0])
         if shown and stamp_ns - shown[-1].stamp_ns < period_ns:
             continue
@@ -75,7 +83,9 @@ def shown_frames(
 class LabelDesk:
     """Frames, and the labels given so far, which are written to their file after every change."""
 
-    def __init__(self, frames: Sequence[ShownFrame], labels: Labels, path: Path) -> None:
+    def __init__(
+        self, frames: Sequence[ShownFrame], labels: Labels, path: Path
+    ) -> None:
         self.frames = frames
         self._labels, self._path, self._lock = labels, path, Lock()
 
@@ -90,26 +100,48 @@ class LabelDesk:
         by_stamp = {frame.stamp_ns: number for number, frame in enumerate(self.frames)}
         for label in self.labels:
             if (number := by_stamp.get(label.stamp_ns)) is not None:
-                column, row = self.frames[number].fan.pixel(label.range_m, label.azimuth_rad)
+                column, row = self.frames[number].fan.pixel(
+                    label.range_m, label.azimuth_rad
+                )
                 rows[number].append({"column": column, "row": row, "id": label.id})
         ids = [label.id for label in self.labels]
-        return {"frames": rows, "counts": {str(key): ids.count(key) for key in set(ids)}, "total": len(ids)}
+        return {
+            "frames": rows,
+            "counts": {str(key): ids.count(key) for key in set(ids)},
+            "total": len(ids),
+        }
 
-    def add(self, frame: int, column: float, row: float, landmark: int | None) -> str | None:
+    def add(
+        self, frame: int, column: float, row: float, landmark: int | None
+    ) -> str | None:
         """Give a label to a pixel, instead of one that is of the same object; the reason where that cannot be."""
         place = self.frames[frame].range_azimuth(column, row)
         if place is None:
             return "outside of the image"
-        label = Label(stamp_ns=self.frames[frame].stamp_ns, range_m=place[0], azimuth_rad=place[1], id=landmark)
+        label = Label(
+            stamp_ns=self.frames[frame].stamp_ns,
+            range_m=place[0],
+            azimuth_rad=place[1],
+            id=landmark,
+        )
         with self._lock:
-            self._write((*(one for one in self.labels if not is_of_one_object(one, label)), label))
+            self._write(
+                (
+                    *(one for one in self.labels if not is_of_one_object(one, label)),
+                    label,
+                )
+            )
         return None
 
     def take_back(self, frame: int) -> str | None:
         """Remove the last label of a frame; the reason where there is none."""
         with self._lock:
             stamp_ns = self.frames[frame].stamp_ns
-            rows = [row for row, label in enumerate(self.labels) if label.stamp_ns == stamp_ns]
+            rows = [
+                row
+                for row, label in enumerate(self.labels)
+                if label.stamp_ns == stamp_ns
+            ]
             if not rows:
                 return "no label in this frame"
             self._write((*self.labels[: rows[-1]], *self.labels[rows[-1] + 1 :]))
@@ -126,7 +158,13 @@ class LabelServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, desk: LabelDesk, page: Callable[[str], str], ids: Sequence[int], port: int = 0) -> None:
+    def __init__(
+        self,
+        desk: LabelDesk,
+        page: Callable[[str], str],
+        ids: Sequence[int],
+        port: int = 0,
+    ) -> None:
         self.desk, self.ids, self._page = desk, frozenset(ids), page
         self.word = secrets.token_urlsafe(16)
         super().__init__((HOST, port), _LabelRequest)
@@ -165,10 +203,15 @@ class _LabelRequest(BaseHTTPRequestHandler):
                 "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; "
                 f"script-src 'nonce-{nonce}'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
             )
-            self._send(self.server.page(nonce).encode(), "text/html; charset=utf-8", policy)
+            self._send(
+                self.server.page(nonce).encode(), "text/html; charset=utf-8", policy
+            )
         elif asked == "state":
             self._send_json(self.server.desk.state())
-        elif asked is not None and (number := self._frame_of(asked.removeprefix("frame/"))) is not None:
+        elif (
+            asked is not None
+            and (number := self._frame_of(asked.removeprefix("frame/"))) is not None
+        ):
             self._send(self.server.desk.frames[number].jpeg, "image/jpeg")
         else:
             self._refuse(HTTPStatus.NOT_FOUND)
@@ -183,9 +226,17 @@ class _LabelRequest(BaseHTTPRequestHandler):
         elif asked == "take-back":
             self._answer(partial(desk.take_back, number))
         else:
-            column, row, landmark = (content.get(name) for name in ("column", "row", "id"))
-            is_known = landmark is None or (isinstance(landmark, int) and landmark in self.server.ids)
-            if not (isinstance(column, int | float) and isinstance(row, int | float) and is_known):
+            column, row, landmark = (
+                content.get(name) for name in ("column", "row", "id")
+            )
+            is_known = landmark is None or (
+                isinstance(landmark, int) and landmark in self.server.ids
+            )
+            if not (
+                isinstance(column, int | float)
+                and isinstance(row, int | float)
+                and is_known
+            ):
                 self._refuse(HTTPStatus.BAD_REQUEST)
                 return
             self._answer(partial(desk.add, number, float(column), float(row), landmark))
@@ -193,16 +244,26 @@ class _LabelRequest(BaseHTTPRequestHandler):
     def _answer(self, change: Callable[[], str | None]) -> None:
         try:
             fault = change()
-        except Exception as error:  # such as a full disk: the page says so, and nothing is lost
+        except (
+            Exception
+        ) as error:  # such as a full disk: the page says so, and nothing is lost
             fault = f"not saved: {error}"
         self._send_json(self.server.desk.state() | {"fault": fault})
 
     def _asked(self) -> str | None:
         """Path after the word; None where the word or the host is another."""
-        if self.headers.get("Host") not in (self.server.host, f"localhost:{self.server.server_port}"):
+        if self.headers.get("Host") not in (
+            self.server.host,
+            f"localhost:{self.server.server_port}",
+        ):
             return None
         word, slash, rest = self.path.removeprefix("/").partition("/")
-        return rest if slash and secrets.compare_digest(word.encode(), self.server.word.encode()) else None
+        return (
+            rest
+            if slash
+            and secrets.compare_digest(word.encode(), self.server.word.encode())
+            else None
+        )
 
     def _content(self) -> dict[str, Any] | None:
         """JSON object of a request; None where it is none, is too long, or comes from another page."""
@@ -232,7 +293,11 @@ class _LabelRequest(BaseHTTPRequestHandler):
         self._send(json.dumps(content).encode(), "application/json")
 
     def _send(
-        self, body: bytes, kind: str, policy: str = "default-src 'none'", status: HTTPStatus = HTTPStatus.OK
+        self,
+        body: bytes,
+        kind: str,
+        policy: str = "default-src 'none'",
+        status: HTTPStatus = HTTPStatus.OK,
     ) -> None:
         self.send_response(status)
         headers = {

@@ -40,7 +40,13 @@ from sonar_graph.recognition.image_motion import MotionFrom
 from sonar_graph.recognition.session import RecognitionSession
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.settings import parse
-from sonar_graph.sonar import SLANT_PLANE, Confusion, ObjectSighting, Recogniser, RecogniserParams
+from sonar_graph.sonar import (
+    SLANT_PLANE,
+    Confusion,
+    ObjectSighting,
+    Recogniser,
+    RecogniserParams,
+)
 
 COLUMNS = ("stamp_ns", "range_m", "azimuth_rad", "id")
 NEAR_M = 0.2
@@ -49,9 +55,18 @@ CLICK_SIGMA_M = 0.01
 """Standard deviation of a label along each axis, where labels do not tell it."""
 MOST_ROWS = 8
 """Rows of labels that a message lists."""
-OUTSIDE, NO_FRAME, UNUSED = "outside of the image", "no such frame", "of a frame that was not used"
-IN_DEGREES = "outside of the image, but not if the azimuth is in degrees; expected radians"
-NO_TRACK, CONTRADICTED = "no track there", "contradicts other labels of its track, so left out"
+OUTSIDE, NO_FRAME, UNUSED = (
+    "outside of the image",
+    "no such frame",
+    "of a frame that was not used",
+)
+IN_DEGREES = (
+    "outside of the image, but not if the azimuth is in degrees; expected radians"
+)
+NO_TRACK, CONTRADICTED = (
+    "no track there",
+    "contradicts other labels of its track, so left out",
+)
 """Why labels tell nothing."""
 NOWHERE = np.array([-1]), np.array([1e9]), np.array([0.0])
 """True landmarks around what is none: one that is far away."""
@@ -103,8 +118,11 @@ def read_labels(path: Path, log: Path) -> Labels:
     [1, None]
     """
     try:
-        text = text_of(path, "utf-8-sig")  # spreadsheets begin their CSV with a byte-order mark
-        content = _from_csv(text, log) if path.suffix.lower() == ".csv" else json.loads(text)
+        # spreadsheets begin their CSV with a byte-order mark
+        text = text_of(path, "utf-8-sig")
+        content = (
+            _from_csv(text, log) if path.suffix.lower() == ".csv" else json.loads(text)
+        )
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
@@ -114,7 +132,11 @@ def read_labels(path: Path, log: Path) -> Labels:
     try:
         labels = parse(Labels, content, str(path))
     except CalibrationError as error:
-        hint = "; angles are in rad, and these seem to be in degrees" if "azimuth_rad: expected" in str(error) else ""
+        hint = (
+            "; angles are in rad, and these seem to be in degrees"
+            if "azimuth_rad: expected" in str(error)
+            else ""
+        )
         raise CalibrationError(f"{error}{hint}") from error
     if labels.log != spelt(log.name):
         raise CalibrationError(
@@ -129,7 +151,8 @@ def _from_csv(text: str, log: Path) -> dict[str, object]:
     if missing := set(COLUMNS) - set(rows.fieldnames or ()):
         raise ValueError(f"no column {', '.join(sorted(missing))}")
     labels = [
-        {name: (row[name] or "").strip() for name in COLUMNS[:3]} | {"id": (row["id"] or "").strip() or None}
+        {name: (row[name] or "").strip() for name in COLUMNS[:3]}
+        | {"id": (row["id"] or "").strip() or None}
         for row in rows
     ]
     return {"log": spelt(log.name), "labels": labels}
@@ -139,7 +162,9 @@ def _from_csv(text: str, log: Path) -> dict[str, object]:
 class LabelledTrack:
     """Sightings of a track with the sonar's pose at each, and the labels that it met, all in one frame at rest."""
 
-    sightings: list[tuple[int, gtsam.Pose3, ObjectSighting, float]] = field(default_factory=list)
+    sightings: list[tuple[int, gtsam.Pose3, ObjectSighting, float]] = field(
+        default_factory=list
+    )
     """Each after its stamp and the pose of the sonar, with the independent share of the frame."""
     seen: list[Floats] = field(default_factory=list)
     """Places of the sightings."""
@@ -158,12 +183,29 @@ class LabelledTrack:
         said_at: dict[int, set[int | None]] = defaultdict(set)
         for _, label in self.labels:
             said_at[label.stamp_ns].add(label.id)
-        sound = [label.id for _, label in self.labels if len(said_at[label.stamp_ns]) == 1]
-        most = [landmark for landmark, count in Counter(sound).items() if 2 * count > len(sound)]
-        kept = [label.id in most and len(said_at[label.stamp_ns]) == 1 for _, label in self.labels]
-        dropped = [row for (row, _), is_kept in zip(self.labels, kept, strict=True) if not is_kept]
-        self.labelled = [place for place, is_kept in zip(self.labelled, kept, strict=True) if is_kept]
-        self.labels = [label for label, is_kept in zip(self.labels, kept, strict=True) if is_kept]
+        sound = [
+            label.id for _, label in self.labels if len(said_at[label.stamp_ns]) == 1
+        ]
+        most = [
+            landmark
+            for landmark, count in Counter(sound).items()
+            if 2 * count > len(sound)
+        ]
+        kept = [
+            label.id in most and len(said_at[label.stamp_ns]) == 1
+            for _, label in self.labels
+        ]
+        dropped = [
+            row
+            for (row, _), is_kept in zip(self.labels, kept, strict=True)
+            if not is_kept
+        ]
+        self.labelled = [
+            place for place, is_kept in zip(self.labelled, kept, strict=True) if is_kept
+        ]
+        self.labels = [
+            label for label, is_kept in zip(self.labels, kept, strict=True) if is_kept
+        ]
         return dropped
 
     def off(self) -> Floats:
@@ -192,7 +234,10 @@ def trusted_share(tracks: Sequence[LabelledTrack]) -> float:
     several = [track for track in tracks if len(track.labelled) > 1]
     spread2 = 2 * CLICK_SIGMA_M**2
     if several:
-        squares = sum(float(np.sum(np.var(track.labelled, axis=0))) * len(track.labelled) for track in several)
+        squares = sum(
+            float(np.sum(np.var(track.labelled, axis=0))) * len(track.labelled)
+            for track in several
+        )
         spread2 = squares / sum(len(track.labelled) - 1 for track in several)
     of_means = float(np.mean([spread2 / len(track.labelled) for track in tracks]))
     measured = float(np.mean([np.sum(track.off() ** 2) for track in tracks]))
@@ -221,30 +266,45 @@ def calibrate_by_labels(
     """
     designs = tuple(designs or DEFAULT_DESIGNS)
     gathered = LabelledSightings(tuple(design.id for design in designs))
-    provenance = {"logs": spelt(", ".join(one.path.name for one in logs)), "what they are": "labels"}
+    provenance = {
+        "logs": spelt(", ".join(one.path.name for one in logs)),
+        "what they are": "labels",
+    }
     for log, one in enumerate(logs, 1):
-        if unknown := {label.id for label in one.labels.labels if label.id is not None} - set(gathered.ids):
+        if unknown := {
+            label.id for label in one.labels.labels if label.id is not None
+        } - set(gathered.ids):
             raise CalibrationError(
                 f"{one.file}: its labels name landmark {', '.join(map(str, sorted(unknown)))}, the designs are "
                 f"{', '.join(map(str, gathered.ids))}; give the designs of the labels with --designs"
             )
         recogniser = Recogniser(one.run.calibration, designs, params)
-        tracks, unmet = _labelled_tracks(one, recogniser, read_sonar_frames(one.path, topic, config, salvage=salvage))
+        tracks, unmet = _labelled_tracks(
+            one, recogniser, read_sonar_frames(one.path, topic, config, salvage=salvage)
+        )
         given = len(one.labels.labels)
         if given and len(unmet[NO_FRAME]) == given:
             raise CalibrationError(
                 f"{one.file}: no frame of {one.path.name} has the stamp of any label; are these labels of another log?"
             )
-        provenance[f"labels {log}"] = f"{spelt(one.file.name)}: {what_labels_met(given, unmet)}"
+        provenance[f"labels {log}"] = (
+            f"{spelt(one.file.name)}: {what_labels_met(given, unmet)}"
+        )
         # those that nobody labelled tell nothing
-        sure = {number: track for number, track in tracks.items() if len(track.ids) == 1}
+        sure = {
+            number: track for number, track in tracks.items() if len(track.ids) == 1
+        }
         known = [track for track in sure.values() if track.ids != {None}]
         share = trusted_share(known) if known else 0.0
         for number, track in sure.items():
             (landmark,) = track.ids
             place = track.middle() + share * track.off()
             for stamp_ns, world_T_sonar, sighting, news in track.sightings:
-                truth = NOWHERE if landmark is None else _seen_from(world_T_sonar, place, landmark)
+                truth = (
+                    NOWHERE
+                    if landmark is None
+                    else _seen_from(world_T_sonar, place, landmark)
+                )
                 gathered.add(sighting, stamp_ns, (log, number), news, *truth)
     try:
         return estimate_confusion(gathered.fits(), gathered.ids, provenance, designs)
@@ -272,7 +332,13 @@ def _labelled_tracks(
 ) -> tuple[dict[int, LabelledTrack], dict[str, list[int]]]:
     """Tracks by number, with the labels that they met, and the rows (from 1) of labels that tell nothing, by reason."""
     used: deque[SonarFrames] = deque(maxlen=1)
-    session = RecognitionSession(log.run, recogniser=recogniser, pictures=False, motion=log.motion, seen=used.append)
+    session = RecognitionSession(
+        log.run,
+        recogniser=recogniser,
+        pictures=False,
+        motion=log.motion,
+        seen=used.append,
+    )
     tracks: dict[int, LabelledTrack] = defaultdict(LabelledTrack)
     unmet: dict[str, list[int]] = defaultdict(list)
     by_stamp: dict[int, list[tuple[int, Label]]] = defaultdict(list)
@@ -283,42 +349,71 @@ def _labelled_tracks(
             unmet[UNUSED] += [row for row, _ in by_stamp.pop(stamp_ns, [])]
             continue
         seen: dict[int, ObjectSighting] = {}
-        rows = zip(recogniser.track_ids.tolist(), recogniser.sightings, recogniser.news.tolist(), strict=True)
+        rows = zip(
+            recogniser.track_ids.tolist(),
+            recogniser.sightings,
+            recogniser.news.tolist(),
+            strict=True,
+        )
         for number, sighting, news in rows:
             if sighting is None:
                 continue
             seen[number] = sighting
-            tracks[number].sightings.append((stamp_ns, session.start_T_sonar, sighting, news))
-            tracks[number].seen.append(place_of(sighting.range_m, sighting.azimuth_rad, session))
+            tracks[number].sightings.append(
+                (stamp_ns, session.start_T_sonar, sighting, news)
+            )
+            tracks[number].seen.append(
+                place_of(sighting.range_m, sighting.azimuth_rad, session)
+            )
         for row, label in by_stamp.pop(stamp_ns, []):
-            away = {number: _distance(sighting, label) for number, sighting in seen.items()}
+            away = {
+                number: _distance(sighting, label) for number, sighting in seen.items()
+            }
             nearest = min(away, key=lambda number: away[number], default=None)
             if nearest is not None and away[nearest] <= NEAR_M:
                 tracks[nearest].labels.append((row, label))
-                tracks[nearest].labelled.append(place_of(label.range_m, label.azimuth_rad, session))
+                tracks[nearest].labelled.append(
+                    place_of(label.range_m, label.azimuth_rad, session)
+                )
             else:
-                in_radians = label.model_copy(update={"azimuth_rad": np.radians(label.azimuth_rad)})
+                in_radians = label.model_copy(
+                    update={"azimuth_rad": np.radians(label.azimuth_rad)}
+                )
                 places = {NO_TRACK: label, IN_DEGREES: in_radians} if used else {}
-                reason = next((said for said, at in places.items() if _is_within(used[0], at)), OUTSIDE)
+                reason = next(
+                    (said for said, at in places.items() if _is_within(used[0], at)),
+                    OUTSIDE,
+                )
                 unmet[reason].append(row)
     unmet[NO_FRAME] = [row for labels in by_stamp.values() for row, _ in labels]
-    unmet[CONTRADICTED] = [row for track in tracks.values() for row in track.drop_contradictions()]
+    unmet[CONTRADICTED] = [
+        row for track in tracks.values() for row in track.drop_contradictions()
+    ]
     return tracks, unmet
 
 
 def _is_within(frame: SonarFrames, label: Label) -> bool:
     """True for a place in the image, up to half a bin and half a beam beyond the outer middles."""
-    half_bin, half_beam = (np.abs(np.diff(axis)).max(initial=0) / 2 for axis in (frame.ranges_m, frame.azimuths_rad))
+    half_bin, half_beam = (
+        np.abs(np.diff(axis)).max(initial=0) / 2
+        for axis in (frame.ranges_m, frame.azimuths_rad)
+    )
     return bool(
-        frame.ranges_m.min() - half_bin <= label.range_m <= frame.ranges_m.max() + half_bin
-        and frame.azimuths_rad.min() - half_beam <= label.azimuth_rad <= frame.azimuths_rad.max() + half_beam
+        frame.ranges_m.min() - half_bin
+        <= label.range_m
+        <= frame.ranges_m.max() + half_bin
+        and frame.azimuths_rad.min() - half_beam
+        <= label.azimuth_rad
+        <= frame.azimuths_rad.max() + half_beam
     )
 
 
 def is_of_one_object(one: Label, other: Label) -> bool:
     """True for labels of one frame as near to each other as no two objects are."""
     across = one.range_m * (one.azimuth_rad - other.azimuth_rad)
-    return one.stamp_ns == other.stamp_ns and bool(np.hypot(one.range_m - other.range_m, across) <= NEAR_M / 2)
+    return one.stamp_ns == other.stamp_ns and bool(
+        np.hypot(one.range_m - other.range_m, across) <= NEAR_M / 2
+    )
 
 
 def _distance(sighting: ObjectSighting, label: Label) -> float:
@@ -335,7 +430,13 @@ def place_of(range_m: float, azimuth_rad: float, session: RecognitionSession) ->
     return np.asarray(session.start_T_sonar.transformFrom(q))
 
 
-def _seen_from(world_T_sonar: gtsam.Pose3, place: Floats, landmark: int) -> tuple[Floats, Floats, Floats]:
+def _seen_from(
+    world_T_sonar: gtsam.Pose3, place: Floats, landmark: int
+) -> tuple[Floats, Floats, Floats]:
     """Identity, range and azimuth of a place, each of shape (1,)."""
     q = world_T_sonar.transformTo(place)
-    return np.array([landmark]), np.array([np.linalg.norm(q)]), np.array([np.arctan2(q[1], q[0])])
+    return (
+        np.array([landmark]),
+        np.array([np.linalg.norm(q)]),
+        np.array([np.arctan2(q[1], q[0])]),
+    )

@@ -13,7 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.files import COMPARISON, read_json, regular, replacing, result_written, write_json
+from sonar_graph.files import (
+    COMPARISON,
+    read_json,
+    regular,
+    replacing,
+    result_written,
+    write_json,
+)
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sonar import Fan
 from sonar_graph.states import LandmarkMap
@@ -24,9 +31,13 @@ NONE = -1
 LEAST_NAMED = 0.5
 """Posterior above which a detection counts as naming a landmark."""
 
-NO_FLOOR = "frame without a known floor: compared with the designs in the plane of the image"
+NO_FLOOR = (
+    "frame without a known floor: compared with the designs in the plane of the image"
+)
 CANDIDATE_OFF_FLOOR = "candidate rejected: off floor"
-OFF_FLOOR = "frame in which no floor can be: by mounting and tilt the sonar looks past it"
+OFF_FLOOR = (
+    "frame in which no floor can be: by mounting and tilt the sonar looks past it"
+)
 LACKS = "detections.floor"
 """Note of what is lacking for a known floor."""
 FEWEST_TRACKS, MOSTLY = 10, 0.9
@@ -67,7 +78,11 @@ class Recognition:
     def warned(self) -> dict[str, int]:
         """Count of warnings by reason, most frequent first."""
         reasons = {reason for _, reason in self.warnings}
-        return {outcome: count for outcome, count in self.outcomes.most_common() if outcome in reasons}
+        return {
+            outcome: count
+            for outcome, count in self.outcomes.most_common()
+            if outcome in reasons
+        }
 
     def naming(self, true_landmarks: LandmarkMap | None = None) -> list[str]:
         """Lines on how often each landmark was the most probable class, with warnings.
@@ -82,13 +97,25 @@ class Recognition:
             ids, probability = self.detections.most_probable()
             named.update(np.where(probability > LEAST_NAMED, ids, NONE).tolist())
         counts = [f"landmark {i}: {n}" for i, n in sorted(named.items()) if i != NONE]
-        looked_for = set() if self.detections is None else set(np.unique(self.detections.candidate_ids).tolist())
+        looked_for = (
+            set()
+            if self.detections is None
+            else set(np.unique(self.detections.candidate_ids).tolist())
+        )
         never = ", ".join(map(str, sorted(looked_for - named.keys())))
         said = [*counts, f"none of them: {named[NONE]}"]
-        lines = [f"Most probable: {', '.join(said)}{f'; never: landmark {never}' if never else ''}"] if named else []
+        lines = (
+            [
+                f"Most probable: {', '.join(said)}{f'; never: landmark {never}' if never else ''}"
+            ]
+            if named
+            else []
+        )
         if not counts:
             designs = self.notes.get("detections.designs", "those given")
-            lines.append(f"Warning: no landmark was recognised; looked for {designs}; --designs gives others")
+            lines.append(
+                f"Warning: no landmark was recognised; looked for {designs}; --designs gives others"
+            )
         if LACKS in self.notes:
             lines.append(f"Warning: {self.notes[LACKS]}")
         if 2 * self.outcomes[OFF_FLOOR] > self.frames:
@@ -96,16 +123,30 @@ class Recognition:
                 f"Warning: in {self.outcomes[OFF_FLOOR]} of {self.frames} frames the sonar looks past the floor: check "
                 "[sonar.mounting] (a positive pitch turns it down), [floor] and sonar.elevation_aperture_rad"
             )
-        judged = sum(count for outcome, count in self.outcomes.items() if outcome.startswith("candidate rejected"))
-        if not counts and judged >= FEWEST_TRACKS and 2 * self.outcomes[CANDIDATE_OFF_FLOOR] > judged:
+        judged = sum(
+            count
+            for outcome, count in self.outcomes.items()
+            if outcome.startswith("candidate rejected")
+        )
+        if (
+            not counts
+            and judged >= FEWEST_TRACKS
+            and 2 * self.outcomes[CANDIDATE_OFF_FLOOR] > judged
+        ):
             lines.append(
                 f"Warning: {self.outcomes[CANDIDATE_OFF_FLOOR]} of {judged} rejected candidates lie where no floor can "
                 "be: check [floor], the depth, and [sonar.mounting]"
             )
-        unknown = sorted(set(true_landmarks.ids.tolist()) - looked_for) if true_landmarks and looked_for else []
+        unknown = (
+            sorted(set(true_landmarks.ids.tolist()) - looked_for)
+            if true_landmarks and looked_for
+            else []
+        )
         if unknown:
             listed = ", ".join(map(str, unknown))
-            lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
+            lines.append(
+                f"Warning: the log has landmarks {listed}, of which there is no design; give --designs"
+            )
         outside, tracks = self.unlike
         if tracks >= FEWEST_TRACKS and 2 * outside > tracks:
             lines.append(
@@ -133,13 +174,20 @@ class Recognition:
     def entry(self) -> dict[str, Any]:
         """Content for JSON, without detections and pictures."""
         outcomes = dict(self.outcomes.most_common())
-        return {"frames": self.frames, "outcomes": outcomes, "warnings": self.warnings, "notes": self.notes}
+        return {
+            "frames": self.frames,
+            "outcomes": outcomes,
+            "warnings": self.warnings,
+            "notes": self.notes,
+        }
 
     def shown(self) -> list[DrawnFrame]:
         """Picture with the highest posterior of each landmark, at most six, in order of identity."""
         surest: dict[int, tuple[float, DrawnFrame]] = {}
         for picture in self.pictures:
-            for landmark, probability in zip(picture.landmark_ids, picture.probabilities, strict=True):
+            for landmark, probability in zip(
+                picture.landmark_ids, picture.probabilities, strict=True
+            ):
                 if probability > surest.get(landmark, (0.5, None))[0]:
                     surest[landmark] = probability, picture
         return [picture for _, (_, picture) in sorted(surest.items())][:MOST_SHOWN]
@@ -148,12 +196,23 @@ class Recognition:
 def write_recognition(recognition: Recognition | None, folder: Path) -> None:
     """Write ``recognition.json`` and the pictures that the report shows; remove those of an earlier comparison."""
     with result_written(folder, COMPARISON) as written:
-        written.remove([RECOGNITION, *(name for name in written.names if name.startswith(f"{PICTURE_FOLDER}/"))])
+        written.remove(
+            [
+                RECOGNITION,
+                *(
+                    name
+                    for name in written.names
+                    if name.startswith(f"{PICTURE_FOLDER}/")
+                ),
+            ]
+        )
         if recognition is None:
             return
         shown = recognition.shown()
         for picture in shown:
-            with replacing(folder / PICTURE_FOLDER / f"{picture.stamp_ns}.jpg") as partial:
+            with replacing(
+                folder / PICTURE_FOLDER / f"{picture.stamp_ns}.jpg"
+            ) as partial:
                 partial.write_bytes(picture.jpeg)
         pictures = [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown]
         write_json(folder / RECOGNITION, recognition.entry() | {"pictures": pictures})
@@ -166,12 +225,22 @@ def read_recognition(folder: Path) -> Recognition | None:
     entry: dict[str, Any] = read_json(folder / RECOGNITION)
     pictures = [
         DrawnFrame(
-            stamp, regular(folder / PICTURE_FOLDER / f"{stamp}.jpg").read_bytes(), tuple(ids), tuple(probabilities)
+            stamp,
+            regular(folder / PICTURE_FOLDER / f"{stamp}.jpg").read_bytes(),
+            tuple(ids),
+            tuple(probabilities),
         )
         for stamp, ids, probabilities in entry["pictures"]
     ]
     warnings = [(stamp, reason) for stamp, reason in entry["warnings"]]
-    return Recognition(entry["frames"], None, Counter(entry["outcomes"]), warnings, pictures, entry["notes"])
+    return Recognition(
+        entry["frames"],
+        None,
+        Counter(entry["outcomes"]),
+        warnings,
+        pictures,
+        entry["notes"],
+    )
 
 
 Picture = NDArray[np.uint8]
@@ -185,27 +254,57 @@ TEXT_SIZE = 0.85
 """Legible where a page shows four pictures in a row."""
 
 
-def draw_fan(image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetections | None) -> Picture:
+def draw_fan(
+    image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetections | None
+) -> Picture:
     """The frame in grey, the detections as rings with identity and posterior; shape (height, width, 3)."""
     low, high = np.percentile(image_db, [5, 99.7])
-    grey = np.clip((image_db - low) / max(high - low, 1e-6) * 255, 0, 255).astype(np.uint8)
-    shown = np.where(fan.beam >= 0, grey[np.maximum(fan.beam, 0), fan.bin], 0).astype(np.uint8)
-    picture = np.asarray(cv2.cvtColor(cv2.medianBlur(shown, 3), cv2.COLOR_GRAY2BGR), np.uint8)
+    grey = np.clip((image_db - low) / max(high - low, 1e-6) * 255, 0, 255).astype(
+        np.uint8
+    )
+    shown = np.where(fan.beam >= 0, grey[np.maximum(fan.beam, 0), fan.bin], 0).astype(
+        np.uint8
+    )
+    picture = np.asarray(
+        cv2.cvtColor(cv2.medianBlur(shown, 3), cv2.COLOR_GRAY2BGR), np.uint8
+    )
     if detections is not None:
         ids, probabilities = detections.most_probable()
-        for i, (landmark, probability) in enumerate(zip(ids.tolist(), probabilities.tolist(), strict=True)):
-            place = fan.pixel(float(detections.range_m[i]), float(detections.azimuth_rad[i]))
+        for i, (landmark, probability) in enumerate(
+            zip(ids.tolist(), probabilities.tolist(), strict=True)
+        ):
+            place = fan.pixel(
+                float(detections.range_m[i]), float(detections.azimuth_rad[i])
+            )
             radius, is_sure = round(0.23 * fan.pixels_per_m), probability >= SURE
             colour = RECOGNISED if is_sure else DOUBTFUL
             text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
             cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)
             cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, 9, 1)
-            (width, height), descent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
-            left = int(np.clip(place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN))
+            (width, height), descent = cv2.getTextSize(
+                text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2
+            )
+            left = int(
+                np.clip(
+                    place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN
+                )
+            )
             foot = max(place[1] - radius - 2 * MARGIN, height + MARGIN)
-            corners = (left - MARGIN, foot - height - MARGIN), (left + width + MARGIN, foot + descent)
+            corners = (
+                (left - MARGIN, foot - height - MARGIN),
+                (left + width + MARGIN, foot + descent),
+            )
             cv2.rectangle(picture, *corners, (0, 0, 0), -1)
-            cv2.putText(picture, text, (left, foot), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
+            cv2.putText(
+                picture,
+                text,
+                (left, foot),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                TEXT_SIZE,
+                colour,
+                2,
+                cv2.LINE_AA,
+            )
     return picture
 
 

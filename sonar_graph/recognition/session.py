@@ -19,7 +19,12 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.images import NO_DEPTH, NO_HEIGHT, NO_TILT, SonarFrames, decibels
-from sonar_graph.logs import ImagesAlone, PartialCalibration, read_log, read_sonar_frames
+from sonar_graph.logs import (
+    ImagesAlone,
+    PartialCalibration,
+    read_log,
+    read_sonar_frames,
+)
 from sonar_graph.logs import no_images as no_images
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
@@ -36,7 +41,16 @@ from sonar_graph.recognition.recognition_record import (
 )
 from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence as Run
-from sonar_graph.sonar import EVIDENCE, Fan, Fate, FloorView, Recogniser, RecogniserParams, SonarStep, with_lens
+from sonar_graph.sonar import (
+    EVIDENCE,
+    Fan,
+    Fate,
+    FloorView,
+    Recogniser,
+    RecogniserParams,
+    SonarStep,
+    with_lens,
+)
 
 MOST_PICTURES = 400
 MOST_WARNINGS = 200
@@ -54,7 +68,10 @@ class LandmarkRecogniser(Protocol):
     """Outcome of every candidate, track and fault in the last frame."""
 
     def process(
-        self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
+        self,
+        frame: SonarFrames,
+        motion: SonarStep | None = None,
+        view: FloorView | None = None,
     ) -> LandmarkDetections | None:
         """Detections in one frame."""
         ...
@@ -128,9 +145,16 @@ def recognise(
     """
     if sequence is None:
         if not isinstance(images, Path | str):
-            raise MeasurementError("recognise: frames need a sequence with IMU and DVL; give one, or the path of a log")
+            raise MeasurementError(
+                "recognise: frames need a sequence with IMU and DVL; give one, or the path of a log"
+            )
         sequence = read_log(
-            Path(images), calibration=calibration, topics=topics, config=config, window=window, salvage=salvage
+            Path(images),
+            calibration=calibration,
+            topics=topics,
+            config=config,
+            window=window,
+            salvage=salvage,
         )
     found = recognise_images(
         images,
@@ -144,7 +168,11 @@ def recognise(
         salvage=salvage,
     )
     if found is None:
-        raise LogError(no_images(images) if isinstance(images, Path | str) else "recognise: no sonar frame was given")
+        raise LogError(
+            no_images(images)
+            if isinstance(images, Path | str)
+            else "recognise: no sonar frame was given"
+        )
     return with_detections(sequence, found)
 
 
@@ -171,9 +199,18 @@ def recognise_images(
 
     Without IMU and Doppler log (`ImagesAlone`) the motion is from the images; "fixed" is of a sonar at rest.
     """
-    session = RecognitionSession(sequence, designs, params, recogniser=recogniser, motion=motion, seen=seen)
+    session = RecognitionSession(
+        sequence, designs, params, recogniser=recogniser, motion=motion, seen=seen
+    )
     if isinstance(images, Path | str):
-        images = read_sonar_frames(Path(images), topic, config, window=window, salvage=salvage, refused=session.refuse)
+        images = read_sonar_frames(
+            Path(images),
+            topic,
+            config,
+            window=window,
+            salvage=salvage,
+            refused=session.refuse,
+        )
     for _ in session.run(images):
         if progress is not None:
             progress(session.result.frames)
@@ -182,18 +219,27 @@ def recognise_images(
 
 def with_detections(sequence: Run, recognition: Recognition) -> Run:
     """The sequence with the detections of a recognition, and its notes."""
-    return replace(sequence, detections=recognition.detections, notes=sequence.notes | recognition.notes)
+    return replace(
+        sequence,
+        detections=recognition.detections,
+        notes=sequence.notes | recognition.notes,
+    )
 
 
 def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:
     """Blocks of one frame each."""
     for row in range(len(block)):
         yield SonarFrames(
-            block.stamps_ns[row : row + 1], block.intensity[row : row + 1], block.ranges_m, block.azimuths_rad
+            block.stamps_ns[row : row + 1],
+            block.intensity[row : row + 1],
+            block.ranges_m,
+            block.azimuths_rad,
         )
 
 
-def without_leaps(frames: Iterable[SonarFrames], refuse: Callable[[int, str], None]) -> Iterator[SonarFrames]:
+def without_leaps(
+    frames: Iterable[SonarFrames], refuse: Callable[[int, str], None]
+) -> Iterator[SonarFrames]:
     """Frames (blocks of one) without those whose stamp leaps ahead.
 
     A frame ahead of the next one is refused if that one is ahead of all before. One of the two stamps is wrong, and
@@ -229,20 +275,30 @@ class RecognitionSession:
     ) -> None:
         self._draws, self._seen = pictures, seen
         self.result = Recognition()
-        self.recogniser = recogniser or Recogniser(sequence.calibration, designs, params)
+        self.recogniser = recogniser or Recogniser(
+            sequence.calibration, designs, params
+        )
         self.start_T_sonar = gtsam.Pose3()
         """Pose of the sonar at the last frame, in its axes at the first."""
         self.view: FloorView | None = None
         """View of the floor at the last frame, where it is known."""
         self._sonar = sequence.calibration.sonar
         has_depth = getattr(sequence, "depth", None) is not None
-        lacking = NO_HEIGHT if sequence.calibration.floor is None else "" if has_depth else NO_DEPTH
+        lacking = (
+            NO_HEIGHT
+            if sequence.calibration.floor is None
+            else ""
+            if has_depth
+            else NO_DEPTH
+        )
         self._lacks = lacking if motion == "navigation" else NO_TILT
         self._motions: SonarMotions | ImageMotions
         if motion == "navigation" and isinstance(sequence, Run):
             self._motions = SonarMotions(sequence)
         else:
-            self._motions = ImageMotions(sequence.calibration, is_fixed=motion == "fixed")
+            self._motions = ImageMotions(
+                sequence.calibration, is_fixed=motion == "fixed"
+            )
         self._blocks: list[LandmarkDetections] = []
         self._beyond: dict[int, tuple[float, int]] = {}
         """Sum of the evidence `beyond` of each track, and number of its frames."""
@@ -282,7 +338,9 @@ class RecognitionSession:
             self.start_T_sonar = self.start_T_sonar.compose(step.previous_T_sonar)
         frame = with_lens(frame, self._sonar.lens)
         self.result.outcomes[NO_FLOOR] += view is None
-        self.result.outcomes[OFF_FLOOR] += view is not None and not self._may_show_floor(frame, view)
+        self.result.outcomes[OFF_FLOOR] += (
+            view is not None and not self._may_show_floor(frame, view)
+        )
         found = self.recogniser.process(frame, step, view)
         is_used = True
         for fate in self.recogniser.fates:
@@ -294,10 +352,16 @@ class RecognitionSession:
         if found is not None:
             self._blocks.append(found)
         if isinstance(self.recogniser, Recogniser):
-            for track, sighting in zip(self.recogniser.track_ids.tolist(), self.recogniser.sightings, strict=True):
+            for track, sighting in zip(
+                self.recogniser.track_ids.tolist(),
+                self.recogniser.sightings,
+                strict=True,
+            ):
                 if sighting is not None and sighting.fit is not None:
                     total, count = self._beyond.get(track, (0.0, 0))
-                    beyond = float(sighting.fit.evidence[:, EVIDENCE.index("beyond")].mean())
+                    beyond = float(
+                        sighting.fit.evidence[:, EVIDENCE.index("beyond")].mean()
+                    )
                     self._beyond[track] = total + beyond, count + 1
         if self._seen is not None and is_used:
             self._seen(frame)
@@ -313,30 +377,49 @@ class RecognitionSession:
     def finish(self) -> Recognition:
         """The whole record."""
         result = self.result
-        result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
-        result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
+        result.detections = (
+            LandmarkDetections.concatenate(self._blocks) if self._blocks else None
+        )
+        result.notes = {
+            "detections": f"recognised in {result.frames} sonar images"
+        } | self.recogniser.notes()
         if isinstance(self._motions, ImageMotions):
             result.notes |= self._motions.notes()
         if self._lacks and result.outcomes[NO_FLOOR]:
             result.notes[LACKS] = self._lacks
-        if isinstance(self.recogniser, Recogniser) and (usual := self.recogniser.confusion.roughness) is not None:
+        if (
+            isinstance(self.recogniser, Recogniser)
+            and (usual := self.recogniser.confusion.roughness) is not None
+        ):
             means = [total / count for total, count in self._beyond.values()]
-            result.unlike = sum(not usual[0] <= mean <= usual[1] for mean in means), len(means)
+            result.unlike = (
+                sum(not usual[0] <= mean <= usual[1] for mean in means),
+                len(means),
+            )
         result.outcomes = +result.outcomes  # drops zero counts
         result.warnings.sort(key=lambda row: row[0])
         if result.warnings:
-            result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())
+            result.notes["detections.warnings"] = "; ".join(
+                f"{n} x {reason}" for reason, n in result.warned().items()
+            )
         return result
 
     def _may_show_floor(self, frame: SonarFrames, view: FloorView) -> bool:
         """Tell whether the floor lies within the vertical aperture at any range ahead."""
         ranges_m = frame.ranges_m
-        q = view.floor_points(ranges_m, np.full(len(ranges_m), float(np.median(frame.azimuths_rad))))
+        q = view.floor_points(
+            ranges_m, np.full(len(ranges_m), float(np.median(frame.azimuths_rad)))
+        )
         elevation_rad = np.arcsin(q[:, 2] / ranges_m)
-        return bool((np.abs(elevation_rad) <= self._sonar.elevation_aperture_rad / 2).any())
+        return bool(
+            (np.abs(elevation_rad) <= self._sonar.elevation_aperture_rad / 2).any()
+        )
 
     def _warn(self, stamp_ns: int, reason: str) -> None:
-        if len(self.result.warnings) < MOST_WARNINGS or reason not in self.result.outcomes:
+        if (
+            len(self.result.warnings) < MOST_WARNINGS
+            or reason not in self.result.outcomes
+        ):
             self.result.warnings.append((stamp_ns, reason))
         self.result.outcomes[reason] += 1
 
@@ -347,12 +430,28 @@ class RecognitionSession:
             if found is None or pictures[-1].landmark_ids:
                 return
             pictures.pop()
-        if self._fan is None or self._fan_of != (id(frame.ranges_m), id(frame.azimuths_rad)):
+        if self._fan is None or self._fan_of != (
+            id(frame.ranges_m),
+            id(frame.azimuths_rad),
+        ):
             self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)
             self._fan_of = (id(frame.ranges_m), id(frame.azimuths_rad))
-        ids, probabilities = found.most_probable() if found is not None else (np.empty(0, int), np.empty(0))
-        picture = draw_fan(decibels(frame.intensity[0], self._sonar.image), self._fan, found)
-        pictures.append(DrawnFrame(stamp_ns, as_jpeg(picture), tuple(ids.tolist()), tuple(probabilities.tolist())))
+        ids, probabilities = (
+            found.most_probable()
+            if found is not None
+            else (np.empty(0, int), np.empty(0))
+        )
+        picture = draw_fan(
+            decibels(frame.intensity[0], self._sonar.image), self._fan, found
+        )
+        pictures.append(
+            DrawnFrame(
+                stamp_ns,
+                as_jpeg(picture),
+                tuple(ids.tolist()),
+                tuple(probabilities.tolist()),
+            )
+        )
         if len(pictures) > MOST_PICTURES:
             del pictures[1::2]
             self._picture_period_ns *= 2

@@ -33,12 +33,22 @@ class _Tilt:
 
     def reach(self, instant_ns: int) -> None:
         """Predict and correct until an instant."""
-        for epoch_ns in self._odometry.epochs(self.epoch_ns + GRAVITY_INTERVAL_NS - 1, instant_ns).tolist():
+        for epoch_ns in self._odometry.epochs(
+            self.epoch_ns + GRAVITY_INTERVAL_NS - 1, instant_ns
+        ).tolist():
             if epoch_ns - self.epoch_ns < GRAVITY_INTERVAL_NS:
                 continue
-            motion = self._odometry.motion(self.epoch_ns, epoch_ns, _NO_BIAS, known_ns=instant_ns)
-            began_at_epoch = self.epoch_ns in self._odometry.epochs(self.epoch_ns - 1, instant_ns)
-            measured = self._gravity(motion, epoch_ns) if self._calibration.use_gravity and began_at_epoch else None
+            motion = self._odometry.motion(
+                self.epoch_ns, epoch_ns, _NO_BIAS, known_ns=instant_ns
+            )
+            began_at_epoch = self.epoch_ns in self._odometry.epochs(
+                self.epoch_ns - 1, instant_ns
+            )
+            measured = (
+                self._gravity(motion, epoch_ns)
+                if self._calibration.use_gravity and began_at_epoch
+                else None
+            )
             self.up, self.variance = self.after(motion)
             if measured is not None:
                 direction, sigma = measured
@@ -51,11 +61,18 @@ class _Tilt:
         """Up in the body and its variance after a motion since the last correction."""
         drift = self._calibration.imu.gyro_bias_sigma * motion.duration_s
         noise = float(np.max(np.diag(motion.covariance)[:3]))
-        return motion.i_T_j.rotation().matrix().T @ self.up, self.variance + noise + drift**2
+        return (
+            motion.i_T_j.rotation().matrix().T @ self.up,
+            self.variance + noise + drift**2,
+        )
 
-    def _gravity(self, motion: PreintegratedMotion, epoch_ns: int) -> tuple[Floats, float] | None:
+    def _gravity(
+        self, motion: PreintegratedMotion, epoch_ns: int
+    ) -> tuple[Floats, float] | None:
         """Measured direction of up at an epoch, and its standard deviation."""
-        (before, variance), (after, other) = map(self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns))
+        (before, variance), (after, other) = map(
+            self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns)
+        )
         sigma = float(np.sqrt(0.5 * (variance + other)))
         return gravity_direction(motion, before, after, sigma, self._calibration)
 
@@ -69,7 +86,9 @@ class _Height:
         self._default = sequence.calibration.depth.sigma_m**2
         start = sequence.calibration.start
         self.z_m, self.variance = start.position_m[2], start.position_sigma_m[2] ** 2
-        self.is_measured = depth is not None and start.position_sigma_m[2] <= KNOWN_HEIGHT_M
+        self.is_measured = (
+            depth is not None and start.position_sigma_m[2] <= KNOWN_HEIGHT_M
+        )
         """True from the first depth sample that corrected it, or with depth and a start whose height is known."""
         self._stamp_ns = sequence.start_ns
 
@@ -80,18 +99,28 @@ class _Height:
 
     def add(self, depth: Depth) -> None:
         """Take in samples that have come since; those before the last frame are forgotten."""
-        kept = None if self._depth is None else self._depth.between(self._stamp_ns, int(self._depth.stamps_ns[-1]))
+        kept = (
+            None
+            if self._depth is None
+            else self._depth.between(self._stamp_ns, int(self._depth.stamps_ns[-1]))
+        )
         parts = [part for part in (kept, depth) if part is not None]
         self._depth = Depth.concatenate(parts)
 
     def correct(self, up: Floats, until_ns: int) -> None:
         """Correct by the latest of the depth samples since the last call."""
-        rows = None if self._depth is None else self._depth.between(self._stamp_ns, until_ns)
+        rows = (
+            None
+            if self._depth is None
+            else self._depth.between(self._stamp_ns, until_ns)
+        )
         self._stamp_ns = until_ns
         if rows is None:
             return
         self.is_measured = True
-        variances = np.where(np.isnan(rows.variance_m2), self._default, rows.variance_m2)
+        variances = np.where(
+            np.isnan(rows.variance_m2), self._default, rows.variance_m2
+        )
         z_m = float(rows.z_m[-1] - up @ self._port)
         gain = self.variance / (self.variance + float(variances[-1]))
         self.z_m += gain * (z_m - self.z_m)
@@ -137,25 +166,45 @@ class SonarMotions:
 
         The motion of the first frame is None, and so is the view where the height is not known or not positive.
         """
-        motion, step, view = self._odometry.motion(self._stamp_ns, stamp_ns, _NO_BIAS), None, None
+        motion, step, view = (
+            self._odometry.motion(self._stamp_ns, stamp_ns, _NO_BIAS),
+            None,
+            None,
+        )
         self._tilt.reach(stamp_ns)
-        up, tilt_variance = self._tilt.after(self._odometry.motion(self._tilt.epoch_ns, stamp_ns, _NO_BIAS))
+        up, tilt_variance = self._tilt.after(
+            self._odometry.motion(self._tilt.epoch_ns, stamp_ns, _NO_BIAS)
+        )
         body_R_previous = motion.i_T_j.rotation().matrix().T
         climbed = up @ body_R_previous @ motion.i_T_j.translation()
-        self._height.carry(float(climbed), float(np.trace(motion.covariance[3:, 3:])) / 3)
+        self._height.carry(
+            float(climbed), float(np.trace(motion.covariance[3:, 3:])) / 3
+        )
         self._height.correct(up, stamp_ns)
         if not self._is_first:
             sonar_T_body = self._body_T_sonar.inverse()
             adjoint = sonar_T_body.AdjointMap()
-            previous_T_sonar = sonar_T_body.compose(motion.i_T_j).compose(self._body_T_sonar)
+            previous_T_sonar = sonar_T_body.compose(motion.i_T_j).compose(
+                self._body_T_sonar
+            )
             step = SonarStep(previous_T_sonar, adjoint @ motion.covariance @ adjoint.T)
         self._stamp_ns, self._is_first = stamp_ns, False
         if self._floor is not None and self._height.is_measured:
-            height_m = float(self._height.z_m + up @ self._body_T_sonar.translation() - self._floor.z_m)
+            height_m = float(
+                self._height.z_m
+                + up @ self._body_T_sonar.translation()
+                - self._floor.z_m
+            )
             if height_m > 0:
-                level_R_sonar = level_from_up(self._body_T_sonar.rotation().matrix().T @ up)
-                sigma_m = float(np.hypot(np.sqrt(self._height.variance), self._floor.sigma_m))
-                view = FloorView(level_R_sonar, height_m, sigma_m, float(np.sqrt(tilt_variance)))
+                level_R_sonar = level_from_up(
+                    self._body_T_sonar.rotation().matrix().T @ up
+                )
+                sigma_m = float(
+                    np.hypot(np.sqrt(self._height.variance), self._floor.sigma_m)
+                )
+                view = FloorView(
+                    level_R_sonar, height_m, sigma_m, float(np.sqrt(tilt_variance))
+                )
         return step, view
 
 

@@ -61,10 +61,18 @@ class TrackStories:
 
     def see(self, frame: SonarFrames, recogniser: Recogniser) -> None:
         """Take in what a recogniser made of a block of one frame."""
-        stamp_ns, views = int(frame.stamps_ns[0]), _Views(frame, self._image, self._fan_of(frame))
+        stamp_ns, views = (
+            int(frame.stamps_ns[0]),
+            _Views(frame, self._image, self._fan_of(frame)),
+        )
         if recogniser.stamp_ns != stamp_ns:
             return
-        rows = zip(recogniser.track_ids.tolist(), recogniser.sightings, recogniser.beliefs, strict=True)
+        rows = zip(
+            recogniser.track_ids.tolist(),
+            recogniser.sightings,
+            recogniser.beliefs,
+            strict=True,
+        )
         for number, sighting, beliefs in rows:
             story = self.tracks.setdefault(number, TrackStory(number, stamp_ns))
             story.beliefs = beliefs
@@ -73,23 +81,39 @@ class TrackStories:
             story.last_ns, story.frames = stamp_ns, story.frames + 1
             visible = 0.0 if sighting.fit is None else sighting.fit.visible
             if visible > story.visible + BETTER:
-                story.visible, story.jpeg = visible, views.around(sighting.range_m, sighting.azimuth_rad)
+                story.visible, story.jpeg = (
+                    visible,
+                    views.around(sighting.range_m, sighting.azimuth_rad),
+                )
         for fate in recogniser.fates:
             if fate.track in self.tracks:
                 self.tracks[fate.track].outcomes[fate.outcome] += 1
             elif fate.track < 0 and np.isfinite(fate.range_m):
                 found = self.rejected.setdefault(fate.outcome, Rejected())
                 found.count += 1
-                is_due = not found.examples or stamp_ns - found.examples[-1][0] >= EXAMPLE_PERIOD_NS
+                is_due = (
+                    not found.examples
+                    or stamp_ns - found.examples[-1][0] >= EXAMPLE_PERIOD_NS
+                )
                 if is_due and len(found.examples) < MOST_EXAMPLES:
-                    found.examples.append((stamp_ns, views.around(fate.range_m, fate.azimuth_rad)))
+                    found.examples.append(
+                        (stamp_ns, views.around(fate.range_m, fate.azimuth_rad))
+                    )
 
     def _fan_of(self, frame: SonarFrames) -> Fan:
         if self._fan is None or not (
-            self._fan[0].ranges_m is frame.ranges_m and self._fan[0].azimuths_rad is frame.azimuths_rad
+            self._fan[0].ranges_m is frame.ranges_m
+            and self._fan[0].azimuths_rad is frame.azimuths_rad
         ):
             extent_m = float(frame.ranges_m.max() - frame.ranges_m.min())
-            self._fan = frame, Fan.of(frame.ranges_m, frame.azimuths_rad, round(extent_m / HALF_M * SIDE_PIXELS / 2))
+            self._fan = (
+                frame,
+                Fan.of(
+                    frame.ranges_m,
+                    frame.azimuths_rad,
+                    round(extent_m / HALF_M * SIDE_PIXELS / 2),
+                ),
+            )
         return self._fan[1]
 
 
@@ -103,11 +127,20 @@ class _Views:
     def around(self, range_m: float, azimuth_rad: float) -> bytes:
         """JPEG of a square about a place."""
         if self._whole is None:
-            self._whole = draw_fan(decibels(self._frame.intensity[0], self._image), self._fan, None)
+            self._whole = draw_fan(
+                decibels(self._frame.intensity[0], self._image), self._fan, None
+            )
         column, row = self._fan.pixel(range_m, azimuth_rad)
         half = round(HALF_M * self._fan.pixels_per_m)
-        padded = cv2.copyMakeBorder(self._whole, half, half, half, half, cv2.BORDER_CONSTANT)
+        padded = cv2.copyMakeBorder(
+            self._whole, half, half, half, half, cv2.BORDER_CONSTANT
+        )
         height, width = self._whole.shape[:2]
-        column, row = int(np.clip(column, 0, width - 1)), int(np.clip(row, 0, height - 1))
+        column, row = (
+            int(np.clip(column, 0, width - 1)),
+            int(np.clip(row, 0, height - 1)),
+        )
         square = padded[row : row + 2 * half, column : column + 2 * half]
-        return as_jpeg(np.asarray(cv2.resize(square, (SIDE_PIXELS, SIDE_PIXELS)), np.uint8))
+        return as_jpeg(
+            np.asarray(cv2.resize(square, (SIDE_PIXELS, SIDE_PIXELS)), np.uint8)
+        )

@@ -14,7 +14,13 @@ from matplotlib.ticker import LogLocator
 from sonar_graph.batch import KINDS, Metric, RecordedBatch, failure_rate, quantile
 from sonar_graph.measurements import Floats
 from sonar_graph.report import figure_style as style
-from sonar_graph.report.batch_tables import SAME_EVIDENCE, Tests, anees_of, is_evidence, unit_of
+from sonar_graph.report.batch_tables import (
+    SAME_EVIDENCE,
+    Tests,
+    anees_of,
+    is_evidence,
+    unit_of,
+)
 from sonar_graph.report.rendering import csv_text
 
 ROW_IN, PANEL_IN = 0.36, 0.95
@@ -31,14 +37,17 @@ LEAST_SPAN = 4.0
 Rows = list[list[str]]
 
 
-def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Figure, list[Axes]]:
+def log_panels(
+    batch: RecordedBatch, logs: list[str], x_label: str
+) -> tuple[Figure, list[Axes]]:
     """A panel a log with a scale of its own; in each a line for each contestant, the first on top."""
     names = batch.contestants
     columns = 1 if len(logs) <= STACKED else min(MOST_COLUMNS, len(logs) - 1)
     rows = -(-len(logs) // columns)
     height_in = rows * (PANEL_IN + ROW_IN * len(names))
     figure, axes = style.blank_panels(rows, columns, (style.width_in(), height_in))
-    figure.set_layout_engine("constrained")  # names of any width stand beside the panels
+    # names of any width stand beside the panels
+    figure.set_layout_engine("constrained")
     panels: list[Axes] = list(axes.flat)
     for panel in panels[len(logs) :]:
         panel.remove()
@@ -46,7 +55,9 @@ def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Fig
         panel, narrow = panels[index], columns > 1
         shown = names if index % columns == 0 else [""] * len(names)
         labels = [folded(name, NAME_LETTERS) if narrow else name for name in shown]
-        panel.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels)
+        panel.set(
+            ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels
+        )
         panel.grid(False, axis="y")
         for place, label in enumerate(panel.get_yticklabels()):
             label.set_color(style.colour(place))
@@ -82,17 +93,28 @@ def spread_out(panel: Axes) -> None:
 
 def spread_drawing(batch: RecordedBatch, metric: Metric) -> style.Illustration | None:
     """Every run's value as a dot, with the median and the middle 80 %."""
-    logs = [log for log in batch.logs if any(_finite(batch, log, name, metric).size for name in batch.contestants)]
+    logs = [
+        log
+        for log in batch.logs
+        if any(_finite(batch, log, name, metric).size for name in batch.contestants)
+    ]
     if not logs:
         return None
     figure, panels = log_panels(batch, logs, f"{metric.label}{unit_of(metric)}")
     for panel, log in zip(panels, logs, strict=True):
-        values = np.concatenate([_finite(batch, log, name, metric) for name in batch.contestants])
+        values = np.concatenate(
+            [_finite(batch, log, name, metric) for name in batch.contestants]
+        )
         if values.min() > 0 and values.max() > SMALL * values.min():
             spread_out(panel)
         for place, contestant in enumerate(batch.contestants):
             for over, key in metric.keys.items():
-                _draw_spread(panel, batch.values(log, contestant, key) * metric.factor, place, over)
+                _draw_spread(
+                    panel,
+                    batch.values(log, contestant, key) * metric.factor,
+                    place,
+                    over,
+                )
     caption = (
         f"{metric.protocol} A dot is a run, the stroke their median, the bar the middle 80 %. {_kinds_told(metric)}"
         "Runs without a value have no dot; their number stands at the right."
@@ -100,17 +122,32 @@ def spread_drawing(batch: RecordedBatch, metric: Metric) -> style.Illustration |
     rows = [["log", "contestant", "seed", "key", "column", "value"]]
     for run in batch.runs:
         seed = "" if run.seed is None else str(run.seed)
-        rows += [[run.log, run.contestant, seed, run.key, key, _text(run.value(key))] for key in metric.keys.values()]
+        rows += [
+            [run.log, run.contestant, seed, run.key, key, _text(run.value(key))]
+            for key in metric.keys.values()
+        ]
     return _drawn(figure, f"spread-{metric.name}", metric.label, caption, rows)
 
 
-def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> style.Illustration | None:
+def difference_drawing(
+    batch: RecordedBatch, metric: Metric, tests: Tests
+) -> style.Illustration | None:
     """Mean differences to the reference with their intervals."""
-    found = {place: test for place, (test, _) in tests.items() if place[0] in metric.keys.values()}
-    logs = [log for log in batch.logs if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())]
+    found = {
+        place: test
+        for place, (test, _) in tests.items()
+        if place[0] in metric.keys.values()
+    }
+    logs = [
+        log
+        for log in batch.logs
+        if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())
+    ]
     if not logs:
         return None
-    figure, panels = log_panels(batch, logs, f"difference to {batch.reference}{unit_of(metric)}")
+    figure, panels = log_panels(
+        batch, logs, f"difference to {batch.reference}{unit_of(metric)}"
+    )
     for panel, log in zip(panels, logs, strict=True):
         panel.axvline(0, color=style.TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
@@ -124,12 +161,36 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> st
         f"left of the line the error is smaller than that of {batch.reference}. {_kinds_told(metric)}A "
         "group in which a run has no value has no mean difference and is not drawn."
     )
-    rows = [["log", "contestant", "column", "pairs", "pairs_of", "mean_difference", "low", "high"]]
+    rows = [
+        [
+            "log",
+            "contestant",
+            "column",
+            "pairs",
+            "pairs_of",
+            "mean_difference",
+            "low",
+            "high",
+        ]
+    ]
     rows += [
-        [log, name, key, str(test.pairs), test.each, *map(_text, (test.mean, *test.interval))]
+        [
+            log,
+            name,
+            key,
+            str(test.pairs),
+            test.each,
+            *map(_text, (test.mean, *test.interval)),
+        ]
         for (key, log, name), test in found.items()
     ]
-    return _drawn(figure, f"difference-{metric.name}", f"{metric.label}: against {batch.reference}", caption, rows)
+    return _drawn(
+        figure,
+        f"difference-{metric.name}",
+        f"{metric.label}: against {batch.reference}",
+        caption,
+        rows,
+    )
 
 
 def consistency_drawing(batch: RecordedBatch, what: str) -> style.Illustration | None:
@@ -139,13 +200,26 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> style.Illustration |
     bands: dict[str, set[tuple[float, float]]] = {}
     for log in batch.logs:
         for contestant in batch.contestants:
-            both = {kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS}
+            both = {
+                kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS
+            }
             for kind, told in both.items():
                 if told is None:
                     continue
-                rows.append([log, contestant, kind, str(told.runs), _text(told.mean), *map(_text, told.band)])
+                rows.append(
+                    [
+                        log,
+                        contestant,
+                        kind,
+                        str(told.runs),
+                        _text(told.mean),
+                        *map(_text, told.band),
+                    ]
+                )
                 if math.isfinite(told.mean) and is_evidence(both, kind):
-                    known.setdefault((log, contestant), []).append((kind.capitalize(), told.mean))
+                    known.setdefault((log, contestant), []).append(
+                        (kind.capitalize(), told.mean)
+                    )
                     bands.setdefault(log, set()).add(told.band)
     if not known:
         return None
@@ -176,7 +250,9 @@ def failure_drawing(batch: RecordedBatch) -> style.Illustration | None:
     if all(run.ended for run in batch.runs):
         return None
     figure, panels = log_panels(batch, batch.logs, "runs that did not end (%)")
-    rows: Rows = [["log", "contestant", "runs", "failed", "failure_rate", "low", "high"]]
+    rows: Rows = [
+        ["log", "contestant", "runs", "failed", "failure_rate", "low", "high"]
+    ]
     for panel, log in zip(panels, batch.logs, strict=True):
         panel.set_xlim(-3, 103)
         for place, contestant in enumerate(batch.contestants):
@@ -184,8 +260,14 @@ def failure_drawing(batch: RecordedBatch) -> style.Illustration | None:
             if group:
                 failed = sum(not run.ended for run in group)
                 rate = failure_rate(failed, len(group))
-                _draw_interval(panel, 100 * np.array([rate.share, rate.low, rate.high]), place, "")
-                numbers = [str(len(group)), str(failed), *map(_text, (rate.share, rate.low, rate.high))]
+                _draw_interval(
+                    panel, 100 * np.array([rate.share, rate.low, rate.high]), place, ""
+                )
+                numbers = [
+                    str(len(group)),
+                    str(failed),
+                    *map(_text, (rate.share, rate.low, rate.high)),
+                ]
                 rows.append([log, contestant, *numbers])
     caption = "Share of runs that failed, took too long, needed too much memory or were killed, with 95 % intervals."
     return _drawn(figure, "failures", "Runs that did not end", caption, rows)
@@ -204,9 +286,18 @@ def cost_drawing(batch: RecordedBatch) -> style.Illustration | None:
             ends = [quantile(batch.values(log, contestant, key), 0.5) for key in keys]
             rows.append([log, contestant, *map(_text, ends)])
             if all(map(math.isfinite, ends)):
-                panel.plot(ends, [place, place], color=style.colour(place), linewidth=2.4)
+                panel.plot(
+                    ends, [place, place], color=style.colour(place), linewidth=2.4
+                )
                 panel.plot(ends[0], place, "o", color=style.colour(place), markersize=6)
-                panel.plot(ends[1], place, "|", color=style.colour(place), markersize=11, markeredgewidth=2.4)
+                panel.plot(
+                    ends[1],
+                    place,
+                    "|",
+                    color=style.colour(place),
+                    markersize=11,
+                    markeredgewidth=2.4,
+                )
     caption = "Dot: median over runs of the median time of an update. Stroke: median over runs of the 99th percentile."
     return _drawn(figure, "costs", "Time of an update", caption, rows)
 
@@ -218,15 +309,38 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
         return
     inside = [quantile(values, share) for share in (0.1, 0.9)]
     if all(map(math.isfinite, inside)) and len(values) > 1:
-        panel.plot(inside, [row, row], color=own, alpha=0.3, linewidth=7, solid_capstyle="butt")
+        panel.plot(
+            inside, [row, row], color=own, alpha=0.3, linewidth=7, solid_capstyle="butt"
+        )
     shifts = row + 0.05 * np.cos(2.4 * np.arange(len(known)))
-    panel.plot(known, shifts, "o", color=own, markersize=3.6, markerfacecolor=own if FILLED[over] else "none")
+    panel.plot(
+        known,
+        shifts,
+        "o",
+        color=own,
+        markersize=3.6,
+        markerfacecolor=own if FILLED[over] else "none",
+    )
     middle = quantile(values, 0.5)
     if math.isfinite(middle):
-        panel.plot(middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6)
+        panel.plot(
+            middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6
+        )
     if len(known) < len(values):
-        across, note = panel.get_yaxis_transform(), f"{len(values) - len(known)} without"
-        panel.text(1.01, row, note, transform=across, ha="left", va="center", color=style.MUTED, fontsize="small")
+        across, note = (
+            panel.get_yaxis_transform(),
+            f"{len(values) - len(known)} without",
+        )
+        panel.text(
+            1.01,
+            row,
+            note,
+            transform=across,
+            ha="left",
+            va="center",
+            color=style.MUTED,
+            fontsize="small",
+        )
 
 
 def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
@@ -241,24 +355,40 @@ def _draw_point(panel: Axes, value: float, place: int, over: str) -> None:
     own = style.colour(place)
     face = own if FILLED[over] else "none"
     panel.plot(
-        value, place + KIND_SHIFT[over], "o", color=own, markerfacecolor=face, markersize=6.5, markeredgewidth=1.6
+        value,
+        place + KIND_SHIFT[over],
+        "o",
+        color=own,
+        markerfacecolor=face,
+        markersize=6.5,
+        markeredgewidth=1.6,
     )
 
 
 def _finite(batch: RecordedBatch, log: str, contestant: str, metric: Metric) -> Floats:
-    values = np.concatenate([batch.values(log, contestant, key) for key in metric.keys.values()])
+    values = np.concatenate(
+        [batch.values(log, contestant, key) for key in metric.keys.values()]
+    )
     return np.asarray(values[np.isfinite(values)])
 
 
 def _kinds_told(metric: Metric) -> str:
-    return "" if "" in metric.keys else "Full dots, above: causal; hollow, below: smoothed. "
+    return (
+        ""
+        if "" in metric.keys
+        else "Full dots, above: causal; hollow, below: smoothed. "
+    )
 
 
 def _text(value: float) -> str:
     return repr(float(value)) if math.isfinite(value) else ""
 
 
-def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> style.Illustration:
+def _drawn(
+    figure: Figure, name: str, title: str, caption: str, rows: Rows
+) -> style.Illustration:
     plain_name = name.replace("_", "-").replace(".", "-")
     svg = style.inline_svg(figure, plain_name, f"{title}. {caption}")
-    return style.Illustration(plain_name, title, caption, svg, data=csv_text(rows), figure=figure)
+    return style.Illustration(
+        plain_name, title, caption, svg, data=csv_text(rows), figure=figure
+    )

@@ -24,7 +24,9 @@ ORIGINS = (
 """Columns of the results that are normally the same for all runs."""
 
 
-def write_batch_report(batch: RecordedBatch, folder: Path, *, overwrite: bool = False) -> Path:
+def write_batch_report(
+    batch: RecordedBatch, folder: Path, *, overwrite: bool = False
+) -> Path:
     """Write ``report.html``, and each table as CSV and LaTeX into ``tables/``, from the results alone.
 
     Files that this package did not write are replaced only with ``overwrite``.
@@ -55,19 +57,46 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     groups = [(log, name) for log in batch.logs for name in batch.contestants]
     chapters: list[dict[str, Any]] = []
     for metric in metrics:
-        if any(batch.is_asked(log, name, key) for key in metric.keys.values() for log, name in groups):
-            drawings = [figures.spread_drawing(batch, metric), figures.difference_drawing(batch, metric, tests)]
-            both = [tables.accuracy_table(batch, metric), tables.difference_table(batch, metric, tests)]
+        if any(
+            batch.is_asked(log, name, key)
+            for key in metric.keys.values()
+            for log, name in groups
+        ):
+            drawings = [
+                figures.spread_drawing(batch, metric),
+                figures.difference_drawing(batch, metric, tests),
+            ]
+            both = [
+                tables.accuracy_table(batch, metric),
+                tables.difference_table(batch, metric, tests),
+            ]
             shown = [summary.marked(batch, table) for table in both if table.rows]
-            chapters.append({"metric": metric, "drawings": list(filter(None, drawings)), "tables": shown})
+            chapters.append(
+                {
+                    "metric": metric,
+                    "drawings": list(filter(None, drawings)),
+                    "tables": shown,
+                }
+            )
     head = summary.head_metric(batch, metrics)
-    overview = [summary.marked(batch, summary.overview_table(batch, head, tests))] if head else []
-    others = (tables.failure_table(batch), tables.consistency_table(batch), tables.cost_table(batch))
+    overview = (
+        [summary.marked(batch, summary.overview_table(batch, head, tests))]
+        if head
+        else []
+    )
+    others = (
+        tables.failure_table(batch),
+        tables.consistency_table(batch),
+        tables.cost_table(batch),
+    )
     failures, consistency, costs = (summary.marked(batch, table) for table in others)
     anees = [figures.consistency_drawing(batch, what) for what in ("position", "yaw")]
     seeds = max(len(batch.group(log, name)) for log, name in groups)
     settings: dict[str, str] = {}
-    for column, name in (("options", "log {0.log}"), ("params", "estimator {0.contestant}")):
+    for column, name in (
+        ("options", "log {0.log}"),
+        ("params", "estimator {0.contestant}"),
+    ):
         for run in batch.runs:
             if run.texts.get(column):
                 settings.setdefault(name.format(run), run.texts[column])
@@ -76,7 +105,10 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         counts = Counter(run.texts[name] for run in batch.runs if name in run.texts)
         if counts:
             many = len(counts) > 1
-            origins[name] = [f"{text} ({count} runs)" if many else text for text, count in counts.items()]
+            origins[name] = [
+                f"{text} ({count} runs)" if many else text
+                for text, count in counts.items()
+            ]
     runs = tables.run_lists(batch, metrics)
     return {
         "name": batch.name,
@@ -86,8 +118,16 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
             f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} "
             f"seed{'s' * (seeds != 1)} each, compared with {batch.reference}."
         ),
-        "failed": [*summary.missing_told(batch), *summary.absent_told(batch), *summary.failures_told(batch)],
-        "warnings": [*summary.reference_told(batch), *summary.instants_told(batch), *summary.power_told(tests)],
+        "failed": [
+            *summary.missing_told(batch),
+            *summary.absent_told(batch),
+            *summary.failures_told(batch),
+        ],
+        "warnings": [
+            *summary.reference_told(batch),
+            *summary.instants_told(batch),
+            *summary.power_told(tests),
+        ],
         "headlines": summary.headlines(batch, head, tests) if head else [],
         "overview": overview[0] if overview else None,
         "log_findings": summary.errors_told(batch, metrics, tests),
@@ -101,7 +141,10 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         "consistency_drawings": list(filter(None, anees)),
         "costs": costs,
         "cost_drawing": figures.cost_drawing(batch),
-        "run_lists": [(log, [one for at, one in runs if at == log]) for log in dict.fromkeys(at for at, _ in runs)],
+        "run_lists": [
+            (log, [one for at, one in runs if at == log])
+            for log in dict.fromkeys(at for at, _ in runs)
+        ],
         "tables": [
             *overview,
             failures,

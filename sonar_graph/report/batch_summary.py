@@ -22,13 +22,23 @@ from sonar_graph.batch import (
     summarise,
 )
 from sonar_graph.evaluation import quantile_text
-from sonar_graph.report.batch_tables import GROUP_COLUMNS, SIGNIFICANT, Tests, p_text, unit_of
+from sonar_graph.report.batch_tables import (
+    GROUP_COLUMNS,
+    SIGNIFICANT,
+    Tests,
+    p_text,
+    unit_of,
+)
 from sonar_graph.table import Cell, Column, Table, absent, number, words
 
 SCORED = "scored_instants"
 NAMED = 3
 """Largest number of logs that a warning names; others are counted."""
-LOWER, HIGHER, DIFFERENT = "\N{DOWNWARDS ARROW}", "\N{UPWARDS ARROW}", "\N{NOT EQUAL TO}"
+LOWER, HIGHER, DIFFERENT = (
+    "\N{DOWNWARDS ARROW}",
+    "\N{UPWARDS ARROW}",
+    "\N{NOT EQUAL TO}",
+)
 SIDES = {LOWER: "lower", HIGHER: "higher", DIFFERENT: "different"}
 
 
@@ -40,14 +50,20 @@ def failures_told(batch: RecordedBatch) -> list[str]:
         failed = [run for run in runs if not run.ended]
         if failed:
             logs = _few(list(dict.fromkeys(run.log for run in failed)))
-            sentences.append(f"{contestant}: {len(failed)} of {len(runs)} runs did not end ({logs}).")
+            sentences.append(
+                f"{contestant}: {len(failed)} of {len(runs)} runs did not end ({logs})."
+            )
     return sentences
 
 
 def reference_told(batch: RecordedBatch) -> list[str]:
     """A warning where the reference never ended: differences then show its failure and nothing else."""
     groups = {log: batch.group(log, batch.reference) for log in batch.logs}
-    lost = [log for log, group in groups.items() if group and not any(run.ended for run in group)]
+    lost = [
+        log
+        for log, group in groups.items()
+        if group and not any(run.ended for run in group)
+    ]
     if not lost:
         return []
     return [
@@ -58,10 +74,19 @@ def reference_told(batch: RecordedBatch) -> list[str]:
 
 def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
     """A sentence for each log on the first error that it has: medians, then significant differences."""
-    columns = [(metric, over, key) for metric in metrics if metric.is_error for over, key in metric.keys.items()]
+    columns = [
+        (metric, over, key)
+        for metric in metrics
+        if metric.is_error
+        for over, key in metric.keys.items()
+    ]
     sentences = []
     for log in batch.logs:
-        known = (one for one in columns if any(batch.is_asked(log, name, one[2]) for name in batch.contestants))
+        known = (
+            one
+            for one in columns
+            if any(batch.is_asked(log, name, one[2]) for name in batch.contestants)
+        )
         found = next(known, None)
         if found is None:
             sentences.append(f"{log}: no run has an error to compare.")
@@ -80,7 +105,10 @@ def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> li
         )
         unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
         which = f"{over.lower()} " if over else ""
-        told, alike = [f"{log}, median {which}error{unit} ({metric.label}): {listed}."], []
+        told, alike = (
+            [f"{log}, median {which}error{unit} ({metric.label}): {listed}."],
+            [],
+        )
         for contestant in batch.contestants:
             if (key, log, contestant) not in tests:
                 continue
@@ -88,7 +116,9 @@ def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> li
             if p_value < SIGNIFICANT:
                 p = p_text(p_value)
                 sign = "" if p.startswith("<") else "= "
-                told.append(f"{contestant} {_side_told(batch, metric, test)} (p {sign}{p}).")
+                told.append(
+                    f"{contestant} {_side_told(batch, metric, test)} (p {sign}{p})."
+                )
             else:
                 alike.append(contestant)
         if alike:
@@ -105,7 +135,9 @@ def _side_told(batch: RecordedBatch, metric: Metric, test: PairedDifference) -> 
     side = f"is {'below' if test.median < 0 else 'above'} {batch.reference}"
     if math.isinf(test.median):
         return f"{side}, {counted}"
-    size = quantile_text(abs(test.median) * metric.factor, test.median_error * metric.factor)
+    size = quantile_text(
+        abs(test.median) * metric.factor, test.median_error * metric.factor
+    )
     return f"{side} by {size} in the median, {counted}"
 
 
@@ -121,7 +153,9 @@ def instants_told(batch: RecordedBatch) -> list[str]:
             uneven.append(log)
     if not uneven:
         return []
-    return [f"Scored at different numbers of instants, which differences then mix in: {_few(uneven)}."]
+    return [
+        f"Scored at different numbers of instants, which differences then mix in: {_few(uneven)}."
+    ]
 
 
 def power_told(tests: Tests) -> list[str]:
@@ -132,13 +166,26 @@ def power_told(tests: Tests) -> list[str]:
     blind: dict[str, str] = {}
     for family in families.values():
         pairs = [test.pairs for test in family.values()]
-        best = holm(np.array([least_p(count) if count >= LEAST_PAIRS else math.nan for count in pairs]))
+        best = holm(
+            np.array(
+                [
+                    least_p(count) if count >= LEAST_PAIRS else math.nan
+                    for count in pairs
+                ]
+            )
+        )
         found = zip(family.items(), best.tolist(), strict=True)
-        blind |= {log: test.counted for ((log, _), test), p_value in found if not p_value < SIGNIFICANT}
+        blind |= {
+            log: test.counted
+            for ((log, _), test), p_value in found
+            if not p_value < SIGNIFICANT
+        }
     if not blind:
         return []
     listed = _few([f"{log} ({counted})" for log, counted in blind.items()])
-    return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
+    return [
+        f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."
+    ]
 
 
 def _few(names: list[str], joint: str = ", ") -> str:
@@ -151,39 +198,72 @@ def head_metric(batch: RecordedBatch, metrics: list[Metric]) -> Metric | None:
     """The error that most logs have, of those the one that the suite names first; None where no run has an error."""
 
     def has(log: str, metric: Metric) -> bool:
-        return any(batch.is_asked(log, name, key) for key in metric.keys.values() for name in batch.contestants)
+        return any(
+            batch.is_asked(log, name, key)
+            for key in metric.keys.values()
+            for name in batch.contestants
+        )
 
-    logs = {metric.name: sum(has(log, metric) for log in batch.logs) for metric in metrics if metric.is_error}
+    logs = {
+        metric.name: sum(has(log, metric) for log in batch.logs)
+        for metric in metrics
+        if metric.is_error
+    }
     if not any(logs.values()):
         return None
-    return max((metric for metric in metrics if metric.is_error), key=lambda metric: logs[metric.name])
+    return max(
+        (metric for metric in metrics if metric.is_error),
+        key=lambda metric: logs[metric.name],
+    )
 
 
 def headlines(batch: RecordedBatch, metric: Metric, tests: Tests) -> list[str]:
     """For each estimate the contestants that differ from the reference, the side, and the number of logs."""
-    own = {place: test for place, test in tests.items() if place[0] in metric.keys.values() and place[1] in batch.logs}
+    own = {
+        place: test
+        for place, test in tests.items()
+        if place[0] in metric.keys.values() and place[1] in batch.logs
+    }
     several = len(batch.logs) > 1
     if own and not any(map(mark_of, own.values())):
         place = " on any one log" if several else ""
-        return [f"{metric.label}: no estimator is told apart from {batch.reference}{place}."]
+        return [
+            f"{metric.label}: no estimator is told apart from {batch.reference}{place}."
+        ]
     sentences = []
     for over, key in metric.keys.items():
-        names = [name for name in _shown(batch, metric, over) if any((key, log, name) in own for log in batch.logs)]
+        names = [
+            name
+            for name in _shown(batch, metric, over)
+            if any((key, log, name) in own for log in batch.logs)
+        ]
         if not names:
             continue
-        marks = {name: [mark_of(own.get((key, log, name))) for log in batch.logs] for name in names}
+        marks = {
+            name: [mark_of(own.get((key, log, name))) for log in batch.logs]
+            for name in names
+        }
         told = []
         for mark, word in SIDES.items():
-            counts = {name: found.count(mark) for name, found in marks.items() if mark in found}
+            counts = {
+                name: found.count(mark)
+                for name, found in marks.items()
+                if mark in found
+            }
             if counts:
-                listed = ", ".join(f"{name} ({count})" if several else name for name, count in counts.items())
+                listed = ", ".join(
+                    f"{name} ({count})" if several else name
+                    for name, count in counts.items()
+                )
                 told.append(f"{word} with {listed}")
         alike = ", ".join(name for name, found in marks.items() if not any(found))
         place = f" (on how many of {len(batch.logs)} logs)" if several and told else ""
         if alike:
             told.append(f"{'never' if several else 'not'} told apart: {alike}")
         subject = f"{over} error" if over else "Error"
-        sentences.append(f"{subject} beside that of {batch.reference}{place}: {'; '.join(told)}.")
+        sentences.append(
+            f"{subject} beside that of {batch.reference}{place}: {'; '.join(told)}."
+        )
     return sentences
 
 
@@ -192,12 +272,22 @@ def mark_of(found: tuple[PairedDifference, float] | None) -> str:
     if found is None or not found[1] < SIGNIFICANT:
         return ""
     median = found[0].median
-    return DIFFERENT if math.isnan(median) or median == 0 else LOWER if median < 0 else HIGHER
+    return (
+        DIFFERENT
+        if math.isnan(median) or median == 0
+        else LOWER
+        if median < 0
+        else HIGHER
+    )
 
 
 def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
     """Logs down, contestants across: medians, with a mark where a contestant differs from the reference."""
-    shown = [(over, key, name) for over, key in metric.keys.items() for name in _shown(batch, metric, over)]
+    shown = [
+        (over, key, name)
+        for over, key in metric.keys.items()
+        for name in _shown(batch, metric, over)
+    ]
     columns = [GROUP_COLUMNS[0]]
     for over, key, name in shown:
         heading = f"{name} (reference)" if name == batch.reference else name
@@ -210,28 +300,52 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             if not batch.is_asked(log, name, key):
                 rows[-1].append(absent(2))
                 continue
-            told, found = summarise(batch.values(log, name, key)), tests.get((key, log, name))
-            text = quantile_text(told.median * metric.factor, told.median_error * metric.factor)
-            note = f"{told.without} of {told.runs} without a value" if told.without else ""
+            told, found = (
+                summarise(batch.values(log, name, key)),
+                tests.get((key, log, name)),
+            )
+            text = quantile_text(
+                told.median * metric.factor, told.median_error * metric.factor
+            )
+            note = (
+                f"{told.without} of {told.runs} without a value" if told.without else ""
+            )
             p_value = found[1] if found else math.nan
-            rows[-1].append(number(told.median, f"{text} {mark_of(found)}".rstrip(), p_value, note=note))
+            rows[-1].append(
+                number(
+                    told.median, f"{text} {mark_of(found)}".rstrip(), p_value, note=note
+                )
+            )
     caption = (
         f"{LOWER} lower, {HIGHER} higher than {batch.reference} on the same seeds, beyond chance "
         f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart."
     )
-    return Table("overview", f"{metric.label}{unit_of(metric)}, median over runs", caption, columns, rows)
+    return Table(
+        "overview",
+        f"{metric.label}{unit_of(metric)}, median over runs",
+        caption,
+        columns,
+        rows,
+    )
 
 
 def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:
     """Contestants that have the estimate; the smoothed one only where it is not the causal one everywhere."""
     key, first = metric.keys[over], next(iter(metric.keys.values()))
-    asked = [name for name in batch.contestants if any(batch.is_asked(log, name, key) for log in batch.logs)]
+    asked = [
+        name
+        for name in batch.contestants
+        if any(batch.is_asked(log, name, key) for log in batch.logs)
+    ]
     if key == first:
         return asked
     return [
         name
         for name in asked
-        if not all(np.array_equal(batch.values(log, name, key), batch.values(log, name, first)) for log in batch.logs)
+        if not all(
+            np.array_equal(batch.values(log, name, key), batch.values(log, name, first))
+            for log in batch.logs
+        )
     ]
 
 
@@ -242,7 +356,9 @@ def missing_told(batch: RecordedBatch) -> list[str]:
     by_contestant = Counter(run.contestant for run in batch.missing)
     planned = by_contestant + Counter(run.contestant for run in batch.runs)
     names = [name for name in batch.contestants if by_contestant[name]]
-    whose = ", ".join(f"{name} {by_contestant[name]} of {planned[name]}" for name in names)
+    whose = ", ".join(
+        f"{name} {by_contestant[name]} of {planned[name]}" for name in names
+    )
     lacking = {run.log for run in batch.missing}
     logs = _few([log for log in batch.logs if log in lacking], "; ")
     return [
@@ -253,7 +369,10 @@ def missing_told(batch: RecordedBatch) -> list[str]:
 
 def absent_told(batch: RecordedBatch) -> list[str]:
     """The logs that were left out because their data was not there, and where it is from."""
-    return [f"Left out, because its data was not there: {name}. Get {source}." for name, source in batch.absent.items()]
+    return [
+        f"Left out, because its data was not there: {name}. Get {source}."
+        for name, source in batch.absent.items()
+    ]
 
 
 def lost_told(batch: RecordedBatch) -> list[str]:
@@ -271,4 +390,6 @@ def marked(batch: RecordedBatch, table: Table) -> Table:
     """The table, with a caption that says where runs are missing: tables are also used outside the page."""
     if not batch.missing:
         return table
-    return replace(table, caption=f"{table.caption} Not complete: {batch.missing_count}.".lstrip())
+    return replace(
+        table, caption=f"{table.caption} Not complete: {batch.missing_count}.".lstrip()
+    )

@@ -54,7 +54,10 @@ SAME_EVIDENCE = (
     "At the last instant a smoothed estimate has seen no more than the causal one: it is no second evidence, and is "
     "shown only where it differs by more than a tenth."
 )
-GROUP_COLUMNS = (Column("log", "Log", is_number=False), Column("contestant", "Estimator", is_number=False))
+GROUP_COLUMNS = (
+    Column("log", "Log", is_number=False),
+    Column("contestant", "Estimator", is_number=False),
+)
 
 
 def unit_of(metric: Metric) -> str:
@@ -77,7 +80,11 @@ def groups_of(batch: RecordedBatch) -> Iterator[tuple[str, str, list[RecordedRun
 
 def runs_cell(batch: RecordedBatch, log: str, contestant: str, note: str = "") -> Cell:
     """The number of a group's runs, with a link to their list."""
-    return count(len(batch.group(log, contestant)), note, link=f"#{group_anchor(batch, log, contestant)}")
+    return count(
+        len(batch.group(log, contestant)),
+        note,
+        link=f"#{group_anchor(batch, log, contestant)}",
+    )
 
 
 def group_anchor(batch: RecordedBatch, log: str, contestant: str) -> str:
@@ -102,13 +109,25 @@ def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
                     own, other = batch.pairs(log, contestant, key)
                     if contestant == batch.reference or not len(own):
                         continue
-                    place = same[key, log, contestant] = (log, contestant, own.tobytes(), other.tobytes())
+                    place = same[key, log, contestant] = (
+                        log,
+                        contestant,
+                        own.tobytes(),
+                        other.tobytes(),
+                    )
                     if place not in distinct:
-                        cases = batch.cases(log, contestant, key) if log == ALL_LOGS else None
+                        cases = (
+                            batch.cases(log, contestant, key)
+                            if log == ALL_LOGS
+                            else None
+                        )
                         distinct[place] = paired(own, other, cases)
         p_values = holm(np.array([test.p_value for test in distinct.values()])).tolist()
         corrected = dict(zip(distinct, p_values, strict=True))
-        tests |= {place: (distinct[numbers], corrected[numbers]) for place, numbers in same.items()}
+        tests |= {
+            place: (distinct[numbers], corrected[numbers])
+            for place, numbers in same.items()
+        }
     return tests
 
 
@@ -138,11 +157,26 @@ def failure_table(batch: RecordedBatch) -> Table:
                 counts = Counter(run.status for run in group)
                 rate = failure_rate(len(group) - counts["ok"], len(group))
                 interval = f"{100 * rate.low:.0f} to {100 * rate.high:.0f} %"
-                cells = [runs_cell(batch, log, contestant), *(count(counts[status]) for status in ("ok", *FAILURES))]
-                cells.append(Cell(f"{100 * rate.share:.0f} %", (rate.share, rate.low, rate.high), interval))
+                cells = [
+                    runs_cell(batch, log, contestant),
+                    *(count(counts[status]) for status in ("ok", *FAILURES)),
+                ]
+                cells.append(
+                    Cell(
+                        f"{100 * rate.share:.0f} %",
+                        (rate.share, rate.low, rate.high),
+                        interval,
+                    )
+                )
             cells += [count(not_run)] if batch.missing else []
             rows.append([*group_cells(batch, log, contestant), *cells])
-    return Table("failures", "Runs that ended", "Rates with 95 % intervals (Wilson).", columns, rows)
+    return Table(
+        "failures",
+        "Runs that ended",
+        "Rates with 95 % intervals (Wilson).",
+        columns,
+        rows,
+    )
 
 
 def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
@@ -163,7 +197,9 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
         ]
         for key in metric.keys.values():
             if batch.is_asked(log, contestant, key):
-                row += summary_cells(summarise(batch.values(log, contestant, key)), metric.factor)
+                row += summary_cells(
+                    summarise(batch.values(log, contestant, key)), metric.factor
+                )
             else:
                 row += [absent(2), absent(), absent(2)]
         rows.append(row)
@@ -175,7 +211,9 @@ def summary_cells(told: SampleSummary, factor: float = 1.0) -> list[Cell]:
     note = f"{told.without} of {told.runs} without a value" if told.without else ""
     text = with_error(told.mean * factor, told.standard_error * factor)
     mean = number(told.mean, text, told.standard_error, note=note)
-    median = number(told.median, quantile_text(told.median * factor, told.median_error * factor))
+    median = number(
+        told.median, quantile_text(told.median * factor, told.median_error * factor)
+    )
     if told.runs == 1:
         return [mean, median, absent(2)]
     low = quantile_text(told.low * factor, told.low_error * factor)
@@ -203,13 +241,19 @@ def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Tabl
             without = max(test.without for test in known)
             note = f"{without} without a value" if without else ""
             pairs = Cell(known[0].counted, (known[0].pairs, known[0].each), note=note)
-            cells = [cell for found in own for cell in _difference_cells(found, metric.factor)]
+            cells = [
+                cell
+                for found in own
+                for cell in _difference_cells(found, metric.factor)
+            ]
             rows.append([*group_cells(batch, log, contestant), pairs, *cells])
     caption = f"{_unit_note(metric)} Contestant minus {batch.reference}: negative means smaller than the reference."
     return _metric_table("difference", metric, caption, columns, rows)
 
 
-def _difference_cells(found: tuple[PairedDifference, float] | None, factor: float) -> list[Cell]:
+def _difference_cells(
+    found: tuple[PairedDifference, float] | None, factor: float
+) -> list[Cell]:
     """Mean with its interval, median, count of smaller ones, and p value."""
     if found is None:
         return [absent(3), absent(), absent(), absent(2)]
@@ -218,7 +262,9 @@ def _difference_cells(found: tuple[PairedDifference, float] | None, factor: floa
     note = "" if math.isnan(low) else between(low * factor, high * factor, error)
     median = quantile_text(test.median * factor, test.median_error * factor)
     if math.isinf(test.median):
-        median = "worse: no value" if test.median > 0 else "better: reference has no value"
+        median = (
+            "worse: no value" if test.median > 0 else "better: reference has no value"
+        )
     return [
         number(test.mean, supported(test.mean * factor, error), low, high, note=note),
         number(test.median, median),
@@ -234,12 +280,26 @@ def p_text(p_value: float) -> str:
     if not p_value < 0.995:
         return "1.0"
     texts = [f"{p_value:.{digits}g}" for digits in range(2, 18)]
-    return next(text for text in texts if np.sign(float(text) - SIGNIFICANT) == np.sign(p_value - SIGNIFICANT))
+    return next(
+        text
+        for text in texts
+        if np.sign(float(text) - SIGNIFICANT) == np.sign(p_value - SIGNIFICANT)
+    )
 
 
-def _metric_table(kind: str, metric: Metric, caption: str, columns: list[Column], rows: list[list[Cell]]) -> Table:
+def _metric_table(
+    kind: str,
+    metric: Metric,
+    caption: str,
+    columns: list[Column],
+    rows: list[list[Cell]],
+) -> Table:
     prefix = metric.keys[""].partition(".")[0] if "" in metric.keys else ""
-    name = "-".join(filter(None, [kind, prefix, metric.name])).replace("_", "-").replace(".", "-")
+    name = (
+        "-".join(filter(None, [kind, prefix, metric.name]))
+        .replace("_", "-")
+        .replace(".", "-")
+    )
     unit = f", {metric.shown_unit}" if metric.shown_unit else ""
     return Table(name, f"{metric.label}{unit}", caption, columns, rows)
 
@@ -249,14 +309,18 @@ def _unit_note(metric: Metric) -> str:
     return f"{metric.protocol}{' ' + metric.direction.capitalize() + '.' if metric.direction else ''}{converted}"
 
 
-def anees_of(batch: RecordedBatch, log: str, contestant: str, kind: str, what: str) -> Anees | None:
+def anees_of(
+    batch: RecordedBatch, log: str, contestant: str, kind: str, what: str
+) -> Anees | None:
     """The ANEES of a group over its runs, at the last instant of each; None where no covariance is reported."""
     key = f"{kind}.nees_{what}{LATEST}"
     if not batch.is_asked(log, contestant, key):
         return None
     group = batch.group(log, contestant)
     dofs = {run.values[f"{key}_dof"] for run in group if f"{key}_dof" in run.values}
-    return anees(batch.values(log, contestant, key), dofs.pop() if len(dofs) == 1 else math.nan)
+    return anees(
+        batch.values(log, contestant, key), dofs.pop() if len(dofs) == 1 else math.nan
+    )
 
 
 def is_evidence(told: dict[str, Anees | None], kind: str) -> bool:
@@ -276,12 +340,16 @@ def is_evidence(told: dict[str, Anees | None], kind: str) -> bool:
 def consistency_table(batch: RecordedBatch) -> Table:
     """ANEES at the last instant of runs that are independent, with its band; a smoothed one only where it differs."""
     told = {
-        (log, contestant, what): {kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS}
+        (log, contestant, what): {
+            kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS
+        }
         for log in batch.logs
         for contestant in batch.contestants
         for what in ("position", "yaw")
     }
-    kinds = [kind for kind in KINDS if any(is_evidence(one, kind) for one in told.values())]
+    kinds = [
+        kind for kind in KINDS if any(is_evidence(one, kind) for one in told.values())
+    ]
     columns = [
         *GROUP_COLUMNS,
         Column("of", "Of", is_number=False),
@@ -290,7 +358,10 @@ def consistency_table(batch: RecordedBatch) -> Table:
     ]
     for kind in kinds:
         over = kind.capitalize()
-        columns += [Column(f"{kind}_anees", "ANEES", over), Column(f"{kind}_verdict", "Reading", over, is_number=False)]
+        columns += [
+            Column(f"{kind}_anees", "ANEES", over),
+            Column(f"{kind}_verdict", "Reading", over, is_number=False),
+        ]
     rows = []
     for (log, contestant, what), both in told.items():
         known = [one for one in both.values() if one is not None]
@@ -299,16 +370,24 @@ def consistency_table(batch: RecordedBatch) -> Table:
         low, high = known[0].band
         failed = sum(not run.ended for run in batch.group(log, contestant))
         cells = [*group_cells(batch, log, contestant), words(what)]
-        cells.append(count(known[0].runs, f"{failed} failed: no average" if failed else ""))
+        cells.append(
+            count(known[0].runs, f"{failed} failed: no average" if failed else "")
+        )
         cells.append(number(low, f"{low:.2f} to {high:.2f}", high))
         for kind in kinds:
-            one, values = both[kind], batch.values(log, contestant, f"{kind}.nees_{what}{LATEST}")
+            one, values = (
+                both[kind],
+                batch.values(log, contestant, f"{kind}.nees_{what}{LATEST}"),
+            )
             if one is None:
                 cells += [absent(), words("")]
             elif not is_evidence(both, kind):
                 cells += [number(one.mean, "as causal"), words("")]
             else:
-                cells += [number(one.mean, supported(one.mean, standard_error(values))), words(one.verdict)]
+                cells += [
+                    number(one.mean, supported(one.mean, standard_error(values))),
+                    words(one.verdict),
+                ]
         rows.append(cells)
     caption = (
         "Average over runs of the normalised squared error at the last instant, per degree of freedom: 1 is "
@@ -327,9 +406,19 @@ def cost_table(batch: RecordedBatch) -> Table:
         columns.append(Column(key, "10 to 90 %", COSTS[key], QUANTILES))
     rows = []
     for log, contestant, _ in groups_of(batch):
-        cells = [summary_cells(summarise(batch.values(log, contestant, key)))[1:] for key in known]
-        rows.append([*group_cells(batch, log, contestant), *(cell for pair in cells for cell in pair)])
-    caption = "Measured while other runs went on beside them: compare within this batch only."
+        cells = [
+            summary_cells(summarise(batch.values(log, contestant, key)))[1:]
+            for key in known
+        ]
+        rows.append(
+            [
+                *group_cells(batch, log, contestant),
+                *(cell for pair in cells for cell in pair),
+            ]
+        )
+    caption = (
+        "Measured while other runs went on beside them: compare within this batch only."
+    )
     return Table("costs", "Time and memory", caption, columns, rows)
 
 
@@ -347,15 +436,26 @@ def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[tuple[str, Ta
             Column("seed", "Seed"),
             Column("key", "Run", is_number=False),
             Column("status", "Status", is_number=False),
-            *(Column(key, f"{metric.label}{unit_of(metric)}", over) for metric, over, key in shown),
+            *(
+                Column(key, f"{metric.label}{unit_of(metric)}", over)
+                for metric, over, key in shown
+            ),
         ]
         rows = []
         for run in group:
             seed = absent() if run.seed is None else count(run.seed)
-            row = [seed, words(run.key, run.log_file), Cell(run.status, (run.status,), note=run.reason)]
+            row = [
+                seed,
+                words(run.key, run.log_file),
+                Cell(run.status, (run.status,), note=run.reason),
+            ]
             for metric, _, key in shown:
                 value = run.value(key)
-                row.append(absent() if math.isinf(value) else number(value, format_value(value * metric.factor)))
+                row.append(
+                    absent()
+                    if math.isinf(value)
+                    else number(value, format_value(value * metric.factor))
+                )
             rows.append(row)
         name = group_anchor(batch, log, contestant)
         lists.append((log, Table(name, f"{log}, {contestant}", "", columns, rows)))

@@ -33,7 +33,11 @@ from sonar_graph.evaluation import (
 from sonar_graph.files import COMPARISON, replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
-from sonar_graph.report.ensemble_section import ensemble_figure, ensemble_sentences, ensemble_table
+from sonar_graph.report.ensemble_section import (
+    ensemble_figure,
+    ensemble_sentences,
+    ensemble_table,
+)
 from sonar_graph.report.figure_style import Illustration, inline_svg, sized
 from sonar_graph.report.figures import illustrations, reliability_figure
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
@@ -52,7 +56,9 @@ RUN_FILES = {
 """Files of a run, and the field of `RunResult` without which a file is absent."""
 
 
-def write_report(comparison: Comparison, folder: str | Path, *, overwrite: bool = False) -> Path:
+def write_report(
+    comparison: Comparison, folder: str | Path, *, overwrite: bool = False
+) -> Path:
     """Write a comparison into a folder: all the files that ``sonar-graph compare`` writes.
 
     The folder is made where it does not exist. It gets ``report.html``, ``comparison.json``, ``sequence.npz``,
@@ -98,7 +104,9 @@ def write_report(comparison: Comparison, folder: str | Path, *, overwrite: bool 
             write_viewer_files(comparison, folder)
             return write_page(comparison, folder)
     except OSError as error:
-        raise EvaluationError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from error
+        raise EvaluationError(
+            f"{folder}: cannot be written: {error.strerror}; choose another folder"
+        ) from error
 
 
 def write_page(comparison: Comparison, folder: Path) -> Path:
@@ -129,7 +137,11 @@ def render_report(comparison: Comparison) -> str:
     is_repeated, failed = repeats_published(sequence), comparison.failed_runs
     detections = len(sequence.detections) if sequence.detections else 0
     lost = sentences.lost_runs(comparison)
-    told = [sentence for sentence in sentences.finding(comparison)[len(failed) :] if sentence not in lost]
+    told = [
+        sentence
+        for sentence in sentences.finding(comparison)[len(failed) :]
+        if sentence not in lost
+    ]
     content = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
@@ -143,7 +155,10 @@ def render_report(comparison: Comparison) -> str:
         ),
         "ensemble": ensemble_sentences(comparison.ensembles),
         "ensembles": [
-            (ensemble_table(one, f"runs-{place}"), ensemble_illustration(one, f"runs-{place}"))
+            (
+                ensemble_table(one, f"runs-{place}"),
+                ensemble_illustration(one, f"runs-{place}"),
+            )
             for place, one in enumerate(comparison.ensembles, start=1)
         ],
         "headline": sentences.headline(comparison) or told[0],
@@ -195,8 +210,15 @@ def render_report(comparison: Comparison) -> str:
 def comparison_tables(comparison: Comparison) -> list[Table]:
     """All tables of numbers that the page has, but the compact one."""
     landmarks = landmark_table(comparison)
-    tables = [score_table(comparison), *([landmarks] if landmarks else []), outcome_table(comparison)]
-    tables += [ensemble_table(one, f"runs-{place}") for place, one in enumerate(comparison.ensembles, start=1)]
+    tables = [
+        score_table(comparison),
+        *([landmarks] if landmarks else []),
+        outcome_table(comparison),
+    ]
+    tables += [
+        ensemble_table(one, f"runs-{place}")
+        for place, one in enumerate(comparison.ensembles, start=1)
+    ]
     return [table for table in [*tables, refused_table(comparison)] if table.rows]
 
 
@@ -222,14 +244,18 @@ def _as_json(values: Any) -> str:
     return json.dumps(values, indent=2, default=str, ensure_ascii=False)
 
 
-def protocols(comparison: Comparison) -> dict[str, list[tuple[str, str, list[tuple[str, str]]]]]:
+def protocols(
+    comparison: Comparison,
+) -> dict[str, list[tuple[str, str, list[tuple[str, str]]]]]:
     """The measuring rules by block of the score table: label, key, and each rule with the runs that it is of.
 
     The runs are left out where one rule is of all.
     """
     table = score_table(comparison)
     found: dict[str, list[tuple[str, str, list[tuple[str, str]]]]] = {}
-    for place, (key, row) in enumerate(zip(score_keys(comparison), table.rows, strict=True)):
+    for place, (key, row) in enumerate(
+        zip(score_keys(comparison), table.rows, strict=True)
+    ):
         if place in table.sections:
             told = found.setdefault(table.sections[place], [])
         rules: dict[str, list[str]] = {}
@@ -237,24 +263,41 @@ def protocols(comparison: Comparison) -> dict[str, list[tuple[str, str, list[tup
             if key in (scores := comparison.scores.get(name, {})):
                 rules.setdefault(scores[key].protocol, []).append(name)
         told.append(
-            (row[0].text, key, [("" if len(rules) == 1 else ", ".join(names), rule) for rule, names in rules.items()])
+            (
+                row[0].text,
+                key,
+                [
+                    ("" if len(rules) == 1 else ", ".join(names), rule)
+                    for rule, names in rules.items()
+                ],
+            )
         )
     return found
 
 
 def outcome_table(comparison: Comparison) -> Table:
     """Outcomes of detections, with count and share by run; a total in the last row."""
-    counts = [Counter(run.detections.outcomes) if run.detections else None for run in comparison.runs]
+    counts = [
+        Counter(run.detections.outcomes) if run.detections else None
+        for run in comparison.runs
+    ]
     rows = []
     for outcome in Outcome:
         if any(count and count[outcome] for count in counts):
             shares = [
-                ABSENT if count is None else f"{count[outcome]} ({100 * count[outcome] / max(count.total(), 1):.1f} %)"
+                ABSENT
+                if count is None
+                else f"{count[outcome]} ({100 * count[outcome] / max(count.total(), 1):.1f} %)"
                 for count in counts
             ]
             rows.append([outcome.value.capitalize(), *shares])
     if rows:
-        rows.append(["All detections", *(ABSENT if count is None else str(count.total()) for count in counts)])
+        rows.append(
+            [
+                "All detections",
+                *(ABSENT if count is None else str(count.total()) for count in counts),
+            ]
+        )
     columns = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
     cells = [[words(text) for text in row] for row in rows]
     return Table("outcomes", "What became of each detection", "", columns, cells)
@@ -272,7 +315,14 @@ def refused_table(comparison: Comparison) -> Table:
         Column("estimators", "Estimators", is_number=False),
     ]
     rows = [
-        [row.sensor, str(row.count), row.times(start_ns), row.reason, row.distances() or ABSENT, ", ".join(names)]
+        [
+            row.sensor,
+            str(row.count),
+            row.times(start_ns),
+            row.reason,
+            row.distances() or ABSENT,
+            ", ".join(names),
+        ]
         for row, names in sentences.refused_by(comparison).items()
     ]
     cells = [[words(text) for text in row] for row in rows]
@@ -284,15 +334,22 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     found, sequence = comparison.recognition, comparison.sequence
     if found is None:
         return None
-    from sonar_graph.recognition import SURE  # a recogniser takes a while to load, and most logs have detections
+    # a recogniser takes a while to load, and most logs have detections
+    from sonar_graph.recognition import (
+        SURE,
+    )
 
     start_ns, judged = sequence.start_ns, reliability_of(sequence)
     pictures = []
     for picture in found.shown():
         pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)
-        named = ", ".join(f"ID {landmark} ({probability:.2f})" for landmark, probability in pairs)
+        named = ", ".join(
+            f"ID {landmark} ({probability:.2f})" for landmark, probability in pairs
+        )
         caption = f"T = {(picture.stamp_ns - start_ns) * 1e-9:.1f} s: {named}"
-        pictures.append({"address": data_address(picture.jpeg, "image/jpeg"), "caption": caption})
+        pictures.append(
+            {"address": data_address(picture.jpeg, "image/jpeg"), "caption": caption}
+        )
     reliability = ""
     if judged is not None:
         description = (
@@ -300,7 +357,9 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
             f"{judged.count.sum()} detections."
         )
         with sized():
-            reliability = inline_svg(reliability_figure(judged), "reliability", description)
+            reliability = inline_svg(
+                reliability_figure(judged), "reliability", description
+            )
     return {
         "frames": found.frames,
         "detections": 0 if sequence.detections is None else len(sequence.detections),
@@ -318,7 +377,10 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
             "frames",
             "Frames that were not used, and changes of the sonar's window",
             ["Time (s)", "Reason"],
-            [[f"{(stamp_ns - start_ns) * 1e-9:.2f}", reason] for stamp_ns, reason in found.warnings],
+            [
+                [f"{(stamp_ns - start_ns) * 1e-9:.2f}", reason]
+                for stamp_ns, reason in found.warnings
+            ],
             numbers=False,
         ),
         "expected_error": None if judged is None else f"{judged.expected_error:.3f}",
@@ -329,26 +391,44 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
 def _of_truth(sequence: Sequence) -> str:
     if sequence.truth is None:
         return "without ground truth"
-    return "with ground truth" if sequence.true_poses else "with true positions, but no true orientation"
+    return (
+        "with ground truth"
+        if sequence.true_poses
+        else "with true positions, but no true orientation"
+    )
 
 
 def naming_table(sequence: Sequence) -> Table | None:
     """Detections by their true class: named rightly, named wrongly, taken for no landmark; None without truth."""
-    if sequence.detections is None or sequence.true_poses is None or sequence.true_landmarks is None:
+    if (
+        sequence.detections is None
+        or sequence.true_poses is None
+        or sequence.true_landmarks is None
+    ):
         return None
     labels = true_identities(sequence, sequence.detections)
     _, named = confidences(sequence.detections)
 
     def counted(chosen: NDArray[np.bool_]) -> list[str]:
-        return [str(int((chosen & (named != NONE)).sum())), str(int((chosen & (named == NONE)).sum()))]
+        return [
+            str(int((chosen & (named != NONE)).sum())),
+            str(int((chosen & (named == NONE)).sum())),
+        ]
 
     rows = []
     for identity in sequence.true_landmarks.ids.tolist():
         seen = labels == identity
         right = int((seen & (named == identity)).sum())
-        rows.append([f"landmark {identity}", str(right), *counted(seen & (named != identity))])
+        rows.append(
+            [f"landmark {identity}", str(right), *counted(seen & (named != identity))]
+        )
     rows.append(["no landmark", ABSENT, *counted(labels == NONE)])
     if np.any(labels == UNJUDGED):
         rows.append(["cannot be told", ABSENT, *counted(labels == UNJUDGED)])
     title = "What detections truly are, and what was most probable for the recogniser"
-    return text_table("naming", title, ["Truly", "named rightly", "named wrongly", "taken for no landmark"], rows)
+    return text_table(
+        "naming",
+        title,
+        ["Truly", "named rightly", "named wrongly", "taken for no landmark"],
+        rows,
+    )

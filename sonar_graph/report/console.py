@@ -5,7 +5,13 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from sonar_graph.evaluation import Comparison, headline_metric, label, repeats_published, score_keys
+from sonar_graph.evaluation import (
+    Comparison,
+    headline_metric,
+    label,
+    repeats_published,
+    score_keys,
+)
 from sonar_graph.report import sentences
 from sonar_graph.report.ensemble_section import ensemble_sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
@@ -48,21 +54,43 @@ def summary(comparison: Comparison) -> Group:
     below the table may be as wide as the terminal.
     """
     metric = headline_metric(comparison)
-    errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
+    errors = (
+        {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"}
+        if metric
+        else {}
+    )
     present = score_keys(comparison)
     mapped = {} if metric else {"landmarks.se2_m": "map"}
-    columns = {key: heading for key, heading in {**errors, **mapped, **COLUMNS}.items() if key in present}
-    table = Table(title=Text(comparison.sequence.name, style="bold"), title_justify="left")
+    columns = {
+        key: heading
+        for key, heading in {**errors, **mapped, **COLUMNS}.items()
+        if key in present
+    }
+    table = Table(
+        title=Text(comparison.sequence.name, style="bold"), title_justify="left"
+    )
     table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
     table.add_column("estimator", no_wrap=True)
     for key, heading in columns.items():
-        unit = next(scores[key].shown_unit for scores in comparison.scores.values() if key in scores)
-        table.add_column(Text(f"{heading}\n({unit})" if unit else heading), justify="right", no_wrap=True)
+        unit = next(
+            scores[key].shown_unit
+            for scores in comparison.scores.values()
+            if key in scores
+        )
+        table.add_column(
+            Text(f"{heading}\n({unit})" if unit else heading),
+            justify="right",
+            no_wrap=True,
+        )
     for name in (run.estimator for run in comparison.runs):
         cells = []
         for key in columns:
             score = comparison.score_of(name, key)
-            mark = {"over-confident": " ▲", "over-cautious": " ▼"}.get(score.verdict, "") if score else ""
+            mark = (
+                {"over-confident": " ▲", "over-cautious": " ▼"}.get(score.verdict, "")
+                if score
+                else ""
+            )
             cells.append(Text(score.text() + mark if score else ABSENT))
         table.add_row(Text(name), *cells)
     return Group(table, Text("\n".join(_lines_below(comparison, metric))))
@@ -76,23 +104,37 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     lines += sentences.lost_runs(comparison)
     lines += sentences.refusal_lines(comparison)
     lines += sentences.withheld_lines(comparison)
-    lines += [*sentences.doubt_of_identities(comparison), *sentences.outliers(comparison)]
+    lines += [
+        *sentences.doubt_of_identities(comparison),
+        *sentences.outliers(comparison),
+    ]
     lines += sentences.nameless_landmarks(comparison)
     if comparison.recognition is not None:
         found = comparison.recognition
         warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
-        lines += [f"Sonar images: {line}" for line in [*found.naming(comparison.sequence.true_landmarks), *warned]]
+        lines += [
+            f"Sonar images: {line}"
+            for line in [*found.naming(comparison.sequence.true_landmarks), *warned]
+        ]
     elif "detections.model" in comparison.sequence.notes:
         lines.append(RECOGNISED_BEFORE)
     has_detections = bool(comparison.sequence.detections)
     if not has_detections:
         lines.append(sentences.no_detections(comparison))
     if metric is None:
-        mapped = f"map: {label('se2_m', comparison)}" if "landmarks.se2_m" in score_keys(comparison) else ""
+        mapped = (
+            f"map: {label('se2_m', comparison)}"
+            if "landmarks.se2_m" in score_keys(comparison)
+            else ""
+        )
         why = comparison.environment["scored instants"].removeprefix("none: ")
         return [*lines, *filter(None, [mapped]), f"No position errors: {why}"]
     lines += [f"causal, smoothed: {label(metric, comparison)}"]
-    lines += [f"on own map: {label('own_map_m', comparison)}"] if "causal.own_map_m" in score_keys(comparison) else []
+    lines += (
+        [f"on own map: {label('own_map_m', comparison)}"]
+        if "causal.own_map_m" in score_keys(comparison)
+        else []
+    )
     lines.append(NEES_LEGEND)
     for name in (run.estimator for run in comparison.runs):
         score = comparison.score_of(name, "causal.nees_position")
@@ -100,7 +142,10 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
         if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
             # odometry alone contradicts the reference: no estimator is to blame
             known = comparison.sequence.notes.get("truth")
-            return [*lines, ASK_INSPECT.format(f" (the log says: {known})" if known else "")]
+            return [
+                *lines,
+                ASK_INSPECT.format(f" (the log says: {known})" if known else ""),
+            ]
     return lines
 
 
@@ -109,25 +154,37 @@ def published_counterpart(comparison: Comparison) -> Group | None:
 
     Landmarks stand across, as in the paper. The numbers are those of the report.
     """
-    found = landmark_table(comparison) if repeats_published(comparison.sequence) else None
+    found = (
+        landmark_table(comparison) if repeats_published(comparison.sequence) else None
+    )
     if found is None:
         return None
     texts = [[cell.text for cell in row] for row in found.rows]
     (split,) = found.sections
     positions, totals = texts[:split], texts[split:]
     landmarks = [row[0].removesuffix(", x") for row in positions[::2]]
-    across = _plain_table("Landmarks: position in metres (estimate minus truth)", ["", *landmarks])
-    below = _plain_table("", ["", "RMS", "RMS after\nSE(2)", "last minus\nfirst x", "last minus\nfirst y"])
+    across = _plain_table(
+        "Landmarks: position in metres (estimate minus truth)", ["", *landmarks]
+    )
+    below = _plain_table(
+        "",
+        ["", "RMS", "RMS after\nSE(2)", "last minus\nfirst x", "last minus\nfirst y"],
+    )
     for place, column in enumerate(found.columns[1:], start=1):
         below.add_row(column.heading, *(row[place] for row in totals))
         if any(row[place] != ABSENT for row in positions):
             for axis in (0, 1):
-                across.add_row(f"{column.heading} {'xy'[axis]}", *(row[place] for row in positions[axis::2]))
+                across.add_row(
+                    f"{column.heading} {'xy'[axis]}",
+                    *(row[place] for row in positions[axis::2]),
+                )
     return Group(across, below, Text(PUBLISHED_LEGEND))
 
 
 def _plain_table(title: str, headings: list[str]) -> Table:
-    table = Table(title=Text(title, style="bold") if title else None, title_justify="left")
+    table = Table(
+        title=Text(title, style="bold") if title else None, title_justify="left"
+    )
     table.box, table.padding = SIMPLE_HEAD, 0
     for number, heading in enumerate(headings):
         table.add_column(heading, no_wrap=True, justify="right" if number else "left")

@@ -27,9 +27,7 @@ SHOWN = {
     "landmarks.se2_m": "Map",
 }
 DOF = {"position": 3, "yaw": 1}
-CAUSAL = (
-    " (causal: told at once, from what was measured until then; after the best shift and turn of the whole path, SE(2))"
-)
+CAUSAL = " (causal: told at once, from what was measured until then; after the best shift and turn of the whole path, SE(2))"
 WORSE = (
     " Here ekf-slam is worse than dead-reckoning, which only adds up motion. That can be: as published the filter has"
     " no gyro bias in its state and believes identities, and a landmark taken for another moves path and map for good."
@@ -40,14 +38,21 @@ LOW, HIGH = 0.1, 0.9
 
 def mean_text(values: Floats) -> str:
     """Mean of the runs with its 95 % interval, metres; the number of runs without a value where there are any."""
-    from sonar_graph.batch import paired  # loads the simulators, which one comparison does not need
+    # loads the simulators, which one comparison does not need
+    from sonar_graph.batch import (
+        paired,
+    )
 
     lost = int(np.isinf(values).sum())
     if lost:
         return f"{lost} of {len(values)} runs without"
     low, high = paired(values, np.zeros_like(values)).interval
     mean = format_value(float(values.mean()))
-    return mean if np.isnan(low) else f"{mean} ({format_value(max(low, 0.0))} to {format_value(high)})"
+    return (
+        mean
+        if np.isnan(low)
+        else f"{mean} ({format_value(max(low, 0.0))} to {format_value(high)})"
+    )
 
 
 def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
@@ -55,7 +60,9 @@ def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
     said = []
     for place, ensemble in enumerate(ensembles):
         values = {name: ensemble.of(name, HEADLINE) for name in ensemble.values}
-        order = sorted(values, key=lambda name: (np.isinf(values[name]).sum(), values[name].mean()))
+        order = sorted(
+            values, key=lambda name: (np.isinf(values[name]).sum(), values[name].mean())
+        )
         listed = ", ".join(f"{name} {mean_text(values[name])}" for name in order)
         opening = "" if place == 0 else "Under other conditions it may be otherwise: "
         said.append(
@@ -66,8 +73,12 @@ def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
             first, second = order[:2]
             wins = int((values[first] < values[second]).sum())
             turned = len(ensemble.seeds) - wins
-            either = f"{wins} of them, {second} in {turned}: one run could have said either"
-            said[-1] += f" {first} has the smaller error {f'in {either}' if turned else 'in every one of them'}."
+            either = (
+                f"{wins} of them, {second} in {turned}: one run could have said either"
+            )
+            said[-1] += (
+                f" {first} has the smaller error {f'in {either}' if turned else 'in every one of them'}."
+            )
         names = {"ekf-slam", "dead-reckoning"} & set(order)
         if len(names) == 2 and order.index("ekf-slam") > order.index("dead-reckoning"):
             said[-1] += WORSE
@@ -77,10 +88,19 @@ def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
 def ensemble_table(ensemble: Ensemble, name: str) -> Table:
     """Mean errors with intervals, and ANEES at the last instant beside its 95 % band, by estimator."""
     columns = [Column("estimator", "Estimator", is_number=False)]
-    columns += [Column(key, heading, "Mean of the runs (95 %), m") for key, heading in SHOWN.items()]
+    columns += [
+        Column(key, heading, "Mean of the runs (95 %), m")
+        for key, heading in SHOWN.items()
+    ]
     for what, dof in DOF.items():
         low, high = anees_interval(len(ensemble.seeds), dof)
-        columns.append(Column(f"anees_{what}", f"{what.capitalize()} ({low:.2f} to {high:.2f})", "ANEES at the end"))
+        columns.append(
+            Column(
+                f"anees_{what}",
+                f"{what.capitalize()} ({low:.2f} to {high:.2f})",
+                "ANEES at the end",
+            )
+        )
     rows = []
     for index, (estimator, scores) in enumerate(ensemble.values.items()):
         cells = [words(estimator, run=index)]
@@ -88,14 +108,24 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
             values = ensemble.of(estimator, key)
             known = any(value is not None for value in scores[key])
             mean, _, interval = mean_text(values).partition(" (")
-            cells.append(number(float(values.mean()), mean, note=interval.removesuffix(")")) if known else absent())
+            cells.append(
+                number(float(values.mean()), mean, note=interval.removesuffix(")"))
+                if known
+                else absent()
+            )
         for what, dof in DOF.items():
             found = anees_at_end(ensemble, estimator, what, dof)
-            cells.append(number(found.mean, format_value(found.mean), note=found.verdict))
+            cells.append(
+                number(found.mean, format_value(found.mean), note=found.verdict)
+            )
         rows.append(cells)
     title = f"{len(ensemble.seeds)} runs {ensemble.condition}"
     return Table(
-        name, title, "Detections are simulated; every run has other seeds of everything random.", columns, rows
+        name,
+        title,
+        "Detections are simulated; every run has other seeds of everything random.",
+        columns,
+        rows,
     )
 
 
@@ -104,7 +134,12 @@ def anees_at_end(ensemble: Ensemble, estimator: str, what: str, dof: int) -> Ane
     from sonar_graph.batch import anees
 
     runs = [np.array(run or [], dtype=float) for run in ensemble.nees[estimator][what]]
-    return anees(np.array([known[-1] if len(known := run[~np.isnan(run)]) else np.inf for run in runs]), dof)
+    return anees(
+        np.array(
+            [known[-1] if len(known := run[~np.isnan(run)]) else np.inf for run in runs]
+        ),
+        dof,
+    )
 
 
 def ensemble_figure(ensemble: Ensemble) -> Figure | None:
@@ -113,19 +148,32 @@ def ensemble_figure(ensemble: Ensemble) -> Figure | None:
     errors, consistency = axes[:, 0]
     least, most = np.inf, 0.0
     for index, name in enumerate(ensemble.values):
-        runs = np.array([run for run in ensemble.errors_m[name] if run is not None], dtype=float)
+        runs = np.array(
+            [run for run in ensemble.errors_m[name] if run is not None], dtype=float
+        )
         if not len(runs):
             continue
-        look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.5}
+        look = {
+            "color": style.colour(index),
+            "linestyle": style.line_style(index),
+            "linewidth": 1.5,
+        }
         scored = np.flatnonzero(~np.isnan(runs).any(axis=0))
         runs, seconds = runs[:, scored], np.array(ensemble.seconds)[scored]
         low, high = np.quantile(runs, [LOW, HIGH], axis=0)
-        errors.fill_between(seconds, low, high, color=style.colour(index), alpha=0.2, linewidth=0)
+        errors.fill_between(
+            seconds, low, high, color=style.colour(index), alpha=0.2, linewidth=0
+        )
         errors.plot(seconds, runs.mean(axis=0), label=name, **look)
         nees = [run for run in ensemble.nees[name]["position"] if run is not None]
         if len(nees) == len(ensemble.seeds):
-            consistency.plot(seconds, np.array(nees, dtype=float)[:, scored].mean(axis=0), **look)
-        least, most = min(least, float(runs[:, 1:].mean(axis=0).min())), max(most, float(high.max()))
+            consistency.plot(
+                seconds, np.array(nees, dtype=float)[:, scored].mean(axis=0), **look
+            )
+        least, most = (
+            min(least, float(runs[:, 1:].mean(axis=0).min())),
+            max(most, float(high.max())),
+        )
     if not most:
         return None
     band = anees_interval(len(ensemble.seeds), DOF["position"])

@@ -33,7 +33,12 @@ RULE = "#d5d9dd"
 TRUTH = "#8b9198"
 ESTIMATOR_COLOURS = ("#0072b2", "#d55e00", "#00805e", "#a8508a", "#7a6a00", "#5b53b0")
 """After Okabe and Ito, told apart with any colour vision; darkened where white paper asks for more contrast."""
-LINE_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (4, 1.4, 1, 1.4)), (0, (1.2, 1.2)))
+LINE_STYLES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.6)),
+    (0, (4, 1.4, 1, 1.4)),
+    (0, (1.2, 1.2)),
+)
 TIME_LABEL = "time since start (s)"
 PAGE_WIDTH_IN, PAGE_TEXT_PT = 7.4, 9.2
 SERIES_POINTS = 700
@@ -80,10 +85,24 @@ def line_style(index: int) -> Any:
 
 
 @contextmanager
-def sized(width_in: float = PAGE_WIDTH_IN, text_pt: float = PAGE_TEXT_PT, font: str = "sans-serif") -> Iterator[None]:
+def sized(
+    width_in: float = PAGE_WIDTH_IN,
+    text_pt: float = PAGE_TEXT_PT,
+    font: str = "sans-serif",
+) -> Iterator[None]:
     """Let all figures that are drawn in the block have this width and size of text."""
-    settings: Any = {"figure.figsize": (width_in, width_in), "font.size": text_pt, "font.family": font}
-    for text in ("axes.labelsize", "axes.titlesize", "xtick.labelsize", "ytick.labelsize", "legend.fontsize"):
+    settings: Any = {
+        "figure.figsize": (width_in, width_in),
+        "font.size": text_pt,
+        "font.family": font,
+    }
+    for text in (
+        "axes.labelsize",
+        "axes.titlesize",
+        "xtick.labelsize",
+        "ytick.labelsize",
+        "legend.fontsize",
+    ):
         settings[text] = "medium"
     with mpl.rc_context(settings):
         yield
@@ -105,7 +124,9 @@ def size_in(rows: int, row_in: float = 1.75) -> tuple[float, float]:
     return width_in(), ((row_in if rows > 1 else 2.3) * rows + 0.8) * narrow
 
 
-def blank_panels(rows: int, columns: int, size_in: tuple[float, float], **sharing: Any) -> tuple[Figure, NDArray[Any]]:
+def blank_panels(
+    rows: int, columns: int, size_in: tuple[float, float], **sharing: Any
+) -> tuple[Figure, NDArray[Any]]:
     """A figure of styled, empty panels, shape (rows, columns), without any state of pyplot."""
     figure = Figure(figsize=size_in, facecolor="none")
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
@@ -130,23 +151,33 @@ def arrange(figure: Figure) -> None:
     """
     if figure.get_layout_engine() is not None:
         return
-    panels: list[Axes] = [panel for panel in figure.axes if panel.get_subplotspec() is not None]
+    panels: list[Axes] = [
+        panel for panel in figure.axes if panel.get_subplotspec() is not None
+    ]
     grid = figure.axes[0].get_subplotspec().get_gridspec()  # type: ignore[union-attr]
     width, height = map(float, figure.get_size_inches())
     size = float(panels[0].xaxis.label.get_fontsize()) / POINTS_PER_INCH
     line = LINE * size
     letter = LETTERS.get(panels[0].xaxis.label.get_fontfamily()[0], LETTER) * size
     titles = line if any(panel.get_title(loc="left") for panel in panels) else 0.0
-    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    above = -(-len(labels) // _legend_columns(width, labels, letter)) * LEGEND_LINE * size + (
-        EDGE_IN if labels else 0.0
-    )
+    labels = [
+        text.get_text() for legend in figure.legends for text in legend.get_texts()
+    ]
+    above = -(
+        -len(labels) // _legend_columns(width, labels, letter)
+    ) * LEGEND_LINE * size + (EDGE_IN if labels else 0.0)
     numbers = {panel: TICK_IN + letter * _letters(panel) for panel in panels}
     outer = [panel for panel in panels if panel.get_subplotspec().is_first_col()]  # type: ignore[union-attr]
     inner = [panel for panel in panels if panel not in outer]
-    lines = max(panel.get_ylabel().count("\n") + 1 if panel.get_ylabel() else 0 for panel in panels)
+    lines = max(
+        panel.get_ylabel().count("\n") + 1 if panel.get_ylabel() else 0
+        for panel in panels
+    )
     left = EDGE_IN / 2 + line * lines + max(numbers[panel] for panel in outer)
-    across = GAP_IN + max((numbers[panel] for panel in inner if _has_numbers(panel.yaxis, "left")), default=0.0)
+    across = GAP_IN + max(
+        (numbers[panel] for panel in inner if _has_numbers(panel.yaxis, "left")),
+        default=0.0,
+    )
     below = EDGE_IN / 2 + 2 * line + TICK_IN
     is_stacked = any(
         _has_numbers(panel.xaxis, "bottom")
@@ -158,9 +189,18 @@ def arrange(figure: Figure) -> None:
     if panels[0].get_aspect() == 1:
         (low, high), (bottom, top) = panels[0].get_xlim(), panels[0].get_ylim()
         shape = float(np.clip((top - bottom) / (high - low), *SHAPES))
-        height = above + titles + EDGE_IN + below + grid.nrows * shape * panel_width + (grid.nrows - 1) * down
+        height = (
+            above
+            + titles
+            + EDGE_IN
+            + below
+            + grid.nrows * shape * panel_width
+            + (grid.nrows - 1) * down
+        )
         figure.set_size_inches(width, height)
-    panel_height = (height - above - titles - EDGE_IN - below - down * (grid.nrows - 1)) / grid.nrows
+    panel_height = (
+        height - above - titles - EDGE_IN - below - down * (grid.nrows - 1)
+    ) / grid.nrows
     figure.subplots_adjust(
         left=left / width,
         right=1 - EDGE_IN / width,
@@ -170,7 +210,9 @@ def arrange(figure: Figure) -> None:
         hspace=down / panel_height,
     )
     for panel in panels:
-        beside = ScaledTranslation(-max(numbers[one] for one in outer), 0, figure.dpi_scale_trans)
+        beside = ScaledTranslation(
+            -max(numbers[one] for one in outer), 0, figure.dpi_scale_trans
+        )
         under = ScaledTranslation(0, -TICK_IN - line, figure.dpi_scale_trans)
         panel.yaxis.set_label_coords(0, 0.5, panel.transAxes + beside)
         panel.xaxis.set_label_coords(0.5, 0, panel.transAxes + under)
@@ -183,7 +225,9 @@ def _has_numbers(axis: Axis, side: str) -> bool:
 
 def _legend_columns(width: float, labels: list[str], letter: float) -> int:
     """Columns of a legend for which there is room; all in inches."""
-    return max(1, min(4, int(width / (HANDLE_IN + letter * max(map(len, labels), default=0)))))
+    return max(
+        1, min(4, int(width / (HANDLE_IN + letter * max(map(len, labels), default=0))))
+    )
 
 
 def _letters(panel: Axes) -> int:
@@ -191,7 +235,11 @@ def _letters(panel: Axes) -> int:
     axis = panel.yaxis
     low, high = sorted(panel.get_ylim())
     shown = [place for place in axis.get_majorticklocs() if low <= place <= high]
-    return max(map(len, axis.get_major_formatter().format_ticks(shown)), default=0) if len(shown) else 0
+    return (
+        max(map(len, axis.get_major_formatter().format_ticks(shown)), default=0)
+        if len(shown)
+        else 0
+    )
 
 
 def name_axes(panel: Axes, x: str = "", y: str = "") -> None:
@@ -202,7 +250,9 @@ def name_axes(panel: Axes, x: str = "", y: str = "") -> None:
 
 def head_panel(panel: Axes, title: str, own_colour: str = INK) -> None:
     """Put a left-aligned heading over a panel."""
-    panel.set_title(title, loc="left", color=own_colour, fontweight="bold", y=1.0, pad=4)
+    panel.set_title(
+        title, loc="left", color=own_colour, fontweight="bold", y=1.0, pad=4
+    )
 
 
 def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
@@ -216,7 +266,11 @@ def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
 def legend_above(figure: Figure, panel: Axes) -> None:
     """One legend for the figure, outside the data, in as many columns as there is room for."""
     handles, labels = panel.get_legend_handles_labels()
-    letter = LETTERS.get(mpl.rcParams["font.family"][0], LETTER) * text_pt() / POINTS_PER_INCH
+    letter = (
+        LETTERS.get(mpl.rcParams["font.family"][0], LETTER)
+        * text_pt()
+        / POINTS_PER_INCH
+    )
     figure.legend(
         handles,
         labels,
@@ -233,10 +287,19 @@ def legend_above(figure: Figure, panel: Axes) -> None:
 def dots(panel: Axes, x: Floats, y: Floats, own_colour: str, label: str = "") -> None:
     """Dots as strokes without length: one element of the drawing, where each marker is one."""
     points = np.column_stack([x, y])
-    path = MarkPath(np.repeat(points, 2, axis=0), [MarkPath.MOVETO, MarkPath.LINETO] * len(x))
+    path = MarkPath(
+        np.repeat(points, 2, axis=0), [MarkPath.MOVETO, MarkPath.LINETO] * len(x)
+    )
     path.should_simplify = False
-    look: dict[str, Any] = {"edgecolor": own_colour, "facecolor": "none", "linewidth": 2.0, "alpha": 0.5}
-    panel.add_artist(PathPatch(path, capstyle="round", transform=panel.transData, **look))
+    look: dict[str, Any] = {
+        "edgecolor": own_colour,
+        "facecolor": "none",
+        "linewidth": 2.0,
+        "alpha": 0.5,
+    }
+    panel.add_artist(
+        PathPatch(path, capstyle="round", transform=panel.transData, **look)
+    )
     panel.update_datalim(points)
     panel.autoscale_view()
     if label:
@@ -265,7 +328,11 @@ def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
 
 def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
     """At most ``points`` rows out of n, equally spaced, first and last among them."""
-    return np.unique(np.linspace(0, n - 1, min(n, points)).round().astype(np.int64)) if n else np.empty(0, np.int64)
+    return (
+        np.unique(np.linspace(0, n - 1, min(n, points)).round().astype(np.int64))
+        if n
+        else np.empty(0, np.int64)
+    )
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:
@@ -278,12 +345,19 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     """
     arrange(figure)
     buffer = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}):
+    with mpl.rc_context(
+        {"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}
+    ):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     svg = buffer.getvalue()
     svg = svg[svg.index(">", svg.index("<svg")) + 1 :]
     # metadata and comments are of no use; a style rule would reach the whole page
-    svg = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(
+        r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->",
+        "",
+        svg,
+        flags=re.DOTALL,
+    )
     svg = re.sub(r"\s*\n\s*", "\n", svg)
     svg = re.sub(r'(\s)id="([^"]+)"', rf'\1id="{name}-\2"', svg)
     svg = re.sub(r'(?:xlink:)?href="#([^"]+)"', rf'href="#{name}-\1"', svg)

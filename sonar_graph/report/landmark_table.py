@@ -59,47 +59,93 @@ def landmark_table(comparison: Comparison) -> Table | None:
     for run in runs:
         if run.landmarks is not None and len(run.landmarks):
             scored = scored_map(run.landmarks, comparison.sequence)
-            mapped[run.estimator] = run.landmarks if scored is None else scored.landmarks
+            mapped[run.estimator] = (
+                run.landmarks if scored is None else scored.landmarks
+            )
             is_aligned |= scored is not None and scored.alignment is not None
     columns = {name: MapColumn(landmarks) for name, landmarks in mapped.items()}
     if repeats:
-        walked = {run.estimator: run.causal for run in runs if run.causal is not None and len(run.causal)}
-        columns = {name: MapColumn(mapped.get(name), path) for name, path in walked.items()}
+        walked = {
+            run.estimator: run.causal
+            for run in runs
+            if run.causal is not None and len(run.causal)
+        }
+        columns = {
+            name: MapColumn(mapped.get(name), path) for name, path in walked.items()
+        }
         columns[PAPER] = MapColumn(published_maps()[0], decimals=PAPER_DECIMALS)
-    known = [column.landmarks for column in columns.values() if column.landmarks is not None]
+    known = [
+        column.landmarks for column in columns.values() if column.landmarks is not None
+    ]
     if not known:
         return None
     rows: list[list[str]] = []
     for id_ in mapped_ids(comparison, known)[:MOST_LANDMARKS]:
         for axis in (0, 1):
             at = coordinate(true, id_, axis)
-            found = [(coordinate(column.landmarks, id_, axis), column.decimals) for column in columns.values()]
+            found = [
+                (coordinate(column.landmarks, id_, axis), column.decimals)
+                for column in columns.values()
+            ]
             cells = [_with_difference(value, at, decimals) for value, decimals in found]
-            rows.append([f"ID {id_}, {'xy'[axis]}", _with_difference(at, None, DECIMALS), *cells])
+            rows.append(
+                [
+                    f"ID {id_}, {'xy'[axis]}",
+                    _with_difference(at, None, DECIMALS),
+                    *cells,
+                ]
+            )
     sections = {}
     if true is not None:
         sections[len(rows)] = "In all"
-        errors = [None if one.landmarks is None else landmark_errors(one.landmarks, true) for one in columns.values()]
+        errors = [
+            None if one.landmarks is None else landmark_errors(one.landmarks, true)
+            for one in columns.values()
+        ]
         raw = [fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors]
-        aligned = [ABSENT if not e or np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS) for e in errors]
-        rows += [] if is_aligned else [[f"RMS, {unaligned(comparison.sequence)}", "", *raw]]
+        aligned = [
+            ABSENT
+            if not e or np.isnan(e.aligned_rmse_m)
+            else fixed(e.aligned_rmse_m, DECIMALS)
+            for e in errors
+        ]
+        rows += (
+            [] if is_aligned else [[f"RMS, {unaligned(comparison.sequence)}", "", *raw]]
+        )
         rows.append(["RMS after SE(2) alignment", "", *aligned])
         if repeats:
-            rows += _return_rows(comparison.sequence.truth, [column.path for column in columns.values()])
+            rows += _return_rows(
+                comparison.sequence.truth, [column.path for column in columns.values()]
+            )
     heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
     heads += [Column(name, name) for name in columns]
     if true is None:
         heads, rows = [heads[0], *heads[2:]], [[row[0], *row[2:]] for row in rows]
-    caption = "Positions in the map at the end, metres" + ("" if true is None else "; in brackets estimate minus truth")
+    caption = "Positions in the map at the end, metres" + (
+        "" if true is None else "; in brackets estimate minus truth"
+    )
     if is_aligned:
-        caption += "; maps aligned to the true landmarks, whose world is not that of the start"
-    return Table("landmarks", caption, "", heads, [[words(text) for text in row] for row in rows], sections)
+        caption += (
+            "; maps aligned to the true landmarks, whose world is not that of the start"
+        )
+    return Table(
+        "landmarks",
+        caption,
+        "",
+        heads,
+        [[words(text) for text in row] for row in rows],
+        sections,
+    )
 
 
 def mapped_ids(comparison: Comparison, maps: list[LandmarkMap]) -> list[int]:
     """Identities of the true landmarks; where these are not known, of the maps."""
     true = comparison.sequence.true_landmarks
-    return np.unique(np.concatenate([landmarks.ids for landmarks in ([true] if true is not None else maps)])).tolist()
+    return np.unique(
+        np.concatenate(
+            [landmarks.ids for landmarks in ([true] if true is not None else maps)]
+        )
+    ).tolist()
 
 
 def landmarks_left_out(comparison: Comparison) -> int:
@@ -108,7 +154,9 @@ def landmarks_left_out(comparison: Comparison) -> int:
     return max(0, len(mapped_ids(comparison, maps)) - MOST_LANDMARKS) if maps else 0
 
 
-def _return_rows(truth: Trajectory | None, paths: list[Trajectory | None]) -> list[list[str]]:
+def _return_rows(
+    truth: Trajectory | None, paths: list[Trajectory | None]
+) -> list[list[str]]:
     """Last minus first position of the causal estimates, and of the truth at the same instants or nearest to them."""
 
     def displacement(path: Trajectory) -> Floats:
@@ -123,10 +171,14 @@ def _return_rows(truth: Trajectory | None, paths: list[Trajectory | None]) -> li
                 continue
             at = None
             if truth is not None:
-                ends_ns = np.clip(path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1])
+                ends_ns = np.clip(
+                    path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1]
+                )
                 if ends_ns[0] < ends_ns[1]:  # else they have no time in common
                     at = float(displacement(truth.at(ends_ns))[axis])
-            cells.append(_with_difference(float(displacement(path)[axis]), at, DECIMALS))
+            cells.append(
+                _with_difference(float(displacement(path)[axis]), at, DECIMALS)
+            )
             first = _with_difference(at, None, DECIMALS) if place == 0 else first
         rows.append([f"last minus first position, {'xy'[axis]}", first, *cells])
     return rows

@@ -24,7 +24,11 @@ from sonar_graph.table import Table
 
 COLUMN_IN, PAGE_IN, TEXT_PT, FONT = 3.5, 7.16, 8.0, "STIXGeneral"
 FIGURES, DOCUMENT, PROTOCOL = "figures", "paper.tex", "protocol.txt"
-EMBEDDED: Any = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "sonar_graph"}
+EMBEDDED: Any = {
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "sonar_graph",
+}
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,9 @@ class PaperFigure:
     """The drawn values as CSV; empty where another file of the result has them."""
 
 
-def write_paper(result: Comparison | RecordedBatch, folder: str | Path, *, overwrite: bool = False) -> Path:
+def write_paper(
+    result: Comparison | RecordedBatch, folder: str | Path, *, overwrite: bool = False
+) -> Path:
     """Write the figures and tables of a comparison or a batch for a paper.
 
     The folder is made where it does not exist. It gets ``figures/NAME.svg`` and ``.pdf``, ``tables/NAME.tex`` and
@@ -85,7 +91,10 @@ def write_paper(result: Comparison | RecordedBatch, folder: str | Path, *, overw
             for one in figures:
                 _write_figure(one, folder)
             write_tables(tables, folder)
-            for name, text in {PROTOCOL: protocol, DOCUMENT: _document(figures, tables, protocol)}.items():
+            for name, text in {
+                PROTOCOL: protocol,
+                DOCUMENT: _document(figures, tables, protocol),
+            }.items():
                 with replacing(folder / name) as partial:
                     partial.write_text(text, "utf-8")
     except OSError as error:
@@ -95,14 +104,18 @@ def write_paper(result: Comparison | RecordedBatch, folder: str | Path, *, overw
     return folder / DOCUMENT
 
 
-def _of_comparison(comparison: Comparison) -> tuple[list[PaperFigure], list[Table], str]:
+def _of_comparison(
+    comparison: Comparison,
+) -> tuple[list[PaperFigure], list[Table], str]:
     figures = []
     for name, drawing in drawings(comparison).items():
         with sized(PAGE_IN if drawing.columns > 1 else COLUMN_IN, TEXT_PT, FONT):
             figure = drawing.draw(comparison)
         if figure is not None:
             caption = f"{drawing.title}. {drawing.caption}"
-            figures.append(PaperFigure(name.replace("_", "-"), caption, figure, drawing.columns))
+            figures.append(
+                PaperFigure(name.replace("_", "-"), caption, figure, drawing.columns)
+            )
     sequence, environment = comparison.sequence, comparison.environment
     lines = [
         f"{', '.join(run.estimator for run in comparison.runs)} were run by sonar_graph {environment['sonar_graph']} "
@@ -112,7 +125,11 @@ def _of_comparison(comparison: Comparison) -> tuple[list[PaperFigure], list[Tabl
         *_rules(comparison),
         f"Settings of every run and all scores: comparison.json. Command: {environment['command']}",
     ]
-    return figures, [compact_table(comparison), *comparison_tables(comparison)], "\n\n".join(lines) + "\n"
+    return (
+        figures,
+        [compact_table(comparison), *comparison_tables(comparison)],
+        "\n\n".join(lines) + "\n",
+    )
 
 
 def _rules(comparison: Comparison) -> list[str]:
@@ -120,11 +137,17 @@ def _rules(comparison: Comparison) -> list[str]:
     rules = []
     labels = {row[0].text for row in score_table(comparison).rows}
     for column in compact_table(comparison).columns[1:]:
-        heading, names = f"{column.over}, {column.heading}".removeprefix(", "), dict[str, list[str]]()
+        heading, names = (
+            f"{column.over}, {column.heading}".removeprefix(", "),
+            dict[str, list[str]](),
+        )
         for run in comparison.runs:
             if score := comparison.score_of(run.estimator, column.key):
                 names.setdefault(score.protocol, []).append(run.estimator)
-        of = {rule: f" of {' and '.join(runs)}" if len(names) > 1 else "" for rule, runs in names.items()}
+        of = {
+            rule: f" of {' and '.join(runs)}" if len(names) > 1 else ""
+            for rule, runs in names.items()
+        }
         rules += [f"{heading}{of[rule]}: {rule}" for rule in names]
     return rules if labels else []
 
@@ -132,7 +155,10 @@ def _rules(comparison: Comparison) -> list[str]:
 def _of_batch(batch: RecordedBatch) -> tuple[list[PaperFigure], list[Table], str]:
     with sized(PAGE_IN, TEXT_PT, FONT):
         content = batch_content(batch)
-    drawn = [content["failure_drawing"], *(one for chapter in content["chapters"] for one in chapter["drawings"])]
+    drawn = [
+        content["failure_drawing"],
+        *(one for chapter in content["chapters"] for one in chapter["drawings"]),
+    ]
     drawn += [*content["consistency_drawings"], content["cost_drawing"]]
     figures = [
         PaperFigure(one.name, f"{one.title}. {one.caption}", one.figure, 2, one.data)
@@ -142,18 +168,28 @@ def _of_batch(batch: RecordedBatch) -> tuple[list[PaperFigure], list[Table], str
     versions = {name: " or ".join(found) for name, found in content["origins"].items()}
     lines = [
         f"{content['summary']} Suite {batch.name}, sonar_graph {versions.get('sonar_graph', 'of unknown version')}.",
-        *(f"{chapter['metric'].label}: {chapter['metric'].protocol}" for chapter in content["chapters"]),
+        *(
+            f"{chapter['metric'].label}: {chapter['metric'].protocol}"
+            for chapter in content["chapters"]
+        ),
         f"{' '.join(content['estimates'])} Tests of a metric are corrected by Holm (1979). "
         f"Every run: {content['results']}.",
     ]
-    return figures, [table for table in content["tables"] if table.rows], "\n\n".join(lines) + "\n"
+    return (
+        figures,
+        [table for table in content["tables"] if table.rows],
+        "\n\n".join(lines) + "\n",
+    )
 
 
 def _write_figure(one: PaperFigure, folder: Path) -> None:
     """The figure as SVG and PDF, and its data where it has any; the same result gives the same bytes."""
     arrange(one.figure)
     with mpl.rc_context(EMBEDDED):
-        for suffix, about in (("svg", {"Date": None}), ("pdf", {"CreationDate": None, "Producer": None})):
+        for suffix, about in (
+            ("svg", {"Date": None}),
+            ("pdf", {"CreationDate": None, "Producer": None}),
+        ):
             with replacing(folder / FIGURES / f"{one.name}.{suffix}") as partial:
                 one.figure.savefig(partial, format=suffix, metadata=about)
     if one.data:
@@ -186,6 +222,14 @@ def _document(figures: list[PaperFigure], tables: list[Table], protocol: str) ->
     lines += [r"\onecolumn", r"\scriptsize", r"\setlength{\tabcolsep}{2.5pt}"]
     lines += [rf"\input{{{FOLDER}/{table.name}.tex}}" for table in tables]
     return (
-        "\n".join([*lines, r"\clearpage\normalsize", r"\section*{Protocol}", latex_text(protocol), r"\end{document}"])
+        "\n".join(
+            [
+                *lines,
+                r"\clearpage\normalsize",
+                r"\section*{Protocol}",
+                latex_text(protocol),
+                r"\end{document}",
+            ]
+        )
         + "\n"
     )

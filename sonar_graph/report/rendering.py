@@ -52,8 +52,15 @@ def render(template: str, content: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"svg": Markup, "csv": as_csv, "latex": as_latex, "address": data_address}
-    environment.filters["html"] = lambda table, is_sortable: Markup(as_html(table, is_sortable=is_sortable))
+    environment.filters |= {
+        "svg": Markup,
+        "csv": as_csv,
+        "latex": as_latex,
+        "address": data_address,
+    }
+    environment.filters["html"] = lambda table, is_sortable: Markup(
+        as_html(table, is_sortable=is_sortable)
+    )
     return spelt(environment.get_template(template).render(**content))
 
 
@@ -77,13 +84,20 @@ def write_tables(tables: list[Table], folder: Path) -> list[Path]:
 
 def as_csv(table: Table) -> str:
     """Numbers in full and in the units of the results; empty where there is none. Sections are a first column."""
-    head = [f"{column.key}_{part}" if part else column.key for column in table.columns for part in column.parts]
+    head = [
+        f"{column.key}_{part}" if part else column.key
+        for column in table.columns
+        for part in column.parts
+    ]
     rows, section = [["section", *head] if table.sections else head], ""
     for place, row in enumerate(table.rows):
         section = table.sections.get(place, section)
         texts = [section] if table.sections else []
         for column, cell in zip(table.columns, row, strict=True):
-            for value in [*cell.numbers, *[math.nan] * (len(column.parts) - len(cell.numbers))]:
+            for value in [
+                *cell.numbers,
+                *[math.nan] * (len(column.parts) - len(cell.numbers)),
+            ]:
                 if isinstance(value, float):
                     texts.append("" if math.isnan(value) else repr(float(value)))
                 else:
@@ -95,7 +109,9 @@ def as_csv(table: Table) -> str:
 def csv_text(rows: list[list[str]]) -> str:
     """Rows of texts as CSV (RFC 4180, with line feeds alone), without formulas for spreadsheets."""
     buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows([map(_plain_cell, row) for row in rows])
+    csv.writer(buffer, lineterminator="\n").writerows(
+        [map(_plain_cell, row) for row in rows]
+    )
     return buffer.getvalue()
 
 
@@ -124,8 +140,12 @@ def as_latex(table: Table) -> str:
     rows = []
     for place, row in enumerate(table.rows):
         if place in table.sections:
-            rows.append(rf"\multicolumn{{{len(row)}}}{{l}}{{\textit{{{latex_text(table.sections[place])}}}}} \\")
-        texts = [f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row]
+            rows.append(
+                rf"\multicolumn{{{len(row)}}}{{l}}{{\textit{{{latex_text(table.sections[place])}}}}} \\"
+            )
+        texts = [
+            f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row
+        ]
         rows.append(" & ".join(map(latex_text, texts)) + r" \\")
     lines = [
         r"% \usepackage{booktabs,textcomp}",

@@ -33,7 +33,9 @@ from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 TOO_CLOSE = 0.05
 """Relative difference below which one run says nothing about which of two errors is the smaller one."""
 CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
-NO_DETECTIONS = "The log has no landmark detections; without them nothing corrects the drift."
+NO_DETECTIONS = (
+    "The log has no landmark detections; without them nothing corrects the drift."
+)
 ABSURD = chi_square_quantile(1 - 1e-9, 2)
 """41.4: the chi-square quantile of two degrees of freedom at 1 - 1e-9."""
 CONTRADICTING_SHARE = 0.2
@@ -70,7 +72,10 @@ def finding(comparison: Comparison) -> list[str]:
     A log without detections, and runs that lost their way, are mentioned after the failures.
     """
     runs = comparison.runs
-    sentences = [f"{run.estimator} failed: {run.reason.rstrip('.')}." for run in comparison.failed_runs]
+    sentences = [
+        f"{run.estimator} failed: {run.reason.rstrip('.')}."
+        for run in comparison.failed_runs
+    ]
     if FITTED in comparison.sequence.notes:
         fitted = comparison.sequence.notes[FITTED]
         sentences.append(f"{fitted[0].upper()}{fitted[1:]}.")
@@ -80,7 +85,9 @@ def finding(comparison: Comparison) -> list[str]:
     metric = headline_metric(comparison)
     if metric is None:
         if len(comparison.failed_runs) == len(runs):
-            sentences.append("No estimator came to an end, so there is nothing to compare.")
+            sentences.append(
+                "No estimator came to an end, so there is nothing to compare."
+            )
         elif mapped := _map_sentence(comparison):
             sentences.append(mapped)
         elif comparison.sequence.truth is None:
@@ -88,31 +95,70 @@ def finding(comparison: Comparison) -> list[str]:
                 "The log has no ground truth, so paths, maps and times can be compared, but no errors given."
             )
         else:
-            sentences.append("No position error could be computed against the log's ground truth.")
-        nis = {run.estimator: comparison.score_of(run.estimator, "detections.nis") for run in runs}
-        told = [f"{name} {score.text()} ({score.verdict})" for name, score in nis.items() if score and score.verdict]
-        return [*sentences, *([f"NIS, 1 where innovations fit their covariances: {', '.join(told)}."] if told else [])]
+            sentences.append(
+                "No position error could be computed against the log's ground truth."
+            )
+        nis = {
+            run.estimator: comparison.score_of(run.estimator, "detections.nis")
+            for run in runs
+        }
+        told = [
+            f"{name} {score.text()} ({score.verdict})"
+            for name, score in nis.items()
+            if score and score.verdict
+        ]
+        return [
+            *sentences,
+            *(
+                [f"NIS, 1 where innovations fit their covariances: {', '.join(told)}."]
+                if told
+                else []
+            ),
+        ]
     sentences.append(_causal_sentence(comparison, metric))
     improved, judged = [], []
     for name in (run.estimator for run in runs):
-        causal, smoothed = (comparison.score_of(name, f"{kind}.{metric}") for kind in ("causal", "smoothed"))
-        if causal and smoothed and not math.isclose(causal.value, smoothed.value, rel_tol=1e-3):
+        causal, smoothed = (
+            comparison.score_of(name, f"{kind}.{metric}")
+            for kind in ("causal", "smoothed")
+        )
+        if (
+            causal
+            and smoothed
+            and not math.isclose(causal.value, smoothed.value, rel_tol=1e-3)
+        ):
             improved.append(f"{name} {smoothed.with_unit}")
-        scores = {what: score for what, key in CONSISTENCY_KEYS.items() if (score := comparison.score_of(name, key))}
+        scores = {
+            what: score
+            for what, key in CONSISTENCY_KEYS.items()
+            if (score := comparison.score_of(name, key))
+        }
         if scores:
             what = max(scores, key=lambda what: _doubt(scores[what]))
             said = [what, scores[what].verdict]
             if (interval := scores[what].interval) is not None:
                 low, high = map(scores[what].text, interval)
                 said.append(f"{low} to {high} expected")
-            judged.append(f"{name} {scores[what].text()} ({', '.join(filter(None, said))})")
-    own = {run.estimator: comparison.score_of(run.estimator, "causal.own_map_m") for run in runs}
-    on_map = sorted(((name, score) for name, score in own.items() if score), key=lambda item: item[1].value)
+            judged.append(
+                f"{name} {scores[what].text()} ({', '.join(filter(None, said))})"
+            )
+    own = {
+        run.estimator: comparison.score_of(run.estimator, "causal.own_map_m")
+        for run in runs
+    }
+    on_map = sorted(
+        ((name, score) for name, score in own.items() if score),
+        key=lambda item: item[1].value,
+    )
     if on_map:
         listed = ", ".join(f"{name} {score.with_unit}" for name, score in on_map)
-        sentences.append(f"Position on its own map, as each knew it at that instant: {listed}.")
+        sentences.append(
+            f"Position on its own map, as each knew it at that instant: {listed}."
+        )
     if improved:
-        sentences.append(f"Looking back from the end of the run (smoothed): {', '.join(improved)}.")
+        sentences.append(
+            f"Looking back from the end of the run (smoothed): {', '.join(improved)}."
+        )
     if judged:
         sentences.append(
             "NEES, of position or yaw whichever is the more doubtful (1: a fitting uncertainty), with what 95 % of "
@@ -123,7 +169,11 @@ def finding(comparison: Comparison) -> list[str]:
 
 def _doubt(score: Score) -> tuple[int, float]:
     """Rank of a NEES by its doubtfulness: over-confident, over-cautious, within its interval; then by its logarithm."""
-    rank = ("over-cautious", "over-confident").index(score.verdict) + 1 if score.verdict.startswith("over") else 0
+    rank = (
+        ("over-cautious", "over-confident").index(score.verdict) + 1
+        if score.verdict.startswith("over")
+        else 0
+    )
     return rank, abs(math.log(max(score.value, math.ulp(0.0))))
 
 
@@ -135,22 +185,49 @@ def headline(comparison: Comparison) -> str:
     metric = headline_metric(comparison)
     if metric is None:
         return ""
-    errors = {run.estimator: comparison.score_of(run.estimator, f"causal.{metric}") for run in comparison.runs}
+    errors = {
+        run.estimator: comparison.score_of(run.estimator, f"causal.{metric}")
+        for run in comparison.runs
+    }
     (name, least), *others = sorted(
-        ((name, score) for name, score in errors.items() if score), key=lambda item: item[1].value
+        ((name, score) for name, score in errors.items() if score),
+        key=lambda item: item[1].value,
     )
-    close = [other for other, score in others if score.value > 0 and 1 - least.value / score.value < TOO_CLOSE]
-    equals = f", {' and '.join(close)} no farther than one run can tell" if close else ""
+    close = [
+        other
+        for other, score in others
+        if score.value > 0 and 1 - least.value / score.value < TOO_CLOSE
+    ]
+    equals = (
+        f", {' and '.join(close)} no farther than one run can tell" if close else ""
+    )
     what = label(metric, comparison, HEADLINES)
     opening = f"{name} is nearest to the truth{equals}: {least.with_unit} off ({what}, causal)"
-    if any(name in line for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]):
+    if any(
+        name in line
+        for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]
+    ):
         return f"{opening}, but not to be believed before its warning is settled."
-    judged = {what: score for what, key in CONSISTENCY_KEYS.items() if (score := comparison.score_of(name, key))}
-    far = {what: score for what, score in judged.items() if score.verdict.startswith("over")}
+    judged = {
+        what: score
+        for what, key in CONSISTENCY_KEYS.items()
+        if (score := comparison.score_of(name, key))
+    }
+    far = {
+        what: score
+        for what, score in judged.items()
+        if score.verdict.startswith("over")
+    }
     if far:
-        listed = " and ".join(f"of {what} {score.text()}" for what, score in far.items())
+        listed = " and ".join(
+            f"of {what} {score.text()}" for what, score in far.items()
+        )
         is_small = any(score.verdict == "over-confident" for score in far.values())
-        told = "smaller than its errors: do not rely on them" if is_small else "larger than its errors"
+        told = (
+            "smaller than its errors: do not rely on them"
+            if is_small
+            else "larger than its errors"
+        )
         return f"{opening}; its covariances are {told} (NEES {listed}, 1 fits)."
     if any(score.verdict for score in judged.values()):
         return f"{opening}; its covariances fit its errors."
@@ -163,7 +240,10 @@ def headline(comparison: Comparison) -> str:
 
 def _map_sentence(comparison: Comparison) -> str:
     """Errors of maps against true landmarks where no path is known; empty without any."""
-    errors = {run.estimator: comparison.score_of(run.estimator, "landmarks.se2_m") for run in comparison.runs}
+    errors = {
+        run.estimator: comparison.score_of(run.estimator, "landmarks.se2_m")
+        for run in comparison.runs
+    }
     listed = [f"{name} {score.with_unit}" for name, score in errors.items() if score]
     if not listed:
         return ""
@@ -173,7 +253,10 @@ def _map_sentence(comparison: Comparison) -> str:
 def no_detections(comparison: Comparison) -> str:
     """The sentence about the drift of a log, or of the chosen part of it, without detections."""
     part = comparison.sequence.notes.get("log.part")
-    aids = {"headings": comparison.sequence.heading, "position fixes": comparison.sequence.positions}
+    aids = {
+        "headings": comparison.sequence.heading,
+        "position fixes": comparison.sequence.positions,
+    }
     if there := " and ".join(name for name, block in aids.items() if block is not None):
         return f"The log has no landmark detections; only its {there} limit the drift."
     if not part:
@@ -183,15 +266,30 @@ def no_detections(comparison: Comparison) -> str:
 
 def _causal_sentence(comparison: Comparison, metric: str) -> str:
     """Causal errors in order of size, and the distance of the smallest from the others."""
-    errors = {run.estimator: comparison.score_of(run.estimator, f"causal.{metric}") for run in comparison.runs}
-    scored = sorted(((name, score) for name, score in errors.items() if score), key=lambda item: item[1].value)
+    errors = {
+        run.estimator: comparison.score_of(run.estimator, f"causal.{metric}")
+        for run in comparison.runs
+    }
+    scored = sorted(
+        ((name, score) for name, score in errors.items() if score),
+        key=lambda item: item[1].value,
+    )
     listed = ", ".join(f"{name} {score.with_unit}" for name, score in scored)
-    opening = f"Causal position error ({label(metric, comparison, HEADLINES)}): {listed}"
+    opening = (
+        f"Causal position error ({label(metric, comparison, HEADLINES)}): {listed}"
+    )
     if len(scored) == 1:
         return opening + "."
     (first, least), *others = scored
-    below = {name: 1 - least.value / score.value if score.value > 0 else 0.0 for name, score in others}
-    far = [f"{100 * share:.0f} % below {name}" for name, share in below.items() if share >= TOO_CLOSE]
+    below = {
+        name: 1 - least.value / score.value if score.value > 0 else 0.0
+        for name, score in others
+    }
+    far = [
+        f"{100 * share:.0f} % below {name}"
+        for name, share in below.items()
+        if share >= TOO_CLOSE
+    ]
     close = [name for name, share in below.items() if share < TOO_CLOSE]
     said = [f"{first} is {' and '.join(far)}"] if far else []
     if close:
@@ -210,7 +308,9 @@ def lost_runs(comparison: Comparison) -> list[str]:
         if gated > GATED_SHARE * max(len(outcomes), 1):
             is_smoother = flattened(run.params).get(POLICY) == "gate"
             advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
-            without = 'identity.policy = "robust"' if is_smoother else "gate_probability = 1"
+            without = (
+                'identity.policy = "robust"' if is_smoother else "gate_probability = 1"
+            )
             said.append(
                 f"{run.estimator} refused {gated} of {len(outcomes)} detections as outside its gate: it has lost its "
                 f"way, identities are wrong{advice}, or noise is set far too small, and the gate may keep it there "
@@ -236,7 +336,8 @@ def beside_the_paper(comparison: Comparison) -> str | None:
         "gravity for roll and pitch": calibration.use_gravity,
         "the plane of the calibration": calibration.planar is not None,
         "the floor's height": calibration.floor is not None,
-        "headings with Huber's kernel and the compass' bias": sequence.heading is not None,
+        "headings with Huber's kernel and the compass' bias": sequence.heading
+        is not None,
         "position fixes with Huber's kernel": sequence.positions is not None,
         "larger noise in gaps of the Doppler log": has_gaps,
         "far_views": has_gaps and params.get("far_views", False),
@@ -257,13 +358,19 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
     lines = []
     blind = {}
     for run in comparison.runs:
-        outcomes = [outcome for outcome in run.detections.outcomes if outcome not in UNHEARD] if run.detections else []
+        outcomes = (
+            [outcome for outcome in run.detections.outcomes if outcome not in UNHEARD]
+            if run.detections
+            else []
+        )
         if outcomes and set(outcomes) <= NAMELESS:
             blind[run.estimator] = len(outcomes)
     if blind:
         runs = [run for run in comparison.runs if run.estimator in blind]
         asked = any(flattened(run.params).get(UNKNOWN) == "associate" for run in runs)
-        hint = "" if asked else f'; isam2 maps them by place with {UNKNOWN} = "associate"'
+        hint = (
+            "" if asked else f'; isam2 maps them by place with {UNKNOWN} = "associate"'
+        )
         lines.append(
             f"{WARNING}: none of {max(blind.values())} detections has an identity that {', '.join(blind)} can use: "
             f"no landmark is mapped{hint}"
@@ -276,25 +383,35 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
             if scored is None:
                 continue
             errors = landmark_errors(scored.landmarks, true)
-            squares = normalised_squares(errors.horizontal_m, errors.horizontal_covs).tolist()
+            squares = normalised_squares(
+                errors.horizontal_m, errors.horizontal_covs
+            ).tolist()
             wrong = {
-                id_: square / 2 for id_, square in zip(errors.ids.tolist(), squares, strict=True) if square > ABSURD
+                id_: square / 2
+                for id_, square in zip(errors.ids.tolist(), squares, strict=True)
+                if square > ABSURD
             }
             said = f" puts {_landmarks(wrong)} far outside its covariance (NEES up to"
         elif run.landmarks is not None and (log := run.detections) is not None:
             innovations = normalised_squares(log.innovations, log.innovation_covs)
-            used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
+            used = np.array(
+                [outcome is Outcome.USED for outcome in log.outcomes], dtype=bool
+            )
             used &= np.isfinite(innovations)
             for id_ in run.landmarks.ids.tolist():
                 own = innovations[used & (log.landmark_ids == id_)]
                 if own.size and np.mean(own > ABSURD) > CONTRADICTING_SHARE:
                     wrong[id_] = float(own.mean() / 2)
-            said = f": sightings of {_landmarks(wrong)} contradict its map (mean NIS up to"
+            said = (
+                f": sightings of {_landmarks(wrong)} contradict its map (mean NIS up to"
+            )
         if wrong:
             policy = flattened(run.params).get(POLICY)
             named = "" if policy is None else f' ({POLICY} is "{policy}")'
             advice = f"look at identities{named}, then at noise and start"
-            lines.append(f"{WARNING}: {run.estimator}{said} {max(wrong.values()):.0f}); {advice}")
+            lines.append(
+                f"{WARNING}: {run.estimator}{said} {max(wrong.values()):.0f}); {advice}"
+            )
     return lines
 
 
@@ -304,10 +421,16 @@ def outliers(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         if (log := run.detections) is not None:
             squares = normalised_squares(log.innovations, log.innovation_covs)
-            is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], np.bool_)
+            is_used = np.array(
+                [outcome is Outcome.USED for outcome in log.outcomes], np.bool_
+            )
             squares = squares[np.isfinite(squares) & is_used]
-            if (far := np.count_nonzero(squares > ABSURD)) > OUTLYING_SHARE * len(squares):
-                said.append(f"{run.estimator} {far} of {len(squares)}{_weight(flattened(run.params))}")
+            if (far := np.count_nonzero(squares > ABSURD)) > OUTLYING_SHARE * len(
+                squares
+            ):
+                said.append(
+                    f"{run.estimator} {far} of {len(squares)}{_weight(flattened(run.params))}"
+                )
     if not said:
         return []
     return [
@@ -322,7 +445,11 @@ def _weight(settings: Mapping[str, object]) -> str:
     if not kernels:
         return ""
     has_kernel = settings[kernels[0]] not in ("none", 0)
-    return ", with less weight by its kernel" if has_kernel else f", with full weight ({kernels[0]} sets a kernel)"
+    return (
+        ", with less weight by its kernel"
+        if has_kernel
+        else f", with full weight ({kernels[0]} sets a kernel)"
+    )
 
 
 def nameless_landmarks(comparison: Comparison) -> list[str]:
@@ -330,17 +457,31 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
     said = []
     true = comparison.sequence.true_landmarks
     for run in comparison.runs:
-        count = 0 if run.landmarks is None else int((run.landmarks.ids >= FIRST_ANONYMOUS_ID).sum())
+        count = (
+            0
+            if run.landmarks is None
+            else int((run.landmarks.ids >= FIRST_ANONYMOUS_ID).sum())
+        )
         if run.landmarks is None or not count:
             continue
         if true is None:
             which = f"identities from {FIRST_ANONYMOUS_ID} on are made up"
         else:
             scored = scored_map(run.landmarks, comparison.sequence)
-            found = [] if scored is None else np.setdiff1d(scored.landmarks.ids, run.landmarks.ids).tolist()
-            which = f"scored by place, as {_listed(found)}" if found else "none is at the place of a true one"
+            found = (
+                []
+                if scored is None
+                else np.setdiff1d(scored.landmarks.ids, run.landmarks.ids).tolist()
+            )
+            which = (
+                f"scored by place, as {_listed(found)}"
+                if found
+                else "none is at the place of a true one"
+            )
         counted = "1 landmark" if count == 1 else f"{count} landmarks"
-        said.append(f"{run.estimator} found {counted} without a name ({UNKNOWN}); {which}.")
+        said.append(
+            f"{run.estimator} found {counted} without a name ({UNKNOWN}); {which}."
+        )
     return said
 
 
@@ -353,14 +494,20 @@ def _landmarks(ids: Iterable[int]) -> str:
 def _listed(ids: list[int]) -> str:
     """The first identities, and the number of the others."""
     if len(ids) > MOST_NAMED:
-        return f"{', '.join(map(str, ids[:MOST_NAMED]))} and {len(ids) - MOST_NAMED} more"
+        return (
+            f"{', '.join(map(str, ids[:MOST_NAMED]))} and {len(ids) - MOST_NAMED} more"
+        )
     *first, last = map(str, ids)
     return f"{', '.join(first)} and {last}" if first else last
 
 
 def doubt_lines(notes: Mapping[str, str]) -> list[str]:
     """A line for each of `SAID_NOTES` that a log has: damage, rows left out, gaps, unlikely numbers."""
-    return [f"{word}: {notes[subject]}" for subject, word in SAID_NOTES.items() if subject in notes]
+    return [
+        f"{word}: {notes[subject]}"
+        for subject, word in SAID_NOTES.items()
+        if subject in notes
+    ]
 
 
 def warning_lines(notes: Mapping[str, str]) -> list[str]:
@@ -383,9 +530,13 @@ def refusal_lines(comparison: Comparison) -> list[str]:
     lines = []
     for refused, names in refused_by(comparison).items():
         count = "" if refused.count == 1 else f"{refused.count} rows, "
-        distance = f" (squared distance {refused.distances()})" if refused.distances() else ""
+        distance = (
+            f" (squared distance {refused.distances()})" if refused.distances() else ""
+        )
         at = f"{count}{refused.times(start_ns)} s"
-        lines.append(f"{WARNING}: {refused.sensor}, {at}: {refused.reason}{distance}; {', '.join(names)}")
+        lines.append(
+            f"{WARNING}: {refused.sensor}, {at}: {refused.reason}{distance}; {', '.join(names)}"
+        )
     return lines
 
 
@@ -393,8 +544,13 @@ def withheld_lines(comparison: Comparison) -> list[str]:
     """Measurements that runs could not use, in their own words: the first ones, and the number of the others."""
     lines = []
     for run in comparison.runs:
-        lines += [f"{WARNING}: {run.estimator}: {message}" for message in run.withheld[:MOST_ROWS_NAMED]]
+        lines += [
+            f"{WARNING}: {run.estimator}: {message}"
+            for message in run.withheld[:MOST_ROWS_NAMED]
+        ]
         more = len(run.withheld) - MOST_ROWS_NAMED
         if more > 0:
-            lines.append(f"{WARNING}: {run.estimator} withheld {more} more: runs/{run.estimator}/result.json has all")
+            lines.append(
+                f"{WARNING}: {run.estimator} withheld {more} more: runs/{run.estimator}/result.json has all"
+            )
     return lines

@@ -16,7 +16,12 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Mounting, SonarImage
-from sonar_graph.devices import DEFAULT_DESIGNS, OWN_DESIGNS, LandmarkDesign, load_designs
+from sonar_graph.devices import (
+    DEFAULT_DESIGNS,
+    OWN_DESIGNS,
+    LandmarkDesign,
+    load_designs,
+)
 from sonar_graph.errors import SimulationError
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import FieldOfView, World, world_on_floor
@@ -35,7 +40,16 @@ from sonar_graph.simulation.sonar_image import (
     true_mounting,
     weathered,
 )
-from sonar_graph.simulation.vehicle import PlanarPose, RouteLeg, VehiclePath, drive, follow, hover, smooth_noise, turn
+from sonar_graph.simulation.vehicle import (
+    PlanarPose,
+    RouteLeg,
+    VehiclePath,
+    drive,
+    follow,
+    hover,
+    smooth_noise,
+    turn,
+)
 
 LANDMARKS_XY_M = np.array([[5.0, 0.0], [7.0, -5.0], [2.0, -7.0], [0.0, -2.0]])
 FLOOR_Z_M = -1.7
@@ -44,9 +58,13 @@ LANDMARK_ALONG_SIDE_M = 5.0
 SIDES = 4
 BODY_Z_M = -0.70
 YSHARK = Vehicle(
-    sonar=Mounting(translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(30), 0.0)),
+    sonar=Mounting(
+        translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(30), 0.0)
+    ),
     fan=FieldOfView(1.25, 2.5, math.radians(14.4), math.radians(7)),
-    dvl=Mounting(translation_m=(-0.20, 0.0, -0.15), rpy_rad=(0.0, 0.0, math.radians(45))),
+    dvl=Mounting(
+        translation_m=(-0.20, 0.0, -0.15), rpy_rad=(0.0, 0.0, math.radians(45))
+    ),
     depth_port_m=(0.10, 0.05, 0.10),
 )
 WATCHING_M = 1.8
@@ -63,7 +81,10 @@ KNOT_S = 0.5
 PAPER_DURATION_S, PAPER_LAPS, PAPER_SPEED_M_S = 2039.0, 3, 0.15
 UNKNOWN_OBJECTS = "unknown objects"
 """Note of a log with strangers: each thing on the floor that is no landmark, and where it lies."""
-NOTES = {"truth": "exact: a quintic spline", "earth rotation": "neither simulated nor to be removed"}
+NOTES = {
+    "truth": "exact: a quintic spline",
+    "earth rotation": "neither simulated nor to be removed",
+}
 
 
 class BasinOptions(SimulationOptions):
@@ -123,19 +144,38 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     options = options or BasinOptions()
     streams = Streams.of(options.seed)
     world, path = _world_and_path(options, streams)
-    sequence = record("basin", options, YSHARK, path, world, streams, provenance(options))
+    sequence = record(
+        "basin", options, YSHARK, path, world, streams, provenance(options)
+    )
     if options.image is None:
         return sequence
     if options.image.strangers:
-        others = [o for o in objects_on_floor(world, options.image, streams.seabed) if o.id < 0]
-        lie = ", ".join(f"{o.kind} at ({o.position_m[0]:.2f}, {o.position_m[1]:.2f})" for o in others)
+        others = [
+            o
+            for o in objects_on_floor(world, options.image, streams.seabed)
+            if o.id < 0
+        ]
+        lie = ", ".join(
+            f"{o.kind} at ({o.position_m[0]:.2f}, {o.position_m[1]:.2f})"
+            for o in others
+        )
         sequence = replace(sequence, notes={**sequence.notes, UNKNOWN_OBJECTS: lie})
-    scale = SonarImage(scale="decibel", decibel_span=SONARS[options.image.sonar].decibel_span, full_scale=255)
+    scale = SonarImage(
+        scale="decibel",
+        decibel_span=SONARS[options.image.sonar].decibel_span,
+        full_scale=255,
+    )
     sonar = sequence.calibration.sonar.model_copy(update={"image": scale})
-    return replace(sequence, detections=None, calibration=sequence.calibration.model_copy(update={"sonar": sonar}))
+    return replace(
+        sequence,
+        detections=None,
+        calibration=sequence.calibration.model_copy(update={"sonar": sonar}),
+    )
 
 
-def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> Iterator[ImagedFrames]:
+def simulate_basin_frames(
+    options: BasinOptions, frames_per_block: int = 32
+) -> Iterator[ImagedFrames]:
     """Simulate the sonar images of the run that `simulate_basin` gives for the same options, a block at a time.
 
     Parameters
@@ -165,27 +205,41 @@ def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> 
     streams = Streams.of(options.seed)
     world, path = _world_and_path(options, streams)
     image = options.image or ImageOptions()
-    simulator = FrameSimulator(image, objects_on_floor(world, image, streams.seabed), FLOOR_Z_M, options.seed)
+    simulator = FrameSimulator(
+        image, objects_on_floor(world, image, streams.seabed), FLOOR_Z_M, options.seed
+    )
     stamps_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
     mounting = true_mounting(YSHARK.sonar, image, options.seed)
     yield from image_along(path, mounting, stamps_ns, simulator, frames_per_block)
 
 
-def _world_and_path(options: BasinOptions, streams: Streams) -> tuple[World, VehiclePath]:
+def _world_and_path(
+    options: BasinOptions, streams: Streams
+) -> tuple[World, VehiclePath]:
     """Landmarks with the identities of their designs, and the route with the wobble of a vehicle under a joystick.
 
     The wobble is slow wandering of a decimetre and quicker swaying of centimetres and degrees.
     """
-    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
-    world = replace(world, landmark_ids=np.array([design.id for design in designs_laid(options.image)]))
-    rng, seconds = streams.path, np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1)
+    world = world_on_floor(
+        LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world
+    )
+    world = replace(
+        world,
+        landmark_ids=np.array([design.id for design in designs_laid(options.image)]),
+    )
+    rng, seconds = (
+        streams.path,
+        np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1),
+    )
     x, y, yaw = follow((0.0, 0.0, 0.0), route(options, rng), seconds).T
     level = np.zeros_like(seconds)
     intended = np.column_stack([x, y, level + BODY_Z_M, level, level, yaw])
     slow = smooth_noise(seconds, np.array([0.12, 0.12, 0.03]), 40.0, 3, rng)
     quick = smooth_noise(seconds, np.array([0.03, 0.03, 0.02]), 5.0, 3, rng)
     swaying = smooth_noise(seconds, np.radians([1.8, 1.8, 3.0]), 4.0, 3, rng)
-    return world, VehiclePath.through(seconds, intended + np.column_stack([slow + quick, swaying]))
+    return world, VehiclePath.through(
+        seconds, intended + np.column_stack([slow + quick, swaying])
+    )
 
 
 def designs_laid(image: ImageOptions | None) -> list[LandmarkDesign]:
@@ -208,27 +262,51 @@ def designs_laid(image: ImageOptions | None) -> list[LandmarkDesign]:
     return sorted(designs, key=lambda design: design.id)[: len(LANDMARKS_XY_M)]
 
 
-def objects_on_floor(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
+def objects_on_floor(
+    world: World, image: ImageOptions, rng: np.random.Generator
+) -> list[SeabedObject]:
     """Landmarks, turned at random and worn, then stones and patches at random spots on the route, then strangers."""
     yaw_rad = rng.uniform(-np.pi, np.pi, len(world.landmark_ids))
-    placed = zip(designs_laid(image), world.landmark_positions, yaw_rad.tolist(), strict=True)
-    landmarks = [place_landmark(*each, FLOOR_Z_M, image.foam_height_m) for each in placed]
+    placed = zip(
+        designs_laid(image), world.landmark_positions, yaw_rad.tolist(), strict=True
+    )
+    landmarks = [
+        place_landmark(*each, FLOOR_Z_M, image.foam_height_m) for each in placed
+    ]
     wear_rng, strangers_rng = rng.spawn(2)
-    landmarks = [weathered(one, image, own) for one, own in zip(landmarks, wear_rng.spawn(len(landmarks)), strict=True)]
+    landmarks = [
+        weathered(one, image, own)
+        for one, own in zip(landmarks, wear_rng.spawn(len(landmarks)), strict=True)
+    ]
     spots, beside, corner = [], [], np.zeros(2)
     for heading_rad in -math.pi / 2 * np.arange(SIDES):
         ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
         left = np.array([-ahead[1], ahead[0]])
         for along_m in OBJECTS_ALONG_SIDE_M:
             aside_m = rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
-            spots.append([*(corner + (along_m + rng.uniform(-0.2, 0.2)) * ahead + aside_m * left), FLOOR_Z_M])
+            spots.append(
+                [
+                    *(
+                        corner
+                        + (along_m + rng.uniform(-0.2, 0.2)) * ahead
+                        + aside_m * left
+                    ),
+                    FLOOR_Z_M,
+                ]
+            )
         for along_m in STRANGERS_ALONG_SIDE_M:
             aside_m = strangers_rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
             beside.append([*(corner + along_m * ahead + aside_m * left), FLOOR_Z_M])
         corner = corner + SIDE_M * ahead
     chosen = rng.permutation(np.array(spots))[: image.stones + image.decoys]
     others = scattered_objects(chosen, image.stones, rng)
-    return landmarks + others + strangers_at(np.array(beside), image.strangers, -1 - len(others), strangers_rng)
+    return (
+        landmarks
+        + others
+        + strangers_at(
+            np.array(beside), image.strangers, -1 - len(others), strangers_rng
+        )
+    )
 
 
 def provenance(options: BasinOptions) -> dict[str, str]:
@@ -239,15 +317,34 @@ def provenance(options: BasinOptions) -> dict[str, str]:
         f"laps: {options.laps}": options.laps == PAPER_LAPS,
         f"{speed_m_s:.3f} m/s while driving": speed_m_s == PAPER_SPEED_M_S,
     }
-    published = ["basin", "landmark positions", "tilt", "window", *(text for text, same in chosen.items() if same)]
-    ours = ["route", "hovering", "sensor models and mountings", "rates", "noise", "wobble"]
-    ours += ["error rates of the recogniser"] if options.image is None else ["landmark designs", "image model"]
+    published = [
+        "basin",
+        "landmark positions",
+        "tilt",
+        "window",
+        *(text for text, same in chosen.items() if same),
+    ]
+    ours = [
+        "route",
+        "hovering",
+        "sensor models and mountings",
+        "rates",
+        "noise",
+        "wobble",
+    ]
+    ours += (
+        ["error rates of the recogniser"]
+        if options.image is None
+        else ["landmark designs", "image model"]
+    )
     ours += [*(text for text, same in chosen.items() if not same)]
     notes = {"from the paper": ", ".join(published), "ours": ", ".join(ours), **NOTES}
     if options.image and options.image.scene != "easy":
         notes["scene"] = options.image.scene
     if options.image and options.image.designs is not None:
-        laid = ", ".join(f"{design.id}: {design.name}" for design in designs_laid(options.image))
+        laid = ", ".join(
+            f"{design.id}: {design.name}" for design in designs_laid(options.image)
+        )
         notes[OWN_DESIGNS] = f"{laid}, of {Path(options.image.designs).name}"
     return {**notes, "speed_m_s": f"{speed_m_s:.3f}"}
 
@@ -277,7 +374,9 @@ def route(options: BasinOptions, rng: np.random.Generator) -> list[RouteLeg]:
     Driving and turning leave some time, which is spent watching, unequally.
     """
     speed, sides = cruise_speed(options), SIDES * options.laps
-    spare_s = max(0.0, options.duration_s - sides * (SIDE_M / speed + 2 * RAMP_S + TURN_S))
+    spare_s = max(
+        0.0, options.duration_s - sides * (SIDE_M / speed + 2 * RAMP_S + TURN_S)
+    )
     share = rng.uniform(0.8, 1.2, sides)
     stop_m = LANDMARK_ALONG_SIDE_M - WATCHING_M - YSHARK.sonar.translation_m[0]
     pose: PlanarPose = (0.0, 0.0, 0.0)

@@ -35,17 +35,25 @@ class World:
 
     def landmark_map(self) -> LandmarkMap:
         """The true landmarks; truth has no covariances (NaN)."""
-        return LandmarkMap(self.landmark_ids, self.landmark_positions, np.full((len(self.landmark_ids), 3, 3), np.nan))
+        return LandmarkMap(
+            self.landmark_ids,
+            self.landmark_positions,
+            np.full((len(self.landmark_ids), 3, 3), np.nan),
+        )
 
 
-def world_on_floor(xy_m: Floats, floor_z_m: float, height_sigma_m: float, rng: np.random.Generator) -> World:
+def world_on_floor(
+    xy_m: Floats, floor_z_m: float, height_sigma_m: float, rng: np.random.Generator
+) -> World:
     """Landmarks with IDs 1, 2, ... whose heights are drawn around that of the floor.
 
     Estimators are given the floor prior N(floor_z_m, height_sigma_m²), from which the heights are drawn: landmarks
     exactly on the floor would make every estimator look too cautious. Horizontal positions have the shape (m, 2).
     """
     heights = floor_z_m + height_sigma_m * rng.standard_normal(len(xy_m))
-    return World(np.arange(1, len(xy_m) + 1), np.column_stack([xy_m, heights]), floor_z_m)
+    return World(
+        np.arange(1, len(xy_m) + 1), np.column_stack([xy_m, heights]), floor_z_m
+    )
 
 
 LONGEST_GAP_S = 1.0
@@ -72,7 +80,9 @@ class Watched:
         newest: dict[int, tuple[int, int]] = {}
         landmarks: list[int] = []
         first_ns: list[int] = []
-        for row, (index, stamp_ns) in enumerate(zip(landmark.tolist(), stamps_ns.tolist(), strict=True)):
+        for row, (index, stamp_ns) in enumerate(
+            zip(landmark.tolist(), stamps_ns.tolist(), strict=True)
+        ):
             number, last_ns = newest.get(index, (-1, 0))
             if number < 0 or stamp_ns - last_ns > LONGEST_GAP_S * 1e9:
                 number = len(landmarks)
@@ -80,7 +90,10 @@ class Watched:
                 first_ns.append(stamp_ns)
             newest[index] = number, stamp_ns
             track[row] = number
-        age_s = np.asarray((stamps_ns - np.array(first_ns, dtype=np.int64)[track]) * 1e-9, dtype=np.float64)
+        age_s = np.asarray(
+            (stamps_ns - np.array(first_ns, dtype=np.int64)[track]) * 1e-9,
+            dtype=np.float64,
+        )
         lifetime_s = np.zeros(len(landmarks))
         np.maximum.at(lifetime_s, track, age_s)
         return cls(np.array(landmarks, dtype=np.int64), track, age_s, lifetime_s)
@@ -129,11 +142,15 @@ class SimulatedRecogniser:
         return cls(**options.model_dump(include={field.name for field in fields(cls)}))
 
 
-def landmarks_in_sonar(path: VehiclePath, stamps_ns: Ints, sonar: SonarCalibration, world: World) -> Floats:
+def landmarks_in_sonar(
+    path: VehiclePath, stamps_ns: Ints, sonar: SonarCalibration, world: World
+) -> Floats:
     """Position of every landmark in the sonar's frame at every instant, shape (n, m, 3), m."""
     motion = path.at(seconds_since_start(stamps_ns))
     world_R_sonar = motion.world_R_body * body_R_sensor(sonar.mounting)
-    sonar_origin = motion.position + motion.world_R_body.apply(np.array(sonar.mounting.translation_m))
+    sonar_origin = motion.position + motion.world_R_body.apply(
+        np.array(sonar.mounting.translation_m)
+    )
     from_sonar = world.landmark_positions[None] - sonar_origin[:, None]
     return np.einsum("nji,nmj->nmi", world_R_sonar.as_matrix(), from_sonar)
 
@@ -141,10 +158,16 @@ def landmarks_in_sonar(path: VehiclePath, stamps_ns: Ints, sonar: SonarCalibrati
 def range_azimuth_elevation(points: Floats) -> tuple[Floats, Floats, Floats]:
     """Polar coordinates of points in the sonar's frame (last axis 3): |q|, atan2(q_y, q_x), asin(q_z / |q|)."""
     distance = np.linalg.norm(points, axis=-1)
-    return distance, np.arctan2(points[..., 1], points[..., 0]), np.arcsin(points[..., 2] / distance)
+    return (
+        distance,
+        np.arctan2(points[..., 1], points[..., 0]),
+        np.arcsin(points[..., 2] / distance),
+    )
 
 
-def inside(fan: FieldOfView, points: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def inside(
+    fan: FieldOfView, points: Floats
+) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """True for points of the sonar's frame (last axis 3) inside the fan."""
     distance, azimuth, elevation = range_azimuth_elevation(points)
     return np.asarray(
@@ -175,28 +198,46 @@ def simulate_detections(
     sigmas = np.array([sonar.range_sigma_m, sonar.azimuth_sigma_rad])
 
     points = landmarks_in_sonar(path, stamps_ns, sonar, world)
-    detected = inside(fan, points) & (true_rng.random(points.shape[:2]) < recogniser.detection_probability)
+    detected = inside(fan, points) & (
+        true_rng.random(points.shape[:2]) < recogniser.detection_probability
+    )
     true_frame, landmark = np.nonzero(detected)
     true_distance, true_azimuth, _ = range_azimuth_elevation(points[detected])
     true_views = np.column_stack([true_distance, true_azimuth])
     true_views = true_views + sigmas * true_rng.standard_normal((len(true_frame), 2))
     if recogniser.tracks:
         watched = Watched.of(landmark, stamps_ns[true_frame])
-        true_track, delay_s, share = watched.track, recogniser.id_delay_s, recogniser.wrong_id_share
-        first_taken_for = _mistaken(watched.landmark, landmarks, recogniser.wrong_id_rate, true_rng)
+        true_track, delay_s, share = (
+            watched.track,
+            recogniser.id_delay_s,
+            recogniser.wrong_id_share,
+        )
+        first_taken_for = _mistaken(
+            watched.landmark, landmarks, recogniser.wrong_id_rate, true_rng
+        )
         corrected_s = delay_s + share * np.maximum(watched.lifetime_s - delay_s, 0.0)
         is_corrected = (watched.age_s >= corrected_s[true_track]) & (share < 1)
-        believed = np.where(is_corrected, watched.landmark[true_track], first_taken_for[true_track])
+        believed = np.where(
+            is_corrected, watched.landmark[true_track], first_taken_for[true_track]
+        )
         true_posterior = _confident(believed, landmarks)
         true_posterior[watched.age_s < delay_s] = 1 / (landmarks + 1)
     else:
         taken_for = _mistaken(landmark, landmarks, recogniser.wrong_id_rate, true_rng)
-        true_posterior, true_track = _confident(taken_for, landmarks), np.full(len(true_frame), NO_TRACK)
+        true_posterior, true_track = (
+            _confident(taken_for, landmarks),
+            np.full(len(true_frame), NO_TRACK),
+        )
 
-    false_frame = np.repeat(np.arange(frames), false_rng.poisson(recogniser.false_detections_per_frame, frames))
+    false_frame = np.repeat(
+        np.arange(frames),
+        false_rng.poisson(recogniser.false_detections_per_frame, frames),
+    )
     count = len(false_frame)
     false_distance = false_rng.uniform(fan.range_min_m, fan.range_max_m, count)
-    false_azimuth = false_rng.uniform(-fan.azimuth_half_rad, fan.azimuth_half_rad, count)
+    false_azimuth = false_rng.uniform(
+        -fan.azimuth_half_rad, fan.azimuth_half_rad, count
+    )
     is_confident = false_rng.random(count) < recogniser.confident_false_fraction
     doubtful = UNRECOGNISED_PROBABILITY * false_rng.dirichlet(np.ones(landmarks), count)
     certain = _confident(false_rng.integers(landmarks, size=count), landmarks)
@@ -206,7 +247,9 @@ def simulate_detections(
     if not len(frame):
         return None
     order = np.argsort(frame, kind="stable")
-    views = np.concatenate([true_views, np.column_stack([false_distance, false_azimuth])])[order]
+    views = np.concatenate(
+        [true_views, np.column_stack([false_distance, false_azimuth])]
+    )[order]
     is_anonymous = rng.spawn(1)[0].random((len(frame), 1)) < recogniser.anonymous_share
     id_probability = np.concatenate([true_posterior, false_posterior])[order]
     return LandmarkDetections(
@@ -220,7 +263,9 @@ def simulate_detections(
     )
 
 
-def _mistaken(landmark: Ints, landmarks: int, rate: float, rng: np.random.Generator) -> Ints:
+def _mistaken(
+    landmark: Ints, landmarks: int, rate: float, rng: np.random.Generator
+) -> Ints:
     """Index of the landmark that each is taken for: at the given rate another one, all equally likely."""
     others = landmarks - 1
     if not others:

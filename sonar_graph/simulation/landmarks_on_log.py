@@ -16,7 +16,12 @@ from sonar_graph.calibration import Mounting, Section, SonarCalibration
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import NS_PER_S
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, World, simulate_detections
+from sonar_graph.simulation.detections import (
+    FieldOfView,
+    SimulatedRecogniser,
+    World,
+    simulate_detections,
+)
 from sonar_graph.simulation.sensors import EPOCH_NS, regular_stamps
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
 
@@ -69,7 +74,9 @@ class LandmarkOptions(Section):
     """Share of the false detections taken confidently for a landmark."""
 
 
-def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) -> Sequence:
+def add_landmarks(
+    recorded: Sequence, options: LandmarkOptions | None = None
+) -> Sequence:
     """Add landmarks, detections and the sonar's calibration to a recorded run; all else stays as recorded.
 
     Parameters
@@ -96,9 +103,14 @@ def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) ->
     for low, high in (("range_min_m", "range_max_m"), ("side_min_m", "side_max_m")):
         least, most = getattr(options, low), getattr(options, high)
         if least >= most:
-            raise SimulationError(f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}")
+            raise SimulationError(
+                f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}"
+            )
     first_ns, path = reference_path(recorded)
-    world_rng, sonar_rng = (np.random.default_rng(child) for child in np.random.SeedSequence(options.seed).spawn(2))
+    world_rng, sonar_rng = (
+        np.random.default_rng(child)
+        for child in np.random.SeedSequence(options.seed).spawn(2)
+    )
     world = landmarks_beside(path, options, world_rng)
     sonar = SonarCalibration(
         mounting=Mounting(),
@@ -106,18 +118,29 @@ def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) ->
         azimuth_sigma_rad=options.azimuth_sigma_rad,
         elevation_aperture_rad=options.elevation_aperture_rad,
     )
-    azimuth_half_rad, elevation_half_rad = options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2
-    fan = FieldOfView(options.range_min_m, options.range_max_m, azimuth_half_rad, elevation_half_rad)
+    azimuth_half_rad, elevation_half_rad = (
+        options.azimuth_aperture_rad / 2,
+        options.elevation_aperture_rad / 2,
+    )
+    fan = FieldOfView(
+        options.range_min_m, options.range_max_m, azimuth_half_rad, elevation_half_rad
+    )
     frames_ns = regular_stamps(options.frame_rate_hz, path.duration_s)
-    detections = simulate_detections(path, frames_ns, sonar, fan, SimulatedRecogniser.of(options), world, sonar_rng)
+    detections = simulate_detections(
+        path, frames_ns, sonar, fan, SimulatedRecogniser.of(options), world, sonar_rng
+    )
     if detections is None:
         raise SimulationError(
             f"{recorded.name}: not one landmark is seen; lower spacing_m = {options.spacing_m:g} or raise range_max_m"
         )
     return replace(
         recorded,
-        calibration=recorded.calibration.model_copy(update={"sonar": sonar, "floor": None}),
-        detections=replace(detections, stamps_ns=detections.stamps_ns - EPOCH_NS + first_ns),  # on the log's clock
+        calibration=recorded.calibration.model_copy(
+            update={"sonar": sonar, "floor": None}
+        ),
+        detections=replace(
+            detections, stamps_ns=detections.stamps_ns - EPOCH_NS + first_ns
+        ),  # on the log's clock
         true_landmarks=world.landmark_map(),
         notes=recorded.notes
         | {
@@ -139,7 +162,9 @@ def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
             "name its topic with --topic truth=TOPIC"
         )
     stamps_ns = reference.stamps_ns
-    inside = np.flatnonzero((stamps_ns >= recorded.start_ns) & (stamps_ns <= recorded.end_ns))
+    inside = np.flatnonzero(
+        (stamps_ns >= recorded.start_ns) & (stamps_ns <= recorded.end_ns)
+    )
     if len(inside) < LEAST_POSES:
         raise SimulationError(
             f"{recorded.name}: {len(inside)} poses of the reference lie within the time of IMU and DVL; "
@@ -153,19 +178,34 @@ def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
     seconds = np.array(knots) if len(knots) >= LEAST_POSES else seconds
     poses = reference.at(stamps_ns[0] + np.rint(seconds * NS_PER_S).astype(np.int64))
     angles = np.unwrap(rpy_from_rotation(poses.rotations()), axis=0)
-    return int(stamps_ns[0]), VehiclePath.through(seconds, np.column_stack([poses.positions, angles]))
+    return int(stamps_ns[0]), VehiclePath.through(
+        seconds, np.column_stack([poses.positions, angles])
+    )
 
 
-def landmarks_beside(path: VehiclePath, options: LandmarkOptions, rng: np.random.Generator) -> World:
+def landmarks_beside(
+    path: VehiclePath, options: LandmarkOptions, rng: np.random.Generator
+) -> World:
     """Landmarks beside the track."""
     seconds = np.arange(0.0, path.duration_s, 0.1)
     motion = path.at(seconds)
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(motion.position[:, :2], axis=0), axis=1))])
-    places_m = np.arange(0.5 * options.spacing_m, max(along_m[-1], options.spacing_m), options.spacing_m)
+    along_m = np.concatenate(
+        [
+            [0.0],
+            np.cumsum(np.linalg.norm(np.diff(motion.position[:, :2], axis=0), axis=1)),
+        ]
+    )
+    places_m = np.arange(
+        0.5 * options.spacing_m, max(along_m[-1], options.spacing_m), options.spacing_m
+    )
     row = np.minimum(np.searchsorted(along_m, places_m), len(seconds) - 1)
     course = np.arctan2(motion.velocity[row, 1], motion.velocity[row, 0])
-    side_m = rng.choice([-1.0, 1.0], len(row)) * rng.uniform(options.side_min_m, options.side_max_m, len(row))
+    side_m = rng.choice([-1.0, 1.0], len(row)) * rng.uniform(
+        options.side_min_m, options.side_max_m, len(row)
+    )
     offset = np.column_stack([-np.sin(course) * side_m, np.cos(course) * side_m])
-    height = motion.position[row, 2] + options.height_sigma_m * rng.standard_normal(len(row))
+    height = motion.position[row, 2] + options.height_sigma_m * rng.standard_normal(
+        len(row)
+    )
     positions = np.column_stack([motion.position[row, :2] + offset, height])
     return World(np.arange(1, len(row) + 1), positions, float(height.min()))

@@ -71,30 +71,49 @@ def simulate_mission(options: MissionOptions | None = None) -> Sequence:
     """
     options = options or MissionOptions()
     streams = Streams.of(options.seed)
-    index = np.arange(options.landmarks)  # the sunflower's spiral: evenly over a disc, without rows
-    radius, angle = FIELD_RADIUS_M * np.sqrt((index + 0.5) / options.landmarks), GOLDEN_ANGLE_RAD * index
+    # the sunflower's spiral: evenly over a disc, without rows
+    index = np.arange(options.landmarks)
+    radius, angle = (
+        FIELD_RADIUS_M * np.sqrt((index + 0.5) / options.landmarks),
+        GOLDEN_ANGLE_RAD * index,
+    )
     landmarks_xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-    world = world_on_floor(landmarks_xy, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    world = world_on_floor(
+        landmarks_xy, FLOOR_Z_M, options.floor_sigma_m, streams.world
+    )
     vehicle = Vehicle(
-        sonar=Mounting(translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(10), 0.0)),
-        fan=FieldOfView(0.5, options.range_max_m, options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2),
+        sonar=Mounting(
+            translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(10), 0.0)
+        ),
+        fan=FieldOfView(
+            0.5,
+            options.range_max_m,
+            options.azimuth_aperture_rad / 2,
+            options.elevation_aperture_rad / 2,
+        ),
         dvl=Mounting(translation_m=(-0.20, 0.0, -0.15)),
         depth_port_m=(0.10, 0.05, 0.10),
     )
-    seconds = np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1)
+    seconds = np.linspace(
+        0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1
+    )
     xy, heading = loop(options.speed_m_s * seconds)
     level = np.zeros_like(seconds)
     intended = np.column_stack([xy, level + BODY_Z_M, level, level, heading])
     position = smooth_noise(seconds, np.array([0.05, 0.05, 0.04]), 8.0, 3, streams.path)
     attitude = smooth_noise(seconds, np.radians([1.8, 1.8, 2.0]), 4.0, 3, streams.path)
-    path = VehiclePath.through(seconds, intended + np.column_stack([position, attitude]))
+    path = VehiclePath.through(
+        seconds, intended + np.column_stack([position, attitude])
+    )
     return record("mission", options, vehicle, path, world, streams, NOTES)
 
 
 def loop(travelled_m: Floats) -> tuple[Floats, Floats]:
     """Position (n, 2) and unwrapped heading (n,) after a distance on the loop r = 6 m + 1.2 m cos(3 angle)."""
     fine = np.linspace(0, 2 * math.pi, 20_001)
-    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(_loop_xy(fine), axis=0).T))])
+    along_m = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(*np.diff(_loop_xy(fine), axis=0).T))]
+    )
     laps, rest_m = np.divmod(travelled_m, along_m[-1])
     angle = np.interp(rest_m, along_m, fine) + 2 * math.pi * laps
     ahead = _loop_xy(angle + 1e-4) - _loop_xy(angle - 1e-4)

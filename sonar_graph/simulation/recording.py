@@ -23,8 +23,19 @@ from sonar_graph.calibration import (
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, World, simulate_detections
-from sonar_graph.simulation.options import DEPTH_RATE_HZ, DVL_PRESETS, IMU_PRESETS, IMU_RATE_HZ, SimulationOptions
+from sonar_graph.simulation.detections import (
+    FieldOfView,
+    SimulatedRecogniser,
+    World,
+    simulate_detections,
+)
+from sonar_graph.simulation.options import (
+    DEPTH_RATE_HZ,
+    DVL_PRESETS,
+    IMU_PRESETS,
+    IMU_RATE_HZ,
+    SimulationOptions,
+)
 from sonar_graph.simulation.sensors import (
     regular_stamps,
     seconds_since_start,
@@ -67,7 +78,12 @@ class Streams:
     @classmethod
     def of(cls, seed: int) -> Streams:
         """Spawn the streams of a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(8)))
+        return cls(
+            *(
+                np.random.default_rng(child)
+                for child in np.random.SeedSequence(seed).spawn(8)
+            )
+        )
 
 
 def record(
@@ -95,14 +111,23 @@ def record(
             f"simulate {name}: wrong_id_share = {options.wrong_id_share:g} is a share of a track; set tracks = true"
         )
     calibration = true_calibration(options, vehicle, path, world, streams.start)
-    rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
-    imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
+    rates_hz = (
+        IMU_RATE_HZ,
+        DVL_PRESETS[options.dvl].rate_hz,
+        DEPTH_RATE_HZ,
+        TRUTH_RATE_HZ,
+    )
+    imu_ns, dvl_ns, depth_ns, truth_ns = (
+        regular_stamps(rate, path.duration_s) for rate in rates_hz
+    )
     frames_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
     truth = path.at(seconds_since_start(truth_ns))
     return Sequence(
         name=name,
         calibration=calibration,
-        imu=simulate_imu(path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu),
+        imu=simulate_imu(
+            path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu
+        ),
         dvl=simulate_dvl(
             path,
             dvl_ns,
@@ -114,11 +139,23 @@ def record(
         ),
         depth=simulate_depth(path, depth_ns, calibration.depth, streams.depth),
         detections=simulate_detections(
-            path, frames_ns, calibration.sonar, vehicle.fan, SimulatedRecogniser.of(options), world, streams.sonar
+            path,
+            frames_ns,
+            calibration.sonar,
+            vehicle.fan,
+            SimulatedRecogniser.of(options),
+            world,
+            streams.sonar,
         ),
-        truth=Trajectory.without_covariances(truth_ns, truth.position, truth.world_R_body.as_quat()),
+        truth=Trajectory.without_covariances(
+            truth_ns, truth.position, truth.world_R_body.as_quat()
+        ),
         true_landmarks=world.landmark_map(),
-        notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
+        notes={
+            "generator": f"sonar_graph {__version__}, {name}",
+            "options": options.model_dump_json(),
+            **notes,
+        },
     )
 
 
@@ -128,20 +165,32 @@ def frame_stamps(rate_hz: float, duration_s: float) -> Ints:
 
 
 def true_calibration(
-    options: SimulationOptions, vehicle: Vehicle, path: VehiclePath, world: World, rng: np.random.Generator
+    options: SimulationOptions,
+    vehicle: Vehicle,
+    path: VehiclePath,
+    world: World,
+    rng: np.random.Generator,
 ) -> Calibration:
     """The noise that is simulated, and a start drawn about the true one, so that its error is as large as it says."""
-    preset, sigma_m_s = IMU_PRESETS[options.imu], DVL_PRESETS[options.dvl].velocity_sigma_m_s
+    preset, sigma_m_s = (
+        IMU_PRESETS[options.imu],
+        DVL_PRESETS[options.dvl].velocity_sigma_m_s,
+    )
     imu = preset.model_copy(
         update={
             "gyro_bias_sigma": preset.gyro_bias_sigma * options.gyro_bias_scale,
-            "gyro_bias_walk_density": preset.gyro_bias_walk_density * options.gyro_bias_scale,
+            "gyro_bias_walk_density": preset.gyro_bias_walk_density
+            * options.gyro_bias_scale,
             "accel_bias_sigma": preset.accel_bias_sigma * options.accel_bias_scale,
         }
     )
     true = path.at(np.zeros(1))
-    position = true.position[0] + options.start_position_sigma_m * rng.standard_normal(3)
-    turn = Rotation.from_rotvec(options.start_rotation_sigma_rad * rng.standard_normal(3))
+    position = true.position[0] + options.start_position_sigma_m * rng.standard_normal(
+        3
+    )
+    turn = Rotation.from_rotvec(
+        options.start_rotation_sigma_rad * rng.standard_normal(3)
+    )
     return Calibration(
         imu=imu,
         dvl=DvlCalibration(velocity_sigma_m_s=(sigma_m_s,) * 3, mounting=vehicle.dvl),

@@ -7,7 +7,12 @@ estimators to remove it. docs/theory/simulation.md
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    DepthCalibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.simulation.vehicle import Kinematics, VehiclePath, rotation_from_rpy
 
@@ -18,7 +23,9 @@ EPOCH_NS = 1_400_000_000 * NS_PER_S
 def regular_stamps(rate_hz: float, duration_s: float, offset_s: float = 0.0) -> Ints:
     """Stamps every 1 / rate from ``offset_s`` after the start of the run to its end, shape (n,), nanoseconds."""
     count = int(np.floor((duration_s - offset_s) * rate_hz + 1e-9)) + 1
-    return EPOCH_NS + np.rint((offset_s + np.arange(count) / rate_hz) * NS_PER_S).astype(np.int64)
+    return EPOCH_NS + np.rint(
+        (offset_s + np.arange(count) / rate_hz) * NS_PER_S
+    ).astype(np.int64)
 
 
 def seconds_since_start(stamps_ns: Ints) -> Floats:
@@ -31,7 +38,9 @@ def body_R_sensor(mounting: Mounting) -> Rotation:
     return rotation_from_rpy(np.array(mounting.rpy_rad))
 
 
-def imu_readings(motion: Kinematics, mounting: Mounting, gravity_m_s2: float) -> tuple[Floats, Floats]:
+def imu_readings(
+    motion: Kinematics, mounting: Mounting, gravity_m_s2: float
+) -> tuple[Floats, Floats]:
     """Exact angular velocity and specific force of an IMU with a lever arm l, in its own frame.
 
     ::
@@ -43,35 +52,61 @@ def imu_readings(motion: Kinematics, mounting: Mounting, gravity_m_s2: float) ->
     """
     imu_R_body = body_R_sensor(mounting).inv()
     lever, omega = np.array(mounting.translation_m), motion.angular_velocity
-    from_gravity = motion.world_R_body.inv().apply(motion.acceleration + np.array([0.0, 0.0, gravity_m_s2]))
-    from_turning = np.cross(motion.angular_acceleration, lever) + np.cross(omega, np.cross(omega, lever))
+    from_gravity = motion.world_R_body.inv().apply(
+        motion.acceleration + np.array([0.0, 0.0, gravity_m_s2])
+    )
+    from_turning = np.cross(motion.angular_acceleration, lever) + np.cross(
+        omega, np.cross(omega, lever)
+    )
     return imu_R_body.apply(omega), imu_R_body.apply(from_gravity + from_turning)
 
 
 def simulate_imu(
-    path: VehiclePath, stamps_ns: Ints, calibration: ImuCalibration, gravity_m_s2: float, rng: np.random.Generator
+    path: VehiclePath,
+    stamps_ns: Ints,
+    calibration: ImuCalibration,
+    gravity_m_s2: float,
+    rng: np.random.Generator,
 ) -> Imu:
     """IMU samples with white noise, constant biases drawn from their sigmas, and a walk of the gyro bias.
 
     White noise of root spectral density d, sampled every dt, has the standard deviation d / sqrt(dt); the bias
     walks by density * sqrt(dt) a sample.
     """
-    omega, force = imu_readings(path.at(seconds_since_start(stamps_ns)), calibration.mounting, gravity_m_s2)
+    omega, force = imu_readings(
+        path.at(seconds_since_start(stamps_ns)), calibration.mounting, gravity_m_s2
+    )
     dt_s = float(np.diff(stamps_ns).mean()) / NS_PER_S
     first_bias = calibration.gyro_bias_sigma * rng.standard_normal(3)
-    steps = calibration.gyro_bias_walk_density * np.sqrt(dt_s) * rng.standard_normal((len(stamps_ns), 3))
+    steps = (
+        calibration.gyro_bias_walk_density
+        * np.sqrt(dt_s)
+        * rng.standard_normal((len(stamps_ns), 3))
+    )
     steps[0] = 0
     gyro_bias = first_bias + np.cumsum(steps, axis=0)
     accel_bias = calibration.accel_bias_sigma * rng.standard_normal(3)
-    gyro_noise = calibration.gyro_noise_density / np.sqrt(dt_s) * rng.standard_normal(omega.shape)
-    accel_noise = calibration.accel_noise_density / np.sqrt(dt_s) * rng.standard_normal(force.shape)
-    return Imu(stamps_ns, omega + gyro_bias + gyro_noise, force + accel_bias + accel_noise)
+    gyro_noise = (
+        calibration.gyro_noise_density
+        / np.sqrt(dt_s)
+        * rng.standard_normal(omega.shape)
+    )
+    accel_noise = (
+        calibration.accel_noise_density
+        / np.sqrt(dt_s)
+        * rng.standard_normal(force.shape)
+    )
+    return Imu(
+        stamps_ns, omega + gyro_bias + gyro_noise, force + accel_bias + accel_noise
+    )
 
 
 def dvl_readings(motion: Kinematics, mounting: Mounting) -> Floats:
     """Exact velocity of a DVL with a lever arm l, in its own frame: dvl_R_body (body_R_world v + omega × l)."""
     at_body = motion.world_R_body.inv().apply(motion.velocity)
-    at_dvl = at_body + np.cross(motion.angular_velocity, np.array(mounting.translation_m))
+    at_dvl = at_body + np.cross(
+        motion.angular_velocity, np.array(mounting.translation_m)
+    )
     readings: Floats = body_R_sensor(mounting).inv().apply(at_dvl)
     return readings
 
@@ -97,15 +132,22 @@ def simulate_dvl(
     velocity = exact + sigmas * rng.standard_normal(exact.shape)
     covariance = np.broadcast_to(np.diag(sigmas**2), (len(stamps_ns), 3, 3))
     duration_s = float(seconds[-1])
-    begins = np.sort(rng.uniform(0, duration_s, rng.poisson(dropouts_per_hour * duration_s / 3600)))
-    latest = np.concatenate([[-np.inf], begins])[np.searchsorted(begins, seconds, side="right")]
+    begins = np.sort(
+        rng.uniform(0, duration_s, rng.poisson(dropouts_per_hour * duration_s / 3600))
+    )
+    latest = np.concatenate([[-np.inf], begins])[
+        np.searchsorted(begins, seconds, side="right")
+    ]
     locked = seconds - latest >= dropout_s
     locked[[0, -1]] = True
     return Dvl(stamps_ns, velocity, covariance).rows(locked)
 
 
 def simulate_depth(
-    path: VehiclePath, stamps_ns: Ints, calibration: DepthCalibration, rng: np.random.Generator
+    path: VehiclePath,
+    stamps_ns: Ints,
+    calibration: DepthCalibration,
+    rng: np.random.Generator,
 ) -> Depth:
     """Heights of the pressure port, ``(p + world_R_body port)_z``, with white noise."""
     motion = path.at(seconds_since_start(stamps_ns))

@@ -62,7 +62,9 @@ class VehiclePath:
     def at(self, seconds: Floats) -> Kinematics:
         """Motion at any instants from 0 to ``duration_s``, shape (n,), seconds since the start."""
         pose, rate, change = (self.spline(seconds, nu=order) for order in range(3))
-        angular_velocity, angular_acceleration = angular_motion(pose[:, 3:], rate[:, 3:], change[:, 3:])
+        angular_velocity, angular_acceleration = angular_motion(
+            pose[:, 3:], rate[:, 3:], change[:, 3:]
+        )
         return Kinematics(
             position=pose[:, :3],
             velocity=rate[:, :3],
@@ -84,7 +86,11 @@ def rpy_from_rotation(rotation: Rotation) -> Floats:
 
 
 def smooth_noise(
-    seconds: Floats, sigma: float | Floats, interval_s: float, columns: int, rng: np.random.Generator
+    seconds: Floats,
+    sigma: float | Floats,
+    interval_s: float,
+    columns: int,
+    rng: np.random.Generator,
 ) -> Floats:
     """Random smooth wandering, shape (n, columns): quintic B-splines with independent normal coefficients.
 
@@ -142,19 +148,25 @@ def follow(start: PlanarPose, legs: list[RouteLeg], seconds: Floats) -> Floats:
     """
     pose = np.tile(np.array(start), (len(seconds), 1))
     begin_s = 0.0
-    for (from_, to), leg in zip(pairwise([start, *(leg.goal for leg in legs)]), legs, strict=True):
+    for (from_, to), leg in zip(
+        pairwise([start, *(leg.goal for leg in legs)]), legs, strict=True
+    ):
         first = np.searchsorted(seconds, begin_s)
         elapsed_s, full_speed_s = seconds[first:] - begin_s, leg.duration_s - leg.ramp_s
         progress = np.ones_like(elapsed_s)
         if full_speed_s > 0:
-            covered = _distance(elapsed_s, leg.ramp_s) - _distance(elapsed_s - full_speed_s, leg.ramp_s)
+            covered = _distance(elapsed_s, leg.ramp_s) - _distance(
+                elapsed_s - full_speed_s, leg.ramp_s
+            )
             progress = covered / full_speed_s
         pose[first:] += progress[:, None] * np.subtract(to, from_)
         begin_s += leg.duration_s
     return pose
 
 
-def drive(start: PlanarPose, length_m: float, speed_m_s: float, ramp_s: float) -> RouteLeg:
+def drive(
+    start: PlanarPose, length_m: float, speed_m_s: float, ramp_s: float
+) -> RouteLeg:
     """Leg straight ahead over a length."""
     x, y, yaw = start
     goal = (x + length_m * float(np.cos(yaw)), y + length_m * float(np.sin(yaw)), yaw)

@@ -62,7 +62,9 @@ CORRELATION_LIMIT = 1e-6
 """Above it, range and azimuth noise are taken together."""
 EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Unit focal lengths; no skew, offset or distortion."""
-BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+BEAM_R_CAMERA = gtsam.Rot3(
+    np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+)
 """Columns: image x to the left, image y up, optical axis along the beam."""
 ORIGIN = np.zeros(3)
 IMAGE_CENTRE = np.zeros(2)
@@ -74,13 +76,21 @@ class SightingError:
 
     __slots__ = ("body_T_sonar", "by_body", "keys", "z")
 
-    def __init__(self, keys: tuple[int, int], body_T_sonar: gtsam.Pose3, z: Floats) -> None:
+    def __init__(
+        self, keys: tuple[int, int], body_T_sonar: gtsam.Pose3, z: Floats
+    ) -> None:
         self.keys = keys
         self.z = z
         self.body_T_sonar = body_T_sonar
-        self.by_body = body_T_sonar.inverse().AdjointMap()  # constant: GTSAM calls thousands of times
+        # constant: GTSAM calls thousands of times
+        self.by_body = body_T_sonar.inverse().AdjointMap()
 
-    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+    def __call__(
+        self,
+        _: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[Floats] | None,
+    ) -> Floats:
         """Error, shape (2,), m and rad."""
         pose_key, landmark_key = self.keys
         world_T_sonar = values.atPose3(pose_key).compose(self.body_T_sonar)
@@ -136,7 +146,9 @@ class SightingStack:
         self._keys = [law.keys for law in laws]
         self._pose_keys = np.array([law.keys[0] for law in laws], np.uint64)
         self._landmark_keys = sorted({law.keys[1] for law in laws})
-        self._landmark_of = np.searchsorted(self._landmark_keys, [law.keys[1] for law in laws])
+        self._landmark_of = np.searchsorted(
+            self._landmark_keys, [law.keys[1] for law in laws]
+        )
         self._body_R_sonar = sonars[:, :3, :3]
         self._body_p_sonar = sonars[:, :3, 3]
         self._by_body = np.array([law.by_body for law in laws])
@@ -146,14 +158,20 @@ class SightingStack:
         is_robust = [isinstance(noise, gtsam.noiseModel.Robust) for noise in noises]
         self._robust = np.flatnonzero(is_robust)
         self._kernels = [noises[k].robust() for k in self._robust]
-        plain = [noise.noise() if robust else noise for noise, robust in zip(noises, is_robust, strict=True)]
+        plain = [
+            noise.noise() if robust else noise
+            for noise, robust in zip(noises, is_robust, strict=True)
+        ]
         self._whitening = np.array([noise.R() for noise in plain])
 
     def error(self, values: gtsam.Values) -> float:
         """Sum of the kernels' losses."""
         view = self._views(values)
         losses = 0.5 * np.vecdot(view.e, view.e)
-        losses[self._robust] = [kernel.loss(d) for kernel, d in zip(self._kernels, view.lengths, strict=True)]
+        losses[self._robust] = [
+            kernel.loss(d)
+            for kernel, d in zip(self._kernels, view.lengths, strict=True)
+        ]
         return float(losses.sum())
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
@@ -161,7 +179,10 @@ class SightingStack:
         view = self._views(values)
         # a robust kernel multiplies rows and residuals by the root of its weight
         root = np.ones((len(view.e), 1))
-        weights = [kernel.weight(d) for kernel, d in zip(self._kernels, view.lengths, strict=True)]
+        weights = [
+            kernel.weight(d)
+            for kernel, d in zip(self._kernels, view.lengths, strict=True)
+        ]
         root[self._robust, 0] = np.sqrt(weights)
         D_q = root[..., None] * self._whitening @ view.D_q  # (n, 2, 3)
         q_x = -np.cross(view.q[:, None, :], np.eye(3))  # [q]x
@@ -181,12 +202,16 @@ class SightingStack:
         world_R_sonar = R @ self._body_R_sonar
         world_p_sonar = poses[:, 9:] + times(R, self._body_p_sonar)
         # each landmark is read once, however many sightings it has
-        points = np.array([values.atPoint3(key) for key in self._landmark_keys])[self._landmark_of]
+        points = np.array([values.atPoint3(key) for key in self._landmark_keys])[
+            self._landmark_of
+        ]
         q = times(world_R_sonar.transpose(0, 2, 1), points - world_p_sonar)
         # the same model, for all sonars at once
         predicted, D_q = project_points(np.ascontiguousarray(q))
         e = times(self._whitening, polar_difference(predicted, self._z))
-        return SightingViews(world_R_sonar, q, D_q, e, np.linalg.norm(e[self._robust], axis=1).tolist())
+        return SightingViews(
+            world_R_sonar, q, D_q, e, np.linalg.norm(e[self._robust], axis=1).tolist()
+        )
 
 
 CorrelatedSighting.Stack = SightingStack
@@ -237,7 +262,9 @@ def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFacto
     # GTSAM's perturbation of a pose is in its own axes
     cov = np.zeros((6, 6))
     cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
-    cov[3:, 3:] = body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
+    cov[3:, 3:] = (
+        body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
+    )
     return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(cov))
 
 
@@ -253,9 +280,13 @@ def bias_walk(key_i: int, key_j: int, sigmas: Floats) -> gtsam.NonlinearFactor:
     return gtsam.BetweenFactorVector(key_i, key_j, np.zeros(len(sigmas)), noise)
 
 
-def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+def odometry(
+    key_i: int, key_j: int, motion: PreintegratedMotion
+) -> gtsam.NonlinearFactor:
     """Relative pose from preintegrated gyro and DVL where the gyro has no bias to estimate."""
-    return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, gaussian(motion.covariance))
+    return gtsam.BetweenFactorPose3(
+        key_i, key_j, motion.i_T_j, gaussian(motion.covariance)
+    )
 
 
 def landmark_sighting(
@@ -283,7 +314,9 @@ def landmark_sighting(
     range_sigma_m = math.sqrt(cov[0, 0])
     azimuth_sigma_rad = math.sqrt(cov[1, 1])
     # apart, an outlier in one of them leaves the other its weight
-    is_correlated = abs(cov[0, 1]) >= CORRELATION_LIMIT * range_sigma_m * azimuth_sigma_rad
+    is_correlated = (
+        abs(cov[0, 1]) >= CORRELATION_LIMIT * range_sigma_m * azimuth_sigma_rad
+    )
     sigmas = np.array([azimuth_sigma_rad, elevation_sigma_rad or UNINFORMATIVE_RAD])
     if is_correlated:
         sigmas[0] = UNINFORMATIVE_RAD  # the azimuth is in the factor with the range
@@ -291,17 +324,34 @@ def landmark_sighting(
     body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
     noise = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
     camera = gtsam.GenericProjectionFactorCal3Fisheye(
-        IMAGE_CENTRE, noise, pose_key, landmark_key, EQUIDISTANT, False, False, body_T_camera
+        IMAGE_CENTRE,
+        noise,
+        pose_key,
+        landmark_key,
+        EQUIDISTANT,
+        False,
+        False,
+        body_T_camera,
     )
     if not is_correlated:
         noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, range_sigma_m))
-        distance = gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, range_m, noise, body_T_sonar)
+        distance = gtsam.RangeFactorWithTransform3D(
+            pose_key, landmark_key, range_m, noise, body_T_sonar
+        )
         return {"azimuth": camera, "range": distance}
-    both = CorrelatedSighting(pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov)))
-    return {"elevation": camera, "range and azimuth": both} if elevation_sigma_rad else {"range and azimuth": both}
+    both = CorrelatedSighting(
+        pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov))
+    )
+    return (
+        {"elevation": camera, "range and azimuth": both}
+        if elevation_sigma_rad
+        else {"range and azimuth": both}
+    )
 
 
-def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:
+def first_direction(
+    pose_key: int, landmark_key: int, body_p_landmark: Floats
+) -> gtsam.NonlinearFactor:
     """A landmark is roughly where it was first seen: direction to a radian, range to its whole length.
 
     Beside a sonar's noise that is no information. But the azimuth factor has no gradient behind the sonar. Where a
@@ -316,22 +366,34 @@ def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -
     range_m = float(np.linalg.norm(body_p_landmark))
     # both components of the direction, then the range
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))
-    return gtsam.BearingRangeFactor3D(pose_key, landmark_key, gtsam.Unit3(body_p_landmark), range_m, noise)
+    return gtsam.BearingRangeFactor3D(
+        pose_key, landmark_key, gtsam.Unit3(body_p_landmark), range_m, noise
+    )
 
 
 def floor_prior(landmark_key: int, z_m: float, sigma_m: float) -> gtsam.NonlinearFactor:
     """Landmark z is N(z_m, sigma_m²); x and y are left to the other factors."""
     sigmas = np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m])
-    return gtsam.PriorFactorPoint3(landmark_key, np.array([0.0, 0.0, z_m]), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+    return gtsam.PriorFactorPoint3(
+        landmark_key,
+        np.array([0.0, 0.0, z_m]),
+        gtsam.noiseModel.Diagonal.Sigmas(sigmas),
+    )
 
 
-def depth(pose_key: int, z_m: float, body_p_port: Floats, sigma_m: float) -> gtsam.NonlinearFactor:
+def depth(
+    pose_key: int, z_m: float, body_p_port: Floats, sigma_m: float
+) -> gtsam.NonlinearFactor:
     """World z of a point of the body, shape (3,) in the body frame, is N(z_m, sigma_m²)."""
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m]))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(
+        np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m])
+    )
     return gtsam.GPSFactorArm(pose_key, np.array([0.0, 0.0, z_m]), body_p_port, noise)
 
 
-def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gtsam.NonlinearFactor:
+def gravity_direction(
+    pose_key: int, up_in_body: Floats, sigma_rad: float
+) -> gtsam.NonlinearFactor:
     """World's up, measured in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis.
 
     ``R^T e_z - up``, GTSAM's factor for a magnetometer without bias. GTSAM's attitude factor compares the two
@@ -351,33 +413,48 @@ def gravity_with_bias(
     ``by_accel``: A, derivative of the unit vector measured by the bias, shape (3, 3), s²/m.
     """
     measured = up_in_body / np.linalg.norm(up_in_body)
-    A = by_accel - np.outer(measured, measured @ by_accel)  # a unit vector only changes across itself
+    # a unit vector only changes across itself
+    A = by_accel - np.outer(measured, measured @ by_accel)
     by_bias = np.zeros((3, BIASES))
     by_bias[:, ACCEL] = A
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
+    ) -> Floats:
         up, by_turn = up_and_derivative(values.atPose3(pose_key).rotation().matrix())
         if jacobians is not None:
             jacobians[0] = np.hstack((by_turn, np.zeros((3, 3))))
             jacobians[1] = by_bias
         return up + A @ values.atVector(bias_key)[ACCEL] - measured
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad), [pose_key, bias_key], error)
+    return gtsam.CustomFactor(
+        gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad), [pose_key, bias_key], error
+    )
 
 
 def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
     """Noise of headings and position fixes, with Huber's kernel against outliers."""
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_WIDTHS[noise.dim()]), noise)
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(HUBER_WIDTHS[noise.dim()]), noise
+    )
 
 
 def heading(
-    pose_key: int, bias_key: int, yaw_rad: float, sigma_rad: float, robust: Robust = huber
+    pose_key: int,
+    bias_key: int,
+    yaw_rad: float,
+    sigma_rad: float,
+    robust: Robust = huber,
 ) -> gtsam.NoiseModelFactor:
     """Measured yaw is that of the body plus the bias of the compass: ``atan2(R_yx, R_xx) + b_compass - yaw``."""
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
+    ) -> Floats:
         b = values.atVector(bias_key)
-        predicted, by_turn = yaw_and_derivative(values.atPose3(pose_key).rotation().matrix())
+        predicted, by_turn = yaw_and_derivative(
+            values.atPose3(pose_key).rotation().matrix()
+        )
         if jacobians is not None:
             jacobians[0] = np.concatenate((by_turn, np.zeros(3)))[None]
             jacobians[1] = np.zeros((1, len(b)))
@@ -389,10 +466,16 @@ def heading(
 
 
 def position(
-    pose_key: int, position_m: Floats, keyframe_p_antenna: Floats, cov_m2: Floats, robust: Robust = huber
+    pose_key: int,
+    position_m: Floats,
+    keyframe_p_antenna: Floats,
+    cov_m2: Floats,
+    robust: Robust = huber,
 ) -> gtsam.NoiseModelFactor:
     """World position of a point l, shape (3,) in the keyframe's body frame: ``p + R l - z``."""
-    return gtsam.GPSFactorArm(pose_key, position_m, keyframe_p_antenna, robust(gaussian(cov_m2)))
+    return gtsam.GPSFactorArm(
+        pose_key, position_m, keyframe_p_antenna, robust(gaussian(cov_m2))
+    )
 
 
 def position_with_biases(
@@ -423,7 +506,9 @@ def position_with_biases(
     """
     pose_key, bias_key = keys
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
+    ) -> Floats:
         world_T_i = values.atPose3(pose_key)
         change = motion.D_bias @ (values.atVector(bias_key) - motion.bias)  # (6,)
         i_T_j = motion.i_T_j.compose(gtsam.Pose3.Expmap(change))
@@ -433,7 +518,9 @@ def position_with_biases(
             R_j = R_i @ i_T_j.rotation().matrix()
             jacobians[0] = body_point_jacobian(R_i, arm)
             by_motion = body_point_jacobian(R_j, body_p_antenna)  # (3, 6)
-            jacobians[1] = by_motion @ gtsam.Pose3.ExpmapDerivative(change) @ motion.D_bias
+            jacobians[1] = (
+                by_motion @ gtsam.Pose3.ExpmapDerivative(change) @ motion.D_bias
+            )
         return np.asarray(world_T_i.transformFrom(arm)) - position_m
 
     return gtsam.CustomFactor(robust(gaussian(cov_m2)), [pose_key, bias_key], error)

@@ -49,7 +49,9 @@ UNIDENTIFIED = {Outcome.NO_IDENTITY, Outcome.REPEATED}
 class Frontend:
     """Adds the factors of detected landmarks to a smoother and records the outcome of each detection."""
 
-    def __init__(self, identity: IdentityParams, kernel: KernelParams, keyframes: Keyframes) -> None:
+    def __init__(
+        self, identity: IdentityParams, kernel: KernelParams, keyframes: Keyframes
+    ) -> None:
         calibration = keyframes.calibration
         factors = SightingFactors(calibration.sonar, kernel.robust(), calibration.floor)
         self.journal = AmendableJournal()
@@ -64,7 +66,9 @@ class Frontend:
         else:
             self.policy = TrackedIdentities(self.landmarks, identity)
             if isinstance(identity.unknown, AssociatedUnknown):
-                self._nameless = NamelessLandmarks(self.landmarks, keyframes, identity.unknown)
+                self._nameless = NamelessLandmarks(
+                    self.landmarks, keyframes, identity.unknown
+                )
 
     def add(self, detections: LandmarkDetections) -> None:
         """Decide on the detections of one frame, and on earlier ones that it concerns."""
@@ -79,9 +83,13 @@ class Frontend:
             self._apply(policy.associate(part))
             if part is None:
                 continue
-            newest = self._keyframes.tie(self._keyframes.motion_since_newest(part.stamp_ns))
+            newest = self._keyframes.tie(
+                self._keyframes.motion_since_newest(part.stamp_ns)
+            )
             if tie is None:  # once a frame: all its sightings hang on one keyframe
-                tie = self._keyframes.tie(self._keyframes.set_for_frame(part.stamp_ns, newest.motion))
+                tie = self._keyframes.tie(
+                    self._keyframes.set_for_frame(part.stamp_ns, newest.motion)
+                )
             seen = self._predicted(policy, part, newest, tie, frozenset(taken))
             decision = policy.judge(seen)
             self._apply(decision)
@@ -93,7 +101,9 @@ class Frontend:
                 later = policy.reconsider()
             for each in decision.assignments:
                 landmark_id = self.landmarks.state(each.sighting).landmark_id
-                if landmark_id is not None:  # it is None where the smoother withheld the sighting
+                if (
+                    landmark_id is not None
+                ):  # it is None where the smoother withheld the sighting
                     taken.add(landmark_id)
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
@@ -143,12 +153,17 @@ class Frontend:
         ]
         z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
         noise = detections.range_azimuth_cov
-        is_unknown = np.isnan(noise).any(axis=(1, 2))  # then the calibration's noise holds
+        # then the calibration's noise holds
+        is_unknown = np.isnan(noise).any(axis=(1, 2))
         if is_unknown.any():
             sonar = self._keyframes.calibration.sonar
             noise = noise.copy()
-            noise[is_unknown] = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
-        return Frame(detections, stamp_ns, rows, ids, refusals, z, noise).select(np.array(is_open))
+            noise[is_unknown] = np.diag(
+                [sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]
+            )
+        return Frame(detections, stamp_ns, rows, ids, refusals, z, noise).select(
+            np.array(is_open)
+        )
 
     def _refusals(self, detections: LandmarkDetections) -> list[Outcome | None]:
         """Reason why a row cannot be used, or has no identity; None: it has one, or the policy chooses it by place."""
@@ -175,10 +190,18 @@ class Frontend:
         if self._nameless is None:
             return [(self.policy, frame)]
         is_nameless = unnamed(frame.detections)
-        return [(self.policy, frame.select(~is_nameless)), (self._nameless, frame.select(is_nameless))]
+        return [
+            (self.policy, frame.select(~is_nameless)),
+            (self._nameless, frame.select(is_nameless)),
+        ]
 
     def _predicted(
-        self, policy: IdentityPolicy, frame: Frame, newest: Tie, tie: Tie, taken: frozenset[int]
+        self,
+        policy: IdentityPolicy,
+        frame: Frame,
+        newest: Tie,
+        tie: Tie,
+        taken: frozenset[int],
     ) -> SeenFrame:
         """The frame with its prediction from the newest keyframe of the window.
 
@@ -187,7 +210,9 @@ class Frontend:
         smoother = self._keyframes.smoother
         body_T_sonar = self.landmarks.factors.body_T_sonar
         world_T_keyframe = smoother.estimates.atPose3(newest.pose_key)
-        world_T_sonar = world_T_keyframe.compose(newest.motion.i_T_j).compose(body_T_sonar)
+        world_T_sonar = world_T_keyframe.compose(newest.motion.i_T_j).compose(
+            body_T_sonar
+        )
         keys = policy.rivals(frame, world_T_sonar)
         joint = smoother.joint_covariance([*newest.keys, *keys])
         view = PredictedView(newest, world_T_keyframe, body_T_sonar, joint)
@@ -210,5 +235,7 @@ class Frontend:
     def _forget(self, left: Set[int]) -> None:
         """Give up sightings that have waited too long, or whose keyframes have left the window."""
         for policy in (self.policy, self._nameless):
-            if policy is not None and (given_up := policy.forget(self._keyframes.advanced_ns, left)):
+            if policy is not None and (
+                given_up := policy.forget(self._keyframes.advanced_ns, left)
+            ):
                 self.landmarks.apply(given_up, self._keyframes.newest_s)

@@ -44,7 +44,15 @@ from sonar_graph.slam.smoother import (
     SmootherParams,
     WholeHistory,
 )
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
+from sonar_graph.states import (
+    DetectionLog,
+    Estimate,
+    LandmarkMap,
+    Outcome,
+    Refusal,
+    RefusedRow,
+    Trajectory,
+)
 
 Over = Literal["window", "history"]
 MOST_LISTED = 12
@@ -80,7 +88,9 @@ class Isam2Params(Section):
 
     @model_validator(mode="after")
     def _check_history(self) -> Self:
-        if self.history.policy == "bounded" and isinstance(self.identity, MixtureIdentity):
+        if self.history.policy == "bounded" and isinstance(
+            self.identity, MixtureIdentity
+        ):
             reason = (
                 f'history.policy = "bounded" cannot be with identity.policy = "{self.identity.policy}", which chooses'
                 ' anew in the whole history; give history.policy = "whole", or identity.policy = "robust"'
@@ -125,16 +135,24 @@ class Isam2:
 
     Params: ClassVar[type[Section]] = Isam2Params
 
-    def __init__(self, calibration: Calibration, odometry: MotionSource, params: Any = None) -> None:
+    def __init__(
+        self, calibration: Calibration, odometry: MotionSource, params: Any = None
+    ) -> None:
         require_params(params, self.Params, "isam2")
         require_source(odometry, calibration, "Isam2(calibration, odometry, params)")
         require_noise(calibration)
         self._params: Isam2Params = params or Isam2Params()
         self._poses = PoseHistory()
         range_sigma_m = calibration.sonar.range_sigma_m
-        self._smoother = Smoother(self._params.smoother, self._params.history, self._poses, range_sigma_m)
-        self._keyframes = Keyframes(calibration, odometry, self._params.keyframes, self._smoother)
-        self._frontend = Frontend(self._params.identity, self._params.kernel, self._keyframes)
+        self._smoother = Smoother(
+            self._params.smoother, self._params.history, self._poses, range_sigma_m
+        )
+        self._keyframes = Keyframes(
+            calibration, odometry, self._params.keyframes, self._smoother
+        )
+        self._frontend = Frontend(
+            self._params.identity, self._params.kernel, self._keyframes
+        )
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -161,9 +179,14 @@ class Isam2:
         """
         require_measurements(measurements, "isam2")
         # motion first: frames and fixes of the same call are predicted with it
-        self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth, measurements.heading)
+        self._keyframes.add(
+            measurements.imu, measurements.dvl, measurements.depth, measurements.heading
+        )
         events = self._fix_events(measurements.positions)
-        is_late = self._poses.newest_ns is not None and measurements.end_ns < self._poses.newest_ns
+        is_late = (
+            self._poses.newest_ns is not None
+            and measurements.end_ns < self._poses.newest_ns
+        )
         if is_late:
             # a fix may be tied to an earlier keyframe, but the motion to an earlier frame is no longer kept
             for event in events:
@@ -184,7 +207,9 @@ class Isam2:
     def _estimate(self, stamp_ns: int) -> Estimate:
         """Estimate at an instant: the newest keyframe's pose, carried on by odometry."""
         # provisional: no keyframe is set here, so that results do not depend on when an estimate is wanted
-        instant = AnchoredPose(stamp_ns, self._keyframes.tie(self._keyframes.motion_since_newest(stamp_ns)))
+        instant = AnchoredPose(
+            stamp_ns, self._keyframes.tie(self._keyframes.motion_since_newest(stamp_ns))
+        )
         self._poses.add(instant)
         joint = self._smoother.joint_covariance(instant.tie.keys)
         return instant.carried_on(self._smoother.estimates, joint)
@@ -193,7 +218,10 @@ class Isam2:
         """Frames of detections, each with the call that takes it in."""
         if detections is None:
             return []
-        return [Event(int(frame.stamps_ns[0]), partial(self._frontend.add, frame)) for frame in detections.frames()]
+        return [
+            Event(int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
+            for frame in detections.frames()
+        ]
 
     def _fix_events(self, positions: PositionFixes | None) -> list[Event]:
         """Valid position fixes, each with the call that adds it to the graph."""
@@ -210,7 +238,17 @@ class Isam2:
             # the receiver gave none: the calibration's noise holds
             if np.isnan(cov_m2).any():
                 cov_m2 = np.diag(np.square(known.sigma_m))
-            events.append(Event(stamp_ns, partial(self._frontend.add_fix, stamp_ns, positions.position_m[k], cov_m2)))
+            events.append(
+                Event(
+                    stamp_ns,
+                    partial(
+                        self._frontend.add_fix,
+                        stamp_ns,
+                        positions.position_m[k],
+                        cov_m2,
+                    ),
+                )
+            )
         return events
 
     def _refuse_late(self, detections: LandmarkDetections | None) -> None:
@@ -218,7 +256,9 @@ class Isam2:
         if detections is None:
             return
         ids, _ = detections.most_probable()
-        for stamp_ns, landmark_id in zip(detections.stamps_ns.tolist(), ids.tolist(), strict=True):
+        for stamp_ns, landmark_id in zip(
+            detections.stamps_ns.tolist(), ids.tolist(), strict=True
+        ):
             self._frontend.journal.record(stamp_ns, landmark_id, Outcome.LATE)
 
     def _forget(self) -> None:
@@ -254,7 +294,9 @@ class Isam2:
         """
         asked = [[] if one is None else [one] for one in (keyframe, stamp_ns, landmark)]
         if sum(map(len, asked)) != 1:
-            raise EstimatorError("isam2: marginal() is of one variable; give one of keyframe, stamp_ns and landmark")
+            raise EstimatorError(
+                "isam2: marginal() is of one variable; give one of keyframe, stamp_ns and landmark"
+            )
         return self.joint_covariance(*asked, over=over).matrix
 
     def joint_covariance(
@@ -288,17 +330,28 @@ class Isam2:
             When something is not known, or has left the window; it says what there is.
         """
         if over not in get_args(Over):
-            raise EstimatorError(f'isam2: over is {over!r}; expected "window" or "history"')
+            raise EstimatorError(
+                f'isam2: over is {over!r}; expected "window" or "history"'
+            )
         numbers = whole_numbers("keyframes", keyframes)
-        numbers += [self._keyframe_at(stamp_ns) for stamp_ns in whole_numbers("stamps_ns", stamps_ns)]
+        numbers += [
+            self._keyframe_at(stamp_ns)
+            for stamp_ns in whole_numbers("stamps_ns", stamps_ns)
+        ]
         ids = whole_numbers("landmarks", landmarks)
         self._require_keyframes(numbers)
         self._require_landmarks(ids, over)
         keys = {*map(X, numbers), *map(L, ids)}
         if not keys:
-            raise EstimatorError("isam2: the covariance of nothing was asked for; give keyframes, stamps or landmarks")
+            raise EstimatorError(
+                "isam2: the covariance of nothing was asked for; give keyframes, stamps or landmarks"
+            )
         self._require_in_window(numbers)
-        marginals = self._smoother.marginals if over == "window" else self._frontend.smoothed().marginals
+        marginals = (
+            self._smoother.marginals
+            if over == "window"
+            else self._frontend.smoothed().marginals
+        )
         return JointCovariance.of(marginals, sorted(keys))
 
     def _keyframe_at(self, stamp_ns: int) -> int:
@@ -307,7 +360,9 @@ class Isam2:
         place = bisect_left(existing_ns, stamp_ns)
         if existing_ns[place : place + 1] == [stamp_ns]:
             return place
-        beside = " and ".join(str(stamp) for stamp in existing_ns[max(place - 1, 0) : place + 1])
+        beside = " and ".join(
+            str(stamp) for stamp in existing_ns[max(place - 1, 0) : place + 1]
+        )
         nearest = f"the nearest are at {beside} ns" if beside else "there is none yet"
         raise EstimatorError(f"isam2: no keyframe at {stamp_ns} ns; {nearest}")
 
@@ -319,18 +374,30 @@ class Isam2:
                 raise EstimatorError(f"isam2: there is no keyframe {number}; {known}")
 
     def _require_landmarks(self, ids: list[int], over: Over) -> None:
-        known = self._smoother.landmark_ids if over == "window" else self._frontend.smoothed().ids
+        known = (
+            self._smoother.landmark_ids
+            if over == "window"
+            else self._frontend.smoothed().ids
+        )
         unknown = [landmark_id for landmark_id in ids if landmark_id not in set(known)]
         if unknown:
-            listed = ", ".join(map(str, known[:MOST_LISTED])) + (", ..." if len(known) > MOST_LISTED else "")
-            raise EstimatorError(f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}")
+            listed = ", ".join(map(str, known[:MOST_LISTED])) + (
+                ", ..." if len(known) > MOST_LISTED else ""
+            )
+            raise EstimatorError(
+                f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}"
+            )
 
     def _require_in_window(self, numbers: list[int]) -> None:
         """Refuse keyframes that have left a bounded window."""
         newest = self.keyframe_count - 1
-        left = [number for number in numbers if not self._smoother.in_window([X(number)])]
+        left = [
+            number for number in numbers if not self._smoother.in_window([X(number)])
+        ]
         if left:
-            first = next((k for k in range(newest) if self._smoother.in_window([X(k)])), newest)
+            first = next(
+                (k for k in range(newest) if self._smoother.in_window([X(k)])), newest
+            )
             raise EstimatorError(
                 f"isam2: keyframe {left[0]} has left the window, which holds {first} to {newest}; none is known any"
                 ' more; history.policy = "whole" keeps all'
@@ -397,12 +464,16 @@ def whole_numbers(field: str, given: Iterable[int]) -> list[int]:
     """A list of integers, or an `EstimatorError` that names the field."""
     found = np.asarray(list(given) if isinstance(given, Iterable) else given)
     if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
-        raise EstimatorError(f"isam2: {field}: expected a list of integers, such as [1, 2], not {given!r}")
+        raise EstimatorError(
+            f"isam2: {field}: expected a list of integers, such as [1, 2], not {given!r}"
+        )
     numbers: list[int] = found.tolist()
     return numbers
 
 
-def map_of(values: Known, marginals: Marginals | gtsam.ISAM2, ids: list[int]) -> LandmarkMap:
+def map_of(
+    values: Known, marginals: Marginals | gtsam.ISAM2, ids: list[int]
+) -> LandmarkMap:
     """Map of landmarks with these identities, from a solution and what gives its marginal covariances."""
     return LandmarkMap(
         np.array(ids, dtype=np.int64),

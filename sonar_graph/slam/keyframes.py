@@ -110,7 +110,9 @@ class Interval(NamedTuple):
     """No row stamped later is used."""
 
 
-def split_at(blocks: list[Block], interval: Interval) -> tuple[Block | None, list[Block]]:
+def split_at(
+    blocks: list[Block], interval: Interval
+) -> tuple[Block | None, list[Block]]:
     """Samples of an interval as one block, None without any, and the blocks of later samples."""
     parts = [block.between(interval.start_ns, interval.node_ns) for block in blocks]
     rests = [block.between(interval.node_ns, LATEST_NS) for block in blocks]
@@ -147,7 +149,8 @@ def average_at_end(variance: Floats, wander: Floats) -> Average:
     P = np.inf
     for k, (r, q) in enumerate(zip(variance.tolist(), wander.tolist(), strict=True)):
         K = P / (P + r) if k else 1.0
-        weights *= 1.0 - K  # older samples share the odometry's error: they give way together
+        # older samples share the odometry's error: they give way together
+        weights *= 1.0 - K
         weights[k] = K
         P = ((1.0 - K) * P if k else r) + q
     return Average(weights, P)
@@ -169,7 +172,11 @@ class Keyframes:
     """
 
     def __init__(
-        self, calibration: Calibration, odometry: MotionSource, params: KeyframeParams, smoother: Smoother
+        self,
+        calibration: Calibration,
+        odometry: MotionSource,
+        params: KeyframeParams,
+        smoother: Smoother,
     ) -> None:
         self.calibration = calibration
         self.odometry = odometry
@@ -184,8 +191,12 @@ class Keyframes:
         self.contradictions = Contradictions()
         """Headings and fixes that contradict the estimate at the keyframe after theirs."""
         self._bias_sigmas, self._walks = bias_sigmas(calibration)
-        self._has_accel_bias = calibration.use_gravity and calibration.imu.accel_bias_sigma > 0
-        self._has_motion_biases = calibration.imu.gyro_bias_sigma > 0 or calibration.dvl.scale_sigma > 0
+        self._has_accel_bias = (
+            calibration.use_gravity and calibration.imu.accel_bias_sigma > 0
+        )
+        self._has_motion_biases = (
+            calibration.imu.gyro_bias_sigma > 0 or calibration.dvl.scale_sigma > 0
+        )
         self._body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
         lag_s = min(smoother.params.lag_s, LONGEST_LATE_S)
         self._lag_ns = round(lag_s * NS_PER_S)
@@ -228,7 +239,13 @@ class Keyframes:
 
     # ---------------------------------------------------------------- rows
 
-    def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None = None, heading: Heading | None = None) -> None:
+    def add(
+        self,
+        imu: Imu | None,
+        dvl: Dvl | None,
+        depth: Depth | None = None,
+        heading: Heading | None = None,
+    ) -> None:
         """Take in rows.
 
         Refused are depths that the source of motion refuses, invalid headings, and depths and headings that arrive
@@ -253,7 +270,9 @@ class Keyframes:
     def _add_headings(self, heading: Heading, set_ns: int) -> None:
         is_sound = heading.are_sound()
         # depths are judged by the odometry; headings here, in the order of their stamps
-        is_late = (heading.stamps_ns <= set_ns) | (heading.stamps_ns < self._newest_heading_ns)
+        is_late = (heading.stamps_ns <= set_ns) | (
+            heading.stamps_ns < self._newest_heading_ns
+        )
         for row in np.flatnonzero(~is_sound | is_late).tolist():
             reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
             self.refuse("heading", int(heading.stamps_ns[row]), reason)
@@ -270,7 +289,11 @@ class Keyframes:
     @property
     def refused(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, and why; rows before the start do not count as late."""
-        own = [row for row in self._refused if row.reason is not Refusal.LATE or row.stamp_ns >= self._reached_ns]
+        own = [
+            row
+            for row in self._refused
+            if row.reason is not Refusal.LATE or row.stamp_ns >= self._reached_ns
+        ]
         return self.odometry.refused + own
 
     # ---------------------------------------------------------------- keyframes
@@ -291,7 +314,9 @@ class Keyframes:
             changes.append(self._updated())
         interval_ns = round(self.params.max_interval_s * NS_PER_S)
         while until_ns >= self.stamps_ns[-1] + interval_ns:
-            due_ns = self.odometry.epochs(self.stamps_ns[-1] + interval_ns - 1, until_ns)
+            due_ns = self.odometry.epochs(
+                self.stamps_ns[-1] + interval_ns - 1, until_ns
+            )
             if not len(due_ns):
                 break
             self._set(int(due_ns[0]), until_ns)
@@ -315,7 +340,9 @@ class Keyframes:
         self.smoother.add({"bias prior": factors.bias_prior(B(0), self._bias_sigmas)})
         self._constrain(0)
 
-    def set_for_frame(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
+    def set_for_frame(
+        self, stamp_ns: int, motion: PreintegratedMotion
+    ) -> PreintegratedMotion:
         """Set a keyframe if the noise of the motion to a frame requires one.
 
         Returns the motion from the keyframe that is newest then to the frame.
@@ -330,7 +357,8 @@ class Keyframes:
 
     def _is_blurred(self, motion: PreintegratedMotion) -> bool:
         """True when the variance of a motion exceeds ``motion_noise_share`` of the sonar's variance."""
-        variances = motion.covariance.diagonal() + self._by_biases(motion.D_bias)  # (6,)
+        # (6,)
+        variances = motion.covariance.diagonal() + self._by_biases(motion.D_bias)
         sonar = self.calibration.sonar
         turn_share = float(variances[:3].max()) / sonar.azimuth_sigma_rad**2
         way_share = float(variances[3:].max()) / sonar.range_sigma_m**2
@@ -340,7 +368,9 @@ class Keyframes:
         """Variances that the biases cause by a derivative, as uncertain as at the start: shape (m, 11) to (m,)."""
         return np.asarray(np.square(D) @ np.square(self._bias_sigmas))
 
-    def _shared_over_gap(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
+    def _shared_over_gap(
+        self, stamp_ns: int, motion: PreintegratedMotion
+    ) -> PreintegratedMotion:
         """The motion to a frame or fix, with a covariance that measurements over the same gap may share.
 
         Measurements tied to one keyframe over the same gap share the error of its motion. With k (k + 1) times the
@@ -365,7 +395,9 @@ class Keyframes:
         world_T_i = self.smoother.estimates.atPose3(X(i))
         linearisation = Linearisation(self.bias(i), world_T_i.rotation().matrix())
         motion = self._motion(start_ns, node_ns, linearisation, known_ns)
-        self.smoother.add_pose(X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS)
+        self.smoother.add_pose(
+            X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS
+        )
         self._add_odometry(i, motion, linearisation)
         self._add_gravity(j, node_ns, motion)
         self._add_averages(j, Interval(start_ns, node_ns, known_ns), linearisation)
@@ -391,7 +423,8 @@ class Keyframes:
         new = B(gtsam.Symbol(old).index() + 1)
         self._bias_since_ns = node_ns
         self.smoother.add_bias(new, self.smoother.estimates.atVector(old))
-        by_walk = self._walks * np.sqrt(elapsed_s)  # a random walk: the variance grows with time
+        # a random walk: the variance grows with time
+        by_walk = self._walks * np.sqrt(elapsed_s)
         walked = np.where(self._walks > 0, by_walk, factors.STEADY * self._bias_sigmas)
         self.smoother.add({"bias walk": factors.bias_walk(old, new, walked)})
         return new
@@ -409,11 +442,15 @@ class Keyframes:
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
         """Provisional motion from the newest keyframe to an instant not before that of any earlier call."""
         if self._latest is None or self._latest[0] != until_ns:
-            motion = self._motion(self.stamps_ns[-1], until_ns, self._linearised, until_ns)
+            motion = self._motion(
+                self.stamps_ns[-1], until_ns, self._linearised, until_ns
+            )
             self._latest = (until_ns, motion)
         return self._latest[1]
 
-    def _motion(self, start_ns: int, end_ns: int, linearisation: Linearisation, known_ns: int) -> PreintegratedMotion:
+    def _motion(
+        self, start_ns: int, end_ns: int, linearisation: Linearisation, known_ns: int
+    ) -> PreintegratedMotion:
         """Motion of the odometry, with derivatives by all biases."""
         biases, attitude = linearisation
         up = self._up(attitude)
@@ -421,7 +458,14 @@ class Keyframes:
         motion = self.odometry.motion(start_ns, end_ns, gyro_bias, attitude, known_ns)
         # the odometry differentiates by the gyro bias alone, and has taken away no other
         dR = motion.i_T_j.rotation().matrix()
-        D = by_biases(motion.D_bias, dR, motion.i_T_j.translation(), up, attitude[2], self._body_p_dvl)
+        D = by_biases(
+            motion.D_bias,
+            dR,
+            motion.i_T_j.translation(),
+            up,
+            attitude[2],
+            self._body_p_dvl,
+        )
         removed = np.concatenate((gyro_bias, gyro_bias, np.zeros(BIASES - 6)))  # (11,)
         motion = replace(motion, D_bias=D, bias=removed)
         # then to first order by the other biases
@@ -442,10 +486,13 @@ class Keyframes:
 
     # ---------------------------------------------------------------- factors of a new keyframe
 
-    def _add_odometry(self, i: int, motion: PreintegratedMotion, linearisation: Linearisation) -> None:
+    def _add_odometry(
+        self, i: int, motion: PreintegratedMotion, linearisation: Linearisation
+    ) -> None:
         between: gtsam.NonlinearFactor
         if self._has_motion_biases:
-            up_j = self._up(linearisation.attitude) @ motion.i_T_j.rotation().matrix()  # R^T up
+            # R^T up
+            up_j = self._up(linearisation.attitude) @ motion.i_T_j.rotation().matrix()
             between = OdometryWithBias(X(i), X(i + 1), self.bias_keys[i], motion, up_j)
         else:
             between = factors.odometry(X(i), X(i + 1), motion)
@@ -458,7 +505,9 @@ class Keyframes:
         velocity_j, variance_j = self.odometry.velocity_at_imu(node_ns)
         sigma_m_s = float(np.sqrt(0.5 * (variance_i + variance_j)))
         # the bias is a variable of the graph, or has no sigma: it is no noise of the direction
-        direction = gravity_direction(motion, velocity_i, velocity_j, sigma_m_s, self.calibration, has_bias=False)
+        direction = gravity_direction(
+            motion, velocity_i, velocity_j, sigma_m_s, self.calibration, has_bias=False
+        )
         if direction is None:
             return
         up, sigma_rad = direction
@@ -466,12 +515,16 @@ class Keyframes:
             # D by the gyro bias is -T times the mean rotation to frame j
             by_gyro = motion.D_bias[:3, TILT] + motion.D_bias[:3, HEADING]
             by_accel = by_gyro / (-motion.duration_s * self.calibration.gravity_m_s2)
-            gravity = factors.gravity_with_bias(X(j), self.bias_keys[-1], up, by_accel, sigma_rad)
+            gravity = factors.gravity_with_bias(
+                X(j), self.bias_keys[-1], up, by_accel, sigma_rad
+            )
         else:
             gravity = factors.gravity_direction(X(j), up, sigma_rad)
         self.smoother.add({"gravity": gravity})
 
-    def _add_averages(self, j: int, interval: Interval, linearisation: Linearisation) -> None:
+    def _add_averages(
+        self, j: int, interval: Interval, linearisation: Linearisation
+    ) -> None:
         """Add one factor for the depths since the last keyframe, and one for the headings."""
         gyro_bias = gyro_bias_of(linearisation.biases, self._up(linearisation.attitude))
         depths, self._depths = split_at(self._depths, interval)
@@ -485,26 +538,39 @@ class Keyframes:
             if carried is not None:
                 self._add_heading(j, headings, carried, linearisation.biases[COMPASS])
 
-    def _carried(self, stamps_ns: Ints, interval: Interval, gyro_bias: Floats) -> Carried | None:
+    def _carried(
+        self, stamps_ns: Ints, interval: Interval, gyro_bias: Floats
+    ) -> Carried | None:
         """Motions from samples to the keyframe after them, not over a gap; None where no sample remains."""
         epochs_ns = self.odometry.epochs(interval.start_ns, interval.node_ns).tolist()
-        gaps_end_ns = [b for a, b in pairwise([interval.start_ns, *epochs_ns]) if self.odometry.is_gap(a, b)]
-        after_ns = gaps_end_ns[-1] - CARRIED_IN_GAP_NS if gaps_end_ns else interval.start_ns
+        gaps_end_ns = [
+            b
+            for a, b in pairwise([interval.start_ns, *epochs_ns])
+            if self.odometry.is_gap(a, b)
+        ]
+        after_ns = (
+            gaps_end_ns[-1] - CARRIED_IN_GAP_NS if gaps_end_ns else interval.start_ns
+        )
         first = int(stamps_ns.searchsorted(after_ns, side="right"))
         from_ns = stamps_ns[first:]
         until_ns = np.append(from_ns[1:], interval.node_ns)[: len(from_ns)]
         known_ns = np.full(len(from_ns), interval.known_ns)
         motions = self.odometry.motions(from_ns, until_ns, known_ns, gyro_bias)
-        lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))  # a gap shorter than a sample is carried over
+        # a gap shorter than a sample is carried over
+        lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))
         kept = int(lost[-1]) + 1 if len(lost) else 0
         if kept == len(from_ns):
             return None
         k_R_j = [np.eye(3)]
         k_p_j = [np.zeros(3)]
-        for dR, dp in zip(motions.dR[kept:][::-1], motions.dp[kept:][::-1], strict=True):
+        for dR, dp in zip(
+            motions.dR[kept:][::-1], motions.dp[kept:][::-1], strict=True
+        ):
             k_p_j.append(dp + dR @ k_p_j[-1])
             k_R_j.append(dR @ k_R_j[-1])
-        return Carried(first + kept, np.array(k_R_j[::-1]), np.array(k_p_j[::-1]), motions.C[kept:])
+        return Carried(
+            first + kept, np.array(k_R_j[::-1]), np.array(k_p_j[::-1]), motions.C[kept:]
+        )
 
     def _add_depth(self, j: int, depth: Depth, carried: Carried) -> None:
         """One factor for the averaged samples; at sample k the port lies at ``k_T_j^-1 port`` in frame j."""
@@ -514,15 +580,21 @@ class Keyframes:
         wander_m2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, 3:, 3:], ups)
         z_m = depth.z_m[carried.first :]
         given_m2 = depth.variance_m2[carried.first :]
-        variance_m2 = np.where(np.isnan(given_m2), self.calibration.depth.sigma_m**2, given_m2)
+        variance_m2 = np.where(
+            np.isnan(given_m2), self.calibration.depth.sigma_m**2, given_m2
+        )
         average = average_at_end(variance_m2, wander_m2)
         port = np.array(self.calibration.depth.port_m)
         ports = np.einsum("kba,kb->ka", carried.k_R_j[:-1], port - carried.k_p_j[:-1])
         height_m = float(average.weights @ z_m)
         sigma_m = average.variance**0.5
-        self.smoother.add({"depth": factors.depth(X(j), height_m, average.weights @ ports, sigma_m)})
+        self.smoother.add(
+            {"depth": factors.depth(X(j), height_m, average.weights @ ports, sigma_m)}
+        )
 
-    def _add_heading(self, j: int, heading: Heading, carried: Carried, compass_rad: float) -> None:
+    def _add_heading(
+        self, j: int, heading: Heading, carried: Carried, compass_rad: float
+    ) -> None:
         """One factor for the averaged innovations of the samples.
 
         A sample far from the median innovation has less weight, after Huber.
@@ -532,20 +604,30 @@ class Keyframes:
         yaw_rad = np.arctan2(R_k[:, 1, 0], R_k[:, 0, 0])
         ups = carried.k_R_j[1:] @ R_j[2]  # (n, 3)
         wander_rad2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, :3, :3], ups)
-        innovation = wrap_angle(heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad)
+        innovation = wrap_angle(
+            heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad
+        )
         given_rad = heading.sigma_rad[carried.first :]
-        sigma_rad = np.where(np.isnan(given_rad), self.calibration.heading.sigma_rad, given_rad)
-        off = np.abs(wrap_angle(innovation - np.median(innovation))) / (HUBER_WIDTHS[1] * sigma_rad)
+        sigma_rad = np.where(
+            np.isnan(given_rad), self.calibration.heading.sigma_rad, given_rad
+        )
+        off = np.abs(wrap_angle(innovation - np.median(innovation))) / (
+            HUBER_WIDTHS[1] * sigma_rad
+        )
         # beyond k sigma the noise grows with the error: R d / k
         average = average_at_end(sigma_rad**2 * np.maximum(1.0, off), wander_rad2)
         measured_rad = float(yaw_rad[-1] + compass_rad + average.weights @ innovation)
-        factor = factors.heading(X(j), self.bias_keys[-1], measured_rad, average.variance**0.5)
+        factor = factors.heading(
+            X(j), self.bias_keys[-1], measured_rad, average.variance**0.5
+        )
         self.smoother.add({"heading": factor})
         bias_sigma_rad = self.calibration.heading.bias_sigma_rad
 
         def distances(values: Known) -> Floats:
             x, y, _ = values.atPose3(X(j)).matrix()[:3, 0]
-            missed_rad = wrap_angle(innovation + compass_rad + yaw_rad[-1] - np.arctan2(y, x))
+            missed_rad = wrap_angle(
+                innovation + compass_rad + yaw_rad[-1] - np.arctan2(y, x)
+            )
             return np.asarray(np.abs(missed_rad) / np.hypot(sigma_rad, bias_sigma_rad))
 
         self._unjudged.append(("heading", distances))
@@ -573,7 +655,9 @@ class Keyframes:
             motion = self._shared_over_gap(stamp_ns, self.motion_since_newest(stamp_ns))
         else:  # late: from an earlier keyframe, by rows that are known by now
             linearisation = Linearisation(self.bias(i), world_R_i)
-            motion = self._motion(self.stamps_ns[i], stamp_ns, linearisation, self.advanced_ns)
+            motion = self._motion(
+                self.stamps_ns[i], stamp_ns, linearisation, self.advanced_ns
+            )
         antenna = np.array(self.calibration.positions.antenna_m)
         arm = motion.i_T_j.transformFrom(antenna)
         world_R_fix = world_R_i @ motion.i_T_j.rotation().matrix()
@@ -584,7 +668,9 @@ class Keyframes:
         by_biases_m2 = self._by_biases(by_motion @ motion.D_bias)  # (3,)
         if (by_biases_m2 > LEAST_BIAS_SHARE * noise_m2.diagonal()).any():
             keys = (X(i), self.bias_keys[i])
-            factor = factors.position_with_biases(keys, position_m, motion, antenna, noise_m2)
+            factor = factors.position_with_biases(
+                keys, position_m, motion, antenna, noise_m2
+            )
         else:
             factor = factors.position(X(i), position_m, arm, noise_m2)
         gain = np.inf  # enters at once
@@ -592,7 +678,9 @@ class Keyframes:
             by_pose = body_point_jacobian(world_R_i, arm)
             P = self.smoother.joint_covariance([X(i)]).at(X(i), X(i))
             predicted_m2 = by_pose @ P @ by_pose.T  # (3, 3)
-            gain = FIX_GAIN * float((predicted_m2.diagonal() / noise_m2.diagonal()).max())
+            gain = FIX_GAIN * float(
+                (predicted_m2.diagonal() / noise_m2.diagonal()).max()
+            )
         self.smoother.add({"position": factor}, gain=gain)
 
         def distance(values: Known) -> Floats:

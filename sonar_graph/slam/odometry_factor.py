@@ -64,11 +64,14 @@ class OdometryError:
 
     __slots__ = ("D", "_R", "_motion", "_p", "_poses", "bias_0", "h", "i_T_j", "keys")
 
-    def __init__(self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats) -> None:
+    def __init__(
+        self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats
+    ) -> None:
         self.keys = keys
         self.bias_0 = motion.bias
         i_R_j = motion.i_T_j.rotation().matrix()
-        self.i_T_j = np.concatenate((i_R_j.ravel(), motion.i_T_j.translation()))  # (12,)
+        # (12,)
+        self.i_T_j = np.concatenate((i_R_j.ravel(), motion.i_T_j.translation()))
         self.h = np.zeros(motion.D_bias.shape[1])
         self.h[HEADING] = up_j @ motion.D_bias[:3, HEADING]
         self.D = motion.D_bias.copy()
@@ -80,7 +83,12 @@ class OdometryError:
         self._R = self._poses[:, 0, :9].reshape(2, 3, 3)
         self._p = self._poses[:, 0, 9:]
 
-    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+    def __call__(
+        self,
+        _: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[Floats] | None,
+    ) -> Floats:
         """Error, shape (6,), unwhitened."""
         for k in range(2):
             world_T_body = values.atPose3(self.keys[k]).matrix()  # (4, 4)
@@ -107,11 +115,18 @@ class OdometryWithBias(gtsam.CustomFactor):
     Stack: ClassVar[type[OdometryStack]]
 
     def __init__(
-        self, key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion, up_j: Floats = ORIGIN
+        self,
+        key_i: int,
+        key_j: int,
+        bias_key: int,
+        motion: PreintegratedMotion,
+        up_j: Floats = ORIGIN,
     ) -> None:
         self.law = OdometryError((key_i, key_j, bias_key), motion, up_j)
         self.covariance = motion.covariance
-        super().__init__(gaussian(motion.covariance), [key_i, key_j, bias_key], self.law)
+        super().__init__(
+            gaussian(motion.covariance), [key_i, key_j, bias_key], self.law
+        )
 
 
 class BiasedMotions(NamedTuple):
@@ -135,7 +150,9 @@ class OdometryStack:
         self._keys = [law.keys for law in laws]
         self._pose_keys = np.array([keys[:2] for keys in self._keys], np.uint64).T
         self._bias_keys = sorted({keys[2] for keys in self._keys})
-        self._bias_of = np.searchsorted(self._bias_keys, [keys[2] for keys in self._keys])
+        self._bias_of = np.searchsorted(
+            self._bias_keys, [keys[2] for keys in self._keys]
+        )
         self._bias_0 = np.array([law.bias_0 for law in laws])
         covariances = np.array([factor.covariance for factor in factors])
         self._motions = BiasedMotions(
@@ -153,10 +170,13 @@ class OdometryStack:
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised."""
         e, *columns = odometry_derivatives(*self._states(values), *self._motions)
-        blocks = (transposed.transpose(0, 2, 1) for transposed in columns)  # stored by columns, as GTSAM stores them
+        # stored by columns, as GTSAM stores them
+        blocks = (transposed.transpose(0, 2, 1) for transposed in columns)
         return [
             gtsam.JacobianFactor(i, A_i, j, A_j, b, A_b, rhs, UNIT)
-            for (i, j, b), A_i, A_j, A_b, rhs in zip(self._keys, *blocks, -e, strict=True)
+            for (i, j, b), A_i, A_j, A_b, rhs in zip(
+                self._keys, *blocks, -e, strict=True
+            )
         ]
 
     def _states(self, values: gtsam.Values) -> tuple[Floats, Floats, Floats]:
@@ -172,7 +192,13 @@ OdometryWithBias.Stack = OdometryStack
 
 @compiled
 def odometry_errors(
-    X_i: Floats, X_j: Floats, changes: Floats, i_T_j: Floats, D: Floats, h: Floats, whitening: Floats
+    X_i: Floats,
+    X_j: Floats,
+    changes: Floats,
+    i_T_j: Floats,
+    D: Floats,
+    h: Floats,
+    whitening: Floats,
 ) -> Floats:
     """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states` and `BiasedMotions`."""
     errors = np.empty((len(i_T_j), 6))
@@ -184,7 +210,13 @@ def odometry_errors(
 
 @compiled
 def odometry_derivatives(
-    X_i: Floats, X_j: Floats, changes: Floats, i_T_j: Floats, D: Floats, h: Floats, whitening: Floats
+    X_i: Floats,
+    X_j: Floats,
+    changes: Floats,
+    i_T_j: Floats,
+    D: Floats,
+    h: Floats,
+    whitening: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """As `odometry_errors`, with the transposed derivatives by both poses, shape (n, 6, 6), and b, shape (n, 11, 6)."""
     n, biases = changes.shape
@@ -209,7 +241,14 @@ def odometry_derivatives(
             a = V_T @ vec(D[k, :3, m])
             column = by_c @ Vec6(a, V_T @ vec(D[k, 3:, m]) - V_T_B @ a)
             h_m = h[k, m]
-            store_row6(Vec6(-1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b), columns, m, 0)
+            store_row6(
+                Vec6(
+                    -1.0 * column.a - h_m * by_psi.a, -1.0 * column.b - h_m * by_psi.b
+                ),
+                columns,
+                m,
+                0,
+            )
     return errors, by_i, by_j, by_b
 
 
@@ -238,7 +277,9 @@ class Evaluated(NamedTuple):
 
 
 @inlined
-def evaluated(X_i: Floats, X_j: Floats, change: Floats, mean: Floats, D: Floats, h: Floats) -> Evaluated:
+def evaluated(
+    X_i: Floats, X_j: Floats, change: Floats, mean: Floats, D: Floats, h: Floats
+) -> Evaluated:
     """Error (1) of one motion."""
     R_i, p_i = pose(X_i)
     R_j, p_j = pose(X_j)
@@ -276,7 +317,12 @@ def log_derivative(theta: Vec3, t: Vec3) -> Mat6:
     a, slope = curvature(x)
     V_inverse = rodrigues(theta, x, -0.5, a)
     bent = slope * (along * theta - x * t) - 2.0 * a * t
-    B = outer(bent, theta) + a * outer(theta, t) + (a * along) * I3 + 0.5 * (I3 @ skew(t))
+    B = (
+        outer(bent, theta)
+        + a * outer(theta, t)
+        + (a * along) * I3
+        + 0.5 * (I3 @ skew(t))
+    )
     return Mat6(V_inverse.T, O3, B @ V_inverse.T, V_inverse.T)  # (6)
 
 

@@ -48,7 +48,9 @@ class Tie(NamedTuple):
     @property
     def keys(self) -> list[int]:
         """Variables on which the pose at the instant depends."""
-        return [self.pose_key] if self.bias_key is None else [self.pose_key, self.bias_key]
+        return (
+            [self.pose_key] if self.bias_key is None else [self.pose_key, self.bias_key]
+        )
 
     def by_state(self, i_T_j: gtsam.Pose3, covariance: JointCovariance) -> Floats:
         """J of (1), by all variables of a joint covariance, shape (6, N), for the motion as corrected for biases."""
@@ -72,10 +74,16 @@ class AnchoredPose:
         """Pose at this instant from the keyframe and the biases, whose errors the motion inherits; (1)."""
         pose_key, bias_key, motion = self.tie
         # the biases may have moved since the motion was integrated
-        i_T_j = motion.i_T_j if bias_key is None else motion.corrected(values.atVector(bias_key))
+        i_T_j = (
+            motion.i_T_j
+            if bias_key is None
+            else motion.corrected(values.atVector(bias_key))
+        )
         J = self.tie.by_state(i_T_j, joint)
         cov = J @ joint.matrix @ J.T + motion.covariance
-        return Estimate(self.stamp_ns, values.atPose3(pose_key).compose(i_T_j), 0.5 * (cov + cov.T))
+        return Estimate(
+            self.stamp_ns, values.atPose3(pose_key).compose(i_T_j), 0.5 * (cov + cov.T)
+        )
 
 
 class PoseHistory:
@@ -106,10 +114,14 @@ class PoseHistory:
         while count < len(self._open) and self._open[count].tie.pose_key in pose_keys:
             count += 1
         if count:
-            part = Trajectory.from_estimates(_estimates(self._open[:count], values, marginals))
+            part = Trajectory.from_estimates(
+                _estimates(self._open[:count], values, marginals)
+            )
             i, j = TRIANGLE
             self._stamps_ns.extend(part.stamps_ns.tolist())
-            self._poses.extend(np.hstack([part.positions, part.quaternions_xyzw]).ravel().tolist())
+            self._poses.extend(
+                np.hstack([part.positions, part.quaternions_xyzw]).ravel().tolist()
+            )
             self._triangles.extend(part.covariances[:, i, j].ravel().tolist())
         del self._open[:count]
 
@@ -140,7 +152,9 @@ class PoseHistory:
         )
 
 
-def _estimates(instants: list[AnchoredPose], values: Known, marginals: Marginals | gtsam.ISAM2) -> list[Estimate]:
+def _estimates(
+    instants: list[AnchoredPose], values: Known, marginals: Marginals | gtsam.ISAM2
+) -> list[Estimate]:
     estimates = []
     # instants of one keyframe share its covariance, which is most of the work
     for _, on_one in groupby(instants, key=lambda instant: instant.tie.pose_key):
@@ -189,10 +203,16 @@ class PredictedView:
     """
 
     def __init__(
-        self, tie: Tie, world_T_keyframe: gtsam.Pose3, body_T_sonar: gtsam.Pose3, covariance: JointCovariance
+        self,
+        tie: Tie,
+        world_T_keyframe: gtsam.Pose3,
+        body_T_sonar: gtsam.Pose3,
+        covariance: JointCovariance,
     ) -> None:
         motion = tie.motion
-        self.world_T_sonar = world_T_keyframe.compose(motion.i_T_j.compose(body_T_sonar))
+        self.world_T_sonar = world_T_keyframe.compose(
+            motion.i_T_j.compose(body_T_sonar)
+        )
         """Pose of the sonar at the frame."""
         self._world_T_keyframe = world_T_keyframe
         self._covariance = covariance
@@ -217,7 +237,9 @@ class PredictedView:
         P = self._covariance.matrix[row : row + 6, row : row + 6]
         Q = self._motion.covariance
         by_keyframe = _height_derivatives(self._world_T_keyframe, points)  # (m, 6)
-        by_body = _height_derivatives(self._world_T_keyframe.compose(self._motion.i_T_j), points)
+        by_body = _height_derivatives(
+            self._world_T_keyframe.compose(self._motion.i_T_j), points
+        )
         from_keyframe = np.vecdot(by_keyframe @ P, by_keyframe)
         from_motion = np.vecdot(by_body @ Q, by_body)
         return np.asarray(from_keyframe + from_motion)
@@ -231,9 +253,12 @@ class PredictedView:
         """
         predicted, joint = self.expect_jointly(keys, points, [])
         m = len(keys)
-        return predicted, np.einsum("kikj->kij", joint.reshape(m, 2, m, 2))  # blocks on the diagonal
+        # blocks on the diagonal
+        return predicted, np.einsum("kikj->kij", joint.reshape(m, 2, m, 2))
 
-    def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
+    def expect_jointly(
+        self, keys: list[int], points: Floats, sources: list[Source]
+    ) -> tuple[Floats, Floats]:
         """Joint expectation of landmarks of the graph, shape (m, 3), and of points that are not in it.
 
         Returns
@@ -252,27 +277,37 @@ class PredictedView:
             H[k, :, rows[key] : rows[key] + 3] = by_point[k]
         for k, source in enumerate(sources, start=len(keys)):
             # += : the point may have been seen from the keyframe itself
-            H[k, :, rows[source.pose_key] : rows[source.pose_key] + 6] += by_point[k] @ source.by_pose
+            H[k, :, rows[source.pose_key] : rows[source.pose_key] + 6] += (
+                by_point[k] @ source.by_pose
+            )
         H = H.reshape(2 * n, len(P))
         H_M = (by_sonar @ self._by_body).reshape(2 * n, 6)
         joint = H @ P @ H.T + H_M @ Q @ H_M.T  # (2)
         for k, source in enumerate(sources, start=len(keys)):
             # own noise of the point, independent of all variables of the graph
-            joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += by_point[k] @ source.cov @ by_point[k].T
+            joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += (
+                by_point[k] @ source.cov @ by_point[k].T
+            )
         return predicted, np.asarray(0.5 * (joint + joint.T))
 
-    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> Compared:
+    def compare(
+        self, keys: list[int], points: Floats, z: Floats, cov: Floats
+    ) -> Compared:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
         predicted, prior_cov = self.expect(keys, points)
         return weigh(z, predicted, prior_cov, cov)
 
-    def blurred(self, cov: Floats, motion: PreintegratedMotion, points: Floats) -> Floats:
+    def blurred(
+        self, cov: Floats, motion: PreintegratedMotion, points: Floats
+    ) -> Floats:
         """Noise of range and azimuth of points of the world, (m, 2, 2), with that of a motion that ends at the frame.
 
         Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
-        H_M = view_points(self.world_T_sonar, points).by_pose @ self._by_body  # (m, 2, 6)
-        variances = (H_M @ motion.covariance * H_M).sum(axis=2)  # diagonals of H_M Q H_M'
+        # (m, 2, 6)
+        H_M = view_points(self.world_T_sonar, points).by_pose @ self._by_body
+        # diagonals of H_M Q H_M'
+        variances = (H_M @ motion.covariance * H_M).sum(axis=2)
         return cov + IDENTITY * variances[:, None]
 
 
@@ -284,7 +319,9 @@ def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compar
     a, b, _, c = S.reshape(-1, 4).T
     # e' S^-1 e with the closed inverse of a 2 x 2 matrix
     distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
-    gain = np.maximum(prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1])
+    gain = np.maximum(
+        prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1]
+    )
     return Compared(innovation, S, distance, gain)
 
 

@@ -91,7 +91,9 @@ class AcTagRecogniser:
         When AcTag is not installed, or refuses the settings.
     """
 
-    def __init__(self, calibration: Calibration, settings: AcTagSettings | None = None) -> None:
+    def __init__(
+        self, calibration: Calibration, settings: AcTagSettings | None = None
+    ) -> None:
         self.settings = settings or AcTagSettings()
         self._image = calibration.sonar.image
         self._check = FrameCheck(calibration.sonar.image)
@@ -99,14 +101,19 @@ class AcTagRecogniser:
         try:
             self._detector(np.array([1.0, 2.0]), np.array([-0.25, 0.25]))
         except (ValueError, FileNotFoundError) as error:
-            raise CalibrationError(f"AcTag: family {self.settings.family}: {error}") from error
+            raise CalibrationError(
+                f"AcTag: family {self.settings.family}: {error}"
+            ) from error
         self._start_T_sonar = gtsam.Pose3()
         self._seen: dict[int, tuple[Floats, int]] = {}
         self.fates: list[Fate] = []
         """Outcome of every tag and fault in the last frame."""
 
     def process(
-        self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
+        self,
+        frame: SonarFrames,
+        motion: SonarStep | None = None,
+        view: FloorView | None = None,
     ) -> LandmarkDetections | None:
         """Tags in a block of one frame; motion as for `Recogniser`, the floor is not used.
 
@@ -121,16 +128,26 @@ class AcTagRecogniser:
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
-            self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
+            self.fates = [
+                Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")
+            ]
             return None
         bit_m = settings.tag_size_m / BITS_OF_INNER_SQUARE
         image_db = decibels(frame.intensity[0], self._image)
         picture_db, rows_m, columns_rad = evenly_sampled(
-            image_db, frame.ranges_m, frame.azimuths_rad, bit_m / settings.pixels_per_bit
+            image_db,
+            frame.ranges_m,
+            frame.azimuths_rad,
+            bit_m / settings.pixels_per_bit,
         )
-        counts = np.clip(np.rint(picture_db * COUNTS_A_DECIBEL), 0, 255).astype(np.int64)
+        counts = np.clip(np.rint(picture_db * COUNTS_A_DECIBEL), 0, 255).astype(
+            np.int64
+        )
         decoded = self._detector(rows_m, columns_rad).run_detection(counts)
-        tags = [Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist()) for id_, _, range_azimuth in decoded]
+        tags = [
+            Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist())
+            for id_, _, range_azimuth in decoded
+        ]
         self.fates, reported = [], []
         for n, tag in enumerate(tags):
             outcome = REPORTED
@@ -160,7 +177,11 @@ class AcTagRecogniser:
         q = points(np.array([tag.range_m]), np.array([tag.azimuth_rad]))[0]
         place = np.asarray(self._start_T_sonar.transformFrom(q))
         before, frames = self._seen.get(tag.id, (place, 0))
-        frames = frames + 1 if np.linalg.norm(place - before) <= self.settings.same_place_m else 1
+        frames = (
+            frames + 1
+            if np.linalg.norm(place - before) <= self.settings.same_place_m
+            else 1
+        )
         self._seen[tag.id] = place, frames
         return frames
 
@@ -184,7 +205,10 @@ class AcTagRecogniser:
 
 
 def evenly_sampled(
-    image_db: NDArray[np.float32], ranges_m: Floats, azimuths_rad: Floats, pixel_m: float
+    image_db: NDArray[np.float32],
+    ranges_m: Floats,
+    azimuths_rad: Floats,
+    pixel_m: float,
 ) -> tuple[NDArray[np.float32], Floats, Floats]:
     """Resample a polar image on equally spaced ranges and azimuths, with square pixels in the middle of the window.
 
@@ -199,8 +223,12 @@ def evenly_sampled(
     order = np.argsort(azimuths_rad)
     bin_m = (last_m - first_m) / (len(ranges_m) - 1)
     smooth_db = cv2.blur(image_db, (max(1, round(pixel_m / bin_m)), 1))
-    bins = np.repeat(((rows_m - first_m) / bin_m)[:, None], columns, axis=1).astype(np.float32)
-    beams = np.repeat(np.interp(columns_rad, azimuths_rad[order], order)[None], len(rows_m), axis=0).astype(np.float32)
+    bins = np.repeat(((rows_m - first_m) / bin_m)[:, None], columns, axis=1).astype(
+        np.float32
+    )
+    beams = np.repeat(
+        np.interp(columns_rad, azimuths_rad[order], order)[None], len(rows_m), axis=0
+    ).astype(np.float32)
     picture = cv2.remap(smooth_db, bins, beams, cv2.INTER_LINEAR)
     return np.asarray(picture, np.float32), rows_m, columns_rad
 
@@ -210,7 +238,9 @@ def _import_actag(module: str, activity: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise CalibrationError(f"{activity} AcTags needs the package actag: {INSTALL} ({error})") from error
+        raise CalibrationError(
+            f"{activity} AcTags needs the package actag: {INSTALL} ({error})"
+        ) from error
 
 
 BITS_ACROSS, PIXELS_A_BIT = 7, 20
@@ -232,8 +262,14 @@ def tag_design(family: str, tag: int, tag_size_m: float) -> LandmarkDesign:
     """
     parameters = _import_actag("actag.tag_parameters", "drawing")
     levels = np.full((BITS_ACROSS, BITS_ACROSS), PLATE_DB)
-    for bit, place in zip(parameters.AcTagParams(family, tag_size_m).tags_in_family[tag], RING, strict=True):
+    for bit, place in zip(
+        parameters.AcTagParams(family, tag_size_m).tags_in_family[tag],
+        RING,
+        strict=True,
+    ):
         levels[place] = FOAM_DB if bit else PLATE_DB
     levels[2:5, 2:5] = FOAM_DB
     mask = np.kron(levels, np.ones((PIXELS_A_BIT, PIXELS_A_BIT)))
-    return LandmarkDesign(tag, f"{family} {tag}", tag_size_m * BITS_ACROSS / BITS_OF_INNER_SQUARE, mask)
+    return LandmarkDesign(
+        tag, f"{family} {tag}", tag_size_m * BITS_ACROSS / BITS_OF_INNER_SQUARE, mask
+    )

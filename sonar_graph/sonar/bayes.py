@@ -34,7 +34,12 @@ Bools = NDArray[np.bool_]
 Rule = Literal["virtual-evidence", "jeffrey"]
 
 
-def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: Floats | float = 1e-3) -> Floats:
+def predict(
+    beliefs: Floats,
+    association: Floats,
+    birth: Floats,
+    forgetting: Floats | float = 1e-3,
+) -> Floats:
     """Predict beliefs by equation (1), with the belief about a new track, shape (K,), and e for all or each track."""
     carried = association[:, :-1] @ beliefs + association[:, -1:] * birth
     total = carried.sum(axis=1, keepdims=True)
@@ -49,13 +54,17 @@ def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
     """
     evidence = predicted @ confusion
     possible = evidence > 0
-    ratio = np.divide(scores, evidence, out=np.zeros_like(scores, dtype=float), where=possible)
+    ratio = np.divide(
+        scores, evidence, out=np.zeros_like(scores, dtype=float), where=possible
+    )
     kept = np.where(possible, 0.0, scores).sum(axis=1, keepdims=True)
     posterior = predicted * (ratio @ confusion.T + kept)
     return np.where(scores.any(axis=1, keepdims=True), posterior, predicted)
 
 
-def bounded_evidence(birth: Floats, log_odds: Floats, counted: Floats, looks: float, doubt: float) -> Floats:
+def bounded_evidence(
+    birth: Floats, log_odds: Floats, counted: Floats, looks: float, doubt: float
+) -> Floats:
     """Beliefs from weighted sums of log odds, shape (M, K), and of the weights, shape (M,).
 
     The mean of the log odds counts, times a share that comes near to 1 with the number of looks: the mismatch between
@@ -64,7 +73,9 @@ def bounded_evidence(birth: Floats, log_odds: Floats, counted: Floats, looks: fl
     """
     log_belief = np.log(birth) + log_odds / (counted + looks)[:, None]
     odds = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
-    return np.asarray((1 - doubt) * odds / odds.sum(axis=1, keepdims=True) + doubt * birth)
+    return np.asarray(
+        (1 - doubt) * odds / odds.sum(axis=1, keepdims=True) + doubt * birth
+    )
 
 
 def news_of_motion(moved_m: Floats, aperture_m: float) -> Floats:
@@ -105,7 +116,9 @@ class IdentityParams(Section):
 
     def birth(self, landmarks: int) -> Floats:
         """Belief about a new track, shape (landmarks + 1,)."""
-        return np.append(np.full(landmarks, (1 - self.unknown_prior) / landmarks), self.unknown_prior)
+        return np.append(
+            np.full(landmarks, (1 - self.unknown_prior) / landmarks), self.unknown_prior
+        )
 
 
 class Beliefs:
@@ -115,7 +128,9 @@ class Beliefs:
     floor and comes back when the sonar comes back.
     """
 
-    def __init__(self, confusion: Confusion, params: IdentityParams | None = None) -> None:
+    def __init__(
+        self, confusion: Confusion, params: IdentityParams | None = None
+    ) -> None:
         self.params = params or IdentityParams()
         self._model = confusion
         known = len(confusion.ids)
@@ -129,7 +144,12 @@ class Beliefs:
         self._places = np.empty((0, 3))
 
     def step(
-        self, association: Association, log_odds: Floats, is_looked: Bools, place: Floats, sideways: Floats
+        self,
+        association: Association,
+        log_odds: Floats,
+        is_looked: Bools,
+        place: Floats,
+        sideways: Floats,
     ) -> Floats:
         """Predict and update for one frame; the beliefs after it, shape (M, K).
 
@@ -145,15 +165,28 @@ class Beliefs:
         self.weights = np.where(is_looked & (news >= self.params.least_news), news, 0.0)
         known = np.where(self.weights[:, None] > 0, log_odds, 0.0)
         if self.params.rule == "jeffrey":
-            predicted = predict(self._beliefs[rows], association.matrix, self._birth, self.params.forgetting)
-            scores = np.where(self.weights[:, None] > 0, soft_scores(known, self._model.looks), 0.0)
+            predicted = predict(
+                self._beliefs[rows],
+                association.matrix,
+                self._birth,
+                self.params.forgetting,
+            )
+            scores = np.where(
+                self.weights[:, None] > 0, soft_scores(known, self._model.looks), 0.0
+            )
             self._beliefs = jeffrey(predicted, scores, self._model.array())
             return self._beliefs
         self._remember(association.ids[self.weights > 0], place)
         carried = association.matrix[:, :-1]
         self._log_odds = carried @ self._log_odds[rows] + self.weights[:, None] * known
         self._counted = carried @ self._counted[rows] + self.weights
-        return bounded_evidence(self._birth, self._log_odds, self._counted, self._model.looks, self._model.doubt)
+        return bounded_evidence(
+            self._birth,
+            self._log_odds,
+            self._counted,
+            self._model.looks,
+            self._model.doubt,
+        )
 
     def _news(self, ids: Ints, place: Floats, sideways: Floats) -> Floats:
         """Independent share of a look from here at each track, shape (M,); places of other tracks are forgotten."""
@@ -174,4 +207,7 @@ class Beliefs:
             return
         _, first, count = np.unique(self._looked, return_index=True, return_counts=True)
         if (too_many := first[count > self.params.most_looks]).size:
-            self._looked, self._places = np.delete(self._looked, too_many), np.delete(self._places, too_many, axis=0)
+            self._looked, self._places = (
+                np.delete(self._looked, too_many),
+                np.delete(self._places, too_many, axis=0),
+            )

@@ -23,7 +23,14 @@ from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.regions import Candidates, CandidateVerdict, Floats32, Regions, background_of, measure_regions
+from sonar_graph.sonar.regions import (
+    Candidates,
+    CandidateVerdict,
+    Floats32,
+    Regions,
+    background_of,
+    measure_regions,
+)
 
 DB_PER_NEPER = 10.0 / np.log(10.0)
 
@@ -69,34 +76,57 @@ def select_candidates(
     """
     params, shape = params or DetectionParams(), (len(azimuths_rad), len(ranges_m))
     if image_db.shape != shape or min(shape) < 2:
-        raise MeasurementError(f"sonar frame: shape {image_db.shape}; beams and bins are {shape}, 2 or more")
+        raise MeasurementError(
+            f"sonar frame: shape {image_db.shape}; beams and bins are {shape}, 2 or more"
+        )
     if not np.isfinite(cv2.sumElems(image_db)[0]):
-        raise MeasurementError("sonar frame: levels that are not finite; leave the frame out")
+        raise MeasurementError(
+            "sonar frame: levels that are not finite; leave the frame out"
+        )
     # width of a beam at mid-range, and length of a bin
     across = abs(float(azimuths_rad[-1] - azimuths_rad[0])) / (len(azimuths_rad) - 1)
     along = abs(float(ranges_m[-1] - ranges_m[0])) / (len(ranges_m) - 1)
     cell_m = across * float(ranges_m[0] + ranges_m[-1]) / 2, along
     smoothing, neighbourhood, closing = (
-        odd_counts(length_m, cell_m) for length_m in (params.smoothing_m, params.background_m, params.closing_m)
+        odd_counts(length_m, cell_m)
+        for length_m in (params.smoothing_m, params.background_m, params.closing_m)
     )
-    smoothing, wide = np.maximum(smoothing, LEAST_COUNT).tolist(), np.maximum(closing, LEAST_COUNT).tolist()
+    smoothing, wide = (
+        np.maximum(smoothing, LEAST_COUNT).tolist(),
+        np.maximum(closing, LEAST_COUNT).tolist(),
+    )
     closing = wide if params.closing_m > 0 else closing
-    smooth = np.asarray(cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+    smooth = np.asarray(
+        cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101),
+        dtype=np.float32,
+    )
     level_db, spread_db = background_of(smooth, smoothing, neighbourhood)
     contrast = smooth - _at_pixels(level_db, shape)
     offsets = false_alarm_offsets_db(spread_db, params.false_alarm)
     mask = cv2.compare(contrast, _at_pixels(offsets, shape), cv2.CMP_GT)
-    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, closing[::-1]))
+    closed = cv2.morphologyEx(
+        mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, closing[::-1])
+    )
     # opencv's default algorithm takes three times as long for the same labels
-    count, found, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(closed, 8, cv2.CV_32S, cv2.CCL_GRANA)
-    labels, boxes = np.asarray(found, dtype=np.int32), stats[1:count].astype(np.int64)[:, [1, 0, 3, 2]]
-    regions = measure_regions(contrast, labels, len(boxes), ranges_m, azimuths_rad, view)
+    count, found, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        closed, 8, cv2.CV_32S, cv2.CCL_GRANA
+    )
+    labels, boxes = (
+        np.asarray(found, dtype=np.int32),
+        stats[1:count].astype(np.int64)[:, [1, 0, 3, 2]],
+    )
+    regions = measure_regions(
+        contrast, labels, len(boxes), ranges_m, azimuths_rad, view
+    )
     if view is None:
-        aperture_rad = params.elevation_aperture_rad  # in which the elevation is uniform
+        # in which the elevation is uniform
+        aperture_rad = params.elevation_aperture_rad
         elevation_sigmas = np.full(len(boxes), aperture_rad / math.sqrt(12.0))
     else:
         elevation_sigmas = view.elevation_sigmas(regions.points_m)
-    window = np.array([[ranges_m.min(), ranges_m.max()], [azimuths_rad.min(), azimuths_rad.max()]])
+    window = np.array(
+        [[ranges_m.min(), ranges_m.max()], [azimuths_rad.min(), azimuths_rad.max()]]
+    )
     return Candidates(
         **vars(regions),
         verdicts=judged(regions, boxes, shape, params),
@@ -107,10 +137,14 @@ def select_candidates(
     )
 
 
-def judged(regions: Regions, boxes: Ints, shape: tuple[int, int], params: DetectionParams) -> Ints:
+def judged(
+    regions: Regions, boxes: Ints, shape: tuple[int, int], params: DetectionParams
+) -> Ints:
     """`CandidateVerdict` of each region in an image of this shape; each overrides those before it."""
     area_m2 = regions.area_m2
-    at_edge = (boxes[:, :2] == 0).any(axis=1) | (boxes[:, :2] + boxes[:, 2:] == shape).any(axis=1)
+    at_edge = (boxes[:, :2] == 0).any(axis=1) | (
+        boxes[:, :2] + boxes[:, 2:] == shape
+    ).any(axis=1)
     verdicts = np.full(len(boxes), int(CandidateVerdict.ACCEPTED))
     verdicts[regions.extent_m > params.max_extent_m] = CandidateVerdict.TOO_LONG
     verdicts[area_m2 > params.max_area_m2] = CandidateVerdict.TOO_LARGE
@@ -118,7 +152,9 @@ def judged(regions: Regions, boxes: Ints, shape: tuple[int, int], params: Detect
     verdicts[at_edge & (not params.keep_at_edge)] = CandidateVerdict.AT_EDGE
     verdicts[~(area_m2 > 0)] = CandidateVerdict.OFF_FLOOR
     accepted = np.flatnonzero(verdicts == CandidateVerdict.ACCEPTED)
-    strongest_first = accepted[np.argsort(-(regions.level_db * area_m2)[accepted], kind="stable")]
+    strongest_first = accepted[
+        np.argsort(-(regions.level_db * area_m2)[accepted], kind="stable")
+    ]
     verdicts[strongest_first[params.max_candidates :]] = CandidateVerdict.BEYOND_LIMIT
     return verdicts
 
@@ -131,7 +167,9 @@ def odd_counts(length_m: float, cell_m: tuple[float, float]) -> tuple[int, int]:
 
 def _at_pixels(nodes: Floats32, shape: tuple[int, int]) -> Floats32:
     """Nodes of the background interpolated to every pixel."""
-    return np.asarray(cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    return np.asarray(
+        cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32
+    )
 
 
 def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
@@ -146,9 +184,15 @@ def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
     for _ in range(30):
         looks = np.exp(log_looks)
         value = float(polygamma(1, looks))
-        log_looks += (np.log(wanted) - np.log(value)) * value / (looks * float(polygamma(2, looks)))
+        log_looks += (
+            (np.log(wanted) - np.log(value))
+            * value
+            / (looks * float(polygamma(2, looks)))
+        )
     looks = float(np.exp(log_looks))
-    return float(DB_PER_NEPER * (np.log(gammainccinv(looks, false_alarm)) - digamma(looks)))
+    return float(
+        DB_PER_NEPER * (np.log(gammainccinv(looks, false_alarm)) - digamma(looks))
+    )
 
 
 SPREADS_DB = np.linspace(0.05, 12.0, 240)
@@ -158,18 +202,26 @@ SPREADS_DB = np.linspace(0.05, 12.0, 240)
 @lru_cache(maxsize=16)
 def offset_table(false_alarm: float) -> Floats32:
     """Offsets of `SPREADS_DB`, for interpolation."""
-    return np.array([false_alarm_offset_db(spread, false_alarm) for spread in SPREADS_DB.tolist()], np.float32)
+    return np.array(
+        [false_alarm_offset_db(spread, false_alarm) for spread in SPREADS_DB.tolist()],
+        np.float32,
+    )
 
 
 def false_alarm_offsets_db(spreads_db: Floats32, false_alarm: float) -> Floats32:
     """`false_alarm_offset_db` of each, by interpolation to 0.01 dB."""
     return interpolated(
-        spreads_db, float(SPREADS_DB[0]), float(SPREADS_DB[1] - SPREADS_DB[0]), offset_table(false_alarm)
+        spreads_db,
+        float(SPREADS_DB[0]),
+        float(SPREADS_DB[1] - SPREADS_DB[0]),
+        offset_table(false_alarm),
     )
 
 
 @compiled
-def interpolated(values: Floats32, first: float, step: float, table: Floats32) -> Floats32:
+def interpolated(
+    values: Floats32, first: float, step: float, table: Floats32
+) -> Floats32:
     """A table of what belongs to equally spaced values, looked up for each; its ends beyond it."""
     found = np.empty_like(values)
     for n in range(values.size):
@@ -186,7 +238,9 @@ CELL_M = 0.005
 """Grid on which designs are checked."""
 
 
-def check_candidates(designs: Iterable[LandmarkDesign], params: DetectionParams, search_m: float) -> None:
+def check_candidates(
+    designs: Iterable[LandmarkDesign], params: DetectionParams, search_m: float
+) -> None:
     """Refuse designs that can never be a candidate.
 
     Only candidates are compared with designs, and a candidate is one connected bright region, whose centroid is where
@@ -214,18 +268,31 @@ def check_candidates(designs: Iterable[LandmarkDesign], params: DetectionParams,
         )
 
 
-def bright_parts(design: LandmarkDesign, params: DetectionParams) -> tuple[Floats, Floats, Floats]:
+def bright_parts(
+    design: LandmarkDesign, params: DetectionParams
+) -> tuple[Floats, Floats, Floats]:
     """Area, length and distance from the design's figure of each connected part over the floor, largest first."""
-    half = int(np.ceil((design.size_m / 2 + params.smoothing_m + params.closing_m) / CELL_M))
+    half = int(
+        np.ceil((design.size_m / 2 + params.smoothing_m + params.closing_m) / CELL_M)
+    )
     x_m, y_m = np.meshgrid(*2 * [CELL_M * np.arange(-half, half + 1)], indexing="ij")
     level_db = np.nan_to_num(design.level_db(x_m, y_m)).astype(np.float32)
     smooth_db = cv2.blur(level_db, odd_counts(params.smoothing_m, (CELL_M, CELL_M)))
     is_bright = (smooth_db >= LEAST_BRIGHT_DB).astype(np.uint8)
     closing = np.ones(odd_counts(params.closing_m, (CELL_M, CELL_M)), np.uint8)
-    count, labels = cv2.connectedComponents(cv2.morphologyEx(is_bright, cv2.MORPH_CLOSE, closing), connectivity=8)
+    count, labels = cv2.connectedComponents(
+        cv2.morphologyEx(is_bright, cv2.MORPH_CLOSE, closing), connectivity=8
+    )
     places = [np.stack([x_m, y_m])[:, labels == part] for part in range(1, count)]
     places.sort(key=lambda place: -place.shape[1])
     areas = np.array([place.shape[1] * CELL_M**2 for place in places])
-    extents = np.array([np.sqrt(12 * np.linalg.eigvalsh(np.cov(place, bias=True)).max()) for place in places])
-    offsets = np.array([np.linalg.norm(place.mean(axis=1) - design.figure_m) for place in places])
+    extents = np.array(
+        [
+            np.sqrt(12 * np.linalg.eigvalsh(np.cov(place, bias=True)).max())
+            for place in places
+        ]
+    )
+    offsets = np.array(
+        [np.linalg.norm(place.mean(axis=1) - design.figure_m) for place in places]
+    )
     return areas, extents, offsets

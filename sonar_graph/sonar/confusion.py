@@ -101,25 +101,41 @@ class Confusion(Section):
 
     @model_validator(mode="after")
     def _is_stochastic(self) -> Confusion:
-        matrix = np.array(self.matrix, float, ndmin=2) if len({len(r) for r in self.matrix}) == 1 else np.empty((0, 0))
+        matrix = (
+            np.array(self.matrix, float, ndmin=2)
+            if len({len(r) for r in self.matrix}) == 1
+            else np.empty((0, 0))
+        )
         classes = len(self.ids) + 1
         if len(set(self.ids)) < len(self.ids):
-            raise ValueError(f"ids: expected each once, not {', '.join(map(str, self.ids))}")
+            raise ValueError(
+                f"ids: expected each once, not {', '.join(map(str, self.ids))}"
+            )
         if self.designs and len(self.designs) != len(self.ids):
-            raise ValueError(f"designs: expected one for each of {len(self.ids)} ids, not {len(self.designs)}")
+            raise ValueError(
+                f"designs: expected one for each of {len(self.ids)} ids, not {len(self.designs)}"
+            )
         if matrix.shape != (classes, classes):
-            raise ValueError(f"matrix: expected {classes} rows of {classes} for {len(self.ids)} ids and none of them")
+            raise ValueError(
+                f"matrix: expected {classes} rows of {classes} for {len(self.ids)} ids and none of them"
+            )
         if len(self.weights) != len(EVIDENCE):
-            raise ValueError(f"weights: expected {len(EVIDENCE)}, for {', '.join(EVIDENCE)}")
+            raise ValueError(
+                f"weights: expected {len(EVIDENCE)}, for {', '.join(EVIDENCE)}"
+            )
         if (matrix < 0).any() or not np.allclose(matrix.sum(axis=1), 1, atol=1e-6):
-            raise ValueError("matrix: each row must be probabilities that sum to 1 (rows are the true classes)")
+            raise ValueError(
+                "matrix: each row must be probabilities that sum to 1 (rows are the true classes)"
+            )
         if (matrix == 0).any():
             raise ValueError(
                 "matrix: an entry is 0; what was never seen in n tracks may still happen: give about 1 / 2n"
             )
         return self
 
-    def check_designs(self, designs: Sequence[LandmarkDesign], source: str = "confusion") -> None:
+    def check_designs(
+        self, designs: Sequence[LandmarkDesign], source: str = "confusion"
+    ) -> None:
         """Refuse designs other than the measured ones.
 
         Raises
@@ -134,7 +150,9 @@ class Confusion(Section):
                 f"{source}: measured for landmarks {_listed(self.ids)}, the designs are {_listed(ids)}; {remedy}"
             )
         if not self.designs:
-            raise CalibrationError(f"{source}: designs: is missing, so that it may be of other landmarks; {remedy}")
+            raise CalibrationError(
+                f"{source}: designs: is missing, so that it may be of other landmarks; {remedy}"
+            )
         for mark, design in zip(self.designs, designs, strict=True):
             if mark != mark_of(design):
                 raise CalibrationError(
@@ -158,7 +176,10 @@ class Confusion(Section):
         millimetres of the landmark wherever it lies, so that the law is in metres across, not in angles.
         """
         usual = np.array([self.range_bound_m, self.across_bound_m])
-        sigmas = np.array([self.range_sigma_m, self.across_sigma_m]) * (bound_m / usual) ** self.bound_power
+        sigmas = (
+            np.array([self.range_sigma_m, self.across_sigma_m])
+            * (bound_m / usual) ** self.bound_power
+        )
         sigmas[:, 1] /= range_m
         covariances = np.zeros((len(bound_m), 2, 2))
         covariances[:, [0, 1], [0, 1]] = sigmas**2
@@ -176,7 +197,9 @@ def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
     confusion that never happened in n trials keeps about 1 / 2n.
     """
     n = trials[:, None]
-    return np.asarray((n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1]))
+    return np.asarray(
+        (n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1])
+    )
 
 
 def mark_of(design: LandmarkDesign) -> DesignMark:
@@ -200,7 +223,11 @@ def read_confusion(path: Path) -> Confusion:
     """
     try:
         values = json.loads(text_of(path))
-        if isinstance(values, dict) and values.keys() & {"sharpness", "error_correlation", "azimuth_sigma_rad"}:
+        if isinstance(values, dict) and values.keys() & {
+            "sharpness",
+            "error_correlation",
+            "azimuth_sigma_rad",
+        }:
             raise CalibrationError(
                 f"{path}: across_bound_m: missing; it is a model of an earlier version without the bounds of the fit's "
                 "accuracy across; measure it again with sonar-graph calibrate"

@@ -29,25 +29,57 @@ from numpy.typing import NDArray
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.sonar.templates import Blur, Floats32, Patch, Templates, drawn, material_radius_m
+from sonar_graph.sonar.templates import (
+    Blur,
+    Floats32,
+    Patch,
+    Templates,
+    drawn,
+    material_radius_m,
+)
 
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
-EVIDENCE = ("prior", "outline", "figure", "contrast", "beyond", "floor", "behind", "plate", "bare", "rival", "covered")
+EVIDENCE = (
+    "prior",
+    "outline",
+    "figure",
+    "contrast",
+    "beyond",
+    "floor",
+    "behind",
+    "plate",
+    "bare",
+    "rival",
+    "covered",
+)
 """prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
 ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
 farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design), or of ln
 R(without B) / R(design) where that is less, since a plate alone is none; bare: 1 for a design without dark parts, which
 no plate can speak for; rival: ln of the least R(covered) of all designs over that of this one, as shares of what one
 level leaves; covered: ln R(design without S) / R(covered)."""
-POWER_OF_CELLS = np.array([1.0 if name in ("outline", "figure", "rival", "covered") else 0.0 for name in EVIDENCE])
+POWER_OF_CELLS = np.array(
+    [
+        1.0 if name in ("outline", "figure", "rival", "covered") else 0.0
+        for name in EVIDENCE
+    ]
+)
 POWER_OF_CELLS[EVIDENCE.index("plate")] = 0.5
 """Power of the share of independent cells by which columns count: logarithms of ratios of two R, and a root of one."""
 COVERED = EVIDENCE.index("covered")
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))
 """Width at half of the power over the standard deviation."""
 STRETCHES = (
-    *((1.0, 1.0), (0.78, 0.78), (0.87, 0.87), (0.94, 0.94), (1.07, 1.07), (1.15, 1.15), (1.27, 1.27)),
+    *(
+        (1.0, 1.0),
+        (0.78, 0.78),
+        (0.87, 0.87),
+        (0.94, 0.94),
+        (1.07, 1.07),
+        (1.15, 1.15),
+        (1.27, 1.27),
+    ),
     *((1.2, 0.83), (0.83, 1.2)),
 )
 """Of the figures of what is no landmark, along the design's axes x and y; the first is the design's own."""
@@ -107,58 +139,117 @@ class Figures(NamedTuple):
     """By how much each column of `EVIDENCE` counts, shape (11,)."""
 
     @classmethod
-    def of(cls, designs: Sequence[LandmarkDesign], templates: Templates, blur_m: Blur, last: int) -> Figures:
+    def of(
+        cls,
+        designs: Sequence[LandmarkDesign],
+        templates: Templates,
+        blur_m: Blur,
+        last: int,
+    ) -> Figures:
         """Models of designs at the headings of their templates, for places 0 to ``last`` along each axis."""
         cell_m, material_m = templates.cell_m, max(map(material_radius_m, designs))
         half = math.ceil((material_m + SHADOW_M) / cell_m)
         side = 2 * half + 1
-        x_m, y_m = np.meshgrid(*2 * [cell_m * np.arange(-half, half + 1)], indexing="ij")
+        x_m, y_m = np.meshgrid(
+            *2 * [cell_m * np.arange(-half, half + 1)], indexing="ij"
+        )
         away_m = np.hypot(x_m, y_m)
-        area = (away_m <= material_m + REACH_M) | ((away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m))
+        area = (away_m <= material_m + REACH_M) | (
+            (away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m)
+        )
         kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
-        beyond_m = np.stack([along_edge(x_m, y_m, edge) for edge in range(EDGES)], axis=-1)
+        beyond_m = np.stack(
+            [along_edge(x_m, y_m, edge) for edge in range(EDGES)], axis=-1
+        )
         columns = []
-        for index, heading in zip(templates.design.tolist(), templates.heading_rad.tolist(), strict=True):
+        for index, heading in zip(
+            templates.design.tolist(), templates.heading_rad.tolist(), strict=True
+        ):
             design = designs[index]
-            parts = [drawn(design, heading, side, cell_m, blur_m, stretch) for stretch in STRETCHES]
+            parts = [
+                drawn(design, heading, side, cell_m, blur_m, stretch)
+                for stretch in STRETCHES
+            ]
             figures = [bright / float(np.nanmax(design.mask)) for bright, _ in parts]
-            figure, dark = figures[0], parts[0][1] / min(float(np.nanmin(design.mask)), -1.0)
+            figure, dark = (
+                figures[0],
+                parts[0][1] / min(float(np.nanmin(design.mask)), -1.0),
+            )
             has_dark = bool((dark > PART).any())
             own_shadow = behind(figure + dark, OWN_SHADOW_CELLS) > PART
             compared = area & ~(own_shadow & ((away_m > material_m) | (not has_dark)))
             is_out = (figure < OUT) & compared
             is_near = cv2.dilate((figure > PART).astype(np.uint8), kernel) > 0
-            zones = NEAR * (is_out & is_near) + BEHIND * (is_out & (behind(figure, BEHIND_CELLS) > PART))
+            zones = NEAR * (is_out & is_near) + BEHIND * (
+                is_out & (behind(figure, BEHIND_CELLS) > PART)
+            )
             zones += FAR * (is_out & ~is_near & (dark < OUT))
             shades = [behind(one, SHADOW_CELLS) for one in figures]
-            exact = np.stack([np.ones_like(figure), dark, *figures, *shades])[:, compared].T
+            exact = np.stack([np.ones_like(figure), dark, *figures, *shades])[
+                :, compared
+            ].T
             values = np.clip(np.rint(exact / STEP), 0, 255).astype(np.uint8)
-            smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[:, compared].T.astype(np.float32)
+            smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[
+                :, compared
+            ].T.astype(np.float32)
             kept, in_steps = np.empty((EDGES * len(OFFSETS), 3)), values.astype(float)
             gram = float(STEP) ** 2 * (in_steps.T @ in_steps)
             x, y = np.nonzero(compared)
-            radius_m = math.sqrt(2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0))))
+            radius_m = math.sqrt(
+                2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0)))
+            )
             uncovered = beyond_m[compared][:, :, None] <= radius_m * np.array(OFFSETS)
             at = (x * (side + last) + y).astype(np.int32)
-            own = at, values, smooth, zones[compared].astype(np.uint8), uncovered.reshape(len(at), -1).astype(np.uint8)
+            own = (
+                at,
+                values,
+                smooth,
+                zones[compared].astype(np.uint8),
+                uncovered.reshape(len(at), -1).astype(np.uint8),
+            )
             kept_sums(values, np.ones(len(values), np.float32), own[-1], kept)
             columns.append((*own, gram, has_dark, kept, radius_m))
         *rows, grams, darks, sums, radii_m = zip(*columns, strict=True)
         first = np.cumsum([0, *map(len, rows[0])])
-        cells, values, smooth, zones, uncovered = (np.ascontiguousarray(np.concatenate(of)) for of in rows)
-        independent = math.prod(min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m)
-        of_templates = np.array(grams), np.array(darks), uncovered, np.array(sums), np.array(radii_m)
+        cells, values, smooth, zones, uncovered = (
+            np.ascontiguousarray(np.concatenate(of)) for of in rows
+        )
+        independent = math.prod(
+            min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m
+        )
+        of_templates = (
+            np.array(grams),
+            np.array(darks),
+            uncovered,
+            np.array(sums),
+            np.array(radii_m),
+        )
         counts = independent**POWER_OF_CELLS
-        return cls(side + last, first, cells, values, smooth, zones, *of_templates, independent, counts)
+        return cls(
+            side + last,
+            first,
+            cells,
+            values,
+            smooth,
+            zones,
+            *of_templates,
+            independent,
+            counts,
+        )
 
-    def evidence(self, patch: Patch, template: Ints, cell: Ints) -> tuple[Floats, Ints] | None:
+    def evidence(
+        self, patch: Patch, template: Ints, cell: Ints
+    ) -> tuple[Floats, Ints] | None:
         """`EVIDENCE` of templates on the parts of a patch that begin at some cells, and the edges that cover them.
 
         Shapes (n,), (n, 2), (n, 11) and (n,). None where too little of one is in view, or where it has one level. An
         edge is numbered by direction and offset; -1: the whole figure is at least as probable as that with the best
         edge, with prior probabilities of 1/2 for the whole and 1/72 for each of 36 edges.
         """
-        found, edge = np.empty((len(template), len(EVIDENCE))), np.full(len(template), -1)
+        found, edge = (
+            np.empty((len(template), len(EVIDENCE))),
+            np.full(len(template), -1),
+        )
         is_measured = fill_evidence(
             patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
             self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.uncovered,
@@ -169,7 +260,9 @@ class Figures(NamedTuple):
     def is_kept(self, template: int, edge: int, x_m: Floats, y_m: Floats) -> Bools:
         """Whether places about the middle of a template lie on the uncovered side of an edge."""
         direction, offset = divmod(edge, len(OFFSETS))
-        return np.asarray(along_edge(x_m, y_m, direction) <= OFFSETS[offset] * self.radius_m[template])
+        return np.asarray(
+            along_edge(x_m, y_m, direction) <= OFFSETS[offset] * self.radius_m[template]
+        )
 
 
 @compiled
@@ -186,7 +279,11 @@ def fill_evidence(
     """
     least = np.inf
     for k in range(len(template)):
-        begin, end, shift = first_of[template[k]], first_of[template[k] + 1], cell[k, 0] * side + cell[k, 1]
+        begin, end, shift = (
+            first_of[template[k]],
+            first_of[template[k] + 1],
+            cell[k, 0] * side + cell[k, 1],
+        )
         cells, values, rows = all_cells[begin:end], all_values[begin:end], end - begin
         smooth, zones = all_smooth[begin:end], all_zones[begin:end]
         level, is_seen = np.empty(rows, np.float32), np.empty(rows, np.float32)
@@ -208,26 +305,44 @@ def fill_evidence(
                 for i in range(len(gram)):
                     for j in range(len(gram)):
                         gram[i, j] -= (STEP * values[n, i]) * (STEP * values[n, j])
-        c, work, dark, first, kinds = np.zeros(4), np.empty((4, 5)), 1, 2, (len(products) - 2) // 2
+        c, work, dark, first, kinds = (
+            np.zeros(4),
+            np.empty((4, 5)),
+            1,
+            2,
+            (len(products) - 2) // 2,
+        )
         # the design: with its dark parts where they are dark, with and without a shadow
         plain, _ = least_squares(gram, products, total, (0, first), c, work)
         design, floor, beta, delta = plain, c[0], c[1], 0.0
         if has_dark[template[k]]:
-            with_dark, _ = least_squares(gram, products, total, (0, first, dark), c, work)
+            with_dark, _ = least_squares(
+                gram, products, total, (0, first, dark), c, work
+            )
             if c[2] < 0:
                 design, floor, beta, delta = with_dark, c[0], c[1], c[2]
         dz = products[dark] - gram[0, dark] / count * products[0]
-        only_dark = total - (dz**2 / (gram[dark, dark] - gram[0, dark] ** 2 / count) if delta < 0 else 0.0)
-        shaded, _ = least_squares(gram, products, total, (0, first, first + kinds), c, work)
+        only_dark = total - (
+            dz**2 / (gram[dark, dark] - gram[0, dark] ** 2 / count)
+            if delta < 0
+            else 0.0
+        )
+        shaded, _ = least_squares(
+            gram, products, total, (0, first, first + kinds), c, work
+        )
         shaded = shaded if c[2] < 0 else plain
         both = min(design, shaded)
         if delta < 0 and shaded < plain:
-            with_both, _ = least_squares(gram, products, total, (0, first, dark, first + kinds), c, work)
+            with_both, _ = least_squares(
+                gram, products, total, (0, first, dark, first + kinds), c, work
+            )
             both = with_both if c[2] < 0 and c[3] < 0 else both
         # otherwise: the best of all figures
         other, other_plain = shaded, plain
         for q in range(first + 1, first + kinds):
-            shaded_q, plain_q = least_squares(gram, products, total, (0, q, q + kinds), c, work)
+            shaded_q, plain_q = least_squares(
+                gram, products, total, (0, q, q + kinds), c, work
+            )
             other_plain = min(other_plain, plain_q)
             other = min(other, shaded_q if c[2] < 0 else plain_q)
         # what is left next to the figure, farther out, and behind
@@ -237,7 +352,13 @@ def fill_evidence(
             at = cells[n] + shift
             if zones[n] == 0 or held[at] <= 0.5:
                 continue
-            off = smooth_db[at] - mean - floor - beta * smooth[n, 1] - delta * smooth[n, 0]
+            off = (
+                smooth_db[at]
+                - mean
+                - floor
+                - beta * smooth[n, 1]
+                - delta * smooth[n, 0]
+            )
             if zones[n] & NEAR:
                 near, near_cells = near + max(off, 0.0) ** 2, near_cells + 1
             if zones[n] & FAR:
@@ -248,8 +369,12 @@ def fill_evidence(
         found[k, 1] = math.log(other / both)
         found[k, 2] = math.log(other_plain / plain)
         found[k, 3] = math.log(max(beta, LEAST_BETA_DB) / math.sqrt(mean_square))
-        found[k, 4] = math.log((near / near_cells if near_cells > 8 else mean_square / 3) + LEAST_DB2)
-        found[k, 5] = math.log((far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2)
+        found[k, 4] = math.log(
+            (near / near_cells if near_cells > 8 else mean_square / 3) + LEAST_DB2
+        )
+        found[k, 5] = math.log(
+            (far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2
+        )
         found[k, 6] = back / back_cells if back_cells > 5 else 0.0
         plate, foam = math.log(shaded / both), math.log(max(only_dark, 1e-3) / design)
         found[k, 7] = math.sqrt(max(min(plate, foam), 0.0)) if delta < 0 else 0.0
@@ -259,11 +384,18 @@ def fill_evidence(
             kept = np.empty(kept.shape)
             kept_sums(values, is_seen, uncovered, kept)
         whole = design if beta > 0 else only_dark
-        covered, best = least_covered(level, values, uncovered, kept, count, gram, only_dark, dz, delta < 0)
-        if 0.5 * count * counts[COVERED] * math.log(max(whole / covered, 1.0)) > math.log(EDGES * len(OFFSETS)):
+        covered, best = least_covered(
+            level, values, uncovered, kept, count, gram, only_dark, dz, delta < 0
+        )
+        if 0.5 * count * counts[COVERED] * math.log(
+            max(whole / covered, 1.0)
+        ) > math.log(EDGES * len(OFFSETS)):
             edge[k] = best
         covered = min(covered, whole)
-        found[k, 9], found[k, 10] = math.log(covered / total), math.log(max(design / covered, 1.0))
+        found[k, 9], found[k, 10] = (
+            math.log(covered / total),
+            math.log(max(design / covered, 1.0)),
+        )
         least = min(least, found[k, 9])
     for k in range(len(template)):
         found[k, 9] = least - found[k, 9]
@@ -279,7 +411,9 @@ def products_of(level: Floats32, values: Bytes) -> Floats32:
         a, b, c, d = level[n], level[n + 1], level[n + 2], level[n + 3]
         for i in range(len(found)):
             found[i] += a * np.float32(values[n, i]) + b * np.float32(values[n + 1, i])
-            found[i] += c * np.float32(values[n + 2, i]) + d * np.float32(values[n + 3, i])
+            found[i] += c * np.float32(values[n + 2, i]) + d * np.float32(
+                values[n + 3, i]
+            )
     for n in range(last, len(level)):
         for i in range(len(found)):
             found[i] += level[n] * np.float32(values[n, i])
@@ -318,9 +452,18 @@ def least_covered(
             bz_n = b_n * level[n]
             for edge in range(len(products)):
                 products[edge] += bz_n * np.float32(uncovered[n, edge])
-    dark_mean, dd, least, best = gram[0, 1] / count, gram[1, 1] - gram[0, 1] ** 2 / count, only_dark, -1
+    dark_mean, dd, least, best = (
+        gram[0, 1] / count,
+        gram[1, 1] - gram[0, 1] ** 2 / count,
+        only_dark,
+        -1,
+    )
     for edge in range(len(kept)):
-        b, bb, bz = kept[edge, 0], kept[edge, 1] - kept[edge, 0] ** 2 / count, float(products[edge])
+        b, bb, bz = (
+            kept[edge, 0],
+            kept[edge, 1] - kept[edge, 0] ** 2 / count,
+            float(products[edge]),
+        )
         if has_dark:
             bd = kept[edge, 2] - b * dark_mean
             bb, bz = bb - bd**2 / dd, bz - bd * dz / dd
@@ -337,7 +480,12 @@ def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
 
 @compiled
 def least_squares(
-    gram: Floats, products: Floats32, total: float, at: tuple[int, ...], c: Floats, a: Floats
+    gram: Floats,
+    products: Floats32,
+    total: float,
+    at: tuple[int, ...],
+    c: Floats,
+    a: Floats,
 ) -> tuple[float, float]:
     """Sums of squares that the columns ``at`` leave, all of them and all but the last; fills in coefficients of all.
 
@@ -365,7 +513,11 @@ def least_squares(
 
 def behind(figure: Floats32, cells: int) -> Floats32:
     """Share of each cell that lies within so many cells behind a figure, and not in it, shape as given."""
-    inside, shaded = np.minimum(figure, 1.0), np.zeros_like(figure)  # the near side of foam is brighter than 1
+    # the near side of foam is brighter than 1
+    inside, shaded = (
+        np.minimum(figure, 1.0),
+        np.zeros_like(figure),
+    )
     for step in range(1, cells + 1):
         shaded[step:] = np.maximum(shaded[step:], inside[:-step])
     return np.clip(shaded - inside, 0.0, 1.0)

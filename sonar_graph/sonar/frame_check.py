@@ -35,13 +35,18 @@ class RangeWindow(NamedTuple):
 
     def shares_arrays(self, other: RangeWindow | None) -> bool:
         """True for windows of one block of frames."""
-        return other is not None and all(own is others for own, others in zip(self, other, strict=True))
+        return other is not None and all(
+            own is others for own, others in zip(self, other, strict=True)
+        )
 
     def is_like(self, other: RangeWindow) -> bool:
         """True for the same bins and beams, up to what a driver computes anew for every ping."""
         return self.shares_arrays(other) or all(
             len(own) == len(others)
-            and bool(np.abs(own - others).max() <= SAME_PLACE * (abs(float(own[-1] - own[0])) / (len(own) - 1)))
+            and bool(
+                np.abs(own - others).max()
+                <= SAME_PLACE * (abs(float(own[-1] - own[0])) / (len(own) - 1))
+            )
             for own, others in zip(self, other, strict=True)
         )
 
@@ -54,10 +59,16 @@ class RangeWindow(NamedTuple):
         if not (np.isfinite(ranges_m).all() and np.isfinite(azimuths_rad).all()):
             return "ranges or azimuths that are not finite"
         steps_m, steps_rad = np.diff(ranges_m), np.diff(azimuths_rad)
-        is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(steps_m.mean())
+        is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(
+            steps_m.mean()
+        )
         if ranges_m[0] < 0 or not steps_m.mean() > 0 or not is_even:
             return "ranges that do not increase evenly from the sonar on"
-        return None if (steps_rad > 0).all() or (steps_rad < 0).all() else "azimuths that do not go one way"
+        return (
+            None
+            if (steps_rad > 0).all() or (steps_rad < 0).all()
+            else "azimuths that do not go one way"
+        )
 
     def __str__(self) -> str:
         size = f"{len(self.azimuths_rad)} x {len(self.ranges_m)}"
@@ -71,7 +82,9 @@ def check_block(frame: SonarFrames) -> None:
     Raises `MeasurementError` when it has more frames, or none.
     """
     if len(frame) != 1:
-        raise MeasurementError(f"a recogniser was given a block of {len(frame)} frames; give blocks of one, in order")
+        raise MeasurementError(
+            f"a recogniser was given a block of {len(frame)} frames; give blocks of one, in order"
+        )
 
 
 class FrameCheck:
@@ -92,14 +105,24 @@ class FrameCheck:
         window = RangeWindow(frame.ranges_m, frame.azimuths_rad)
         self.change = None
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            return "duplicated: same stamp as the frame before" if stamp_ns == self._stamp_ns else "out of order"
-        reason = (None if window.shares_arrays(self._window) else window.fault()) or self._fault_of_samples(image)
+            return (
+                "duplicated: same stamp as the frame before"
+                if stamp_ns == self._stamp_ns
+                else "out of order"
+            )
+        reason = (
+            None if window.shares_arrays(self._window) else window.fault()
+        ) or self._fault_of_samples(image)
         if reason is not None:
             return reason
         is_change = self._window is not None and not window.is_like(self._window)
-        if (self._window is None or is_change) and not any(window.is_like(seen) for seen in self._seen):
+        if (self._window is None or is_change) and not any(
+            window.is_like(seen) for seen in self._seen
+        ):
             self._seen = [*self._seen[-MOST_WINDOWS + 1 :], window]
-            if len(self._seen) > 1:  # a window counts from its second frame on; the first of all is taken as it is
+            if (
+                len(self._seen) > 1
+            ):  # a window counts from its second frame on; the first of all is taken as it is
                 return f"wrong size or window: {window}; used if it comes again"
         if is_change:
             self.change = f"window changed: {window}; tracks that lie in it go on"
@@ -109,7 +132,10 @@ class FrameCheck:
     def _fault_of_samples(self, image: NDArray[np.generic]) -> str | None:
         """Reason not to use these samples."""
         low, high = image.min(), image.max()
-        if np.issubdtype(image.dtype, np.floating) and not max(abs(low), abs(high)) < np.finfo(np.float32).max:
+        if (
+            np.issubdtype(image.dtype, np.floating)
+            and not max(abs(low), abs(high)) < np.finfo(np.float32).max
+        ):
             return "samples that are not finite"
         if low == high < self._scale.full_scale:
             return "all samples are zero" if high == 0 else "all samples are the same"

@@ -59,12 +59,18 @@ class FloorView:
 
     def __post_init__(self) -> None:
         if not self.height_m > 0:
-            raise CalibrationError(f"FloorView.height_m: {self.height_m} m; the sonar must be above the floor")
+            raise CalibrationError(
+                f"FloorView.height_m: {self.height_m} m; the sonar must be above the floor"
+            )
         if not math.hypot(self.level_R_sonar[0, 0], self.level_R_sonar[1, 0]) > 1e-6:
-            raise CalibrationError("FloorView: the centre beam is vertical, so that level axes have no direction")
+            raise CalibrationError(
+                "FloorView: the centre beam is vertical, so that level axes have no direction"
+            )
 
     @classmethod
-    def from_angles(cls, height_m: float, roll_rad: float, pitch_rad: float) -> FloorView:
+    def from_angles(
+        cls, height_m: float, roll_rad: float, pitch_rad: float
+    ) -> FloorView:
         """View of a sonar with this roll and pitch; a positive pitch turns the centre beam down."""
         return cls(gtsam.Rot3.RzRyRx(roll_rad, pitch_rad, 0.0).matrix(), height_m)
 
@@ -74,18 +80,30 @@ class FloorView:
         rotation = world_T_sonar.rotation()
         forward = rotation.matrix()[:, 0]
         heading = gtsam.Rot3.Rz(math.atan2(forward[1], forward[0]))
-        return cls((heading.inverse() * rotation).matrix(), float(world_T_sonar.translation()[2]) - floor_z_m)
+        return cls(
+            (heading.inverse() * rotation).matrix(),
+            float(world_T_sonar.translation()[2]) - floor_z_m,
+        )
 
     def turned(self, bearing_rad: float) -> FloorView:
         """The same view with level axes whose x axis points to this bearing."""
         cos, sin = math.cos(bearing_rad), math.sin(bearing_rad)
         ahead_R_level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return FloorView(ahead_R_level @ self.level_R_sonar, self.height_m, self.height_sigma_m, self.tilt_sigma_rad)
+        return FloorView(
+            ahead_R_level @ self.level_R_sonar,
+            self.height_m,
+            self.height_sigma_m,
+            self.tilt_sigma_rad,
+        )
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
         cos_e, sin_e = floor_lift(
-            ranges_m, np.cos(azimuths_rad), np.sin(azimuths_rad), self.level_R_sonar[2], self.height_m
+            ranges_m,
+            np.cos(azimuths_rad),
+            np.sin(azimuths_rad),
+            self.level_R_sonar[2],
+            self.height_m,
         )
         elevations = np.arctan2(sin_e, cos_e)
         return points(ranges_m, azimuths_rad, elevations)
@@ -97,7 +115,9 @@ class FloorView:
 
     def range_azimuth(self, xy_m: Floats) -> tuple[Floats, Floats]:
         """Ranges and azimuths of floor points, shape (n,), from level (x, y), shape (n, 2)."""
-        x, y, z = (xy_m @ self.level_R_sonar[:2] - self.height_m * self.level_R_sonar[2]).T
+        x, y, z = (
+            xy_m @ self.level_R_sonar[:2] - self.height_m * self.level_R_sonar[2]
+        ).T
         return np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)
 
     def elevation_sigmas(self, points_m: Floats) -> Floats:
@@ -111,7 +131,8 @@ class FloorView:
         horizontal2 = np.maximum(np.sum(points_m**2, axis=1) - along**2, 0.0)
         slope = np.abs(_elevation_derivatives(points_m) @ up)
         return np.asarray(
-            np.sqrt(self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2) / np.maximum(slope, 1e-9)
+            np.sqrt(self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2)
+            / np.maximum(slope, 1e-9)
         )
 
 
@@ -145,20 +166,30 @@ class Fan:
         lowest, half_width = r0 * np.cos(widest), r1 * np.sin(min(widest, np.pi / 2))
         scale = pixels_high / (r1 - lowest)
         ahead = lowest + (np.arange(pixels_high)[::-1, None] + 0.5) / scale
-        across = half_width - (np.arange(int(2 * half_width * scale))[None] + 0.5) / scale
+        across = (
+            half_width - (np.arange(int(2 * half_width * scale))[None] + 0.5) / scale
+        )
         distance, azimuth = np.hypot(ahead, across), np.arctan2(across, ahead)
         order = np.argsort(azimuths_rad)
         place = np.interp(azimuth, azimuths_rad[order], np.arange(len(order)), -1, -1)
         inside = (place >= 0) & (distance >= r0) & (distance <= r1)
         beam = np.where(inside, order[np.rint(np.maximum(place, 0)).astype(int)], -1)
         at = np.rint(np.interp(distance, np.sort(ranges_m), np.argsort(ranges_m)))
-        return cls(beam.astype(np.int32), at.astype(np.int32), scale, float(lowest), float(half_width))
+        return cls(
+            beam.astype(np.int32),
+            at.astype(np.int32),
+            scale,
+            float(lowest),
+            float(half_width),
+        )
 
     def pixel(self, range_m: float, azimuth_rad: float) -> tuple[int, int]:
         """Column and row of a point."""
         ahead, across = range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)
         column = (self.half_width_m - across) * self.pixels_per_m
-        return round(column), round(len(self.beam) - (ahead - self.lowest_m) * self.pixels_per_m)
+        return round(column), round(
+            len(self.beam) - (ahead - self.lowest_m) * self.pixels_per_m
+        )
 
 
 def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
@@ -184,7 +215,12 @@ def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
     if lens == "as-logged":
         return frames
     logged_rad = frames.azimuths_rad
-    return replace(frames, azimuths_rad=lens_azimuths(lens, len(logged_rad), bool(logged_rad[0] < logged_rad[-1])))
+    return replace(
+        frames,
+        azimuths_rad=lens_azimuths(
+            lens, len(logged_rad), bool(logged_rad[0] < logged_rad[-1])
+        ),
+    )
 
 
 @lru_cache(maxsize=8)
@@ -198,17 +234,24 @@ def lens_azimuths(lens: str, beams: int, is_rightmost_first: bool = True) -> Flo
     else:
         table = aris_azimuths(beams, telephoto=lens == "aris-telephoto")
     if table is None:
-        raise CalibrationError(f"calibration.sonar.lens: no table of {lens} has {beams} beams; set it to as-logged")
+        raise CalibrationError(
+            f"calibration.sonar.lens: no table of {lens} has {beams} beams; set it to as-logged"
+        )
     table = table if is_rightmost_first else table[::-1].copy()
     table.flags.writeable = False
     return table
 
 
-def points(ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats | float = 0.0) -> Floats:
+def points(
+    ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats | float = 0.0
+) -> Floats:
     """Points in the sonar frame, shape (n, 3)."""
     level = ranges_m * np.cos(elevations_rad)
     z = ranges_m * np.sin(elevations_rad)
-    return np.stack([level * np.cos(azimuths_rad), level * np.sin(azimuths_rad), z + 0.0 * level], axis=-1)
+    return np.stack(
+        [level * np.cos(azimuths_rad), level * np.sin(azimuths_rad), z + 0.0 * level],
+        axis=-1,
+    )
 
 
 def ranges_azimuths_elevations(points_m: Floats) -> tuple[Floats, Floats, Floats]:
@@ -218,14 +261,18 @@ def ranges_azimuths_elevations(points_m: Floats) -> tuple[Floats, Floats, Floats
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
 
 
-def point_covariances(points_m: Floats, range_azimuth_cov: Floats, elevation_sigmas_rad: Floats) -> Floats:
+def point_covariances(
+    points_m: Floats, range_azimuth_cov: Floats, elevation_sigmas_rad: Floats
+) -> Floats:
     """Covariance of points in the sonar frame, first order, shape (n, 3, 3).
 
     ``J blockdiag(R, sigma_e^2) J^T``, R of shape (n, 2, 2) or (2, 2), J the derivative of q by (r, a, e).
     """
     r, _, _ = ranges_azimuths_elevations(points_m)
     by_azimuth = np.stack([-points_m[:, 1], points_m[:, 0], np.zeros(len(r))], axis=1)
-    jacobian = np.stack([points_m / r[:, None], by_azimuth, _elevation_derivatives(points_m)], axis=2)
+    jacobian = np.stack(
+        [points_m / r[:, None], by_azimuth, _elevation_derivatives(points_m)], axis=2
+    )
     spherical = np.zeros((len(r), 3, 3))
     spherical[:, :2, :2] = range_azimuth_cov
     spherical[:, 2, 2] = elevation_sigmas_rad**2
@@ -239,7 +286,9 @@ def _elevation_derivatives(points_m: Floats) -> Floats:
     return np.stack([-lift * points_m[:, 0], -lift * points_m[:, 1], level], axis=1)
 
 
-def floor_lift(ranges_m: Floats, cos_a: Floats, sin_a: Floats, up: Floats, height_m: float) -> tuple[Floats, Floats]:
+def floor_lift(
+    ranges_m: Floats, cos_a: Floats, sin_a: Floats, up: Floats, height_m: float
+) -> tuple[Floats, Floats]:
     """Cosine and sine of the elevation at which rays meet the floor, shape (n,); NaN where they do not.
 
     With ``A = u1 cos a + u2 sin a``, ``B = u3``, ``k = -h / r``, ``w = sqrt(A^2 + B^2 - k^2)``, the solutions are

@@ -21,7 +21,15 @@ import numpy as np
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.sonar.templates import FINE, Blur, Floats32, echo_power, seen_db, seen_share, with_side
+from sonar_graph.sonar.templates import (
+    FINE,
+    Blur,
+    Floats32,
+    echo_power,
+    seen_db,
+    seen_share,
+    with_side,
+)
 
 SIDE_M = 0.006
 """Width of the side for which it is drawn, to a fine point."""
@@ -46,24 +54,40 @@ class Relief(NamedTuple):
 
     @classmethod
     def of(
-        cls, design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, blur_m: Blur, shade_steps: int
+        cls,
+        design: LandmarkDesign,
+        heading_rad: float,
+        side: int,
+        cell_m: float,
+        blur_m: Blur,
+        shade_steps: int,
     ) -> Relief:
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
         of_bright, power = echo_power(design, heading_rad, side, cell_m)
         is_bright = power > 1
         width = max(1, round(SIDE_M / cell_m * FINE))
         shaded, raised_power = is_bright.copy(), with_side(power, width)
-        bright, whole, raised = (seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power))
+        bright, whole, raised = (
+            seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power)
+        )
         for _ in range(shade_steps * SHADE_FINE):
             shaded[1:] |= shaded[:-1]
         shorter = seen_share(shaded & ~is_bright, cell_m, blur_m)
         for _ in range(SHADE_FINE):
             shaded[1:] |= shaded[:-1]
         shades = shorter, seen_share(shaded & ~is_bright, cell_m, blur_m)
-        return cls(bright, (raised - whole) / (width * cell_m / FINE), whole - bright, shades)
+        return cls(
+            bright, (raised - whole) / (width * cell_m / FINE), whole - bright, shades
+        )
 
     def place(
-        self, level_db: Floats32, seen: Floats32, cells: tuple[Ints, Ints], start: Floats, side_m: float, longer: float
+        self,
+        level_db: Floats32,
+        seen: Floats32,
+        cells: tuple[Ints, Ints],
+        start: Floats,
+        side_m: float,
+        longer: float,
     ) -> tuple[Floats, Floats]:
         """Place of the first cell of the figure's square in a patch, and the bound of its standard deviation, in cells.
 
@@ -104,7 +128,11 @@ def fit_place(
     beta, delta, gamma = np.float32(0), np.float32(0), np.float32(0)
     last, count = len(level_db) - 1, np.float32(0)
     mean = np.float32(np.sum(level_db * seen) / max(np.sum(seen), 1.0))
-    along, across, M = np.zeros_like(figure), np.zeros_like(figure), np.empty((7, len(rows)), np.float32)
+    along, across, M = (
+        np.zeros_like(figure),
+        np.zeros_like(figure),
+        np.empty((7, len(rows)), np.float32),
+    )
     for step in range(STEPS + 1):
         size, x0, y0 = 4 if step == 0 else 6, round(place[0]), round(place[1])
         if step > 0:
@@ -113,8 +141,17 @@ def fit_place(
             i, j = rows[n], columns[n]
             x, y = x0 + i, y0 + j
             if 0 <= x <= last and 0 <= y <= last and seen[x, y] > 0:
-                M[0, n], M[1, n], M[2, n], M[3, n] = 1, figure[i, j], dark[i, j], shade[i, j]
-                M[4, n], M[5, n], M[6, n] = along[i, j], across[i, j], level_db[x, y] - mean
+                M[0, n], M[1, n], M[2, n], M[3, n] = (
+                    1,
+                    figure[i, j],
+                    dark[i, j],
+                    shade[i, j],
+                )
+                M[4, n], M[5, n], M[6, n] = (
+                    along[i, j],
+                    across[i, j],
+                    level_db[x, y] - mean,
+                )
             else:
                 M[:, n] = 0
         products = np.dot(M, M.T).astype(np.float64)
@@ -122,7 +159,11 @@ def fit_place(
         if count < LEAST_CELLS:
             return
         c, inverse = solved(products, size)
-        beta, delta, gamma = np.float32(max(c[1], LEAST_BETA_DB)), np.float32(max(c[2], 0)), np.float32(min(c[3], 0))
+        beta, delta, gamma = (
+            np.float32(max(c[1], LEAST_BETA_DB)),
+            np.float32(max(c[2], 0)),
+            np.float32(min(c[3], 0)),
+        )
         if size == 6:
             variance = max(products[6, 6] - np.dot(c, products[6, :6]), 0.0) / count
             for a in range(2):
@@ -137,10 +178,15 @@ def slopes(picture: Floats32, along: Floats32, across: Floats32) -> None:
     for i in range(last + 1):
         before, after = max(i - 1, 0), min(i + 1, last)
         for j in range(last + 1):
-            along[i, j] = (picture[before, j] - picture[after, j]) / np.float32(after - before)
+            along[i, j] = (picture[before, j] - picture[after, j]) / np.float32(
+                after - before
+            )
         for j in range(1, last):
             across[i, j] = (picture[i, j - 1] - picture[i, j + 1]) / np.float32(2)
-        across[i, 0], across[i, last] = picture[i, 0] - picture[i, 1], picture[i, last - 1] - picture[i, last]
+        across[i, 0], across[i, last] = (
+            picture[i, 0] - picture[i, 1],
+            picture[i, last - 1] - picture[i, last],
+        )
 
 
 @compiled
@@ -164,4 +210,7 @@ def solved(products: Floats, size: int) -> tuple[Floats, tuple[float, float]]:
         for j in range(i + 1, size):
             c[i] -= a[i, j] * c[j]
         c[i] /= a[i, i]
-    return c, (second / (a[size - 2, size - 2] * a[size - 1, size - 1]), 1 / a[size - 1, size - 1])
+    return c, (
+        second / (a[size - 2, size - 2] * a[size - 1, size - 1]),
+        1 / a[size - 1, size - 1],
+    )

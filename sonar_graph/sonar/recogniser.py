@@ -88,8 +88,13 @@ PITCH_RAD, STEEPEST_RAD = 0.15, 1.3
 ACCEPTED_FROM = (0.5, 0.7)
 """Posteriors from which an identity is likelier than not, and from which estimators accept it by default."""
 REPORTED = "reported"
-NOT_INDEPENDENT = "not reported: too soon after the track's last detection to be independent of it"
-REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in CandidateVerdict}
+NOT_INDEPENDENT = (
+    "not reported: too soon after the track's last detection to be independent of it"
+)
+REJECTED = {
+    int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}"
+    for v in CandidateVerdict
+}
 
 
 class Recogniser:
@@ -134,16 +139,24 @@ class Recogniser:
         self.confusion = self.params.confusion or confusion_for(self.designs)
         self.ids = np.array([design.id for design in self.designs])
         self.confusion.check_designs(self.designs)
-        check_candidates(self.designs, self.params.detection, self.params.appearance.search_m)
+        check_candidates(
+            self.designs, self.params.detection, self.params.appearance.search_m
+        )
         check_headings(self.designs)
         self._calibration = calibration
         opening_rad = calibration.sonar.elevation_aperture_rad
-        self._look = CandidateFit(self.designs, self.params.appearance, self.confusion, opening_rad)
+        self._look = CandidateFit(
+            self.designs, self.params.appearance, self.confusion, opening_rad
+        )
         self._tracker = Tracker(self.params.tracking)
         self._beliefs = Beliefs(self.confusion, self.params.identity)
         self._check = FrameCheck(calibration.sonar.image)
         self._start_T_sonar = gtsam.Pose3()
-        self._interval_ns = round(1e9 * self.confusion.report_interval_s) if self.params.independent else 0
+        self._interval_ns = (
+            round(1e9 * self.confusion.report_interval_s)
+            if self.params.independent
+            else 0
+        )
         self._reported: dict[int, tuple[int, tuple[int, int]]] = {}
         """Stamp of the last report of each track, its most probable identity then, and how many of `ACCEPTED_FROM` that
         had reached."""
@@ -163,12 +176,21 @@ class Recogniser:
     def prepare(self, frame: SonarFrames) -> None:
         """Draw the templates that frames with these ranges and beams may need, while nobody waits."""
         sonar = self._calibration.sonar
-        tilt_rad, half_rad = abs(sonar.mounting.rpy_rad[1]), sonar.elevation_aperture_rad / 2 + PITCH_RAD
-        depressions_rad = max(tilt_rad - half_rad, 0.0), min(tilt_rad + half_rad, STEEPEST_RAD)
+        tilt_rad, half_rad = (
+            abs(sonar.mounting.rpy_rad[1]),
+            sonar.elevation_aperture_rad / 2 + PITCH_RAD,
+        )
+        depressions_rad = (
+            max(tilt_rad - half_rad, 0.0),
+            min(tilt_rad + half_rad, STEEPEST_RAD),
+        )
         self._look.prepare(frame.ranges_m, frame.azimuths_rad, depressions_rad)
 
     def process(
-        self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
+        self,
+        frame: SonarFrames,
+        motion: SonarStep | None = None,
+        view: FloorView | None = None,
     ) -> LandmarkDetections | None:
         """Detections in one frame: cfar, tracker, appearance, bayes.
 
@@ -194,23 +216,37 @@ class Recogniser:
         """
         check_block(frame)
         self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
-        self.sightings, self.track_ids, self.news = [], np.empty(0, dtype=np.int64), np.empty(0)
+        self.sightings, self.track_ids, self.news = (
+            [],
+            np.empty(0, dtype=np.int64),
+            np.empty(0),
+        )
         self.beliefs = np.empty((0, len(self.ids) + 1))
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
             self._tracker.skip(motion or SonarStep.none())
-            self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
+            self.fates = [
+                Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")
+            ]
             return None
-        image_db = decibels(np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image)
-        candidates = select_candidates(image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection)
+        image_db = decibels(
+            np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image
+        )
+        candidates = select_candidates(
+            image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection
+        )
         association = self._tracker.step(candidates, motion, stamp_ns)
         self.track_ids = association.ids
-        self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
+        self.sightings = self._look.at(
+            image_db, frame, view, candidates, association.candidate
+        )
         log_odds = self._look.log_odds(self.sightings)
         is_looked = np.isfinite(log_odds[:, -1])
         azimuth = np.arctan2(association.position_m[:, 1], association.position_m[:, 0])
-        across = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)])
+        across = np.column_stack(
+            [-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)]
+        )
         sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
         place = self._start_T_sonar.translation()
         beliefs = self._beliefs.step(association, log_odds, is_looked, place, sideways)
@@ -221,10 +257,16 @@ class Recogniser:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
         return found
 
-    def _report(self, candidates: Candidates, association: Association, beliefs: Floats) -> LandmarkDetections | None:
+    def _report(
+        self, candidates: Candidates, association: Association, beliefs: Floats
+    ) -> LandmarkDetections | None:
         """Rows for the tracks that are seen and trusted; fates of all candidates and tracks."""
         stamp_ns, params = association.stamp_ns, self.params
-        columns = candidates.verdicts.tolist(), candidates.range_m.tolist(), candidates.azimuth_rad.tolist()
+        columns = (
+            candidates.verdicts.tolist(),
+            candidates.range_m.tolist(),
+            candidates.azimuth_rad.tolist(),
+        )
         self.fates = [
             Fate(stamp_ns, -1, range_m, azimuth_rad, REJECTED[verdict])
             for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
@@ -232,29 +274,50 @@ class Recogniser:
         ]
         reported = []
         before = self._reported
-        self._reported = {track: before[track] for track in association.ids.tolist() if track in before}
+        self._reported = {
+            track: before[track]
+            for track in association.ids.tolist()
+            if track in before
+        }
         for row, sighting in enumerate(self.sightings):
             if sighting is None:
                 continue
             outcome, track = REPORTED, int(association.ids[row])
             best = int(np.argmax(beliefs[row]))
-            said = best, bisect_right(ACCEPTED_FROM, beliefs[row, best]) if best < len(self.ids) else 0
+            said = (
+                best,
+                bisect_right(ACCEPTED_FROM, beliefs[row, best])
+                if best < len(self.ids)
+                else 0,
+            )
             last_ns, last_said = before.get(track, (stamp_ns - self._interval_ns, said))
             if sighting.fit is None:
                 outcome = "not reported: too little of it is in view"
             elif association.frames_seen[row] < params.least_frames:
-                outcome = f"not reported: seen in fewer than {params.least_frames} frames"
+                outcome = (
+                    f"not reported: seen in fewer than {params.least_frames} frames"
+                )
             elif association.existence[row] < params.least_existence:
-                outcome = f"not reported: exists with less than {params.least_existence:g}"
-            elif stamp_ns - last_ns < self._interval_ns and said[0] == last_said[0] and said[1] <= last_said[1]:
+                outcome = (
+                    f"not reported: exists with less than {params.least_existence:g}"
+                )
+            elif (
+                stamp_ns - last_ns < self._interval_ns
+                and said[0] == last_said[0]
+                and said[1] <= last_said[1]
+            ):
                 outcome = NOT_INDEPENDENT
             else:
                 reported.append((row, sighting))
                 self._reported[track] = stamp_ns, said
-            self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
+            self.fates.append(
+                Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome)
+            )
         self.fates += [
             Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")
-            for track, reason in zip(association.ended_ids.tolist(), association.ended_reasons, strict=True)
+            for track, reason in zip(
+                association.ended_ids.tolist(), association.ended_reasons, strict=True
+            )
         ]
         if not reported:
             return None
@@ -263,7 +326,9 @@ class Recogniser:
             stamps_ns=np.full(len(rows), stamp_ns),
             range_m=np.array([sighting.range_m for _, sighting in reported]),
             azimuth_rad=np.array([sighting.azimuth_rad for _, sighting in reported]),
-            range_azimuth_cov=np.array([sighting.covariance for _, sighting in reported]),
+            range_azimuth_cov=np.array(
+                [sighting.covariance for _, sighting in reported]
+            ),
             candidate_ids=np.tile(self.ids, (len(rows), 1)),
             id_probability=each_once(beliefs[rows])[:, :-1],
             track=association.ids[rows],
@@ -273,8 +338,13 @@ class Recogniser:
         """Rule, designs and model, for the notes of a log."""
         return {
             "detections.rule": self.params.identity.rule,
-            "detections.designs": ", ".join(f"{design.id}: {design.name}" for design in self.designs),
-            "detections.model": "; ".join(f"{k}: {v}" for k, v in self.confusion.provenance.items()) or "not said",
+            "detections.designs": ", ".join(
+                f"{design.id}: {design.name}" for design in self.designs
+            ),
+            "detections.model": "; ".join(
+                f"{k}: {v}" for k, v in self.confusion.provenance.items()
+            )
+            or "not said",
         }
 
 
@@ -289,7 +359,12 @@ def each_once(beliefs: Floats) -> Floats:
     named = best[best < known]
     if len(np.unique(named)) == len(named):
         return beliefs
-    cost = -np.log(np.maximum(np.hstack([beliefs[:, :known], np.tile(beliefs[:, known:], (1, tracks))]), 1e-12))
+    cost = -np.log(
+        np.maximum(
+            np.hstack([beliefs[:, :known], np.tile(beliefs[:, known:], (1, tracks))]),
+            1e-12,
+        )
+    )
     _, assigned = linear_sum_assignment(cost)
     result = beliefs.copy()
     for track, landmark in enumerate(best.tolist()):

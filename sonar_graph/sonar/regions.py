@@ -43,21 +43,42 @@ def background_of(
     beams, bins = smoothing
     nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
     ordered, count = np.sort(nodes, axis=0), len(nodes)
-    medians = (ordered[[(count - 1) // 2]] + ordered[[count // 2]]) / 2  # np.median takes three times as long
+    medians = (
+        ordered[[(count - 1) // 2]] + ordered[[count // 2]]
+    ) / 2  # np.median takes three times as long
     trend = cv2.blur(medians, (TREND_NODES, 1))
-    window = min(round((neighbourhood[0] / beams + neighbourhood[1] / bins) / 2), LARGEST_WINDOW) // 2 * 2 + 1
+    window = (
+        min(
+            round((neighbourhood[0] / beams + neighbourhood[1] / bins) / 2),
+            LARGEST_WINDOW,
+        )
+        // 2
+        * 2
+        + 1
+    )
     residual = nodes - trend
     local = _median(residual, window, STEPS_PER_DB, 128.0)
-    spread = MEDIAN_TO_SIGMA * _median(np.abs(residual - local), window, DEVIATION_STEPS_PER_DB, 0.0)
+    spread = MEDIAN_TO_SIGMA * _median(
+        np.abs(residual - local), window, DEVIATION_STEPS_PER_DB, 0.0
+    )
     return local + trend, np.maximum(spread, np.float32(LEAST_SPREAD_DB))
 
 
-def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> Floats32:
+def _median(
+    values: Floats32, window: int, steps_per_db: float, zero: float
+) -> Floats32:
     """Median over a square window, to half a step; mirrored at the edges."""
     half = window // 2
-    counts = cv2.convertScaleAbs(np.maximum(values, -zero / steps_per_db), alpha=steps_per_db, beta=zero)
-    mirrored = np.asarray(cv2.copyMakeBorder(counts, half, half, half, half, cv2.BORDER_REFLECT_101), np.uint8)
-    return (running_median(mirrored, window).astype(np.float32) - np.float32(zero)) / np.float32(steps_per_db)
+    counts = cv2.convertScaleAbs(
+        np.maximum(values, -zero / steps_per_db), alpha=steps_per_db, beta=zero
+    )
+    mirrored = np.asarray(
+        cv2.copyMakeBorder(counts, half, half, half, half, cv2.BORDER_REFLECT_101),
+        np.uint8,
+    )
+    return (
+        running_median(mirrored, window).astype(np.float32) - np.float32(zero)
+    ) / np.float32(steps_per_db)
 
 
 @compiled
@@ -120,21 +141,41 @@ def measure_regions(
     view: FloorView | None,
 ) -> Regions:
     """Measure regions 1 to ``count`` of a label image, on the floor or (None) in the slant plane."""
-    level_R_sonar, height_m = (np.eye(3), 0.0) if view is None else (view.level_R_sonar, view.height_m)
-    sums = pixel_sums(contrast_db, labels, count, ranges_m, azimuths_rad, np.ascontiguousarray(level_R_sonar), height_m)
+    level_R_sonar, height_m = (
+        (np.eye(3), 0.0) if view is None else (view.level_R_sonar, view.height_m)
+    )
+    sums = pixel_sums(
+        contrast_db,
+        labels,
+        count,
+        ranges_m,
+        azimuths_rad,
+        np.ascontiguousarray(level_R_sonar),
+        height_m,
+    )
     weight = np.maximum(sums[:, AREA], 1e-12)
     x, y = sums[:, X] / weight, sums[:, Y] / weight
-    xx, xy, yy = sums[:, XX] / weight - x * x, sums[:, XY] / weight - x * y, sums[:, YY] / weight - y * y
+    xx, xy, yy = (
+        sums[:, XX] / weight - x * x,
+        sums[:, XY] / weight - x * y,
+        sums[:, YY] / weight - y * y,
+    )
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
     points = np.stack([x, y, np.full(count, -height_m)], axis=1) @ level_R_sonar
     r, a, e = ranges_azimuths_elevations(points)
     level = sums[:, LEVEL] / np.maximum(sums[:, PIXELS], 1)
-    return Regions(points, r, a, e, sums[:, AREA], np.sqrt(12 * np.maximum(largest, 0)), level)
+    return Regions(
+        points, r, a, e, sums[:, AREA], np.sqrt(12 * np.maximum(largest, 0)), level
+    )
 
 
 @inlined
 def floor_cell(
-    r: float, cos_a: float, sin_a: float, R: tuple[tuple[float, ...], ...], height_m: float
+    r: float,
+    cos_a: float,
+    sin_a: float,
+    R: tuple[tuple[float, ...], ...],
+    height_m: float,
 ) -> tuple[float, float, float]:
     """Level x and y of the floor point at a range and azimuth, and area per unit of both there; 0 off the floor.
 
@@ -148,7 +189,11 @@ def floor_cell(
     w = math.copysign(math.sqrt(norm2 - k * k), up_z)
     cos_e, sin_e = (across * k + up_z * w) / norm2, (up_z * k - across * w) / norm2
     ratio = (up_y * cos_a - up_x * sin_a) * cos_e / (up_z * cos_e - sin_e * across)
-    area = r * r * math.sqrt((cos_e * cos_e + ratio * ratio) / (r * r - height_m * height_m))
+    area = (
+        r
+        * r
+        * math.sqrt((cos_e * cos_e + ratio * ratio) / (r * r - height_m * height_m))
+    )
     if not (area > 0 and r > height_m):
         return 0.0, 0.0, 0.0
     px, py, pz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
@@ -172,10 +217,22 @@ def pixel_sums(
             if labels[beam, n] == 0:
                 continue
             r, row = ranges_m[n], sums[labels[beam, n] - 1]
-            x, y, area = floor_cell(r, cos_a, sin_a, R, height_m) if height_m > 0 else (r * cos_a, r * sin_a, r)
+            x, y, area = (
+                floor_cell(r, cos_a, sin_a, R, height_m)
+                if height_m > 0
+                else (r * cos_a, r * sin_a, r)
+            )
             area *= dr * da
-            row[AREA], row[LEVEL], row[PIXELS] = row[AREA] + area, row[LEVEL] + contrast_db[beam, n], row[PIXELS] + 1
-            row[X], row[Y], row[XX] = row[X] + area * x, row[Y] + area * y, row[XX] + area * x * x
+            row[AREA], row[LEVEL], row[PIXELS] = (
+                row[AREA] + area,
+                row[LEVEL] + contrast_db[beam, n],
+                row[PIXELS] + 1,
+            )
+            row[X], row[Y], row[XX] = (
+                row[X] + area * x,
+                row[Y] + area * y,
+                row[XX] + area * x * x,
+            )
             row[XY], row[YY] = row[XY] + area * x * y, row[YY] + area * y * y
     return sums
 

@@ -69,7 +69,13 @@ class Templates:
     """Of the design's x axis against the grid's, shape (templates,)."""
 
     @classmethod
-    def of(cls, designs: Sequence[LandmarkDesign], cell_m: float, margin_m: float, blur_m: Blur) -> Templates:
+    def of(
+        cls,
+        designs: Sequence[LandmarkDesign],
+        cell_m: float,
+        margin_m: float,
+        blur_m: Blur,
+    ) -> Templates:
         """Templates of all designs at all headings, blurred by the resolution of the sonar (`drawn`).
 
         Around the largest design lies a ring of floor, without the part behind it, which the design may shade: the x
@@ -100,7 +106,14 @@ class Templates:
                     pictures.append(picture)
                     of.append(index)
                     headings.append(heading)
-        return cls(cell_m, side, cells, np.array(pictures, np.float32), np.array(of), np.array(headings))
+        return cls(
+            cell_m,
+            side,
+            cells,
+            np.array(pictures, np.float32),
+            np.array(of),
+            np.array(headings),
+        )
 
 
 def drawn(
@@ -132,7 +145,11 @@ def with_side(power: Floats32, width: int) -> Floats32:
 
 @lru_cache(maxsize=MOST_POWERS)
 def echo_power(
-    design: LandmarkDesign, heading_rad: float, side: int, cell_m: float, stretch: tuple[float, float] = (1.0, 1.0)
+    design: LandmarkDesign,
+    heading_rad: float,
+    side: int,
+    cell_m: float,
+    stretch: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Floats32, Floats32]:
     """Power of the echo of a design's bright parts and of all of it, not blurred, over `FINE` points a cell.
 
@@ -142,15 +159,22 @@ def echo_power(
     x_m, y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     (x0, y0), (x_share, y_share) = design.figure_m, stretch
-    level = design.level_db(x0 + (cos * x_m + sin * y_m) / x_share, y0 + (-sin * x_m + cos * y_m) / y_share)
+    level = design.level_db(
+        x0 + (cos * x_m + sin * y_m) / x_share, y0 + (-sin * x_m + cos * y_m) / y_share
+    )
     level = np.nan_to_num(level).astype(np.float32)
-    bright, whole = (np.asarray(10 ** (one / 10), np.float32) for one in (np.maximum(level, 0), level))
+    bright, whole = (
+        np.asarray(10 ** (one / 10), np.float32)
+        for one in (np.maximum(level, 0), level)
+    )
     return bright, whole
 
 
 def seen_db(power: Floats32, cell_m: float, blur_m: Blur) -> Floats32:
     """Levels of cells, as the sonar sees the power of fine ones."""
-    return of_cells(np.asarray(10 * np.log10(blurred(power, cell_m, blur_m)), np.float32))
+    return of_cells(
+        np.asarray(10 * np.log10(blurred(power, cell_m, blur_m)), np.float32)
+    )
 
 
 def seen_share(is_in: NDArray[np.bool_], cell_m: float, blur_m: Blur) -> Floats32:
@@ -161,13 +185,17 @@ def seen_share(is_in: NDArray[np.bool_], cell_m: float, blur_m: Blur) -> Floats3
 def blurred(fine: Floats32, cell_m: float, blur_m: Blur) -> Floats32:
     """Power on a fine grid, blurred away from the sonar (x) and across."""
     away, across = (max(one, LEAST_BLUR_M) / cell_m * FINE for one in blur_m)
-    return np.asarray(cv2.GaussianBlur(fine, (0, 0), sigmaX=across, sigmaY=away), np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(fine, (0, 0), sigmaX=across, sigmaY=away), np.float32
+    )
 
 
 def of_cells(fine: Floats32) -> Floats32:
     """Means of the fine points of each cell."""
     side = len(fine) // FINE
-    return np.asarray(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(
+        cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32
+    )
 
 
 def material_radius_m(design: LandmarkDesign) -> float:
@@ -197,12 +225,20 @@ def check_headings(designs: Sequence[LandmarkDesign]) -> None:
             continue
         side = 2 * math.ceil(material_radius_m(design) / CHECKED_CELL_M) + 1
         first, *turned = (
-            drawn(design, 2 * math.pi * k / HEADINGS, side, CHECKED_CELL_M, (CHECKED_CELL_M, CHECKED_CELL_M))
+            drawn(
+                design,
+                2 * math.pi * k / HEADINGS,
+                side,
+                CHECKED_CELL_M,
+                (CHECKED_CELL_M, CHECKED_CELL_M),
+            )
             for k in range(HEADINGS)
         )
         off = [float(np.mean((sum(one) - sum(first)) ** 2)) for one in turned]
         least = round(TURNED_RAD * HEADINGS / (2 * math.pi))
-        if min(off[least - 1 : -least + 1 or None]) < SAME_SHARE * float(np.var(sum(first))):
+        if min(off[least - 1 : -least + 1 or None]) < SAME_SHARE * float(
+            np.var(sum(first))
+        ):
             away_cm = 100 * math.hypot(*design.figure_m)
             raise CalibrationError(
                 f"landmark design {design.name} (id {design.id}): its figure lies {away_cm:.0f} cm from the middle of "
@@ -255,10 +291,17 @@ class PolarGrid(NamedTuple):
     """Sine of the elevation at the rim of the opening; what lies above is not in the image, whatever the range."""
 
     @classmethod
-    def of(cls, ranges_m: Floats, azimuths_rad: Floats, elevation_aperture_rad: float = math.pi) -> PolarGrid:
+    def of(
+        cls,
+        ranges_m: Floats,
+        azimuths_rad: Floats,
+        elevation_aperture_rad: float = math.pi,
+    ) -> PolarGrid:
         """Grid of equally spaced bins, shape (bins,), and of beams in one direction, shape (beams,)."""
         order = np.argsort(azimuths_rad)
-        places = np.linspace(azimuths_rad.min(), azimuths_rad.max(), _STEPS_A_BEAM * len(azimuths_rad))
+        places = np.linspace(
+            azimuths_rad.min(), azimuths_rad.max(), _STEPS_A_BEAM * len(azimuths_rad)
+        )
         return cls(
             float(ranges_m[0]),
             float(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1),
@@ -275,11 +318,17 @@ class PolarGrid(NamedTuple):
         Sonars sample their images as finely as they resolve: a beam, both ways, is at half of its power as wide as
         beams are apart, and the pulse as long as a bin.
         """
-        return WIDTH_TO_SIGMA * self.bin_m * range_m / away_m, WIDTH_TO_SIGMA * self.spacing_rad * range_m
+        return (
+            WIDTH_TO_SIGMA * self.bin_m * range_m / away_m,
+            WIDTH_TO_SIGMA * self.spacing_rad * range_m,
+        )
 
     def blur_steps(self, away_m: float, range_m: float) -> tuple[int, int]:
         """Nearest steps of `BLUR_RATIO`, from a millimetre on, to the resolution on the floor."""
-        away, across = (max(0, round(math.log(one / 1e-3, BLUR_RATIO))) for one in self.blur_m(away_m, range_m))
+        away, across = (
+            max(0, round(math.log(one / 1e-3, BLUR_RATIO)))
+            for one in self.blur_m(away_m, range_m)
+        )
         return away, across
 
     def steps_in_view(
@@ -287,18 +336,40 @@ class PolarGrid(NamedTuple):
     ) -> list[tuple[int, int]]:
         """All `blur_steps` between two ranges and depressions, those of middle ranges first."""
         first_m = max(first_m, last_m / NEAREST)
-        shares = np.linspace(-0.5, 0.5, math.ceil(4 * math.log(last_m / first_m, BLUR_RATIO)) + 2)
+        shares = np.linspace(
+            -0.5, 0.5, math.ceil(4 * math.log(last_m / first_m, BLUR_RATIO)) + 2
+        )
         found = dict[tuple[int, int], None]()
         for share in sorted(shares.tolist(), key=abs):
             range_m = math.sqrt(first_m * last_m) * (last_m / first_m) ** share
             for depression_rad in np.linspace(*depressions_rad, 5).tolist():
-                found[self.blur_steps(range_m * math.cos(depression_rad), range_m)] = None
+                found[self.blur_steps(range_m * math.cos(depression_rad), range_m)] = (
+                    None
+                )
         return list(found)
 
-    def patch(self, image_db: Floats32, view: FloorView, centre_m: Floats, side: int, cell_m: float) -> Patch:
+    def patch(
+        self,
+        image_db: Floats32,
+        view: FloorView,
+        centre_m: Floats,
+        side: int,
+        cell_m: float,
+    ) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
         level, seen, smooth, held = np.zeros((4, side, side), np.float32)
-        sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, cell_m, level, seen, smooth, held)
+        sample_floor(
+            self,
+            image_db,
+            view.level_R_sonar,
+            view.height_m,
+            centre_m,
+            cell_m,
+            level,
+            seen,
+            smooth,
+            held,
+        )
         return Patch(level, seen, smooth, held, centre_m)
 
 
@@ -311,12 +382,23 @@ def azimuth(x: float, y: float) -> float:
     half = y / (x + math.sqrt(x * x + y * y))
     t = half / (1 + math.sqrt(1 + half * half))
     u = t * t
-    tail = 0.1065626393 + u * (-0.07528964 + u * (0.0429096138 + u * (-0.0161657367 + u * 0.0028662257)))
-    return 4 * t * (1 + u * (-0.3333314528 + u * (0.1999355085 + u * (-0.1420889944 + u * tail))))
+    tail = 0.1065626393 + u * (
+        -0.07528964 + u * (0.0429096138 + u * (-0.0161657367 + u * 0.0028662257))
+    )
+    return (
+        4
+        * t
+        * (
+            1
+            + u * (-0.3333314528 + u * (0.1999355085 + u * (-0.1420889944 + u * tail)))
+        )
+    )
 
 
 @compiled
-def smooth_levels(level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32) -> None:
+def smooth_levels(
+    level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32
+) -> None:
     """Fill in means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
     side = len(level)
     total, count = np.empty(side + 2, np.float32), np.empty(side + 2, np.float32)
@@ -325,11 +407,18 @@ def smooth_levels(level: Floats32, seen: Floats32, smooth: Floats32, held: Float
         for j in range(side):
             total[j + 1] = level[before, j] + level[i, j] + level[after, j]
             count[j + 1] = seen[before, j] + seen[i, j] + seen[after, j]
-        total[0], total[-1], count[0], count[-1] = total[2], total[-3], count[2], count[-3]
+        total[0], total[-1], count[0], count[-1] = (
+            total[2],
+            total[-3],
+            count[2],
+            count[-3],
+        )
         for j in range(side):
             n = count[j] + count[j + 1] + count[j + 2]
             held[i, j] = n / np.float32(9)
-            smooth[i, j] = (total[j] + total[j + 1] + total[j + 2]) / max(n, np.float32(0.9))
+            smooth[i, j] = (total[j] + total[j + 1] + total[j + 2]) / max(
+                n, np.float32(0.9)
+            )
 
 
 @compiled
@@ -346,17 +435,27 @@ def sample_floor(
     per_bin, per_step = 1 / grid.bin_m, 1 / grid.azimuth_step_rad
     half_bins, half, z = 0.5 * cell_m * per_bin, 0.5 * (side - 1), -height_m
     is_fine = half_bins < 0.5
-    reach, places, middles = 1.0 if is_fine else half_bins, np.empty(side), np.empty(side)
+    reach, places, middles = (
+        1.0 if is_fine else half_bins,
+        np.empty(side),
+        np.empty(side),
+    )
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
     for i in range(side):
         x = centre[0] + cell_m * (i - half)
         for j in range(side):
             y = centre[1] + cell_m * (j - half)
-            q0, q1, q2 = xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+            q0, q1, q2 = (
+                xx * x + yx * y + zx * z,
+                xy * x + yy * y + zy * z,
+                xz * x + yz * y + zz * z,
+            )
             distance = math.sqrt(x * x + y * y + z * z)
             places[j] = (azimuth(q0, q1) - grid.first_azimuth_rad) * per_step
             is_lit = abs(q2) <= grid.highest_sine * distance
-            middles[j] = (distance - grid.first_range_m) * per_bin if is_lit else -2.0 * reach
+            middles[j] = (
+                (distance - grid.first_range_m) * per_bin if is_lit else -2.0 * reach
+            )
         for j in range(side):
             place, middle = places[j], middles[j]
             first, last = math.floor(middle - reach + 1), math.floor(middle + reach)
@@ -376,6 +475,8 @@ def sample_floor(
                 of_one, of_other = 0.0, 0.0
                 for n in range(first, last + np.uint32(1)):
                     of_one, of_other = of_one + one[n], of_other + other[n]
-                level[i, j] = (of_one + share * (of_other - of_one)) / (last - first + np.uint32(1))
+                level[i, j] = (of_one + share * (of_other - of_one)) / (
+                    last - first + np.uint32(1)
+                )
             seen[i, j] = 1.0
     smooth_levels(level, seen, smooth, held)

@@ -39,7 +39,13 @@ from sonar_graph.sonar.regions import Candidates
 
 NEVER = 1e9
 """Cost of what cannot be assigned."""
-SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]])
+SKEW = np.array(
+    [
+        [0, 0, 0, 0, 0, -1, 0, 1, 0],
+        [0, 0, 1, 0, 0, 0, -1, 0, 0],
+        [0, -1, 0, 1, 0, 0, 0, 0, 0],
+    ]
+)
 """Nine elements of [q]x as ``q @ SKEW``."""
 
 
@@ -72,7 +78,9 @@ class SonarStep:
         """Both steps, one after the other, with independent errors."""
         adjoint = later.previous_T_sonar.inverse().AdjointMap()
         covariance = adjoint @ self.covariance @ adjoint.T + later.covariance
-        return SonarStep(self.previous_T_sonar.compose(later.previous_T_sonar), covariance)
+        return SonarStep(
+            self.previous_T_sonar.compose(later.previous_T_sonar), covariance
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +118,17 @@ class TrackStates:
 
     def moved(self, step: SonarStep, drift_m: float) -> TrackStates:
         """Prediction: the tracks in the sonar frame after a step."""
-        R, t = step.previous_T_sonar.rotation().matrix(), step.previous_T_sonar.translation()
+        R, t = (
+            step.previous_T_sonar.rotation().matrix(),
+            step.previous_T_sonar.translation(),
+        )
         q, J = (self.position_m - t) @ R, np.empty((len(self), 3, 6))
         J[:, :, :3], J[:, :, 3:] = (q @ SKEW).reshape(-1, 3, 3), -np.eye(3)
-        P = R.T @ self.position_cov @ R + J @ step.covariance @ J.mT + drift_m**2 * np.eye(3)
+        P = (
+            R.T @ self.position_cov @ R
+            + J @ step.covariance @ J.mT
+            + drift_m**2 * np.eye(3)
+        )
         return replace(self, position_m=q, position_cov=P)
 
 
@@ -150,7 +165,9 @@ class Expected(NamedTuple):
         return np.where(distance2 <= gate, peak * np.exp(-0.5 * distance2), 0.0)
 
 
-def corrected(tracks: TrackStates, expected: Expected, z: Floats, took: Ints, noise: Floats) -> TrackStates:
+def corrected(
+    tracks: TrackStates, expected: Expected, z: Floats, took: Ints, noise: Floats
+) -> TrackStates:
     """Update by the measurement that each track took (-1: none), with the covariance in Joseph's form."""
     if not (took >= 0).any():
         return tracks
@@ -158,7 +175,9 @@ def corrected(tracks: TrackStates, expected: Expected, z: Floats, took: Ints, no
     K = P @ H.mT @ expected.information * (took >= 0)[:, None, None]
     q = tracks.position_m + (K @ expected.innovations(z[took])[:, :, None])[:, :, 0]
     rest = np.eye(3) - K @ H
-    return replace(tracks, position_m=q, position_cov=rest @ P @ rest.mT + K @ noise @ K.mT)
+    return replace(
+        tracks, position_m=q, position_cov=rest @ P @ rest.mT + K @ noise @ K.mT
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +229,9 @@ class Tracker:
 
     def __init__(self, params: TrackingParams | None = None) -> None:
         self.params = params or TrackingParams()
-        self._noise = np.diag([self.params.range_sigma_m**2, self.params.azimuth_sigma_rad**2])
+        self._noise = np.diag(
+            [self.params.range_sigma_m**2, self.params.azimuth_sigma_rad**2]
+        )
         self._gate = chi_square_quantile(self.params.gate_probability, 2)
         self._tracks = TrackStates.none()
         self._skipped: SonarStep | None = None
@@ -224,7 +245,9 @@ class Tracker:
     def _since_last_frame(self, motion: SonarStep) -> SonarStep:
         return motion if self._skipped is None else self._skipped.then(motion)
 
-    def step(self, candidates: Candidates, motion: SonarStep | None, stamp_ns: int) -> Association:
+    def step(
+        self, candidates: Candidates, motion: SonarStep | None, stamp_ns: int
+    ) -> Association:
         """Predict the tracks by the motion since the frame before or the last `skip` (None: none), and update them.
 
         Raises `MeasurementError` when the stamp is not later.
@@ -234,16 +257,25 @@ class Tracker:
                 f"sonar frame at {stamp_ns} ns is not later than the one before, {self._stamp_ns} ns; leave it out"
             )
         params, rows = self.params, candidates.accepted
-        elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
-        moved = self._tracks.moved(self._since_last_frame(motion or SonarStep.none()), params.drift_m)
-        before = replace(moved, existence=moved.existence * np.exp(-elapsed_s / params.lifetime_s))
+        elapsed_s = (
+            0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
+        )
+        moved = self._tracks.moved(
+            self._since_last_frame(motion or SonarStep.none()), params.drift_m
+        )
+        before = replace(
+            moved, existence=moved.existence * np.exp(-elapsed_s / params.lifetime_s)
+        )
         self._stamp_ns, self._skipped = stamp_ns, None
 
         z = np.array([candidates.range_m[rows], candidates.azimuth_rad[rows]]).T
         expected, window = Expected.of(before, self._noise), candidates.window
         sigma = np.sqrt(np.diagonal(expected.S, axis1=1, axis2=2))
         # standard deviations from the lower and upper limits of range and azimuth, positive inside, shapes (M', 2)
-        above, below = (expected.z - window[:, 0]) / sigma, (window[:, 1] - expected.z) / sigma
+        above, below = (
+            (expected.z - window[:, 0]) / sigma,
+            (window[:, 1] - expected.z) / sigma,
+        )
         in_image = (ndtr(above) - ndtr(-below)).prod(axis=1)
         detection = params.detection_probability * in_image
         densities = expected.densities(z, self._gate)
@@ -256,39 +288,76 @@ class Tracker:
         took = most_probable_assignment(matrix)
 
         likelihood, seen = 1.0 - detection, np.flatnonzero(took >= 0)
-        likelihood[seen] += detection[seen] * densities[took[seen], seen] * area / params.clutter_per_frame
-        existence = before.existence * likelihood / (1.0 - before.existence + before.existence * likelihood)
+        likelihood[seen] += (
+            detection[seen]
+            * densities[took[seen], seen]
+            * area
+            / params.clutter_per_frame
+        )
+        existence = (
+            before.existence
+            * likelihood
+            / (1.0 - before.existence + before.existence * likelihood)
+        )
         after = corrected(before, expected, z, took, self._noise)
-        after = replace(after, existence=existence, frames_seen=before.frames_seen + (took >= 0))
+        after = replace(
+            after, existence=existence, frames_seen=before.frames_seen + (took >= 0)
+        )
         least_inside = np.minimum(above, below).min(axis=1)
-        reasons = ["left the image" if least < -params.leaving_sigmas else "" for least in least_inside]
+        reasons = [
+            "left the image" if least < -params.leaving_sigmas else ""
+            for least in least_inside
+        ]
         for row in np.flatnonzero(existence < params.least_existence):
             reasons[row] = f"exists with less than {params.least_existence:g}"
         return self._keep(stamp_ns, candidates, after, matrix, took, reasons)
 
     def _keep(
-        self, stamp_ns: int, candidates: Candidates, after: TrackStates, matrix: Floats, took: Ints, reasons: list[str]
+        self,
+        stamp_ns: int,
+        candidates: Candidates,
+        after: TrackStates,
+        matrix: Floats,
+        took: Ints,
+        reasons: list[str],
     ) -> Association:
         """Keep the tracks without a reason to end, start new ones, and associate them with the tracks before."""
         stay = np.flatnonzero([not reason for reason in reasons])
         ended = np.flatnonzero([bool(reason) for reason in reasons])
-        new = np.array(sorted(set(range(len(matrix))).difference(took.tolist())), dtype=np.int64)
+        new = np.array(
+            sorted(set(range(len(matrix))).difference(took.tolist())), dtype=np.int64
+        )
         rows, previous_ids = np.append(took[stay], new), after.ids
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
         own = np.vstack([itself, np.zeros((len(new), len(previous_ids) + 1))])
         own[rows >= 0] = matrix[rows[rows >= 0]]
         old = np.arange(len(stay))
-        own[old, stay] += own[old, -1]  # where its candidate is of something new, a track was not seen and is itself
+        # where its candidate is of something new, a track was not seen and is itself
+        own[old, stay] += own[old, -1]
         own[old, -1] = 0.0
         tracks = after.rows(stay)
         if len(new):
             params, start, n = self.params, candidates.accepted[new], len(new)
-            position = points(candidates.range_m[start], candidates.azimuth_rad[start], candidates.elevation_rad[start])
-            covariance = point_covariances(position, self._noise, candidates.elevation_sigma_rad[start])
-            existence = np.full(n, params.new_per_frame / (params.new_per_frame + params.clutter_per_frame))
+            position = points(
+                candidates.range_m[start],
+                candidates.azimuth_rad[start],
+                candidates.elevation_rad[start],
+            )
+            covariance = point_covariances(
+                position, self._noise, candidates.elevation_sigma_rad[start]
+            )
+            existence = np.full(
+                n,
+                params.new_per_frame
+                / (params.new_per_frame + params.clutter_per_frame),
+            )
             ids = self._next_id + np.arange(n)
             self._next_id += n
-            tracks = tracks.and_(TrackStates(ids, position, covariance, existence, np.ones(n, dtype=np.int64)))
+            tracks = tracks.and_(
+                TrackStates(
+                    ids, position, covariance, existence, np.ones(n, dtype=np.int64)
+                )
+            )
         self._tracks = tracks
         return Association(
             **vars(tracks),
@@ -309,7 +378,9 @@ def most_probable_assignment(matrix: Floats) -> Ints:
     cost = np.full((candidates, tracks + candidates), NEVER)
     np.log(matrix[:, :tracks], out=cost[:, :tracks], where=matrix[:, :tracks] > 0)
     cost[:, :tracks] = np.where(matrix[:, :tracks] > 0, -cost[:, :tracks], NEVER)
-    cost[np.arange(candidates), tracks + np.arange(candidates)] = -np.log(matrix[:, tracks])
+    cost[np.arange(candidates), tracks + np.arange(candidates)] = -np.log(
+        matrix[:, tracks]
+    )
     chosen = linear_sum_assignment(cost)[1]
     took = np.full(tracks, -1)
     taken = np.flatnonzero(chosen < tracks)

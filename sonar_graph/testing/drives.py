@@ -8,8 +8,23 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, ImuCalibration, PositionCalibration, Start
-from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Heading, Imu, Ints, LandmarkDetections, PositionFixes
+from sonar_graph.calibration import (
+    Calibration,
+    ImuCalibration,
+    PositionCalibration,
+    Start,
+)
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Depth,
+    Dvl,
+    Floats,
+    Heading,
+    Imu,
+    Ints,
+    LandmarkDetections,
+    PositionFixes,
+)
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -43,15 +58,30 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
     (20.0, 1001, 101, array([ 4,  9, 11]))
     """
     noise = np.random.default_rng(SEED)
-    x, y, z = _circle(np.array([START_NS + round(dvl_delay_s * NS_PER_S)], dtype=np.int64)).positions[0].tolist()
-    start = Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, YAW_RATE_RAD_S * dvl_delay_s))
+    x, y, z = (
+        _circle(np.array([START_NS + round(dvl_delay_s * NS_PER_S)], dtype=np.int64))
+        .positions[0]
+        .tolist()
+    )
+    start = Start(
+        position_m=(x, y, z), rpy_rad=(0.0, 0.0, YAW_RATE_RAD_S * dvl_delay_s)
+    )
     calibration = Calibration(start=start, imu=ImuCalibration(gyro_bias_sigma=1e-5))
     imu = _turning_imu(calibration, noise)
-    dvl_ns, depth_ns = _stamps(dvl_delay_s, DVL_HZ, DURATION_S), _stamps(0, DEPTH_HZ, DURATION_S)
+    dvl_ns, depth_ns = (
+        _stamps(dvl_delay_s, DVL_HZ, DURATION_S),
+        _stamps(0, DEPTH_HZ, DURATION_S),
+    )
     n, m = len(dvl_ns), len(depth_ns)
-    velocity = np.array([SPEED_M_S, 0.0, 0.0]) + calibration.dvl.velocity_sigma_m_s * noise.standard_normal((n, 3))
+    velocity = np.array(
+        [SPEED_M_S, 0.0, 0.0]
+    ) + calibration.dvl.velocity_sigma_m_s * noise.standard_normal((n, 3))
     dvl = Dvl(dvl_ns, velocity, np.full((n, 3, 3), np.nan))
-    depth = Depth(depth_ns, HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(m), np.full(m, np.nan))
+    depth = Depth(
+        depth_ns,
+        HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(m),
+        np.full(m, np.nan),
+    )
     return Sequence(
         name="left turn",
         calibration=calibration,
@@ -76,11 +106,20 @@ def aided_world() -> Sequence:
     """
     world, noise = small_world(), np.random.default_rng(SEED)
     calibration = world.calibration.model_copy(
-        update={"positions": PositionCalibration(sigma_m=(0.5, 0.5, 1.0), antenna_m=(-0.4, 0.2, 0.6))}
+        update={
+            "positions": PositionCalibration(
+                sigma_m=(0.5, 0.5, 1.0), antenna_m=(-0.4, 0.2, 0.6)
+            )
+        }
     )
-    heading_ns, fixes_ns = _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7, _stamps(0, FIX_HZ, DURATION_S)
+    heading_ns, fixes_ns = (
+        _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7,
+        _stamps(0, FIX_HZ, DURATION_S),
+    )
     m, n = len(heading_ns), len(fixes_ns)
-    yaw_rad = YAW_RATE_RAD_S * (heading_ns - START_NS) * 1e-9 + calibration.heading.sigma_rad * noise.standard_normal(m)
+    yaw_rad = YAW_RATE_RAD_S * (
+        heading_ns - START_NS
+    ) * 1e-9 + calibration.heading.sigma_rad * noise.standard_normal(m)
     body = _circle(fixes_ns)
     antenna = body.positions + body.rotations().apply(calibration.positions.antenna_m)
     fixes = antenna + calibration.positions.sigma_m * noise.standard_normal((n, 3))
@@ -89,8 +128,14 @@ def aided_world() -> Sequence:
         world,
         name="left turn with heading and fixes",
         calibration=calibration,
-        heading=Heading(heading_ns, yaw_rad, np.where(np.arange(m) % 2, calibration.heading.sigma_rad, np.nan)),
-        positions=PositionFixes(fixes_ns, fixes, np.where((np.arange(n) % 2)[:, None, None], covs, np.nan)),
+        heading=Heading(
+            heading_ns,
+            yaw_rad,
+            np.where(np.arange(m) % 2, calibration.heading.sigma_rad, np.nan),
+        ),
+        positions=PositionFixes(
+            fixes_ns, fixes, np.where((np.arange(n) % 2)[:, None, None], covs, np.nan)
+        ),
     )
 
 
@@ -115,11 +160,15 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     frame, place = np.divmod(np.arange(len(rows)), len(LANDMARKS_M))
     track = frame // TRACK_FRAMES * len(LANDMARKS_M) + place
     said = noise.choice(["right", "wrong", "nothing"], len(rows), p=[0.7, 0.2, 0.1])
-    said = np.where(frame < MISNAMED_FRAMES, "wrong", said[track] if is_tracked else said)
+    said = np.where(
+        frame < MISNAMED_FRAMES, "wrong", said[track] if is_tracked else said
+    )
     names = np.array(list(LANDMARKS_M), dtype=np.int64)
     wrong = names[(place + 1) % len(names)]
     ids = np.select([said == "wrong", said == "nothing"], [wrong, -1], names[place])
-    misnamed = replace(rows, candidate_ids=ids[:, None], track=track if is_tracked else rows.track)
+    misnamed = replace(
+        rows, candidate_ids=ids[:, None], track=track if is_tracked else rows.track
+    )
     return replace(world, detections=misnamed)
 
 
@@ -135,12 +184,20 @@ def still_world() -> Sequence:
     """
     calibration = Calibration(start=STILL_START)
     imu_stamps, slow_stamps = _stamps(0, IMU_HZ, STILL_S), _stamps(0, DVL_HZ, STILL_S)
-    up_in_body = Rotation.from_euler("xyz", STILL_START.rpy_rad).inv().apply([0.0, 0.0, calibration.gravity_m_s2])
+    up_in_body = (
+        Rotation.from_euler("xyz", STILL_START.rpy_rad)
+        .inv()
+        .apply([0.0, 0.0, calibration.gravity_m_s2])
+    )
     n = len(slow_stamps)
     return Sequence(
         name="at rest",
         calibration=calibration,
-        imu=Imu(imu_stamps, np.zeros((len(imu_stamps), 3)), np.tile(up_in_body, (len(imu_stamps), 1))),
+        imu=Imu(
+            imu_stamps,
+            np.zeros((len(imu_stamps), 3)),
+            np.tile(up_in_body, (len(imu_stamps), 1)),
+        ),
         dvl=Dvl(slow_stamps, np.zeros((n, 3)), np.full((n, 3, 3), np.nan)),
         depth=Depth(slow_stamps, np.full(n, HEIGHT_M), np.full(n, np.nan)),
     )
@@ -148,12 +205,16 @@ def still_world() -> Sequence:
 
 def every_stamp(sequence: Sequence) -> Ints:
     """Stamps of all measurements after the start until the end, shape (n,)."""
-    stamps_ns = np.unique(np.concatenate([block.stamps_ns for block in sequence.blocks().values()]))
+    stamps_ns = np.unique(
+        np.concatenate([block.stamps_ns for block in sequence.blocks().values()])
+    )
     return stamps_ns[(stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)]
 
 
 def _stamps(first_s: float, rate_hz: int, until_s: int) -> Ints:
-    return START_NS + np.arange(round(first_s * rate_hz), until_s * rate_hz + 1, dtype=np.int64) * (NS_PER_S // rate_hz)
+    return START_NS + np.arange(
+        round(first_s * rate_hz), until_s * rate_hz + 1, dtype=np.int64
+    ) * (NS_PER_S // rate_hz)
 
 
 def _circle(stamps_ns: Ints) -> Trajectory:
@@ -162,7 +223,9 @@ def _circle(stamps_ns: Ints) -> Trajectory:
     radius_m = SPEED_M_S / YAW_RATE_RAD_S
     x, y = radius_m * np.sin(yaw_rad), radius_m * (1 - np.cos(yaw_rad))
     positions = np.column_stack([x, y, np.full(len(x), HEIGHT_M)])
-    return Trajectory.without_covariances(stamps_ns, positions, Rotation.from_euler("z", yaw_rad[:, None]).as_quat())
+    return Trajectory.without_covariances(
+        stamps_ns, positions, Rotation.from_euler("z", yaw_rad[:, None]).as_quat()
+    )
 
 
 def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
@@ -172,24 +235,33 @@ def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
     force = np.array([0.0, SPEED_M_S * YAW_RATE_RAD_S, calibration.gravity_m_s2])
     rate_sigma = calibration.imu.gyro_noise_density * root_hz
     force_sigma = calibration.imu.accel_noise_density * root_hz
-    rates = np.array([0.0, 0.0, YAW_RATE_RAD_S]) + rate_sigma * noise.standard_normal(shape)
+    rates = np.array([0.0, 0.0, YAW_RATE_RAD_S]) + rate_sigma * noise.standard_normal(
+        shape
+    )
     return Imu(stamps_ns, rates, force + force_sigma * noise.standard_normal(shape))
 
 
-def _detections(calibration: Calibration, noise: np.random.Generator) -> LandmarkDetections:
+def _detections(
+    calibration: Calibration, noise: np.random.Generator
+) -> LandmarkDetections:
     """Every landmark in every frame that lies between two IMU samples; one in ten is not recognised."""
     frames_ns = _stamps(0, FRAME_HZ, DURATION_S - 2)[3:] + NS_PER_S // 3
     stamps_ns = np.repeat(frames_ns, len(LANDMARKS_M))
     n = len(stamps_ns)
     there = np.tile(_true_landmarks().positions, (len(frames_ns), 1))
     body = _circle(frames_ns)
-    here, facing = np.repeat(body.positions, len(LANDMARKS_M), axis=0), np.repeat(body.quaternions_xyzw, 3, axis=0)
+    here, facing = (
+        np.repeat(body.positions, len(LANDMARKS_M), axis=0),
+        np.repeat(body.quaternions_xyzw, 3, axis=0),
+    )
     seen: Floats = Rotation.from_quat(facing).inv().apply(there - here)
     ids = np.tile(np.array(list(LANDMARKS_M), dtype=np.int64), len(frames_ns))[:, None]
     return LandmarkDetections(
         stamps_ns,
-        np.linalg.norm(seen, axis=1) + calibration.sonar.range_sigma_m * noise.standard_normal(n),
-        np.arctan2(seen[:, 1], seen[:, 0]) + calibration.sonar.azimuth_sigma_rad * noise.standard_normal(n),
+        np.linalg.norm(seen, axis=1)
+        + calibration.sonar.range_sigma_m * noise.standard_normal(n),
+        np.arctan2(seen[:, 1], seen[:, 0])
+        + calibration.sonar.azimuth_sigma_rad * noise.standard_normal(n),
         np.full((n, 2, 2), np.nan),
         ids,
         np.where(np.arange(n) % 10 == 9, 0.05, 0.99)[:, None],
@@ -198,4 +270,8 @@ def _detections(calibration: Calibration, noise: np.random.Generator) -> Landmar
 
 def _true_landmarks() -> LandmarkMap:
     positions = np.array([(x, y, HEIGHT_M) for x, y in LANDMARKS_M.values()])
-    return LandmarkMap(np.array(list(LANDMARKS_M), dtype=np.int64), positions, np.full((len(positions), 3, 3), np.nan))
+    return LandmarkMap(
+        np.array(list(LANDMARKS_M), dtype=np.int64),
+        positions,
+        np.full((len(positions), 3, 3), np.nan),
+    )

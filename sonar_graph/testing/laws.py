@@ -76,7 +76,9 @@ class EstimatorRun:
     def causal(self, stamps_ns: list[int]) -> Trajectory:
         """Causal estimates at some of the instants."""
         wanted = set(stamps_ns)
-        return Trajectory.from_estimates([e for e in self.estimates if e.stamp_ns in wanted])
+        return Trajectory.from_estimates(
+            [e for e in self.estimates if e.stamp_ns in wanted]
+        )
 
 
 def fresh(make: MakeEstimator, calibration: Calibration) -> Estimator:
@@ -85,7 +87,11 @@ def fresh(make: MakeEstimator, calibration: Calibration) -> Estimator:
 
 
 def run(
-    make: MakeEstimator, sequence: Sequence, instants_ns: Ints | None = None, *, ask_every: int = 0
+    make: MakeEstimator,
+    sequence: Sequence,
+    instants_ns: Ints | None = None,
+    *,
+    ask_every: int = 0,
 ) -> EstimatorRun:
     """Run a fresh estimator over a sequence, cut at the instants, and ask for all results at the end.
 
@@ -94,17 +100,25 @@ def run(
     """
     estimator = fresh(make, sequence.calibration)
     estimates: list[Estimate] = []
-    steps = sequence.replay(sequence.instants(ASK_HZ) if instants_ns is None else instants_ns)
+    steps = sequence.replay(
+        sequence.instants(ASK_HZ) if instants_ns is None else instants_ns
+    )
     for number, step in enumerate(steps, start=1):
         estimate = estimator.process(step)
         estimates += [] if estimate is None else [estimate]
         if ask_every and number % ask_every == 0:
             _answer_twice(estimator, estimates)
-    return _answer_twice(estimator, estimates) if ask_every else _answer(estimator, estimates)
+    return (
+        _answer_twice(estimator, estimates)
+        if ask_every
+        else _answer(estimator, estimates)
+    )
 
 
 def _answer(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
-    return EstimatorRun(estimates, estimator.trajectory(), estimator.landmarks(), estimator.detections())
+    return EstimatorRun(
+        estimates, estimator.trajectory(), estimator.landmarks(), estimator.detections()
+    )
 
 
 def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
@@ -117,12 +131,17 @@ def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorR
 def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
     """Names of the results that differ in any bit."""
     parts: dict[str, tuple[object, object]] = {
-        "causal estimates": (Trajectory.from_estimates(one.estimates), Trajectory.from_estimates(other.estimates)),
+        "causal estimates": (
+            Trajectory.from_estimates(one.estimates),
+            Trajectory.from_estimates(other.estimates),
+        ),
         "trajectory()": (one.trajectory, other.trajectory),
         "landmarks()": (one.landmarks, other.landmarks),
         "detections()": (one.detections, other.detections),
     }
-    return [name for name, (mine, theirs) in parts.items() if not _is_same(mine, theirs)]
+    return [
+        name for name, (mine, theirs) in parts.items() if not _is_same(mine, theirs)
+    ]
 
 
 def _is_same(mine: Any, theirs: Any) -> bool:
@@ -131,7 +150,10 @@ def _is_same(mine: Any, theirs: Any) -> bool:
         np.array_equal(column, other, equal_nan=column.dtype.kind == "f")
         if isinstance(column, np.ndarray)
         else column == other
-        for column, other in ((getattr(mine, field.name), getattr(theirs, field.name)) for field in fields(mine))
+        for column, other in (
+            (getattr(mine, field.name), getattr(theirs, field.name))
+            for field in fields(mine)
+        )
     )
 
 
@@ -141,7 +163,9 @@ def difference(one: EstimatorRun, other: EstimatorRun) -> float:
     Infinite where an instant or a landmark is missing from ``other``.
     """
     mine, theirs = _at_same_instants(one, other)
-    if len(mine) != len(theirs) or not np.array_equal(one.landmarks.ids, other.landmarks.ids):
+    if len(mine) != len(theirs) or not np.array_equal(
+        one.landmarks.ids, other.landmarks.ids
+    ):
         return float("inf")
     pairs = (
         (_perturbation(mine, theirs), 0.0),
@@ -163,11 +187,17 @@ def deviation(one: EstimatorRun, other: EstimatorRun) -> tuple[float, float]:
     products = np.einsum("ni,nj->nij", sigmas, sigmas)
     return (
         float(np.max(np.abs(_perturbation(mine, theirs)) / sigmas, initial=0.0)),
-        float(np.max(np.abs(mine.covariances - theirs.covariances) / products, initial=0.0)),
+        float(
+            np.max(
+                np.abs(mine.covariances - theirs.covariances) / products, initial=0.0
+            )
+        ),
     )
 
 
-def _at_same_instants(one: EstimatorRun, other: EstimatorRun) -> tuple[Trajectory, Trajectory]:
+def _at_same_instants(
+    one: EstimatorRun, other: EstimatorRun
+) -> tuple[Trajectory, Trajectory]:
     stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
     return one.causal(stamps_ns), other.causal(stamps_ns)
 
@@ -177,7 +207,12 @@ def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
     if not len(mine):
         return np.empty((0, 6))
     into_body = mine.rotations().inv()
-    return np.hstack([(into_body * theirs.rotations()).as_rotvec(), into_body.apply(theirs.positions - mine.positions)])
+    return np.hstack(
+        [
+            (into_body * theirs.rotations()).as_rotvec(),
+            into_body.apply(theirs.positions - mine.positions),
+        ]
+    )
 
 
 def require(kept: bool, violation: str) -> None:
@@ -188,13 +223,18 @@ def require(kept: bool, violation: str) -> None:
 
 def require_covariance(matrix: Floats, size: int, name: str) -> None:
     """Raise `ContractError` unless finite, symmetric, positive semi-definite, shape (size, size)."""
-    require(matrix.shape == (size, size), f"{name}: shape {matrix.shape}, not {(size, size)}")
+    require(
+        matrix.shape == (size, size),
+        f"{name}: shape {matrix.shape}, not {(size, size)}",
+    )
     require(bool(np.isfinite(matrix).all()), f"{name} is not finite")
     scale = float(np.abs(matrix).max())
     asymmetry = float(np.abs(matrix - matrix.T).max())
     require(asymmetry <= SYMMETRY * scale, f"{name} is not symmetric: {asymmetry:.1e}")
     least = float(np.linalg.eigvalsh(matrix).min())
-    require(least >= -SYMMETRY * scale, f"{name} has a negative eigenvalue: {least:.1e}")
+    require(
+        least >= -SYMMETRY * scale, f"{name} has a negative eigenvalue: {least:.1e}"
+    )
 
 
 Check = Callable[[MakeEstimator], None]
@@ -213,14 +253,23 @@ def settings_have_defaults(make: MakeEstimator) -> None:
         if isinstance(make, type):
             make(calibration, Odometry(calibration), params)
     except Exception as error:
-        raise ContractError(f"Params(), or make(calibration, odometry, params), fails: {error}") from error
+        raise ContractError(
+            f"Params(), or make(calibration, odometry, params), fails: {error}"
+        ) from error
 
 
 def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:
     """A fresh estimator has no pose, no landmark and no detection."""
     estimator = fresh(make, small_world().calibration)
-    sizes = len(estimator.trajectory()), len(estimator.landmarks()), len(estimator.detections())
-    require(sizes == (0, 0, 0), f"a fresh estimator has {sizes} poses, landmarks, detections")
+    sizes = (
+        len(estimator.trajectory()),
+        len(estimator.landmarks()),
+        len(estimator.detections()),
+    )
+    require(
+        sizes == (0, 0, 0),
+        f"a fresh estimator has {sizes} poses, landmarks, detections",
+    )
 
 
 def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
@@ -231,12 +280,22 @@ def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
     for step in world.replay(instants):
         estimate = estimator.process(step)
         if step.end_ns < world.start_ns:
-            require(estimate is None, "an estimate is returned before the first DVL sample")
+            require(
+                estimate is None, "an estimate is returned before the first DVL sample"
+            )
         elif step.end_ns > world.start_ns:
             if estimate is None:
-                raise ContractError("nothing is returned although there are IMU and DVL")
-            require(isinstance(estimate, Estimate), f"{type(estimate).__name__} is returned, not an Estimate")
-            require(estimate.stamp_ns == step.end_ns, f"asked for {step.end_ns}, answered for {estimate.stamp_ns}")
+                raise ContractError(
+                    "nothing is returned although there are IMU and DVL"
+                )
+            require(
+                isinstance(estimate, Estimate),
+                f"{type(estimate).__name__} is returned, not an Estimate",
+            )
+            require(
+                estimate.stamp_ns == step.end_ns,
+                f"asked for {step.end_ns}, answered for {estimate.stamp_ns}",
+            )
 
 
 def covariances_are_covariances(make: MakeEstimator) -> None:
@@ -254,7 +313,10 @@ def trajectory_has_the_instants_of_the_estimates(make: MakeEstimator) -> None:
     """`trajectory` has one pose for each instant at which `process` returned an estimate."""
     outcome = run(make, small_world())
     asked = [estimate.stamp_ns for estimate in outcome.estimates]
-    require(outcome.trajectory.stamps_ns.tolist() == asked, "the stamps of trajectory() are not those of the estimates")
+    require(
+        outcome.trajectory.stamps_ns.tolist() == asked,
+        "the stamps of trajectory() are not those of the estimates",
+    )
 
 
 def frames_and_signs_are_those_of_the_vocabulary(make: MakeEstimator) -> None:
@@ -268,20 +330,37 @@ def frames_and_signs_are_those_of_the_vocabulary(make: MakeEstimator) -> None:
         assert world.true_landmarks is not None
         truth = world.truth.at(outcome.trajectory.stamps_ns)
         off_m = np.linalg.norm(outcome.trajectory.positions - truth.positions, axis=1)
-        require(off_m.max() < 0.3, f"{world.name}: the trajectory leaves the truth by {off_m.max():.2f} m")
+        require(
+            off_m.max() < 0.3,
+            f"{world.name}: the trajectory leaves the truth by {off_m.max():.2f} m",
+        )
         known = np.isin(world.true_landmarks.ids, outcome.landmarks.ids)
         if known.any():
-            off_m = np.linalg.norm((outcome.landmarks.positions - world.true_landmarks.positions[known])[:, :2], axis=1)
-            require(off_m.max() < 0.5, f"{world.name}: a landmark is {off_m.max():.2f} m from the truth, horizontally")
+            off_m = np.linalg.norm(
+                (outcome.landmarks.positions - world.true_landmarks.positions[known])[
+                    :, :2
+                ],
+                axis=1,
+            )
+            require(
+                off_m.max() < 0.5,
+                f"{world.name}: a landmark is {off_m.max():.2f} m from the truth, horizontally",
+            )
 
 
 def landmarks_are_sorted_and_unique(make: MakeEstimator) -> None:
     """Identities in `landmarks` ascend, and are among those that were detected."""
     found = run(make, small_world()).landmarks
-    require(bool(np.all(np.diff(found.ids) > 0)), f"landmark ids do not ascend strictly: {found.ids.tolist()}")
+    require(
+        bool(np.all(np.diff(found.ids) > 0)),
+        f"landmark ids do not ascend strictly: {found.ids.tolist()}",
+    )
     strangers = set(found.ids.tolist()) - set(LANDMARKS_M)
     require(not strangers, f"landmarks that nobody detected: {sorted(strangers)}")
-    require(found.positions.shape == (len(found), 3), f"positions of landmarks have shape {found.positions.shape}")
+    require(
+        found.positions.shape == (len(found), 3),
+        f"positions of landmarks have shape {found.positions.shape}",
+    )
 
 
 def every_detection_has_an_outcome(make: MakeEstimator) -> None:
@@ -290,15 +369,27 @@ def every_detection_has_an_outcome(make: MakeEstimator) -> None:
     assert world.detections is not None
     log = run(make, world).detections
     given, told = world.detections.stamps_ns.tolist(), sorted(log.stamps_ns.tolist())
-    require(told == given, f"{len(given)} detections were given, {len(told)} are accounted for")
-    rows = {len(log.outcomes), len(log.landmark_ids), len(log.innovations), len(log.innovation_covs)}
-    require(rows == {len(given)}, f"the columns of detections() have {sorted(rows)} rows")
+    require(
+        told == given,
+        f"{len(given)} detections were given, {len(told)} are accounted for",
+    )
+    rows = {
+        len(log.outcomes),
+        len(log.landmark_ids),
+        len(log.innovations),
+        len(log.innovation_covs),
+    }
+    require(
+        rows == {len(given)}, f"the columns of detections() have {sorted(rows)} rows"
+    )
 
 
 def same_input_gives_same_output(make: MakeEstimator) -> None:
     """Two estimators that are fed alike agree to the last bit."""
     first, second = run(make, small_world()), run(make, small_world())
-    require(difference(first, second) == 0.0, "two runs on the same measurements differ")
+    require(
+        difference(first, second) == 0.0, "two runs on the same measurements differ"
+    )
 
 
 def asking_changes_nothing(make: MakeEstimator) -> None:
@@ -306,9 +397,16 @@ def asking_changes_nothing(make: MakeEstimator) -> None:
 
     Also where identities are wrong or missing, and an estimator may revise them when it is asked.
     """
-    for world, every in ((aided_world(), 1), (misnamed_world(), 3), (misnamed_world(is_tracked=True), 7)):
+    for world, every in (
+        (aided_world(), 1),
+        (misnamed_world(), 3),
+        (misnamed_world(is_tracked=True), 7),
+    ):
         differing = unlike(run(make, world), run(make, world, ask_every=every))
-        require(not differing, f"asking after every {every} steps changes {', '.join(differing)}")
+        require(
+            not differing,
+            f"asking after every {every} steps changes {', '.join(differing)}",
+        )
 
 
 def live_agrees_with_replay(make: MakeEstimator) -> None:
@@ -320,8 +418,14 @@ def live_agrees_with_replay(make: MakeEstimator) -> None:
     world = aided_world()
     windows, live = run(make, world), run(make, world, every_stamp(world))
     mean, covariance = deviation(windows, live)
-    require(mean < LIVE_SIGMAS, f"cut row by row the estimate moves by {mean:.2f} of its standard deviation")
-    require(covariance < LIVE_COVARIANCE, f"cut row by row the covariance changes by {covariance:.0%}")
+    require(
+        mean < LIVE_SIGMAS,
+        f"cut row by row the estimate moves by {mean:.2f} of its standard deviation",
+    )
+    require(
+        covariance < LIVE_COVARIANCE,
+        f"cut row by row the covariance changes by {covariance:.0%}",
+    )
 
 
 def live_equals_replay(make: MakeEstimator) -> None:
@@ -335,9 +439,13 @@ def input_stays_as_it_was(make: MakeEstimator) -> None:
     """No array of the measurements is written to."""
     world, untouched = aided_world(), aided_world()
     run(make, world)
-    for block, before in zip(world.blocks().values(), untouched.blocks().values(), strict=True):
+    for block, before in zip(
+        world.blocks().values(), untouched.blocks().values(), strict=True
+    ):
         for field in fields(block):
-            same = np.array_equal(getattr(block, field.name), getattr(before, field.name), equal_nan=True)
+            same = np.array_equal(
+                getattr(block, field.name), getattr(before, field.name), equal_nan=True
+            )
             require(same, f"{type(block).__name__}.{field.name} was changed")
 
 
@@ -348,9 +456,13 @@ def still_vehicle_stays_still(make: MakeEstimator) -> None:
     for estimate in estimates:
         moved = start.between(estimate.world_T_body)
         drift_m = float(np.linalg.norm(moved.translation()))
-        turn_rad = float(np.linalg.norm(Rotation.from_matrix(moved.rotation().matrix()).as_rotvec()))
+        turn_rad = float(
+            np.linalg.norm(Rotation.from_matrix(moved.rotation().matrix()).as_rotvec())
+        )
         require(drift_m < STILL_DRIFT_M, f"a still vehicle drifts by {drift_m:.3f} m")
-        require(turn_rad < STILL_TURN_RAD, f"a still vehicle turns by {turn_rad:.4f} rad")
+        require(
+            turn_rad < STILL_TURN_RAD, f"a still vehicle turns by {turn_rad:.4f} rad"
+        )
 
 
 FILTER_CHECKS: tuple[Check, ...] = (live_equals_replay,)

@@ -12,7 +12,11 @@ from sonar_graph.measurements import Floats
 
 
 def central_differences(
-    function: Callable[[Floats], ArrayLike], at: ArrayLike, *, angles: Sequence[int] = (), step: float = 1e-5
+    function: Callable[[Floats], ArrayLike],
+    at: ArrayLike,
+    *,
+    angles: Sequence[int] = (),
+    step: float = 1e-5,
 ) -> Floats:
     """Derivative by differences, ``(f(x + step u_k) - f(x - step u_k)) / (2 step)`` along the last axis.
 
@@ -20,7 +24,11 @@ def central_differences(
     """
     x, columns = np.asarray(at, np.float64), []
     for direction in np.eye(len(x)):
-        change = np.subtract(function(x + step * direction), function(x - step * direction), dtype=np.float64)
+        change = np.subtract(
+            function(x + step * direction),
+            function(x - step * direction),
+            dtype=np.float64,
+        )
         for row in angles:
             change[row] = math.remainder(change[row], 2 * math.pi)
         columns.append(change / (2 * step))
@@ -73,13 +81,20 @@ def check_derivative(
         ...
     AssertionError: derivative of row 1 by direction 0: stated 0.16, by differences -0.16
     """
-    stated, numeric = np.asarray(jacobian, np.float64), central_differences(function, at, angles=angles, step=step)
+    stated, numeric = (
+        np.asarray(jacobian, np.float64),
+        central_differences(function, at, angles=angles, step=step),
+    )
     if stated.shape != numeric.shape:
-        raise ValueError(f"expected a Jacobian of shape {numeric.shape}, not {stated.shape}")
+        raise ValueError(
+            f"expected a Jacobian of shape {numeric.shape}, not {stated.shape}"
+        )
     largest = np.fmax(np.abs(stated), np.abs(numeric)).max(axis=-1, keepdims=True)
     off = np.abs(stated - numeric) / np.fmax(1.0, largest)
     if not off.max() <= tolerance:
-        *row, k = place = np.unravel_index(int(np.argmax(np.where(np.isnan(off), np.inf, off))), off.shape)
+        *row, k = place = np.unravel_index(
+            int(np.argmax(np.where(np.isnan(off), np.inf, off))), off.shape
+        )
         raise AssertionError(
             f"derivative of row {', '.join(map(str, row)) or 0} by direction {k}:"
             f" stated {stated[tuple(place)]:.9g}, by differences {numeric[tuple(place)]:.9g}"
@@ -87,7 +102,11 @@ def check_derivative(
 
 
 def check_jacobians(
-    factor: gtsam.NoiseModelFactor, values: gtsam.Values, *, step: float = 1e-5, tolerance: float = 1e-5
+    factor: gtsam.NoiseModelFactor,
+    values: gtsam.Values,
+    *,
+    step: float = 1e-5,
+    tolerance: float = 1e-5,
 ) -> None:
     """Compare the Jacobians of a factor with central differences of its error, by `check_derivative`.
 
@@ -127,13 +146,22 @@ def check_jacobians(
     >>> check_jacobians(factor, values)
     """
     noise = factor.noiseModel()
-    if not isinstance(noise, gtsam.noiseModel.Gaussian) or isinstance(noise, gtsam.noiseModel.Constrained):
-        advice = "; leave out its kernel" if isinstance(noise, gtsam.noiseModel.Robust) else ""
-        raise TypeError(f"expected a factor with a Gaussian noise model, not {type(noise).__name__}{advice}")
+    if not isinstance(noise, gtsam.noiseModel.Gaussian) or isinstance(
+        noise, gtsam.noiseModel.Constrained
+    ):
+        advice = (
+            "; leave out its kernel"
+            if isinstance(noise, gtsam.noiseModel.Robust)
+            else ""
+        )
+        raise TypeError(
+            f"expected a factor with a Gaussian noise model, not {type(noise).__name__}{advice}"
+        )
     if len(set(factor.keys())) < len(factor.keys()):
         raise ValueError("expected a factor of different variables; one is named twice")
     whitened = np.asarray(factor.linearize(values).jacobian()[0])
-    jacobians = np.linalg.solve(np.asarray(noise.R()), whitened)  # linearize gives R J, R^T R the information
+    # linearize gives R J, R^T R the information
+    jacobians = np.linalg.solve(np.asarray(noise.R()), whitened)
     zeros, column = values.zeroVectors(), 0
     for key in factor.keys():  # noqa: SIM118  # no dictionary
 
@@ -147,7 +175,9 @@ def check_jacobians(
             stated = jacobians[:, column : column + len(zero)]
             check_derivative(error_after, stated, zero, step=step, tolerance=tolerance)
         except AssertionError as error:
-            raise AssertionError(f"variable {gtsam.DefaultKeyFormatter(key)}: {error}") from None
+            raise AssertionError(
+                f"variable {gtsam.DefaultKeyFormatter(key)}: {error}"
+            ) from None
         column += len(zero)
 
 
@@ -188,12 +218,18 @@ def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> 
     """
     squares: Floats = np.asarray(nees, np.float64)
     if squares.ndim != 1 or dof < 1:
-        raise ValueError(f"expected NEES of shape (n,) and dof >= 1, not {squares.shape} and {dof}")
+        raise ValueError(
+            f"expected NEES of shape (n,) and dof >= 1, not {squares.shape} and {dof}"
+        )
     impossible = squares[~(np.isfinite(squares) & (squares >= 0))]
     if not len(squares) or len(impossible):
-        raise AssertionError(f"expected finite NEES of at least 0, not {impossible.tolist() or 'none'}")
+        raise AssertionError(
+            f"expected finite NEES of at least 0, not {impossible.tolist() or 'none'}"
+        )
     total_dof = len(squares) * dof
-    lowest, highest = (float(bound) / total_dof for bound in chi2.interval(confidence, total_dof))
+    lowest, highest = (
+        float(bound) / total_dof for bound in chi2.interval(confidence, total_dof)
+    )
     mean = float(squares.mean() / dof)
     if not lowest <= mean <= highest:
         side, sizes = ("below", "large") if mean < lowest else ("above", "small")

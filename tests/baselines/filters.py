@@ -32,7 +32,10 @@ CALIBRATION = Calibration(
     positions=PositionCalibration(antenna_m=tuple(ANTENNA)),
 )
 NOISE = np.diag([0.02**2, 0.01**2])
-BODY_M, LANDMARKS = np.array([1.0, -2.0, 0.5]), np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]])
+BODY_M, LANDMARKS = (
+    np.array([1.0, -2.0, 0.5]),
+    np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]]),
+)
 BIAS = np.array([1e-3, -2e-3, 3e-3, 2e-3, 1e-3, -3e-3, 0.02, 0.01, -0.03, 0.04, 0.0])
 D_BIAS, NOTHING = np.random.default_rng(11).normal(size=(6, 3)), np.zeros(6)
 TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
@@ -43,7 +46,11 @@ def triples(*parts: Any) -> Any:
     return st.builds(lambda *v: np.array(v), *parts)
 
 
-half_turn = st.builds(lambda off, side: side * (np.pi - off), st.floats(0.0, 1e-3), st.sampled_from([-1, 1]))
+half_turn = st.builds(
+    lambda off, side: side * (np.pi - off),
+    st.floats(0.0, 1e-3),
+    st.sampled_from([-1, 1]),
+)
 tiny = st.floats(-1e-7, 1e-7)
 attitudes = st.one_of(
     triples(st.floats(-3.1, 3.1), st.floats(-1.3, 1.3), st.floats(-3.1, 3.1)),
@@ -52,7 +59,9 @@ attitudes = st.one_of(
 )
 """Roll, pitch and yaw: random, near the identity, and about half a turn."""
 twists = triples(*[st.floats(-0.5, 0.5)] * 6)
-views = triples(st.floats(1.0, 10.0), st.floats(-math.pi, math.pi), st.floats(-0.8, 0.8))
+views = triples(
+    st.floats(1.0, 10.0), st.floats(-math.pi, math.pi), st.floats(-0.8, 0.8)
+)
 
 
 def rotation(vector: Floats) -> Floats:
@@ -69,7 +78,11 @@ class World(NamedTuple):
 
 
 def world_at(angles: Any, landmarks: Any = LANDMARKS) -> World:
-    return World(gtsam.Rot3.RzRyRx(np.array(angles)).matrix(), BODY_M, np.reshape(landmarks, (-1, 3)))
+    return World(
+        gtsam.Rot3.RzRyRx(np.array(angles)).matrix(),
+        BODY_M,
+        np.reshape(landmarks, (-1, 3)),
+    )
 
 
 def motion_of(twist: Floats, C: Floats = MOTION_COV, D: Floats = D_BIAS) -> Motion:
@@ -93,7 +106,9 @@ def pose_after(world: World, motion: Motion, eps: Floats = NOTHING) -> gtsam.Pos
     rho = motion.D[3:] @ (tilting + up_i * (up_i @ (turning - tilting)))
     rho -= scale * motion.dR.T @ (motion.dp - up_i * (up_i @ motion.dp))
     eps = eps + np.concatenate([theta, rho])
-    i_T_j = gtsam.Pose3(gtsam.Rot3(motion.dR @ rotation(eps[:3])), motion.dp + motion.dR @ eps[3:])
+    i_T_j = gtsam.Pose3(
+        gtsam.Rot3(motion.dR @ rotation(eps[:3])), motion.dp + motion.dR @ eps[3:]
+    )
     return gtsam.Pose3(gtsam.Rot3(world.R), world.X).compose(i_T_j)
 
 
@@ -119,14 +134,23 @@ class Ekf:
 
     @staticmethod
     def begin(slam: Any, world: World, P: Floats) -> None:
-        slam._x = np.concatenate([world.X, gtsam.Rot3(world.R).rpy(), world.bias[9:10], world.landmarks.ravel()])
+        slam._x = np.concatenate(
+            [
+                world.X,
+                gtsam.Rot3(world.R).rpy(),
+                world.bias[9:10],
+                world.landmarks.ravel(),
+            ]
+        )
         slam._P = P.copy()
 
     @staticmethod
     def estimate(slam: Any) -> tuple[World, Floats]:
         _, x, P = slam.state()
         bias = np.concatenate([BIAS[:9], x[6:7], BIAS[10:]])
-        return World(gtsam.Rot3.RzRyRx(x[3:6]).matrix(), x[:3], x[7:].reshape(-1, 3), bias), P
+        return World(
+            gtsam.Rot3.RzRyRx(x[3:6]).matrix(), x[:3], x[7:].reshape(-1, 3), bias
+        ), P
 
     @staticmethod
     def moved(world: World, xi: Floats) -> World:
@@ -140,7 +164,14 @@ class Ekf:
         turn = gtsam.Rot3(true.R).rpy() - gtsam.Rot3(estimate.R).rpy()
         turn = [math.remainder(angle, 2 * math.pi) for angle in turn]
         compass = (true.bias - estimate.bias)[9:10]
-        return np.concatenate([true.X - estimate.X, turn, compass, (true.landmarks - estimate.landmarks).ravel()])
+        return np.concatenate(
+            [
+                true.X - estimate.X,
+                turn,
+                compass,
+                (true.landmarks - estimate.landmarks).ravel(),
+            ]
+        )
 
 
 class Invariant:
@@ -155,7 +186,14 @@ class Invariant:
     @staticmethod
     def state(world: World, P: Floats) -> InvariantState:
         points = np.vstack([world.X, world.landmarks])
-        return InvariantState(world.R.copy(), points, world.bias.copy(), P.copy(), np.zeros(3), is_level=True)
+        return InvariantState(
+            world.R.copy(),
+            points,
+            world.bias.copy(),
+            P.copy(),
+            np.zeros(3),
+            is_level=True,
+        )
 
     @staticmethod
     def estimate(slam: Any) -> tuple[World, Floats]:
@@ -177,12 +215,25 @@ class Invariant:
     def error(true: World, estimate: World) -> Floats:
         """First-order xi of a world close to an estimate: the logarithm's chord is left out."""
         turn = true.R @ estimate.R.T
-        theta = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+        theta = (
+            np.array(
+                [
+                    turn[2, 1] - turn[1, 2],
+                    turn[0, 2] - turn[2, 0],
+                    turn[1, 0] - turn[0, 1],
+                ]
+            )
+            / 2
+        )
         shifts = [np.vstack([world.X, world.landmarks]) for world in (true, estimate)]
-        return np.concatenate([theta, true.bias - estimate.bias, (shifts[0] - shifts[1] @ turn.T).ravel()])
+        return np.concatenate(
+            [theta, true.bias - estimate.bias, (shifts[0] - shifts[1] @ turn.T).ravel()]
+        )
 
 
-both = pytest.mark.parametrize("filter_", [Ekf, Invariant], ids=["ekf-slam", "invariant-ekf"])
+both = pytest.mark.parametrize(
+    "filter_", [Ekf, Invariant], ids=["ekf-slam", "invariant-ekf"]
+)
 
 
 def begun(

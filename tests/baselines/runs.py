@@ -19,7 +19,16 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Heading, Imu, LandmarkDetections, Measurements, PositionFixes
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Depth,
+    Dvl,
+    Heading,
+    Imu,
+    LandmarkDetections,
+    Measurements,
+    PositionFixes,
+)
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
@@ -36,7 +45,12 @@ STANDARD_FORCE = np.array([0.0, 0.0, 9.80665])
 NO_FORCE = (math.nan,) * 3
 
 
-NAMES = {DeadReckoning: "dead-reckoning", EkfSlam: "ekf-slam", InvariantEkf: "invariant-ekf", Isam2: "isam2"}
+NAMES = {
+    DeadReckoning: "dead-reckoning",
+    EkfSlam: "ekf-slam",
+    InvariantEkf: "invariant-ekf",
+    Isam2: "isam2",
+}
 
 
 def for_estimators(*kinds):
@@ -63,23 +77,43 @@ def later(*seconds):
 
 def imu(seconds, rate=(0.0, 0.0, 0.0), force=STANDARD_FORCE, rate_hz=50):
     t = later(*np.arange(round(seconds * rate_hz) + 1) / rate_hz)
-    return Imu(t, np.broadcast_to(rate, (len(t), 3)), np.broadcast_to(force, (len(t), 3)))
+    return Imu(
+        t, np.broadcast_to(rate, (len(t), 3)), np.broadcast_to(force, (len(t), 3))
+    )
 
 
 def dvl(seconds, velocity=(0.0, 0.0, 0.0), rate_hz=5):
     t = later(*np.arange(round(seconds * rate_hz) + 1) / rate_hz)
-    return Dvl(t, np.broadcast_to(np.asarray(velocity, float), (len(t), 3)), np.full((len(t), 3, 3), np.nan))
+    return Dvl(
+        t,
+        np.broadcast_to(np.asarray(velocity, float), (len(t), 3)),
+        np.full((len(t), 3, 3), np.nan),
+    )
 
 
 def depths(stamps_ns, z_m, variance_m2=math.nan):
-    return Depth(stamps_ns, np.full(len(stamps_ns), z_m), np.full(len(stamps_ns), variance_m2))
+    return Depth(
+        stamps_ns, np.full(len(stamps_ns), z_m), np.full(len(stamps_ns), variance_m2)
+    )
 
 
 def seen(stamps_ns, range_m=2.0, azimuth_rad=0.1, landmark=3, probability=1.0):
     shape = np.shape(stamps_ns)
-    rows = [np.broadcast_to(np.asarray(values, float), shape) for values in (range_m, azimuth_rad)]
-    ids, probabilities = np.full((*shape, 1), landmark), np.full((*shape, 1), probability)
-    return LandmarkDetections(np.asarray(stamps_ns), *rows, np.full((*shape, 2, 2), np.nan), ids, probabilities)
+    rows = [
+        np.broadcast_to(np.asarray(values, float), shape)
+        for values in (range_m, azimuth_rad)
+    ]
+    ids, probabilities = (
+        np.full((*shape, 1), landmark),
+        np.full((*shape, 1), probability),
+    )
+    return LandmarkDetections(
+        np.asarray(stamps_ns),
+        *rows,
+        np.full((*shape, 2, 2), np.nan),
+        ids,
+        probabilities,
+    )
 
 
 def begun(kind, calibration, **params):
@@ -120,7 +154,10 @@ CIRCLE_S, CIRCLE_START = 20, Start(position_m=(1.0, 2.0, -3.0), rpy_rad=(0.0, 0.
 def circle_calibration(**imu_noise):
     return Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-3, **imu_noise),
-        dvl=DvlCalibration(velocity_sigma_m_s=(0.02, 0.02, 0.02), mounting=Mounting(translation_m=tuple(LEVER))),
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=(0.02, 0.02, 0.02),
+            mounting=Mounting(translation_m=tuple(LEVER)),
+        ),
         start=CIRCLE_START,
     )
 
@@ -145,16 +182,27 @@ def in_a_gap(depth=None, detections=None):
         start=Start(position_sigma_m=(1.0, 1.0, 1.0)),
         sonar=SonarCalibration(range_sigma_m=0.001, azimuth_sigma_rad=0.001),
     )
-    rows = doppler.rows((seconds <= 2.0) | ((seconds >= 12.0) & (seconds <= 14.0)) | (seconds >= 24.0))
-    return Sequence("gap", calibration, imu(25, force=NO_FORCE), rows, depth, detections)
+    rows = doppler.rows(
+        (seconds <= 2.0) | ((seconds >= 12.0) & (seconds <= 14.0)) | (seconds >= 24.0)
+    )
+    return Sequence(
+        "gap", calibration, imu(25, force=NO_FORCE), rows, depth, detections
+    )
 
 
 def aided(mission):
     """The mission with headings and fixes at stamps of depths and a little later; some rows are unsound."""
     depth_ns = mission.depth.stamps_ns[1:-1]
-    heading_ns, fixes_ns = (np.sort(np.append(depth_ns[::n], depth_ns[::n] + 1_000_000)) for n in (3, 7))
+    heading_ns, fixes_ns = (
+        np.sort(np.append(depth_ns[::n], depth_ns[::n] + 1_000_000)) for n in (3, 7)
+    )
     yaw_rad = mission.truth.at(heading_ns).rotations().as_euler("ZYX")[:, 0]
-    sigma_rad, covs = np.full(len(yaw_rad), math.nan), np.full((len(fixes_ns), 3, 3), math.nan)
+    sigma_rad, covs = (
+        np.full(len(yaw_rad), math.nan),
+        np.full((len(fixes_ns), 3, 3), math.nan),
+    )
     sigma_rad[5::10], covs[3::10] = -1.0, -np.eye(3)
     fixes = PositionFixes(fixes_ns, mission.truth.at(fixes_ns).positions + 1.0, covs)
-    return replace(mission, heading=Heading(heading_ns, yaw_rad + 0.03, sigma_rad), positions=fixes)
+    return replace(
+        mission, heading=Heading(heading_ns, yaw_rad + 0.03, sigma_rad), positions=fixes
+    )

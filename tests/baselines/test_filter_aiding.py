@@ -36,7 +36,11 @@ def test_aiding_of_huge_noise_tells_nothing_and_less_of_it_more(mission, kind, s
         n, runs = len(block), mission
         if sigma is not None:
             covs = np.tile(sigma**2 * np.eye(3), (n, 1, 1))
-            noise = {"sigma_rad": covs[:, 0, 0] ** 0.5} if sensor == "heading" else {"covariance_m2": covs}
+            noise = (
+                {"sigma_rad": covs[:, 0, 0] ** 0.5}
+                if sensor == "heading"
+                else {"covariance_m2": covs}
+            )
             runs = replace(mission, **{sensor: replace(block, **noise)})
         states.append(run(kind, runs).trajectory())
     for poses in ("positions", "covariances"):
@@ -49,7 +53,9 @@ def test_aiding_of_huge_noise_tells_nothing_and_less_of_it_more(mission, kind, s
 def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind):
     """Ten fixes at 9 s of a gap tell of the start rather less than an exact one; a heading is as good as elsewhere."""
     fixes_ns, unknown = later(*np.linspace(9.0, 9.9, 10)), np.full((10, 3, 3), math.nan)
-    fixes = PositionFixes(fixes_ns, np.zeros((10, 3)), np.where(np.isnan(unknown), 1e-8 * np.eye(3), 0.0))
+    fixes = PositionFixes(
+        fixes_ns, np.zeros((10, 3)), np.where(np.isnan(unknown), 1e-8 * np.eye(3), 0.0)
+    )
     sequence = replace(in_a_gap(), positions=fixes)
     slam = begun(kind, sequence.calibration)
     for window in sequence.replay(later(8.0, 9.95)):
@@ -58,20 +64,36 @@ def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind):
     assert 1 / (1 + 1 / walked) < height_and_tilt(slam)[1] < 0.9
 
 
-def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(monkeypatch):
+def test_a_late_fix_has_the_motion_backwards_with_its_covariance_and_derivative(
+    monkeypatch,
+):
     """By differences of the inverse; it is asked for with the attitude at its start, that of the fix."""
     told, (gyro, doppler), nothing = [], circle(), np.zeros(6)
-    monkeypatch.setattr(EkfSlam, "update_position", lambda _, motion, *__: told.append(motion) or 0.0)
-    slam, end_ns, fix_ns = begun(EkfSlam, circle_calibration()), later(10.0), later(6.03)
-    slam.process(Measurements(end_ns, gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)))
+    monkeypatch.setattr(
+        EkfSlam, "update_position", lambda _, motion, *__: told.append(motion) or 0.0
+    )
+    slam, end_ns, fix_ns = (
+        begun(EkfSlam, circle_calibration()),
+        later(10.0),
+        later(6.03),
+    )
+    slam.process(
+        Measurements(
+            end_ns, gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)
+        )
+    )
     late = PositionFixes(np.array([fix_ns]), np.zeros((1, 3)), np.eye(3)[None])
     asked, motion = [], slam.odometry.motion
-    monkeypatch.setattr(slam.odometry, "motion", lambda *of: asked.append(of[3]) or motion(*of))
+    monkeypatch.setattr(
+        slam.odometry, "motion", lambda *of: asked.append(of[3]) or motion(*of)
+    )
     slam.process(Measurements(end_ns, positions=late))
     monkeypatch.undo()
     forth, (back,) = slam.odometry.motion(fix_ns, slam.node_ns, np.zeros(3)), told
     inverse = forth.i_T_j.inverse()
-    assert_allclose(asked[-1] @ forth.i_T_j.rotation().matrix(), slam.attitude(), atol=1e-9)
+    assert_allclose(
+        asked[-1] @ forth.i_T_j.rotation().matrix(), slam.attitude(), atol=1e-9
+    )
     assert_allclose(back.dR, inverse.rotation().matrix(), atol=1e-12)
     assert_allclose(back.dp, inverse.translation(), atol=1e-12)
     moved = lambda eps: inverse.localCoordinates(forth.i_T_j.retract(eps).inverse())  # noqa: E731
@@ -91,19 +113,36 @@ def on_a_winding_way(kind, *cuts):
     """
     gyro, doppler = circle(seconds=65)
     wave = np.cos(0.1 * (gyro.stamps_ns[:, None] - T0_NS) * 1e-9)
-    gyro = replace(gyro, angular_velocity=gyro.angular_velocity * wave + GYRO_BIAS * (kind is InvariantEkf))
+    gyro = replace(
+        gyro,
+        angular_velocity=gyro.angular_velocity * wave
+        + GYRO_BIAS * (kind is InvariantEkf),
+    )
     doppler = replace(doppler, velocity=doppler.velocity * (1.0 + 0.3 * wave[::10]))
     slam, before_ns = begun(kind, circle_calibration()), T0_NS - 1
     for end_ns in (later(cut) for cut in cuts):
-        slam.process(Measurements(end_ns, gyro.between(before_ns, end_ns), doppler.between(before_ns, end_ns)))
+        slam.process(
+            Measurements(
+                end_ns,
+                gyro.between(before_ns, end_ns),
+                doppler.between(before_ns, end_ns),
+            )
+        )
         before_ns = end_ns
         if kind is InvariantEkf:
             slam._state.bias[:6] = np.tile(GYRO_BIAS, 2)
-    return slam, (gyro.between(before_ns, later(65.0)), doppler.between(before_ns, later(65.0)))
+    return slam, (
+        gyro.between(before_ns, later(65.0)),
+        doppler.between(before_ns, later(65.0)),
+    )
 
 
 def fix_at(second, position_m, sigma_m=0.01):
-    return PositionFixes(np.array([later(second)]), np.reshape(position_m, (1, 3)), sigma_m**2 * np.eye(3)[None])
+    return PositionFixes(
+        np.array([later(second)]),
+        np.reshape(position_m, (1, 3)),
+        sigma_m**2 * np.eye(3)[None],
+    )
 
 
 def means_and_covariance(slam):
@@ -116,7 +155,9 @@ def means_and_covariance(slam):
 
 @slam_filters
 @pytest.mark.parametrize("late_s", [6.03, 9.93])
-def test_a_late_fix_where_the_filter_said_that_it_was_moves_nothing_but_tells(kind, late_s):
+def test_a_late_fix_where_the_filter_said_that_it_was_moves_nothing_but_tells(
+    kind, late_s
+):
     """Before the newest epoch, at 9.8 s, and after it; with a gyro bias in the state, where there is one."""
     slam, _ = on_a_winding_way(kind, 1.0, late_s, 9.95)
     assert slam.node_ns == later(9.8)
@@ -127,7 +168,9 @@ def assert_moved_by_a_late_fix(slam, late_s, now_s, *, is_used):
     """A fix where the filter said that it was leaves the means, and makes the covariance less where it is used."""
     said, (mean, P) = slam.trajectory(), means_and_covariance(slam)
     (then,) = np.flatnonzero(said.stamps_ns == later(late_s))
-    slam.process(Measurements(later(now_s), positions=fix_at(late_s, said.positions[then])))
+    slam.process(
+        Measurements(later(now_s), positions=fix_at(late_s, said.positions[then]))
+    )
     mean_after, P_after = means_and_covariance(slam)
     assert [row.reason for row in slam.refused_rows()] == [Refusal.LATE] * (not is_used)
     assert_allclose(mean_after, mean, atol=1e-4 if is_used else 0.0)
@@ -152,8 +195,12 @@ def test_a_late_fix_counts_the_same_alone_as_with_rows_of_later(kind):
 
 
 @slam_filters
-@pytest.mark.parametrize(("age_s", "is_used"), [(20.0, True), (20.5, False), (35.0, False)])
-def test_a_fix_counts_up_to_twenty_seconds_late_however_long_the_run(kind, age_s, is_used):
+@pytest.mark.parametrize(
+    ("age_s", "is_used"), [(20.0, True), (20.5, False), (35.0, False)]
+)
+def test_a_fix_counts_up_to_twenty_seconds_late_however_long_the_run(
+    kind, age_s, is_used
+):
     """As far back as rows are kept, however many of an older time still are; an older one is refused by name."""
     now_s = 61.5  # rows were just dropped
     slam, _ = on_a_winding_way(kind, *np.arange(0.5, now_s + 0.1, 0.5))

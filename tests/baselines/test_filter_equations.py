@@ -46,8 +46,14 @@ INVARIANT_XI, UP = np.zeros(23), np.array([0.0, 0.0, 1.0])
 def numerical(function, filter_, world, angles=()):
     """Derivatives of a function of world and motion's perturbation, by both."""
     n = filter_.bare + world.landmarks.size
-    by_world = central_differences(lambda xi: function(filter_.moved(world, xi), NOTHING), np.zeros(n), angles=angles)
-    return by_world, central_differences(lambda eps: function(world, eps), NOTHING, angles=angles)
+    by_world = central_differences(
+        lambda xi: function(filter_.moved(world, xi), NOTHING),
+        np.zeros(n),
+        angles=angles,
+    )
+    return by_world, central_differences(
+        lambda eps: function(world, eps), NOTHING, angles=angles
+    )
 
 
 def assert_covariance(actual, expected):
@@ -61,17 +67,25 @@ def assert_corrected(filter_, slam, world, P, H, R, e):
     K = P @ H.T @ np.linalg.inv(S)
     I_KH = np.eye(len(P)) - K @ H
     estimate, covariance = filter_.estimate(slam)
-    assert_allclose(filter_.error(estimate, filter_.moved(world, K @ e)), 0.0, atol=1e-7)
+    assert_allclose(
+        filter_.error(estimate, filter_.moved(world, K @ e)), 0.0, atol=1e-7
+    )
     assert_covariance(covariance, I_KH @ P @ I_KH.T + K @ R @ K.T)
 
 
 @both
 @given(attitudes, twists)
-def test_prediction_has_the_numerical_covariance_of_state_and_motion(filter_, angles, twist):
+def test_prediction_has_the_numerical_covariance_of_state_and_motion(
+    filter_, angles, twist
+):
     world, motion = world_at(angles), motion_of(twist, C)
     assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
     expected, slam = carried(world, motion), begun(filter_, world)
-    F, J = numerical(lambda true, eps: filter_.error(carried(true, motion, eps), expected), filter_, world)
+    F, J = numerical(
+        lambda true, eps: filter_.error(carried(true, motion, eps), expected),
+        filter_,
+        world,
+    )
     _, P = filter_.estimate(slam)
     slam.predict(motion, 0.0)
     after, covariance = filter_.estimate(slam)
@@ -81,7 +95,9 @@ def test_prediction_has_the_numerical_covariance_of_state_and_motion(filter_, an
 
 @both
 @given(attitudes, twists)
-def test_pose_and_landmarks_have_the_numerical_covariance_of_the_contract(filter_, angles, twist):
+def test_pose_and_landmarks_have_the_numerical_covariance_of_the_contract(
+    filter_, angles, twist
+):
     """The pose in the body's own perturbation, a landmark in the world's axes."""
     world, motion = world_at(angles), motion_of(twist, C)
     slam, expected = begun(filter_, world), pose_after(world, motion)
@@ -89,10 +105,16 @@ def test_pose_and_landmarks_have_the_numerical_covariance_of_the_contract(filter
     R, X, cov = slam.pose_after(motion)
     assert_allclose(R, expected.rotation().matrix(), atol=1e-12)
     assert_allclose(X, expected.translation(), atol=1e-12)
-    T, T_m = numerical(lambda true, eps: expected.localCoordinates(pose_after(true, motion, eps)), filter_, world)
+    T, T_m = numerical(
+        lambda true, eps: expected.localCoordinates(pose_after(true, motion, eps)),
+        filter_,
+        world,
+    )
     assert_covariance(cov, T @ P @ T.T + T_m @ C @ T_m.T)
     for slot, at in enumerate(LANDMARKS):
-        G, _ = numerical(lambda true, _, slot=slot: true.landmarks[slot], filter_, world)
+        G, _ = numerical(
+            lambda true, _, slot=slot: true.landmarks[slot], filter_, world
+        )
         position, covariance = slam.landmark(slot)
         assert_array_equal(position, at)
         assert_covariance(covariance, G @ P @ G.T)
@@ -106,14 +128,25 @@ def in_view(angles, motion, view):
 
 @both
 @given(attitudes, twists, views)
-def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, angles, twist, view):
+def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(
+    filter_, angles, twist, view
+):
     """With numerical derivatives; the log's noise is correlated."""
-    motion, e, R_z = motion_of(twist, C), np.array([0.01, -0.005]), np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
+    motion, e, R_z = (
+        motion_of(twist, C),
+        np.array([0.01, -0.005]),
+        np.array([[4e-4, 1e-4], [1e-4, 1e-4]]),
+    )
     world = in_view(angles, motion, view)
     slam = begun(filter_, world, gate=1.0)
     _, P = filter_.estimate(slam)
     H, H_m = numerical(
-        lambda true, eps: range_azimuth(sonar_after(true, motion, eps), true.landmarks[1]), filter_, world, [1]
+        lambda true, eps: range_azimuth(
+            sonar_after(true, motion, eps), true.landmarks[1]
+        ),
+        filter_,
+        world,
+        [1],
     )
     outcome, innovation, S = slam.observe(motion, 1, view[:2] + e, R_z)
     assert outcome == USED
@@ -125,10 +158,15 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, 
     height = lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT)[2:]  # noqa: E731
     H, H_m = numerical(height, filter_, world)
     slam.update_depth(motion, height(world, NOTHING)[0] + 0.02, 3e-4)
-    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02]))
+    assert_corrected(
+        filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02])
+    )
 
     assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
-    compass = lambda true, eps: np.array([pose_after(true, motion, eps).rotation().yaw() + true.bias[9]])  # noqa: E731
+
+    def compass(true, eps):
+        return np.array([pose_after(true, motion, eps).rotation().yaw() + true.bias[9]])
+
     H, H_m = numerical(compass, filter_, world, [0])
     slam, e = begun(filter_, world), np.array([-0.01])
     slam.update_heading(motion, compass(world, NOTHING)[0] + e[0] - 2 * np.pi, 3e-4)
@@ -136,7 +174,11 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(filter_, 
 
     antenna = lambda true, eps: pose_after(true, motion, eps).transformFrom(ANTENNA)  # noqa: E731
     H, H_m = numerical(antenna, filter_, world)
-    slam, e, R_z = begun(filter_, world), np.array([0.01, -0.02, 0.03]), random_covariance(3, 0.05) + 1e-3 * np.eye(3)
+    slam, e, R_z = (
+        begun(filter_, world),
+        np.array([0.01, -0.02, 0.03]),
+        random_covariance(3, 0.05) + 1e-3 * np.eye(3),
+    )
     slam.update_position(motion, antenna(world, NOTHING) + e, R_z)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + R_z, e)
 
@@ -146,14 +188,25 @@ def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
     """Ten standard deviations S off, ``R`` is ``10 / 1.628 R``; 1.6 off it is R; k of a heading is 1.345."""
     world, R_z = world_at(ANGLES), np.diag([0.04, 0.09, 0.25])
     _, P = filter_.estimate(begun(filter_, world))
-    H, _ = numerical(lambda true, eps: pose_after(true, STILL, eps).transformFrom(ANTENNA), filter_, world)
+    H, _ = numerical(
+        lambda true, eps: pose_after(true, STILL, eps).transformFrom(ANTENNA),
+        filter_,
+        world,
+    )
     for deviations, times in ((1.6, 1.0), (10.0, 10.0 / 1.628)):
         slam, e = begun(filter_, world), np.zeros(3)
         e[0] = deviations / np.sqrt(np.linalg.inv(H @ P @ H.T + R_z)[0, 0])
-        slam.update_position(STILL, pose_after(world, STILL).transformFrom(ANTENNA) + e, R_z)
+        slam.update_position(
+            STILL, pose_after(world, STILL).transformFrom(ANTENNA) + e, R_z
+        )
         assert_corrected(filter_, slam, world, P, H, times * R_z, e)
     H, _ = numerical(
-        lambda true, eps: np.array([pose_after(true, STILL, eps).rotation().yaw() + true.bias[9]]), filter_, world, [0]
+        lambda true, eps: np.array(
+            [pose_after(true, STILL, eps).rotation().yaw() + true.bias[9]]
+        ),
+        filter_,
+        world,
+        [0],
     )
     S = (H @ P @ H.T).item() + 1e-4
     for deviations, times in ((1.3, 1.0), (5.0, 5.0 / 1.345)):
@@ -165,7 +218,9 @@ def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
 
 @both
 @given(attitudes, twists, views)
-def test_a_new_landmark_has_the_numerical_covariance_and_correlations(filter_, angles, twist, view):
+def test_a_new_landmark_has_the_numerical_covariance_and_correlations(
+    filter_, angles, twist, view
+):
     world, motion = world_at(angles), motion_of(twist, C)
     slam, view = begun(filter_, world), view * [1.0, 1.0, 0.0]
 
@@ -174,8 +229,12 @@ def test_a_new_landmark_has_the_numerical_covariance_and_correlations(filter_, a
         return true._replace(landmarks=np.vstack([true.landmarks, point]))
 
     expected = located(world, NOTHING)
-    G, G_m = numerical(lambda true, eps: filter_.error(located(true, eps), expected), filter_, world)
-    G_z = central_differences(lambda off: filter_.error(located(world, NOTHING, off), expected), np.zeros(3))
+    G, G_m = numerical(
+        lambda true, eps: filter_.error(located(true, eps), expected), filter_, world
+    )
+    G_z = central_differences(
+        lambda off: filter_.error(located(world, NOTHING, off), expected), np.zeros(3)
+    )
     _, P = filter_.estimate(slam)
     slam.augment(motion, view[:2], NOISE)
     after, covariance = filter_.estimate(slam)
@@ -187,7 +246,10 @@ def test_a_new_landmark_has_the_numerical_covariance_and_correlations(filter_, a
 @both
 def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(filter_):
     """At the origin and level: ``1 / P' = 1 / P + 1 / R``, and the estimate moves by ``P / (P + R)``."""
-    start, depth = Start(rpy_sigma_rad=(0.1, 0.2, 0.3), position_sigma_m=(0.1, 0.2, 0.5)), DepthCalibration()
+    start, depth = (
+        Start(rpy_sigma_rad=(0.1, 0.2, 0.3), position_sigma_m=(0.1, 0.2, 0.5)),
+        DepthCalibration(),
+    )
     calibration = CALIBRATION.model_copy(update={"start": start, "depth": depth})
     roll, pitch, _, _, _, z = np.square((*start.rpy_sigma_rad, *start.position_sigma_m))
     still = motion_of(np.zeros(6), np.zeros((6, 6)), np.zeros((6, 3)))
@@ -203,12 +265,22 @@ def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates(f
     assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
     assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
-    rpy, _, variances = after(lambda slam: slam.update_up(np.array([0.0, 0.001, 1.0]), np.sqrt(0.05), np.eye(3)))
-    assert_allclose(variances[:2], [1 / (1 / roll + 20), 1 / (1 / pitch + 20)], rtol=1e-5)
+    rpy, _, variances = after(
+        lambda slam: slam.update_up(
+            np.array([0.0, 0.001, 1.0]), np.sqrt(0.05), np.eye(3)
+        )
+    )
+    assert_allclose(
+        variances[:2], [1 / (1 / roll + 20), 1 / (1 / pitch + 20)], rtol=1e-5
+    )
     assert rpy[0] == pytest.approx(0.001 * roll / (roll + 0.05), rel=1e-3)
     plane = PlanarMotion(z_m=0.02, z_sigma_m=np.sqrt(0.05), tilt_sigma_rad=0.1)
     _, X, variances = after(lambda slam: slam.update_plane(plane))
-    assert_allclose(variances[[0, 1, 5]], [1 / (1 / roll + 100), 1 / (1 / pitch + 100), 1 / (1 / z + 20)], rtol=1e-3)
+    assert_allclose(
+        variances[[0, 1, 5]],
+        [1 / (1 / roll + 100), 1 / (1 / pitch + 100), 1 / (1 / z + 20)],
+        rtol=1e-3,
+    )
     assert X[2] == pytest.approx(0.02 * z / (z + 0.05))
 
 
@@ -222,16 +294,27 @@ def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
 
 
 def test_roll_has_the_variance_of_the_tilt_over_the_squared_cosine_of_the_pitch():
-    roll, pitch, sigma, prior = 0.1, -0.9, 0.03, np.array([1e-2, 2e-2, 3e-2, 1e-3, 2e-3, 3e-3, 1.0])
-    up = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
+    roll, pitch, sigma, prior = (
+        0.1,
+        -0.9,
+        0.03,
+        np.array([1e-2, 2e-2, 3e-2, 1e-3, 2e-3, 3e-3, 1.0]),
+    )
+    up = np.array(
+        [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
+    )
     slam = begun(Ekf, world_at([0.05, -0.88, 0.3], []), np.diag(prior))
     _, before, _ = slam.state()
     slam.update_up(up, sigma, np.eye(3))
     _, x, P = slam.state()
     R = np.array([(sigma / np.cos(pitch)) ** 2, sigma**2])
     gain = prior[3:5] / (prior[3:5] + R)
-    assert_allclose(x[3:5], before[3:5] + gain * ([roll, pitch] - before[3:5]), atol=1e-12)
-    assert_allclose(np.diag(P), [*prior[:3], *((1 - gain) * prior[3:5]), *prior[5:]], atol=1e-15)
+    assert_allclose(
+        x[3:5], before[3:5] + gain * ([roll, pitch] - before[3:5]), atol=1e-12
+    )
+    assert_allclose(
+        np.diag(P), [*prior[:3], *((1 - gain) * prior[3:5]), *prior[5:]], atol=1e-15
+    )
 
 
 # ---------------------------------------------------------------------------------------------- invariant filter
@@ -244,14 +327,22 @@ def test_an_error_moves_the_estimate_by_the_group_s_exponential(angles, turn):
     expected, state = Invariant.moved(world, xi), Invariant.state(world, np.eye(23))
     invariant_ekf.update(state, np.eye(23), xi, 1e-15 * np.eye(23))
     assert_allclose(state.R, expected.R, atol=1e-12)
-    assert_allclose(state.points, np.vstack([expected.X, expected.landmarks]), atol=1e-11)
+    assert_allclose(
+        state.points, np.vstack([expected.X, expected.landmarks]), atol=1e-11
+    )
     assert_allclose(state.bias, expected.bias, atol=1e-14)
 
 
 @given(attitudes)
-def test_the_direction_of_up_has_the_numerical_derivative_and_updates_as_the_textbook_s(angles):
+def test_the_direction_of_up_has_the_numerical_derivative_and_updates_as_the_textbook_s(
+    angles,
+):
     """With the bias of the accelerometers, by half a turn between both ends."""
-    world, i_R_j, e = world_at(angles), rotation(np.array([0.1, -0.2, 0.5])), np.array([0.01, -0.02])
+    world, i_R_j, e = (
+        world_at(angles),
+        rotation(np.array([0.1, -0.2, 0.5])),
+        np.array([0.01, -0.02]),
+    )
     A = 0.5 * (np.eye(3) + i_R_j.T) / CALIBRATION.gravity_m_s2
     slam = begun(Invariant, world)
     _, P = Invariant.estimate(slam)
@@ -268,9 +359,15 @@ def test_the_direction_of_up_has_the_numerical_derivative_and_updates_as_the_tex
 
 @both
 @given(attitudes, twists, views)
-def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(filter_, angles, twist, view):
+def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(
+    filter_, angles, twist, view
+):
     """By ``0 = g(x_v, z) - p``, which is compared where range and azimuth are not linear enough; turns cancel in it."""
-    motion, R_z, e = motion_of(twist, C), 1e-6 * np.eye(2), np.array([0.02, -0.01, 0.03])
+    motion, R_z, e = (
+        motion_of(twist, C),
+        1e-6 * np.eye(2),
+        np.array([0.02, -0.01, 0.03]),
+    )
     view = view * [1.0, 1.0, 0.0]
     where = locate(sonar_after(world_at(angles), motion), *view)
     world = world_at(angles, np.vstack([LANDMARKS[0], where - e]))
@@ -279,10 +376,16 @@ def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(filter_, angles, tw
 
     def seen(true, eps, off=np.zeros(3)):  # noqa: B008
         point = locate(sonar_after(true, motion, eps), *(view + off))
-        return filter_.error(true._replace(landmarks=point[None]), world._replace(landmarks=where[None]))[-3:]
+        return filter_.error(
+            true._replace(landmarks=point[None]), world._replace(landmarks=where[None])
+        )[-3:]
 
     def shift(true, eps):
-        turned = filter_.error(true, world)[-3:] if filter_ is Ekf else Invariant.error(true, world)[-3:]
+        turned = (
+            filter_.error(true, world)[-3:]
+            if filter_ is Ekf
+            else Invariant.error(true, world)[-3:]
+        )
         return turned - seen(true, eps)
 
     H, H_m = numerical(shift, filter_, world)
@@ -295,11 +398,21 @@ def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(filter_, angles, tw
 
 
 def test_the_bias_walks_where_there_is_one():
-    slam, motion, duration_s = begun(Invariant, world_at(ANGLES)), motion_of(np.zeros(6), np.zeros((6, 6))), 4.0
+    slam, motion, duration_s = (
+        begun(Invariant, world_at(ANGLES)),
+        motion_of(np.zeros(6), np.zeros((6, 6))),
+        4.0,
+    )
     before = slam.state()[1].P
-    walks = [CALIBRATION.imu.gyro_bias_walk_density] * 6 + [CALIBRATION.imu.accel_bias_walk_density] * 3 + [0.0] * 2
+    walks = (
+        [CALIBRATION.imu.gyro_bias_walk_density] * 6
+        + [CALIBRATION.imu.accel_bias_walk_density] * 3
+        + [0.0] * 2
+    )
     slam.predict(motion._replace(D=np.zeros((6, 3))), duration_s)
-    walked = np.diag([0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9)
+    walked = np.diag(
+        [0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9
+    )
     assert_allclose(slam.state()[1].P - before, walked, atol=1e-15)
 
 
@@ -307,11 +420,17 @@ def test_the_bias_walks_where_there_is_one():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_correction_by_many_numbers_is_joseph_s_and_exactly_symmetric(seed, m):
     rng, P, n = np.random.default_rng(seed), random_covariance(15, seed=seed), 15
-    H, root, e = rng.normal(size=(m, n)), 0.1 * rng.normal(size=(m, m)), 0.01 * rng.normal(size=m)
+    H, root, e = (
+        rng.normal(size=(m, n)),
+        0.1 * rng.normal(size=(m, m)),
+        0.01 * rng.normal(size=m),
+    )
     R = root @ root.T + 1e-3 * np.eye(m)
     after, K = P.copy(), P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     assert_allclose(correction(after, H, e, R), K @ e, atol=1e-12)
-    assert_covariance(after, (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T)
+    assert_covariance(
+        after, (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T
+    )
 
 
 def gauge(axes):
@@ -324,7 +443,9 @@ def gauge(axes):
 
 
 @given(attitudes, twists, views)
-def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angles, twist, view):
+def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(
+    angles, twist, view
+):
     """At any estimate, right or wrong: of ``P = N N^T`` prediction and updates leave all. Height and tilt are told."""
     motion = motion_of(twist, np.zeros((6, 6)))
     world, known = in_view(angles, motion, view), gauge(2) @ gauge(2).T
@@ -347,21 +468,35 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(angle
 
 @both
 @pytest.mark.parametrize("wander", [0.0, 0.1])
-def test_only_the_invariant_filter_leaves_three_directions_open_at_any_estimates(filter_, wander):
+def test_only_the_invariant_filter_leaves_three_directions_open_at_any_estimates(
+    filter_, wander
+):
     """The world's x, y and heading, over 12 steps with height, up direction and two landmarks at each.
 
     Rows H F ... F at estimates that are true, or as far off as corrections throw estimates about.
     """
-    rng, step, still = np.random.default_rng(1), motion_of([0.05, -0.03, 0.25, 0.5, 0.1, -0.05]), motion_of(NOTHING)
+    rng, step, still = (
+        np.random.default_rng(1),
+        motion_of([0.05, -0.03, 0.25, 0.5, 0.1, -0.05]),
+        motion_of(NOTHING),
+    )
     true = world_at([0.1, -0.2, 0.5])
     F, rows = np.eye(filter_.bare + LANDMARKS.size), []
     for _ in range(12):
         off = wander * rng.normal(size=(4, 3))
-        world = true._replace(R=rotation(off[0]) @ true.R, X=true.X + off[1], landmarks=LANDMARKS + off[2:])
+        world = true._replace(
+            R=rotation(off[0]) @ true.R,
+            X=true.X + off[1],
+            landmarks=LANDMARKS + off[2:],
+        )
 
         def told(world, _):
-            views = [range_azimuth(sonar_after(world, still), at) for at in world.landmarks]
-            return np.array([*np.concatenate(views), world.X[2], *world.R[2], *world.bias[6:10]])
+            views = [
+                range_azimuth(sonar_after(world, still), at) for at in world.landmarks
+            ]
+            return np.array(
+                [*np.concatenate(views), world.X[2], *world.R[2], *world.bias[6:10]]
+            )
 
         def carried_error(world, _, after=carried(world, step)):  # noqa: B008
             return filter_.error(carried(world, step), after)

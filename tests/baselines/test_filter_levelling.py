@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, ImuCalibration, PlanarMotion, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DepthCalibration,
+    DvlCalibration,
+    ImuCalibration,
+    PlanarMotion,
+    Start,
+)
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome, Refusal
@@ -34,7 +41,10 @@ from .runs import (
 def test_gravity_keeps_a_turning_vehicle_level(kind):
     """On a level circle, over many intervals of gravity; each is in the frame of its own start."""
     rate, speed = 0.5, 1.0
-    rows = imu(10, (0.0, 0.0, rate), (0.0, rate * speed, 9.80665)), dvl(10, (speed, 0.0, 0.0))
+    rows = (
+        imu(10, (0.0, 0.0, rate), (0.0, rate * speed, 9.80665)),
+        dvl(10, (speed, 0.0, 0.0)),
+    )
     level = Calibration(start=Start(rpy_sigma_rad=(0.1, 0.1, 0.1)))
     tilts = []
     for calibration in (level, level.model_copy(update={"use_gravity": False})):
@@ -52,10 +62,16 @@ def test_gravity_tells_roll_and_pitch_and_nothing_else_does(kind, is_felt):
     """Start level, lie tilted."""
     R = np.array(Start(rpy_rad=(0.1, -0.07, 0.0)).pose().rotation().matrix())
     rows = imu(20, force=R.T @ STANDARD_FORCE if is_felt else NO_FORCE), dvl(20)
-    estimate = estimate_after(kind, Calibration(start=Start(rpy_sigma_rad=(0.2, 0.2, 1e-3))), 20, *rows)
+    estimate = estimate_after(
+        kind, Calibration(start=Start(rpy_sigma_rad=(0.2, 0.2, 1e-3))), 20, *rows
+    )
     sigma = np.sqrt(np.diag(estimate.covariance)[:2])
     expected = [0.1, -0.07] if is_felt else [0.0, 0.0]
-    assert_allclose(estimate.world_T_body.rotation().rpy()[:2], expected, atol=1e-3 if is_felt else 1e-9)
+    assert_allclose(
+        estimate.world_T_body.rotation().rpy()[:2],
+        expected,
+        atol=1e-3 if is_felt else 1e-9,
+    )
     assert sigma.max() < 2.5e-3 if is_felt else sigma.min() > 0.19
 
 
@@ -66,30 +82,49 @@ def test_an_accelerating_vehicle_is_not_taken_for_a_tilted_one(kind):
     velocity = np.outer((doppler.stamps_ns - T0_NS) * 1e-9, [acceleration, 0.0, 0.0])
     force = STANDARD_FORCE + np.array([acceleration, 0.0, 0.0])
     rows = imu(seconds, force=force, rate_hz=100), replace(doppler, velocity=velocity)
-    estimate = estimate_after(kind, Calibration(start=Start(rpy_sigma_rad=(0.05, 0.05, 1e-3))), seconds, *rows)
+    estimate = estimate_after(
+        kind, Calibration(start=Start(rpy_sigma_rad=(0.05, 0.05, 1e-3))), seconds, *rows
+    )
     assert_allclose(estimate.world_T_body.rotation().rpy(), 0.0, atol=1e-6)
-    assert estimate.world_T_body.translation()[0] == pytest.approx(0.5 * acceleration * seconds**2, abs=1e-6)
+    assert estimate.world_T_body.translation()[0] == pytest.approx(
+        0.5 * acceleration * seconds**2, abs=1e-6
+    )
 
 
 @slam_filters
 def test_gravity_counts_once_an_interval_with_its_own_variance(kind):
     """At rest: after n intervals a wide prior has become ``sigma^2 / n``, sigma that of one direction."""
     seconds, noise = 10, 0.02
-    known = {"gyro_noise_density": 1e-9, "gyro_bias_sigma": 0.0, "accel_bias_sigma": 0.0}
+    known = {
+        "gyro_noise_density": 1e-9,
+        "gyro_bias_sigma": 0.0,
+        "accel_bias_sigma": 0.0,
+    }
     calibration = Calibration(
         imu=ImuCalibration(accel_noise_density=noise, **known),
         dvl=DvlCalibration(velocity_sigma_m_s=(1e-6, 1e-6, 1e-6)),
         start=Start(rpy_sigma_rad=(1.0, 1.0, 1e-3)),
     )
     slam = run(kind, Sequence("at rest", calibration, imu(seconds), dvl(seconds)))
-    assert_allclose(height_and_tilt(slam)[2], noise**2 / calibration.gravity_m_s2**2 / seconds, rtol=1e-3)
+    assert_allclose(
+        height_and_tilt(slam)[2],
+        noise**2 / calibration.gravity_m_s2**2 / seconds,
+        rtol=1e-3,
+    )
 
 
 @slam_filters
 def test_gravity_has_the_velocity_noise_of_both_ends_of_its_interval(kind):
     """At rest for one interval of a second, a Doppler log that grows ten times as exact, and a wide prior."""
-    known = {"gyro_noise_density": 1e-9, "gyro_bias_sigma": 0.0, "accel_bias_sigma": 0.0, "accel_noise_density": 1e-9}
-    calibration = Calibration(imu=ImuCalibration(**known), start=Start(rpy_sigma_rad=(1.0, 1.0, 1e-3)))
+    known = {
+        "gyro_noise_density": 1e-9,
+        "gyro_bias_sigma": 0.0,
+        "accel_bias_sigma": 0.0,
+        "accel_noise_density": 1e-9,
+    }
+    calibration = Calibration(
+        imu=ImuCalibration(**known), start=Start(rpy_sigma_rad=(1.0, 1.0, 1e-3))
+    )
     doppler, variances = dvl(1), np.array([4e-4] + [4e-6] * 5)
     doppler = replace(doppler, velocity_cov=variances[:, None, None] * np.eye(3))
     slam = run(kind, Sequence("at rest", calibration, imu(1.1), doppler))
@@ -99,12 +134,20 @@ def test_gravity_has_the_velocity_noise_of_both_ends_of_its_interval(kind):
 
 @slam_filters
 def test_depth_of_a_port_off_the_origin_holds_the_height(kind):
-    start = Start(position_m=(50.0, 80.0, -1.2), rpy_rad=(0.0, 0.3, 1.0), rpy_sigma_rad=(1e-6, 1e-6, 1e-6))
+    start = Start(
+        position_m=(50.0, 80.0, -1.2),
+        rpy_rad=(0.0, 0.3, 1.0),
+        rpy_sigma_rad=(1e-6, 1e-6, 1e-6),
+    )
     port_m = (0.4, 0.1, -0.2)
-    calibration = Calibration(start=start, depth=DepthCalibration(port_m=port_m), use_gravity=False)
+    calibration = Calibration(
+        start=start, depth=DepthCalibration(port_m=port_m), use_gravity=False
+    )
     true_z = -1.5 - start.pose().rotation().rotate(np.array(port_m))[2]
     rows = imu(20), dvl(20, (0.0, 0.0, 0.01))
-    held = estimate_after(kind, calibration, 20, *rows, depths(later(*np.arange(0, 20.01, 0.1)), -1.5))
+    held = estimate_after(
+        kind, calibration, 20, *rows, depths(later(*np.arange(0, 20.01, 0.1)), -1.5)
+    )
     free = estimate_after(kind, calibration, 20, *rows)
     assert abs(held.world_T_body.translation()[2] - true_z) < 0.02
     assert abs(free.world_T_body.translation()[2] - true_z) > 0.1
@@ -121,7 +164,9 @@ def test_planar_motion_keeps_height_and_tilt(kind):
     )
     rows = imu(10, (0.01, -0.01, 0.1)), dvl(10, (0.3, 0.0, 0.02))
     held = estimate_after(kind, calibration, 10, *rows).world_T_body
-    free = estimate_after(kind, calibration.model_copy(update={"planar": None}), 10, *rows).world_T_body
+    free = estimate_after(
+        kind, calibration.model_copy(update={"planar": None}), 10, *rows
+    ).world_T_body
     assert abs(held.translation()[2] - 0.5) < 0.01
     assert abs(free.translation()[2] - 0.5) > 0.1
     assert np.abs(held.rotation().rpy()[:2]).max() < 0.005
@@ -129,11 +174,21 @@ def test_planar_motion_keeps_height_and_tilt(kind):
 
 
 @slam_filters
-def test_a_logged_depth_variance_goes_before_the_calibration_s_and_a_negative_one_is_refused(kind):
-    depth_m = {variance: in_a_gap(depths(np.array([later(1.0)]), 1.0, variance)) for variance in (1e6, math.nan, -1e6)}
+def test_a_logged_depth_variance_goes_before_the_calibration_s_and_a_negative_one_is_refused(
+    kind,
+):
+    depth_m = {
+        variance: in_a_gap(depths(np.array([later(1.0)]), 1.0, variance))
+        for variance in (1e6, math.nan, -1e6)
+    }
     runs = [run(kind, sequence) for sequence in depth_m.values()]
-    assert [height_and_tilt(slam)[0] for slam in runs] == pytest.approx([0.0, 1.0, 0.0], abs=1e-3)
-    assert [[row.reason for row in slam.refused_rows() if row.sensor == "depth"] for slam in runs] == [
+    assert [height_and_tilt(slam)[0] for slam in runs] == pytest.approx(
+        [0.0, 1.0, 0.0], abs=1e-3
+    )
+    assert [
+        [row.reason for row in slam.refused_rows() if row.sensor == "depth"]
+        for slam in runs
+    ] == [
         [],
         [],
         [Refusal.UNSOUND],
@@ -155,13 +210,17 @@ def test_many_depths_in_a_gap_tell_less_of_the_start_than_one_exact_one(kind):
 @slam_filters
 def test_detections_in_a_gap_count_less_and_less_and_those_after_it_in_full(kind):
     """``k (k + 1)`` times the motion's covariance, which is nearly all of the innovation's."""
-    sequence = in_a_gap(detections=seen(later(1.5, 9.0, 9.001, 13.0, 13.1, 21.0), 3.0, 0.0))
+    sequence = in_a_gap(
+        detections=seen(later(1.5, 9.0, 9.001, 13.0, 13.1, 21.0), 3.0, 0.0)
+    )
     log = run(kind, sequence).detections()
     assert log.outcomes == [Outcome.NEW, *[Outcome.USED] * 5]
     variances = log.innovation_covs[:, 0, 0]
     assert variances[2] / variances[1] == pytest.approx(3.0, rel=0.01)
     assert variances[4] < 1e-3 * variances[1]
-    assert variances[5] == pytest.approx(variances[1], rel=0.01), "the next gap counts anew"
+    assert variances[5] == pytest.approx(variances[1], rel=0.01), (
+        "the next gap counts anew"
+    )
 
 
 @slam_filters
@@ -172,7 +231,9 @@ def test_landmarks_of_one_frame_in_a_gap_share_its_error(kind):
     for n in (1, 3):
         stamps_ns = np.concatenate([known, later(9.0, 9.0, 9.0)[:n]])
         rows = seen(stamps_ns, 3.0, [*azimuths, *azimuths[:n]])
-        rows = replace(rows, candidate_ids=np.array([[3], [4], [5], [3], [4], [5]])[: len(rows)])
+        rows = replace(
+            rows, candidate_ids=np.array([[3], [4], [5], [3], [4], [5]])[: len(rows)]
+        )
         log = run(kind, in_a_gap(detections=rows)).detections()
         assert log.outcomes == [Outcome.NEW] * 3 + [Outcome.USED] * n
         variances.append(log.innovation_covs[3, 0, 0])

@@ -13,7 +13,13 @@ from baselines.filter import lockout_messages
 from baselines.kalman import GATED, USED, far_covariance, is_far, judged, judged_far
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import NS_PER_S
-from sonar_graph.models import FLOOR_GATE, RobustKernel, elevation_on_floor, locate, range_azimuth
+from sonar_graph.models import (
+    FLOOR_GATE,
+    RobustKernel,
+    elevation_on_floor,
+    locate,
+    range_azimuth,
+)
 from sonar_graph.navigation import Odometry
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
@@ -66,7 +72,9 @@ def with_landmark(filter_, angles=TILTED, view=(2.0, 0.3, 0.05), scale=0.002):
 
 
 def floored(z_m, sigma_m=1e-2):
-    return CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=z_m, sigma_m=sigma_m)})
+    return CALIBRATION.model_copy(
+        update={"floor": FloorPrior(z_m=z_m, sigma_m=sigma_m)}
+    )
 
 
 def augmented(filter_, angles, scale, z, calibration=CALIBRATION):
@@ -87,7 +95,11 @@ def test_a_new_landmark_has_the_covariance_of_many_draws(filter_):
     draws = []
     for _ in range(20_000):
         z = rng.multivariate_normal([2.0, 0.3], NOISE)
-        draws.append(locate(drawn(filter_, *before, rng)[1], *z, rng.uniform(-0.5, 0.5) * aperture))
+        draws.append(
+            locate(
+                drawn(filter_, *before, rng)[1], *z, rng.uniform(-0.5, 0.5) * aperture
+            )
+        )
     assert_allclose(position, np.mean(draws, axis=0), atol=2e-3)
     assert_covariance_of(draws, covariance)
 
@@ -97,7 +109,9 @@ def test_a_new_landmark_has_the_covariance_of_many_draws(filter_):
 def test_an_innovation_has_the_covariance_of_many_draws(filter_):
     rng = np.random.default_rng(7)
     world, P, z = with_landmark(filter_)
-    outcome, e, S = begun(filter_, world, P).observe(MOTION, 0, z + np.array([0.01, -0.005]), NOISE)
+    outcome, e, S = begun(filter_, world, P).observe(
+        MOTION, 0, z + np.array([0.01, -0.005]), NOISE
+    )
     assert outcome == USED
     assert_allclose(e, [0.01, -0.005], atol=1e-9)
     views = []
@@ -111,13 +125,17 @@ def test_an_innovation_has_the_covariance_of_many_draws(filter_):
 @both
 def test_a_known_floor_fixes_the_height_of_a_new_landmark(filter_):
     true = locate(sonar_after(world_at(LEVEL), MOTION), 2.0, 0.3, 0.05)
-    _, position, covariance = augmented(filter_, LEVEL, 0.003, [2.0, 0.3], floored(true[2], 1e-3))
+    _, position, covariance = augmented(
+        filter_, LEVEL, 0.003, [2.0, 0.3], floored(true[2], 1e-3)
+    )
     assert_allclose(position, true, atol=1e-3)
     assert covariance[2, 2] == pytest.approx(1e-6, rel=0.01)
 
 
 @both
-def test_without_a_floor_in_reach_a_new_landmark_is_on_the_centre_beam_and_the_vehicle_stays(filter_):
+def test_without_a_floor_in_reach_a_new_landmark_is_on_the_centre_beam_and_the_vehicle_stays(
+    filter_,
+):
     world, P = bare(filter_, TILTED, 0.003)
     middle = locate(sonar_after(world, MOTION), 3.0, 0.3, 0.0)
     for calibration in (CALIBRATION, floored(BODY_M[2] - 5.0)):
@@ -129,17 +147,28 @@ def test_without_a_floor_in_reach_a_new_landmark_is_on_the_centre_beam_and_the_v
 
 
 @both
-@pytest.mark.parametrize(("share", "is_used"), [(0.5, True), (0.999, True), (1.001, False)])
+@pytest.mark.parametrize(
+    ("share", "is_used"), [(0.5, True), (0.999, True), (1.001, False)]
+)
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_floor_outside_the_aperture_counts_up_to_its_gate(filter_, side, share, is_used):
+def test_a_floor_outside_the_aperture_counts_up_to_its_gate(
+    filter_, side, share, is_used
+):
     """The innovation's variance has the aperture's share, the pose's and the floor's."""
     _, position, covariance = augmented(filter_, TILTED, 0.002, [2.0, 0.3])
     variance, floor_variance = covariance[2, 2], 1e-4
     off_m = side * math.sqrt(share * FLOOR_GATE * (variance + floor_variance))
     floor_z_m = position[2] + off_m
     pose = sonar_after(world_at(TILTED), MOTION)
-    assert elevation_on_floor(pose, 2.0, 0.3, floor_z_m, CALIBRATION.sonar.elevation_aperture_rad) is None
-    _, after, cov = augmented(filter_, TILTED, 0.002, [2.0, 0.3], floored(floor_z_m, 1e-2))
+    assert (
+        elevation_on_floor(
+            pose, 2.0, 0.3, floor_z_m, CALIBRATION.sonar.elevation_aperture_rad
+        )
+        is None
+    )
+    _, after, cov = augmented(
+        filter_, TILTED, 0.002, [2.0, 0.3], floored(floor_z_m, 1e-2)
+    )
     if is_used:
         gain = variance / (variance + floor_variance)
         assert cov[2, 2] == pytest.approx(gain * floor_variance, rel=0.05)
@@ -176,17 +205,24 @@ def test_the_innovation_of_azimuth_wraps_around(filter_):
 
 
 @pytest.mark.parametrize("hole", [(0, 0), (1, 1), (0, 1)])
-def test_noise_is_the_log_s_made_symmetric_and_where_it_has_a_hole_the_calibration_s(hole):
+def test_noise_is_the_log_s_made_symmetric_and_where_it_has_a_hole_the_calibration_s(
+    hole,
+):
     logged = np.array([[[4e-4, 3e-5], [1e-5, 1e-4]]] * 2)
     logged[(1, *hole)] = math.nan
-    assert_allclose(read_detections(*np.ones((2, 2)), logged, NOISE)[1], [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE])
+    assert_allclose(
+        read_detections(*np.ones((2, 2)), logged, NOISE)[1],
+        [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE],
+    )
 
 
 # ---------------------------------------------------------------------------------------------- views from far away
 
 FAR_LANDMARK, APERTURE_RAD = np.array([25.0, 12.0, -1.0]), 0.3
 TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
-AHEAD = CALIBRATION.model_copy(update={"sonar": SonarCalibration(elevation_aperture_rad=APERTURE_RAD)})
+AHEAD = CALIBRATION.model_copy(
+    update={"sonar": SonarCalibration(elevation_aperture_rad=APERTURE_RAD)}
+)
 """A sonar at the origin of the body."""
 
 
@@ -198,7 +234,9 @@ def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
     here = World(np.eye(3), np.zeros(3), FAR_LANDMARK[None])
 
     def error(shift):
-        return filter_.error(World(rotation(shift[3:6]), shift[:3], here.landmarks + shift[6:]), here)
+        return filter_.error(
+            World(rotation(shift[3:6]), shift[:3], here.landmarks + shift[6:]), here
+        )
 
     T = central_differences(error, np.zeros(9))
     P = T @ np.diag(np.repeat(np.square([position_sigma_m, 1e-3, 0.01]), 3)) @ T.T
@@ -234,7 +272,9 @@ def test_a_vehicle_near_where_it_was_expected_sees_as_without_a_gap(filter_):
 
 @both
 def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
-    outcome, at, _, e, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
+    outcome, at, _, e, S = look(
+        filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0
+    )
     assert outcome == GATED
     assert_allclose(at, 0.0, atol=1e-15)
     assert e @ np.linalg.solve(S, e) > chi_square_quantile(0.999, 2)
@@ -242,30 +282,49 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
 
 def far(cov, G_z, range_m, noise):
     """True where a detection with this covariance of range and azimuth is compared with the point seen."""
-    return is_far(np.array(cov, float), np.array(G_z, float), range_m, np.array(noise, float))
+    return is_far(
+        np.array(cov, float), np.array(G_z, float), range_m, np.array(noise, float)
+    )
 
 
 def test_the_noise_of_a_view_holds_that_of_many_beams_and_without_aperture_is_the_detection_s():
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
-    elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
+    elevation = np.random.default_rng(3).uniform(
+        -APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000
+    )
     V = far_covariance(np.zeros((2, 2)), 40.0, APERTURE_RAD)
-    assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
+    assert V[0, 0] == pytest.approx(
+        np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02
+    )
     assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
     noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
     assert_array_equal(far_covariance(noise, 40.0, 0.0), np.pad(noise, (0, 1)))
 
 
 def test_gate_and_kernel_judge_a_far_view_by_its_shift_along_the_beam_and_across_it():
-    G_z, R_z, z = TURNED @ np.diag([1.0, 10.0, 10.0]), np.diag([0.04, 0.0009]), np.array([10.0, 0.3])
-    e, cov, nothing = TURNED @ [9.0, 7.0, 0.0], TURNED @ np.diag([1.0, 9.0, 1.0]) @ TURNED.T, np.zeros((3, 3))
-    sonar = begun(Ekf, world_at(LEVEL), kernel_width=1.5, gate=1.0).sonar._replace(aperture_rad=0.0)
+    G_z, R_z, z = (
+        TURNED @ np.diag([1.0, 10.0, 10.0]),
+        np.diag([0.04, 0.0009]),
+        np.array([10.0, 0.3]),
+    )
+    e, cov, nothing = (
+        TURNED @ [9.0, 7.0, 0.0],
+        TURNED @ np.diag([1.0, 9.0, 1.0]) @ TURNED.T,
+        np.zeros((3, 3)),
+    )
+    sonar = begun(Ekf, world_at(LEVEL), kernel_width=1.5, gate=1.0).sonar._replace(
+        aperture_rad=0.0
+    )
     told, noise = judged_far(e, cov, nothing, G_z, sonar, z, R_z)
     assert told.outcome == USED
     assert_allclose(told.e, [9.0, 0.7], atol=1e-12)
     assert_allclose(told.S, np.diag([1.04, 0.0909]), atol=1e-12)
     widened = judged(told.e, told.S, R_z, math.inf, 1.5)[1]
     assert_allclose(noise, G_z[:, :2] @ (R_z + widened) @ G_z[:, :2].T, atol=1e-12)
-    assert judged_far(e, cov, nothing, G_z, sonar._replace(gate=3.7), z, R_z)[0].outcome == GATED
+    assert (
+        judged_far(e, cov, nothing, G_z, sonar._replace(gate=3.7), z, R_z)[0].outcome
+        == GATED
+    )
     assert judged_far(e, 1e-6 * cov, nothing, G_z, sonar, z, R_z)[0] is None
 
 
@@ -273,27 +332,48 @@ def test_linear_is_what_errs_by_less_than_the_noise():
     """Sagitta of an exact circle: across a beam of 10 m, sigma 1 m, a range is 5 cm longer."""
     G_z, longer_m = np.diag([1.0, 10.0, 10.0]), np.hypot(10.0, 1.0) - 10.0
     for share, is_linear in ((1.05, True), (0.95, False)):
-        assert far(np.diag([0.0, 1.0, 0.0]), G_z, 10.0, np.diag([(share * longer_m) ** 2, 1.0])) != is_linear
+        assert (
+            far(
+                np.diag([0.0, 1.0, 0.0]),
+                G_z,
+                10.0,
+                np.diag([(share * longer_m) ** 2, 1.0]),
+            )
+            != is_linear
+        )
     for sigma, is_linear in ((0.0101, True), (0.0099, False)):
-        assert far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, np.diag([1.0, sigma**2])) != is_linear
+        assert (
+            far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, np.diag([1.0, sigma**2]))
+            != is_linear
+        )
     assert not far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4]))
 
 
 @pytest.mark.parametrize("range_m", [10.0, 3.0])
 def test_what_is_linear_is_the_same_wherever_the_sonar_points(range_m):
     """Blind to elevation; with 0.3 m along and 0.2 m across, 2 % on each side of linear."""
-    G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
+    G_z, cov = (
+        TURNED @ np.diag([1.0, range_m, range_m]),
+        TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T,
+    )
     longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
     for share, is_linear in ((0.98, False), (1.02, True)):
-        assert far(cov, G_z, range_m, np.diag([(share * longer_m) ** 2, 9.0])) != is_linear
-        assert far(cov, G_z, range_m, np.diag([9.0, (share * turned_rad) ** 2])) != is_linear
+        assert (
+            far(cov, G_z, range_m, np.diag([(share * longer_m) ** 2, 9.0])) != is_linear
+        )
+        assert (
+            far(cov, G_z, range_m, np.diag([9.0, (share * turned_rad) ** 2]))
+            != is_linear
+        )
 
 
 @pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
 def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
     """Range and azimuth correlated by 0.9: along the long axis far more passes than across it."""
     S, threshold = np.array([[4.0, 1.8], [1.8, 1.0]]), chi_square_quantile(0.999, 2)
-    e = np.array(direction) * np.sqrt(threshold / (direction @ np.linalg.solve(S, direction)))
+    e = np.array(direction) * np.sqrt(
+        threshold / (direction @ np.linalg.solve(S, direction))
+    )
     assert admitted(0.999 * e, S, gate_probability=0.999)[0] == USED
     assert admitted(1.001 * e, S, gate_probability=0.999)[0] == GATED
     assert admitted(1e3 * e, S)[0] == USED
@@ -307,7 +387,10 @@ def admitted(e, S, R_z=NOISE, *, gate_probability=1.0, kernel_width=0.0):
 
 def test_a_kernel_weighs_range_and_azimuth_each_as_in_the_graph():
     """By GTSAM's own weight at the innovation over its sigma; a correlation of the noise stays as it is."""
-    kernel, R_z = RobustKernel(shape="cauchy", width=1.2), np.array([[4e-4, 1e-5], [1e-5, 1e-4]])
+    kernel, R_z = (
+        RobustKernel(shape="cauchy", width=1.2),
+        np.array([[4e-4, 1e-5], [1e-5, 1e-4]]),
+    )
     S, weight = np.array([[0.04, 0.01], [0.01, 0.09]]), kernel.estimator().weight
     for e in ([0.6, 0.3], [-0.1, -3.0], [0.0, 0.0], [1e4, 1e4]):
         outcome, widened = admitted(e, S, R_z, kernel_width=1.2)
@@ -325,7 +408,9 @@ def test_an_outlier_moves_a_filter_with_a_kernel_less_and_what_agrees_as_much(fi
         for kernel_width in (0.0, 1.5):
             slam = begun(filter_, world, P, gate=1.0, kernel_width=kernel_width)
             slam.observe(MOTION, 0, z + np.array([1e-6 + off, 0.0]), NOISE)
-            moved.append(np.linalg.norm(filter_.estimate(slam)[0].landmarks - world.landmarks))
+            moved.append(
+                np.linalg.norm(filter_.estimate(slam)[0].landmarks - world.landmarks)
+            )
         assert shares[0] - 1e-3 < moved[1] / moved[0] < shares[1] + 1e-3
 
 
@@ -334,7 +419,9 @@ def log_of(squared):
     e = np.column_stack([np.sqrt(squared), np.zeros(len(squared))])
     stamps_ns = np.arange(len(squared))
     outcomes = [Outcome.USED] * len(squared)
-    return DetectionLog(stamps_ns, stamps_ns, e, np.tile(np.eye(2), (len(squared), 1, 1)), outcomes)
+    return DetectionLog(
+        stamps_ns, stamps_ns, e, np.tile(np.eye(2), (len(squared), 1, 1)), outcomes
+    )
 
 
 def test_a_lock_out_is_named_where_outliers_are_far_more_than_noise_and_a_tenth_explain():
@@ -348,7 +435,9 @@ def test_a_lock_out_is_named_where_outliers_are_far_more_than_noise_and_a_tenth_
         assert lockout_messages(log_of(np.concatenate([new, squared]))) == []
     (message,) = lockout_messages(log_of(np.concatenate([new, third])))
     outliers = int(np.sum(third > chi2.ppf(0.999, 2)))
-    assert message.startswith(f"{outliers} of 2000 detections of known landmarks lie outside")
+    assert message.startswith(
+        f"{outliers} of 2000 detections of known landmarks lie outside"
+    )
     assert "kernel_width = 0" in message
 
 
@@ -358,23 +447,36 @@ BEFORE_S, LOST_S, AFTER_S = 25.0, 120.0, np.array([3.0, 10.0, 20.0])
 def nees_after_gap(filter_, seed, forgets_gap):
     """NEES of position at `AFTER_S`; where the gap is forgotten, views are linearised at the predicted place."""
     options = MissionOptions(
-        seed=seed, duration_s=BEFORE_S + LOST_S + 22.0, frame_rate_hz=0.5, false_detections_per_frame=0
+        seed=seed,
+        duration_s=BEFORE_S + LOST_S + 22.0,
+        frame_rate_hz=0.5,
+        false_detections_per_frame=0,
     )
     mission = simulate_mission(options)
     start_ns = mission.start_ns
     seconds = (mission.dvl.stamps_ns - start_ns) / NS_PER_S
     lost = mission.dvl.rows((seconds <= BEFORE_S) | (seconds >= BEFORE_S + LOST_S))
-    first_after = np.searchsorted(lost.stamps_ns, start_ns + (BEFORE_S + LOST_S) * NS_PER_S)
+    first_after = np.searchsorted(
+        lost.stamps_ns, start_ns + (BEFORE_S + LOST_S) * NS_PER_S
+    )
     closed_ns = lost.stamps_ns[first_after + 1]  # the second row confirms the first
     after_ns = closed_ns + np.round(AFTER_S * NS_PER_S).astype(np.int64)
-    sequence = Sequence("gap", mission.calibration, mission.imu, lost, None, mission.detections)
+    sequence = Sequence(
+        "gap", mission.calibration, mission.imu, lost, None, mission.detections
+    )
     params = filter_.kind.Params(far_views=not forgets_gap)
-    estimator, squares = filter_.kind(mission.calibration, Odometry(mission.calibration), params), []
+    estimator, squares = (
+        filter_.kind(mission.calibration, Odometry(mission.calibration), params),
+        [],
+    )
     for window in sequence.replay(np.r_[closed_ns + NS_PER_S // 50, after_ns]):
         estimate = estimator.process(window)
         if window.end_ns in after_ns:
             world_T_body = estimate.world_T_body
-            error = world_T_body.translation() - mission.truth.at(np.array([window.end_ns])).positions[0]
+            error = (
+                world_T_body.translation()
+                - mission.truth.at(np.array([window.end_ns])).positions[0]
+            )
             error = world_T_body.rotation().unrotate(error)
             squares.append(error @ np.linalg.solve(estimate.covariance[3:, 3:], error))
     return np.array(squares)

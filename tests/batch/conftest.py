@@ -33,7 +33,10 @@ EAT = "self.eaten = bytearray(os.urandom(1)) * 700_000_000"
 DIE = "os.kill(os.getpid(), signal.SIGKILL)"
 MISBEHAVING = {
     "sleeps": ["time.sleep(1000)"],
-    "prints": ["os.write(1, b'written by native code')", "raise RuntimeError('diverged')"],
+    "prints": [
+        "os.write(1, b'written by native code')",
+        "raise RuntimeError('diverged')",
+    ],
     "hungry": [EAT, "time.sleep(1000)"],
     "forks": [FORK, "time.sleep(1000)"],
     "dies-after-forking": [FORK, DIE],
@@ -44,7 +47,9 @@ MISBEHAVING = {
         *("if not mark.exists():", "    mark.touch()", f"    {DIE}"),
         "return super().process(measurements)",
     ],
-    "sums-over-a-set": ["raise RuntimeError('-'.join({f'mine {number}' for number in range(20)}))"],
+    "sums-over-a-set": [
+        "raise RuntimeError('-'.join({f'mine {number}' for number in range(20)}))"
+    ],
 }
 """What an estimator does when it gets measurements, by its name."""
 
@@ -55,17 +60,29 @@ def misbehaving(tmp_path, monkeypatch):
     folder = tmp_path / "site"
     about = folder / "misbehaving-1.0.dist-info"
     about.mkdir(parents=True)
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: misbehaving\nVersion: 1.0\n")
-    points, code = ["[sonar_graph.estimators]", "broken = not_there:Broken"], ["import os, signal, time"]
-    code += ["from pathlib import Path", "from baselines.dead_reckoning import DeadReckoning"]
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: misbehaving\nVersion: 1.0\n"
+    )
+    points, code = (
+        ["[sonar_graph.estimators]", "broken = not_there:Broken"],
+        ["import os, signal, time"],
+    )
+    code += [
+        "from pathlib import Path",
+        "from baselines.dead_reckoning import DeadReckoning",
+    ]
     for name, lines in MISBEHAVING.items():
         class_name = name.title().replace("-", "")
         points.append(f"{name} = misbehaving:{class_name}")
-        code += [f"class {class_name}(DeadReckoning):", "    def process(self, measurements):"]
+        code += [
+            f"class {class_name}(DeadReckoning):",
+            "    def process(self, measurements):",
+        ]
         code += [f"        {line}" for line in lines]
     (about / "entry_points.txt").write_text("\n".join([*points, ""]))
     (folder / "misbehaving.py").write_text("\n".join([*code, ""]))
-    monkeypatch.delitem(sys.modules, "misbehaving", raising=False)  # the one of an earlier test's folder
+    # the one of an earlier test's folder
+    monkeypatch.delitem(sys.modules, "misbehaving", raising=False)
     source_hash.cache_clear()
     versions_of.cache_clear()
     monkeypatch.syspath_prepend(folder)
@@ -79,7 +96,11 @@ def planned(write_suite) -> Callable[..., PlannedRun]:
     """The one run of a suite with a named estimator."""
 
     def plan(name: str = "dead-reckoning") -> PlannedRun:
-        suite = write_suite(HEADER.replace("dead-reckoning", name), BASIN, f'[[estimators]]\nname = "{name}"\n')
+        suite = write_suite(
+            HEADER.replace("dead-reckoning", name),
+            BASIN,
+            f'[[estimators]]\nname = "{name}"\n',
+        )
         (run,) = plan_runs(read_suite(suite))
         return run
 

@@ -20,11 +20,22 @@ from sonar_graph.batch.batch import Batch, limits_of, run_suite
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.recorded import is_batch, read_batch
 from sonar_graph.batch.result_table import RESULTS, is_timing
-from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
+from sonar_graph.batch.store import (
+    Limits,
+    PlannedRun,
+    Progress,
+    RunOutcome,
+    Store,
+    Where,
+)
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
 from sonar_graph.evaluation import comparison
-from sonar_graph.files import deferred_interrupt, noticed_interrupts, terminations_as_interrupts
+from sonar_graph.files import (
+    deferred_interrupt,
+    noticed_interrupts,
+    terminations_as_interrupts,
+)
 from sonar_graph.logs import write_log
 from sonar_graph.testing import small_world
 
@@ -44,7 +55,10 @@ def nobody(_run: PlannedRun, _outcome: RunOutcome) -> None:
 
 def table(folder: Path) -> list[dict[str, Any]]:
     rows = pq.read_table(folder / RESULTS).to_pylist()
-    return [{name: value for name, value in row.items() if not is_timing(name)} for row in rows]
+    return [
+        {name: value for name, value in row.items() if not is_timing(name)}
+        for row in rows
+    ]
 
 
 def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
@@ -52,7 +66,10 @@ def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
     for run in runs:
         with tempfile.TemporaryDirectory() as scratch:
             row = perform(run, Path(scratch))
-            files = {p.relative_to(scratch).as_posix(): p.read_bytes() for p in Path(scratch).glob("runs/*/*.[tc]*")}
+            files = {
+                p.relative_to(scratch).as_posix(): p.read_bytes()
+                for p in Path(scratch).glob("runs/*/*.[tc]*")
+            }
             store.write(run.key, RunOutcome(row, files=files))
 
 
@@ -72,7 +89,9 @@ def statuses_after(batch: Batch) -> Counter[str]:
     return Counter(str(row["status"]) for row in batch.rows().values())
 
 
-def test_a_run_alone_in_another_folder_gives_the_same_bytes(suite, tmp_path, monkeypatch):
+def test_a_run_alone_in_another_folder_gives_the_same_bytes(
+    suite, tmp_path, monkeypatch
+):
     monkeypatch.setattr(cluster, "run_batch", do_here)
     whole = run_suite(suite, tmp_path / "whole")
     key = whole.runs[2].key
@@ -81,16 +100,29 @@ def test_a_run_alone_in_another_folder_gives_the_same_bytes(suite, tmp_path, mon
     assert [path.name for path in (tmp_path / "again" / "runs").iterdir()] == [key]
     for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
         file = Path("runs", key, "runs", "dead-reckoning", name)
-        assert (tmp_path / "again" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
-    paths = [tmp_path / "whole" / "runs" / run.key / "runs" / "dead-reckoning" / "causal.tum" for run in whole.runs]
-    assert len({path.read_bytes() for path in paths}) == 4, "other seeds have other bytes"
-    with pytest.raises(BatchError, match="none of its 4 runs has the key 0123; keys stand in the"):
+        assert (tmp_path / "again" / file).read_bytes() == (
+            tmp_path / "whole" / file
+        ).read_bytes()
+    paths = [
+        tmp_path / "whole" / "runs" / run.key / "runs" / "dead-reckoning" / "causal.tum"
+        for run in whole.runs
+    ]
+    assert len({path.read_bytes() for path in paths}) == 4, (
+        "other seeds have other bytes"
+    )
+    with pytest.raises(
+        BatchError, match="none of its 4 runs has the key 0123; keys stand in the"
+    ):
         run_suite(suite, tmp_path / "again", only=["0123"])
 
 
-def test_what_a_large_log_takes_is_said_before_its_first_run(write_suite, in_this_process, monkeypatch, tmp_path):
+def test_what_a_large_log_takes_is_said_before_its_first_run(
+    write_suite, in_this_process, monkeypatch, tmp_path
+):
     write_log(tmp_path / "a.mcap", small_world())
-    suite = write_suite(HEADER, '[[logs]]\nname = "a"\nlog = "a.mcap"\n', DEAD_RECKONING)
+    suite = write_suite(
+        HEADER, '[[logs]]\nname = "a"\nlog = "a.mcap"\n', DEAD_RECKONING
+    )
     said: list[str] = []
 
     def do_and_say(runs: list[PlannedRun], *given: Any) -> None:
@@ -115,7 +147,9 @@ def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
     return table(folder)
 
 
-def test_resumed_batch_has_the_table_of_an_undisturbed_one(suite, tmp_path, in_this_process, monkeypatch):
+def test_resumed_batch_has_the_table_of_an_undisturbed_one(
+    suite, tmp_path, in_this_process, monkeypatch
+):
     undisturbed = finished(suite, tmp_path / "a")
     assert len({row["causal.ate_raw_m"] for row in undisturbed}) == 4
     done: list[str] = []
@@ -127,7 +161,10 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(suite, tmp_path, in_t
 
     for count in (1, 2, 3):
         monkeypatch.setattr(cluster, "run_batch", interrupted)
-        with Batch.opened(read_suite(suite), tmp_path / "b") as batch, pytest.raises(KeyboardInterrupt):
+        with (
+            Batch.opened(read_suite(suite), tmp_path / "b") as batch,
+            pytest.raises(KeyboardInterrupt),
+        ):
             batch.run(HERE, LIMITS, nobody)
         statuses = [row["status"] for row in table(tmp_path / "b")]
         assert statuses == ["ok"] * count + ["not run"] * (4 - count)
@@ -137,7 +174,9 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(suite, tmp_path, in_t
     assert len(set(done)) == 3
 
 
-def test_full_disk_is_told_and_loses_no_run_that_is_done(suite, tmp_path, in_this_process, monkeypatch):
+def test_full_disk_is_told_and_loses_no_run_that_is_done(
+    suite, tmp_path, in_this_process, monkeypatch
+):
     class Full(Store):
         def write(self, key: str, outcome: RunOutcome) -> None:
             if len(list((self.folder / "runs").iterdir())) == 2:
@@ -160,9 +199,15 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(suite, tmp_path, in_thi
 
     monkeypatch.setattr(cluster, "run_batch", kept)
     folder = tmp_path / "out"
-    with Batch.opened(read_suite(suite), folder) as batch, monkeypatch.context() as patch:
+    with (
+        Batch.opened(read_suite(suite), folder) as batch,
+        monkeypatch.context() as patch,
+    ):
         patch.setattr(batch_module, "write_results", no_space)
-        with pytest.raises(BatchError, match=r"No space left.*2 of 4 runs are done and kept; the same command"):
+        with pytest.raises(
+            BatchError,
+            match=r"No space left.*2 of 4 runs are done and kept; the same command",
+        ):
             Batch(batch.file, batch.runs, Full(folder)).run(HERE, LIMITS, nobody)
     stamps = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/row.json")}
     monkeypatch.setattr(cluster, "run_batch", do_here)
@@ -170,16 +215,25 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(suite, tmp_path, in_thi
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
-def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(suite, tmp_path, in_this_process, monkeypatch):
+def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
+    suite, tmp_path, in_this_process, monkeypatch
+):
     folder = tmp_path / "out"
     with monkeypatch.context() as patch:
         kill(suite, folder, 0, patch)
         assert is_batch(folder)
-        with pytest.raises(EvaluationError, match=r"before any of its runs was done; give the bench command .* again"):
+        with pytest.raises(
+            EvaluationError,
+            match=r"before any of its runs was done; give the bench command .* again",
+        ):
             read_batch(folder)
         kill(suite, folder, 3, patch)
     batch = read_batch(folder)
-    assert [(run.seed, run.status) for run in batch.runs] == [(0, "ok"), (1, "ok"), (2, "ok")]
+    assert [(run.seed, run.status) for run in batch.runs] == [
+        (0, "ok"),
+        (1, "ok"),
+        (2, "ok"),
+    ]
     assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
     finished(suite, folder)
     whole = read_batch(folder)
@@ -188,7 +242,11 @@ def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(suite, tmp_path
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".toml", ".parquet")}
+    return {
+        path.name: path.read_bytes()
+        for path in folder.iterdir()
+        if path.suffix in (".toml", ".parquet")
+    }
 
 
 def test_a_changed_suite_goes_on_in_the_folder_once_a_run_is_done_and_another_suite_is_refused(
@@ -220,9 +278,14 @@ def test_a_changed_suite_goes_on_in_the_folder_once_a_run_is_done_and_another_su
     assert [row["status"] for row in table(folder)] == ["ok", *["not run"] * 4]
 
 
-def test_failed_runs_are_kept_until_they_are_discarded(suite, tmp_path, in_this_process):
+def test_failed_runs_are_kept_until_they_are_discarded(
+    suite, tmp_path, in_this_process
+):
     with Batch.opened(read_suite(suite), tmp_path) as batch:
-        batch.store.write(batch.runs[0].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
+        batch.store.write(
+            batch.runs[0].key,
+            RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}),
+        )
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
         batch.discard_failed(batch.runs)
@@ -235,7 +298,10 @@ def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path
         half_written = folder / "runs" / f".partial-{batch.runs[0].key}-0123abcd"
         half_written.mkdir()
         suite.write_text(suite.read_text().replace("short", "other"))
-        with pytest.raises(BatchError, match="another command is writing"), Batch.opened(read_suite(suite), folder):
+        with (
+            pytest.raises(BatchError, match="another command is writing"),
+            Batch.opened(read_suite(suite), folder),
+        ):
             pass
         assert half_written.is_dir()
         assert not (folder / "suite.toml").exists()
@@ -243,10 +309,18 @@ def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path
         assert not half_written.exists()
 
 
-def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def kill(
+    suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Some runs are done and told, and then the process is gone."""
 
-    def killed(runs: list[PlannedRun], store: Store, _limits: Limits, _where: Where, progress: Progress) -> None:
+    def killed(
+        runs: list[PlannedRun],
+        store: Store,
+        _limits: Limits,
+        _where: Where,
+        progress: Progress,
+    ) -> None:
         for run in runs[:count]:
             do_here([run], store)
             progress(run, RunOutcome({"status": "ok"}))
@@ -258,7 +332,9 @@ def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite):
-    file = read_suite(write_suite(HEADER, "timeout_s = 7\nmemory_mb = 900\n", BASIN, DEAD_RECKONING))
+    file = read_suite(
+        write_suite(HEADER, "timeout_s = 7\nmemory_mb = 900\n", BASIN, DEAD_RECKONING)
+    )
     assert limits_of(file, None) == Limits(7.0, 900.0)
     assert limits_of(file, 3.0) == Limits(3.0, 900.0)
 
@@ -266,7 +342,10 @@ def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite):
 @pytest.fixture
 def handler(request) -> Iterator[Any]:
     """The handler of interrupts, Python's own or another one; tests must leave it, and that of terminations, as is."""
-    before, terminated = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    before, terminated = (
+        signal.getsignal(signal.SIGINT),
+        signal.getsignal(signal.SIGTERM),
+    )
     given = getattr(request, "param", signal.default_int_handler)
     signal.signal(signal.SIGINT, given)
     yield given
@@ -304,7 +383,9 @@ def test_an_error_of_the_block_is_not_hidden_and_an_interrupt_outlives_it(handle
         raise OSError("full")
 
 
-def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is_noticed(handler):
+def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is_noticed(
+    handler,
+):
     with noticed_interrupts() as check:
         check()
         with contextlib.suppress(KeyboardInterrupt):
@@ -313,8 +394,12 @@ def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is
             check()
 
 
-@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True)
-def test_termination_counts_like_an_interrupt_and_an_interrupt_that_shells_let_be_ignored_stays_so(handler):
+@pytest.mark.parametrize(
+    "handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True
+)
+def test_termination_counts_like_an_interrupt_and_an_interrupt_that_shells_let_be_ignored_stays_so(
+    handler,
+):
     with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():
         os.kill(os.getpid(), signal.SIGTERM)
     if handler is signal.SIG_IGN:

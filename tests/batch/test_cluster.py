@@ -39,8 +39,23 @@ pytestmark = pytest.mark.slow
 
 
 def bench(suite: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", MAIN, "bench", str(suite), "-o", str(folder), *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    command = [
+        sys.executable,
+        "-c",
+        MAIN,
+        "bench",
+        str(suite),
+        "-o",
+        str(folder),
+        *options,
+    ]
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
 
 
 def test_faults_lose_no_run_and_change_no_number():
@@ -48,17 +63,27 @@ def test_faults_lose_no_run_and_change_no_number():
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout.splitlines()[-1])
-    assert (figures["rows_equal"], figures["runs_lost"], figures["all_ok"]) == (True, 0, True)
+    assert (figures["rows_equal"], figures["runs_lost"], figures["all_ok"]) == (
+        True,
+        0,
+        True,
+    )
 
 
-def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path, monkeypatch):
+def test_rows_that_differ_are_told_apart_and_times_are_not_compared(
+    tmp_path, monkeypatch
+):
     monkeypatch.syspath_prepend(str(VALIDATION))
     faults = importlib.import_module("batch_faults")
     tables = []
-    for number, changed in enumerate(({}, {"wall_s": 2.0}, {"causal.ate_raw_m": math.nextafter(0.1, 1)})):
+    for number, changed in enumerate(
+        ({}, {"wall_s": 2.0}, {"causal.ate_raw_m": math.nextafter(0.1, 1)})
+    ):
         (tmp_path / str(number)).mkdir()
         row = {"key": "a", "causal.ate_raw_m": 0.1, "wall_s": 1.0} | changed
-        pq.write_table(pa.Table.from_pylist([row]), tmp_path / str(number) / "results.parquet")
+        pq.write_table(
+            pa.Table.from_pylist([row]), tmp_path / str(number) / "results.parquet"
+        )
         tables.append(faults.table(tmp_path / str(number)))
     assert tables[0] == tables[1] != tables[2]
 
@@ -87,15 +112,22 @@ def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
     assert time.monotonic() - began < 20
     assert process.returncode == 130
     (line,) = said.splitlines()
-    assert line == "sonar-graph: interrupted; 1 of 4 runs are done and kept; the same command goes on from there"
+    assert (
+        line
+        == "sonar-graph: interrupted; 1 of 4 runs are done and kept; the same command goes on from there"
+    )
     _, alive = psutil.wait_procs(family, timeout=10)
     assert not alive
     statuses = pq.read_table(tmp_path / "out" / "results.parquet")["status"].to_pylist()
     assert statuses == ["ok", "not run", "not run", "not run"]
 
 
-def test_failures_are_rows_and_the_exit_code_says_so(write_suite, misbehaving, tmp_path):
-    failing = "".join(f'[[estimators]]\nname = "{name}"\n' for name in ("sleeps", "broken", "dies"))
+def test_failures_are_rows_and_the_exit_code_says_so(
+    write_suite, misbehaving, tmp_path
+):
+    failing = "".join(
+        f'[[estimators]]\nname = "{name}"\n' for name in ("sleeps", "broken", "dies")
+    )
     suite = write_suite(HEADER, BASIN, DEAD_RECKONING, failing)
     with bench(suite, tmp_path / "out", "--workers", "1", "--timeout", "20") as process:
         answer, said = process.communicate(timeout=300)
@@ -108,11 +140,23 @@ def test_failures_are_rows_and_the_exit_code_says_so(write_suite, misbehaving, t
     assert all((tmp_path / "out" / row["log_file"]).is_file() for row in rows)
 
 
-def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(write_suite, misbehaving, tmp_path):
-    suite = write_suite(HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "sleeps"\n')
+def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
+    write_suite, misbehaving, tmp_path
+):
+    suite = write_suite(
+        HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "sleeps"\n'
+    )
     told = ["--scheduler-file", str(tmp_path / "scheduler.json"), "--no-dashboard"]
     quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    dask = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+    ]
     with subprocess.Popen([*dask, *told], **quiet) as scheduler:
         while not (tmp_path / "scheduler.json").exists():
             time.sleep(0.05)
@@ -127,10 +171,14 @@ def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(write_suite, mi
     assert process.returncode == 2
     (line,) = said.splitlines()
     assert "the scheduler was lost" in line
-    assert line.endswith("1 of 2 runs are done and kept; the same command goes on from there")
+    assert line.endswith(
+        "1 of 2 runs are done and kept; the same command goes on from there"
+    )
 
 
-def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(planned, tmp_path, monkeypatch):
+def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
+    planned, tmp_path, monkeypatch
+):
     """The first batch is waiting while the second one, of the same run, fails and cancels what it asked for."""
     done: list[str] = []
     run = planned()
@@ -139,9 +187,14 @@ def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(planne
         done.append(planned_run.key)
 
     monkeypatch.setattr(execution, "perform_watched", wait_a_second)
-    with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0") as cluster:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0"
+    ) as cluster:
         where = Where(scheduler=cluster.scheduler_address)
-        first = threading.Thread(target=run_batch, args=([run], Store(tmp_path / "a"), Limits(9.0), where, told))
+        first = threading.Thread(
+            target=run_batch,
+            args=([run], Store(tmp_path / "a"), Limits(9.0), where, told),
+        )
         first.start()
         time.sleep(0.5)
         with contextlib.suppress(BatchError):
@@ -165,21 +218,30 @@ def test_scheduler_and_workers_of_this_machine_listen_to_it_alone():
         workers = client.scheduler_info()["workers"]
         addresses += [*workers, *(worker["nanny"] for worker in workers.values())]
         children = [psutil.Process(), *psutil.Process().children(recursive=True)]
-        listening = [c.laddr.ip for p in children for c in p.net_connections("inet") if c.status == psutil.CONN_LISTEN]
+        listening = [
+            c.laddr.ip
+            for p in children
+            for c in p.net_connections("inet")
+            if c.status == psutil.CONN_LISTEN
+        ]
     assert len(workers) == 1
     assert all("://127.0.0.1:" in address for address in addresses)
     assert set(listening) == {"127.0.0.1"}
 
 
 def test_missing_scheduler_is_one_line(write_suite, tmp_path):
-    with bench(write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9") as process:
+    with bench(
+        write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9"
+    ) as process:
         _, said = process.communicate(timeout=120)
     assert process.returncode == 2
     assert len(said.splitlines()) == 1
     assert "no Dask scheduler at tcp://127.0.0.1:9" in said
 
 
-def test_a_script_that_workers_cannot_import_is_told_what_to_write(write_suite, tmp_path):
+def test_a_script_that_workers_cannot_import_is_told_what_to_write(
+    write_suite, tmp_path
+):
     """Without a guard of its main part each worker would begin the batch again."""
     script = tmp_path / "script.py"
     script.write_text(f"""
@@ -196,6 +258,8 @@ with Batch.opened(file, Path({str(tmp_path / "batch")!r})) as batch:
     except BatchError as error:
         print(error)
 """)
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=120
+    )
     assert "no worker could be started" in done.stdout
     assert '`if __name__ == "__main__":`' in done.stdout

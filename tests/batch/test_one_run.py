@@ -31,21 +31,32 @@ def numbers(row: dict[str, Any]) -> dict[str, Any]:
 
 def test_scores_are_those_of_compare_bit_for_bit(planned, tmp_path):
     row = perform(planned("isam2"), tmp_path / "run")
-    comparison = compare(simulate_basin(BasinOptions(duration_s=120, laps=1)), ["isam2"])
+    comparison = compare(
+        simulate_basin(BasinOptions(duration_s=120, laps=1)), ["isam2"]
+    )
     scores = {key: score.value for key, score in comparison.scores["isam2"].items()}
     assert set(scores) <= set(row) & set(METRICS)
     assert numbers({key: row[key] for key in scores}) == numbers(scores)
-    assert set(row) - set(METRICS) - set(COLUMNS) == {name for name in row if name.endswith(("_dof", "_end"))}
+    assert set(row) - set(METRICS) - set(COLUMNS) == {
+        name for name in row if name.endswith(("_dof", "_end"))
+    }
 
 
-def test_same_run_gives_the_same_bits_with_the_last_errors_and_all_libraries_of_its_key(planned, tmp_path):
+def test_same_run_gives_the_same_bits_with_the_last_errors_and_all_libraries_of_its_key(
+    planned, tmp_path
+):
     run = planned()
     row, again = (perform(run, tmp_path / name) for name in ("a", "b"))
     assert numbers(row) == numbers(again)
-    assert perform(replace(run, seed=1), tmp_path / "c")["causal.ate_raw_m"] != row["causal.ate_raw_m"]
+    assert (
+        perform(replace(run, seed=1), tmp_path / "c")["causal.ate_raw_m"]
+        != row["causal.ate_raw_m"]
+    )
     libraries = {"gtsam", "numpy", "scipy", "numba"}
     assert libraries <= set(COLUMNS)
-    assert {name: row[name] for name in libraries} == {name: run.versions[name] for name in libraries}
+    assert {name: row[name] for name in libraries} == {
+        name: run.versions[name] for name in libraries
+    }
     (errors,) = read_comparison(tmp_path / "a").errors.values()
     causal = errors["causal"]
     share = causal.position_m[-1] / causal.position_sigma_m[-1]
@@ -59,10 +70,18 @@ def test_same_run_gives_the_same_bits_with_the_last_errors_and_all_libraries_of_
 
 def of_log(run: PlannedRun, log: Path) -> PlannedRun:
     options = {"log": str(log)}
-    return replace(run, kind="mcap", options=options, content=fingerprint("mcap", options), seed=None)
+    return replace(
+        run,
+        kind="mcap",
+        options=options,
+        content=fingerprint("mcap", options),
+        seed=None,
+    )
 
 
-def test_a_log_that_cannot_be_read_and_an_estimator_that_fails_are_rows_with_a_reason(planned, misbehaving, tmp_path):
+def test_a_log_that_cannot_be_read_and_an_estimator_that_fails_are_rows_with_a_reason(
+    planned, misbehaving, tmp_path
+):
     log = tmp_path / "dive.mcap"
     log.write_bytes(b"not a log")
     for run, begins, ends in (
@@ -86,9 +105,14 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
     log.write_text("150")
     long = perform(of_log(planned(), log), tmp_path / "long")
     assert long["scored_instants"] > short["scored_instants"] > 0
-    with pytest.raises(BatchError, match=r"log \S+dive\.mcap: not what it was when the run was planned"):
+    with pytest.raises(
+        BatchError, match=r"log \S+dive\.mcap: not what it was when the run was planned"
+    ):
         perform(replace(planned_short, seed=1), tmp_path / "run")  # not in hand
-    run, read = replace(of_log(planned(), log), landmarks={}, seed=0), one_run.read_source
+    run, read = (
+        replace(of_log(planned(), log), landmarks={}, seed=0),
+        one_run.read_source,
+    )
 
     def read_and_changed(*given: Any) -> Sequence:
         sequence = read(*given)
@@ -100,11 +124,15 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
         perform(run, tmp_path / "run")
 
 
-def log_with_duration(folder: Path, monkeypatch: pytest.MonkeyPatch, duration_s: int) -> Path:
+def log_with_duration(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, duration_s: int
+) -> Path:
     """A file with a number in it, which is read as a simulated basin that lasts so long."""
 
     def read(options: LogOptions) -> Sequence:
-        return simulate_basin(BasinOptions(duration_s=int(Path(options.log).read_text()), laps=1))
+        return simulate_basin(
+            BasinOptions(duration_s=int(Path(options.log).read_text()), laps=1)
+        )
 
     monkeypatch.setitem(KINDS, "mcap", SourceKind(LogOptions, read))
     log = folder / "dive.mcap"
@@ -124,7 +152,9 @@ def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch
     monkeypatch.setattr(one_run, "run_estimator", noted)
     assert perform(run, tmp_path / "run")["status"] == "ok"
     recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
-    expected, other = (add_landmarks(recorded, LandmarkOptions(seed=seed)) for seed in (1, 0))
+    expected, other = (
+        add_landmarks(recorded, LandmarkOptions(seed=seed)) for seed in (1, 0)
+    )
     assert map_of(used[0]) == map_of(expected) != map_of(other)
 
 
@@ -132,11 +162,19 @@ def map_of(sequence: Sequence) -> list[list[float]]:
     return sequence.true_landmarks.positions.tolist()
 
 
-def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(planned, tmp_path):
+def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(
+    planned, tmp_path
+):
     run = planned()
     for changed, told in (
-        ({"gtsam": "4.2"}, r"a worker has gtsam 4\.3\S*, planned with gtsam 4\.2; install the same"),
-        ({"source": "changed"}, r"a worker has source \w+, planned with source changed; "),
+        (
+            {"gtsam": "4.2"},
+            r"a worker has gtsam 4\.3\S*, planned with gtsam 4\.2; install the same",
+        ),
+        (
+            {"source": "changed"},
+            r"a worker has source \w+, planned with source changed; ",
+        ),
     ):
         with pytest.raises(BatchError, match=told):
             perform(replace(run, versions=run.versions | changed), tmp_path / "run")
@@ -145,7 +183,9 @@ def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_
         perform(run, tmp_path / "file")
 
 
-def test_estimator_that_changes_during_a_run_gives_no_result(planned, misbehaving, tmp_path, monkeypatch):
+def test_estimator_that_changes_during_a_run_gives_no_result(
+    planned, misbehaving, tmp_path, monkeypatch
+):
     """It is changed after the first look at its source, and before it runs: it may import more of it only then."""
     module = tmp_path / "site" / "misbehaving.py"
     run = planned("prints")
@@ -157,11 +197,16 @@ def test_estimator_that_changes_during_a_run_gives_no_result(planned, misbehavin
         return run_estimator(*given, **named)
 
     monkeypatch.setattr(one_run, "run_estimator", changed_and_run)
-    with pytest.raises(BatchError, match=r"the code changed during a run: estimator_source \w+, planned with "):
+    with pytest.raises(
+        BatchError,
+        match=r"the code changed during a run: estimator_source \w+, planned with ",
+    ):
         perform(run, tmp_path / "after")
 
 
-def test_estimator_is_loaded_between_two_looks_at_its_source(planned, tmp_path, monkeypatch):
+def test_estimator_is_loaded_between_two_looks_at_its_source(
+    planned, tmp_path, monkeypatch
+):
     run, order = planned(), []
     monkeypatch.delitem(sys.modules, "baselines.dead_reckoning")
     for name in ("versions_of", "load_estimator", "run_estimator", "sources_now"):

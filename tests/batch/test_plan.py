@@ -40,7 +40,11 @@ def test_every_combination_is_planned_once_in_order(write_suite):
         ISAM2 + 'variant = "short"\ngrid = { smoother.lag_s = [5, 15] }\n',
     )
     assert len({run.key for run in runs}) == len(runs) == 4 * 2 * 3
-    assert [run.variant for run in runs[:3]] == ["default", "short, smoother.lag_s=5", "short, smoother.lag_s=15"]
+    assert [run.variant for run in runs[:3]] == [
+        "default",
+        "short, smoother.lag_s=5",
+        "short, smoother.lag_s=15",
+    ]
     assert [run.seed for run in runs[:6]] == [0, 0, 0, 1, 1, 1]
     assert runs[-1].log == "basin, wrong_id_rate=0.1, frame_rate_hz=2"
     assert runs[-1].options["wrong_id_rate"] == 0.1
@@ -51,23 +55,39 @@ PARK = '[[logs]]\nname = "park"\ndataset = "victoria-park"\n'
 OTHERS = {
     "another simulation": (HEADER_OF_ISAM2, BASIN.replace("120", "121"), ISAM2),
     "another seed": (HEADER_OF_ISAM2, BASIN, "seeds = [1]\n", ISAM2),
-    "another setting": (HEADER_OF_ISAM2, BASIN, ISAM2, "params = { smoother.lag_s = 14 }\n"),
+    "another setting": (
+        HEADER_OF_ISAM2,
+        BASIN,
+        ISAM2,
+        "params = { smoother.lag_s = 14 }\n",
+    ),
     "another rate": (HEADER_OF_ISAM2, "rate_hz = 1\n", BASIN, ISAM2),
     "another estimator": (HEADER, BASIN, DEAD_RECKONING),
     "a log": (HEADER, PARK, DEAD_RECKONING),
     "landmarks": (HEADER, PARK, "landmarks = {}\n", DEAD_RECKONING),
-    "other landmarks": (HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING),
+    "other landmarks": (
+        HEADER,
+        PARK,
+        "landmarks = { frame_rate_hz = 3 }\n",
+        DEAD_RECKONING,
+    ),
 }
 
 
-def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_defaults(write_suite):
+def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_defaults(
+    write_suite,
+):
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
     assert run.content == fingerprint(run.kind, run.options)
-    assert len({run.key, *(key(write_suite, *parts) for parts in OTHERS.values())}) == 1 + len(OTHERS)
+    assert len(
+        {run.key, *(key(write_suite, *parts) for parts in OTHERS.values())}
+    ) == 1 + len(OTHERS)
     same = key(
         write_suite,
         HEADER_OF_ISAM2.replace("short", "another") + "timeout_s = 9\n",
-        BASIN.replace('"basin"\ngen', '"pool"\ngen').replace("laps = 1", "laps = 1, wrong_id_rate = 0.0"),
+        BASIN.replace('"basin"\ngen', '"pool"\ngen').replace(
+            "laps = 1", "laps = 1, wrong_id_rate = 0.0"
+        ),
         "seeds = [0]\n",
         ISAM2,
         "params = { smoother.lag_s = 15.0 }\n",
@@ -80,11 +100,18 @@ def test_key_changes_with_the_class_behind_the_name_and_with_the_version_of_pyth
 ):
     def anew() -> str:
         versions_of.cache_clear()
-        return key(write_suite, HEADER.replace("dead-reckoning", "dies"), BASIN, '[[estimators]]\nname = "dies"\n')
+        return key(
+            write_suite,
+            HEADER.replace("dead-reckoning", "dies"),
+            BASIN,
+            '[[estimators]]\nname = "dies"\n',
+        )
 
     keys = [anew()]
     points = tmp_path / "site" / "misbehaving-1.0.dist-info" / "entry_points.txt"
-    points.write_text(points.read_text().replace("misbehaving:Dies\n", "misbehaving:Prints\n"))
+    points.write_text(
+        points.read_text().replace("misbehaving:Dies\n", "misbehaving:Prints\n")
+    )
     keys.append(anew())
     with monkeypatch.context() as patch:
         patch.setattr("platform.python_version", lambda: "3.99.0")
@@ -106,7 +133,11 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
 
 def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
     """Names and contents of the first three are the same characters one after the other."""
-    for name, files in (("one", {"a": "b", "c": ""}), ("two", {"a": "", "bc": ""}), ("three", {"abc": ""})):
+    for name, files in (
+        ("one", {"a": "b", "c": ""}),
+        ("two", {"a": "", "bc": ""}),
+        ("three", {"abc": ""}),
+    ):
         (tmp_path / name).mkdir()
         for file, content in files.items():
             (tmp_path / name / file).write_text(content)
@@ -125,7 +156,11 @@ def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_b
     write_suite, misbehaving
 ):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
-    assert versions_of("isam2")["estimator_source"] == versions_of("dies")["source"] == source_hash("sonar_graph")
+    assert (
+        versions_of("isam2")["estimator_source"]
+        == versions_of("dies")["source"]
+        == source_hash("sonar_graph")
+    )
     broken = '[[estimators]]\nname = "broken"\nparams = { a = 1 }\n'
     _, run = planned(write_suite, HEADER, BASIN, DEAD_RECKONING, broken)
     assert (run.params, run.versions["estimator_source"]) == ({"a": 1}, "")
@@ -133,12 +168,20 @@ def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_b
 
 def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite):
     text = 'params = { identity.policy = "max-mixture" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
-    with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"max-mixture", which chooses anew'):
+    with pytest.raises(
+        BatchError,
+        match=r'line 11: estimators\.0\.grid\.history: .*"max-mixture", which chooses anew',
+    ):
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 
-def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content(write_suite, tmp_path):
-    grid, params = "grid = { wrong_id_rate = [0.1] }\n", "params = { smoother.lag_s = 14 }\n"
+def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content(
+    write_suite, tmp_path
+):
+    grid, params = (
+        "grid = { wrong_id_rate = [0.1] }\n",
+        "params = { smoother.lag_s = 14 }\n",
+    )
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
     assert run.asked == {
         "generator": "basin",
@@ -148,7 +191,9 @@ def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content
         "settings": {"smoother": {"lag_s": 14}},
         "rate_hz": 2.0,
     }
-    (run,) = planned(write_suite, HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING)
+    (run,) = planned(
+        write_suite, HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING
+    )
     assert run.asked["files"] == {"file": fingerprint("victoria-park", {})["file"]}
     assert run.asked["landmarks"] == {"frame_rate_hz": 3}
     (tmp_path / "robots").mkdir()
@@ -182,12 +227,16 @@ def hashed() -> Iterator[Hashed]:
     source_hash.cache_clear()
 
 
-def test_hash_changes_with_code_data_and_names_also_behind_links_that_may_be_circles(package, hashed, tmp_path):
+def test_hash_changes_with_code_data_and_names_also_behind_links_that_may_be_circles(
+    package, hashed, tmp_path
+):
     (elsewhere := tmp_path / "elsewhere").mkdir()
     (elsewhere / "linked.py").write_text("a = 1\n")
     (elsewhere / "around").symlink_to(package, target_is_directory=True)
     changes = [
-        lambda: (package / "__init__.py").write_text("raise RuntimeError('Imported')\n"),
+        lambda: (package / "__init__.py").write_text(
+            "raise RuntimeError('Imported')\n"
+        ),
         lambda: (package / "inner" / "data.json").write_text("[]"),
         lambda: (package / "inner" / "data.json").rename(package / "data.json"),
         (package / "more.py").touch,
@@ -201,7 +250,9 @@ def test_hash_changes_with_code_data_and_names_also_behind_links_that_may_be_cir
     assert len({*hashes, ""}) == len(changes) + 2
 
 
-def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(package, hashed, tmp_path, monkeypatch):
+def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
+    package, hashed, tmp_path, monkeypatch
+):
     before = hashed()
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "kernel.nbi").write_text("compiled")
@@ -222,12 +273,17 @@ def test_hash_of_a_module_is_of_its_file(tmp_path, hashed, monkeypatch):
     assert len(set(hashes)) == 3
 
 
-def test_hash_is_taken_once_in_a_process_and_a_look_at_the_disk_sees_a_change_of_equal_size_and_time(package, hashed):
+def test_hash_is_taken_once_in_a_process_and_a_look_at_the_disk_sees_a_change_of_equal_size_and_time(
+    package, hashed
+):
     before, code = hashed(), package / "__init__.py"
     state = code.stat()
     code.write_text("raise RuntimeError('Imported')\n")
     os.utime(code, ns=(state.st_atime_ns, state.st_mtime_ns))
-    assert (code.stat().st_size, code.stat().st_mtime_ns) == (state.st_size, state.st_mtime_ns)
+    assert (code.stat().st_size, code.stat().st_mtime_ns) == (
+        state.st_size,
+        state.st_mtime_ns,
+    )
     assert source_hash("hashed_package") == before
     assert source_hash_now("hashed_package") == hashed() != before
 
@@ -240,8 +296,14 @@ def test_key_changes_with_a_changed_checkout(write_suite, tmp_path):
 
     for package in (sonar_graph, baselines):
         folder = Path(str(package.__file__)).parent
-        shutil.copytree(folder, tmp_path / "copy" / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
-    suite = write_suite(HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "isam2"\n')
+        shutil.copytree(
+            folder,
+            tmp_path / "copy" / folder.name,
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
+    suite = write_suite(
+        HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "isam2"\n'
+    )
     here = [run.key for run in plan_runs(read_suite(suite))]
     assert keys_by(tmp_path / "copy", suite) == here
     with (tmp_path / "copy" / "baselines" / "dead_reckoning.py").open("a") as file:
@@ -262,17 +324,24 @@ def keys_by(code: Path, suite: Path) -> list[str]:
         f"assert plan.__file__.startswith({str(code)!r})\n"
         f"print(*(run.key for run in plan.plan_runs(read_suite(Path({str(suite)!r})))))"
     )
-    return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout.split()
+    return subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True
+    ).stdout.split()
 
 
 ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'
 
 
-def test_a_log_whose_files_are_absent_is_left_out_where_the_suite_says_how_to_obtain_it(write_suite):
+def test_a_log_whose_files_are_absent_is_left_out_where_the_suite_says_how_to_obtain_it(
+    write_suite,
+):
     obtain = 'obtain = "the data set from its authors"\n'
     runs = planned(write_suite, HEADER, BASIN, ABSENT, obtain, DEAD_RECKONING)
     assert [run.log for run in runs] == ["basin"]
     with pytest.raises(BatchError, match="absent is not in"):
         planned(write_suite, HEADER, BASIN, ABSENT, DEAD_RECKONING)
-    with pytest.raises(BatchError, match="no data of any log is here; get the data set from its authors"):
+    with pytest.raises(
+        BatchError,
+        match="no data of any log is here; get the data set from its authors",
+    ):
         planned(write_suite, HEADER, ABSENT, obtain, DEAD_RECKONING)

@@ -11,7 +11,12 @@ import pytest
 
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import ALL_LOGS, RESULTS, is_batch, read_batch
-from sonar_graph.batch.result_table import COLUMNS, SUITE_METADATA, is_timing, write_results
+from sonar_graph.batch.result_table import (
+    COLUMNS,
+    SUITE_METADATA,
+    is_timing,
+    write_results,
+)
 from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import EvaluationError
@@ -29,7 +34,12 @@ def test_a_batch_is_read_as_it_was_written_also_against_another_reference(tmp_pa
     for name in ("name", "reference", "metrics", "suite"):
         assert getattr(back, name) == getattr(batch, name)
     for own, run in zip(back.runs, batch.runs, strict=True):
-        assert (own.key, own.log, own.seed, own.contestant) == (run.key, run.log, run.seed, run.contestant)
+        assert (own.key, own.log, own.seed, own.contestant) == (
+            run.key,
+            run.log,
+            run.seed,
+            run.contestant,
+        )
         assert own.values == pytest.approx(run.values)
     assert read_batch(tmp_path, "isam2").reference == "isam2"
 
@@ -38,9 +48,18 @@ def test_pairs_have_the_same_log_and_seed():
     batch = drawn_batch(5)
     own, reference = batch.pairs(LOGS[0], "isam2", ATE)
     assert own.tolist() == [run.value(ATE) for run in batch.group(LOGS[0], "isam2")]
-    assert reference.tolist() == [run.value(ATE) for run in batch.group(LOGS[0], "dead-reckoning")]
+    assert reference.tolist() == [
+        run.value(ATE) for run in batch.group(LOGS[0], "dead-reckoning")
+    ]
     assert len(batch.pairs(ALL_LOGS, "isam2", ATE)[0]) == 10
-    fewer = replace(batch, runs=[run for run in batch.runs if (run.contestant, run.seed) != ("dead-reckoning", 1)])
+    fewer = replace(
+        batch,
+        runs=[
+            run
+            for run in batch.runs
+            if (run.contestant, run.seed) != ("dead-reckoning", 1)
+        ],
+    )
     assert len(fewer.pairs(LOGS[0], "isam2", ATE)[0]) == 4
 
 
@@ -71,18 +90,30 @@ def test_what_is_no_batch_is_refused_with_the_file_at_fault(tmp_path):
     pq.write_table(pa.table({"key": ["a"], "log": ["b"]}), tmp_path / RESULTS)
     refused("no column estimator, status")
     write_batch(drawn_batch(2), tmp_path)
-    refused("no run of the reference 'isam3'; there are runs of: dead-reckoning, isam", "isam3")
+    refused(
+        "no run of the reference 'isam3'; there are runs of: dead-reckoning, isam",
+        "isam3",
+    )
     table = pq.read_table(tmp_path / RESULTS)
     pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), tmp_path / RESULTS)
     refused("has more than one row")
 
 
-def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_suite, tmp_path):
+def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(
+    write_suite, tmp_path
+):
     file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
     runs, store = plan_runs(file), Store(tmp_path / "out")
     for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
-        store.write(run.key, RunOutcome({"status": "ok", "causal.ate_raw_m": error_m, "causal.nees_yaw_dof": 1}))
-    store.write(runs[3].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
+        store.write(
+            run.key,
+            RunOutcome(
+                {"status": "ok", "causal.ate_raw_m": error_m, "causal.nees_yaw_dof": 1}
+            ),
+        )
+    store.write(
+        runs[3].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"})
+    )
     table = pq.read_table(write_results(store, file.suite, runs))
     assert table.column_names == [*COLUMNS, "causal.ate_raw_m", "causal.nees_yaw_dof"]
     assert table["seed"].to_pylist() == [0, 1, 2, 3]
@@ -108,6 +139,18 @@ def test_table_of_a_batch_without_any_run_has_the_columns(write_suite, tmp_path)
 
 
 def test_times_and_memory_alone_may_differ_between_equal_runs():
-    timings = {"wall_s", "cpu_s", "peak_memory_mb", "update_p99_ms", "time.total_s", "memory.peak_mb"}
+    timings = {
+        "wall_s",
+        "cpu_s",
+        "peak_memory_mb",
+        "update_p99_ms",
+        "time.total_s",
+        "memory.peak_mb",
+    }
     assert all(map(is_timing, timings))
-    assert not any(map(is_timing, ("key", "causal.ate_raw_m", "scored_instants", "machine", "status")))
+    assert not any(
+        map(
+            is_timing,
+            ("key", "causal.ate_raw_m", "scored_instants", "machine", "status"),
+        )
+    )

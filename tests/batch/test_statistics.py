@@ -20,14 +20,23 @@ shares = st.floats(0, 1)
 def closed_testing(p_values: list[float]) -> list[float]:
     """Holm by its other definition: a hypothesis falls when Bonferroni refuses every intersection that has it."""
     every = range(len(p_values))
-    subsets = [s for size in range(1, len(p_values) + 1) for s in itertools.combinations(every, size)]
-    return [max(min(1.0, len(s) * min(p_values[j] for j in s)) for s in subsets if i in s) for i in every]
+    subsets = [
+        s
+        for size in range(1, len(p_values) + 1)
+        for s in itertools.combinations(every, size)
+    ]
+    return [
+        max(min(1.0, len(s) * min(p_values[j] for j in s)) for s in subsets if i in s)
+        for i in every
+    ]
 
 
 @given(st.lists(shares | st.just(math.nan), min_size=1, max_size=7))
 def test_holm_is_closed_testing_with_bonferroni_of_what_was_tested(p_values):
     corrected, is_known = statistics.holm(np.array(p_values)), ~np.isnan(p_values)
-    assert corrected[is_known].tolist() == pytest.approx(closed_testing(np.array(p_values)[is_known].tolist()))
+    assert corrected[is_known].tolist() == pytest.approx(
+        closed_testing(np.array(p_values)[is_known].tolist())
+    )
     assert np.isnan(corrected[~is_known]).all()
 
 
@@ -37,35 +46,49 @@ def test_failure_rate_solves_wilsons_equation(counts):
     rate = statistics.failure_rate(failed, runs)
     z = stats.norm.ppf(0.975)
     for bound in (rate.low, rate.high):
-        assert (rate.share - bound) ** 2 == pytest.approx(z**2 * bound * (1 - bound) / runs, abs=1e-9)
+        assert (rate.share - bound) ** 2 == pytest.approx(
+            z**2 * bound * (1 - bound) / runs, abs=1e-9
+        )
     assert 0 <= rate.low <= rate.share <= rate.high <= 1
 
 
 def test_one_false_finding_in_twenty_families_and_not_more():
     rng = np.random.default_rng(0)
     families = rng.normal(size=(300, 4, 10))
-    single = np.array([[statistics.signed_rank_p(test) for test in family] for family in families])
+    single = np.array(
+        [[statistics.signed_rank_p(test) for test in family] for family in families]
+    )
     found = np.mean([(statistics.holm(p) < 0.05).any() for p in single])
     assert found < 0.05 + 2 * math.sqrt(0.05 * 0.95 / 300)
-    assert np.mean((single < 0.05).any(axis=1)) > 0.12, "uncorrected tests find more: the check can fail"
+    assert np.mean((single < 0.05).any(axis=1)) > 0.12, (
+        "uncorrected tests find more: the check can fail"
+    )
 
 
 @pytest.mark.parametrize("pairs", [6, 10, 25])
 def test_the_interval_holds_the_mean_as_often_as_it_says(pairs):
     rng = np.random.default_rng(1)
-    intervals = np.array([statistics.mean_interval(rng.normal(0.3, 1, pairs)) for _ in range(2000)])
+    intervals = np.array(
+        [statistics.mean_interval(rng.normal(0.3, 1, pairs)) for _ in range(2000)]
+    )
     inside = np.mean((intervals[:, 0] < 0.3) & (intervals[:, 1] > 0.3))
     middle, half = intervals.mean(axis=1), 0.25 * np.ptp(intervals, axis=1)
     assert inside == pytest.approx(0.95, abs=0.017)
-    assert np.mean(np.abs(middle - 0.3) < half) < 0.85, "intervals half as wide do not: the check can fail"
+    assert np.mean(np.abs(middle - 0.3) < half) < 0.85, (
+        "intervals half as wide do not: the check can fail"
+    )
 
 
 def test_the_interval_of_skewed_differences_holds_their_mean_more_often_than_students():
     draws = np.random.default_rng(2).lognormal(0, 1, (2000, 10))
     mean = math.exp(0.5)
     own = np.array([statistics.mean_interval(values) for values in draws])
-    students = np.stack(stats.t.interval(0.95, 9, draws.mean(axis=1), stats.sem(draws, axis=1)), axis=1)
-    held, held_by_student = (np.mean((low < mean) & (mean < high)) for low, high in (own.T, students.T))
+    students = np.stack(
+        stats.t.interval(0.95, 9, draws.mean(axis=1), stats.sem(draws, axis=1)), axis=1
+    )
+    held, held_by_student = (
+        np.mean((low < mean) & (mean < high)) for low, high in (own.T, students.T)
+    )
     assert held > 0.89
     assert held_by_student < held - 0.03
 
@@ -79,7 +102,9 @@ def test_the_interval_solves_halls_equation(listed):
     for bound, side in zip(statistics.mean_interval(values), (1, -1), strict=True):
         w = (mean - bound) / deviation
         transformed = math.sqrt(n) * (w + g * w**2 / 3 + g**2 * w**3 / 27 + g / (6 * n))
-        assert transformed == pytest.approx(side * stats.t.ppf(0.975, n - 1), rel=1e-6, abs=1e-6)
+        assert transformed == pytest.approx(
+            side * stats.t.ppf(0.975, n - 1), rel=1e-6, abs=1e-6
+        )
 
 
 def test_the_interval_moves_with_the_differences_is_a_point_where_they_are_equal_and_unknown_for_few():
@@ -97,18 +122,35 @@ def test_the_interval_moves_with_the_differences_is_a_point_where_they_are_equal
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), shares)
 def test_quantile_of_finite_values_is_numpys(values, share):
     expected = float(np.quantile(values, share))
-    assert statistics.quantile(np.array(values), share) == pytest.approx(expected, rel=1e-9, abs=1e-6)
+    assert statistics.quantile(np.array(values), share) == pytest.approx(
+        expected, rel=1e-9, abs=1e-6
+    )
 
 
 def test_runs_without_a_value_lie_at_the_ends_of_quantiles_and_leave_no_mean():
     for values, share, expected in (
-        *(([1.0, 2.0, 3.0, INF, INF], 0.5, 3.0), ([1.0, 2.0, INF, INF], 0.5, INF), ([INF, 1.0], 0.1, INF)),
-        *(([-INF, 1.0], 0.5, -INF), ([-INF, -INF, 1.0, 2.0], 0.5, -INF), ([-INF, 1.0, 2.0], 0.5, 1.0)),
+        *(
+            ([1.0, 2.0, 3.0, INF, INF], 0.5, 3.0),
+            ([1.0, 2.0, INF, INF], 0.5, INF),
+            ([INF, 1.0], 0.1, INF),
+        ),
+        *(
+            ([-INF, 1.0], 0.5, -INF),
+            ([-INF, -INF, 1.0, 2.0], 0.5, -INF),
+            ([-INF, 1.0, 2.0], 0.5, 1.0),
+        ),
         *(([], 0.5, math.nan), ([-INF, INF], 0.5, math.nan)),
     ):
-        assert statistics.quantile(np.array(values), share) == pytest.approx(expected, nan_ok=True), values
-    complete, short = (statistics.summarise(np.array([1.0, 2.0, third, 4.0])) for third in (3.0, INF))
-    assert (complete.mean, complete.standard_error) == (2.5, pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0])))
+        assert statistics.quantile(np.array(values), share) == pytest.approx(
+            expected, nan_ok=True
+        ), values
+    complete, short = (
+        statistics.summarise(np.array([1.0, 2.0, third, 4.0])) for third in (3.0, INF)
+    )
+    assert (complete.mean, complete.standard_error) == (
+        2.5,
+        pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0])),
+    )
     assert math.isnan(short.mean)
     assert math.isnan(short.standard_error)
     assert (short.runs, short.without, short.median) == (4, 1, 3.0)
@@ -126,13 +168,17 @@ def test_each_quantile_has_the_error_of_its_own_values_and_lost_runs_do_not_take
     values = np.random.default_rng(15).lognormal(0, 1, 30)
     told = statistics.summarise(values)
     assert told.low_error == statistics.quantile_error(values, 0.1) != told.high_error
-    assert told.high_error == statistics.quantile_error(values, 0.9) != told.median_error
+    assert (
+        told.high_error == statistics.quantile_error(values, 0.9) != told.median_error
+    )
     lost = np.append(np.random.default_rng(9).normal(0.2, 0.01, 19), 5000.0)
     assert statistics.standard_error(lost) > 100
     assert statistics.summarise(lost).median_error < 0.01
     assert statistics.paired(lost, np.zeros(20)).median_error < 0.01
     unknown = np.array([1.0, 2.0, 3.0, 4.0, INF, INF, INF])
-    assert statistics.quantile_error(unknown, 0.5) == pytest.approx(math.sqrt(7) / 2), "that of the lower side"
+    assert statistics.quantile_error(unknown, 0.5) == pytest.approx(math.sqrt(7) / 2), (
+        "that of the lower side"
+    )
     assert math.isnan(statistics.quantile_error(unknown, 0.9))
 
 
@@ -145,7 +191,9 @@ def test_pairing_takes_away_what_hard_seeds_cost_everybody():
     assert told.p_value < 0.001
     assert told.interval[0] < -0.3 < told.interval[1] < 0
     assert told.smaller >= 18
-    assert statistics.paired(rng.permutation(own), reference).p_value > 0.05, "without pairs the seeds hide it"
+    assert statistics.paired(rng.permutation(own), reference).p_value > 0.05, (
+        "without pairs the seeds hide it"
+    )
 
 
 def test_failing_where_it_was_worse_makes_nobody_better():
@@ -155,9 +203,14 @@ def test_failing_where_it_was_worse_makes_nobody_better():
     worst = np.argsort(own - reference)[-4:]
     survivors = own.copy()
     survivors[worst] = INF
-    whole, told = statistics.paired(own, reference), statistics.paired(survivors, reference)
+    whole, told = (
+        statistics.paired(own, reference),
+        statistics.paired(survivors, reference),
+    )
     kept = np.delete(np.arange(12), worst)
-    assert statistics.paired(own[kept], reference[kept]).mean < whole.mean, "over survivors it would look better"
+    assert statistics.paired(own[kept], reference[kept]).mean < whole.mean, (
+        "over survivors it would look better"
+    )
     assert math.isnan(told.mean)
     assert math.isnan(told.interval[0])
     assert told.without == 4
@@ -174,7 +227,9 @@ def test_what_logs_share_by_their_seed_is_no_finding():
         single.append(statistics.paired(own, np.zeros(40)).p_value < 0.05)
         clustered.append(statistics.paired(own, np.zeros(40), cases).p_value < 0.05)
     assert np.mean(clustered) < 0.05 + 2 * math.sqrt(0.05 * 0.95 / 200)
-    assert np.mean(single) > 0.2, "pairs taken as independent find more: the check can fail"
+    assert np.mean(single) > 0.2, (
+        "pairs taken as independent find more: the check can fail"
+    )
 
 
 # fmt: off
@@ -193,9 +248,16 @@ PAIRS = [
 # fmt: on
 
 
-@pytest.mark.parametrize(("own", "reference", "cases", "counted", "without", "smaller", "median", "mean"), PAIRS)
-def test_pairs_of_one_case_make_one_difference(own, reference, cases, counted, without, smaller, median, mean):
-    told = statistics.paired(np.array(own, dtype=float), np.array(reference, dtype=float), cases)
+@pytest.mark.parametrize(
+    ("own", "reference", "cases", "counted", "without", "smaller", "median", "mean"),
+    PAIRS,
+)
+def test_pairs_of_one_case_make_one_difference(
+    own, reference, cases, counted, without, smaller, median, mean
+):
+    told = statistics.paired(
+        np.array(own, dtype=float), np.array(reference, dtype=float), cases
+    )
     assert (told.counted, told.without, told.smaller) == (counted, without, smaller)
     assert (told.median, told.mean) == pytest.approx((median, mean), nan_ok=True)
 
@@ -203,21 +265,42 @@ def test_pairs_of_one_case_make_one_difference(own, reference, cases, counted, w
 def test_a_mean_difference_is_that_of_the_means_of_cases_and_is_rounded_by_pairs_that_have_a_value():
     own, reference = np.arange(12.0), np.array([1.0, 0.0] * 6)
     halves = statistics.paired(own, reference, [i // 2 for i in range(12)])
-    assert halves == replace(statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)), each="seed")
+    assert halves == replace(
+        statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)),
+        each="seed",
+    )
     lost = np.array([1.0, 2.0, 4.0, 5.0, 7.0, 8.0, INF])
-    assert statistics.paired(lost, np.zeros(7)).rounding_error == pytest.approx(stats.sem(lost[:-1]))
+    assert statistics.paired(lost, np.zeros(7)).rounding_error == pytest.approx(
+        stats.sem(lost[:-1])
+    )
 
 
 @pytest.mark.parametrize(
     ("scale", "verdict", "least", "most"),
-    [(1.0, "consistent", 0.92, 0.98), (4.0, "over-confident", 0.95, 1.0), (0.2, "over-cautious", 0.95, 1.0)],
+    [
+        (1.0, "consistent", 0.92, 0.98),
+        (4.0, "over-confident", 0.95, 1.0),
+        (0.2, "over-cautious", 0.95, 1.0),
+    ],
 )
-def test_anees_of_consistent_runs_lies_in_its_band_and_that_of_others_does_not(scale, verdict, least, most):
+def test_anees_of_consistent_runs_lies_in_its_band_and_that_of_others_does_not(
+    scale, verdict, least, most
+):
     rng = np.random.default_rng(6)
-    found = np.mean([statistics.anees(scale * rng.chisquare(2, 15) / 2, 2).verdict == verdict for _ in range(400)])
+    found = np.mean(
+        [
+            statistics.anees(scale * rng.chisquare(2, 15) / 2, 2).verdict == verdict
+            for _ in range(400)
+        ]
+    )
     assert least < found <= most
-    for unknown in (statistics.anees(np.array([1.0, INF]), 2), statistics.anees(np.array([9.0, 9.0]), math.nan)):
-        assert unknown.verdict == "", "not of survivors, and without degrees of freedom there is no band"
+    for unknown in (
+        statistics.anees(np.array([1.0, INF]), 2),
+        statistics.anees(np.array([9.0, 9.0]), math.nan),
+    ):
+        assert unknown.verdict == "", (
+            "not of survivors, and without degrees of freedom there is no band"
+        )
     assert math.isnan(statistics.anees(np.array([1.0, INF]), 2).mean)
 
 
@@ -226,11 +309,19 @@ def test_up_to_five_values_may_agree_by_chance_and_six_do_not():
     for values in (alike, -alike):
         for count in (2, 5):
             few = statistics.paired(values[:count], np.zeros(count))
-            errors = few.rounding_error, few.median_error, statistics.summarise(values[:count]).median_error
+            errors = (
+                few.rounding_error,
+                few.median_error,
+                statistics.summarise(values[:count]).median_error,
+            )
             assert errors == pytest.approx((0.105,) * 3, abs=1e-3)
         six = statistics.paired(values, np.zeros(6))
         assert six.rounding_error == pytest.approx(stats.sem(alike))
-        assert six.median_error == statistics.summarise(values).median_error == pytest.approx(0.5 * np.ptp(alike))
+        assert (
+            six.median_error
+            == statistics.summarise(values).median_error
+            == pytest.approx(0.5 * np.ptp(alike))
+        )
 
 
 KINDS = ("distinct", "ties", "zeros", "infinite", "mostly zeros", "one size")
@@ -264,7 +355,9 @@ def normal_p(differences: np.ndarray) -> float:
 
 def ranks_of(differences: np.ndarray) -> np.ndarray:
     """Whole ranks of what is not zero."""
-    doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)[differences != 0]
+    doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)[
+        differences != 0
+    ]
     return doubled // np.gcd.reduce(doubled)
 
 
@@ -273,45 +366,72 @@ def enumerated_p(differences: np.ndarray) -> float:
     ranks = stats.rankdata(np.abs(differences))
     observed = abs((np.sign(differences) * ranks).sum())
     ranks = ranks[differences != 0]
-    sums = [abs(np.dot(signs, ranks)) for signs in itertools.product((-1, 1), repeat=len(ranks))]
+    sums = [
+        abs(np.dot(signs, ranks))
+        for signs in itertools.product((-1, 1), repeat=len(ranks))
+    ]
     return float(np.mean([total >= observed - 1e-9 for total in sums]))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_exact_test_is_that_of_all_sign_patterns_and_without_ties_and_zeros_scipys(kind):
+def test_the_exact_test_is_that_of_all_sign_patterns_and_without_ties_and_zeros_scipys(
+    kind,
+):
     for seed in range(6):
         differences = drawn(kind, 9, seed, shift=0.4)
-        assert statistics.signed_rank_p(differences) == pytest.approx(enumerated_p(finite(differences)), abs=1e-12)
+        assert statistics.signed_rank_p(differences) == pytest.approx(
+            enumerated_p(finite(differences)), abs=1e-12
+        )
     for count in (30, 60) if kind == "distinct" else ():
         differences = drawn(kind, count, shift=0.3)
         expected = stats.wilcoxon(differences, method="exact").pvalue
-        assert statistics.signed_rank_p(differences) == pytest.approx(expected, rel=1e-9)
+        assert statistics.signed_rank_p(differences) == pytest.approx(
+            expected, rel=1e-9
+        )
     ranks = ranks_of(drawn(kind, 80))
     counts = np.zeros(ranks.sum() + 1, dtype=object)
     counts[0] = 1
     for rank in ranks.tolist():  # in whole numbers
         counts[rank:] += counts[:-rank].copy()
     for most in (0, int(0.3 * ranks.sum()), int(0.5 * ranks.sum())):
-        assert statistics.exact_tail(ranks, most) == pytest.approx(sum(counts[: most + 1]) / 2 ** len(ranks), rel=1e-9)
+        assert statistics.exact_tail(ranks, most) == pytest.approx(
+            sum(counts[: most + 1]) / 2 ** len(ranks), rel=1e-9
+        )
 
 
 def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
     assert statistics.signed_rank_p(np.zeros(8)) == 1.0
     assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
-    assert statistics.signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(statistics.least_p(8))
-    assert statistics.signed_rank_p(np.arange(1.0, 7.0)) == pytest.approx(statistics.least_p(6)) == 2**-5
-    assert statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0])) == 1.0
+    assert statistics.signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(
+        statistics.least_p(8)
+    )
+    assert (
+        statistics.signed_rank_p(np.arange(1.0, 7.0))
+        == pytest.approx(statistics.least_p(6))
+        == 2**-5
+    )
+    assert (
+        statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
+        == 1.0
+    )
 
 
 @pytest.mark.parametrize(("kind", "last"), [("distinct", 341), ("ties", 271)])
 def test_it_is_exact_where_that_is_cheap(kind, last):
-    for count, tail in ((last, statistics.exact_tail), (last + 1, statistics.near_tail)):
+    for count, tail in (
+        (last, statistics.exact_tail),
+        (last + 1, statistics.near_tail),
+    ):
         differences = drawn(kind, count)
         ranks = ranks_of(differences)
         least = min(ranks[differences > 0].sum(), ranks[differences < 0].sum())
-        assert statistics.signed_rank_p(differences) == pytest.approx(2 * tail(ranks, least), rel=1e-12)
+        assert statistics.signed_rank_p(differences) == pytest.approx(
+            2 * tail(ranks, least), rel=1e-12
+        )
         near = statistics.near_tail(ranks, least)
-        assert statistics.exact_tail(ranks, least) != pytest.approx(near, rel=1e-7), "the check can fail"
+        assert statistics.exact_tail(ranks, least) != pytest.approx(near, rel=1e-7), (
+            "the check can fail"
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -326,7 +446,9 @@ def test_it_is_quick_however_many_pairs_there_are(kind, count):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_not_exact_is_close_to_it_and_of_very_many_as_the_normal_distribution_says(kind):
+def test_what_is_not_exact_is_close_to_it_and_of_very_many_as_the_normal_distribution_says(
+    kind,
+):
     ranks = ranks_of(drawn(kind, 300))
     for share in (0.42, 0.45, 0.48):
         most = int(share * ranks.sum())
@@ -335,22 +457,36 @@ def test_what_is_not_exact_is_close_to_it_and_of_very_many_as_the_normal_distrib
         assert statistics.near_tail(ranks, most) == pytest.approx(exact, rel=0.01)
     if kind in ("distinct", "zeros", "ties"):
         differences = drawn(kind, 10_000, shift=0.0)
-        assert statistics.signed_rank_p(differences) == pytest.approx(normal_p(differences), rel=2e-3)
+        assert statistics.signed_rank_p(differences) == pytest.approx(
+            normal_p(differences), rel=2e-3
+        )
 
 
 def test_the_sum_has_the_variance_of_drawing_without_replacement():
     ranks, most = np.array([1, 2, 4, 7, 9, 9]), 13
     chance = 0.0
     for count in range(len(ranks) + 1):
-        sums = np.array([sum(drawn) for drawn in itertools.combinations(ranks.tolist(), count)])
-        below = stats.norm.cdf(most + 0.5, sums.mean(), sums.std()) if np.ptp(sums) else float(sums[0] <= most)
+        sums = np.array(
+            [sum(drawn) for drawn in itertools.combinations(ranks.tolist(), count)]
+        )
+        below = (
+            stats.norm.cdf(most + 0.5, sums.mean(), sums.std())
+            if np.ptp(sums)
+            else float(sums[0] <= most)
+        )
         chance += math.comb(len(ranks), count) / 2 ** len(ranks) * below
     assert statistics.near_tail(ranks, most) == pytest.approx(chance, rel=1e-9)
 
 
 def test_equal_ranks_keep_their_steps():
     ranks = np.ones(500, dtype=np.int64)
-    assert statistics.near_tail(ranks, 231) == pytest.approx(stats.binom.cdf(231, 500, 0.5), rel=1e-9)
+    assert statistics.near_tail(ranks, 231) == pytest.approx(
+        stats.binom.cdf(231, 500, 0.5), rel=1e-9
+    )
     differences = np.repeat([1.0, -1.0], [5100, 4900])
-    assert statistics.signed_rank_p(differences) == pytest.approx(stats.binomtest(5100, 10_000).pvalue, rel=1e-6)
-    assert normal_p(differences) != pytest.approx(stats.binomtest(5100, 10_000).pvalue, rel=0.01), "the check can fail"
+    assert statistics.signed_rank_p(differences) == pytest.approx(
+        stats.binomtest(5100, 10_000).pvalue, rel=1e-6
+    )
+    assert normal_p(differences) != pytest.approx(
+        stats.binomtest(5100, 10_000).pvalue, rel=0.01
+    ), "the check can fail"

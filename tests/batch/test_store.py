@@ -11,7 +11,9 @@ from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.errors import BatchError
 
 OUTCOME = RunOutcome(
-    {"status": "ok", "causal.ate_raw_m": 0.1}, {"runs/isam2/series.npz": b"123", "a.json": b"{}"}, "said"
+    {"status": "ok", "causal.ate_raw_m": 0.1},
+    {"runs/isam2/series.npz": b"123", "a.json": b"{}"},
+    "said",
 )
 
 
@@ -20,7 +22,11 @@ class Died(BaseException):
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return sorted(
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file()
+    )
 
 
 def test_what_is_written_is_what_is_read(tmp_path):
@@ -29,13 +35,22 @@ def test_what_is_written_is_what_is_read(tmp_path):
     store.write("k", OUTCOME)
     assert store.row("k") == OUTCOME.row
     assert names(tmp_path) == [
-        f"runs/k/{name}" for name in (".sonar_graph.json", "a.json", "log.txt", "row.json", "runs/isam2/series.npz")
+        f"runs/k/{name}"
+        for name in (
+            ".sonar_graph.json",
+            "a.json",
+            "log.txt",
+            "row.json",
+            "runs/isam2/series.npz",
+        )
     ]
     assert (tmp_path / store.log_file("k")).read_text() == "said"
 
 
 @pytest.mark.parametrize("last", range(5))
-def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(tmp_path, monkeypatch, last):
+def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
+    tmp_path, monkeypatch, last
+):
     store = Store(tmp_path)
     store.write("done", OUTCOME)
     before = names(tmp_path)
@@ -66,7 +81,8 @@ def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", die)
-        patch.setattr("sonar_graph.batch.store.remove_written", lambda _: None)  # a killed process cleans nothing up
+        # a killed process cleans nothing up
+        patch.setattr("sonar_graph.batch.store.remove_written", lambda _: None)
         with pytest.raises(Died):
             store.write("k", OUTCOME)
     assert store.row("k") is None
@@ -76,7 +92,9 @@ def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("act", ["discard", "write"])
-def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(tmp_path, monkeypatch, act):
+def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
+    tmp_path, monkeypatch, act
+):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     whole = names(store.run_folder("k"))
@@ -96,7 +114,9 @@ def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
     assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
 
 
-def test_row_that_the_machine_lost_or_that_is_of_another_run_counts_as_not_done(tmp_path):
+def test_row_that_the_machine_lost_or_that_is_of_another_run_counts_as_not_done(
+    tmp_path,
+):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     (store.run_folder("k") / "row.json").write_bytes(b"")
@@ -114,7 +134,10 @@ def test_others_files_in_the_folder_of_a_run_or_beside_it_are_never_removed(tmp_
     store.write("k", OUTCOME)
     (store.run_folder("k") / "log.txt").write_text("mine")
     for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
-        with pytest.raises(BatchError, match=r"runs/k: would be replaced, and holds log\.txt, .*move it away"):
+        with pytest.raises(
+            BatchError,
+            match=r"runs/k: would be replaced, and holds log\.txt, .*move it away",
+        ):
             act()
     assert (store.run_folder("k") / "log.txt").read_text() == "mine"
     (store.run_folder("k") / "log.txt").write_text(OUTCOME.log)
@@ -126,7 +149,10 @@ def test_others_files_in_the_folder_of_a_run_or_beside_it_are_never_removed(tmp_
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
     for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
-        with pytest.raises(BatchError, match=r"runs/k: would be replaced, and holds notes\.txt, .*move it away"):
+        with pytest.raises(
+            BatchError,
+            match=r"runs/k: would be replaced, and holds notes\.txt, .*move it away",
+        ):
             act()
     store.remove_partial()
     assert [path.read_text() for path in notes] == ["mine"] * 3

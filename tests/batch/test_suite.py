@@ -15,11 +15,16 @@ SUITES = sorted((Path(__file__).parents[2] / "benchmarks" / "suites").glob("*.to
 ISAM2 = '\n[[estimators]]\nname = "isam2"\n'
 LAG_TWICE = "params = { smoother.lag_s = 3 }\ngrid = { smoother.lag_s = [4] }\n"
 AGAIN, PARK = ISAM2 + 'variant = "again"\n', 'dataset = "victoria-park"\n'
-DEAF, POOL = DEAD_RECKONING.replace("dead-", "deaf-"), BASIN.replace('"basin"\ngen', '"pool"\ngen')
+DEAF, POOL = (
+    DEAD_RECKONING.replace("dead-", "deaf-"),
+    BASIN.replace('"basin"\ngen', '"pool"\ngen'),
+)
 
 
 def line(text: str, word: str) -> int:
-    return next(number for number, content in enumerate(text.splitlines(), 1) if word in content)
+    return next(
+        number for number, content in enumerate(text.splitlines(), 1) if word in content
+    )
 
 
 def head(text: str) -> str:
@@ -49,18 +54,38 @@ def second(entry: str) -> str:
 @pytest.mark.parametrize(
     ("text", "at", "words"),
     [
-        (head("nmae = 1\n"), "nmae", "nmae: there is no such field; did you mean name?"),
-        (HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING, "name", "name: expected a text"),
+        (
+            head("nmae = 1\n"),
+            "nmae",
+            "nmae: there is no such field; did you mean name?",
+        ),
+        (
+            HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING,
+            "name",
+            "name: expected a text",
+        ),
         (
             HEADER.replace('"short"', '"a\\u001b[2J"') + BASIN + DEAD_RECKONING,
             "name",
             "expected a name without control",
         ),
-        (end('variant = "a\\u202eb"\n'), "variant", "expected a name without control characters"),
+        (
+            end('variant = "a\\u202eb"\n'),
+            "variant",
+            "expected a name without control characters",
+        ),
         (end("grdi = {}\n"), "grdi", "did you mean grid?"),
         (log("seeds = -1.5\n"), "seeds", "seeds"),
-        (log('log = "x.mcap"\n'), "[[logs]]", "exactly one of log, dataset and generator"),
-        (basin('"basin"\nopt', '"pool"\nopt'), "generator", "there are: basin, mission"),
+        (
+            log('log = "x.mcap"\n'),
+            "[[logs]]",
+            "exactly one of log, dataset and generator",
+        ),
+        (
+            basin('"basin"\nopt', '"pool"\nopt'),
+            "generator",
+            "there are: basin, mission",
+        ),
         (basin("laps = 1", "lapse = 1"), "lapse", "options.lapse"),
         (basin("120", "20"), "options", "too short for laps"),
         (basin("laps = 1", "seed = 1"), "seed =", "seeds = [...]"),
@@ -72,14 +97,38 @@ def second(entry: str) -> str:
         (log("seeds = []\n"), "seeds", "has no seeds"),
         (log("landmarks = {}\n"), "[[logs]]", "a generator has its own"),
         (HEADER + BASIN + DEAF, "deaf", "estimators.0.name: no estimator is called"),
-        (end(ISAM2 + "params = { smoother.lag = 1 }\n"), "lag = 1", "did you mean lag_s?"),
-        (end(ISAM2 + "[estimators.grid]\n\nsmoother.lag_s = [1, -1]\n"), "lag_s", "grid.smoother.lag_s"),
-        (HEADER + BASIN + ISAM2, "reference", "'dead-reckoning' does not run here; what does: isam2"),
+        (
+            end(ISAM2 + "params = { smoother.lag = 1 }\n"),
+            "lag = 1",
+            "did you mean lag_s?",
+        ),
+        (
+            end(ISAM2 + "[estimators.grid]\n\nsmoother.lag_s = [1, -1]\n"),
+            "lag_s",
+            "grid.smoother.lag_s",
+        ),
+        (
+            HEADER + BASIN + ISAM2,
+            "reference",
+            "'dead-reckoning' does not run here; what does: isam2",
+        ),
         (head('metrics = ["ate"]\n'), "metrics", "there is no score 'ate'"),
         (log(second(BASIN)), "# second", "logs.1: two logs are called 'basin'"),
-        (log(second(POOL)), "# second", "logs.1: 'pool' and 'basin' are the same with seed 0"),
-        (end(second(DEAD_RECKONING)), "# second", "estimators.1: dead-reckoning/default is there twice"),
-        (end(ISAM2 + second(AGAIN)), "# second", "estimators.2: isam2/again and isam2/default have the same settings"),
+        (
+            log(second(POOL)),
+            "# second",
+            "logs.1: 'pool' and 'basin' are the same with seed 0",
+        ),
+        (
+            end(second(DEAD_RECKONING)),
+            "# second",
+            "estimators.1: dead-reckoning/default is there twice",
+        ),
+        (
+            end(ISAM2 + second(AGAIN)),
+            "# second",
+            "estimators.2: isam2/again and isam2/default have the same settings",
+        ),
         (log("seeds = [1, 1]\n"), "seeds", "list of different whole numbers"),
         (log("seeds = [-1]\n"), "seeds", "logs.0.seeds: expected the number of seeds"),
         (log("seeds = [9223372036854775808]\n"), "seeds", "to 9223372036854775807"),
@@ -87,17 +136,29 @@ def second(entry: str) -> str:
         (log("seeds = true\n"), "seeds", "not true"),
         (log('seeds = "2"\n'), "seeds", "not '2'"),
         (basin("120", "inf"), "options", "options.duration_s"),
-        (log("grid = { wrong_id_rate = [0.1, 0.1] }\n"), "grid", "has 0.1 more than once"),
+        (
+            log("grid = { wrong_id_rate = [0.1, 0.1] }\n"),
+            "grid",
+            "has 0.1 more than once",
+        ),
         (basin("[[logs]]", "[logs]"), "[logs]", "expected a list of tables, [[logs]]"),
         (basin('"basin"\ngen', '"all logs"\ngen'), "all logs", "stands for all logs"),
         (end("params = { lag = 3 }\n"), "lag = 3", "it has: gravity_interval_s"),
         (head("metrics = []\n"), "metrics", "metrics"),
-        (head('metrics = ["causal.ate_se3"]\n'), "metrics", "did you mean causal.ate_se3_m?"),
+        (
+            head('metrics = ["causal.ate_se3"]\n'),
+            "metrics",
+            "did you mean causal.ate_se3_m?",
+        ),
         (other('log = "no.mcap"\n'), "no.mcap", "no.mcap is not in"),
         (other('log = "suite.toml"\n'), "suite.toml", "not an MCAP file but a text"),
         (other('log = "."\n'), "log =", "is a folder without metadata.yaml"),
         (other('dataset = "mrclam"\n'), "[[logs]]", "robot: is missing"),
-        (other(f"{PARK}landmarks = {{ seed = 1 }}\n"), "landmarks", "logs.0.landmarks.seed: cannot be set"),
+        (
+            other(f"{PARK}landmarks = {{ seed = 1 }}\n"),
+            "landmarks",
+            "logs.0.landmarks.seed: cannot be set",
+        ),
         (HEADER + "[[logs]\n", "[[logs]", "not TOML"),
     ],
 )
@@ -112,7 +173,9 @@ def test_mistake_is_told_with_file_line_and_key(write_suite, text, at, words):
     assert "\n" not in message
 
 
-def test_data_beside_the_suite_goes_before_the_folder_of_data_sets(write_suite, tmp_path, monkeypatch):
+def test_data_beside_the_suite_goes_before_the_folder_of_data_sets(
+    write_suite, tmp_path, monkeypatch
+):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "dive.mcap").touch()
@@ -133,11 +196,26 @@ def test_suites_that_ship_are_sound(path):
         assert plan_runs(file)
 
 
-def test_suites_without_mistakes_are_planned_such_as_the_example_in_the_documentation(write_suite):
+def test_suites_without_mistakes_are_planned_such_as_the_example_in_the_documentation(
+    write_suite,
+):
     from sonar_graph.batch import suite
 
-    assert len(plan_runs(read_suite(write_suite(HEADER, BASIN, "seeds = [4, 2]\n", DEAD_RECKONING, ISAM2)))) == 4
-    example = "\n".join(row[4:] for row in (suite.__doc__ or "").splitlines() if row.startswith("    "))
+    assert (
+        len(
+            plan_runs(
+                read_suite(
+                    write_suite(
+                        HEADER, BASIN, "seeds = [4, 2]\n", DEAD_RECKONING, ISAM2
+                    )
+                )
+            )
+        )
+        == 4
+    )
+    example = "\n".join(
+        row[4:] for row in (suite.__doc__ or "").splitlines() if row.startswith("    ")
+    )
     assert tomllib.loads(example)["name"] == "smoke"
     assert len(plan_runs(read_suite(write_suite(example)))) == 2 * 3 * 3
 

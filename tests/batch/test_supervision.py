@@ -29,10 +29,16 @@ def no_process_left() -> Iterator[None]:
 
 
 def runners() -> list[psutil.Process]:
-    return [p for p in psutil.Process().children() if "sonar_graph.batch.one_run" in p.cmdline()]
+    return [
+        p
+        for p in psutil.Process().children()
+        if "sonar_graph.batch.one_run" in p.cmdline()
+    ]
 
 
-def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned, misbehaving):
+def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(
+    planned, misbehaving
+):
     perform_watched(planned(), AMPLE)  # compiled from here on
     began = time.monotonic()
     outcome = perform_watched(planned("sleeps"), Limits(2.0))
@@ -46,10 +52,25 @@ def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned, misb
 @pytest.mark.parametrize(
     ("estimator", "limits", "status", "reason"),
     [
-        ("hungry", Limits(120.0, memory_mb=700.0), "memory", "its processes needed more than 700 MB"),
-        ("hungry-child", Limits(120.0, memory_mb=700.0), "memory", "its processes needed more than 700 MB"),
+        (
+            "hungry",
+            Limits(120.0, memory_mb=700.0),
+            "memory",
+            "its processes needed more than 700 MB",
+        ),
+        (
+            "hungry-child",
+            Limits(120.0, memory_mb=700.0),
+            "memory",
+            "its processes needed more than 700 MB",
+        ),
         ("forks", Limits(5.0), "timeout", "took longer than 5 s"),
-        ("dies-after-forking", Limits(120.0), "killed", "its process was ended by SIGKILL, 2 times"),
+        (
+            "dies-after-forking",
+            Limits(120.0),
+            "killed",
+            "its process was ended by SIGKILL, 2 times",
+        ),
         ("dies", AMPLE, "killed", "its process was ended by SIGKILL, 2 times"),
         ("dies-once", AMPLE, "ok", ""),
     ],
@@ -59,18 +80,26 @@ def test_a_run_is_ended_with_the_processes_that_it_starts_and_one_that_is_killed
 ):
     row = perform_watched(planned(estimator), limits).row
     assert (row["status"], row["reason"]) == (status, reason)
-    assert status == "ok" or not [p for p in psutil.process_iter() if is_runner_of_this_test(p)]
+    assert status == "ok" or not [
+        p for p in psutil.process_iter() if is_runner_of_this_test(p)
+    ]
 
 
 def is_runner_of_this_test(process: psutil.Process) -> bool:
     """Children of a runner have its command and environment."""
     with contextlib.suppress(psutil.Error):
         is_runner = "sonar_graph.batch.one_run" in process.cmdline()
-        return is_runner and process.environ().get("SONAR_GRAPH_TEST_MARK") == os.environ["SONAR_GRAPH_TEST_MARK"]
+        return (
+            is_runner
+            and process.environ().get("SONAR_GRAPH_TEST_MARK")
+            == os.environ["SONAR_GRAPH_TEST_MARK"]
+        )
     return False
 
 
-def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(planned, misbehaving):
+def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
+    planned, misbehaving
+):
     runner = Runner()
     outcome = runner.perform(planned("prints"), AMPLE)
     assert outcome.row["status"] == "failed"
@@ -82,7 +111,9 @@ def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(plan
     runner.end()
 
 
-def test_a_process_is_kept_for_the_next_run_but_after_one_of_another_package(planned, misbehaving):
+def test_a_process_is_kept_for_the_next_run_but_after_one_of_another_package(
+    planned, misbehaving
+):
     perform_watched(planned(), AMPLE)
     (kept,) = runners()
     perform_watched(planned(), AMPLE)
@@ -91,7 +122,9 @@ def test_a_process_is_kept_for_the_next_run_but_after_one_of_another_package(pla
     assert not runners()
 
 
-def test_order_of_sets_does_not_hang_on_who_started_the_process(planned, misbehaving, monkeypatch):
+def test_order_of_sets_does_not_hang_on_who_started_the_process(
+    planned, misbehaving, monkeypatch
+):
     reasons = set()
     for seed in ("1", "2"):
         monkeypatch.setenv("PYTHONHASHSEED", seed)
@@ -102,7 +135,9 @@ def test_order_of_sets_does_not_hang_on_who_started_the_process(planned, misbeha
     assert "mine 7" in str(reason)
 
 
-def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(planned, misbehaving, monkeypatch):
+def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
+    planned, misbehaving, monkeypatch
+):
     asked: list[str] = []
     ask = Runner._ask
 
@@ -111,12 +146,22 @@ def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(planned,
         return ask(self, request, limits)
 
     monkeypatch.setattr(Runner, "_ask", told)
-    rows = [perform_watched(planned(name), AMPLE).row for name in ("dead-reckoning", "dead-reckoning", "prints")]
-    assert asked == ["Preparation 3600", "PlannedRun 600", "PlannedRun 600", "PlannedRun 600"]
+    rows = [
+        perform_watched(planned(name), AMPLE).row
+        for name in ("dead-reckoning", "dead-reckoning", "prints")
+    ]
+    assert asked == [
+        "Preparation 3600",
+        "PlannedRun 600",
+        "PlannedRun 600",
+        "PlannedRun 600",
+    ]
     assert rows[0]["causal.ate_raw_m"] == rows[1]["causal.ate_raw_m"]
 
 
-def test_a_warm_up_that_does_not_end_and_a_process_that_is_not_ready_in_time_are_ended_and_told(planned, monkeypatch):
+def test_a_warm_up_that_does_not_end_and_a_process_that_is_not_ready_in_time_are_ended_and_told(
+    planned, monkeypatch
+):
     run = planned()
     with monkeypatch.context() as patch:
         patch.setattr(supervision, "WARM_UP_S", 0.0)
@@ -124,7 +169,9 @@ def test_a_warm_up_that_does_not_end_and_a_process_that_is_not_ready_in_time_are
     assert (row["status"], row["reason"]) == ("timeout", "took longer than 0 s")
     assert not runners()
     monkeypatch.setattr(supervision, "START_S", 0.0)
-    with pytest.raises(BatchError, match=r"no process for runs on .*: it was not ready after 0 s"):
+    with pytest.raises(
+        BatchError, match=r"no process for runs on .*: it was not ready after 0 s"
+    ):
         Runner()
     assert not runners()
 
@@ -134,7 +181,9 @@ def test_process_of_runs_does_not_outlive_who_started_it():
         "from sonar_graph.batch.supervision import Runner; import time;"
         "print(Runner().pid, flush=True); time.sleep(1000)"
     )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as starter:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as starter:
         runner = psutil.Process(int(starter.stdout.readline()))
         starter.kill()
     assert runner.wait(timeout=30) is None

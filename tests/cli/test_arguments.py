@@ -11,11 +11,22 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from sonar_graph.cli import arguments
-from sonar_graph.cli.arguments import ReadingOptions, estimator_settings, parse_settings, with_options
+from sonar_graph.cli.arguments import (
+    ReadingOptions,
+    estimator_settings,
+    parse_settings,
+    with_options,
+)
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 
 
-@given(st.one_of(st.integers(-(2**62), 2**62), st.booleans(), st.floats(allow_nan=False, allow_infinity=False)))
+@given(
+    st.one_of(
+        st.integers(-(2**62), 2**62),
+        st.booleans(),
+        st.floats(allow_nan=False, allow_infinity=False),
+    )
+)
 def test_setting_keeps_type_and_value(value):
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     ((name, parsed),) = parse_settings([f"gain = {text}"]).items()
@@ -23,7 +34,14 @@ def test_setting_keeps_type_and_value(value):
 
 
 def test_setting_that_is_no_toml_is_text():
-    cases = {"huber": "huber", '"2"': "2", "[1, 2.5]": [1, 2.5], "": "", "x=y": "x=y", "1\nb=2": "1\nb=2"}
+    cases = {
+        "huber": "huber",
+        '"2"': "2",
+        "[1, 2.5]": [1, 2.5],
+        "": "",
+        "x=y": "x=y",
+        "1\nb=2": "1\nb=2",
+    }
     for text, value in cases.items():
         assert parse_settings([f"a={text}"]) == {"a": value}
 
@@ -36,24 +54,39 @@ def test_settings_go_to_their_estimator_at_any_depth():
     }
 
 
-def test_topics_go_to_their_roles_and_calibrations_are_read_from_toml_and_json(tmp_path):
-    assert ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"]).choices == {"imu": "/imu/data", "dvl": "/a=b"}
-    for name, text in (("a.toml", "[imu]\ngyro_bias_sigma = 0.5\n"), ("a.json", '{"imu": {"gyro_bias_sigma": 0.5}}')):
+def test_topics_go_to_their_roles_and_calibrations_are_read_from_toml_and_json(
+    tmp_path,
+):
+    assert ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"]).choices == {
+        "imu": "/imu/data",
+        "dvl": "/a=b",
+    }
+    for name, text in (
+        ("a.toml", "[imu]\ngyro_bias_sigma = 0.5\n"),
+        ("a.json", '{"imu": {"gyro_bias_sigma": 0.5}}'),
+    ):
         (tmp_path / name).write_text(text)
         given = ReadingOptions(calibration=tmp_path / name).given
-        assert given == PartialCalibration({"imu": {"gyro_bias_sigma": 0.5}}, str(tmp_path / name))
+        assert given == PartialCalibration(
+            {"imu": {"gyro_bias_sigma": 0.5}}, str(tmp_path / name)
+        )
 
 
 def test_fields_of_a_group_are_options_and_those_left_out_have_their_defaults():
     given: list[object] = []
 
     @with_options("end", "salvage")
-    def command(name: Annotated[str, typer.Argument()], reading: ReadingOptions, times: int = 2) -> None:
+    def command(
+        name: Annotated[str, typer.Argument()], reading: ReadingOptions, times: int = 2
+    ) -> None:
         given.extend([name, reading, times])
 
     app = typer.Typer()
     app.command()(command)
-    assert CliRunner().invoke(app, ["a", "--start", "3", "--topic", "imu=/b"]).exit_code == 0
+    assert (
+        CliRunner().invoke(app, ["a", "--start", "3", "--topic", "imu=/b"]).exit_code
+        == 0
+    )
     assert given == ["a", ReadingOptions(topics=["imu=/b"], start="3"), 2]
     assert CliRunner().invoke(app, ["a", "--salvage"]).exit_code == 2
 

@@ -22,7 +22,12 @@ from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import NS_PER_S, Dvl, Heading, Imu, PositionFixes
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
+from sonar_graph.simulation.basin import (
+    FASTEST_M_S,
+    PAPER_LAPS,
+    BasinOptions,
+    cruise_speed,
+)
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +41,28 @@ def compared(run, basin_content, tmp_path_factory):
 
 
 def test_compare_writes_report_numbers_results_and_runs(compared):
-    for name in ("report.html", "comparison.json", "result.mcap", "result.foxglove.json", "result.rviz"):
+    for name in (
+        "report.html",
+        "comparison.json",
+        "result.mcap",
+        "result.foxglove.json",
+        "result.rviz",
+    ):
         assert (compared / name).stat().st_size > 1000
     for estimator in ("isam2", "ekf-slam", "dead-reckoning"):
         there = {path.name for path in (compared / "runs" / estimator).iterdir()}
         assert {"trajectory.tum", "causal.tum", "landmarks.csv", "result.json"} <= there
-        assert json.loads((compared / "runs" / estimator / "result.json").read_text())["status"] == "ok"
+        assert (
+            json.loads((compared / "runs" / estimator / "result.json").read_text())[
+                "status"
+            ]
+            == "ok"
+        )
 
 
-def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(run, basin, tmp_path, capsys):
+def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(
+    run, basin, tmp_path, capsys
+):
     assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
     told, page = capsys.readouterr(), tmp_path / "report.html"
     assert f"Report: {page}" in told.out.splitlines()
@@ -56,18 +74,44 @@ def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(r
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
 
 
-def test_names_that_are_not_utf_8_are_read_and_spelt_out_where_they_are_told(run, basin, tmp_path, capsys):
+def test_names_that_are_not_utf_8_are_read_and_spelt_out_where_they_are_told(
+    run, basin, tmp_path, capsys
+):
     odd = basin.rename(tmp_path / "odd\udcff.mcap")
-    assert run("compare", odd, "-o", tmp_path / "out\udcff", "--estimators", "dead-reckoning") == 0
+    assert (
+        run(
+            "compare",
+            odd,
+            "-o",
+            tmp_path / "out\udcff",
+            "--estimators",
+            "dead-reckoning",
+        )
+        == 0
+    )
     assert run("report", tmp_path / "out\udcff") == 0
     assert "out\\udcff/report.html" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(basin, tmp_path, number):
+def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(
+    basin, tmp_path, number
+):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "sonar_graph", "compare", str(basin), "-o", str(out), "--rate-hz", "10"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "sonar_graph",
+        "compare",
+        str(basin),
+        "-o",
+        str(out),
+        "--rate-hz",
+        "10",
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         while process.poll() is None and not (out / ".lock").exists():
             time.sleep(0.01)
         process.send_signal(number)
@@ -76,18 +120,33 @@ def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(basin, 
     assert not out.exists()
 
 
-def test_failed_run_is_written_and_reported_by_exit_code(run, basin, tmp_path, monkeypatch, capsys):
+def test_failed_run_is_written_and_reported_by_exit_code(
+    run, basin, tmp_path, monkeypatch, capsys
+):
     from baselines.dead_reckoning import DeadReckoning
 
     def fail(*_: object) -> None:
         raise RuntimeError("the filter is tired")
 
     monkeypatch.setattr(DeadReckoning, "process", fail)
-    assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam") == 1
+    assert (
+        run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam")
+        == 1
+    )
     assert "the filter is tired" in capsys.readouterr().err
     assert "the filter is tired" in (tmp_path / "report.html").read_text()
-    assert json.loads((tmp_path / "runs" / "dead-reckoning" / "result.json").read_text())["status"] == "failed"
-    assert json.loads((tmp_path / "runs" / "ekf-slam" / "result.json").read_text())["status"] == "ok"
+    assert (
+        json.loads((tmp_path / "runs" / "dead-reckoning" / "result.json").read_text())[
+            "status"
+        ]
+        == "failed"
+    )
+    assert (
+        json.loads((tmp_path / "runs" / "ekf-slam" / "result.json").read_text())[
+            "status"
+        ]
+        == "ok"
+    )
 
 
 def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_log_field_by_field(
@@ -99,30 +158,57 @@ def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_
     calibrations = []
     for more in ((), ("--calibration", moved)):
         assert run(*arguments, *more) == 0
-        said = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]
+        said = json.loads((tmp_path / "out" / "comparison.json").read_text())[
+            "sequence"
+        ]
         calibrations.append(said["calibration"])
-    assert [path.name for path in (tmp_path / "out" / "runs").iterdir()] == ["dead-reckoning"]
-    first = (tmp_path / "out" / "runs" / "dead-reckoning" / "causal.tum").read_text().splitlines()[1].split()
+    assert [path.name for path in (tmp_path / "out" / "runs").iterdir()] == [
+        "dead-reckoning"
+    ]
+    first = (
+        (tmp_path / "out" / "runs" / "dead-reckoning" / "causal.tum")
+        .read_text()
+        .splitlines()[1]
+        .split()
+    )
     assert float(first[1]) == pytest.approx(100, abs=3)
     of_log, changed = calibrations
     assert changed["start"].pop("position_m") != of_log["start"].pop("position_m")
     assert changed == of_log
-    assert said["notes"]["log.calibration"] == f"from {moved}: start.position_m; else from the log"
+    assert (
+        said["notes"]["log.calibration"]
+        == f"from {moved}: start.position_m; else from the log"
+    )
 
 
 def degrees(sequence: Sequence) -> Sequence:
-    return replace(sequence, imu=replace(sequence.imu, angular_velocity=np.degrees(sequence.imu.angular_velocity)))
+    return replace(
+        sequence,
+        imu=replace(
+            sequence.imu, angular_velocity=np.degrees(sequence.imu.angular_velocity)
+        ),
+    )
 
 
 def fast(sequence: Sequence) -> Sequence:
-    return replace(sequence, dvl=replace(sequence.dvl, velocity=100 * sequence.dvl.velocity))
+    return replace(
+        sequence, dvl=replace(sequence.dvl, velocity=100 * sequence.dvl.velocity)
+    )
 
 
 def aided(sequence: Sequence, sense: float = 1.0, unit: float = 1.0) -> Sequence:
     """With a compass and position fixes of the truth."""
-    truth = sequence.truth.at(np.arange(sequence.start_ns, sequence.truth.stamps_ns[-1], NS_PER_S))
-    heading = Heading(truth.stamps_ns, sense * truth.rotations().as_euler("ZYX")[:, 0], np.full(len(truth), np.nan))
-    fixes = PositionFixes(truth.stamps_ns, unit * truth.positions, np.full((len(truth), 3, 3), np.nan))
+    truth = sequence.truth.at(
+        np.arange(sequence.start_ns, sequence.truth.stamps_ns[-1], NS_PER_S)
+    )
+    heading = Heading(
+        truth.stamps_ns,
+        sense * truth.rotations().as_euler("ZYX")[:, 0],
+        np.full(len(truth), np.nan),
+    )
+    fixes = PositionFixes(
+        truth.stamps_ns, unit * truth.positions, np.full((len(truth), 3, 3), np.nan)
+    )
     return replace(sequence, heading=heading, positions=fixes)
 
 
@@ -150,7 +236,9 @@ def test_run_and_compare_name_first_what_sensors_contradict_and_nothing_of_a_sou
         if told:
             assert text.partition("Warning: ")[2].startswith(told)
         else:
-            assert not re.search("turn over that of the gyros|position fixes: unit", text)
+            assert not re.search(
+                "turn over that of the gyros|position fixes: unit", text
+            )
 
 
 def test_estimators_lists_every_setting(run, capsys):
@@ -165,29 +253,40 @@ def test_estimators_lists_every_setting(run, capsys):
 def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys):
     options = ("--estimator", "dead-reckoning", "--start", "30", "--end", "60")
     assert run("run", basin, "-o", tmp_path / "out", *options) == 0
-    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]["notes"]
+    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"][
+        "notes"
+    ]
     assert notes["log.part"] == "30.000 s to 60.000 s of the recording"
     capsys.readouterr()
-    assert run("inspect", basin, "--start", "30", "--end", "60") == 3  # the start that the log states is another
+    # the start that the log states is another
+    assert run("inspect", basin, "--start", "30", "--end", "60") == 3
     assert ", 30.0 s" in capsys.readouterr().out
 
 
-def test_a_damaged_log_is_refused_with_the_option_that_reads_it(run, basin, tmp_path, capsys):
+def test_a_damaged_log_is_refused_with_the_option_that_reads_it(
+    run, basin, tmp_path, capsys
+):
     log = tmp_path / "damaged.mcap"
     content = bytearray(basin.read_bytes())
     content[len(content) // 3] ^= 1
     log.write_bytes(content)
     options = ("-o", tmp_path / "out", "--estimator", "dead-reckoning")
     assert run("run", log, *options) == 2
-    assert re.search(r"is damaged: bytes .* is lost: .*--salvage", capsys.readouterr().err)
+    assert re.search(
+        r"is damaged: bytes .* is lost: .*--salvage", capsys.readouterr().err
+    )
     assert run("run", log, *options, "--salvage") == 0
-    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]["notes"]
+    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"][
+        "notes"
+    ]
     assert "is lost" in notes["log.damage"]
 
 
 @pytest.mark.slow
 def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sonar_graph.cli.compare.DEMO", DEMO | {"duration_s": 130.0, "laps": 1})
+    monkeypatch.setattr(
+        "sonar_graph.cli.compare.DEMO", DEMO | {"duration_s": 130.0, "laps": 1}
+    )
     assert run("demo", "-o", tmp_path) == 0
     told = capsys.readouterr().out
     assert f"Report: {tmp_path / 'report.html'}" in told
@@ -197,7 +296,11 @@ def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkey
     comparison = read_comparison(tmp_path)
     assert comparison.recognition is not None
     assert comparison.recognition.frames > 600
-    found = {run.estimator for run in comparison.runs if run.landmarks is not None and len(run.landmarks) == 4}
+    found = {
+        run.estimator
+        for run in comparison.runs
+        if run.landmarks is not None and len(run.landmarks) == 4
+    }
     assert found == {"isam2", "ekf-slam"}
 
 
@@ -216,11 +319,16 @@ def measured_at(stamps_s: list[float]) -> Sequence:
 
 
 def test_estimates_are_asked_for_at_most_as_often_as_the_imu_measures_or_at_the_default_rate():
-    dive, slow = measured_at(np.arange(0, 10.01, 0.05).tolist()), measured_at([0.0, 1.0, 2.0])
+    dive, slow = (
+        measured_at(np.arange(0, 10.01, 0.05).tolist()),
+        measured_at([0.0, 1.0, 2.0]),
+    )
     one_row = replace(slow, imu=slow.imu.between(0, 10**9))
     for rate_hz, sequence in ((20.0, dive), (2.0, slow), (2.0, one_row)):
         check_rate(rate_hz, sequence)
-    with pytest.raises(EvaluationError, match=r"--rate-hz 21: the IMU of dive .* at most 20\.1"):
+    with pytest.raises(
+        EvaluationError, match=r"--rate-hz 21: the IMU of dive .* at most 20\.1"
+    ):
         check_rate(21.0, dive)
     with pytest.raises(EvaluationError, match=r"give at most 2$"):
         check_rate(3.0, slow)
@@ -231,12 +339,16 @@ PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
 
 @pytest.mark.slow
 @pytest.mark.recording
-def test_the_documented_commands_convert_inspect_and_reckon(run, recordings, tmp_path, monkeypatch, capsys):
+def test_the_documented_commands_convert_inspect_and_reckon(
+    run, recordings, tmp_path, monkeypatch, capsys
+):
     """A pool run with a Doppler log of unknown axes: the commands and the file of the page, and no code."""
     section = PAGE.read_text(encoding="utf-8").split("## SONIA")[1]
     (toml,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
     (tmp_path / "sonia.toml").write_text(toml, encoding="utf-8")
-    (tmp_path / "sonia_imu_dvl.bag").symlink_to(recordings / "bags" / "sonia_imu_dvl.bag")
+    (tmp_path / "sonia_imu_dvl.bag").symlink_to(
+        recordings / "bags" / "sonia_imu_dvl.bag"
+    )
     monkeypatch.chdir(tmp_path)
     printed = []
     for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE):
@@ -244,7 +356,10 @@ def test_the_documented_commands_convert_inspect_and_reckon(run, recordings, tmp
         assert run(*line.split()) == (3 if line.startswith("inspect") else 0)
         printed.append(capsys.readouterr().out)
     assert len(printed) == 3
-    assert re.search(r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act", printed[1])
+    assert re.search(
+        r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act",
+        printed[1],
+    )
     path = np.loadtxt("sonia/runs/dead-reckoning/causal.tum")[:, 1:4]
     assert np.all(np.ptp(path, axis=0)[:2] < 5), "the vehicle stays in the pool"
     assert 35 < np.linalg.norm(np.diff(path, axis=0), axis=1).sum() < 50

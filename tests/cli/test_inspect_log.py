@@ -17,7 +17,9 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 @pytest.fixture(scope="module")
 def log(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("inspect") / "mission.mcap"
-    write_log(path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2)))
+    write_log(
+        path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2))
+    )
     return path
 
 
@@ -35,7 +37,10 @@ def sensor(said: dict, quantity: str) -> dict:
 def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log, tmp_path):
     (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
     here = sensor(answer(log), "DVL against IMU: time offset")
-    there = sensor(answer(log, "--log-config", tmp_path / "late.toml"), "DVL against IMU: time offset")
+    there = sensor(
+        answer(log, "--log-config", tmp_path / "late.toml"),
+        "DVL against IMU: time offset",
+    )
     assert there["value"] - here["value"] == pytest.approx(-0.5, abs=there["sigma"])
     assert there["sigma"] < 0.1
     assert there["act"]
@@ -43,14 +48,18 @@ def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log, tmp_pat
 
 def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
-    yaw = sensor(answer(log, "--calibration", tmp_path / "turned.toml"), "DVL mounting yaw")
+    yaw = sensor(
+        answer(log, "--calibration", tmp_path / "turned.toml"), "DVL mounting yaw"
+    )
     assert yaw["value"] == pytest.approx(-5.73, abs=1.0)
     assert "dvl.mounting.rpy_rad" in yaw["advice"]
 
 
 def test_json_has_lever_arm_bias_and_start_as_numbers_unless_nothing_was_compared(log):
     said = answer(log)
-    assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(-0.2, abs=0.1)
+    assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(
+        -0.2, abs=0.1
+    )
     assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"
     assert abs(sensor(said, "gyro bias, x")["value"]) < 1e-3
     assert 0 < sensor(said, "start pitch: value")["sigma"] < 0.2
@@ -66,24 +75,39 @@ def test_sentences_say_whether_to_act(log):
     assert "sensors against each other (± 95 %)" in result.stdout
     assert "no need to act" in result.stdout
     assert "cannot be told: never still for 30 s" in result.stdout
-    for row in ("lever arm from IMU to DVL, x", "gyro bias, x", "start roll: value", "start pitch: value"):
+    for row in (
+        "lever arm from IMU to DVL, x",
+        "gyro bias, x",
+        "start roll: value",
+        "start pitch: value",
+    ):
         assert f"\n{row} " in result.stdout
 
 
-def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(run, basin, monkeypatch, capsys):
+def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
+    run, basin, monkeypatch, capsys
+):
     assert run("inspect", basin) == 0
     shown = capsys.readouterr().out
-    for name in ("sensor_msgs/msg/Imu", "marine_acoustic_msgs/msg/Dvl", "sonar_graph_msgs/msg/LandmarkDetections"):
+    for name in (
+        "sensor_msgs/msg/Imu",
+        "marine_acoustic_msgs/msg/Dvl",
+        "sonar_graph_msgs/msg/LandmarkDetections",
+    ):
         assert name in shown
     assert "not usable" not in shown
-    monkeypatch.setattr(LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)"))
+    monkeypatch.setattr(
+        LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)")
+    )
     assert run("inspect", basin) == 1
     *_, lack, advice = capsys.readouterr().out.splitlines()
     assert lack == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
     assert "--toml > log.toml" in advice
 
 
-def test_inspect_and_compare_say_what_a_large_log_takes(run, basin, tmp_path, monkeypatch, capsys):
+def test_inspect_and_compare_say_what_a_large_log_takes(
+    run, basin, tmp_path, monkeypatch, capsys
+):
     words = "compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning"
     assert run("inspect", basin) == run(*words) == 0
     assert "for each estimator" not in "".join(capsys.readouterr())
@@ -98,10 +122,14 @@ def test_inspect_and_compare_say_what_a_large_log_takes(run, basin, tmp_path, mo
     assert re.search(r"^A large log, for each estimator: \d+ IMU rows, ", told.err)
 
 
-def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(run, basin, monkeypatch, capsys):
+def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
+    run, basin, monkeypatch, capsys
+):
     monkeypatch.setattr("sonar_graph.cli.inspect_log.MOST_TOPICS", 2)
     assert run("inspect", basin, "--quick") == 0
-    shown, hidden = re.search(r"(?s)(.*?)not shown (\d+) more topics", capsys.readouterr().out).groups()
+    shown, hidden = re.search(
+        r"(?s)(.*?)not shown (\d+) more topics", capsys.readouterr().out
+    ).groups()
     topics = {topic["name"] for topic in answer(basin, "--quick")["topics"]}
     assert len(topics) == 2 + int(hidden)
     assert sum(f"\n{name} " in shown for name in topics) == 2

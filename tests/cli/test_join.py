@@ -9,7 +9,13 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from sonar_graph.calibration import Calibration, FloorPrior, Mounting, SonarCalibration, SonarImage
+from sonar_graph.calibration import (
+    Calibration,
+    FloorPrior,
+    Mounting,
+    SonarCalibration,
+    SonarImage,
+)
 from sonar_graph.logs.mcap.writer import recording
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.sonar_images import read_sonar_frames
@@ -23,8 +29,12 @@ OFFSET_S = 2.4
 
 def images_log(lane: Lane, path: Path, offset_s: float = OFFSET_S) -> Path:
     """The images by a clock that is behind, in a log that says what their samples mean."""
-    calibration = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=75.0)))
-    frames = replace(lane.frames, stamps_ns=lane.frames.stamps_ns - round(offset_s * 1e9))
+    calibration = Calibration(
+        sonar=SonarCalibration(image=SonarImage(decibel_span=75.0))
+    )
+    frames = replace(
+        lane.frames, stamps_ns=lane.frames.stamps_ns - round(offset_s * 1e9)
+    )
     own = calibration.model_dump_json(exclude_unset=True)
     with recording(path, {METADATA: {"calibration": own}}) as writer:
         writer.write([sonar_image_messages(TOPIC, frames)])
@@ -38,19 +48,27 @@ def both(lane, tmp_path_factory) -> tuple[Path, Path]:
     return images_log(lane, folder / "images.mcap"), folder / "nav.mcap"
 
 
-def test_images_come_onto_the_clock_of_the_navigation_with_all_else_as_it_was(lane, both, run, tmp_path, capsys):
+def test_images_come_onto_the_clock_of_the_navigation_with_all_else_as_it_was(
+    lane, both, run, tmp_path, capsys
+):
     out = tmp_path / "joined.mcap"
     assert run("join", *both, "-o", out) == 0
     said = capsys.readouterr().out
-    match = re.search(r"Clock offset, to be added .*: \+(\d\.\d+) s ± (\d\.\d+) s", said)
+    match = re.search(
+        r"Clock offset, to be added .*: \+(\d\.\d+) s ± (\d\.\d+) s", said
+    )
     assert abs(float(match[1]) - OFFSET_S) < 3 * float(match[2]) + 0.01
     assert f"{len(lane.frames)} frames, " in said
     joined = read_log(out)
     np.testing.assert_array_equal(joined.imu.stamps_ns, lane.sequence.imu.stamps_ns)
     blocks = list(read_sonar_frames(out))
     stamps = np.concatenate([block.stamps_ns for block in blocks])
-    np.testing.assert_allclose(stamps, lane.frames.stamps_ns, atol=3e9 * float(match[2]) + 1e7)
-    np.testing.assert_array_equal(np.concatenate([block.intensity for block in blocks]), lane.frames.intensity)
+    np.testing.assert_allclose(
+        stamps, lane.frames.stamps_ns, atol=3e9 * float(match[2]) + 1e7
+    )
+    np.testing.assert_array_equal(
+        np.concatenate([block.intensity for block in blocks]), lane.frames.intensity
+    )
     assert joined.notes["images.clock_offset"].startswith(f"+{match[1]} s")
     expected = lane.sequence.calibration
     assert joined.calibration.sonar.mounting == expected.sonar.mounting
@@ -63,47 +81,84 @@ def bare(lane, tmp_path_factory) -> Path:
     """Navigation as another program writes it: mountings in ``/tf_static``, and no record of this package."""
     folder = tmp_path_factory.mktemp("bare")
     write_log(folder / "whole.mcap", lane.sequence)
-    with (folder / "whole.mcap").open("rb") as stream, (folder / "nav.mcap").open("wb") as out:
+    with (
+        (folder / "whole.mcap").open("rb") as stream,
+        (folder / "nav.mcap").open("wb") as out,
+    ):
         writer, channels = Writer(out), {}
         writer.start()
         for schema, channel, message in make_reader(stream).iter_messages():
             if channel.topic not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                number = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
                 channels[channel.topic] = writer.register_channel(
                     channel.topic, channel.message_encoding, number, channel.metadata
                 )
-            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+            writer.add_message(
+                channels[channel.topic],
+                message.log_time,
+                message.data,
+                message.publish_time,
+            )
         writer.finish()
     return folder / "nav.mcap"
 
 
-def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(lane, both, bare, run, tmp_path):
+def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
+    lane, both, bare, run, tmp_path
+):
     out, expected = tmp_path / "joined.mcap", lane.sequence.calibration.sonar.mounting
     assert expected != Mounting()
     assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
     joined = read_log(out)
-    np.testing.assert_allclose(joined.calibration.sonar.mounting.translation_m, expected.translation_m, atol=1e-12)
-    np.testing.assert_allclose(joined.calibration.sonar.mounting.rpy_rad, expected.rpy_rad, atol=1e-12)
+    np.testing.assert_allclose(
+        joined.calibration.sonar.mounting.translation_m,
+        expected.translation_m,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        joined.calibration.sonar.mounting.rpy_rad, expected.rpy_rad, atol=1e-12
+    )
     assert joined.calibration.sonar.image.decibel_span == 75.0
     assert "not stated" in joined.notes["log.start"]
 
 
-def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(both, bare, run, tmp_path):
+def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
+    both, bare, run, tmp_path
+):
     given, out = tmp_path / "vehicle.toml", tmp_path / "joined.mcap"
     given.write_text(
         "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
         "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
     )
     for navigation in (bare, both[1]):
-        assert run("join", both[0], navigation, "-o", out, "--offset", OFFSET_S, "--calibration", given) == 0
+        assert (
+            run(
+                "join",
+                both[0],
+                navigation,
+                "-o",
+                out,
+                "--offset",
+                OFFSET_S,
+                "--calibration",
+                given,
+            )
+            == 0
+        )
         found = read_log(out).calibration
         assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
         assert found.start.position_m == (1.0, 2.0, -0.5)
         assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
-        assert found.dvl.mounting.rpy_rad == pytest.approx(read_log(navigation).calibration.dvl.mounting.rpy_rad)
+        assert found.dvl.mounting.rpy_rad == pytest.approx(
+            read_log(navigation).calibration.dvl.mounting.rpy_rad
+        )
 
 
-def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(lane, both, run, tmp_path, capsys):
+def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
+    lane, both, run, tmp_path, capsys
+):
     out = tmp_path / "joined.mcap"
     assert run("join", *both, "-o", out, "--offset", OFFSET_S) == 0
     said = capsys.readouterr().out
@@ -128,19 +183,40 @@ def test_files_without_common_time_are_refused_with_the_offset_that_would_make_b
     )
     assert found
     assert not out.exists()
-    assert run("join", far, both[1], "-o", out, "--offset", float(found[1]), "--search", 3) == 0
+    assert (
+        run("join", far, both[1], "-o", out, "--offset", float(found[1]), "--search", 3)
+        == 0
+    )
     refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", capsys.readouterr().out)
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
-def test_a_file_of_a_sonar_is_converted_and_what_cannot_tell_must_be_stated(both, run, tmp_path, capsys):
+def test_a_file_of_a_sonar_is_converted_and_what_cannot_tell_must_be_stated(
+    both, run, tmp_path, capsys
+):
     recorded = tmp_path / "dive.aris"
     recorded.write_bytes(Aris(images(6, 128, 300)).content())
     first_ns = next(read_sonar_frames(converted(run, recorded))).stamps_ns[0]
     offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
     out = tmp_path / "joined.mcap"
-    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}", "--search", 2) == 2
-    assert "steps between them could be measured, and 50 are needed; state it" in capsys.readouterr().err
+    assert (
+        run(
+            "join",
+            recorded,
+            both[1],
+            "-o",
+            out,
+            "--offset",
+            f"{offset_s:.6f}",
+            "--search",
+            2,
+        )
+        == 2
+    )
+    assert (
+        "steps between them could be measured, and 50 are needed; state it"
+        in capsys.readouterr().err
+    )
     assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
     assert "as stated; the images cannot tell" in capsys.readouterr().out
     assert sum(len(block) for block in read_sonar_frames(out)) == 6
@@ -156,8 +232,13 @@ def converted(run, recorded: Path) -> Path:
     return out
 
 
-def test_navigation_that_has_images_already_is_refused_before_the_images_are_read(lane_log, run, tmp_path, capsys):
+def test_navigation_that_has_images_already_is_refused_before_the_images_are_read(
+    lane_log, run, tmp_path, capsys
+):
     nothing = tmp_path / "none.aris"
     nothing.write_bytes(b"")
     assert run("join", nothing, lane_log, "-o", tmp_path / "joined.mcap") == 2
-    assert f"{lane_log}: has /sonar/image already; recognise it as it is" in capsys.readouterr().err
+    assert (
+        f"{lane_log}: has /sonar/image already; recognise it as it is"
+        in capsys.readouterr().err
+    )

@@ -14,13 +14,17 @@ import sonar_graph
 from sonar_graph.cli.main import app
 
 
-def commands(group: Any = None, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
+def commands(
+    group: Any = None, path: tuple[str, ...] = ()
+) -> dict[tuple[str, ...], Any]:
     """Every command by its path, groups left out."""
     group = group or typer.main.get_command(app)
     found: dict[tuple[str, ...], Any] = {}
     for name, command in group.commands.items():
         deeper = hasattr(command, "commands")
-        found |= commands(command, (*path, name)) if deeper else {(*path, name): command}
+        found |= (
+            commands(command, (*path, name)) if deeper else {(*path, name): command}
+        )
     return found
 
 
@@ -31,15 +35,29 @@ def test_no_argument_shows_the_commands(run, capsys):
         assert path[0] in shown
 
 
-def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_compiles_nothing(run, basin, tmp_path):
+def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_compiles_nothing(
+    run, basin, tmp_path
+):
     run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
-    heavy, cache = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}, tmp_path / "cache"
-    park, report = ["convert", "victoria-park", "-o", str(tmp_path / "park.mcap")], ["report", str(tmp_path)]
+    heavy, cache = (
+        {"gtsam", "matplotlib", "numba", "numpy", "scipy"},
+        tmp_path / "cache",
+    )
+    park, report = (
+        ["convert", "victoria-park", "-o", str(tmp_path / "park.mcap")],
+        ["report", str(tmp_path)],
+    )
     for arguments, unused in ((["--help"], heavy), (park, {"numba"}), (report, set())):
         at_exit = f"lambda: print(sorted({unused} & set(sys.modules)), file=sys.stderr)"
         code = f"import atexit, sys, sonar_graph.cli; atexit.register({at_exit}); sonar_graph.cli.main({arguments})"
         env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=env,
+        )
         assert done.stderr.splitlines()[-1] == "[]"
     assert not list(cache.rglob("*.nbi"))
 
@@ -47,8 +65,16 @@ def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_co
 def test_version_is_that_of_the_package_which_can_be_run_as_a_module(run, capsys):
     assert run("--version", "nonsense") == 0
     assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
-    done = subprocess.run([sys.executable, "-m", "sonar_graph", "--version"], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"sonar-graph {sonar_graph.__version__}\n", "")
+    done = subprocess.run(
+        [sys.executable, "-m", "sonar_graph", "--version"],
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (
+        0,
+        f"sonar-graph {sonar_graph.__version__}\n",
+        "",
+    )
 
 
 GROUPS = {(path[0],): None for path in commands() if len(path) > 1}
@@ -57,13 +83,22 @@ GROUPS = {(path[0],): None for path in commands() if len(path) > 1}
 @pytest.mark.parametrize("path", commands() | GROUPS, ids=" ".join)
 def test_every_command_and_group_has_help_that_ends_in_examples(run, path, capsys):
     assert run(*path, "--help") == 0
-    assert f"sonar-graph {' '.join(path)}" in capsys.readouterr().out.partition("Examples:")[2]
+    assert (
+        f"sonar-graph {' '.join(path)}"
+        in capsys.readouterr().out.partition("Examples:")[2]
+    )
 
 
 def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
-    for name in (*files.split(), "imu.csv", "dvl.csv", "dive_sonar.mcap", "labels.json"):
+    for name in (
+        *files.split(),
+        "imu.csv",
+        "dvl.csv",
+        "dive_sonar.mcap",
+        "labels.json",
+    ):
         Path(name).touch()
     for name in (
         "comparison",
@@ -92,25 +127,59 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
     from sonar_graph.simulation.sonar_image import SCENES, ImageOptions
 
     options = BasinOptions()
-    helps = {option.name: option.help for option in commands()["simulate", "basin"].params}
+    helps = {
+        option.name: option.help for option in commands()["simulate", "basin"].params
+    }
     for name in ("seed", "duration_s", "laps"):
         assert helps[name].endswith(f" Default: {getattr(options, name):g}.")
     for name, presets in (("imu", IMU_PRESETS), ("dvl", DVL_PRESETS)):
         assert f"{getattr(options, name)} (default)" in helps[name]
         assert all(preset in helps[name] for preset in presets)
-    said = set(re.findall(r"[a-z_]+", helps["settings"].partition("repeated: ")[2].partition(". ")[0]))
-    others = BasinOptions.model_fields.keys() - {"seed", "imu", "dvl", "duration_s", "laps", "image"}
-    assert said - {"and", "with", "images", "image"} == others | ImageOptions.model_fields.keys()
-    assert all(scene in helps["settings"].partition("image.scene is")[2] for scene in SCENES)
-    topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
+    said = set(
+        re.findall(
+            r"[a-z_]+", helps["settings"].partition("repeated: ")[2].partition(". ")[0]
+        )
+    )
+    others = BasinOptions.model_fields.keys() - {
+        "seed",
+        "imu",
+        "dvl",
+        "duration_s",
+        "laps",
+        "image",
+    }
+    assert (
+        said - {"and", "with", "images", "image"}
+        == others | ImageOptions.model_fields.keys()
+    )
+    assert all(
+        scene in helps["settings"].partition("image.scene is")[2] for scene in SCENES
+    )
+    topic = next(
+        option.help
+        for option in commands()["compare",].params
+        if option.name == "topics"
+    )
     assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
 
 
 def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs():
     """A command that joins later must not be forgotten."""
-    writing = {path[-1] for path, c in commands().items() if any(option.name == "output" for option in c.params)}
+    writing = {
+        path[-1]
+        for path, c in commands().items()
+        if any(option.name == "output" for option in c.params)
+    }
     of_folders, of_nothing = {"mrclam", "dlr", "akit", "stpere"}, {"basin", "demo"}
     converted = {"rosbag", "didson", "aris", "oculus", "victoria-park"}
-    tried = converted | {"compare", "recognise", "landmarks", "calibrate", "join", "label"}  # and live, in tests/live
+    # and live, in tests/live
+    tried = converted | {
+        "compare",
+        "recognise",
+        "landmarks",
+        "calibrate",
+        "join",
+        "label",
+    }
     elsewhere = {"run", "live", "figures", "csv"}  # test_show, test_own_files
     assert writing == tried | of_folders | of_nothing | elsewhere

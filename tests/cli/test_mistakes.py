@@ -14,7 +14,10 @@ from sonar_graph.logs.writing import sonar_image_messages, write_log
 
 DESIGN = '[[landmark]]\nid = {id}\nname = "plate"\nsize_m = {size_m}\nshapes = [{{ level_db = 12.0, {shape} }}]\n'
 SUITE = 'name = "x"\nreference = "b"\n[[logs]]\nname = "a"\nlog = "a.mcap"\n[[estimators]]\nname = "b"\n'
-CIRCLE, BAR = "circle_m = [0.0, 0.0, 0.15]", "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
+CIRCLE, BAR = (
+    "circle_m = [0.0, 0.0, 0.15]",
+    "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]",
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,17 +29,33 @@ def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
     write_log(folder / "bare.mcap", lane.sequence)
     blind = replace(lane, sequence=replace(lane.sequence, truth=None))
     blind.write(folder / "blind.mcap", [lane.one(k) for k in range(3)])
-    images = [sonar_image_messages("/sonar", lane.one(0), frequency_hz=1.8e6, sound_speed_m_s=1480)]
+    images = [
+        sonar_image_messages(
+            "/sonar", lane.one(0), frequency_hz=1.8e6, sound_speed_m_s=1480
+        )
+    ]
     write_recording(folder / "images.mcap", images, {})
-    texts = {"notes.txt": "these are = = words", "words.json": "{ no", "list.json": "[1]"}
+    texts = {
+        "notes.txt": "these are = = words",
+        "words.json": "{ no",
+        "list.json": "[1]",
+    }
     texts |= {"strange.toml": DESIGN.format(id=9, size_m=0.6, shape=BAR)}
     texts |= {"broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE)}
-    texts |= {"large.toml": DESIGN.format(id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0"))}
-    high = (
-        "[floor]\nz_m = -1700.0\nsigma_m = 0.1\n[start]\nposition_m = [0.0, 0.0, -700.0]\nrpy_rad = [0.0, 0.5, 0.0]\n"
-    )
-    texts |= {"millimetres.toml": high, "labels.json": '{"log": "lane.mcap", "labels": []}'}
-    texts |= {"gyro.toml": "[imu]\ngyro_sigma = 1\n", "logs.toml": 'name = "x"\nreference = "isam2"\nlogs = 3\n'}
+    texts |= {
+        "large.toml": DESIGN.format(
+            id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0")
+        )
+    }
+    high = "[floor]\nz_m = -1700.0\nsigma_m = 0.1\n[start]\nposition_m = [0.0, 0.0, -700.0]\nrpy_rad = [0.0, 0.5, 0.0]\n"
+    texts |= {
+        "millimetres.toml": high,
+        "labels.json": '{"log": "lane.mcap", "labels": []}',
+    }
+    texts |= {
+        "gyro.toml": "[imu]\ngyro_sigma = 1\n",
+        "logs.toml": 'name = "x"\nreference = "isam2"\nlogs = 3\n',
+    }
     texts |= {
         "late.toml": SUITE,
         "killed/.sonar_graph.json": '{"format": "sonar_graph folder 1", "kind": "batch", "files": {}}',
@@ -142,7 +161,9 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("command", "expected"), MISTAKES.items())
-def test_a_mistake_is_named_in_one_line_and_no_file_is_written(run, command, expected, files, monkeypatch, capsys):
+def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
+    run, command, expected, files, monkeypatch, capsys
+):
     def content() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in files.rglob("*") if path.is_file()}
 
@@ -155,8 +176,12 @@ def test_a_mistake_is_named_in_one_line_and_no_file_is_written(run, command, exp
     assert content() == before
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")])
-def test_interruption_and_refused_access_end_in_one_line(run, stop, basin, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")]
+)
+def test_interruption_and_refused_access_end_in_one_line(
+    run, stop, basin, monkeypatch, capsys
+):
     monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(stop))
     assert run("inspect", basin) == (130 if stop is KeyboardInterrupt else 2)
     assert re.fullmatch(r"sonar-graph: .+\n", capsys.readouterr().err)

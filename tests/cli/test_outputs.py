@@ -32,16 +32,26 @@ def links(target: Path, folder: Path) -> list[Path]:
     return [symbolic, hard]
 
 
-CONVERSIONS = [f"convert {kind}" for kind in ("rosbag", "didson", "aris", "oculus", "victoria-park --file")]
+CONVERSIONS = [
+    f"convert {kind}"
+    for kind in ("rosbag", "didson", "aris", "oculus", "victoria-park --file")
+]
 
 
 @pytest.mark.parametrize("flags", [(), ("--overwrite",)])
-@pytest.mark.parametrize("command", [*CONVERSIONS, "recognise", "simulate landmarks --on"])
-def test_a_log_made_from_a_file_never_replaces_it(command, flags, basin, run, tmp_path, capsys):
+@pytest.mark.parametrize(
+    "command", [*CONVERSIONS, "recognise", "simulate landmarks --on"]
+)
+def test_a_log_made_from_a_file_never_replaces_it(
+    command, flags, basin, run, tmp_path, capsys
+):
     before = basin.read_bytes()
     for output in (basin, tmp_path / "." / basin.name, *links(basin, tmp_path)):
         assert run(*command.split(), basin, "-o", output, *flags) == 2
-        assert re.fullmatch(r"sonar-graph: \S+: is what is read, .*choose another name.*\n", capsys.readouterr().err)
+        assert re.fullmatch(
+            r"sonar-graph: \S+: is what is read, .*choose another name.*\n",
+            capsys.readouterr().err,
+        )
     assert basin.read_bytes() == before
 
 
@@ -57,19 +67,31 @@ def test_neither_of_two_logs_that_are_joined_is_replaced(basin, run, tmp_path, c
     assert basin.read_bytes() == before
 
 
-def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either(basin, run, tmp_path, capsys):
+def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either(
+    basin, run, tmp_path, capsys
+):
     part, model = tmp_path / "bag" / "bag_0.mcap", tmp_path / "log.json"
     contents = foreign_log(part), basin.read_bytes()
     model.hardlink_to(basin)
     rosbag = ("convert", "rosbag", part.parent, "-o", part, "--overwrite")
-    for command in (rosbag, ("calibrate", basin, "-o", model), ("label", basin, "-o", model)):
+    for command in (
+        rosbag,
+        ("calibrate", basin, "-o", model),
+        ("label", basin, "-o", model),
+    ):
         assert run(*command) == 2
         assert "is what is read" in capsys.readouterr().err
     assert (part.read_bytes(), basin.read_bytes()) == contents
 
 
 @pytest.mark.parametrize(
-    "name", ["result.mcap", "comparison.json", "report.html", "runs/dead-reckoning/trajectory.tum"]
+    "name",
+    [
+        "result.mcap",
+        "comparison.json",
+        "report.html",
+        "runs/dead-reckoning/trajectory.tum",
+    ],
 )
 def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
     log = tmp_path / "results" / name
@@ -77,78 +99,135 @@ def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
     before = basin.read_bytes()
     basin.rename(log)
     for given in (log, *links(log, tmp_path)):
-        for command, options in (("compare", QUICK), ("run", ("--estimator", "dead-reckoning"))):
+        for command, options in (
+            ("compare", QUICK),
+            ("run", ("--estimator", "dead-reckoning")),
+        ):
             assert run(command, given, "-o", tmp_path / "results", *options) == 2
-            assert re.fullmatch(rf"sonar-graph: .*{name}: is what is read, .*\n", capsys.readouterr().err)
+            assert re.fullmatch(
+                rf"sonar-graph: .*{name}: is what is read, .*\n",
+                capsys.readouterr().err,
+            )
             assert log.read_bytes() == before
 
 
-def test_results_never_overwrite_settings_or_a_log_of_another_program(basin, run, tmp_path):
+def test_results_never_overwrite_settings_or_a_log_of_another_program(
+    basin, run, tmp_path
+):
     settings = tmp_path / "comparison.json"
     settings.write_text("{}")
     for option in ("--calibration", "--log-config"):
         assert run("compare", basin, "-o", tmp_path, option, settings, *QUICK) == 2
     assert settings.read_text() == "{}"
-    for path, command in (("a/result.mcap", ("compare", basin, *QUICK)), ("b/basin.mcap", ("demo",))):
+    for path, command in (
+        ("a/result.mcap", ("compare", basin, *QUICK)),
+        ("b/basin.mcap", ("demo",)),
+    ):
         before = foreign_log(tmp_path / path)
         assert run(*command, "-o", (tmp_path / path).parent) == 2
         assert (tmp_path / path).read_bytes() == before
 
 
-def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_read_and_written(basin, run, tmp_path):
+def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_read_and_written(
+    basin, run, tmp_path
+):
     before = basin.read_bytes()
     for _ in range(2):
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
     assert basin.read_bytes() == before
-    written = {path for path in tmp_path.rglob("*") if path.is_file()} - {basin, tmp_path / LOCK, tmp_path / MANIFEST}
+    written = {path for path in tmp_path.rglob("*") if path.is_file()} - {
+        basin,
+        tmp_path / LOCK,
+        tmp_path / MANIFEST,
+    }
     names = names_written(["dead-reckoning"])
     assert {path.relative_to(tmp_path).as_posix() for path in written} <= set(names)
     assert len(written) > 8
     for path in written:
-        with pytest.raises(EvaluationError, match="is what is read"), writable_folder(tmp_path, names, [path]):
+        with (
+            pytest.raises(EvaluationError, match="is what is read"),
+            writable_folder(tmp_path, names, [path]),
+        ):
             pass
 
 
 @pytest.mark.parametrize("content", ["another program's", "a text", "cut off"])
-def test_what_another_program_wrote_is_replaced_only_when_asked_for(content, run, tmp_path, capsys):
+def test_what_another_program_wrote_is_replaced_only_when_asked_for(
+    content, run, tmp_path, capsys
+):
     log = tmp_path / "log.mcap"
-    before = foreign_log(log) if content == "another program's" else b"words" if content == "a text" else b"\x89MCAP0"
+    before = (
+        foreign_log(log)
+        if content == "another program's"
+        else b"words"
+        if content == "a text"
+        else b"\x89MCAP0"
+    )
     log.write_bytes(before)
-    for command in (("convert", "victoria-park"), ("simulate", "basin", "--duration-s", "120", "--laps", "1")):
+    for command in (
+        ("convert", "victoria-park"),
+        ("simulate", "basin", "--duration-s", "120", "--laps", "1"),
+    ):
         assert run(*command, "-o", log) == 2
-        assert re.fullmatch(r"sonar-graph: .*did not write it; .*--overwrite\n", capsys.readouterr().err)
+        assert re.fullmatch(
+            r"sonar-graph: .*did not write it; .*--overwrite\n", capsys.readouterr().err
+        )
         assert log.read_bytes() == before
     assert run("convert", "victoria-park", "-o", log, "--overwrite") == 0
     assert log.read_bytes() != before
 
 
-def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothing(run, tmp_path, capsys):
+def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothing(
+    run, tmp_path, capsys
+):
     log = tmp_path / "log.mcap"
     log.touch()  # an empty file holds nothing to lose
     for told in ("", f"Replaces {log}\n"):
         capsys.readouterr()
         assert run("convert", "victoria-park", "-o", log) == 0
         assert capsys.readouterr().err == told
-        assert run("simulate", "basin", "--duration-s", "120", "--laps", "1", "-o", log) == 0
+        assert (
+            run("simulate", "basin", "--duration-s", "120", "--laps", "1", "-o", log)
+            == 0
+        )
     (tmp_path / "link.mcap").symlink_to(tmp_path / "missing.mcap")
     assert run("convert", "victoria-park", "-o", tmp_path / "link.mcap") == 0
     assert (tmp_path / "link.mcap").stat().st_size > 0
 
 
-def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_there(run, basin, tmp_path):
+def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_there(
+    run, basin, tmp_path
+):
     unreadable, there = tmp_path / "words.mcap", tmp_path / "there"
     unreadable.write_text("words")
     there.mkdir()
     for place in (tmp_path / "made" / "below", there, there / "below"):
         assert run("compare", unreadable, "-o", place, *QUICK) == 2
-        assert run("run", basin, "-o", place, "--estimator", "dead-reckoning", "--rate-hz", "1e6") == 2
-        assert run("convert", "mrclam", tmp_path, "--robot", "1", "-o", place / "log.mcap") == 2
+        assert (
+            run(
+                "run",
+                basin,
+                "-o",
+                place,
+                "--estimator",
+                "dead-reckoning",
+                "--rate-hz",
+                "1e6",
+            )
+            == 2
+        )
+        assert (
+            run("convert", "mrclam", tmp_path, "--robot", "1", "-o", place / "log.mcap")
+            == 2
+        )
         assert {basin, unreadable, there} == set(tmp_path.iterdir())
         assert not list(there.iterdir())
     assert run("compare", basin, "-o", tmp_path / "made" / "below", *QUICK) == 0
 
 
-def test_to_look_whether_a_place_can_be_written_makes_no_folder_that_another_command_may_find(tmp_path, monkeypatch):
+def test_to_look_whether_a_place_can_be_written_makes_no_folder_that_another_command_may_find(
+    tmp_path, monkeypatch
+):
     """Two commands begin at once in a new folder: neither removes it before the other has written to it."""
     made = []
     monkeypatch.setattr("os.mkdir", lambda path, *_: made.append(path))
@@ -157,23 +236,44 @@ def test_to_look_whether_a_place_can_be_written_makes_no_folder_that_another_com
     (tmp_path / "words").write_text("words")
     (tmp_path / "link").symlink_to("nowhere")
     for place in ("words", "words/below", "link", "link/below"):
-        with pytest.raises(LogError, match=r"log\.mcap: cannot be written: (Not a directory|No such file)"):
+        with pytest.raises(
+            LogError,
+            match=r"log\.mcap: cannot be written: (Not a directory|No such file)",
+        ):
             writable_log(tmp_path / place / "log.mcap")
 
 
-OURS = ["recognised/1.jpg", "runs/dead-reckoning/result.json", "report.html", "comparison.json"]
-THEIRS = ["recognised/mine.jpg", "runs/mine/result.json", ".log.mcap.partial", ".partial-log.mcap", "log.mcap.part"]
+OURS = [
+    "recognised/1.jpg",
+    "runs/dead-reckoning/result.json",
+    "report.html",
+    "comparison.json",
+]
+THEIRS = [
+    "recognised/mine.jpg",
+    "runs/mine/result.json",
+    ".log.mcap.partial",
+    ".partial-log.mcap",
+    "log.mcap.part",
+]
 
 
 @pytest.mark.parametrize("ours", [None, *OURS])
-def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(ours, basin, run, tmp_path, capsys):
+def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
+    ours, basin, run, tmp_path, capsys
+):
     folder = tmp_path / "out"
     mine = [folder / name for name in [*THEIRS, *([ours] if ours else [])]]
     for path in mine:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("mine")
-    for command in (("compare", basin, *QUICK), ("run", basin, "--estimator", "dead-reckoning")):
+    for command in (
+        ("compare", basin, *QUICK),
+        ("run", basin, "--estimator", "dead-reckoning"),
+    ):
         assert run(*command, "-o", folder) == (2 if ours else 0)
-        assert (f"holds {ours}, which sonar-graph did not write" in capsys.readouterr().err) == bool(ours)
+        assert (
+            f"holds {ours}, which sonar-graph did not write" in capsys.readouterr().err
+        ) == bool(ours)
     assert run("convert", "victoria-park", "-o", folder / "log.mcap") == 0
     assert {path.read_text() for path in mine} == {"mine"}

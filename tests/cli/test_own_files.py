@@ -25,23 +25,42 @@ TRUTH = '[truth]\nfile = "truth.csv"\nposition = ["x", "y", "z"]\n'
 
 def rows(stamps_ns: np.ndarray, *columns: np.ndarray) -> list[str]:
     table = np.column_stack(columns).tolist()
-    return [",".join(map(repr, [ns * 1e-9, *row])) for ns, row in zip(stamps_ns.tolist(), table, strict=True)]
+    return [
+        ",".join(map(repr, [ns * 1e-9, *row]))
+        for ns, row in zip(stamps_ns.tolist(), table, strict=True)
+    ]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Tables and logs of one dive, good ones and spoilt ones."""
     path, world = tmp_path_factory.mktemp("own"), small_world()
-    imu = ["time,wx,wy,wz,ax,ay,az", *rows(world.imu.stamps_ns, world.imu.angular_velocity, world.imu.specific_force)]
+    imu = [
+        "time,wx,wy,wz,ax,ay,az",
+        *rows(
+            world.imu.stamps_ns, world.imu.angular_velocity, world.imu.specific_force
+        ),
+    ]
     dvl = ["time,vx,vy,vz", *rows(world.dvl.stamps_ns, world.dvl.velocity)]
     word, short, late, time = list(imu), list(imu), list(imu), list(imu)
     word[7] = word[7].replace(",", ",fast,", 1).rpartition(",")[0]
     short[9] = short[9].rpartition(",")[0]
     late[20], late[900] = late[900], late[20]
     time[5] = "noon" + time[5][time[5].index(",") :]
-    tables = {"imu": imu, "dvl": dvl, "word": word, "short": short, "late": late, "noon": time, "header": imu[:1]}
+    tables = {
+        "imu": imu,
+        "dvl": dvl,
+        "word": word,
+        "short": short,
+        "late": late,
+        "noon": time,
+        "header": imu[:1],
+    }
     tables["comma"] = [line.replace(",", ";").replace(".", ",") for line in dvl]
-    tables["gap"] = [dvl[0], *(re.sub(r"^[^,]*", lambda m: repr(float(m[0]) + 1e6), row) for row in dvl[1:])]
+    tables["gap"] = [
+        dvl[0],
+        *(re.sub(r"^[^,]*", lambda m: repr(float(m[0]) + 1e6), row) for row in dvl[1:]),
+    ]
     for name, lines in tables.items():
         (path / f"{name}.csv").write_text("\n".join(lines) + "\n")
     (path / "empty.csv").write_text("")
@@ -56,7 +75,9 @@ def folder(tmp_path_factory) -> Path:
         name: IMU.replace("imu.csv", f"{name}.csv") + DVL
         for name in ("word", "short", "noon", "header", "empty", "image", "late")
     }
-    configurations |= {name: IMU + DVL.replace("dvl.csv", f"{name}.csv") for name in ("comma", "gap")}
+    configurations |= {
+        name: IMU + DVL.replace("dvl.csv", f"{name}.csv") for name in ("comma", "gap")
+    }
     configurations |= {
         "column": IMU.replace('"wx"', '"gyro_x"') + DVL,
         "role": IMU + DVL.replace("[dvl]", "[dlv]"),
@@ -74,7 +95,9 @@ def folder(tmp_path_factory) -> Path:
     write_log(path / "fast.mcap", replace(world, dvl=fast, detections=None))
     (path / "bag").mkdir()
     listed = "  storage_identifier: mcap\n  relative_file_paths:\n    - lost_0.mcap\n"
-    (path / "bag" / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n{listed}")
+    (path / "bag" / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information:\n{listed}"
+    )
     (path / "wall").write_text("a file")
     return path
 
@@ -118,7 +141,9 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("command", "expected"), WRONG.items())
-def test_a_wrong_use_is_one_line_that_says_what_to_do(run, folder, command, expected, monkeypatch, capsys):
+def test_a_wrong_use_is_one_line_that_says_what_to_do(
+    run, folder, command, expected, monkeypatch, capsys
+):
     before = sorted(folder.rglob("*"))
     monkeypatch.chdir(folder)
     assert run(*command.split()) == 2
@@ -129,12 +154,25 @@ def test_a_wrong_use_is_one_line_that_says_what_to_do(run, folder, command, expe
 
 
 def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, capsys):
-    words = "convert", "csv", folder, "--config", folder / "late.toml", "-o", tmp_path / "late.mcap"
+    words = (
+        "convert",
+        "csv",
+        folder,
+        "--config",
+        folder / "late.toml",
+        "-o",
+        tmp_path / "late.mcap",
+    )
     assert run(*words) == 0
-    assert re.search(r"warning: imu: 2 times backwards, by .* rows are sorted", capsys.readouterr().err)
+    assert re.search(
+        r"warning: imu: 2 times backwards, by .* rows are sorted",
+        capsys.readouterr().err,
+    )
 
 
-def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(folder, tmp_path):
+def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(
+    folder, tmp_path
+):
     world = small_world()
     truth = ["time,x,y,z", *rows(world.truth.stamps_ns, world.truth.positions)]
     (tmp_path / "truth.csv").write_text("\n".join(truth) + "\n")
@@ -147,17 +185,46 @@ def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(
         read_csv(tables, tmp_path / "dive.toml")
 
 
-def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converted(run, folder, tmp_path, capsys):
+def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converted(
+    run, folder, tmp_path, capsys
+):
     (tmp_path / "dive.toml").write_text(IMU + DVL + "scale = 1000\n")
-    assert run("convert", "csv", folder, "--config", tmp_path / "dive.toml", "-o", tmp_path / "new.mcap") == 0
+    assert (
+        run(
+            "convert",
+            "csv",
+            folder,
+            "--config",
+            tmp_path / "dive.toml",
+            "-o",
+            tmp_path / "new.mcap",
+        )
+        == 0
+    )
     said = capsys.readouterr().err
-    assert re.search(r"warning: DVL: unit: velocities look 1000 times too large .*`scale = 0\.001` .*dive\.toml", said)
-    assert run("convert", "csv", folder, "--config", folder / "good.toml", "-o", tmp_path / "good.mcap") == 0
+    assert re.search(
+        r"warning: DVL: unit: velocities look 1000 times too large .*`scale = 0\.001` .*dive\.toml",
+        said,
+    )
+    assert (
+        run(
+            "convert",
+            "csv",
+            folder,
+            "--config",
+            folder / "good.toml",
+            "-o",
+            tmp_path / "good.mcap",
+        )
+        == 0
+    )
     assert "unit" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["run", "compare"])
-def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(run, folder, tmp_path, command, capsys):
+def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(
+    run, folder, tmp_path, command, capsys
+):
     names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")
     run(command, folder / "fast.mcap", "-o", tmp_path / "out", *names)
     said = " ".join(capsys.readouterr().out.split())
@@ -165,18 +232,43 @@ def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(run,
     assert "`scale = 0.001` under [dvl]" in said
 
 
-def test_a_start_that_nobody_stated_is_said_and_errors_are_after_the_fit(run, folder, tmp_path, capsys):
+def test_a_start_that_nobody_stated_is_said_and_errors_are_after_the_fit(
+    run, folder, tmp_path, capsys
+):
     world = small_world()
-    far = Trajectory.of_positions(world.truth.stamps_ns, world.truth.positions[:, [1, 0, 2]] * [-1, 1, 1] + 5e5)
-    bare = world.calibration.model_copy(update={"start": type(world.calibration.start)()})
+    far = Trajectory.of_positions(
+        world.truth.stamps_ns, world.truth.positions[:, [1, 0, 2]] * [-1, 1, 1] + 5e5
+    )
+    bare = world.calibration.model_copy(
+        update={"start": type(world.calibration.start)()}
+    )
     bare.model_fields_set.discard("start")
-    write_log(tmp_path / "free.mcap", replace(world, truth=far, calibration=bare, true_landmarks=None))
+    write_log(
+        tmp_path / "free.mcap",
+        replace(world, truth=far, calibration=bare, true_landmarks=None),
+    )
     out = tmp_path / "out"
-    assert run("compare", tmp_path / "free.mcap", "-o", out, "--estimators", "dead-reckoning") == 0
+    assert (
+        run(
+            "compare",
+            tmp_path / "free.mcap",
+            "-o",
+            out,
+            "--estimators",
+            "dead-reckoning",
+        )
+        == 0
+    )
     said = " ".join(capsys.readouterr().out.split())
-    assert "Truth: the log states no start, so the truth was brought into the world of the estimates" in said
+    assert (
+        "Truth: the log states no start, so the truth was brought into the world of the estimates"
+        in said
+    )
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "The log states no start, so the truth was brought into the world of the estimates" in page
+    assert (
+        "The log states no start, so the truth was brought into the world of the estimates"
+        in page
+    )
 
 
 def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):

@@ -40,10 +40,15 @@ def recognised(lane_log, run, tmp_path_factory):
 
 def contents(path: Path) -> Counter[tuple[str, int, bytes]]:
     with path.open("rb") as stream:
-        return Counter((channel.topic, m.log_time, m.data) for _, channel, m in make_reader(stream).iter_messages())
+        return Counter(
+            (channel.topic, m.log_time, m.data)
+            for _, channel, m in make_reader(stream).iter_messages()
+        )
 
 
-def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(lane_log, recognised, lane_recognition):
+def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(
+    lane_log, recognised, lane_recognition
+):
     before, after = contents(lane_log), contents(recognised)
     assert before - after == Counter()
     added = after - before
@@ -51,34 +56,61 @@ def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(lane_log, recog
     found, expected = read_log(recognised).detections, lane_recognition.detections
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
     np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
-    np.testing.assert_allclose(found.range_azimuth_cov, expected.range_azimuth_cov, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(
+        found.range_azimuth_cov, expected.range_azimuth_cov, rtol=1e-3, atol=1e-9
+    )
     np.testing.assert_array_equal(found.most_probable()[0], expected.most_probable()[0])
-    np.testing.assert_allclose(found.id_probability.sum(axis=1), expected.id_probability.sum(axis=1), atol=1e-3)
+    np.testing.assert_allclose(
+        found.id_probability.sum(axis=1), expected.id_probability.sum(axis=1), atol=1e-3
+    )
 
 
-def test_recognise_says_what_became_of_everything(lane, lane_log, lane_recognition, run, tmp_path, capsys):
+def test_recognise_says_what_became_of_everything(
+    lane, lane_log, lane_recognition, run, tmp_path, capsys
+):
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap") == 0
     said = capsys.readouterr().out
-    assert f"{len(lane.frames)} frames, {len(lane_recognition.detections)} detections" in said
+    assert (
+        f"{len(lane.frames)} frames, {len(lane_recognition.detections)} detections"
+        in said
+    )
     for outcome, count in lane_recognition.outcomes.items():
-        assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE), outcome
+        assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE), (
+            outcome
+        )
     assert said.rstrip().endswith("out.mcap")
     ids, probability = lane_recognition.detections.most_probable()
-    counts = [f"landmark {k}: {np.count_nonzero((ids == k) & (probability > 0.5))}" for k in (1, 2, 3, 4)]
+    counts = [
+        f"landmark {k}: {np.count_nonzero((ids == k) & (probability > 0.5))}"
+        for k in (1, 2, 3, 4)
+    ]
     rest = np.count_nonzero(probability <= 0.5)
     assert f"Most probable: {', '.join(counts)}, none of them: {rest}\n" in said
     assert "Warning" not in said
 
 
-def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(lane_log, run, tmp_path, capsys):
+def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(
+    lane_log, run, tmp_path, capsys
+):
     strange = tmp_path / "strange.toml"  # of a landmark that is not in the log
     bar = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
-    text = DESIGNS.replace("size_m = 0.3", "size_m = 0.6").replace("circle_m = [0.0, 0.0, 0.15]", bar)
+    text = DESIGNS.replace("size_m = 0.3", "size_m = 0.6").replace(
+        "circle_m = [0.0, 0.0, 0.15]", bar
+    )
     strange.write_text(text.replace("id = 4", "id = 9"))
-    for command, out, more in (("recognise", "out.mcap", ()), ("compare", "out", QUICK)):
-        assert run(command, lane_log, "-o", tmp_path / out, "--designs", strange, *more) == 0
+    for command, out, more in (
+        ("recognise", "out.mcap", ()),
+        ("compare", "out", QUICK),
+    ):
+        assert (
+            run(command, lane_log, "-o", tmp_path / out, "--designs", strange, *more)
+            == 0
+        )
         said = capsys.readouterr().out
-        assert "Warning: no landmark was recognised; looked for 9: plate; --designs gives others" in said
+        assert (
+            "Warning: no landmark was recognised; looked for 9: plate; --designs gives others"
+            in said
+        )
 
 
 def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
@@ -88,81 +120,172 @@ def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
     made.write(log, [lane.one(k) for k in range(3)])
     assert run("recognise", log, "-o", tmp_path / "out.mcap") == 0
     said = capsys.readouterr().out
-    assert "Warning: the log was made with the designs of mine.toml; give them with --designs" in said
+    assert (
+        "Warning: the log was made with the designs of mine.toml; give them with --designs"
+        in said
+    )
 
 
 def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, capsys):
-    assert run("recognise", recognised, "-o", tmp_path / "again.mcap", "--rule", "jeffrey") == 0
+    assert (
+        run("recognise", recognised, "-o", tmp_path / "again.mcap", "--rule", "jeffrey")
+        == 0
+    )
     assert "Replaced: " in capsys.readouterr().out
-    one, other = read_log(recognised).detections, read_log(tmp_path / "again.mcap").detections
+    one, other = (
+        read_log(recognised).detections,
+        read_log(tmp_path / "again.mcap").detections,
+    )
     assert set(one.track.tolist()) == set(other.track.tolist())
-    of_both = [(a, b) for a in range(len(one)) for b in range(len(other)) if one.stamps_ns[a] == other.stamps_ns[b]]
+    of_both = [
+        (a, b)
+        for a in range(len(one))
+        for b in range(len(other))
+        if one.stamps_ns[a] == other.stamps_ns[b]
+    ]
     same = [(a, b) for a, b in of_both if one.track[a] == other.track[b]]
     mine, its = np.array(same).T
     assert not np.allclose(one.id_probability[mine], other.id_probability[its])
 
 
-def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, recognised, run, tmp_path, capsys):
+def test_compare_recognises_by_itself_and_gives_what_recognise_gives(
+    lane_log, recognised, run, tmp_path, capsys
+):
     assert run("compare", lane_log, "-o", tmp_path / "images", *QUICK) == 0
     assert run("compare", recognised, "-o", tmp_path / "detections", *QUICK) == 0
-    pages = [(tmp_path / name / "report.html").read_text() for name in ("images", "detections")]
+    pages = [
+        (tmp_path / name / "report.html").read_text()
+        for name in ("images", "detections")
+    ]
     assert 'id="recognition"' in pages[0]
     assert 'id="recognition"' not in pages[1]
-    said = [" ".join(text.split()) for text in capsys.readouterr().out.split("Report: ")]
+    said = [
+        " ".join(text.split()) for text in capsys.readouterr().out.split("Report: ")
+    ]
     assert "Most probable: landmark 1: " in said[0]
     assert "those that recognise put into the log" in said[1]
     assert "--rule virtual-evidence" in said[1]
-    assert run("compare", recognised, "-o", tmp_path / "anew", *QUICK, "--rule", "virtual-evidence") == 0
+    assert (
+        run(
+            "compare",
+            recognised,
+            "-o",
+            tmp_path / "anew",
+            *QUICK,
+            "--rule",
+            "virtual-evidence",
+        )
+        == 0
+    )
     assert 'id="recognition"' in (tmp_path / "anew" / "report.html").read_text()
-    assert json.loads((tmp_path / "images" / "recognition.json").read_text())["frames"] > 100
+    assert (
+        json.loads((tmp_path / "images" / "recognition.json").read_text())["frames"]
+        > 100
+    )
     topics = {topic for topic, _, _ in contents(tmp_path / "images" / "result.mcap")}
     assert "/sonar/recognised" in topics
 
 
-def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypatch, capsys):
+def test_a_model_that_calibrate_wrote_is_used(
+    lane_log, run, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 10**6)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 2
-    assert re.fullmatch(r"sonar-graph: too few labelled frames .*give longer or more logs\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"sonar-graph: too few labelled frames .*give longer or more logs\n",
+        capsys.readouterr().err,
+    )
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 0
     said = capsys.readouterr().out
     assert re.search(r"^  landmark 1: \d+ frames, 1 track$", said, re.MULTILINE)
-    assert re.search(r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE)
+    assert re.search(
+        r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE
+    )
     model = read_confusion(tmp_path / "model.json")
     sigmas = f"  range sigma {1e3 * model.range_sigma_m:.1f} mm, across {1e3 * model.across_sigma_m:.1f} mm, "
     of_errors = f"a track is reported every {model.report_interval_s:.1f} s\n"
     assert f"{sigmas}{of_errors}" in said
     assert run("label", lane_log, "-o", tmp_path / "model.json") == 2
-    assert "model.json: exists, and holds something else than labels; choose" in capsys.readouterr().err
+    assert (
+        "model.json: exists, and holds something else than labels; choose"
+        in capsys.readouterr().err
+    )
     assert model.provenance["logs"] == "lane.mcap"
-    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
+    assert (
+        run(
+            "recognise",
+            lane_log,
+            "-o",
+            tmp_path / "out.mcap",
+            "--model",
+            tmp_path / "model.json",
+        )
+        == 0
+    )
     found = read_log(tmp_path / "out.mcap").detections
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
 
 
-def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(lane_log, run, tmp_path, monkeypatch, capsys):
+def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(
+    lane_log, run, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr("sonar_graph.cli.label.serve", lambda *_, **__: None)
-    designs, labels = Path(devices.__file__).with_name("default_landmarks.toml"), tmp_path / "labels.json"
-    assert run("label", lane_log, "-o", labels, "--designs", designs, "--no-browser") == 0
+    designs, labels = (
+        Path(devices.__file__).with_name("default_landmarks.toml"),
+        tmp_path / "labels.json",
+    )
+    assert (
+        run("label", lane_log, "-o", labels, "--designs", designs, "--no-browser") == 0
+    )
     said = " ".join("".join(capsys.readouterr()).split())
-    assert f"Next: sonar-graph calibrate {lane_log} --labels {labels} --designs {designs} -o model.json" in said
+    assert (
+        f"Next: sonar-graph calibrate {lane_log} --labels {labels} --designs {designs} -o model.json"
+        in said
+    )
 
 
-def test_label_says_whether_a_log_or_a_part_of_it_has_no_images(lane, lane_log, run, tmp_path, capsys):
-    assert run("label", lane_log, "-o", tmp_path / "labels.json", "--start", "3600", "--no-browser") == 2
-    assert f"{lane_log}: has no sonar images between --start and --end" in capsys.readouterr().err
+def test_label_says_whether_a_log_or_a_part_of_it_has_no_images(
+    lane, lane_log, run, tmp_path, capsys
+):
+    assert (
+        run(
+            "label",
+            lane_log,
+            "-o",
+            tmp_path / "labels.json",
+            "--start",
+            "3600",
+            "--no-browser",
+        )
+        == 2
+    )
+    assert (
+        f"{lane_log}: has no sonar images between --start and --end"
+        in capsys.readouterr().err
+    )
     write_log(blind := tmp_path / "blind.mcap", lane.sequence)
     assert run("label", blind, "-o", tmp_path / "labels.json", "--no-browser") == 2
-    assert f"{blind}: has no sonar images; `sonar-graph inspect" in capsys.readouterr().err
+    assert (
+        f"{blind}: has no sonar images; `sonar-graph inspect" in capsys.readouterr().err
+    )
 
 
-def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane, lane_log, run, tmp_path, capsys):
+def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(
+    lane, lane_log, run, tmp_path, capsys
+):
     model, given = tmp_path / "model.json", tmp_path / "labels.json"
     stamp_ns = int(lane.frames.stamps_ns[40])
     given.write_text(json.dumps({"log": "lane.mcap", "labels": []}))
     for words, said in (
-        (("--labels", given), "labels.json: 0 of 0 labels met a track of the recogniser; too few labelled frames"),
-        (("--labels", given, "--labels", given), "1 logs and 2 files for --labels; give one for each log"),
+        (
+            ("--labels", given),
+            "labels.json: 0 of 0 labels met a track of the recogniser; too few labelled frames",
+        ),
+        (
+            ("--labels", given, "--labels", given),
+            "1 logs and 2 files for --labels; give one for each log",
+        ),
         (("--motion", "images"), "--motion is for --labels"),
     ):
         assert run("calibrate", lane_log, "-o", model, *words) == 2
@@ -170,31 +293,75 @@ def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(lane,
     label = {"stamp_ns": stamp_ns, "range_m": 1.9, "azimuth_rad": 0.0, "id": 12}
     given.write_text(json.dumps({"log": "lane.mcap", "labels": [label]}))
     assert run("calibrate", lane_log, "-o", model, "--labels", given) == 2
-    assert "labels.json: its labels name landmark 12, the designs are 1, 2, 3, 4" in capsys.readouterr().err
-    assert run("label", lane_log, "-o", given.rename(tmp_path / "other.json").with_name("model.toml")) == 2
+    assert (
+        "labels.json: its labels name landmark 12, the designs are 1, 2, 3, 4"
+        in capsys.readouterr().err
+    )
+    assert (
+        run(
+            "label",
+            lane_log,
+            "-o",
+            given.rename(tmp_path / "other.json").with_name("model.toml"),
+        )
+        == 2
+    )
     assert "expected the name of a file that ends in .json" in capsys.readouterr().err
 
 
 def test_designs_of_ones_own_and_settings_need_no_code(lane_log, run, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text(DESIGNS)
-    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml") == 0
-    assert "Warning: the log has landmarks 1, 2, 3, of which there is no design" in capsys.readouterr().out
+    assert (
+        run(
+            "recognise",
+            lane_log,
+            "-o",
+            tmp_path / "out.mcap",
+            "--designs",
+            tmp_path / "mine.toml",
+        )
+        == 0
+    )
+    assert (
+        "Warning: the log has landmarks 1, 2, 3, of which there is no design"
+        in capsys.readouterr().out
+    )
     found = read_log(tmp_path / "out.mcap").detections
     assert np.unique(found.candidate_ids).tolist() == [4]
-    assert run("recognise", lane_log, "-o", tmp_path / "none.mcap", "--set", "least_frames=10000") == 0
+    assert (
+        run(
+            "recognise",
+            lane_log,
+            "-o",
+            tmp_path / "none.mcap",
+            "--set",
+            "least_frames=10000",
+        )
+        == 0
+    )
     assert read_log(tmp_path / "none.mcap").detections is None
 
 
-def test_images_alone_are_recognised_and_what_is_lost_is_said(lane, run, tmp_path, capsys):
+def test_images_alone_are_recognised_and_what_is_lost_is_said(
+    lane, run, tmp_path, capsys
+):
     log, out = tmp_path / "sonar.mcap", tmp_path / "out.mcap"
     with recording(log, {}) as writer:
         writer.write([sonar_image_messages(TOPIC, lane.frames)])
     assert run("recognise", log, "-o", out, "--motion", "navigation") == 2
     assert "no IMU and no DVL in the log; leave --motion out" in capsys.readouterr().err
-    (tmp_path / "over.json").write_text(lane.sequence.calibration.model_dump_json(exclude_unset=True))
+    (tmp_path / "over.json").write_text(
+        lane.sequence.calibration.model_dump_json(exclude_unset=True)
+    )
     for more, said in (
-        ((), "Warning: height and tilt are not known: landmarks are compared in the plane of the image"),
-        (("--motion", "fixed"), "Without navigation: motion none: the sonar is taken to be at rest"),
+        (
+            (),
+            "Warning: height and tilt are not known: landmarks are compared in the plane of the image",
+        ),
+        (
+            ("--motion", "fixed"),
+            "Without navigation: motion none: the sonar is taken to be at rest",
+        ),
         (
             ("--calibration", tmp_path / "over.json"),
             "Without navigation: height and tilt are taken to stay those of the calibration's",
@@ -207,44 +374,68 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(lane, run, tmp_pat
     assert run("inspect", log) == 3
     assert f"sonar-graph recognise {log} -o recognised.mcap" in capsys.readouterr().out
     assert run("compare", log, "-o", tmp_path / "compared") == 2
-    assert f"`sonar-graph recognise {log}` needs its sonar images only" in capsys.readouterr().err
+    assert (
+        f"`sonar-graph recognise {log}` needs its sonar images only"
+        in capsys.readouterr().err
+    )
     with out.open("rb") as stream:
-        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
+        topics = {
+            channel.topic for _, channel, _ in make_reader(stream).iter_messages()
+        }
     assert topics == {TOPIC, "/sonar/landmarks"}
 
 
-def test_who_recognises_without_a_floor_or_past_it_is_told(lane, lane_log, run, tmp_path, capsys):
+def test_who_recognises_without_a_floor_or_past_it_is_told(
+    lane, lane_log, run, tmp_path, capsys
+):
     out, given = tmp_path / "out.mcap", tmp_path / "given.toml"
     for text in ("floor = false", "[sonar.mounting]\nrpy_rad = [0.0, 0.0, 0.0]", ""):
         given.write_text(text)
         assert run("recognise", lane_log, "-o", out, "--calibration", given) == 0
         lines = capsys.readouterr().out
         assert ("floor is not known: landmarks" in lines) == text.startswith("floor")
-        assert ("looks past the floor: check [sonar.mounting]" in lines) == text.startswith("[sonar")
+        assert (
+            "looks past the floor: check [sonar.mounting]" in lines
+        ) == text.startswith("[sonar")
     assert run("recognise", lane_log, "-o", out, "--motion", "fixed") == 0
     lines = capsys.readouterr().out
     assert "the log's IMU and Doppler log are not used, as --motion fixed asks" in lines
     assert "sonar-graph join" not in lines
 
 
-def test_labels_in_the_place_of_a_model_and_a_log_without_truth_are_told_the_way(lane_log, run, tmp_path, capsys):
+def test_labels_in_the_place_of_a_model_and_a_log_without_truth_are_told_the_way(
+    lane_log, run, tmp_path, capsys
+):
     labels, log = tmp_path / "labels.json", tmp_path / "bare.mcap"
     labels.write_text('{"log": "x.mcap", "labels": []}')
-    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", labels) == 2
-    assert f"`sonar-graph calibrate LOG --labels {labels} -o model.json` makes a model" in capsys.readouterr().err
+    assert (
+        run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", labels) == 2
+    )
+    assert (
+        f"`sonar-graph calibrate LOG --labels {labels} -o model.json` makes a model"
+        in capsys.readouterr().err
+    )
     write_log(log, replace(read_log(lane_log), truth=None, true_landmarks=None))
     assert run("calibrate", log, "-o", tmp_path / "model.json") == 2
-    assert "`calibrate --labels labels.json` measure the model" in capsys.readouterr().err
-    labels.write_text('{"log": "bare.mcap", "labels": [{"stamp_ns": 1, "range_m": 2, "azimuth_rad": 9, "id": 1}]}')
+    assert (
+        "`calibrate --labels labels.json` measure the model" in capsys.readouterr().err
+    )
+    labels.write_text(
+        '{"log": "bare.mcap", "labels": [{"stamp_ns": 1, "range_m": 2, "azimuth_rad": 9, "id": 1}]}'
+    )
     assert run("calibrate", log, "-o", tmp_path / "model.json", "--labels", labels) == 2
     assert "these seem to be in degrees" in capsys.readouterr().err
 
 
-def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(lane_log, run, tmp_path, capsys):
+def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(
+    lane_log, run, tmp_path, capsys
+):
     page, out = tmp_path / "page.html", tmp_path / "out.mcap"
     page.write_text("mine")
     assert run("recognise", lane_log, "-o", out, "--report", page) == 2
-    assert "page.html: exists, and sonar-graph did not write it" in capsys.readouterr().err
+    assert (
+        "page.html: exists, and sonar-graph did not write it" in capsys.readouterr().err
+    )
     assert run("recognise", lane_log, "-o", out, "--report", tmp_path / "page.pdf") == 2
     assert "expected the name of a file that ends in .html" in capsys.readouterr().err
     for more in (("--overwrite",), ()):
@@ -264,14 +455,28 @@ class Decoder:
         return [[5, corners, corners]] if image.any() else []
 
 
-def test_tags_are_written_as_landmarks_where_actag_is_installed(lane_log, run, tmp_path, monkeypatch, capsys):
+def test_tags_are_written_as_landmarks_where_actag_is_installed(
+    lane_log, run, tmp_path, monkeypatch, capsys
+):
     written = tmp_path / "tags.mcap"
     monkeypatch.setitem(sys.modules, "actag", None)
     assert run("recognise", lane_log, "-o", written, "--recogniser", "actag") == 2
     assert "sonar-graph[actag]" in " ".join(capsys.readouterr().err.split())
     assert not written.exists()
     monkeypatch.setitem(sys.modules, "actag", SimpleNamespace(AcTag=Decoder))
-    assert run("recognise", lane_log, "-o", written, "--recogniser", "actag", "--set", "tag_size_m=0.15") == 0
+    assert (
+        run(
+            "recognise",
+            lane_log,
+            "-o",
+            written,
+            "--recogniser",
+            "actag",
+            "--set",
+            "tag_size_m=0.15",
+        )
+        == 0
+    )
     sequence = read_log(written)
     found = sequence.detections
     assert len(found) > 50

@@ -19,15 +19,22 @@ def result(tmp_path_factory) -> Path:
 def opened(monkeypatch) -> list[str]:
     """Addresses that are given to a browser, on a machine with a screen and no viewer."""
     addresses: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", lambda address: addresses.append(address) or True)
+    monkeypatch.setattr(
+        webbrowser, "open", lambda address: addresses.append(address) or True
+    )
     monkeypatch.setattr(show, "has_screen", lambda: True)
     monkeypatch.setattr(show, "command_of", lambda _: [])
     return addresses
 
 
-def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(result, run, tmp_path, capsys):
+def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(
+    result, run, tmp_path, capsys
+):
     assert run("figures", result) == 0
-    assert capsys.readouterr().out == f"Figures and tables: {result / 'paper' / 'paper.tex'}\n"
+    assert (
+        capsys.readouterr().out
+        == f"Figures and tables: {result / 'paper' / 'paper.tex'}\n"
+    )
     assert (result / "paper" / "figures" / "map.pdf").is_file()
     assert run("figures", tmp_path) == 2
     assert "no comparison.json in it" in capsys.readouterr().err
@@ -35,7 +42,9 @@ def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(result, run, tm
     assert "holds a comparison, and would become a paper" in capsys.readouterr().err
 
 
-def test_without_a_viewer_the_page_opens_and_what_to_install_is_said(result, run, opened, capsys):
+def test_without_a_viewer_the_page_opens_and_what_to_install_is_said(
+    result, run, opened, capsys
+):
     for given in (result, result / "result.mcap"):
         assert run("view", given) == 0
         said = capsys.readouterr()
@@ -51,32 +60,59 @@ def test_without_a_screen_nothing_is_started(result, run, opened, monkeypatch, c
     assert capsys.readouterr().out == f"No screen here; open {result / 'report.html'}\n"
     monkeypatch.setattr(show, "command_of", lambda _: ["/no/such/viewer"])
     assert run("view", result) == 0
-    assert capsys.readouterr().out.startswith(f"No screen here; open {result / 'result.mcap'} with lichtblick")
+    assert capsys.readouterr().out.startswith(
+        f"No screen here; open {result / 'result.mcap'} with lichtblick"
+    )
     assert opened == []
 
 
-def test_a_viewer_gets_the_log_and_is_not_waited_for(result, run, opened, monkeypatch, tmp_path, capsys):
+def test_a_viewer_gets_the_log_and_is_not_waited_for(
+    result, run, opened, monkeypatch, tmp_path, capsys
+):
     viewer = tmp_path / "lichtblick"
     viewer.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/given\nsleep 60\n')
     viewer.chmod(0o755)
     started = []
-    monkeypatch.setattr(show.subprocess, "Popen", lambda words, **options: started.append((words, options)))
-    monkeypatch.setattr(show, "command_of", lambda one: [str(viewer)] if one is show.VIEWERS["lichtblick"] else [])
+    monkeypatch.setattr(
+        show.subprocess,
+        "Popen",
+        lambda words, **options: started.append((words, options)),
+    )
+    monkeypatch.setattr(
+        show,
+        "command_of",
+        lambda one: [str(viewer)] if one is show.VIEWERS["lichtblick"] else [],
+    )
     assert run("view", result) == 0
     ((words, options),) = started
     assert words == [str(viewer), str(result / "result.mcap")]
     assert options["start_new_session"]
-    assert f"import {result / 'result.foxglove.json'} as its layout" in capsys.readouterr().out
+    assert (
+        f"import {result / 'result.foxglove.json'} as its layout"
+        in capsys.readouterr().out
+    )
     assert opened == []
 
 
 def test_wrong_uses_of_view_are_told_in_one_line(result, run, opened, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     for words, said in {
-        (tmp_path,): "holds neither result.mcap nor report.html; give the folder that compare wrote",
-        (tmp_path / "notes.txt",): "expected the folder of a result, or its result.mcap",
-        (result, "--viewer", "paraview"): "--viewer paraview: expected lichtblick, foxglove, rerun or browser",
-        (result, "--viewer", "rerun"): "--viewer rerun: is not installed: pip install rerun-sdk",
+        (
+            tmp_path,
+        ): "holds neither result.mcap nor report.html; give the folder that compare wrote",
+        (
+            tmp_path / "notes.txt",
+        ): "expected the folder of a result, or its result.mcap",
+        (
+            result,
+            "--viewer",
+            "paraview",
+        ): "--viewer paraview: expected lichtblick, foxglove, rerun or browser",
+        (
+            result,
+            "--viewer",
+            "rerun",
+        ): "--viewer rerun: is not installed: pip install rerun-sdk",
     }.items():
         assert run("view", *words) == 2
         told = capsys.readouterr().err

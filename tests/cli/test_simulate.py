@@ -13,36 +13,74 @@ from sonar_graph.cli.main import app
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.logs.writing import write_log
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.basin import (
+    BasinOptions,
+    simulate_basin,
+    simulate_basin_frames,
+)
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
-SHORT = {"duration_s": 120, "laps": 1, "frame_rate_hz": 0.5, "image": {"multipath": False}}
+SHORT = {
+    "duration_s": 120,
+    "laps": 1,
+    "frame_rate_hz": 0.5,
+    "image": {"multipath": False},
+}
 
 
 def simulate(path: Path, *more: str, said: str = "Log: ") -> None:
-    words = ["simulate", "basin", "-o", str(path), "--images", "--duration-s", "120", "--laps", "1"]
-    result = CliRunner().invoke(app, [*words, "--set", "frame_rate_hz=0.5", "--set", "image.multipath=false", *more])
+    words = [
+        "simulate",
+        "basin",
+        "-o",
+        str(path),
+        "--images",
+        "--duration-s",
+        "120",
+        "--laps",
+        "1",
+    ]
+    result = CliRunner().invoke(
+        app,
+        [*words, "--set", "frame_rate_hz=0.5", "--set", "image.multipath=false", *more],
+    )
     assert result.exit_code == 0, result.output
     assert said in result.output
 
 
-def test_images_and_other_sensors_are_those_of_the_library_in_the_order_of_time(tmp_path):
+def test_images_and_other_sensors_are_those_of_the_library_in_the_order_of_time(
+    tmp_path,
+):
     simulate(
-        tmp_path / "a.mcap", said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross"
+        tmp_path / "a.mcap",
+        said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross",
     )
     options = BasinOptions.model_validate(SHORT)
-    read, made = list(read_sonar_frames(tmp_path / "a.mcap")), list(simulate_basin_frames(options))
+    read, made = (
+        list(read_sonar_frames(tmp_path / "a.mcap")),
+        list(simulate_basin_frames(options)),
+    )
     order = np.argsort([block.stamps_ns[0] for block in read])
     images = np.concatenate([read[k].intensity for k in order])
-    np.testing.assert_array_equal(images, np.concatenate([block.frames.intensity for block in made]))
-    np.testing.assert_allclose(read[0].azimuths_rad, made[0].frames.azimuths_rad, atol=1e-12)
+    np.testing.assert_array_equal(
+        images, np.concatenate([block.frames.intensity for block in made])
+    )
+    np.testing.assert_allclose(
+        read[0].azimuths_rad, made[0].frames.azimuths_rad, atol=1e-12
+    )
     sequence, expected = read_log(tmp_path / "a.mcap"), simulate_basin(options)
     assert sequence.detections is None
-    np.testing.assert_array_equal(sequence.imu.angular_velocity, expected.imu.angular_velocity)
+    np.testing.assert_array_equal(
+        sequence.imu.angular_velocity, expected.imu.angular_velocity
+    )
     assert sequence.true_landmarks is not None
     with (tmp_path / "a.mcap").open("rb") as stream:
-        times_ns = [record.log_time for record in StreamReader(stream).records if isinstance(record, Message)]
+        times_ns = [
+            record.log_time
+            for record in StreamReader(stream).records
+            if isinstance(record, Message)
+        ]
     assert len(times_ns) > 60
     assert times_ns == sorted(times_ns)
 
@@ -56,11 +94,23 @@ def test_same_seed_gives_the_same_bytes(tmp_path):
     assert contents[0] != contents[2]
 
 
-def test_simulation_flags_and_settings_reach_the_simulator(run, tmp_path, monkeypatch, capsys):
+def test_simulation_flags_and_settings_reach_the_simulator(
+    run, tmp_path, monkeypatch, capsys
+):
     given_options = []
     monkeypatch.setattr("sonar_graph.simulation.simulate_basin", given_options.append)
     monkeypatch.setattr("sonar_graph.logs.write_log", lambda path, _: path.touch())
-    flags = ("--seed", 7, "--laps", 2, "--imu", "mti1", "--no-bias", "--set", "wrong_id_rate=0.05")
+    flags = (
+        "--seed",
+        7,
+        "--laps",
+        2,
+        "--imu",
+        "mti1",
+        "--no-bias",
+        "--set",
+        "wrong_id_rate=0.05",
+    )
     assert run("simulate", "basin", "-o", tmp_path / "basin.mcap", *flags) == 0
     options = given_options[0]
     assert (options.seed, options.laps, options.imu) == (7, 2, "mti1")
@@ -76,17 +126,39 @@ def log(tmp_path_factory) -> Path:
     return path
 
 
-def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log, run, tmp_path, capsys):
+def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(
+    log, run, tmp_path, capsys
+):
     maps = []
     for seed in (3, 4):
         new = tmp_path / f"{seed}.mcap"
-        assert run("simulate", "landmarks", "--on", log, "-o", new, "--seed", seed, "--set", "spacing_m=4") == 0
+        assert (
+            run(
+                "simulate",
+                "landmarks",
+                "--on",
+                log,
+                "-o",
+                new,
+                "--seed",
+                seed,
+                "--set",
+                "spacing_m=4",
+            )
+            == 0
+        )
         read, recorded = read_log(new), read_log(log)
         expected = add_landmarks(recorded, LandmarkOptions(seed=seed, spacing_m=4.0))
-        np.testing.assert_allclose(read.detections.range_m, expected.detections.range_m, atol=1e-6)
-        np.testing.assert_array_equal(read.imu.angular_velocity, recorded.imu.angular_velocity)
+        np.testing.assert_allclose(
+            read.detections.range_m, expected.detections.range_m, atol=1e-6
+        )
+        np.testing.assert_array_equal(
+            read.imu.angular_velocity, recorded.imu.angular_velocity
+        )
         np.testing.assert_array_equal(read.dvl.velocity, recorded.dvl.velocity)
-        said = f"{len(read.true_landmarks)} landmarks, {len(read.detections)} detections"
+        said = (
+            f"{len(read.true_landmarks)} landmarks, {len(read.detections)} detections"
+        )
         assert said in " ".join(capsys.readouterr().out.split())
         maps.append(read.true_landmarks.positions)
     assert not np.array_equal(*maps)

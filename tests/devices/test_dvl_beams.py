@@ -10,7 +10,13 @@ from sonar_graph.navigation.samples import is_partial
 
 TILT, SIGMA = np.radians(30.0), 0.02
 AZIMUTHS = np.radians([45.0, -45.0, -135.0, 135.0])
-JANUS = np.column_stack([np.sin(TILT) * np.cos(AZIMUTHS), np.sin(TILT) * np.sin(AZIMUTHS), np.full(4, np.cos(TILT))])
+JANUS = np.column_stack(
+    [
+        np.sin(TILT) * np.cos(AZIMUTHS),
+        np.sin(TILT) * np.sin(AZIMUTHS),
+        np.full(4, np.cos(TILT)),
+    ]
+)
 VELOCITY = np.array([1.2, -0.3, 0.1])
 subsets = st.lists(st.booleans(), min_size=4, max_size=4)
 seeds = st.integers(0, 2**32 - 1)
@@ -18,7 +24,9 @@ seeds = st.integers(0, 2**32 - 1)
 
 def solved(directions, valid):
     """One ping of a known velocity without noise."""
-    velocity, cov = velocity_of_beams(directions, (directions @ VELOCITY)[None], np.array([valid]), SIGMA)
+    velocity, cov = velocity_of_beams(
+        directions, (directions @ VELOCITY)[None], np.array([valid]), SIGMA
+    )
     return velocity[0], cov[0]
 
 
@@ -26,7 +34,10 @@ def test_four_beams_of_a_janus_are_a_velocity_with_the_covariance_of_the_textboo
     """By least squares; horizontally sigma^2 / (2 sin^2 tilt), vertically sigma^2 / (4 cos^2 tilt)."""
     along = JANUS @ VELOCITY + SIGMA * np.random.default_rng(0).standard_normal((1, 4))
     velocity, cov = velocity_of_beams(JANUS, along, np.ones((1, 4), dtype=bool), SIGMA)
-    across, down = SIGMA**2 / (2 * np.sin(TILT) ** 2), SIGMA**2 / (4 * np.cos(TILT) ** 2)
+    across, down = (
+        SIGMA**2 / (2 * np.sin(TILT) ** 2),
+        SIGMA**2 / (4 * np.cos(TILT) ** 2),
+    )
     np.testing.assert_allclose(velocity, along @ np.linalg.pinv(JANUS).T, atol=1e-12)
     np.testing.assert_allclose(cov[0], np.diag([across, across, down]), atol=1e-16)
 
@@ -37,7 +48,9 @@ def test_the_information_is_the_sum_over_the_beams(valid, seed):
     velocity, cov = solved(directions, valid)
     used = directions[np.array(valid)]
     total = used.T @ used / SIGMA**2
-    np.testing.assert_allclose(np.linalg.inv(cov), total, atol=2 / UNMEASURED_M_S**2, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.inv(cov), total, atol=2 / UNMEASURED_M_S**2, rtol=1e-5
+    )
     np.testing.assert_allclose(used @ velocity, used @ VELOCITY, atol=1e-12)
     assert is_partial(cov[None])[0] == (sum(valid) < 3)
 
@@ -57,6 +70,8 @@ def test_rows_do_not_mix_and_what_is_not_valid_may_be_anything():
     along = np.where(valid, velocities @ JANUS.T, np.nan)
     together, covs = velocity_of_beams(JANUS, along, valid, SIGMA)
     for k in range(50):
-        alone, cov = velocity_of_beams(JANUS, velocities[k : k + 1] @ JANUS.T, valid[k : k + 1], SIGMA)
+        alone, cov = velocity_of_beams(
+            JANUS, velocities[k : k + 1] @ JANUS.T, valid[k : k + 1], SIGMA
+        )
         np.testing.assert_allclose(alone[0], together[k], atol=1e-14)
         np.testing.assert_array_equal(cov[0], covs[k])

@@ -1,51 +1,107 @@
 import numpy as np
 import pytest
 
-from sonar_graph.devices.sonar_lenses import aris_azimuths, didson_azimuths, even_azimuths
+from sonar_graph.devices.sonar_lenses import (
+    aris_azimuths,
+    didson_azimuths,
+    even_azimuths,
+)
 
 
 @pytest.mark.parametrize(
     ("beams", "telephoto", "published_deg"),
     [
-        (48, False, {1: -13.1419, 6: -10.7921, 14: -6.2897, 22: -1.0343, 30: 4.3823, 47: 13.5735}),
-        (96, False, {3: -13.0975, 12: -10.9676, 28: -6.4652, 45: -0.8664, 61: 4.5722, 77: 9.4607, 94: 13.6586}),
+        (
+            48,
+            False,
+            {
+                1: -13.1419,
+                6: -10.7921,
+                14: -6.2897,
+                22: -1.0343,
+                30: 4.3823,
+                47: 13.5735,
+            },
+        ),
+        (
+            96,
+            False,
+            {
+                3: -13.0975,
+                12: -10.9676,
+                28: -6.4652,
+                45: -0.8664,
+                61: 4.5722,
+                77: 9.4607,
+                94: 13.6586,
+            },
+        ),
         (64, False, {2: -13.827, 15: -7.812, 30: -0.745, 40: 4.074, 62: 14.265}),
-        (128, False, {5: -13.619, 30: -7.870, 60: -0.861, 70: 1.6, 100: 8.565, 126: 14.488}),
+        (
+            128,
+            False,
+            {5: -13.619, 30: -7.870, 60: -0.861, 70: 1.6, 100: 8.565, 126: 14.488},
+        ),
         (48, True, {3: -5.934, 12: -3.403, 20: -1.069, 40: 4.839}),
-        (96, True, {4: -6.824, 12: -5.609, 36: -1.836, 44: -0.560, 60: 1.995, 90: 6.674}),
+        (
+            96,
+            True,
+            {4: -6.824, 12: -5.609, 36: -1.836, 44: -0.560, 60: 1.995, 90: 6.674},
+        ),
     ],
 )
-def test_aris_beams_are_those_of_the_published_tables(beams: int, telephoto: bool, published_deg: dict) -> None:
+def test_aris_beams_are_those_of_the_published_tables(
+    beams: int, telephoto: bool, published_deg: dict
+) -> None:
     """Rows of the manufacturer's that the package does not hold: beam from the left, degrees to the right."""
     azimuths_rad = aris_azimuths(beams, telephoto=telephoto)
     assert azimuths_rad is not None
     from_left_deg = -np.degrees(azimuths_rad)[::-1]
-    assert {beam: from_left_deg[beam] for beam in published_deg} == pytest.approx(published_deg, abs=0.005)
+    assert {beam: from_left_deg[beam] for beam in published_deg} == pytest.approx(
+        published_deg, abs=0.005
+    )
     assert aris_azimuths(128, telephoto=True) is None
 
 
 @pytest.mark.parametrize(
     ("beams", "polynomial"),
     [
-        (96, lambda x: 1.012 * (0.0030 * x**3 - 0.0055 * x**2 + 2.6829 * x + 48.04) + 1),
+        (
+            96,
+            lambda x: 1.012 * (0.0030 * x**3 - 0.0055 * x**2 + 2.6829 * x + 48.04) + 1,
+        ),
         (48, lambda x: 0.0015 * x**3 - 0.0036 * x**2 + 1.3351 * x + 24.0976 + 1),
     ],
 )
 def test_didson_beams_solve_the_published_polynomial(beams, polynomial) -> None:
     """The polynomial counts from the left from 1, with angles to the right in degrees."""
     to_right_deg = -np.degrees(didson_azimuths(beams))
-    np.testing.assert_allclose(polynomial(to_right_deg), beams - np.arange(beams), atol=1e-4)
+    np.testing.assert_allclose(
+        polynomial(to_right_deg), beams - np.arange(beams), atol=1e-4
+    )
 
 
 def test_didson_beams_are_far_from_evenly_spaced() -> None:
     azimuths_deg = np.degrees(didson_azimuths(96))
-    assert np.diff(azimuths_deg)[[0, 47, -1]] == pytest.approx([0.22, 0.37, 0.22], abs=0.015)
-    assert np.abs(azimuths_deg - np.degrees(even_azimuths(96, 14.4))).max() == pytest.approx(1.25, abs=0.05)
+    assert np.diff(azimuths_deg)[[0, 47, -1]] == pytest.approx(
+        [0.22, 0.37, 0.22], abs=0.015
+    )
+    assert np.abs(
+        azimuths_deg - np.degrees(even_azimuths(96, 14.4))
+    ).max() == pytest.approx(1.25, abs=0.05)
 
 
-def test_the_first_beam_is_the_right_most_and_even_beams_are_middles_of_equal_parts() -> None:
-    for azimuths_rad in (didson_azimuths(96), aris_azimuths(128, telephoto=False), even_azimuths(48, 14.0)):
+def test_the_first_beam_is_the_right_most_and_even_beams_are_middles_of_equal_parts() -> (
+    None
+):
+    for azimuths_rad in (
+        didson_azimuths(96),
+        aris_azimuths(128, telephoto=False),
+        even_azimuths(48, 14.0),
+    ):
         assert azimuths_rad is not None
         assert azimuths_rad[0] < 0 < azimuths_rad[-1]
         assert np.all(np.diff(azimuths_rad) > 0)
-    np.testing.assert_allclose(np.degrees(even_azimuths(4, 14.0)), [-10.5, -3.5, 3.5, 10.5])
+    np.testing.assert_allclose(
+        np.degrees(even_azimuths(4, 14.0)), [-10.5, -3.5, 3.5, 10.5]
+    )

@@ -25,50 +25,87 @@ def compass(run: Sequence, yaw_of) -> Sequence:
     yaw_rad = run.truth.rotations().as_euler("ZYX")[rows, 0]
     noise = 0.02 * np.random.default_rng(0).standard_normal(len(yaw_rad))
     return replace(
-        run, heading=Heading(run.truth.stamps_ns[rows], yaw_of(yaw_rad) + noise, np.full(len(yaw_rad), np.nan))
+        run,
+        heading=Heading(
+            run.truth.stamps_ns[rows],
+            yaw_of(yaw_rad) + noise,
+            np.full(len(yaw_rad), np.nan),
+        ),
     )
 
 
 @pytest.mark.parametrize("upside_down", [False, True])
 @pytest.mark.parametrize("gyro_bias", [0.0, 0.01])
-def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(gyro_bias: float, upside_down: bool):
+def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(
+    gyro_bias: float, upside_down: bool
+):
     """Whatever the bias of the gyros, and however the IMU sits, as gravity tells."""
-    imu = replace(RIGHT.imu, angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]))
+    imu = replace(
+        RIGHT.imu,
+        angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]),
+    )
     if upside_down:
-        turned = [values * [1.0, -1.0, -1.0] for values in (imu.angular_velocity, imu.specific_force)]
+        turned = [
+            values * [1.0, -1.0, -1.0]
+            for values in (imu.angular_velocity, imu.specific_force)
+        ]
         imu = replace(imu, angular_velocity=turned[0], specific_force=turned[1])
     run = replace(RIGHT, imu=imu, truth=RIGHT.truth)
     bearing = compass(run, lambda yaw_rad: np.pi / 2 - yaw_rad)
-    for given, config, world in ((bearing, {}, "ned"), (bearing, {"heading": {"world": "ned"}}, "enu")):
+    for given, config, world in (
+        (bearing, {}, "ned"),
+        (bearing, {"heading": {"world": "ned"}}, "enu"),
+    ):
         (finding,) = aiding_check.heading_findings(given, LogConfig.parse(config, "x"))
         assert finding.acts
         assert "turns against the gyros, clockwise" in finding.advice
         assert line_of(finding) == {"world": world}
         assert finding.estimate.value == pytest.approx(-1.0, abs=0.1)
-    sense, _ = aiding_check.heading_findings(compass(run, lambda yaw_rad: yaw_rad + 0.01), NO_CONFIG)
+    sense, _ = aiding_check.heading_findings(
+        compass(run, lambda yaw_rad: yaw_rad + 0.01), NO_CONFIG
+    )
     assert not sense.acts
     assert sense.estimate.value == pytest.approx(1.0, abs=0.1)
-    (stuck,) = aiding_check.heading_findings(compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG)
+    (stuck,) = aiding_check.heading_findings(
+        compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG
+    )
     assert stuck.acts
     assert "it hardly turns where the gyros do" in stuck.text()
 
 
 def test_without_turns_nothing_is_said_of_the_sense():
-    straight = replace(RIGHT, imu=replace(RIGHT.imu, angular_velocity=np.zeros_like(RIGHT.imu.angular_velocity)))
-    sense, *_ = aiding_check.heading_findings(compass(straight, lambda yaw_rad: -yaw_rad), NO_CONFIG)
+    straight = replace(
+        RIGHT,
+        imu=replace(
+            RIGHT.imu, angular_velocity=np.zeros_like(RIGHT.imu.angular_velocity)
+        ),
+    )
+    sense, *_ = aiding_check.heading_findings(
+        compass(straight, lambda yaw_rad: -yaw_rad), NO_CONFIG
+    )
     assert not sense.acts
     assert sense.text() == "cannot be told: too little turning"
 
 
-def fixed(run: Sequence, scale=1.0, origin=(0.0, 0.0, 0.0), sigma_m=0.0, every_s=1.0) -> Sequence:
+def fixed(
+    run: Sequence, scale=1.0, origin=(0.0, 0.0, 0.0), sigma_m=0.0, every_s=1.0
+) -> Sequence:
     """Fixes by satellites of the true position, in another unit and from another origin, with noise."""
     t = np.arange(run.truth.stamps_ns[0], run.truth.stamps_ns[-1], round(every_s * 1e9))
     noise = sigma_m * np.random.default_rng(1).standard_normal((len(t), 3))
     places = scale * (run.truth.at(t).positions + noise) + origin
-    return replace(run, positions=PositionFixes(t, places, np.full((len(t), 3, 3), np.nan)))
+    return replace(
+        run, positions=PositionFixes(t, places, np.full((len(t), 3, 3), np.nan))
+    )
 
 
-UNITS = [(1e3, {"scale": 1e-3}), (1e2, {"scale": 1e-2}), (1e-3, {"scale": 1e3}), (1 / 1.1e5, "geodetic"), (1.0, None)]
+UNITS = [
+    (1e3, {"scale": 1e-3}),
+    (1e2, {"scale": 1e-2}),
+    (1e-3, {"scale": 1e3}),
+    (1 / 1.1e5, "geodetic"),
+    (1.0, None),
+]
 
 
 @pytest.mark.parametrize(("scale", "line"), UNITS)
@@ -78,18 +115,25 @@ def test_fixes_in_another_unit_are_named_by_what_the_doppler_log_moves(scale, li
     if isinstance(line, dict):
         assert line_of(finding) == pytest.approx(line)
     elif line:
-        assert "degrees? `geodetic`, with the fields of latitude and longitude" in finding.advice
+        assert (
+            "degrees? `geodetic`, with the fields of latitude and longitude"
+            in finding.advice
+        )
 
 
 @pytest.mark.parametrize("every_s", [1.0, 15.0])
 def test_noise_of_fixes_of_a_slow_vehicle_is_no_unit_and_no_distance(every_s: float):
-    (finding,) = aiding_check.position_findings(fixed(SLOW, sigma_m=2.5, every_s=every_s), NO_CONFIG)
+    (finding,) = aiding_check.position_findings(
+        fixed(SLOW, sigma_m=2.5, every_s=every_s), NO_CONFIG
+    )
     assert not finding.acts, finding.text()
 
 
 @pytest.mark.parametrize("rows", [1, 2, 100])
 def test_a_doppler_log_of_one_row_or_a_few_tells_nothing_of_fixes(rows: int):
-    (finding,) = aiding_check.position_findings(fixed(replace(RIGHT, dvl=RIGHT.dvl.rows(slice(rows)))), NO_CONFIG)
+    (finding,) = aiding_check.position_findings(
+        fixed(replace(RIGHT, dvl=RIGHT.dvl.rows(slice(rows)))), NO_CONFIG
+    )
     assert finding.text() == "cannot be told: too few fixes beside the Doppler log"
 
 
@@ -99,9 +143,13 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
     (finding,) = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
     assert finding.acts
     assert "from the start, the whole way is" in finding.advice
-    assert line_of(finding)["origin_m"] == pytest.approx(grid + RIGHT.truth.positions[0] + [1, 2, 3], abs=2.0)
+    assert line_of(finding)["origin_m"] == pytest.approx(
+        grid + RIGHT.truth.positions[0] + [1, 2, 3], abs=2.0
+    )
     started = RIGHT.calibration.start.model_copy(update={"position_m": tuple(grid)})
-    begun = replace(RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": started}))
+    begun = replace(
+        RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": started})
+    )
     (finding,) = aiding_check.position_findings(fixed(begun, origin=grid), config)
     assert "from the origin of the world, the whole way is" in finding.advice
     few = fixed(RIGHT, every_s=1000.0)
@@ -111,17 +159,27 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
 
 
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 30.0])
-def test_fixes_that_no_vehicle_can_follow_are_named_and_outliers_among_good_ones_are_not(every_s: float):
+def test_fixes_that_no_vehicle_can_follow_are_named_and_outliers_among_good_ones_are_not(
+    every_s: float,
+):
     good = fixed(SLOW if every_s < 30 else RIGHT, sigma_m=2.5, every_s=every_s)
     places = good.positions.position_m
-    yaw_deg = np.degrees(np.interp(good.positions.stamps_ns, good.truth.stamps_ns, yaw_of(good)))
+    yaw_deg = np.degrees(
+        np.interp(good.positions.stamps_ns, good.truth.stamps_ns, yaw_of(good))
+    )
     angles = np.column_stack([0 * yaw_deg, 0 * yaw_deg, 10 * yaw_deg])
     spikes = places + 500.0 * (np.arange(len(places)) % 20 == 3)[:, None]
     for wrong, is_named in ((places, False), (spikes, False), (angles, True)):
         given = replace(good, positions=replace(good.positions, position_m=wrong))
-        found = [f.quantity for f in aiding_check.position_findings(given, NO_CONFIG) if f.acts]
+        found = [
+            f.quantity
+            for f in aiding_check.position_findings(given, NO_CONFIG)
+            if f.acts
+        ]
         assert ("position fixes: jumps" in found) == is_named, (found, every_s)
-        assert [f.quantity for f in doubts(given, NO_CONFIG) if "jumps" in f.quantity] == found
+        assert [
+            f.quantity for f in doubts(given, NO_CONFIG) if "jumps" in f.quantity
+        ] == found
 
 
 def yaw_of(run: Sequence) -> np.ndarray:
@@ -129,7 +187,9 @@ def yaw_of(run: Sequence) -> np.ndarray:
 
 
 @pytest.mark.parametrize("places", ["fixes", "true positions", "neither"])
-def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(places: str):
+def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(
+    places: str,
+):
     """A Doppler log that is turned on the body is no turn of the heading."""
     truth, off_rad = RIGHT.truth, 0.4
     rows = slice(0, len(truth), max(1, len(truth) // 1000))
@@ -137,11 +197,21 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
     stamps_ns, positions = truth.stamps_ns[rows], truth.positions[rows]
     fixes = PositionFixes(stamps_ns, positions, np.full((len(positions), 3, 3), np.nan))
     velocity = Rotation.from_euler("z", -0.7).apply(RIGHT.dvl.velocity)
-    run = with_mounting(replace(RIGHT, dvl=replace(RIGHT.dvl, velocity=velocity)), "dvl", rpy_rad=(0.0, 0.0, 0.7))
-    run = replace(
-        run, truth=truth if places == "true positions" else None, positions=fixes if places == "fixes" else None
+    run = with_mounting(
+        replace(RIGHT, dvl=replace(RIGHT.dvl, velocity=velocity)),
+        "dvl",
+        rpy_rad=(0.0, 0.0, 0.7),
     )
-    for said, before in ((yaw_rad + off_rad, 0.0), (yaw_rad + off_rad, 0.1), (yaw_rad, 0.0)):
+    run = replace(
+        run,
+        truth=truth if places == "true positions" else None,
+        positions=fixes if places == "fixes" else None,
+    )
+    for said, before in (
+        (yaw_rad + off_rad, 0.0),
+        (yaw_rad + off_rad, 0.1),
+        (yaw_rad, 0.0),
+    ):
         run = replace(run, heading=Heading(stamps_ns, said, np.full(len(said), np.nan)))
         config = LogConfig.parse({"heading": {"yaw_offset_rad": before}}, "x")
         found = list(aiding_check.heading_findings(run, config))
@@ -152,33 +222,57 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
             continue
         (finding,) = found
         wrong = said[0] != yaw_rad[0]
-        assert finding.estimate.value == pytest.approx(np.degrees(-off_rad * wrong), abs=2.0)
+        assert finding.estimate.value == pytest.approx(
+            np.degrees(-off_rad * wrong), abs=2.0
+        )
         assert finding.acts == wrong
         if wrong:
-            assert line_of(finding) == pytest.approx({"yaw_offset_rad": before - off_rad}, abs=0.04)
-            cure = tomllib.loads(finding.advice.split("`")[3])["dvl"]["mounting"]["rpy_rad"]
+            assert line_of(finding) == pytest.approx(
+                {"yaw_offset_rad": before - off_rad}, abs=0.04
+            )
+            cure = tomllib.loads(finding.advice.split("`")[3])["dvl"]["mounting"][
+                "rpy_rad"
+            ]
             assert cure == pytest.approx([0.0, 0.0, 0.7 - off_rad], abs=0.04)
             turned = with_mounting(run, "dvl", rpy_rad=cure)
-            assert not [f for f in aiding_check.heading_findings(turned, config) if f.acts]
+            assert not [
+                f for f in aiding_check.heading_findings(turned, config) if f.acts
+            ]
             assert finding.quantity in [f.quantity for f in doubts(run, config)]
     still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
-    assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[1:])
+    assert not any(
+        f.estimate.is_known
+        for f in list(aiding_check.heading_findings(still, LogConfig()))[1:]
+    )
 
 
-@pytest.mark.parametrize(("off_deg", "gyro_bias"), [(6.0, 0.0), (20.0, 0.0), (20.0, 0.01)])
-def test_a_turned_heading_is_a_warning_beyond_ten_degrees_and_a_gyro_bias_comes_first(off_deg, gyro_bias):
-    imu = replace(RIGHT.imu, angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]))
-    run = compass(replace(RIGHT, imu=imu), lambda yaw_rad: yaw_rad + np.radians(off_deg))
+@pytest.mark.parametrize(
+    ("off_deg", "gyro_bias"), [(6.0, 0.0), (20.0, 0.0), (20.0, 0.01)]
+)
+def test_a_turned_heading_is_a_warning_beyond_ten_degrees_and_a_gyro_bias_comes_first(
+    off_deg, gyro_bias
+):
+    imu = replace(
+        RIGHT.imu,
+        angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]),
+    )
+    run = compass(
+        replace(RIGHT, imu=imu), lambda yaw_rad: yaw_rad + np.radians(off_deg)
+    )
     found = doubts(run, NO_CONFIG)
     turned = [f for f in found if f.quantity == "heading: turn towards the positions"]
     assert [f.acts for f in turned] == [True] * (off_deg > 10)
-    assert ["gyro bias is put right, which comes first" in f.advice for f in turned] == [gyro_bias > 0] * len(turned)
+    assert [
+        "gyro bias is put right, which comes first" in f.advice for f in turned
+    ] == [gyro_bias > 0] * len(turned)
     assert not turned or found[-1] == turned[0]
 
 
 @pytest.mark.parametrize("upside_down", [False, True])
 @pytest.mark.parametrize("reference", ["heading", "truth"])
-def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(reference: str, upside_down: bool):
+def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(
+    reference: str, upside_down: bool
+):
     """0.67 degrees a second about the vertical, however the IMU sits."""
     given = compass(RIGHT, lambda yaw_rad: yaw_rad) if reference == "heading" else RIGHT
     right = aiding_check.vertical_bias(given)
@@ -186,18 +280,28 @@ def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(refere
     assert not right.acts
     turn = np.array([1.0, -1.0, -1.0]) if upside_down else np.ones(3)
     rate = RIGHT.imu.angular_velocity + np.array([0.0, 0.0, np.radians(0.67)])
-    imu = replace(RIGHT.imu, angular_velocity=rate * turn, specific_force=RIGHT.imu.specific_force * turn)
+    imu = replace(
+        RIGHT.imu,
+        angular_velocity=rate * turn,
+        specific_force=RIGHT.imu.specific_force * turn,
+    )
     biased = replace(given, imu=imu)
     found = aiding_check.vertical_bias(biased)
     assert found is not None
     assert found.acts
-    assert found.estimate.value == pytest.approx(np.radians(0.67), abs=4 * found.estimate.sigma)
+    assert found.estimate.value == pytest.approx(
+        np.radians(0.67), abs=4 * found.estimate.sigma
+    )
     assert found in doubts(biased, NO_CONFIG)
     (line,) = re.findall(r"`(imu\.gyro_bias_rad_s = \[.*?\])`", found.text())
     assert re.search(r"0\.6[67]\d?°/s beyond", found.text())
     known = tomllib.loads(line)["imu"]["gyro_bias_rad_s"]
-    section = biased.calibration.imu.model_copy(update={"gyro_bias_rad_s": tuple(known)})
-    mended = replace(biased, calibration=biased.calibration.model_copy(update={"imu": section}))
+    section = biased.calibration.imu.model_copy(
+        update={"gyro_bias_rad_s": tuple(known)}
+    )
+    mended = replace(
+        biased, calibration=biased.calibration.model_copy(update={"imu": section})
+    )
     again = aiding_check.vertical_bias(mended)
     assert again is not None
     assert not again.acts

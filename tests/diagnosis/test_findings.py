@@ -33,7 +33,10 @@ UNKNOWN = Estimate1D(np.nan, np.inf, "too little turning")
 GIVEN = parse(
     Calibration,
     {
-        "imu": {"mounting": {"translation_m": [0.5, 0.1, 0.0]}, "gyro_bias_sigma": 1e-4},
+        "imu": {
+            "mounting": {"translation_m": [0.5, 0.1, 0.0]},
+            "gyro_bias_sigma": 1e-4,
+        },
         "dvl": {"mounting": {"translation_m": [-1.0, 0.2, 0.3]}},
     },
     "by hand",
@@ -41,7 +44,9 @@ GIVEN = parse(
 """An arm of (-1.5, 0.1, 0.3) m."""
 
 
-def match(lever: tuple[Estimate1D, ...], bias: tuple[Estimate1D, ...] = (UNKNOWN,) * 3) -> DvlMatch:
+def match(
+    lever: tuple[Estimate1D, ...], bias: tuple[Estimate1D, ...] = (UNKNOWN,) * 3
+) -> DvlMatch:
     return DvlMatch(UNKNOWN, UNKNOWN, UNKNOWN, lever, bias)  # type: ignore[arg-type]
 
 
@@ -60,13 +65,20 @@ def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
     assert [row.acts for row in rows] == [True, False, True]
     texts = [row.text() for row in rows]
     assert "not the calibration's -1.50 m" in texts[0]
-    assert texts[1] == "+0.110 ± 0.020 m: the calibration's +0.10 m fits, no need to act"
+    assert (
+        texts[1] == "+0.110 ± 0.020 m: the calibration's +0.10 m fits, no need to act"
+    )
     assert texts[2] == "+0.900 ± 0.020 m: put right by the line above"
     imu, dvl = lines_of(rows[0])
-    places = [imu["imu"]["mounting"]["translation_m"], dvl["dvl"]["mounting"]["translation_m"]]
+    places = [
+        imu["imu"]["mounting"]["translation_m"],
+        dvl["dvl"]["mounting"]["translation_m"],
+    ]
     assert np.subtract((-1.0, 0.2, 0.3), places[0]) == pytest.approx([-0.2, 0.1, 0.9])
     assert np.subtract(places[1], (0.5, 0.1, 0.0)) == pytest.approx([-0.2, 0.1, 0.9])
-    assert with_fitted(match(arm(-0.2, 0.11, 0.9)), GIVEN).imu.mounting.translation_m == pytest.approx(places[0])
+    assert with_fitted(
+        match(arm(-0.2, 0.11, 0.9)), GIVEN
+    ).imu.mounting.translation_m == pytest.approx(places[0])
 
 
 def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_says_why():
@@ -74,17 +86,29 @@ def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_
     assert rows[0].text() == "cannot be told: too little turning"
     assert [row.acts for row in rows] == [False, True, False]
     assert "`imu.mounting.translation_m = [0.500, -0.400, 0.000]`" in rows[1].advice
-    rows = [*lever_findings(match((UNKNOWN,) * 3), GIVEN), *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu)]
+    rows = [
+        *lever_findings(match((UNKNOWN,) * 3), GIVEN),
+        *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu),
+    ]
     assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
     assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
     assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
 
 
-@pytest.mark.parametrize(("error_m", "sigma_m", "acts"), [(0.04, 0.01, False), (0.06, 0.01, True), (0.5, 0.3, False)])
-def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(error_m: float, sigma_m: float, acts: bool):
-    (row, *_) = lever_findings(match(arm(-1.5 + error_m, 0.1, 0.3, sigma=sigma_m)), GIVEN)
+@pytest.mark.parametrize(
+    ("error_m", "sigma_m", "acts"),
+    [(0.04, 0.01, False), (0.06, 0.01, True), (0.5, 0.3, False)],
+)
+def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(
+    error_m: float, sigma_m: float, acts: bool
+):
+    (row, *_) = lever_findings(
+        match(arm(-1.5 + error_m, 0.1, 0.3, sigma=sigma_m)), GIVEN
+    )
     assert row.acts == acts
-    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s", "digits that the interval supports"
+    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s", (
+        "digits that the interval supports"
+    )
     assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
 
 
@@ -99,8 +123,12 @@ def test_a_bias_beyond_its_sigma_asks_for_one_that_holds_the_largest():
     changed = with_fitted(match(arm(-1.5, 0.1, 0.3), biases), GIVEN).imu
     assert changed.gyro_bias_sigma == 0.004
     assert not any(row.acts for row in bias_findings(biases, sources, changed))
-    fibre = ImuCalibration(gyro_bias_sigma=3e-6)  # the rotation of the Earth is no fault of a gyro
-    assert not any(row.acts for row in bias_findings(arm(7.3e-5, 0.0, -7.3e-5, sigma=1e-5), sources, fibre))
+    # the rotation of the Earth is no fault of a gyro
+    fibre = ImuCalibration(gyro_bias_sigma=3e-6)
+    assert not any(
+        row.acts
+        for row in bias_findings(arm(7.3e-5, 0.0, -7.3e-5, sigma=1e-5), sources, fibre)
+    )
     assert bias_findings(arm(1.2e-4, 0.0, 0.0, sigma=1e-5), sources, fibre)[0].acts
 
 
@@ -117,7 +145,9 @@ def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequ
     force = STANDARD_GRAVITY * up + off + 1.2e-2 * rng.standard_normal((len(t), 3))
     rate = BIAS + 1.2e-3 * rng.standard_normal((len(t), 3))
     speed = 0.4 * np.clip(dvl_t - rest_s, 0.0, 2.0)
-    velocity = np.outer(speed, [1.0, 0.0, 0.0]) + 0.01 * rng.standard_normal((len(dvl_t), 3))
+    velocity = np.outer(speed, [1.0, 0.0, 0.0]) + 0.01 * rng.standard_normal(
+        (len(dvl_t), 3)
+    )
     imu_ns, dvl_ns = (np.round(NS * seconds).astype(np.int64) for seconds in (t, dvl_t))
     dvl = Dvl(dvl_ns, velocity, np.full((len(dvl_t), 3, 3), np.nan))
     return Sequence("by hand", Calibration(), Imu(imu_ns, rate, force), dvl)
@@ -140,21 +170,50 @@ def test_a_rest_at_the_start_is_used_as_long_as_it_lasts(rest_s: float, used: in
 
 @pytest.mark.parametrize(
     ("turn_rad_s", "said_rad_s", "left"),
-    [(0.011, 0.011, 0.0), (0.011, -0.011, 0.0), (0.011, 0.0, 0.011), (0.0, 0.011, 0.0), (0.011, None, 0.011)],
-    ids=["turning", "turning, compass mirrored", "gyro bias", "compass drifts", "no compass"],
+    [
+        (0.011, 0.011, 0.0),
+        (0.011, -0.011, 0.0),
+        (0.011, 0.0, 0.011),
+        (0.0, 0.011, 0.0),
+        (0.011, None, 0.011),
+    ],
+    ids=[
+        "turning",
+        "turning, compass mirrored",
+        "gyro bias",
+        "compass drifts",
+        "no compass",
+    ],
 )
-def test_a_slow_turn_that_the_heading_confirms_is_no_gyro_bias(turn_rad_s, said_rad_s, left):
+def test_a_slow_turn_that_the_heading_confirms_is_no_gyro_bias(
+    turn_rad_s, said_rad_s, left
+):
     """About the vertical of a tilted vehicle; and no turn without a heading that tells it from a bias."""
-    run, up = resting(50.0), Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
-    turning = replace(run.imu, angular_velocity=run.imu.angular_velocity + turn_rad_s * up)
+    run, up = (
+        resting(50.0),
+        Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0]),
+    )
+    turning = replace(
+        run.imu, angular_velocity=run.imu.angular_velocity + turn_rad_s * up
+    )
     t = np.arange(0, 60, 0.1)
-    yaw_rad = 3.0 + (said_rad_s or 0.0) * t + 0.005 * np.random.default_rng(0).standard_normal(len(t))
-    heading = Heading(np.round(NS * t).astype(np.int64), yaw_rad, np.full(len(t), np.nan))
-    found = find_start_tilt(replace(run, imu=turning, heading=None if said_rad_s is None else heading))
+    yaw_rad = (
+        3.0
+        + (said_rad_s or 0.0) * t
+        + 0.005 * np.random.default_rng(0).standard_normal(len(t))
+    )
+    heading = Heading(
+        np.round(NS * t).astype(np.int64), yaw_rad, np.full(len(t), np.nan)
+    )
+    found = find_start_tilt(
+        replace(run, imu=turning, heading=None if said_rad_s is None else heading)
+    )
     bias = found.gyro_bias()
     for one, true in zip(bias, BIAS + left * up, strict=True):
         assert one.value == pytest.approx(true, abs=8e-4)
-    assert ("less the turn of the heading" in found.said) == (turn_rad_s != 0 and bool(said_rad_s))
+    assert ("less the turn of the heading" in found.said) == (
+        turn_rad_s != 0 and bool(said_rad_s)
+    )
 
 
 def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion_counts():
@@ -162,7 +221,9 @@ def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion
     assert not late.is_rest
     assert "in motion" in late.said
     run = simulate_mission(MissionOptions(seed=8, duration_s=70, landmarks=1))
-    _, pitch, roll = run.truth.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    _, pitch, roll = (
+        run.truth.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    )
     for sequence, rpy in ((resting(4.0), (ROLL, PITCH)), (run, (roll, pitch))):
         found = find_start_tilt(sequence)
         assert found.said.endswith("s in motion")
@@ -178,8 +239,12 @@ def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
     assert "the calibration's -4.01° fits, no need to act" in rows[1].text()
     rpy, sigma = (line["start"] for line in lines_of(rows[0]))
     assert rpy["rpy_rad"] == pytest.approx([ROLL, PITCH, 0.9], abs=5e-3)
-    assert sigma["rpy_sigma_rad"] == pytest.approx([found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05)
-    right = Start(rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"]))
+    assert sigma["rpy_sigma_rad"] == pytest.approx(
+        [found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05
+    )
+    right = Start(
+        rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"])
+    )
     for fits in (right, Start(rpy_sigma_rad=(0.1, 0.1, 0.1))):
         assert not any(row.acts for row in tilt_findings(found, fits, 0.9))
 
@@ -187,7 +252,14 @@ def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
 def test_what_speaks_against_both_ways_is_said_in_one_row():
     """No accelerometers; velocities that have nothing to do with the accelerations; a calibration without noise."""
     run = resting(50.0)
-    blind = replace(run, imu=Imu(run.imu.stamps_ns, run.imu.angular_velocity, np.full((len(run.imu), 3), np.nan)))
+    blind = replace(
+        run,
+        imu=Imu(
+            run.imu.stamps_ns,
+            run.imu.angular_velocity,
+            np.full((len(run.imu), 3), np.nan),
+        ),
+    )
     found = find_start_tilt(blind)
     assert found.tilt is None
     (row,) = tilt_findings(found, Start(), 0.0)
@@ -201,28 +273,43 @@ def test_what_speaks_against_both_ways_is_said_in_one_row():
     assert "at rest: Imu.specific_force: varies" in found.said
     assert "in motion: alignment: velocities and accelerations differ" in found.said
     assert "inspect" not in found.said
-    silent = {"imu": {"gyro_noise_density": 0.0, "accel_noise_density": 0.0}, "dvl": {"velocity_sigma_m_s": [0.0] * 3}}
-    found = find_start_tilt(replace(run, calibration=parse(Calibration, silent, "by hand")))
+    silent = {
+        "imu": {"gyro_noise_density": 0.0, "accel_noise_density": 0.0},
+        "dvl": {"velocity_sigma_m_s": [0.0] * 3},
+    }
+    found = find_start_tilt(
+        replace(run, calibration=parse(Calibration, silent, "by hand"))
+    )
     assert found.said.endswith("in motion: the calibration's noise is zero")
 
 
-@pytest.mark.parametrize("begin_s", [-5.0, 0.0, 0.2, -60.0], ids=["within", "first", "after", "last"])
+@pytest.mark.parametrize(
+    "begin_s", [-5.0, 0.0, 0.2, -60.0], ids=["within", "first", "after", "last"]
+)
 def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float):
     """0.1 rad/s and an offset of 0.1 s: 0.01 rad beside a tenth of a degree, wherever the reference begins or ends."""
     run, t = resting(50.0), np.arange(0.0, 60.01, 0.1)
     turning = Rotation.from_euler("z", 0.1 * (t + begin_s)[:, None]).as_quat()
     stamps_ns = run.start_ns + np.round(NS * (t + begin_s)).astype(np.int64)
-    reference = Trajectory.without_covariances(stamps_ns, np.zeros((len(t), 3)), turning)
+    reference = Trajectory.without_covariances(
+        stamps_ns, np.zeros((len(t), 3)), turning
+    )
     found = find_start_heading(run, reference, Estimate1D(0.0, 0.1))
     assert found.error.sigma == pytest.approx(np.hypot(np.radians(0.1), 0.01), rel=1e-6)
-    assert found.rpy_rad[2] == pytest.approx(0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6)
+    assert found.rpy_rad[2] == pytest.approx(
+        0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6
+    )
 
 
 def test_a_wrong_heading_has_the_roll_and_pitch_of_the_alignment_also_where_the_calibrations_fit():
     """The reference's contradict the row of the alignment; they are written only where there is none."""
     found = find_start_tilt(resting(50.0))
-    heading = StartHeading((ROLL - 0.04, PITCH + 0.03, 0.9), (1.0, 2.0, -3.0), Estimate1D(0.2, 0.002))
-    assert not any(row.acts for row in tilt_findings(found, Start(rpy_rad=(ROLL, PITCH, 0.7)), 0.9))
+    heading = StartHeading(
+        (ROLL - 0.04, PITCH + 0.03, 0.9), (1.0, 2.0, -3.0), Estimate1D(0.2, 0.002)
+    )
+    assert not any(
+        row.acts for row in tilt_findings(found, Start(rpy_rad=(ROLL, PITCH, 0.7)), 0.9)
+    )
     row = heading.finding(found)
     rpy, place = (line["start"] for line in lines_of(row))
     expected = [found.angle(0).value, found.angle(1).value, 0.9]
@@ -230,5 +317,7 @@ def test_a_wrong_heading_has_the_roll_and_pitch_of_the_alignment_also_where_the_
     assert place["position_m"] == [1.0, 2.0, -3.0]
     assert "with roll and pitch from 40 s of rest" in row.text()
     alone = heading.finding(StartTilt(None, "no rows"))
-    assert lines_of(alone)[0]["start"]["rpy_rad"] == pytest.approx(heading.rpy_rad, abs=1e-4)
+    assert lines_of(alone)[0]["start"]["rpy_rad"] == pytest.approx(
+        heading.rpy_rad, abs=1e-4
+    )
     assert "roll and pitch" not in alone.text()

@@ -29,8 +29,14 @@ FAR_M = (0.9, 0.0, -0.7)
 
 def with_rows(rate: Floats, force: Floats, velocity: Floats) -> Sequence:
     """The mission with other rows: the IMU at 100 Hz, the Doppler log at 5 Hz."""
-    imu = Imu(np.arange(len(rate)) * 10_000_000, rate, force + np.array([0, 0, 9.80665]))
-    dvl = Dvl(np.arange(len(velocity)) * 200_000_000, velocity, np.full((len(velocity), 3, 3), np.nan))
+    imu = Imu(
+        np.arange(len(rate)) * 10_000_000, rate, force + np.array([0, 0, 9.80665])
+    )
+    dvl = Dvl(
+        np.arange(len(velocity)) * 200_000_000,
+        velocity,
+        np.full((len(velocity), 3, 3), np.nan),
+    )
     return replace(RIGHT, imu=imu, dvl=dvl, truth=None)
 
 
@@ -53,13 +59,17 @@ def found_in_spoilt() -> dict[str, Finding]:
 
 def with_mounting(run: Sequence, sensor: str, **change: tuple[float, ...]) -> Sequence:
     section = getattr(run.calibration, sensor)
-    moved = section.model_copy(update={"mounting": section.mounting.model_copy(update=change)})
+    moved = section.model_copy(
+        update={"mounting": section.mounting.model_copy(update=change)}
+    )
     return replace(run, calibration=run.calibration.model_copy(update={sensor: moved}))
 
 
 def start_of(run: Sequence, reference: Trajectory) -> tuple[float, float, float]:
     """Roll, pitch and yaw at the start."""
-    yaw, pitch, roll = reference.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    yaw, pitch, roll = (
+        reference.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    )
     return roll, pitch, yaw
 
 
@@ -74,13 +84,28 @@ def line_of(finding: Finding) -> dict[str, Any]:
 
 def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
     """The Doppler log as the advice's own lines make it."""
-    lines = {name: line_of(finding) for name, finding in found.items() if finding.acts and "`" in finding.advice}
-    shift_s, scale = lines["DVL against IMU: time offset"]["stamp_offset_s"], lines["DVL scale"]["scale"]
+    lines = {
+        name: line_of(finding)
+        for name, finding in found.items()
+        if finding.acts and "`" in finding.advice
+    }
+    shift_s, scale = (
+        lines["DVL against IMU: time offset"]["stamp_offset_s"],
+        lines["DVL scale"]["scale"],
+    )
     rpy = tuple(lines["DVL mounting yaw"]["dvl"]["mounting"]["rpy_rad"])
-    place = tuple(lines["lever arm from IMU to DVL, x"]["imu"]["mounting"]["translation_m"])
+    place = tuple(
+        lines["lever arm from IMU to DVL, x"]["imu"]["mounting"]["translation_m"]
+    )
     dvl = run.dvl
-    moved = Dvl(dvl.stamps_ns + round(shift_s * 1e9), dvl.velocity * scale, dvl.velocity_cov)
-    return with_mounting(with_mounting(replace(run, dvl=moved), "dvl", rpy_rad=rpy), "imu", translation_m=place)
+    moved = Dvl(
+        dvl.stamps_ns + round(shift_s * 1e9), dvl.velocity * scale, dvl.velocity_cov
+    )
+    return with_mounting(
+        with_mounting(replace(run, dvl=moved), "dvl", rpy_rad=rpy),
+        "imu",
+        translation_m=place,
+    )
 
 
 @pytest.mark.slow
@@ -93,29 +118,47 @@ def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]
         assert again[name].advice == "no need to act"
     arms = [finding for name, finding in found.items() if name.startswith("lever arm")]
     assert [arm.acts for arm in arms] == [True, False, True]
-    for finding in found.values():  # each line to change with the option that takes the file
+    for (
+        finding
+    ) in found.values():  # each line to change with the option that takes the file
         if "`" in finding.advice:
-            assert " FILE)" in finding.advice or "`--start`" in finding.advice, finding.advice
+            assert " FILE)" in finding.advice or "`--start`" in finding.advice, (
+                finding.advice
+            )
     assert not any(again[arm.quantity].acts for arm in arms)
 
 
-def test_the_start_is_aligned_with_what_was_found_before(found_in_spoilt: dict[str, Finding]):
+def test_the_start_is_aligned_with_what_was_found_before(
+    found_in_spoilt: dict[str, Finding],
+):
     """With stamps half a second off, velocities and accelerations differ too much for an alignment."""
-    for name, angle in zip(("roll", "pitch"), np.degrees(start_of(RIGHT, RIGHT.truth)[:2]), strict=True):
-        assert found_in_spoilt[f"start {name}: value"].estimate.value == pytest.approx(angle, abs=0.1)
+    for name, angle in zip(
+        ("roll", "pitch"), np.degrees(start_of(RIGHT, RIGHT.truth)[:2]), strict=True
+    ):
+        assert found_in_spoilt[f"start {name}: value"].estimate.value == pytest.approx(
+            angle, abs=0.1
+        )
     assert find_start_tilt(spoilt()).tilt is None
 
 
 def test_corrections_are_added_to_what_the_configuration_says_and_a_wrong_unit_is_named_alone():
     config = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
     found = by_name(sensor_check.check_sensors(spoilt(), config))
-    offset, scale = (line_of(found[name]) for name in ("DVL against IMU: time offset", "DVL scale"))
+    offset, scale = (
+        line_of(found[name]) for name in ("DVL against IMU: time offset", "DVL scale")
+    )
     assert offset["stamp_offset_s"] == pytest.approx(OFFSET_S - 0.1, abs=0.15)
     assert scale["scale"] == pytest.approx(2 * SCALE, abs=0.05)
     dvl = RIGHT.dvl
-    in_mm = replace(RIGHT, dvl=Dvl(dvl.stamps_ns, dvl.velocity * 1000.0, dvl.velocity_cov))
+    in_mm = replace(
+        RIGHT, dvl=Dvl(dvl.stamps_ns, dvl.velocity * 1000.0, dvl.velocity_cov)
+    )
     (finding,) = sensor_check.check_sensors(in_mm, config)
-    assert (finding.quantity, finding.acts, line_of(finding)) == ("DVL: unit", True, {"scale": 0.002})
+    assert (finding.quantity, finding.acts, line_of(finding)) == (
+        "DVL: unit",
+        True,
+        {"scale": 0.002},
+    )
 
 
 def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
@@ -127,18 +170,35 @@ def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
         run = started_at(turning, *start_of(turning, reference))
         finding = by_name(sensor_check.check_sensors(run))["start heading: error"]
         assert finding.acts == acts, finding.text()
-        assert ("(--calibration FILE); the position too is the reference's" in finding.advice) == acts
+        assert (
+            "(--calibration FILE); the position too is the reference's"
+            in finding.advice
+        ) == acts
 
 
 def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
     roll, pitch, yaw = start_of(SHORT, SHORT.truth)
-    found = by_name(sensor_check.check_sensors(started_at(SHORT, roll + 0.1, pitch, yaw + 0.2)))
-    ours, theirs = (line_of(found[name])["start"] for name in ("start roll: value", "start heading: error"))
-    assert ours["rpy_rad"] == theirs["rpy_rad"] == pytest.approx([roll, pitch, yaw], abs=2e-3)
+    found = by_name(
+        sensor_check.check_sensors(started_at(SHORT, roll + 0.1, pitch, yaw + 0.2))
+    )
+    ours, theirs = (
+        line_of(found[name])["start"]
+        for name in ("start roll: value", "start heading: error")
+    )
+    assert (
+        ours["rpy_rad"]
+        == theirs["rpy_rad"]
+        == pytest.approx([roll, pitch, yaw], abs=2e-3)
+    )
 
 
 def test_a_number_that_cannot_be_told_asks_for_nothing():
-    short = replace(RIGHT, imu=RIGHT.imu.rows(slice(0, 150)), dvl=RIGHT.dvl.rows(slice(0, 9)), truth=None)
+    short = replace(
+        RIGHT,
+        imu=RIGHT.imu.rows(slice(0, 150)),
+        dvl=RIGHT.dvl.rows(slice(0, 9)),
+        truth=None,
+    )
     for finding in sensor_check.check_sensors(short):
         assert not finding.acts
         assert finding.text().startswith("cannot be told: ")
@@ -147,7 +207,9 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hole_s", [2.0, 5.0])
-def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.MonkeyPatch):
+def test_a_hole_of_the_imu_asks_for_nothing(
+    hole_s: float, monkeypatch: pytest.MonkeyPatch
+):
     """Drawn straight across, 5 s of manoeuvres make a wrong scale and a wrong offset of the reference."""
     t = (RIGHT.imu.stamps_ns - RIGHT.imu.stamps_ns[0]) * 1e-9
     run = replace(RIGHT, imu=RIGHT.imu.rows((t <= 100.0) | (t >= 100.0 + hole_s)))
@@ -155,12 +217,20 @@ def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.M
     assert [finding.text() for finding in found.values() if finding.acts] == []
     assert found["DVL scale"].estimate.is_known
     assert found["reference against IMU: time offset"].estimate.is_known
-    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like)
+    monkeypatch.setattr(
+        "sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like
+    )
     blind = by_name(sensor_check.check_sensors(run))
-    assert blind["DVL scale"].acts == blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
+    assert (
+        blind["DVL scale"].acts
+        == blind["reference against IMU: time offset"].acts
+        == (hole_s > 2.0)
+    )
 
 
-@pytest.mark.parametrize(("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)])
+@pytest.mark.parametrize(
+    ("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)]
+)
 def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told: bool):
     rng, n = np.random.default_rng(0), 5000
     force, rate = 0.05 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
@@ -171,17 +241,26 @@ def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told:
         assert is_told or "steady, but at 0.8 m/s" in found[name].text()
 
 
-@pytest.mark.parametrize(("factor", "acts"), [(0.5, True), (0.75, False), (1.0, False), (1.35, False), (2.0, True)])
+@pytest.mark.parametrize(
+    ("factor", "acts"),
+    [(0.5, True), (0.75, False), (1.0, False), (1.35, False), (2.0, True)],
+)
 def test_a_density_matters_by_half_as_much_again_either_way(factor: float, acts: bool):
     """100 s of rest at 100 Hz, which tells a density to some percent."""
     rng, n, given = np.random.default_rng(1), 10_000, RIGHT.calibration.imu
     rate, force = factor * 10 * rng.standard_normal((2, n, 3))
-    run = with_rows(given.gyro_noise_density * rate, given.accel_noise_density * force, np.zeros((500, 3)))
+    run = with_rows(
+        given.gyro_noise_density * rate,
+        given.accel_noise_density * force,
+        np.zeros((500, 3)),
+    )
     for finding in sensor_check.noise_findings(run):
         assert finding.acts == acts, finding.text()
 
 
-def told(*values: float, sigma: float = 1e-3) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
+def told(
+    *values: float, sigma: float = 1e-3
+) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
     x, y, z = (Estimate1D(value, sigma) for value in values)
     return x, y, z
 
@@ -190,28 +269,57 @@ def told(*values: float, sigma: float = 1e-3) -> tuple[Estimate1D, Estimate1D, E
 def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
     offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
     numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
-    match = DvlMatch(*numbers, lever=told(-0.2, 0.0, -0.15), gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6))
+    match = DvlMatch(
+        *numbers,
+        lever=told(-0.2, 0.0, -0.15),
+        gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6),
+    )
     turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
     rows = list(sensor_check.dvl_findings(match, turned, LogConfig()))
     assert [row.acts for row in rows] == [acts] * 3
-    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), "that of a sample's instant"
+    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), (
+        "that of a sample's instant"
+    )
     right = sensor_check.corrected_sequence(turned, match, rows)
-    assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(400_000_000 if acts else 0)
-    assert right.dvl.velocity == pytest.approx(RIGHT.dvl.velocity * (1.04 if acts else 1.0))
-    assert right.calibration.dvl.mounting.rpy_rad == pytest.approx((0.3, 0.1, 0.25 if acts else 0.2))
+    assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(
+        400_000_000 if acts else 0
+    )
+    assert right.dvl.velocity == pytest.approx(
+        RIGHT.dvl.velocity * (1.04 if acts else 1.0)
+    )
+    assert right.calibration.dvl.mounting.rpy_rad == pytest.approx(
+        (0.3, 0.1, 0.25 if acts else 0.2)
+    )
 
 
 def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
     unknown = Estimate1D(np.nan, np.inf, "too little turning")
     nothing = told(0.0, 0.0, 0.0)
     x, y, _ = told(1.0, 2.0, 3.0, sigma=1e-4)
-    drive = DvlMatch(unknown, unknown, unknown, nothing, (x, replace(y, sigma=1e-2), unknown))
+    drive = DvlMatch(
+        unknown, unknown, unknown, nothing, (x, replace(y, sigma=1e-2), unknown)
+    )
     sigmas = np.array([1.0, 1.0, 1e-3, 1e-3, 1e-3])
-    rest = InitialTilt(0, 0.0, 0.0, np.array([10.0, 20.0, 30.0]), np.diag(sigmas**2), np.ones(3, dtype=np.bool_))
-    bias, sources = sensor_check.surest_bias(drive, StartTilt(rest, "from 20 s of rest", is_rest=True))
+    rest = InitialTilt(
+        0,
+        0.0,
+        0.0,
+        np.array([10.0, 20.0, 30.0]),
+        np.diag(sigmas**2),
+        np.ones(3, dtype=np.bool_),
+    )
+    bias, sources = sensor_check.surest_bias(
+        drive, StartTilt(rest, "from 20 s of rest", is_rest=True)
+    )
     assert [one.value for one in bias] == [1.0, 20.0, 30.0]
-    assert sources == ("from the turns of the drive", "from 20 s of rest", "from 20 s of rest")
-    moving, sources = sensor_check.surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
+    assert sources == (
+        "from the turns of the drive",
+        "from 20 s of rest",
+        "from 20 s of rest",
+    )
+    moving, sources = sensor_check.surest_bias(
+        drive, StartTilt(rest, "from 60 s in motion")
+    )
     assert moving == drive.gyro_bias
     assert set(sources) == {"from the turns of the drive"}
 
@@ -230,8 +338,14 @@ def units(
     **scales: dict[str, float],
 ) -> list[Finding]:  # fmt: skip
     """Wrong units of readings so long; a force may be rows."""
-    stamps_ns, forces = np.arange(N) * 10_000_000, force if np.ndim(force) == 2 else vectors(force)
-    imu, dvl = Imu(stamps_ns, vectors(turn), forces), Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan))
+    stamps_ns, forces = (
+        np.arange(N) * 10_000_000,
+        force if np.ndim(force) == 2 else vectors(force),
+    )
+    imu, dvl = (
+        Imu(stamps_ns, vectors(turn), forces),
+        Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan)),
+    )
     sequence = Sequence("hand", Calibration(gravity_m_s2=gravity), imu, dvl)
     return sensor_check.wrong_units(sequence, LogConfig.parse(scales, "x"))
 
@@ -249,23 +363,33 @@ FORCES = [
 
 
 @pytest.mark.parametrize(("speed", "unit", "times", "scale"), SPEEDS)
-def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_three(speed, unit, times, scale):
+def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_three(
+    speed, unit, times, scale
+):
     (fault,) = units(speed=speed)
     assert fault.quantity == "DVL: unit"
-    assert fault.advice.startswith(f"velocities look {times} times too large (up to {speed:.3g} m/s): {unit}? ")
+    assert fault.advice.startswith(
+        f"velocities look {times} times too large (up to {speed:.3g} m/s): {unit}? "
+    )
     assert line_of(fault) == pytest.approx({"scale": scale})
     assert ("mm/s if the vehicle moves at" in fault.advice) == (unit == "cm/s")
 
 
-SLOW = simulate_mission(MissionOptions(seed=5, duration_s=60.0, frame_rate_hz=2.0, speed_m_s=0.1))
+SLOW = simulate_mission(
+    MissionOptions(seed=5, duration_s=60.0, frame_rate_hz=2.0, speed_m_s=0.1)
+)
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.0, 30.0, 100.0])
-def test_velocities_that_a_vehicle_has_are_in_another_unit_where_ranges_change_by_a_tenth(factor: float):
+def test_velocities_that_a_vehicle_has_are_in_another_unit_where_ranges_change_by_a_tenth(
+    factor: float,
+):
     run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=factor * SLOW.dvl.velocity))
     measured_m, by_dvl_m = sensor_check.range_changes(run)
     assert by_dvl_m / measured_m == pytest.approx(factor, rel=0.4)
-    (said,) = [fault.advice for fault in sensor_check.wrong_units(run, LogConfig())] or [""]
+    (said,) = [
+        fault.advice for fault in sensor_check.wrong_units(run, LogConfig())
+    ] or [""]
     assert ("cm/s? `scale = 0.01`" in said) == (factor > 10.0)
     assert ("ranges to landmarks change by" in said) == (factor > 10.0)
 
@@ -281,12 +405,18 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     sonar = SLOW.calibration.sonar.model_copy(update={"range_sigma_m": 0.05})
     coarse = replace(SLOW.detections, range_m=np.full(len(SLOW.detections), 2.0))
     calibration = SLOW.calibration.model_copy(update={"sonar": sonar})
-    assert not sensor_check.wrong_units(replace(SLOW, detections=coarse, calibration=calibration), LogConfig())
+    assert not sensor_check.wrong_units(
+        replace(SLOW, detections=coarse, calibration=calibration), LogConfig()
+    )
     few = SLOW.detections.rows(slice(0, 15))
     far = replace(SLOW.dvl, velocity=100.0 * velocity)
     assert sensor_check.range_changes(replace(SLOW, detections=few)) is None
-    assert not sensor_check.wrong_units(replace(SLOW, detections=few, dvl=far), LogConfig())
-    assert not sensor_check.wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
+    assert not sensor_check.wrong_units(
+        replace(SLOW, detections=few, dvl=far), LogConfig()
+    )
+    assert not sensor_check.wrong_units(
+        replace(SLOW, detections=None, dvl=far), LogConfig()
+    )
 
 
 @pytest.mark.parametrize(("unit", "factor", "shares"), FORCES)
@@ -296,7 +426,9 @@ def test_a_force_is_in_the_unit_that_brings_it_nearest_to_gravity(unit, factor, 
         (fault,) = units(force=share * 9.80665 / factor)
         assert fault.quantity == "accelerometer: unit"
         assert f"instead of 9.807 m/s²: {unit}?" in fault.advice
-        assert line_of(fault) == pytest.approx({"linear_acceleration_scale": factor}, rel=1e-5)
+        assert line_of(fault) == pytest.approx(
+            {"linear_acceleration_scale": factor}, rel=1e-5
+        )
 
 
 def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
@@ -309,7 +441,9 @@ def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
     (fault,) = units(force=np.where(np.arange(N) < 40, 20.0, 1.0))
     assert "typically 1 instead" in fault.advice
     (fault,) = units(turn=2.1)
-    assert fault.advice.startswith("rates look 57 times too large (up to 2.1 rad/s): degrees a second? ")
+    assert fault.advice.startswith(
+        "rates look 57 times too large (up to 2.1 rad/s): degrees a second? "
+    )
 
 
 def test_slow_rates_in_degrees_are_told_by_gravity():
@@ -321,34 +455,51 @@ def test_slow_rates_in_degrees_are_told_by_gravity():
     for turn, acts in ((np.degrees(1.0), True), (1.0, False)):
         rates = imu.angular_velocity * turn
         assert np.percentile(np.linalg.norm(rates, axis=1), 95) < 10.0
-        slow = replace(RIGHT, imu=replace(imu, angular_velocity=rates * [1, 1, 0] + [0.5, -0.5, 0.0]))
+        slow = replace(
+            RIGHT,
+            imu=replace(imu, angular_velocity=rates * [1, 1, 0] + [0.5, -0.5, 0.0]),
+        )
         faults = sensor_check.wrong_units(slow, LogConfig())
         assert [fault.quantity for fault in faults] == ["gyro: unit"] * acts
-        unmeasured = replace(slow.imu, specific_force=np.full_like(imu.specific_force, np.nan))
+        unmeasured = replace(
+            slow.imu, specific_force=np.full_like(imu.specific_force, np.nan)
+        )
         assert not sensor_check.wrong_units(replace(slow, imu=unmeasured), LogConfig())
         if acts:
-            assert line_of(faults[0]) == pytest.approx({"angular_velocity_scale": np.pi / 180}, rel=1e-4)
+            assert line_of(faults[0]) == pytest.approx(
+                {"angular_velocity_scale": np.pi / 180}, rel=1e-4
+            )
             assert "they tilt the vehicle by" in faults[0].advice
 
 
 def test_readings_that_never_change_have_no_noise_to_be_told():
     """A density of zero would be believed; one changed digit is noise again."""
     commanded = with_rows(
-        np.zeros((6000, 3)), 0.01 * np.random.default_rng(1).standard_normal((6000, 3)), np.zeros((300, 3))
+        np.zeros((6000, 3)),
+        0.01 * np.random.default_rng(1).standard_normal((6000, 3)),
+        np.zeros((300, 3)),
     )
     gyro = by_name(list(sensor_check.noise_findings(commanded)))["gyro noise density"]
     assert not gyro.acts
-    assert gyro.text().startswith("cannot be told: the same to the last bit while still")
+    assert gyro.text().startswith(
+        "cannot be told: the same to the last bit while still"
+    )
     changed = np.zeros((6000, 3))
     changed[::7] = 1e-4
     moved = with_rows(changed, np.zeros((6000, 3)), np.zeros((300, 3)))
-    assert by_name(list(sensor_check.noise_findings(moved)))["gyro noise density"].estimate.is_known
+    assert by_name(list(sensor_check.noise_findings(moved)))[
+        "gyro noise density"
+    ].estimate.is_known
 
 
 def test_what_the_configuration_scales_is_taken_over():
     imu = {"angular_velocity_scale": -1.0, "linear_acceleration_scale": 2.0}
     faults = units(speed=200.0, turn=20.0, force=1.0, dvl={"scale": 3.0}, imu=imu)
-    assert [fault.quantity for fault in faults] == ["DVL: unit", "gyro: unit", "accelerometer: unit"]
+    assert [fault.quantity for fault in faults] == [
+        "DVL: unit",
+        "gyro: unit",
+        "accelerometer: unit",
+    ]
     speed, turn, force = map(line_of, faults)
     assert speed == pytest.approx({"scale": 0.03})
     assert turn == pytest.approx({"angular_velocity_scale": -np.pi / 180}, rel=1e-4)
@@ -359,7 +510,10 @@ def test_a_twentieth_of_spikes_and_rows_that_were_not_measured_in_full_count_for
     """A vector without one component looks shorter than it is; without any row there is nothing to say."""
     few, many = (np.where(np.arange(N) < k, 1e4, 0.1) for k in (4, 7))
     assert not units(speed=few, turn=few)
-    assert [fault.quantity for fault in units(speed=many, turn=many)] == ["DVL: unit", "gyro: unit"]
+    assert [fault.quantity for fault in units(speed=many, turn=many)] == [
+        "DVL: unit",
+        "gyro: unit",
+    ]
     force = vectors(9.8).copy()
     force[: N - 10] = [np.nan, 0.0, 1.0]
     assert not units(force=force)

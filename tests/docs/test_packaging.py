@@ -26,17 +26,31 @@ def test_the_recipe_has_the_versions_of_the_project():
         name, version = re.fullmatch(r"([a-z0-9-]+)(.*)", dependency).groups()
         wanted.add(f"{OTHER_NAMES.get(name, name)} {version.removeprefix('==')}")
     assert set(listed("run", RECIPE)) == wanted
-    assert set(listed("run", RECIPE.replace("numpy >=2.0", "numpy >=1.0"))) != wanted, "a difference is found"
+    assert set(listed("run", RECIPE.replace("numpy >=2.0", "numpy >=1.0"))) != wanted, (
+        "a difference is found"
+    )
 
 
 def test_the_recipe_starts_the_command_of_the_project():
-    assert listed("entry_points", RECIPE) == [f"{name} = {place}" for name, place in PROJECT["scripts"].items()]
+    assert listed("entry_points", RECIPE) == [
+        f"{name} = {place}" for name, place in PROJECT["scripts"].items()
+    ]
 
 
 def test_the_container_file_copies_all_that_a_build_needs():
     text = (ROOT / "docs/packaging/Containerfile").read_text("utf-8")
-    copied = {word for line in re.findall(r"^COPY (.*) /source", text, re.MULTILINE) for word in line.split()}
-    assert copied == {"pyproject.toml", "README.md", "LICENSE", "sonar_graph", "baselines"}
+    copied = {
+        word
+        for line in re.findall(r"^COPY (.*) /source", text, re.MULTILINE)
+        for word in line.split()
+    }
+    assert copied == {
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+        "sonar_graph",
+        "baselines",
+    }
     assert all((ROOT / name).exists() for name in copied)
     for extra in re.search(r"/source\[(.*)\]", text)[1].split(","):
         assert extra in PROJECT["optional-dependencies"]

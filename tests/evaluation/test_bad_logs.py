@@ -24,22 +24,33 @@ def frames_of(lane: Lane) -> list[SonarFrames]:
     return [lane.one(k) for k in range(COUNT)]
 
 
-def write(lane: Lane, log: Path, frames: list[SonarFrames] | None = None, **changes: object) -> Path:
+def write(
+    lane: Lane, log: Path, frames: list[SonarFrames] | None = None, **changes: object
+) -> Path:
     """A log with frames; changes are of message 30."""
-    messages = [sonar_image_messages(TOPIC, frame) for frame in frames or frames_of(lane)]
+    messages = [
+        sonar_image_messages(TOPIC, frame) for frame in frames or frames_of(lane)
+    ]
     if changes:
         messages[30] = replace(messages[30], **changes)
     write_log(log, lane.sequence, messages)
     return log
 
 
-def recognised(lane: Lane, folder: Path, frames: list[SonarFrames] | None = None, **changes: object) -> Recognition:
+def recognised(
+    lane: Lane, folder: Path, frames: list[SonarFrames] | None = None, **changes: object
+) -> Recognition:
     log = write(lane, folder / "log.mcap", frames, **changes)
     return recognise_images(log, read_log(log))
 
 
 def cropped(frame: SonarFrames, bins: int) -> SonarFrames:
-    return SonarFrames(frame.stamps_ns, frame.intensity[:, :, :bins], frame.ranges_m[:bins], frame.azimuths_rad)
+    return SonarFrames(
+        frame.stamps_ns,
+        frame.intensity[:, :, :bins],
+        frame.ranges_m[:bins],
+        frame.azimuths_rad,
+    )
 
 
 def sure(found: Recognition) -> set[int]:
@@ -53,15 +64,25 @@ def plain(lane, tmp_path_factory) -> Recognition:
 
 
 def test_a_window_that_changes_costs_one_frame_and_tracks_go_on(lane, tmp_path, plain):
-    frames = [cropped(f, 450) if 20 <= k < 45 else f for k, f in enumerate(frames_of(lane))]
+    frames = [
+        cropped(f, 450) if 20 <= k < 45 else f for k, f in enumerate(frames_of(lane))
+    ]
     found = recognised(lane, tmp_path, frames)
     stamps = [int(frames[k].stamps_ns[0]) for k in (20, 21, 45)]
     assert [stamp for stamp, _ in found.warnings] == stamps
-    words = ["used if it comes again", "window changed: 96 x 450", "window changed: 96 x 512"]
-    assert all(word in reason for word, (_, reason) in zip(words, found.warnings, strict=True))
+    words = [
+        "used if it comes again",
+        "window changed: 96 x 450",
+        "window changed: 96 x 512",
+    ]
+    assert all(
+        word in reason for word, (_, reason) in zip(words, found.warnings, strict=True)
+    )
     assert sure(found) == sure(plain)
     reported = Counter(found.detections.stamps_ns.tolist())
-    for stamp in stamps[1:]:  # a track that began anew would not be reported in its first frames
+    for stamp in stamps[
+        1:
+    ]:  # a track that began anew would not be reported in its first frames
         assert reported[stamp] == Counter(plain.detections.stamps_ns.tolist())[stamp]
 
 
@@ -71,7 +92,9 @@ def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
     assert sum("not used" in reason for _, reason in found.warnings) == 1
     assert sure(found) == sure(plain)
     stamps = [int(frame.stamps_ns[0]) for frame in frames]
-    assert {stamps.index(stamp) % 2 for stamp in found.detections.stamps_ns.tolist()} == {0, 1}
+    assert {
+        stamps.index(stamp) % 2 for stamp in found.detections.stamps_ns.tolist()
+    } == {0, 1}
 
 
 def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):
@@ -79,11 +102,15 @@ def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):
     recorded_ns = frames[30].stamps_ns
     frames[30] = replace(frames[30], stamps_ns=recorded_ns + 10 * SECONDS)
     found = recognised(lane, tmp_path, frames, log_times_ns=recorded_ns)
-    assert found.warnings == [(int(frames[30].stamps_ns[0]), f"frame not used: {LEAPT}")]
+    assert found.warnings == [
+        (int(frames[30].stamps_ns[0]), f"frame not used: {LEAPT}")
+    ]
     assert len(found.detections) >= len(plain.detections) - 3
 
 
-def test_a_message_that_is_no_image_is_named_and_the_others_are_used(lane, tmp_path, plain):
+def test_a_message_that_is_no_image_is_named_and_the_others_are_used(
+    lane, tmp_path, plain
+):
     whole = sonar_image_messages(TOPIC, lane.one(30)).payloads
     found = recognised(lane, tmp_path, payloads=np.ascontiguousarray(whole[:, :-1000]))
     ((stamp, reason),) = found.warnings
@@ -94,22 +121,36 @@ def test_a_message_that_is_no_image_is_named_and_the_others_are_used(lane, tmp_p
 
 
 def test_bad_frames_are_never_drawn(lane, tmp_path):
-    frames = [replace(f, intensity=np.full(f.intensity.shape, np.nan, np.float32)) for f in frames_of(lane)[:12]]
+    frames = [
+        replace(f, intensity=np.full(f.intensity.shape, np.nan, np.float32))
+        for f in frames_of(lane)[:12]
+    ]
     found = recognised(lane, tmp_path, frames)
     assert found.pictures == []
     assert found.outcomes == {"frame not used: samples that are not finite": 12}
 
 
-def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_path, plain):
+def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(
+    lane, tmp_path, plain
+):
     log = tmp_path / "log.mcap"
-    messages = [sonar_image_messages(topic, f) for f in frames_of(lane) for topic in (TOPIC, "/other/image")]
+    messages = [
+        sonar_image_messages(topic, f)
+        for f in frames_of(lane)
+        for topic in (TOPIC, "/other/image")
+    ]
     write_log(log, lane.sequence, messages)
     sequence, done = read_log(log), []
-    with pytest.raises(LogError, match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar="):
+    with pytest.raises(
+        LogError,
+        match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar=",
+    ):
         recognise_images(log, sequence, progress=done.append)
     assert done == []
     assert recognise_images(log, sequence, topic=TOPIC).frames == COUNT
-    with pytest.raises(MissingTopicError, match="/none was chosen but is not in the log"):
+    with pytest.raises(
+        MissingTopicError, match="/none was chosen but is not in the log"
+    ):
         recognise_images(log, sequence, topic="/none")
 
 
@@ -135,7 +176,11 @@ def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp
 
 
 def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tmp_path):
-    bare = replace(lane.sequence, depth=None, calibration=lane.sequence.calibration.model_copy(update={"floor": None}))
+    bare = replace(
+        lane.sequence,
+        depth=None,
+        calibration=lane.sequence.calibration.model_copy(update={"floor": None}),
+    )
     found = recognised(replace(lane, sequence=bare), tmp_path)
     assert found.frames == COUNT
     assert found.warnings == []

@@ -10,7 +10,11 @@ from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimator
 from sonar_graph.evaluation.comparison import compare, expense
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores
+from sonar_graph.evaluation.scores import (
+    detection_scores,
+    landmark_scores,
+    resource_scores,
+)
 from sonar_graph.measurements import Imu, LandmarkDetections, Measurements
 from sonar_graph.report import sentences
 from sonar_graph.report.figures.maps import true_landmarks_drawn
@@ -20,13 +24,28 @@ from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Tra
 from .conftest import Offset, straight_sequence
 
 TRAJECTORY_KEYS = {
-    *("ate_raw_m", "ate_yaw_m", "ate_se2_m", "ate_se3_m", "rpe_1s_m", "rpe_1s_rad", "rpe_10s_m", "rpe_10s_rad"),
+    *(
+        "ate_raw_m",
+        "ate_yaw_m",
+        "ate_se2_m",
+        "ate_se3_m",
+        "rpe_1s_m",
+        "rpe_1s_rad",
+        "rpe_10s_m",
+        "rpe_10s_rad",
+    ),
     *("yaw_rmse_rad", "return_error_m", "nees_position", "nees_yaw"),
 }
 OTHER_KEYS = {
     *("landmarks.raw_m", "landmarks.se2_m", "landmarks.count", "landmarks.nees"),
     *("detections.used", "detections.refused", "detections.unnamed", "detections.nis"),
-    *("time.update_median_ms", "time.update_p99_ms", "time.update_max_ms", "time.total_s", "time.real_time_factor"),
+    *(
+        "time.update_median_ms",
+        "time.update_p99_ms",
+        "time.update_max_ms",
+        "time.total_s",
+        "time.real_time_factor",
+    ),
 }
 
 
@@ -42,25 +61,46 @@ def test_only_large_logs_are_said_to_take_long():
         id_probability=np.tile([1.0, 0.0], (count, 1)),
     )
     assert expense(small) == ""
-    assert expense(replace(small, detections=many)) == (  # 8 (3 · 1000 + 15)² bytes, gone over 20,000 times
+    assert expense(
+        replace(small, detections=many)
+    ) == (  # 8 (3 · 1000 + 15)² bytes, gone over 20,000 times
         "for each estimator: 1000 landmark identities in 10000 detections, at least 0.1 GB and 2 min where an "
         "estimator keeps their joint covariance"
     )
-    kept = {name: np.resize(getattr(many, name), (200_000, *getattr(many, name).shape[1:])) for name in vars(many)}
-    kept |= {"stamps_ns": np.arange(200_000), "candidate_ids": np.tile([1, -1], (200_000, 1))}
+    kept = {
+        name: np.resize(getattr(many, name), (200_000, *getattr(many, name).shape[1:]))
+        for name in vars(many)
+    }
+    kept |= {
+        "stamps_ns": np.arange(200_000),
+        "candidate_ids": np.tile([1, -1], (200_000, 1)),
+    }
     assert expense(replace(small, detections=LandmarkDetections(**kept))) == (
         "for each estimator: 200000 detections, at least 4 min where an estimator keeps and solves for all of them"
     )
     rows = Imu(np.arange(2_000_000), *(np.zeros((2_000_000, 3)),) * 2)
-    assert expense(replace(small, imu=rows)) == "for each estimator: 2000000 IMU rows, about 1 min"
+    assert (
+        expense(replace(small, imu=rows))
+        == "for each estimator: 2000000 IMU rows, about 1 min"
+    )
 
 
 def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install):
-    scores = compare(straight_sequence(), ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}).scores["offset"]
+    scores = compare(
+        straight_sequence(), ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
+    ).scores["offset"]
     value = {key: score.value for key, score in scores.items()}
     assert value["causal.ate_raw_m"] == pytest.approx(0.4)
     assert value["smoothed.ate_raw_m"] == pytest.approx(0.2)
-    for key in ("ate_yaw_m", "ate_se2_m", "ate_se3_m", "rpe_1s_m", "rpe_10s_m", "yaw_rmse_rad", "return_error_m"):
+    for key in (
+        "ate_yaw_m",
+        "ate_se2_m",
+        "ate_se3_m",
+        "rpe_1s_m",
+        "rpe_10s_m",
+        "yaw_rmse_rad",
+        "return_error_m",
+    ):
         assert value[f"causal.{key}"] == pytest.approx(0.0, abs=1e-9)
     assert value["causal.nees_position"] == pytest.approx(0.4**2 / 0.1**2 / 2)
     assert value["smoothed.nees_position"] == pytest.approx(0.2**2 / 0.1**2 / 2)
@@ -70,7 +110,9 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
     assert value["landmarks.nees"] == pytest.approx(0.1**2 / 0.01 / 2)
     assert (value["detections.used"], value["detections.refused"]) == (3, 1)
     assert value["detections.nis"] == pytest.approx((4.0 + 1.0) / 2 / 2)
-    expected = {f"{kind}.{key}" for kind in ("causal", "smoothed") for key in TRAJECTORY_KEYS} | OTHER_KEYS
+    expected = {
+        f"{kind}.{key}" for kind in ("causal", "smoothed") for key in TRAJECTORY_KEYS
+    } | OTHER_KEYS
     assert set(scores) - {"memory.peak_mb"} == expected
     for key, score in scores.items():
         assert np.isfinite(score.value), key
@@ -86,15 +128,28 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
 def test_truth_with_positions_only_scores_positions_alone(install):
     """Nothing that needs a true orientation is scored, drawn or summed up; what is scored has the same value."""
     whole = straight_sequence()
-    climbing = whole.truth.positions + np.linspace(0.0, 1e-3, len(whole.truth))[:, None] * [0, 0, 1]
+    climbing = whole.truth.positions + np.linspace(0.0, 1e-3, len(whole.truth))[
+        :, None
+    ] * [0, 0, 1]
     whole = replace(whole, truth=replace(whole.truth, positions=climbing))
-    positions = replace(whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, climbing))
+    positions = replace(
+        whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, climbing)
+    )
     settings = {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
-    full, partial = (compare(sequence, ["offset"], settings) for sequence in (whole, positions))
+    full, partial = (
+        compare(sequence, ["offset"], settings) for sequence in (whole, positions)
+    )
     lacking = {
         f"{kind}.{key}"
         for kind in ("causal", "smoothed")
-        for key in ("yaw_rmse_rad", "nees_yaw", "rpe_1s_m", "rpe_10s_m", "rpe_1s_rad", "rpe_10s_rad")
+        for key in (
+            "yaw_rmse_rad",
+            "nees_yaw",
+            "rpe_1s_m",
+            "rpe_10s_m",
+            "rpe_1s_rad",
+            "rpe_10s_rad",
+        )
     }
     scores = partial.scores["offset"]
     assert full.scores["offset"].keys() - {"memory.peak_mb"} - scores.keys() == lacking
@@ -116,15 +171,29 @@ def test_of_a_truth_whose_heights_nobody_measured_x_and_y_alone_count(install):
     assert scores["causal.ate_raw_m"].value == pytest.approx(np.sqrt(np.mean(off**2)))
     assert "rms of horizontal position error" in scores["causal.ate_raw_m"].protocol
     assert "position (x and y)" in scores["causal.nees_position"].protocol
-    assert "not measured: errors and NEES are of x and y" in judged.sequence.notes["truth.height"]
-    for known in (whole, replace(flat, truth=replace(flat.truth, positions=level + np.arange(len(level))[:, None]))):
+    assert (
+        "not measured: errors and NEES are of x and y"
+        in judged.sequence.notes["truth.height"]
+    )
+    for known in (
+        whole,
+        replace(
+            flat,
+            truth=replace(flat.truth, positions=level + np.arange(len(level))[:, None]),
+        ),
+    ):
         assert "truth.height" not in compare(known, ["offset"]).sequence.notes
 
 
 def test_ignored_detections_are_neither_used_nor_refused():
     n = 3
     unpredicted = (np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan))
-    log = DetectionLog(np.arange(n), np.ones(n, int), *unpredicted, [Outcome.IGNORED] * 2 + [Outcome.NO_IDENTITY])
+    log = DetectionLog(
+        np.arange(n),
+        np.ones(n, int),
+        *unpredicted,
+        [Outcome.IGNORED] * 2 + [Outcome.NO_IDENTITY],
+    )
     scores = detection_scores(log)
     kinds = ("used", "refused", "unnamed")
     assert [scores[f"detections.{kind}"].value for kind in kinds] == [0, 0, 1]
@@ -137,30 +206,51 @@ def test_bands_are_of_independent_samples_and_spatial_runs_score_height_too(inst
     scores = comparison.scores["offset"]
     assert comparison.errors["offset"]["causal"].position_dof == 3
     assert scores["causal.nees_position"].value == pytest.approx(1 / 3)
-    assert scores["causal.nees_position"].interval == (0.0, pytest.approx(chi2.ppf(0.975, 3) / 3))
+    assert scores["causal.nees_position"].interval == (
+        0.0,
+        pytest.approx(chi2.ppf(0.975, 3) / 3),
+    )
     assert "worth 1 independent samples" in scores["causal.nees_position"].protocol
-    assert scores["detections.nis"].interval == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 4) / 4))
+    assert scores["detections.nis"].interval == pytest.approx(
+        tuple(chi2.ppf([0.025, 0.975], 4) / 4)
+    )
 
 
 def test_all_are_scored_at_the_instants_that_all_have(install):
     class Late(Offset):
         def process(self, measurements: Measurements) -> Estimate | None:
-            return None if measurements.end_ns < 4_000_000_000 else super().process(measurements)
+            return (
+                None
+                if measurements.end_ns < 4_000_000_000
+                else super().process(measurements)
+            )
 
     install(late=Late)
     comparison = compare(straight_sequence(), ["offset", "late"])
     for name in ("offset", "late"):
         assert comparison.errors[name]["causal"].stamps_ns[0] == 4_000_000_000
-        assert "5 without an estimate" in comparison.scores[name]["causal.ate_raw_m"].protocol
+        assert (
+            "5 without an estimate"
+            in comparison.scores[name]["causal.ate_raw_m"].protocol
+        )
     assert len(comparison.runs[0].causal or ()) == 40
 
 
 def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
-    together, alone = compare(straight_sequence(), ["broken", "offset"]), compare(straight_sequence(), ["offset"])
-    assert [(run.estimator, run.status) for run in together.runs] == [("broken", "failed"), ("offset", "ok")]
+    together, alone = (
+        compare(straight_sequence(), ["broken", "offset"]),
+        compare(straight_sequence(), ["offset"]),
+    )
+    assert [(run.estimator, run.status) for run in together.runs] == [
+        ("broken", "failed"),
+        ("offset", "ok"),
+    ]
     assert together.scores["broken"] == {}
     assert together.errors["broken"] == {}
-    assert together.scores["offset"]["causal.ate_raw_m"] == alone.scores["offset"]["causal.ate_raw_m"]
+    assert (
+        together.scores["offset"]["causal.ate_raw_m"]
+        == alone.scores["offset"]["causal.ate_raw_m"]
+    )
 
 
 def test_without_truth_or_with_too_little_the_rest_is_scored_and_it_is_said(install):
@@ -172,7 +262,9 @@ def test_without_truth_or_with_too_little_the_rest_is_scored_and_it_is_said(inst
     assert comparison.errors == {}
     assert "no truth" in comparison.environment["scored instants"]
     sequence = straight_sequence()
-    comparison = compare(replace(sequence, truth=sequence.truth.rows(slice(0, 7))), ["offset"])
+    comparison = compare(
+        replace(sequence, truth=sequence.truth.rows(slice(0, 7))), ["offset"]
+    )
     assert comparison.errors == {}, "one instant is too little"
     assert comparison.environment["scored instants"].startswith("1 of 40 instants")
 
@@ -180,7 +272,9 @@ def test_without_truth_or_with_too_little_the_rest_is_scored_and_it_is_said(inst
 def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
     class Modest(Offset):
         def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
-            return replace(super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan))
+            return replace(
+                super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan)
+            )
 
     install(modest=Modest)
     scores = compare(straight_sequence(), ["modest"]).scores["modest"]
@@ -199,19 +293,36 @@ def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
         (("offset",), TypeError, r"names is a list: give \['offset'\]"),
     ],
 )
-def test_mistakes_of_the_user_are_raised_before_anything_runs(install, arguments, error, said):
+def test_mistakes_of_the_user_are_raised_before_anything_runs(
+    install, arguments, error, said
+):
     calls: list[Any] = []
     with pytest.raises(error, match=said):
-        compare(straight_sequence(), *arguments, progress=lambda *call: calls.append(call))
+        compare(
+            straight_sequence(), *arguments, progress=lambda *call: calls.append(call)
+        )
     assert calls == []
-    for call in (lambda log: compare(log, ["offset"]), lambda log: run_estimator(log, "offset")):
-        with pytest.raises(TypeError, match="expected a Sequence, not str; read_log gives one"):
+    for call in (
+        lambda log: compare(log, ["offset"]),
+        lambda log: run_estimator(log, "offset"),
+    ):
+        with pytest.raises(
+            TypeError, match="expected a Sequence, not str; read_log gives one"
+        ):
             call("dive.mcap")
 
 
 def test_times_by_hand():
-    run = RunResult("by hand", {}, "ok", update_s=np.array([0.001, 0.002, 0.003, 0.010]), finish_s=0.984)
-    value = {key: score.value for key, score in resource_scores(run, log_s=50.0).items()}
+    run = RunResult(
+        "by hand",
+        {},
+        "ok",
+        update_s=np.array([0.001, 0.002, 0.003, 0.010]),
+        finish_s=0.984,
+    )
+    value = {
+        key: score.value for key, score in resource_scores(run, log_s=50.0).items()
+    }
     assert value["time.update_median_ms"] == pytest.approx(2.5)
     assert value["time.update_p99_ms"] == pytest.approx(3.0 + 0.97 * 7.0)
     assert value["time.update_max_ms"] == pytest.approx(10.0)
@@ -220,10 +331,17 @@ def test_times_by_hand():
     assert "memory.peak_mb" not in value
 
 
-def test_progress_names_the_estimator_and_the_environment_versions_machine_date_and_command(install):
+def test_progress_names_the_estimator_and_the_environment_versions_machine_date_and_command(
+    install,
+):
     install(one=Offset, two=Offset)
     calls: list[tuple[str, int, int]] = []
-    comparison = compare(straight_sequence(2.0), ["one", "two"], rate_hz=1.0, progress=lambda *call: calls.append(call))
+    comparison = compare(
+        straight_sequence(2.0),
+        ["one", "two"],
+        rate_hz=1.0,
+        progress=lambda *call: calls.append(call),
+    )
     assert calls == [("one", 1, 2), ("one", 2, 2), ("two", 1, 2), ("two", 2, 2)]
     expected = {"sonar_graph", "python", "numpy", "gtsam", "machine", "date", "command"}
     assert expected <= set(comparison.environment)
@@ -233,54 +351,79 @@ def test_progress_names_the_estimator_and_the_environment_versions_machine_date_
 TURNED = gtsam.Pose3(gtsam.Rot3.Yaw(2.0), np.array([40.0, -7.0, 3.0]))
 
 
-def surveyed_elsewhere(offsets_m: dict[int, float] | None = None, *, has_truth: bool) -> Any:
+def surveyed_elsewhere(
+    offsets_m: dict[int, float] | None = None, *, has_truth: bool
+) -> Any:
     """A comparison of an estimator whose map is right but for offsets, and true landmarks in a world of their own."""
     ids = np.arange(1, 9)
     places = np.random.default_rng(3).uniform(-9, 9, (8, 3)) * [1, 1, 0]
 
     class Surveyor(Offset):
         def landmarks(self) -> LandmarkMap:
-            moved = places + np.array([[(offsets_m or {}).get(i, 0.0), 0, 0] for i in ids.tolist()])
-            return LandmarkMap(ids, moved, np.tile(np.diag([1e-4, 4e-4, 1e-4]), (8, 1, 1)))
+            moved = places + np.array(
+                [[(offsets_m or {}).get(i, 0.0), 0, 0] for i in ids.tolist()]
+            )
+            return LandmarkMap(
+                ids, moved, np.tile(np.diag([1e-4, 4e-4, 1e-4]), (8, 1, 1))
+            )
 
     world = np.array([TURNED.transformFrom(place) for place in places])
     sequence = replace(
-        straight_sequence(truth=has_truth), true_landmarks=LandmarkMap(ids, world, np.full((8, 3, 3), np.nan))
+        straight_sequence(truth=has_truth),
+        true_landmarks=LandmarkMap(ids, world, np.full((8, 3, 3), np.nan)),
     )
     return Surveyor, sequence
 
 
 @pytest.mark.parametrize("has_truth", [False, True])
-def test_a_map_in_another_world_is_scored_after_alignment_where_no_path_tells_the_world(install, has_truth):
+def test_a_map_in_another_world_is_scored_after_alignment_where_no_path_tells_the_world(
+    install, has_truth
+):
     kind, sequence = surveyed_elsewhere(has_truth=has_truth)
     install(surveyor=kind)
     comparison = compare(sequence, ["surveyor"])
     scores = comparison.scores["surveyor"]
     assert scores["landmarks.se2_m"].value == pytest.approx(0.0, abs=1e-9)
     assert ("landmarks.raw_m" in scores) == has_truth
-    assert bool(sentences.doubt_of_identities(comparison)) == has_truth, "with a true path the worlds are one"
-    assert scores["landmarks.nees"].value == pytest.approx(0.0, abs=1e-9) or scores["landmarks.nees"].value > 1e4
+    assert bool(sentences.doubt_of_identities(comparison)) == has_truth, (
+        "with a true path the worlds are one"
+    )
+    assert (
+        scores["landmarks.nees"].value == pytest.approx(0.0, abs=1e-9)
+        or scores["landmarks.nees"].value > 1e4
+    )
     assert "aligned" in scores["landmarks.nees"].protocol
     if not has_truth:
         said = [
-            one for one in sentences.finding(comparison) if one.startswith("No true path is known, but the landmarks")
+            one
+            for one in sentences.finding(comparison)
+            if one.startswith("No true path is known, but the landmarks")
         ]
         assert len(said) == 1
         drawn = true_landmarks_drawn(comparison)
-        np.testing.assert_allclose(drawn.positions, comparison.runs[0].landmarks.positions, atol=1e-9)
-        table = {row[0].text: [cell.text for cell in row[1:]] for row in landmark_table(comparison).rows}
+        np.testing.assert_allclose(
+            drawn.positions, comparison.runs[0].landmarks.positions, atol=1e-9
+        )
+        table = {
+            row[0].text: [cell.text for cell in row[1:]]
+            for row in landmark_table(comparison).rows
+        }
         assert "RMS, not aligned" not in table
         assert table["ID 1, x"][1].endswith("(0.000)")
 
 
-def test_a_wrong_landmark_is_told_in_another_world_and_does_not_make_the_others_wrong(install):
+def test_a_wrong_landmark_is_told_in_another_world_and_does_not_make_the_others_wrong(
+    install,
+):
     kind, sequence = surveyed_elsewhere({5: 3.0}, has_truth=False)
     install(surveyor=kind)
     (line,) = sentences.doubt_of_identities(compare(sequence, ["surveyor"]))
     assert "puts landmark 5 far outside its covariance" in line
 
 
-def test_the_normalised_error_of_an_aligned_map_has_the_freedom_that_alignment_leaves(install):
+def test_the_normalised_error_of_an_aligned_map_has_the_freedom_that_alignment_leaves(
+    install,
+):
     """Errors drawn from the covariance of the map, which turns with the alignment: 2 k - 3 degrees of freedom."""
     found = []
     for seed in range(200):
@@ -293,7 +436,11 @@ def test_the_normalised_error_of_an_aligned_map_has_the_freedom_that_alignment_l
                 noise = rng.standard_normal((8, 3)) * [0.01, 0.02, 0.0]
                 return replace(exact, positions=exact.positions + noise)
 
-        found.append(landmark_scores(Noisy(sequence.calibration).landmarks(), sequence)["landmarks.nees"].value)
+        found.append(
+            landmark_scores(Noisy(sequence.calibration).landmarks(), sequence)[
+                "landmarks.nees"
+            ].value
+        )
     assert np.mean(found) == pytest.approx(1.0, abs=0.1)
 
 
@@ -302,17 +449,23 @@ class Moving(Offset):
 
     def wander(self, stamp_ns: int) -> gtsam.Pose3:
         seconds = (stamp_ns - 1_000_000_000) * 1e-9
-        return gtsam.Pose3(gtsam.Rot3.Yaw(0.02 * seconds), np.array([0.3 * seconds, 0.0, 0.0]))
+        return gtsam.Pose3(
+            gtsam.Rot3.Yaw(0.02 * seconds), np.array([0.3 * seconds, 0.0, 0.0])
+        )
 
     def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
         right = super().beside(stamp_ns, offset_m)
-        return replace(right, world_T_body=self.wander(stamp_ns).compose(right.world_T_body))
+        return replace(
+            right, world_T_body=self.wander(stamp_ns).compose(right.world_T_body)
+        )
 
     def landmarks(self) -> LandmarkMap:
         places = np.array([[1.0, 1, 0], [2, -1, 0], [4, 2, 0]])
         wander = self.wander(self.estimates[-1].stamp_ns)
         moved = np.array([wander.transformFrom(place) for place in places])
-        return LandmarkMap(np.array([7, 9, 11]), moved, np.tile(np.eye(3) * 0.01, (3, 1, 1)))
+        return LandmarkMap(
+            np.array([7, 9, 11]), moved, np.tile(np.eye(3) * 0.01, (3, 1, 1))
+        )
 
 
 class Few(Moving):
@@ -321,19 +474,30 @@ class Few(Moving):
     def landmarks(self) -> LandmarkMap:
         known, late = super().landmarks(), self.estimates[-1].stamp_ns > 11_000_000_000
         rows = slice(0, 3 if late else 2)
-        return LandmarkMap(known.ids[rows], known.positions[rows], known.covariances[rows])
+        return LandmarkMap(
+            known.ids[rows], known.positions[rows], known.covariances[rows]
+        )
 
 
-def test_the_error_on_its_own_map_does_not_count_how_the_map_moved_and_is_of_the_same_instants_for_all(install):
+def test_the_error_on_its_own_map_does_not_count_how_the_map_moved_and_is_of_the_same_instants_for_all(
+    install,
+):
     install(moving=Moving, few=Few)
     places = np.array([[1.0, 1, 0], [2, -1, 0], [4, 2, 0]])
     true = LandmarkMap(np.array([7, 9, 11]), places, np.full((3, 3, 3), np.nan))
     sequence = replace(straight_sequence(), true_landmarks=true)
-    scores = compare(sequence, ["moving"], {"moving": {"offset_m": 0.25}}).scores["moving"]
+    scores = compare(sequence, ["moving"], {"moving": {"offset_m": 0.25}}).scores[
+        "moving"
+    ]
     assert scores["causal.own_map_m"].value == pytest.approx(0.25, abs=1e-9)
     assert scores["causal.ate_se2_m"].value > 0.5, "the path counts it"
     both = compare(sequence, ["moving", "few", "offset"])
-    counts = {name: both.scores[name]["causal.own_map_m"].protocol.split()[3] for name in ("moving", "few")}
+    counts = {
+        name: both.scores[name]["causal.own_map_m"].protocol.split()[3]
+        for name in ("moving", "few")
+    }
     assert counts["moving"] == counts["few"]
     assert int(counts["few"]) < int(scores["causal.own_map_m"].protocol.split()[3])
-    assert "causal.own_map_m" not in both.scores["offset"], "its map names two true landmarks"
+    assert "causal.own_map_m" not in both.scores["offset"], (
+        "its map names two true landmarks"
+    )

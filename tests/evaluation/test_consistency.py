@@ -36,7 +36,9 @@ def numerical_covariance(pose: gtsam.Pose3, covariance: np.ndarray) -> np.ndarra
     for axis in np.eye(6):
         plus, minus = pose.retract(step * axis), pose.retract(-step * axis)
         yaw = plus.rotation().yaw() - minus.rotation().yaw()
-        columns.append(np.append(plus.translation() - minus.translation(), yaw) / (2 * step))
+        columns.append(
+            np.append(plus.translation() - minus.translation(), yaw) / (2 * step)
+        )
     J = np.array(columns).T
     return J @ covariance @ J.T
 
@@ -48,8 +50,14 @@ def test_world_covariances_equal_numerical_propagation(seed, roll, pitch, yaw):
     trajectory = single(pose, random_covariance(seed))
     expected = numerical_covariance(pose, random_covariance(seed))
     scale = np.abs(expected).max()
-    np.testing.assert_allclose(consistency.world_position_covs(trajectory)[0], expected[:3, :3], atol=1e-6 * scale)
-    assert consistency.yaw_variances(trajectory)[0] == pytest.approx(expected[3, 3], abs=1e-6 * scale)
+    np.testing.assert_allclose(
+        consistency.world_position_covs(trajectory)[0],
+        expected[:3, :3],
+        atol=1e-6 * scale,
+    )
+    assert consistency.yaw_variances(trajectory)[0] == pytest.approx(
+        expected[3, 3], abs=1e-6 * scale
+    )
 
 
 @pytest.mark.parametrize("dof", [2, 3])
@@ -59,8 +67,12 @@ def test_nees_of_samples_from_the_reported_covariance_is_chi_square(dof):
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 1.0), np.array([3.0, -2.0, 1.0]))
     covariance = random_covariance(1)
     errors = rng.multivariate_normal(np.zeros(6), covariance, size=n)
-    estimate = Trajectory.from_estimates([Estimate(i, pose, covariance) for i in range(n)])
-    truth = Trajectory.from_estimates([Estimate(i, pose.retract(e), covariance) for i, e in enumerate(errors)])
+    estimate = Trajectory.from_estimates(
+        [Estimate(i, pose, covariance) for i in range(n)]
+    )
+    truth = Trajectory.from_estimates(
+        [Estimate(i, pose.retract(e), covariance) for i, e in enumerate(errors)]
+    )
     series = consistency.error_series(estimate, truth, dof)
     low, high = consistency.anees_interval(n, dof, 0.999)
     assert low < consistency.mean_normalised(series.nees_position, dof) < high
@@ -73,8 +85,12 @@ def test_nees_of_samples_from_the_reported_covariance_is_chi_square(dof):
 def test_planar_nees_ignores_height():
     pose, above = gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 5.0]))
     covariance = np.diag([1e-2] * 3 + [1e-2] * 3)
-    planar = consistency.error_series(single(above, covariance), single(pose, covariance), 2)
-    spatial = consistency.error_series(single(above, covariance), single(pose, covariance), 3)
+    planar = consistency.error_series(
+        single(above, covariance), single(pose, covariance), 2
+    )
+    spatial = consistency.error_series(
+        single(above, covariance), single(pose, covariance), 3
+    )
     assert planar.nees_position[0] == pytest.approx(1.0)
     assert spatial.nees_position[0] == pytest.approx(1.0 + 2500.0)
 
@@ -90,7 +106,9 @@ def test_unknown_or_singular_covariances_have_no_nees():
 @given(st.integers(1, 500), st.integers(1, 6))
 def test_anees_interval_contains_one_and_narrows_with_runs_to_the_textbooks(runs, dof):
     # Bar-Shalom et al. 2001, example 5.4.2: 50 runs of 2 degrees of freedom, chi-square(100) in [74.2, 129.6].
-    assert 100 * np.array(consistency.anees_interval(50, 2)) == pytest.approx([74.2, 129.6], abs=0.05)
+    assert 100 * np.array(consistency.anees_interval(50, 2)) == pytest.approx(
+        [74.2, 129.6], abs=0.05
+    )
     low, high = consistency.anees_interval(runs, dof)
     narrower_low, narrower_high = consistency.anees_interval(4 * runs, dof)
     assert low < narrower_low < 1 < narrower_high < high
@@ -113,27 +131,36 @@ def drawn(rng: np.random.Generator, n: int, dof: int, tau: float) -> np.ndarray:
 
 def judged(unit: np.ndarray) -> str:
     dof = unit.shape[1]
-    interval = consistency.time_average_interval(consistency.effective_samples(unit), dof)
+    interval = consistency.time_average_interval(
+        consistency.effective_samples(unit), dof
+    )
     return Score(float(np.mean(unit**2)), "1", "By hand.", interval, "inside").verdict
 
 
 @pytest.mark.parametrize("dof", [1, 2])
 @pytest.mark.parametrize("tau", [0.01, 10.0, 100.0, 1e4])
-def test_of_healthy_runs_hardly_one_is_called_inconsistent_however_slow_its_errors(tau, dof):
+def test_of_healthy_runs_hardly_one_is_called_inconsistent_however_slow_its_errors(
+    tau, dof
+):
     rng = np.random.default_rng(4)
     verdicts = [judged(drawn(rng, 600, dof, tau)) for _ in range(200)]
     assert np.mean([verdict == "over-confident" for verdict in verdicts]) <= 0.05
     assert np.mean([verdict == "over-cautious" for verdict in verdicts]) <= 0.08
-    fast = tau <= 10  # then a run is worth enough samples to tell errors of twice the size
+    # then a run is worth enough samples to tell errors of twice the size
+    fast = tau <= 10
     bad = [judged(2 * drawn(rng, 600, dof, tau)) for _ in range(50)]
-    assert np.mean([verdict == "over-confident" for verdict in bad]) >= (0.9 if fast else 0.0)
+    assert np.mean([verdict == "over-confident" for verdict in bad]) >= (
+        0.9 if fast else 0.0
+    )
 
 
 def test_a_constant_error_is_one_sample_and_white_ones_are_all_and_unknown_none():
     rng = np.random.default_rng(0)
     white = rng.standard_normal((500, 3))
     assert consistency.effective_samples(white) > 400
-    assert consistency.effective_samples(10 * white) == consistency.effective_samples(white), "size does not matter"
+    assert consistency.effective_samples(10 * white) == consistency.effective_samples(
+        white
+    ), "size does not matter"
     assert consistency.effective_samples(np.full((500, 1), 3.0)) == 1
     half = white.copy()
     half[::2] = np.nan
@@ -145,15 +172,25 @@ def test_a_constant_error_is_one_sample_and_white_ones_are_all_and_unknown_none(
 def test_nis_takes_used_detections_only():
     outcomes = [Outcome.NEW, Outcome.USED, Outcome.GATED]
     covs = np.array([np.full((2, 2), np.nan), np.diag([4.0, 1.0]), np.eye(2)])
-    log = DetectionLog(np.arange(3), np.ones(3, int), np.array([[np.nan] * 2, [2.0, 3.0], [9.0, 9.0]]), covs, outcomes)
+    log = DetectionLog(
+        np.arange(3),
+        np.ones(3, int),
+        np.array([[np.nan] * 2, [2.0, 3.0], [9.0, 9.0]]),
+        covs,
+        outcomes,
+    )
     np.testing.assert_allclose(consistency.nis(log), [1.0 + 9.0])
-    empty = DetectionLog(np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), [])
+    empty = DetectionLog(
+        np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), []
+    )
     assert consistency.nis(empty).shape == (0,)
 
 
 def test_expected_error_of_five_detections_by_hand():
     """Two at 0.95 and both right, one at 0.85 and wrong, two at 0.55 of which one is right: (0.1 + 0.85 + 0.1) / 5."""
-    found = consistency.reliability(np.array([0.95, 0.95, 0.85, 0.55, 0.55]), np.array([1.0, 1.0, 0.0, 1.0, 0.0]))
+    found = consistency.reliability(
+        np.array([0.95, 0.95, 0.85, 0.55, 0.55]), np.array([1.0, 1.0, 0.0, 1.0, 0.0])
+    )
     assert found.count.tolist() == [0, 0, 0, 0, 0, 2, 0, 0, 1, 2]
     assert found.right[[5, 8, 9]].tolist() == [0.5, 0.0, 1.0]
     assert found.confidence[[5, 8, 9]] == pytest.approx([0.55, 0.85, 0.95])
@@ -168,17 +205,32 @@ def test_bins_are_those_of_another_implementation(n, seed):
     rng = np.random.default_rng(seed)
     confidence, right = rng.uniform(0, 1, n), rng.integers(0, 2, n).astype(float)
     found = consistency.reliability(confidence, right)
-    means = [binned_statistic(confidence, v, "mean", 10, (0, 1)).statistic for v in (confidence, right)]
+    means = [
+        binned_statistic(confidence, v, "mean", 10, (0, 1)).statistic
+        for v in (confidence, right)
+    ]
     count = binned_statistic(confidence, right, "count", 10, (0, 1)).statistic
     np.testing.assert_array_equal(found.count, count)
     np.testing.assert_allclose([found.confidence, found.right], means)
-    expected = sum(k / n * abs(c - r) for k, c, r in zip(count, *means, strict=True) if k)
+    expected = sum(
+        k / n * abs(c - r) for k, c, r in zip(count, *means, strict=True) if k
+    )
     assert found.expected_error == pytest.approx(expected)
 
 
 def test_confidence_is_that_of_the_most_probable_class_none_of_them_included():
-    ids, probabilities = np.tile([4, 9], (3, 1)), np.array([[0.1, 0.7], [0.3, 0.1], [0.5, 0.5]])
-    detections = LandmarkDetections(np.zeros(3, int), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), ids, probabilities)
+    ids, probabilities = (
+        np.tile([4, 9], (3, 1)),
+        np.array([[0.1, 0.7], [0.3, 0.1], [0.5, 0.5]]),
+    )
+    detections = LandmarkDetections(
+        np.zeros(3, int),
+        np.ones(3),
+        np.zeros(3),
+        np.zeros((3, 2, 2)),
+        ids,
+        probabilities,
+    )
     confidence, named = consistency.confidences(detections)
     assert confidence == pytest.approx([0.7, 0.6, 0.5])
     assert named.tolist() == [9, consistency.NONE, 4]
@@ -191,7 +243,10 @@ IDS = np.array([11, 7])
 
 def turning_truth() -> Trajectory:
     stamps_ns = np.arange(11) * 10**8
-    yaw = Rotation.from_euler("ZYX", np.column_stack([0.3 * np.arange(11), 0.02 * np.arange(11), np.zeros(11)]))
+    yaw = Rotation.from_euler(
+        "ZYX",
+        np.column_stack([0.3 * np.arange(11), 0.02 * np.arange(11), np.zeros(11)]),
+    )
     positions = np.column_stack([0.1 * np.arange(11), np.zeros(11), np.full(11, -0.5)])
     return Trajectory.without_covariances(stamps_ns, positions, yaw.as_quat())
 
@@ -201,14 +256,22 @@ def seen_at(stamp_ns: int, point: np.ndarray) -> tuple[float, float]:
     truth = turning_truth()
     row = truth.stamps_ns.tolist().index(stamp_ns)
     in_body = truth.rotations()[row].inv().apply(point - truth.positions[row])
-    q = Rotation.from_euler("ZYX", [0.1, 0.5, 0.0]).inv().apply(in_body - [0.3, 0.1, -0.1])
+    q = (
+        Rotation.from_euler("ZYX", [0.1, 0.5, 0.0])
+        .inv()
+        .apply(in_body - [0.3, 0.1, -0.1])
+    )
     return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))
 
 
-def run_with(rows: list[tuple[int, float, float]], named: list[int], probability: list[float]) -> Sequence:
+def run_with(
+    rows: list[tuple[int, float, float]], named: list[int], probability: list[float]
+) -> Sequence:
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     ids, probabilities = np.array(named)[:, None], np.array(probability)[:, None]
-    detections = LandmarkDetections(*columns, np.zeros((len(rows), 2, 2)), ids, probabilities)
+    detections = LandmarkDetections(
+        *columns, np.zeros((len(rows), 2, 2)), ids, probabilities
+    )
     return Sequence(
         "hand",
         Calibration(sonar=SonarCalibration(mounting=MOUNTING)),
@@ -235,21 +298,36 @@ def test_a_detection_is_of_the_landmark_that_lies_there():
 
 def test_azimuths_are_compared_round_the_circle_and_what_lies_outside_the_truth_is_not_judged():
     r, a = seen_at(0, LANDMARKS_M[0])
-    rows = [(-5, r, a), (0, r, a), (0, r, a - 2 * np.pi), (0, r, a + np.pi), (10**9, r, a), (10**9 + 1, r, a)]
+    rows = [
+        (-5, r, a),
+        (0, r, a),
+        (0, r, a - 2 * np.pi),
+        (0, r, a + np.pi),
+        (10**9, r, a),
+        (10**9 + 1, r, a),
+    ]
     run = run_with(rows, [0] * 6, [1.0] * 6)
     labels = consistency.true_identities(run, run.detections)
     assert labels[[0, 5]].tolist() == [consistency.UNJUDGED] * 2
     assert labels[1:4].tolist() == [11, 11, consistency.NONE]
     early = run_with([(-5, r, a)], [0], [1.0])
-    assert consistency.true_identities(early, early.detections).tolist() == [consistency.UNJUDGED]
+    assert consistency.true_identities(early, early.detections).tolist() == [
+        consistency.UNJUDGED
+    ]
     assert consistency.reliability_of(early) is None
 
 
 def test_a_sequence_is_judged_by_what_is_true():
     """One right at 0.95, one taken for another at 0.85, one that is none and called so at 0.75, one left out."""
     r, a = seen_at(2 * 10**8, LANDMARKS_M[0])
-    there, away, unclear = (2 * 10**8, r, a), (2 * 10**8, r, a + 0.6 / r), (2 * 10**8, r + 0.25, a)
-    run = run_with([there, there, away, unclear], [11, 7, 11, 11], [0.95, 0.85, 0.25, 0.5])
+    there, away, unclear = (
+        (2 * 10**8, r, a),
+        (2 * 10**8, r, a + 0.6 / r),
+        (2 * 10**8, r + 0.25, a),
+    )
+    run = run_with(
+        [there, there, away, unclear], [11, 7, 11, 11], [0.95, 0.85, 0.25, 0.5]
+    )
     found = consistency.reliability_of(run)
     assert found.count.tolist() == [0] * 7 + [1, 1, 1]
     assert found.right[7:].tolist() == [1.0, 0.0, 1.0]
@@ -261,4 +339,6 @@ def test_nothing_is_judged_without_truth():
     run = run_with([(0, r, a)], [11], [0.9])
     assert consistency.reliability_of(run) is not None
     for missing in ("detections", "truth", "true_landmarks"):
-        assert consistency.reliability_of(replace(run, **{missing: None})) is None, missing
+        assert consistency.reliability_of(replace(run, **{missing: None})) is None, (
+            missing
+        )

@@ -33,7 +33,9 @@ def test_digits_end_where_the_standard_error_begins(error, decimals):
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e3))
-def test_rounding_changes_a_value_by_less_than_half_its_standard_error_also_of_a_quantile(value, error):
+def test_rounding_changes_a_value_by_less_than_half_its_standard_error_also_of_a_quantile(
+    value, error
+):
     if abs(value) >= 10 * error:
         assert quantile_text(value, error) == supported(value, error)
     shown = float(supported(value, error).replace("\N{MINUS SIGN}", "-"))
@@ -43,16 +45,28 @@ def test_rounding_changes_a_value_by_less_than_half_its_standard_error_also_of_a
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        (with_error(0.123456, 0.0034), "0.123 ± 0.003"),  # value and error have the same digits
+        (
+            with_error(0.123456, 0.0034),
+            "0.123 ± 0.003",
+        ),  # value and error have the same digits
         (with_error(1234.5, 86.0), "1230 ± 90"),
         (with_error(-2.0, 0.15), "-2.00 ± 0.15"),
         (supported(0.123456, math.nan), "0.123"),  # without an error three digits
         (with_error(0.123456, math.nan), "0.123"),
-        *((form(0.123456, 0.0), "0.123") for form in (supported, quantile_text, with_error)),  # zero is no error
-        (quantile_text(0.123456, 40.0), "0.12"),  # a quantile has two digits however large its error
+        *(
+            (form(0.123456, 0.0), "0.123")
+            for form in (supported, quantile_text, with_error)
+        ),  # zero is no error
+        (
+            quantile_text(0.123456, 40.0),
+            "0.12",
+        ),  # a quantile has two digits however large its error
         (quantile_text(-0.00098765, 40.0), "-0.00099"),
         (quantile_text(0.0, 40.0), "0"),
-        (with_error(3.21e-20, 4e-22), "3.21e-20 ± 4.00e-22"),  # nothing at twelve decimals: a power of ten
+        (
+            with_error(3.21e-20, 4e-22),
+            "3.21e-20 ± 4.00e-22",
+        ),  # nothing at twelve decimals: a power of ten
         (with_error(0.25, 5e-324), "0.250000000000 ± 4.94e-324"),
         (quantile_text(5e-324, 1.0), "4.94e-324"),
         (quantile_text(0.25, 5e-324), "0.250000000000"),
@@ -63,7 +77,10 @@ def test_rounding_changes_a_value_by_less_than_half_its_standard_error_also_of_a
         (supported(math.inf, 0.1), "no value"),
         (between(0.1, math.inf), "0.100 to no value"),
         (between(0.123456, 0.987654, 0.03), "0.12 to 0.99"),
-        *((between(*bounds), "\N{EN DASH}") for bounds in ((math.nan, math.nan), (0.1, math.nan), (math.nan, 0.1))),
+        *(
+            (between(*bounds), "\N{EN DASH}")
+            for bounds in ((math.nan, math.nan), (0.1, math.nan), (math.nan, 0.1))
+        ),
     ],
 )
 def test_digits_by_hand(text, shown):
@@ -72,7 +89,11 @@ def test_digits_by_hand(text, shown):
 
 @given(st.floats(-1e300, 1e300), st.floats(0.0, 1e300))
 def test_every_number_can_be_written(value, error):
-    for text in (supported(value, error), quantile_text(value, error), with_error(value, error)):
+    for text in (
+        supported(value, error),
+        quantile_text(value, error),
+        with_error(value, error),
+    ):
         assert text
         assert "nan" not in text
 
@@ -84,4 +105,6 @@ def test_numbers_have_as_many_digits_as_mean_something(value, text):
 
 @given(st.floats(1e-9, 1e9))
 def test_a_shown_number_is_within_half_a_percent(value):
-    assert float(format_value(value).replace("\N{MINUS SIGN}", "-")) == pytest.approx(value, rel=5.1e-3)
+    assert float(format_value(value).replace("\N{MINUS SIGN}", "-")) == pytest.approx(
+        value, rel=5.1e-3
+    )

@@ -19,19 +19,29 @@ STEP_NS = 500_000_000
 
 def random_walk(seed: int, n: int = 60) -> Trajectory:
     rng = np.random.default_rng(seed)
-    rotations = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.1, size=(n, 3)), axis=0))
+    rotations = Rotation.from_rotvec(
+        np.cumsum(rng.normal(scale=0.1, size=(n, 3)), axis=0)
+    )
     positions = np.cumsum(rng.normal(size=(n, 3)), axis=0)
-    return Trajectory.without_covariances(np.arange(n) * STEP_NS, positions, rotations.as_quat())
+    return Trajectory.without_covariances(
+        np.arange(n) * STEP_NS, positions, rotations.as_quat()
+    )
 
 
 def disturbed(truth: Trajectory, seed: int) -> Trajectory:
     rng = np.random.default_rng(seed)
     positions = truth.positions + rng.normal(scale=0.3, size=truth.positions.shape)
-    rotations = truth.rotations() * Rotation.from_rotvec(rng.normal(scale=0.05, size=(len(truth), 3)))
-    return Trajectory.without_covariances(truth.stamps_ns, positions, rotations.as_quat())
+    rotations = truth.rotations() * Rotation.from_rotvec(
+        rng.normal(scale=0.05, size=(len(truth), 3))
+    )
+    return Trajectory.without_covariances(
+        truth.stamps_ns, positions, rotations.as_quat()
+    )
 
 
-def moved(path: Trajectory, turn: Rotation, shift: tuple[float, float, float]) -> Trajectory:
+def moved(
+    path: Trajectory, turn: Rotation, shift: tuple[float, float, float]
+) -> Trajectory:
     places, attitudes = turn.apply(path.positions) + shift, turn * path.rotations()
     return Trajectory.without_covariances(path.stamps_ns, places, attitudes.as_quat())
 
@@ -44,7 +54,9 @@ def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     )
 
 
-def evo_rmse(metric: APE | RPE, truth: PoseTrajectory3D, estimate: PoseTrajectory3D) -> float:
+def evo_rmse(
+    metric: APE | RPE, truth: PoseTrajectory3D, estimate: PoseTrajectory3D
+) -> float:
     metric.process_data((truth, estimate))
     return metric.get_statistic(StatisticsType.rmse)
 
@@ -53,7 +65,9 @@ def evo_rmse(metric: APE | RPE, truth: PoseTrajectory3D, estimate: PoseTrajector
 @given(seeds)
 def test_ate_agrees_with_evo(seed):
     truth = random_walk(seed)
-    estimate = moved(disturbed(truth, seed + 1), Rotation.from_euler("z", 0.4), (1.0, 2.0, 3.0))
+    estimate = moved(
+        disturbed(truth, seed + 1), Rotation.from_euler("z", 0.4), (1.0, 2.0, 3.0)
+    )
     raw = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), as_evo(estimate))
     assert metrics.ate_raw_m(estimate, truth) == pytest.approx(raw, abs=1e-9)
     aligned = as_evo(estimate)
@@ -65,21 +79,29 @@ def test_ate_agrees_with_evo(seed):
 
 def flat(trajectory: Trajectory) -> Trajectory:
     level = Rotation.from_euler("z", trajectory.rotations().as_euler("ZYX")[:, :1])
-    return Trajectory.without_covariances(trajectory.stamps_ns, trajectory.positions * [1, 1, 0], level.as_quat())
+    return Trajectory.without_covariances(
+        trajectory.stamps_ns, trajectory.positions * [1, 1, 0], level.as_quat()
+    )
 
 
 @settings(max_examples=20)
 @given(seeds)
 def test_errors_on_a_plane_agree_with_evo(seed):
     truth = flat(random_walk(seed))
-    estimate = moved(flat(disturbed(truth, seed + 1)), Rotation.from_euler("z", 0.4), (1.0, 2.0, 0.0))
+    estimate = moved(
+        flat(disturbed(truth, seed + 1)), Rotation.from_euler("z", 0.4), (1.0, 2.0, 0.0)
+    )
     aligned = as_evo(estimate)
     aligned.align(as_evo(truth))
     se2 = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), aligned)
     assert metrics.ate_se2_m(estimate, truth) == pytest.approx(se2, abs=1e-9)
-    turns = RPE(PoseRelation.rotation_angle_rad, delta=2, delta_unit=Unit.frames, all_pairs=True)
+    turns = RPE(
+        PoseRelation.rotation_angle_rad, delta=2, delta_unit=Unit.frames, all_pairs=True
+    )
     expected = evo_rmse(turns, as_evo(truth), as_evo(estimate))
-    assert metrics.rmse(metrics.relative_errors(estimate, truth, 1).yaw_rad) == pytest.approx(expected, abs=1e-9)
+    assert metrics.rmse(
+        metrics.relative_errors(estimate, truth, 1).yaw_rad
+    ) == pytest.approx(expected, abs=1e-9)
     assert expected > 0.01
 
 
@@ -89,7 +111,12 @@ def test_relative_error_agrees_with_evo(seed, delta_s):
     truth = random_walk(seed)
     estimate = disturbed(truth, seed + 1)
     frames = delta_s * 1_000_000_000 // STEP_NS
-    evo = RPE(PoseRelation.translation_part, delta=frames, delta_unit=Unit.frames, all_pairs=True)
+    evo = RPE(
+        PoseRelation.translation_part,
+        delta=frames,
+        delta_unit=Unit.frames,
+        all_pairs=True,
+    )
     expected = evo_rmse(evo, as_evo(truth), as_evo(estimate))
     relative = metrics.relative_errors(estimate, truth, delta_s)
     assert metrics.rmse(relative.translation_m) == pytest.approx(expected, abs=1e-9)
@@ -103,15 +130,22 @@ def test_aligned_and_relative_errors_do_not_depend_on_the_world(seed, angle):
     estimate = disturbed(truth, seed + 1)
     elsewhere = moved(estimate, Rotation.from_euler("z", angle), (10.0, -5.0, 1.0))
     for metric in (metrics.ate_yaw_m, metrics.ate_se2_m, metrics.ate_se3_m):
-        assert metric(elsewhere, truth) == pytest.approx(metric(estimate, truth), abs=1e-9)
-    there, here = (metrics.relative_errors(t, truth, 10.0).translation_m for t in (elsewhere, estimate))
+        assert metric(elsewhere, truth) == pytest.approx(
+            metric(estimate, truth), abs=1e-9
+        )
+    there, here = (
+        metrics.relative_errors(t, truth, 10.0).translation_m
+        for t in (elsewhere, estimate)
+    )
     np.testing.assert_allclose(there, here, atol=1e-9)
     assert metrics.ate_raw_m(elsewhere, truth) > 3.0
 
 
 def line(yaws: list[float], positions: list[list[float]]) -> Trajectory:
     quaternions = Rotation.from_euler("z", np.array(yaws)[:, None]).as_quat()
-    return Trajectory.without_covariances(np.arange(len(yaws)) * STEP_NS, np.array(positions, dtype=float), quaternions)
+    return Trajectory.without_covariances(
+        np.arange(len(yaws)) * STEP_NS, np.array(positions, dtype=float), quaternions
+    )
 
 
 def test_errors_by_hand():
@@ -124,7 +158,9 @@ def test_errors_by_hand():
     truth = line([np.pi - 0.01] * 3, [[0, 0, 0], [5, 0, 0], [0, 0, 0]])
     estimate = line([-np.pi + 0.02] * 3, [[1, 1, 0], [9, 9, 9], [1.3, 1.4, 0]])
     assert metrics.return_error_m(estimate, truth) == pytest.approx(0.5)
-    np.testing.assert_allclose(metrics.yaw_errors_rad(estimate, truth), [0.03] * 3, atol=1e-12)
+    np.testing.assert_allclose(
+        metrics.yaw_errors_rad(estimate, truth), [0.03] * 3, atol=1e-12
+    )
     with pytest.raises(EvaluationError, match=r"Trajectory\.at"):
         metrics.ate_raw_m(truth.rows(slice(1, None)), truth)
 
@@ -133,25 +169,37 @@ def test_a_constant_heading_error_is_in_yaw_but_not_in_relative_yaw():
     truth = random_walk(3)
     estimate = moved(truth, Rotation.from_euler("z", 0.2), (0.0, 0.0, 0.0))
     assert metrics.rmse(metrics.yaw_errors_rad(estimate, truth)) == pytest.approx(0.2)
-    assert metrics.rmse(metrics.relative_errors(estimate, truth, 1.0).yaw_rad) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.rmse(
+        metrics.relative_errors(estimate, truth, 1.0).yaw_rad
+    ) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     ("stamps_s", "pairs"),
     [
-        ([0.0, 0.5, 1.0, 1.5, 4.0, 5.0], [(0, 2), (1, 3), (4, 5)]),  # instants without a partner are skipped
-        ([k * 0.333_333_333 for k in range(10)], [(k, k + 3) for k in range(7)]),  # a third of a second is rounded
+        (
+            [0.0, 0.5, 1.0, 1.5, 4.0, 5.0],
+            [(0, 2), (1, 3), (4, 5)],
+        ),  # instants without a partner are skipped
+        (
+            [k * 0.333_333_333 for k in range(10)],
+            [(k, k + 3) for k in range(7)],
+        ),  # a third of a second is rounded
         ([5.0], []),
     ],
 )
 def test_pairs_are_a_second_apart(stamps_s, pairs):
-    first, second = metrics.pairs_apart(np.round(np.array(stamps_s) * 1e9).astype(np.int64), 1.0)
+    first, second = metrics.pairs_apart(
+        np.round(np.array(stamps_s) * 1e9).astype(np.int64), 1.0
+    )
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == pairs
 
 
 def landmark_map(ids: list[int], positions: object) -> LandmarkMap:
     places = np.reshape(np.asarray(positions, dtype=float), (len(ids), 3))
-    return LandmarkMap(np.array(ids, dtype=np.int64), places, np.tile(np.eye(3), (len(ids), 1, 1)))
+    return LandmarkMap(
+        np.array(ids, dtype=np.int64), places, np.tile(np.eye(3), (len(ids), 1, 1))
+    )
 
 
 def on_floor(xy: np.ndarray) -> np.ndarray:
@@ -161,7 +209,14 @@ def on_floor(xy: np.ndarray) -> np.ndarray:
 def test_landmarks_of_the_seed_experiment_by_hand():
     true = landmark_map([1, 2, 3, 4], [[5, 0, 0], [7, -5, 0], [2, -7, 0], [0, -2, 0]])
     estimated = landmark_map(
-        [1, 2, 3, 4, 8], [[4.81, -0.07, 9], [6.74, -5.01, 9], [1.85, -6.85, 9], [-0.14, -1.82, 9], [0, 0, 0]]
+        [1, 2, 3, 4, 8],
+        [
+            [4.81, -0.07, 9],
+            [6.74, -5.01, 9],
+            [1.85, -6.85, 9],
+            [-0.14, -1.82, 9],
+            [0, 0, 0],
+        ],
     )
     errors = metrics.landmark_errors(estimated, true)
     assert len(errors) == 4
@@ -176,7 +231,9 @@ def test_landmarks_are_matched_by_identity_not_by_row():
     np.testing.assert_array_equal(errors.ids, [8, 20])
     np.testing.assert_allclose(errors.horizontal_m, [[0, 0.5], [0, 0]])
     one = landmark_map([1], [[0, 0, 0]])
-    assert np.isnan(metrics.landmark_errors(one, one).aligned_rmse_m), "one landmark cannot be aligned"
+    assert np.isnan(metrics.landmark_errors(one, one).aligned_rmse_m), (
+        "one landmark cannot be aligned"
+    )
 
 
 UNKNOWN = 3_000_000_000
@@ -187,9 +244,13 @@ FARTHEST_M = 1.0
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 4), m=st.integers(1, 4))
 def test_unnamed_landmarks_are_matched_as_the_best_of_all_matchings_says(seed, n, m):
     rng = np.random.default_rng(seed)
-    estimated = landmark_map([UNKNOWN + k for k in range(n)], on_floor(1.2 * rng.standard_normal((n, 2))))
+    estimated = landmark_map(
+        [UNKNOWN + k for k in range(n)], on_floor(1.2 * rng.standard_normal((n, 2)))
+    )
     true = landmark_map(list(range(m)), on_floor(1.2 * rng.standard_normal((m, 2))))
-    squared = np.sum((estimated.positions[:, None] - true.positions[None]) ** 2, axis=-1)
+    squared = np.sum(
+        (estimated.positions[:, None] - true.positions[None]) ** 2, axis=-1
+    )
     best = (0, 0.0)
     for order in permutations([*range(m), *[-1] * n], n):
         pairs = [(k, j) for k, j in enumerate(order) if j >= 0]
@@ -204,7 +265,9 @@ def test_unnamed_landmarks_are_matched_as_the_best_of_all_matchings_says(seed, n
 
 def test_known_identities_stay_wherever_they_are():
     true = landmark_map([1, 2], [[0, 0, 0], [5, 0, 0]])
-    estimated = landmark_map([1, UNKNOWN, UNKNOWN + 1], [[5, 0, 0], [0, 0, 0], [5.1, 0, 0]])
+    estimated = landmark_map(
+        [1, UNKNOWN, UNKNOWN + 1], [[5, 0, 0], [0, 0, 0], [5.1, 0, 0]]
+    )
     named = metrics.named_by_place(estimated, true, FARTHEST_M)
     assert named.ids.tolist() == [1, 2, UNKNOWN]
     assert named.positions[:, 0].tolist() == [5.0, 5.1, 0.0]
@@ -212,7 +275,9 @@ def test_known_identities_stay_wherever_they_are():
     assert len(metrics.named_by_place(empty, true, FARTHEST_M)) == 0
     assert metrics.named_by_place(true, empty, FARTHEST_M).ids.tolist() == [1, 2]
     unnamed = landmark_map([UNKNOWN], [[0, 0, 0]])
-    assert len(metrics.landmark_errors(unnamed, true)) == 0, "unnamed landmarks are never taken for known ones"
+    assert len(metrics.landmark_errors(unnamed, true)) == 0, (
+        "unnamed landmarks are never taken for known ones"
+    )
 
 
 def cloud(seed: int, n: int = 30) -> np.ndarray:
@@ -222,7 +287,10 @@ def cloud(seed: int, n: int = 30) -> np.ndarray:
 @given(seeds, st.floats(-np.pi, np.pi))
 def test_alignment_undoes_a_motion_that_it_allows(seed, angle):
     points, shift = cloud(seed), np.array([10.0, -3.0, 2.0])
-    turns = Rotation.random(rng=seed).as_matrix(), Rotation.from_euler("z", angle).as_matrix()
+    turns = (
+        Rotation.random(rng=seed).as_matrix(),
+        Rotation.from_euler("z", angle).as_matrix(),
+    )
     for align, turn in zip((metrics.align_se3, metrics.align_yaw), turns, strict=True):
         alignment = align(points, points @ turn.T + shift)
         np.testing.assert_allclose(alignment.rotation, turn, atol=1e-10)
@@ -239,21 +307,38 @@ def test_umeyama_agrees_with_evo(seed, dimension):
 
 
 def test_yaw_alignment_leaves_a_tilt_where_se3_removes_it_and_one_place_is_moved_to_another():
-    np.testing.assert_allclose(metrics.align_se3(np.ones((5, 3)), np.full((5, 3), 3.0)).apply(np.ones((5, 3))), 3.0)
+    np.testing.assert_allclose(
+        metrics.align_se3(np.ones((5, 3)), np.full((5, 3), 3.0)).apply(np.ones((5, 3))),
+        3.0,
+    )
     points = cloud(0)
     tilted = points @ Rotation.from_euler("x", 0.2).as_matrix().T
-    assert metrics.rmse(metrics.align_se3(points, tilted).apply(points) - tilted) < 1e-10
+    assert (
+        metrics.rmse(metrics.align_se3(points, tilted).apply(points) - tilted) < 1e-10
+    )
     assert metrics.rmse(metrics.align_yaw(points, tilted).apply(points) - tilted) > 0.1
 
 
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_more_freedom_never_fits_worse_and_yaw_alignment_is_the_best_of_the_plane(seed, turn, x, y):
-    points, targets = cloud(seed), cloud(seed) + np.random.default_rng(seed + 1).normal(size=(30, 3))
+def test_more_freedom_never_fits_worse_and_yaw_alignment_is_the_best_of_the_plane(
+    seed, turn, x, y
+):
+    points, targets = (
+        cloud(seed),
+        cloud(seed) + np.random.default_rng(seed + 1).normal(size=(30, 3)),
+    )
     aligned = metrics.align_yaw(points, targets).apply(points)
     se3 = metrics.rmse(metrics.align_se3(points, targets).apply(points) - targets)
-    assert se3 - 1e-12 <= metrics.rmse(aligned - targets) <= metrics.rmse(points - targets) + 1e-12
+    assert (
+        se3 - 1e-12
+        <= metrics.rmse(aligned - targets)
+        <= metrics.rmse(points - targets) + 1e-12
+    )
     other = aligned @ Rotation.from_euler("z", turn).as_matrix().T + [x, y, 0.0]
-    assert metrics.rmse((aligned - targets)[:, :2]) <= metrics.rmse((other - targets)[:, :2]) + 1e-12
+    assert (
+        metrics.rmse((aligned - targets)[:, :2])
+        <= metrics.rmse((other - targets)[:, :2]) + 1e-12
+    )
 
 
 @pytest.mark.parametrize("shapes", [((0, 3), (0, 3)), ((4, 3), (5, 3))])

@@ -83,7 +83,16 @@ class Interrupts(DeadReckoning):
     def process(self, measurements):
         raise KeyboardInterrupt("of its own")
 """
-CLASSES = ("Meddling", "Subclassing", "Wording", "Leaving", "Exits", "ExitsAtOnce", "Aborts", "Interrupts")
+CLASSES = (
+    "Meddling",
+    "Subclassing",
+    "Wording",
+    "Leaving",
+    "Exits",
+    "ExitsAtOnce",
+    "Aborts",
+    "Interrupts",
+)
 
 
 @pytest.fixture
@@ -91,9 +100,13 @@ def plugin(tmp_path, monkeypatch) -> None:
     """Estimators of another package, called ``their-NAME``."""
     about = tmp_path / "theirs-1.0.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n"
+    )
     points = [f"their-{name.lower()} = theirs:{name}" for name in CLASSES]
-    (about / "entry_points.txt").write_text("\n".join(["[sonar_graph.estimators]", *points, ""]))
+    (about / "entry_points.txt").write_text(
+        "\n".join(["[sonar_graph.estimators]", *points, ""])
+    )
     (tmp_path / "theirs.py").write_text(PLUGIN)
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -104,10 +117,19 @@ def mission():
 
 
 def state() -> tuple[object, ...]:
-    return np.sqrt, np.linalg.norm, np.geterr(), sys.getrecursionlimit(), Path.cwd(), dict(os.environ)
+    return (
+        np.sqrt,
+        np.linalg.norm,
+        np.geterr(),
+        sys.getrecursionlimit(),
+        Path.cwd(),
+        dict(os.environ),
+    )
 
 
-def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(plugin, mission):
+def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(
+    plugin, mission
+):
     own = ["dead-reckoning", "ekf-slam"]
     alone, before = compare(mission, own), state()
     together = compare(mission, [own[0], "their-meddling", own[1]])
@@ -121,16 +143,26 @@ def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(plu
                 assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
-def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_process(plugin, mission, monkeypatch):
+def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_process(
+    plugin, mission, monkeypatch
+):
     steps = []
-    apart = run_estimator(mission, "dead-reckoning", progress=lambda *step: steps.append(step))
-    monkeypatch.setattr("sonar_graph.estimator.DISTRIBUTION", "another name of this package")
+    apart = run_estimator(
+        mission, "dead-reckoning", progress=lambda *step: steps.append(step)
+    )
+    monkeypatch.setattr(
+        "sonar_graph.estimator.DISTRIBUTION", "another name of this package"
+    )
     assert is_foreign("dead-reckoning")
     told = []
-    here = run_estimator(mission, "dead-reckoning", progress=lambda *step: told.append(step))
+    here = run_estimator(
+        mission, "dead-reckoning", progress=lambda *step: told.append(step)
+    )
     assert here.causal.positions.tobytes() == apart.causal.positions.tobytes()
     assert told == steps
-    with pytest.raises(EstimatorError, match=r"settings of dead-reckoning: \w+.* no such"):
+    with pytest.raises(
+        EstimatorError, match=r"settings of dead-reckoning: \w+.* no such"
+    ):
         check_request("dead-reckoning", {"wrong": 1})
 
 
@@ -141,10 +173,15 @@ def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_pro
         ("exitsatonce", "its process ended with code 4"),
         ("aborts", "its process was ended by SIGABRT"),
         ("interrupts", "KeyboardInterrupt: of its own"),
-        ("wording", r"its answer cannot be read: it has a theirs\.Word; expected a class of sonar_graph"),
+        (
+            "wording",
+            r"its answer cannot be read: it has a theirs\.Word; expected a class of sonar_graph",
+        ),
     ],
 )
-def test_the_end_of_a_process_is_the_failure_of_its_run_alone(plugin, mission, name, reason):
+def test_the_end_of_a_process_is_the_failure_of_its_run_alone(
+    plugin, mission, name, reason
+):
     comparison = compare(mission, [f"their-{name}", "dead-reckoning"])
     assert [run.status for run in comparison.runs] == ["failed", "ok"]
     assert re.search(reason, comparison.runs[0].reason)
@@ -158,15 +195,22 @@ def test_results_of_classes_of_its_own_are_taken_as_ours(plugin, mission):
     assert "theirs" not in sys.modules
 
 
-def test_processes_that_an_estimator_leaves_behind_end_with_its_own(plugin, mission, tmp_path, monkeypatch):
+def test_processes_that_an_estimator_leaves_behind_end_with_its_own(
+    plugin, mission, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SONAR_GRAPH_CHILD", str(tmp_path / "child"))
     assert run_estimator(mission, "their-leaving").status == "ok"
     child = int((tmp_path / "child").read_text())
-    assert not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE
+    assert (
+        not psutil.pid_exists(child)
+        or psutil.Process(child).status() == psutil.STATUS_ZOMBIE
+    )
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, None])
-def test_an_interrupt_that_compiled_code_swallows_is_no_failure_of_the_estimator(mission, monkeypatch, failure):
+def test_an_interrupt_that_compiled_code_swallows_is_no_failure_of_the_estimator(
+    mission, monkeypatch, failure
+):
     def swallow(*_: object) -> None:
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)

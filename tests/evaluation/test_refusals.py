@@ -35,46 +35,69 @@ NS = 10**9
 
 
 def without_rows(sequence: Sequence, rows: list[int]) -> Sequence:
-    return replace(sequence, dvl=sequence.dvl.rows(np.delete(np.arange(len(sequence.dvl)), rows)))
+    return replace(
+        sequence, dvl=sequence.dvl.rows(np.delete(np.arange(len(sequence.dvl)), rows))
+    )
 
 
 def with_outliers(sequence: Sequence, rows: list[int]) -> Sequence:
     velocity = sequence.dvl.velocity.copy()
     velocity[rows, 1] += 3.0
-    return replace(sequence, dvl=Dvl(sequence.dvl.stamps_ns, velocity, sequence.dvl.velocity_cov))
+    return replace(
+        sequence, dvl=Dvl(sequence.dvl.stamps_ns, velocity, sequence.dvl.velocity_cov)
+    )
 
 
 def test_few_rows_are_named_each_and_many_are_counted_by_sensor_and_reason():
     few = [outlier(k, 50.0 + k) for k in range(MOST_ROWS_NAMED)]
-    assert [(rows.count, rows.first_ns, rows.distances()) for rows in gathered(few[::-1])] == [
-        (1, k, f"{50 + k}") for k in range(MOST_ROWS_NAMED)
-    ]
+    assert [
+        (rows.count, rows.first_ns, rows.distances()) for rows in gathered(few[::-1])
+    ] == [(1, k, f"{50 + k}") for k in range(MOST_ROWS_NAMED)]
     (many,) = gathered([*few, outlier(99, 7.5)])
     assert (many.count, many.first_ns, many.last_ns) == (MOST_ROWS_NAMED + 1, 0, 99)
     assert (many.times(-NS), many.distances()) == ("1.000 to 1.000", "7.50 to 54")
-    rows = [outlier(k) for k in range(9)] + [late(k) for k in range(9)] + [RefusedRow("dvl", 3, Refusal.LATE, math.nan)]
+    rows = (
+        [outlier(k) for k in range(9)]
+        + [late(k) for k in range(9)]
+        + [RefusedRow("dvl", 3, Refusal.LATE, math.nan)]
+    )
     found = Counter({(rows.sensor, rows.reason): rows.count for rows in gathered(rows)})
-    assert found == {("dvl", Refusal.OUTLIER): 9, ("imu", Refusal.LATE): 9, ("dvl", Refusal.LATE): 1}
+    assert found == {
+        ("dvl", Refusal.OUTLIER): 9,
+        ("imu", Refusal.LATE): 9,
+        ("dvl", Refusal.LATE): 1,
+    }
 
 
 def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path):
     rows = [outlier(k * NS, 50.0 + k) for k in range(8)] + [late(3)]
     comparison = refusing(rows, "isam2", "ekf-slam")
-    comparison = with_run(comparison, replace(comparison.runs[0], withheld=["landmark 3; open: z"]))
+    comparison = with_run(
+        comparison, replace(comparison.runs[0], withheld=["landmark 3; open: z"])
+    )
     write_comparison(comparison, tmp_path)
     for path, entry in (
         (tmp_path / "comparison.json", lambda content: content["runs"]["isam2"]),
         (tmp_path / "runs" / "isam2" / "result.json", lambda content: content),
     ):
         told = entry(json.loads(path.read_text()))["refused"]
-        expected = {"sensor": "dvl", "reason": Refusal.OUTLIER.value, "count": 8, "first_ns": 0, "last_ns": 7 * NS}
+        expected = {
+            "sensor": "dvl",
+            "reason": Refusal.OUTLIER.value,
+            "count": 8,
+            "first_ns": 0,
+            "last_ns": 7 * NS,
+        }
         assert told[0] == {**expected, "least_and_largest_distance": [50.0, 57.0]}
         assert told[1]["least_and_largest_distance"] is None
     restored = read_comparison(tmp_path)
     assert [run.withheld for run in restored.runs] == [["landmark 3; open: z"], [], []]
     for run, again in zip(comparison.runs, restored.runs, strict=True):
         assert [row[:3] for row in again.refused] == [row[:3] for row in run.refused]
-        np.testing.assert_array_equal([row.distance for row in again.refused], [row.distance for row in run.refused])
+        np.testing.assert_array_equal(
+            [row.distance for row in again.refused],
+            [row.distance for row in run.refused],
+        )
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +124,9 @@ def mission() -> Sequence:
     return simulate_mission(MissionOptions(duration_s=20.0))
 
 
-def changed(sequence: Sequence, sensor: str, column: str, rows: list[int], value: Any) -> Sequence:
+def changed(
+    sequence: Sequence, sensor: str, column: str, rows: list[int], value: Any
+) -> Sequence:
     """Some rows of a column have another value."""
     block = getattr(sequence, sensor)
     values = getattr(block, column).copy()
@@ -111,14 +136,20 @@ def changed(sequence: Sequence, sensor: str, column: str, rows: list[int], value
 
 def without(sequence: Sequence, sensor: str, rows: list[int]) -> Sequence:
     block = getattr(sequence, sensor)
-    return replace(sequence, **{sensor: block.rows(np.delete(np.arange(len(block)), rows))})
+    return replace(
+        sequence, **{sensor: block.rows(np.delete(np.arange(len(block)), rows))}
+    )
 
 
 def assert_same_numbers(one: RunResult, other: RunResult) -> None:
     assert (one.status, other.status) == ("ok", "ok")
     for part in ("positions", "quaternions_xyzw", "covariances"):
-        np.testing.assert_array_equal(getattr(one.causal, part), getattr(other.causal, part))
-        np.testing.assert_array_equal(getattr(one.smoothed, part), getattr(other.smoothed, part))
+        np.testing.assert_array_equal(
+            getattr(one.causal, part), getattr(other.causal, part)
+        )
+        np.testing.assert_array_equal(
+            getattr(one.smoothed, part), getattr(other.smoothed, part)
+        )
     np.testing.assert_array_equal(one.landmarks.positions, other.landmarks.positions)
 
 
@@ -140,24 +171,34 @@ def test_rows_that_no_sensor_or_vehicle_gives_are_named_and_change_nothing(
     mission, name, sensor, column, rows, value, reason
 ):
     faulty = run_estimator(changed(mission, sensor, column, rows, value), name)
-    known = run_estimator(without(mission, sensor, rows), name, instants_ns=mission.instants(2.0))
+    known = run_estimator(
+        without(mission, sensor, rows), name, instants_ns=mission.instants(2.0)
+    )
     assert_same_numbers(faulty, known)
     stamps_ns = getattr(mission, sensor).stamps_ns[rows]
     assert [(row.sensor, row.stamp_ns, row.reason) for row in faulty.refused] == [
         (sensor, stamp_ns, reason) for stamp_ns in stamps_ns
     ]
-    assert all((row.distance > 37.3) == (reason is Refusal.OUT_OF_REACH) for row in faulty.refused)
+    assert all(
+        (row.distance > 37.3) == (reason is Refusal.OUT_OF_REACH)
+        for row in faulty.refused
+    )
     assert not known.refused
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_an_unsound_detection_is_named_and_changes_nothing(mission, name):
-    for column, value in (("range_azimuth_cov", [[1e-4, 1e-2], [1e-2, 1e-4]]), ("range_m", -3.0)):
+    for column, value in (
+        ("range_azimuth_cov", [[1e-4, 1e-2], [1e-2, 1e-4]]),
+        ("range_m", -3.0),
+    ):
         faulty = run_estimator(changed(mission, "detections", column, [9], value), name)
         known = run_estimator(without(mission, "detections", [9]), name)
         assert_same_numbers(faulty, known)
         outcomes = faulty.detections.outcomes
-        assert [row for row, outcome in enumerate(outcomes) if outcome is Outcome.UNSOUND] == [9]
+        assert [
+            row for row, outcome in enumerate(outcomes) if outcome is Outcome.UNSOUND
+        ] == [9]
         assert outcomes[:9] + outcomes[10:] == known.detections.outcomes
 
 
@@ -165,7 +206,10 @@ def test_an_unsound_detection_is_named_and_changes_nothing(mission, name):
 def test_rows_that_a_sensor_and_a_vehicle_can_give_are_used(mission, name):
     """The control: half a metre more of depth, and quick turns and knocks, change what comes out."""
     clean = run_estimator(mission, name)
-    sensors = [("imu", "angular_velocity", [900], 3.0), ("depth", "z_m", [40], mission.depth.z_m[40] + 0.5)]
+    sensors = [
+        ("imu", "angular_velocity", [900], 3.0),
+        ("depth", "z_m", [40], mission.depth.z_m[40] + 0.5),
+    ]
     for change in sensors if name != "dead-reckoning" else sensors[:1]:
         run = run_estimator(changed(mission, *change), name)
         assert not run.refused
@@ -177,7 +221,9 @@ def off_the_clock(sequence: Sequence, rows: int, step_ns: int) -> Sequence:
     blocks = {}
     for sensor in ("imu", "dvl", "depth", "detections"):
         block = getattr(sequence, sensor)
-        blocks[sensor] = replace(block, stamps_ns=np.r_[np.arange(rows) * step_ns, block.stamps_ns[rows:]])
+        blocks[sensor] = replace(
+            block, stamps_ns=np.r_[np.arange(rows) * step_ns, block.stamps_ns[rows:]]
+        )
     return replace(sequence, **blocks)
 
 
@@ -189,41 +235,68 @@ def begun_at(sequence: Sequence, rows: int) -> Sequence:
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize(("rows", "step_ns"), [(1, 0), (3, 0), (5, NS // 10)])
-def test_first_rows_before_the_clock_was_set_are_named_and_change_nothing(mission, name, rows, step_ns):
+def test_first_rows_before_the_clock_was_set_are_named_and_change_nothing(
+    mission, name, rows, step_ns
+):
     faulty, known = off_the_clock(mission, rows, step_ns), begun_at(mission, rows)
     run = run_estimator(faulty, name)
     assert_same_numbers(run, run_estimator(known, name))
     assert Counter((row.sensor, row.reason) for row in run.refused) == {
-        (sensor, Refusal.CLOCK): rows for sensor in ("imu", "dvl", "depth", "detections")
+        (sensor, Refusal.CLOCK): rows
+        for sensor in ("imu", "dvl", "depth", "detections")
     }
     assert np.array_equal(faulty.instants(2.0), known.instants(2.0))
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("cuts_hz", [0.1, 3.0])
-def test_a_row_before_the_clock_was_set_starts_no_estimator_however_the_log_is_cut(mission, name, cuts_hz):
+def test_a_row_before_the_clock_was_set_starts_no_estimator_however_the_log_is_cut(
+    mission, name, cuts_hz
+):
     """A caller that gets rows as they come, and cannot know what follows."""
     poses = []
     for sequence in (off_the_clock(mission, 1, 0), begun_at(mission, 1)):
-        estimator = load_estimator(name)(sequence.calibration, Odometry(sequence.calibration))
+        estimator = load_estimator(name)(
+            sequence.calibration, Odometry(sequence.calibration)
+        )
         if not sequence.imu.stamps_ns[0]:
-            first = (block.between(-1, 0) for block in (sequence.imu, sequence.dvl, sequence.depth))
+            first = (
+                block.between(-1, 0)
+                for block in (sequence.imu, sequence.dvl, sequence.depth)
+            )
             assert estimator.process(Measurements(0, *first)) is None
         for step in sequence.replay(sequence.instants(cuts_hz)):
             estimator.process(step)
         poses.append(estimator.trajectory())
-        told = {(row.sensor, row.stamp_ns, row.reason) for row in estimator.refused_rows()}
-        assert told == ({(s, 0, Refusal.CLOCK) for s in ("imu", "dvl")} if len(poses) == 1 else set())
+        told = {
+            (row.sensor, row.stamp_ns, row.reason) for row in estimator.refused_rows()
+        }
+        assert told == (
+            {(s, 0, Refusal.CLOCK) for s in ("imu", "dvl")}
+            if len(poses) == 1
+            else set()
+        )
     np.testing.assert_array_equal(poses[0].positions, poses[1].positions)
     np.testing.assert_array_equal(poses[0].stamps_ns, poses[1].stamps_ns)
 
 
-def live(name: str, sequence: Sequence, late: Measurements | None) -> tuple[Estimate | None, list[RefusedRow]]:
+def live(
+    name: str, sequence: Sequence, late: Measurements | None
+) -> tuple[Estimate | None, list[RefusedRow]]:
     """Half a second of both sensors is missing, and perhaps comes at the end."""
-    estimator = load_estimator(name)(sequence.calibration, Odometry(sequence.calibration))
+    estimator = load_estimator(name)(
+        sequence.calibration, Odometry(sequence.calibration)
+    )
     resumed_ns = HELD_NS[1] + 4 * NS
-    for after_ns, until_ns in ((0, HELD_NS[0]), (HELD_NS[1], resumed_ns), (resumed_ns, sequence.end_ns)):
-        imu, dvl = sequence.imu.between(after_ns, until_ns), sequence.dvl.between(after_ns, until_ns)
+    for after_ns, until_ns in (
+        (0, HELD_NS[0]),
+        (HELD_NS[1], resumed_ns),
+        (resumed_ns, sequence.end_ns),
+    ):
+        imu, dvl = (
+            sequence.imu.between(after_ns, until_ns),
+            sequence.dvl.between(after_ns, until_ns),
+        )
         estimator.process(Measurements(until_ns, imu, dvl))
     if late is not None:
         estimator.process(late)
@@ -260,7 +333,11 @@ def recorded_late(path: Path, out: Path, delays_ns: dict[str, int]) -> None:
         reader = make_reader(file)
         for schema, channel, message in reader.iter_messages():
             counts[channel.topic] += 1
-            delay_ns = delays_ns.get(channel.topic, 0) if counts[channel.topic] % 10 == 0 else 0
+            delay_ns = (
+                delays_ns.get(channel.topic, 0)
+                if counts[channel.topic] % 10 == 0
+                else 0
+            )
             messages.append((message.log_time + delay_ns, schema, channel, message))
         records = list(reader.iter_metadata())
     with out.open("wb") as file:
@@ -269,24 +346,47 @@ def recorded_late(path: Path, out: Path, delays_ns: dict[str, int]) -> None:
         for record in records:
             writer.add_metadata(record.name, record.metadata)
         channels: dict[int, int] = {}
-        for at_ns, schema, channel, message in sorted(messages, key=lambda entry: entry[0]):
+        for at_ns, schema, channel, message in sorted(
+            messages, key=lambda entry: entry[0]
+        ):
             if channel.id not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+                known = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, known
+                )
             writer.add_message(channels[channel.id], at_ns, message.data, at_ns)
         writer.finish()
 
 
-def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_path, capsys):
+def test_rows_recorded_late_are_placed_by_their_stamps_and_said(
+    straight, tmp_path, capsys
+):
     write_log(tmp_path / "log.mcap", straight)
     with (tmp_path / "log.mcap").open("rb") as file:
-        topics = [channel.topic for channel in make_reader(file).get_summary().channels.values()]
-    delays_ns = {topic: 350_000_000 for topic in topics if "imu" in topic or "dvl" in topic}
+        topics = [
+            channel.topic
+            for channel in make_reader(file).get_summary().channels.values()
+        ]
+    delays_ns = {
+        topic: 350_000_000 for topic in topics if "imu" in topic or "dvl" in topic
+    }
     assert len(delays_ns) == 2
     recorded_late(tmp_path / "log.mcap", tmp_path / "late.mcap", delays_ns)
     for name in ("log", "late"):
-        said = told_by(capsys, "run", tmp_path / f"{name}.mcap", "-o", tmp_path / name, "--estimator", "dead-reckoning")
-        assert said.count("backwards, by 0.3 s at most: rows are sorted") == (2 if name == "late" else 0)
+        said = told_by(
+            capsys,
+            "run",
+            tmp_path / f"{name}.mcap",
+            "-o",
+            tmp_path / name,
+            "--estimator",
+            "dead-reckoning",
+        )
+        assert said.count("backwards, by 0.3 s at most: rows are sorted") == (
+            2 if name == "late" else 0
+        )
         assert "refused" not in said
     one, other = (read_comparison(tmp_path / name).runs[0] for name in ("log", "late"))
     np.testing.assert_array_equal(one.causal.positions, other.causal.positions)
@@ -295,14 +395,25 @@ def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_pa
 def test_run_and_compare_name_what_was_refused_in_a_log(straight, tmp_path, capsys):
     """Two velocities are wrong."""
     write_log(tmp_path / "log.mcap", with_outliers(straight, [20, 60]))
-    for arguments in (["run", "--estimator", "dead-reckoning"], ["compare", "--estimators", "dead-reckoning,ekf-slam"]):
+    for arguments in (
+        ["run", "--estimator", "dead-reckoning"],
+        ["compare", "--estimators", "dead-reckoning,ekf-slam"],
+    ):
         out = tmp_path / arguments[0]
-        said = told_by(capsys, arguments[0], tmp_path / "log.mcap", "-o", out, *arguments[1:])
+        said = told_by(
+            capsys, arguments[0], tmp_path / "log.mcap", "-o", out, *arguments[1:]
+        )
         for seconds in ("2.000", "6.000"):
-            assert f"Warning: dvl, {seconds} s: {Refusal.OUTLIER} (squared distance" in said
+            assert (
+                f"Warning: dvl, {seconds} s: {Refusal.OUTLIER} (squared distance"
+                in said
+            )
         index = json.loads((out / "comparison.json").read_text())
         for entry in index["runs"].values():
-            assert [(rows["sensor"], rows["count"]) for rows in entry["refused"]] == [("dvl", 1), ("dvl", 1)]
+            assert [(rows["sensor"], rows["count"]) for rows in entry["refused"]] == [
+                ("dvl", 1),
+                ("dvl", 1),
+            ]
 
 
 def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatch):
@@ -310,10 +421,18 @@ def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatc
     make = SightingFactors.make
     first = {int(sequence.detections.most_probable()[0][0])}
 
-    def without(self: SightingFactors, sighting: Any, key: int, *, is_first: bool) -> Any:
+    def without(
+        self: SightingFactors, sighting: Any, key: int, *, is_first: bool
+    ) -> Any:
         made = make(self, sighting, key, is_first=is_first)
-        unplaced = {} if {key} != {L(id_) for id_ in first} else {"first direction", "floor prior"}
-        return {label: factor for label, factor in made.items() if label not in unplaced}
+        unplaced = (
+            {}
+            if {key} != {L(id_) for id_ in first}
+            else {"first direction", "floor prior"}
+        )
+        return {
+            label: factor for label, factor in made.items() if label not in unplaced
+        }
 
     monkeypatch.setattr(SightingFactors, "make", without)
     (line, *_) = run_estimator(sequence, "isam2").withheld
@@ -323,15 +442,23 @@ def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatc
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("unit", [1, 1000], ids=["s", "ms"])
-def test_headings_and_fixes_that_are_not_stamped_in_nanoseconds_are_named_and_change_nothing(straight, name, unit):
+def test_headings_and_fixes_that_are_not_stamped_in_nanoseconds_are_named_and_change_nothing(
+    straight, name, unit
+):
     """Also in a log whose clock begins at zero, where they lie within the run."""
     stamps_ns = straight.imu.stamps_ns[0] + unit * np.arange(20)
     slow_ns = straight.imu.stamps_ns[0] + NS // 10 * np.arange(20)
     blocks = {
         "heading": lambda t: Heading(t, np.zeros(20), np.full(20, np.nan)),
-        "positions": lambda t: PositionFixes(t, np.zeros((20, 3)), np.full((20, 3, 3), np.nan)),
+        "positions": lambda t: PositionFixes(
+            t, np.zeros((20, 3)), np.full((20, 3, 3), np.nan)
+        ),
     }
     for sensor, block in blocks.items():
         run = run_estimator(replace(straight, **{sensor: block(stamps_ns)}), name)
-        assert Counter((row.sensor, row.reason) for row in run.refused) == {(sensor, Refusal.RATE): 20}
-        assert not run_estimator(replace(straight, **{sensor: block(slow_ns)}), name).refused
+        assert Counter((row.sensor, row.reason) for row in run.refused) == {
+            (sensor, Refusal.RATE): 20
+        }
+        assert not run_estimator(
+            replace(straight, **{sensor: block(slow_ns)}), name
+        ).refused

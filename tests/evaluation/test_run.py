@@ -38,8 +38,12 @@ def ran(install) -> Callable[..., RunResult]:
             self.seen.append(measurements)
             return methods.get("process", Offset.process)(self, measurements)
 
-        install(own=type("Own", (Offset,), methods | {"__init__": init, "process": process}))
-        return run_estimator(sequence or straight_sequence(), "own", settings, **(options or {}))
+        install(
+            own=type("Own", (Offset,), methods | {"__init__": init, "process": process})
+        )
+        return run_estimator(
+            sequence or straight_sequence(), "own", settings, **(options or {})
+        )
 
     run.made = []
     return run
@@ -56,7 +60,9 @@ def changing(**change):
 
 
 def with_covariance(covariance):
-    return lambda self, stamp_ns, offset_m: replace(Offset.beside(self, stamp_ns, offset_m), covariance=covariance)
+    return lambda self, stamp_ns, offset_m: replace(
+        Offset.beside(self, stamp_ns, offset_m), covariance=covariance
+    )
 
 
 def failing_after(steps: int, error: BaseException):
@@ -82,15 +88,21 @@ def off_by(path, offset):
 
 def map_of(positions: list[list[float]]) -> LandmarkMap:
     n = len(positions)
-    return LandmarkMap(np.arange(7, 7 + n), np.reshape(positions, (n, 3)), np.full((n, 3, 3), np.nan))
+    return LandmarkMap(
+        np.arange(7, 7 + n), np.reshape(positions, (n, 3)), np.full((n, 3, 3), np.nan)
+    )
 
 
 def test_every_row_reaches_the_estimator_once_and_in_order(ran):
     sequence = straight_sequence()
     assert ran(sequence).status == "ok"
     seen = ran.made[-1].seen
-    np.testing.assert_array_equal(np.concatenate([s.imu.stamps_ns for s in seen if s.imu]), sequence.imu.stamps_ns)
-    np.testing.assert_array_equal([step.end_ns for step in seen], sequence.instants(2.0))
+    np.testing.assert_array_equal(
+        np.concatenate([s.imu.stamps_ns for s in seen if s.imu]), sequence.imu.stamps_ns
+    )
+    np.testing.assert_array_equal(
+        [step.end_ns for step in seen], sequence.instants(2.0)
+    )
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -105,10 +117,16 @@ def test_nothing_of_the_instance_that_warms_up_reaches_the_result(ran, fails):
         time.sleep(0.05)
         return self.beside(measurements.end_ns, 99.0)
 
-    result = ran(straight_sequence(5.0), options={"progress": lambda *call: calls.append(call)}, process=process)
+    result = ran(
+        straight_sequence(5.0),
+        options={"progress": lambda *call: calls.append(call)},
+        process=process,
+    )
     assert len(ran.made) == 2
     assert (result.status, result.reason) == ("ok", "")
-    np.testing.assert_array_equal(result.causal.positions, ran(straight_sequence(5.0)).causal.positions)
+    np.testing.assert_array_equal(
+        result.causal.positions, ran(straight_sequence(5.0)).causal.positions
+    )
     assert len(result.update_s) == 10
     assert result.update_s.min() < 0.05
     assert calls == [(i, 10) for i in range(1, 11)]
@@ -137,7 +155,9 @@ def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(ran):
     n = len(stamps_ns)
     probable = np.where(np.arange(n) < 10, 0.2, 0.9)[:, None]
     noise, ids = np.full((n, 2, 2), np.nan), np.full((n, 1), 7)
-    unsure = LandmarkDetections(stamps_ns, np.ones(n), np.zeros(n), noise, ids, probable)
+    unsure = LandmarkDetections(
+        stamps_ns, np.ones(n), np.zeros(n), noise, ids, probable
+    )
     assert ran(replace(sequence, detections=unsure)).status == "ok"
     warmed_up, judged = (one.seen for one in ran.made)
     assert warmed_up[-1].end_ns >= stamps_ns[11]
@@ -172,16 +192,24 @@ def test_only_calls_of_the_estimator_are_timed(ran):
 
 
 def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(ran):
-    result = ran(process=failing_after(6, ZeroDivisionError("the matrix\n  is singular")))
+    result = ran(
+        process=failing_after(6, ZeroDivisionError("the matrix\n  is singular"))
+    )
     assert result.status == "failed"
-    assert result.reason == "3.500 s after the start (4500000000 ns): ZeroDivisionError: the matrix is singular"
+    assert (
+        result.reason
+        == "3.500 s after the start (4500000000 ns): ZeroDivisionError: the matrix is singular"
+    )
     assert result.causal is None
     assert len(result.update_s) == 6
 
 
 @pytest.mark.parametrize("can_tell", [True, False])
 def test_a_run_names_what_was_refused_and_withheld_even_where_it_fails(ran, can_tell):
-    told = {"refused": [RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)], "withheld": ["landmark 3; open: z"]}
+    told = {
+        "refused": [RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)],
+        "withheld": ["landmark 3; open: z"],
+    }
 
     def telling(what: str):
         return lambda _: told[what] if can_tell else 1 / 0
@@ -196,7 +224,10 @@ def test_a_run_names_what_was_refused_and_withheld_even_where_it_fails(ran, can_
     assert (ran().refused, ran().withheld) == ([], []), "telling is optional"
     assert (
         withheld_of(
-            load_estimator("dead-reckoning")(straight_sequence().calibration, Odometry(straight_sequence().calibration))
+            load_estimator("dead-reckoning")(
+                straight_sequence().calibration,
+                Odometry(straight_sequence().calibration),
+            )
         )
         == []
     )
@@ -209,18 +240,55 @@ IMPOSSIBLE = "causal covariance is impossible"
 @pytest.mark.parametrize(
     ("methods", "reason"),
     [
-        ({"process": changing(world_T_body=NAN_POSE)}, "causal pose is not finite in 39 of 40 rows, first at ns"),
-        ({"trajectory": lambda self: off_by(Offset.trajectory(self), np.nan)}, "smoothed pose is not finite in 40 of"),
-        ({"landmarks": lambda _: replace(map_of([[0.0] * 3]), covariances=-np.eye(3)[None])}, "at landmark 7"),
-        ({"process": changing(covariance=np.diag([1.0] * 5 + [-1e-3]))}, f"{IMPOSSIBLE} in 39 of 40 rows"),
-        ({"process": changing(covariance=np.eye(6) + 0.5 * np.eye(6, k=1))}, IMPOSSIBLE),
-        ({"process": changing(covariance=np.where(np.eye(6) > 0, np.nan, 0.0))}, IMPOSSIBLE),
-        ({"process": changing(stamp_ns=17)}, "returned an estimate for 17 ns when asked for 2000000000 ns"),
+        (
+            {"process": changing(world_T_body=NAN_POSE)},
+            "causal pose is not finite in 39 of 40 rows, first at ns",
+        ),
+        (
+            {"trajectory": lambda self: off_by(Offset.trajectory(self), np.nan)},
+            "smoothed pose is not finite in 40 of",
+        ),
+        (
+            {
+                "landmarks": lambda _: replace(
+                    map_of([[0.0] * 3]), covariances=-np.eye(3)[None]
+                )
+            },
+            "at landmark 7",
+        ),
+        (
+            {"process": changing(covariance=np.diag([1.0] * 5 + [-1e-3]))},
+            f"{IMPOSSIBLE} in 39 of 40 rows",
+        ),
+        (
+            {"process": changing(covariance=np.eye(6) + 0.5 * np.eye(6, k=1))},
+            IMPOSSIBLE,
+        ),
+        (
+            {"process": changing(covariance=np.where(np.eye(6) > 0, np.nan, 0.0))},
+            IMPOSSIBLE,
+        ),
+        (
+            {"process": changing(stamp_ns=17)},
+            "returned an estimate for 17 ns when asked for 2000000000 ns",
+        ),
         ({"process": lambda *_: None}, "never returned an estimate"),
-        ({"trajectory": lambda self: Offset.trajectory(self).rows(slice(1, None))}, "has 39 instants, not the 40"),
-        ({"landmarks": lambda _: map_of([[np.inf, 0.0, 0.0]])}, "is not finite in 1 of 1 rows, first at landmark 7"),
-        ({"beside": with_covariance(np.full((6, 6), np.nan))}, ""),  # unknown covariances are allowed,
-        ({"beside": with_covariance(np.diag([1.0] * 5 + [-1e-12]))}, ""),  # rounding below zero,
+        (
+            {"trajectory": lambda self: Offset.trajectory(self).rows(slice(1, None))},
+            "has 39 instants, not the 40",
+        ),
+        (
+            {"landmarks": lambda _: map_of([[np.inf, 0.0, 0.0]])},
+            "is not finite in 1 of 1 rows, first at landmark 7",
+        ),
+        (
+            {"beside": with_covariance(np.full((6, 6), np.nan))},
+            "",
+        ),  # unknown covariances are allowed,
+        (
+            {"beside": with_covariance(np.diag([1.0] * 5 + [-1e-12]))},
+            "",
+        ),  # rounding below zero,
         ({"landmarks": lambda _: map_of([])}, ""),  # and an empty map
     ],
 )
@@ -231,7 +299,9 @@ def test_results_that_cannot_be_scored_fail_the_run(ran, methods, reason):
     assert bool(result.reason) == bool(reason)
 
 
-def test_mistakes_and_interruptions_of_the_user_are_raised_and_a_broken_installation_is_a_failed_run(ran, monkeypatch):
+def test_mistakes_and_interruptions_of_the_user_are_raised_and_a_broken_installation_is_a_failed_run(
+    ran, monkeypatch
+):
     with pytest.raises(EstimatorError, match="offset_cm"):
         ran(settings={"offset_cm": 3})
     with pytest.raises(UnknownEstimatorError):
@@ -251,15 +321,23 @@ def test_mistakes_and_interruptions_of_the_user_are_raised_and_a_broken_installa
 def test_the_map_is_kept_on_the_way_as_it_was_known_then(ran):
     """The estimator has as many landmarks as it took steps."""
     sequence = straight_sequence()
-    result = ran(sequence, landmarks=lambda self: map_of([[0.0] * 3] * len(self.estimates)))
+    result = ran(
+        sequence, landmarks=lambda self: map_of([[0.0] * 3] * len(self.estimates))
+    )
     instants = sequence.instants(2.0)
     expected = kept_map_instants(instants, sequence.start_ns)
-    assert MAPS_KEPT < len(expected) <= MAPS_KEPT + 2, "those of the paper, and the last one once"
+    assert MAPS_KEPT < len(expected) <= MAPS_KEPT + 2, (
+        "those of the paper, and the last one once"
+    )
     assert [known.stamp_ns for known in result.maps] == expected.tolist()
-    assert [len(known.landmarks) for known in result.maps] == (np.searchsorted(instants, expected) + 1).tolist()
+    assert [len(known.landmarks) for known in result.maps] == (
+        np.searchsorted(instants, expected) + 1
+    ).tolist()
     assert result.landmarks is result.maps[-1].landmarks
     only_last = ran(sequence, options={"interim_maps": False})
-    assert [known.stamp_ns for known in only_last.maps] == [only_last.causal.stamps_ns[-1]]
+    assert [known.stamp_ns for known in only_last.maps] == [
+        only_last.causal.stamps_ns[-1]
+    ]
 
 
 def test_no_map_is_asked_for_before_the_first_estimate(ran):
@@ -272,7 +350,9 @@ def test_no_map_is_asked_for_before_the_first_estimate(ran):
         return Offset.landmarks(self)
 
     result = ran(
-        process=process, landmarks=landmarks, trajectory=lambda self: Trajectory.from_estimates(self.estimates[29:])
+        process=process,
+        landmarks=landmarks,
+        trajectory=lambda self: Trajectory.from_estimates(self.estimates[29:]),
     )
     assert (result.status, result.reason) == ("ok", "")
     assert 0 < len(result.maps) < MAPS_KEPT
@@ -300,8 +380,13 @@ def touch() -> float:
     return float(np.ones(MEGABYTES * 125_000).sum())
 
 
-@pytest.mark.skipif(np.isnan(PeakMemory().rise_mb()), reason="this system does not tell a process's peak memory")
-def test_peak_memory_sees_what_was_freed_again_and_forgets_what_was_before(monkeypatch, tmp_path):
+@pytest.mark.skipif(
+    np.isnan(PeakMemory().rise_mb()),
+    reason="this system does not tell a process's peak memory",
+)
+def test_peak_memory_sees_what_was_freed_again_and_forgets_what_was_before(
+    monkeypatch, tmp_path
+):
     touch()
     quiet = PeakMemory()
     assert quiet.rise_mb() < MEGABYTES / 2

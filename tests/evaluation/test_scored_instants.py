@@ -27,7 +27,9 @@ def trajectory(seconds: list[float]) -> Trajectory:
     stamps = np.round(np.array(seconds) * 1e9).astype(np.int64)
     n = len(stamps)
     positions = np.column_stack([stamps * 1e-9, np.zeros((n, 2))])
-    return Trajectory.without_covariances(stamps, positions, np.tile([0.0, 0, 0, 1], (n, 1)))
+    return Trajectory.without_covariances(
+        stamps, positions, np.tile([0.0, 0, 0, 1], (n, 1))
+    )
 
 
 def seconds(*values: float) -> np.ndarray:
@@ -37,7 +39,10 @@ def seconds(*values: float) -> np.ndarray:
 DENSE = np.arange(0, 3.01, 0.1).tolist()
 
 
-OCCLUDED, HIDDEN_SHORTLY = ([t for t in DENSE if not low < t < high] for low, high in ((1.0, 1.95), (1.05, 1.45)))
+OCCLUDED, HIDDEN_SHORTLY = (
+    [t for t in DENSE if not low < t < high]
+    for low, high in ((1.0, 1.95), (1.05, 1.45))
+)
 SPARSE = [0.0, 1.0, 2.0, 3.0, 6.0, 7.0]
 # fmt: off
 SCORED = [
@@ -52,13 +57,26 @@ SCORED = [
 # fmt: on
 
 
-@pytest.mark.parametrize(("asked", "truth", "runs", "kept", "outside", "in_gap", "lacking", "said"), SCORED)
-def test_every_instant_is_scored_or_left_out_for_one_reason(asked, truth, runs, kept, outside, in_gap, lacking, said):
+@pytest.mark.parametrize(
+    ("asked", "truth", "runs", "kept", "outside", "in_gap", "lacking", "said"), SCORED
+)
+def test_every_instant_is_scored_or_left_out_for_one_reason(
+    asked, truth, runs, kept, outside, in_gap, lacking, said
+):
     """Edges of a gap are in the truth; what lies outside the truth or in its gap is no fault of a run."""
-    results = [RunResult("a", {}, "ok", causal=trajectory(of)) if of else RunResult("a", {}, "failed") for of in runs]
+    results = [
+        RunResult("a", {}, "ok", causal=trajectory(of))
+        if of
+        else RunResult("a", {}, "failed")
+        for of in runs
+    ]
     scored = scored_instants(seconds(*asked), trajectory(truth), results)
     np.testing.assert_array_equal(scored.stamps_ns, seconds(*kept))
-    assert (scored.outside_truth, scored.in_truth_gap, scored.not_estimated) == (outside, in_gap, lacking)
+    assert (scored.outside_truth, scored.in_truth_gap, scored.not_estimated) == (
+        outside,
+        in_gap,
+        lacking,
+    )
     assert scored.asked == len(asked)
     assert said in str(scored)
 
@@ -75,7 +93,9 @@ def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s):
     kept = map_instants(asked, int(seconds(7.0)[0]))
     assert set(kept.tolist()) <= set(asked.tolist())
     np.testing.assert_allclose(
-        (kept - seconds(7.0)) * 1e-9, np.array([833.1, 1369.4, 2039.0]) * scale, atol=0.26 * scale
+        (kept - seconds(7.0)) * 1e-9,
+        np.array([833.1, 1369.4, 2039.0]) * scale,
+        atol=0.26 * scale,
     )
     assert kept[-1] == asked[-1]
 
@@ -119,9 +139,19 @@ def test_only_the_same_landmarks_of_its_design_repeat_the_published_experiment()
         ({"positions": true.positions + np.array([0.0, 0.005, 0.0])}, False),
         ({"ids": IDS + 1}, False),
     ):
-        assert repeats_published(replace(run, true_landmarks=replace(true, **change))) == repeats, change
+        assert (
+            repeats_published(replace(run, true_landmarks=replace(true, **change)))
+            == repeats
+        ), change
     assert not repeats_published(replace(run, true_landmarks=None))
     assert not repeats_published(
-        replace(run, true_landmarks=LandmarkMap(np.arange(1, 6), np.zeros((5, 3)), np.zeros((5, 3, 3))))
+        replace(
+            run,
+            true_landmarks=LandmarkMap(
+                np.arange(1, 6), np.zeros((5, 3)), np.zeros((5, 3, 3))
+            ),
+        )
     )
-    assert not repeats_published(replace(run, true_landmarks=true, notes={OWN_DESIGNS: "1: ring, of mine.toml"}))
+    assert not repeats_published(
+        replace(run, true_landmarks=true, notes={OWN_DESIGNS: "1: ring, of mine.toml"})
+    )

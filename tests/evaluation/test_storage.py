@@ -14,7 +14,11 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files
+from sonar_graph.evaluation.storage import (
+    read_comparison,
+    write_comparison,
+    write_viewer_files,
+)
 from sonar_graph.report import write_report
 
 from .conftest import Offset, straight_sequence
@@ -24,7 +28,9 @@ from .conftest import Offset, straight_sequence
 def comparison(install) -> Comparison:
     """One run that went well, one that failed."""
     install(other=Offset)
-    return compare(straight_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}})
+    return compare(
+        straight_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}}
+    )
 
 
 @pytest.fixture
@@ -43,7 +49,11 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
     """Equal all the way down; arrays exactly, NaN equal to NaN."""
     if is_dataclass(left):
         for field in fields(left):
-            assert_same(getattr(left, field.name), getattr(right, field.name), f"{where}.{field.name}")
+            assert_same(
+                getattr(left, field.name),
+                getattr(right, field.name),
+                f"{where}.{field.name}",
+            )
     elif isinstance(left, dict):
         assert list(left) == list(right), where
         for key in left:
@@ -62,19 +72,33 @@ def test_reading_returns_what_was_written(comparison, folder):
     restored = read_comparison(folder)
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
         assert_same(getattr(comparison, name), getattr(restored, name), name)
-    for name in ("name", "notes", "truth", "true_landmarks", "detections", "start_ns", "end_ns"):
-        assert_same(getattr(comparison.sequence, name), getattr(restored.sequence, name), name)
+    for name in (
+        "name",
+        "notes",
+        "truth",
+        "true_landmarks",
+        "detections",
+        "start_ns",
+        "end_ns",
+    ):
+        assert_same(
+            getattr(comparison.sequence, name), getattr(restored.sequence, name), name
+        )
     assert restored.sequence.calibration == comparison.sequence.calibration
     assert isinstance(restored.sequence.calibration, Calibration)
 
 
 @pytest.mark.parametrize("truth", ["none", "without covariances", "with covariances"])
-def test_truth_keeps_its_covariances_and_what_is_unknown_takes_no_space(install, tmp_path, truth):
+def test_truth_keeps_its_covariances_and_what_is_unknown_takes_no_space(
+    install, tmp_path, truth
+):
     sequence = straight_sequence(truth=truth != "none")
     if truth == "with covariances":
         covariances = sequence.truth.covariances.copy()
         covariances[-1] = np.diag(np.arange(1.0, 7.0))
-        sequence = replace(sequence, truth=replace(sequence.truth, covariances=covariances))
+        sequence = replace(
+            sequence, truth=replace(sequence.truth, covariances=covariances)
+        )
     written = compare(sequence, ["offset"])
     write_comparison(written, tmp_path)
     restored = read_comparison(tmp_path)
@@ -89,13 +113,17 @@ def test_json_is_strict_and_tells_units_and_protocol(folder):
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
 
-    index = json.loads((folder / "comparison.json").read_text("utf-8"), parse_constant=refuse)
+    index = json.loads(
+        (folder / "comparison.json").read_text("utf-8"), parse_constant=refuse
+    )
     score = index["runs"]["offset"]["scores"]["causal.ate_raw_m"]
     assert score["value"] == pytest.approx(0.4)
     assert score["unit"] == "m"
     assert "not aligned" in score["protocol"]
     assert index["runs"]["offset"]["params"]["offset_m"] == 0.4
-    assert index["runs"]["offset"]["errors"]["causal"]["rms_xyz_m"] == pytest.approx([0.0, 0.4, 0.0])
+    assert index["runs"]["offset"]["errors"]["causal"]["rms_xyz_m"] == pytest.approx(
+        [0.0, 0.4, 0.0]
+    )
     assert index["runs"]["broken"]["status"] == "failed"
     assert "diverged" in index["runs"]["broken"]["reason"]
 
@@ -103,15 +131,25 @@ def test_json_is_strict_and_tells_units_and_protocol(folder):
 def test_what_is_not_a_number_is_null(comparison, tmp_path):
     object.__setattr__(comparison.runs[0], "peak_memory_mb", float("nan"))
     write_comparison(comparison, tmp_path)
-    assert json.loads((tmp_path / "comparison.json").read_text("utf-8"))["runs"]["offset"]["peak_memory_mb"] is None
+    assert (
+        json.loads((tmp_path / "comparison.json").read_text("utf-8"))["runs"]["offset"][
+            "peak_memory_mb"
+        ]
+        is None
+    )
     assert np.isnan(read_comparison(tmp_path).runs[0].peak_memory_mb)
 
 
-def test_folder_holds_what_other_tools_read_without_code_and_of_a_failed_run_only_its_reason(folder):
+def test_folder_holds_what_other_tools_read_without_code_and_of_a_failed_run_only_its_reason(
+    folder,
+):
     good, failed = folder / "runs" / "offset", folder / "runs" / "broken"
     files = "causal.tum", "landmarks.csv", "result.json", "series.npz", "trajectory.tum"
     assert tuple(sorted(path.name for path in good.iterdir())) == files
-    assert sorted(path.name for path in failed.iterdir()) == ["result.json", "series.npz"]
+    assert sorted(path.name for path in failed.iterdir()) == [
+        "result.json",
+        "series.npz",
+    ]
     causal = file_interface.read_tum_trajectory_file(good / "causal.tum")
     smoothed = file_interface.read_tum_trajectory_file(good / "trajectory.tum")
     np.testing.assert_allclose(causal.positions_xyz[:, 1], 0.4)
@@ -122,7 +160,9 @@ def test_folder_holds_what_other_tools_read_without_code_and_of_a_failed_run_onl
     assert result["params"]["offset_m"] == 0.4
     assert result["environment"]["gtsam"]
     assert result["timings"]["update_median_ms"] > 0
-    assert "diverged" in json.loads((failed / "result.json").read_text("utf-8"))["reason"]
+    assert (
+        "diverged" in json.loads((failed / "result.json").read_text("utf-8"))["reason"]
+    )
     for path in folder.rglob("*.npz"):
         with zipfile.ZipFile(path) as archive:
             for name in archive.namelist():
@@ -133,14 +173,23 @@ def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
     write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
     (tmp_path / "runs" / "other" / "my notes.txt").write_text("kept")
     (tmp_path / "runs" / "broken").mkdir()
-    (tmp_path / "runs" / "broken" / "trajectory.tum").write_text("of a run that another program did")
+    (tmp_path / "runs" / "broken" / "trajectory.tum").write_text(
+        "of a run that another program did"
+    )
     write_comparison(comparison, tmp_path)
-    assert [path.name for path in (tmp_path / "runs" / "other").iterdir()] == ["my notes.txt"]
+    assert [path.name for path in (tmp_path / "runs" / "other").iterdir()] == [
+        "my notes.txt"
+    ]
     assert (tmp_path / "runs" / "broken" / "trajectory.tum").exists()
-    assert [run.estimator for run in read_comparison(tmp_path).runs] == ["offset", "broken"]
+    assert [run.estimator for run in read_comparison(tmp_path).runs] == [
+        "offset",
+        "broken",
+    ]
 
 
-def test_a_page_of_an_earlier_comparison_does_not_stay_beside_the_numbers_of_a_later_one(comparison, tmp_path):
+def test_a_page_of_an_earlier_comparison_does_not_stay_beside_the_numbers_of_a_later_one(
+    comparison, tmp_path
+):
     write_report(comparison, tmp_path)
     write_comparison(comparison, tmp_path)
     assert not (tmp_path / "report.html").exists()
@@ -149,7 +198,9 @@ def test_a_page_of_an_earlier_comparison_does_not_stay_beside_the_numbers_of_a_l
     assert (tmp_path / "report.html").read_text() == "mine"
 
 
-def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(comparison, monkeypatch, tmp_path):
+def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(
+    comparison, monkeypatch, tmp_path
+):
     write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
@@ -159,7 +210,9 @@ def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(comparis
     monkeypatch.setattr("sonar_graph.evaluation.storage.write_landmarks_csv", fail)
     with pytest.raises(OSError, match="no space"):
         write_comparison(comparison, tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()
+    } == before
     with pytest.raises(OSError, match="no space"):
         write_comparison(comparison, tmp_path / "new")
     assert not (tmp_path / "new").exists()
@@ -179,7 +232,11 @@ def test_a_name_that_leaves_the_folder_is_refused(comparison, tmp_path):
         ("comparison.json", b'{"format": "something else"}', "something else"),
         ("runs/offset/series.npz", b"PK cut off", r"series\.npz"),
         ("sequence.npz", None, r"sequence\.npz"),
-        ("sequence.npz", "truth.positions", "truth lacks positions"),  # the name of a column to leave out
+        (
+            "sequence.npz",
+            "truth.positions",
+            "truth lacks positions",
+        ),  # the name of a column to leave out
     ],
 )
 def test_damage_is_named(folder, file, content, named):
@@ -226,12 +283,20 @@ def test_a_pipe_in_the_place_of_results_is_refused(folder):
         read_comparison(folder)
 
 
-def test_the_result_carries_the_json_files_beside_it_settings_versions_and_topics(with_viewer_files):
+def test_the_result_carries_the_json_files_beside_it_settings_versions_and_topics(
+    with_viewer_files,
+):
     with (with_viewer_files / "result.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         attached = {a.name: a.data for a in reader.iter_attachments()}
-        record = {m.name: m.metadata for m in reader.iter_metadata()}["sonar_graph_result"]
-    assert set(attached) == {"comparison.json", "runs/offset/result.json", "runs/broken/result.json"}
+        record = {m.name: m.metadata for m in reader.iter_metadata()}[
+            "sonar_graph_result"
+        ]
+    assert set(attached) == {
+        "comparison.json",
+        "runs/offset/result.json",
+        "runs/broken/result.json",
+    }
     for name, content in attached.items():
         assert content == (with_viewer_files / name).read_bytes()
     environment = json.loads(attached["comparison.json"])["environment"]
@@ -243,6 +308,8 @@ def test_the_result_carries_the_json_files_beside_it_settings_versions_and_topic
 
 def test_layouts_name_what_ran_and_not_what_failed(with_viewer_files):
     layout = json.loads((with_viewer_files / "result.foxglove.json").read_text("utf-8"))
-    names = {topic.split("/")[1] for topic in layout["configById"]["3D!result"]["topics"]}
+    names = {
+        topic.split("/")[1] for topic in layout["configById"]["3D!result"]["topics"]
+    }
     assert names == {"offset", "ground_truth"}
     assert "/offset/path" in (with_viewer_files / "result.rviz").read_text("utf-8")

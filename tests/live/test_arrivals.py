@@ -12,11 +12,19 @@ MS = 1_000_000
 
 
 def imu(at_ms):
-    return "imu", at_ms * MS, Imu(np.array([at_ms * MS]), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.81]]))
+    return (
+        "imu",
+        at_ms * MS,
+        Imu(np.array([at_ms * MS]), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.81]])),
+    )
 
 
 def dvl(at_ms):
-    return "dvl", at_ms * MS, Dvl(np.array([at_ms * MS]), np.zeros((1, 3)), np.full((1, 3, 3), np.nan))
+    return (
+        "dvl",
+        at_ms * MS,
+        Dvl(np.array([at_ms * MS]), np.zeros((1, 3)), np.full((1, 3, 3), np.nan)),
+    )
 
 
 def depth(at_ms):
@@ -95,10 +103,14 @@ def test_the_last_steps_end_with_imu_and_doppler_log():
     arrivals = given(imu(0), dvl(0), imu(250), dvl(230), depth(900))
     assert ends_ms(arrivals) == [100, 200, 300, 400, 500, 600]
     arrivals = given(imu(0), dvl(0), imu(250), dvl(230))
-    assert [step.end_ns // MS for step in arrivals.steps()] + [s.end_ns // MS for s in arrivals.rest()] == [100, 200]
+    assert [step.end_ns // MS for step in arrivals.steps()] + [
+        s.end_ns // MS for s in arrivals.rest()
+    ] == [100, 200]
 
 
-@pytest.mark.parametrize(("rate_hz", "lateness_s"), [(0.0, 0.1), (np.nan, 0.1), (1.0, -0.1), (1.0, np.inf)])
+@pytest.mark.parametrize(
+    ("rate_hz", "lateness_s"), [(0.0, 0.1), (np.nan, 0.1), (1.0, -0.1), (1.0, np.inf)]
+)
 def test_impossible_choices_are_refused(rate_hz, lateness_s):
     with pytest.raises(MeasurementError, match=r"rate|budget"):
         Arrivals(rate_hz, lateness_s)

@@ -30,8 +30,12 @@ def test_a_record_that_is_there_is_not_written_over(tmp_path, capsys):
     assert (tmp_path / "record.mcap").read_bytes() == b"precious"
 
 
-def test_a_router_that_is_not_there_is_named_before_anything_is_written(tmp_path, capsys):
-    code, line = said(capsys, "live", "-o", tmp_path / "dive", "--connect", "tcp/127.0.0.1:1")
+def test_a_router_that_is_not_there_is_named_before_anything_is_written(
+    tmp_path, capsys
+):
+    code, line = said(
+        capsys, "live", "-o", tmp_path / "dive", "--connect", "tcp/127.0.0.1:1"
+    )
     assert code == 2
     assert "tcp/127.0.0.1:1" in line
     assert not (tmp_path / "dive").exists()
@@ -58,15 +62,24 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     world = simulate_mission(MissionOptions(duration_s=40.0, frame_rate_hz=5.0))
     write_log(tmp_path / "log.mcap", world)
     where, go = free_endpoint(), tmp_path / "go"
-    player = subprocess.Popen([*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go])
+    player = subprocess.Popen(
+        [*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go]
+    )
     time.sleep(3.0)
     try:
-        live = begun(tmp_path / "first", where, "--calibration", str(tmp_path / "log.mcap"))
+        live = begun(
+            tmp_path / "first", where, "--calibration", str(tmp_path / "log.mcap")
+        )
         go.touch()
         time.sleep(12.0)
         live.kill()
         live.communicate()
-        live = begun(tmp_path / "second", where, "--resume", str(tmp_path / "first" / "record.mcap"))
+        live = begun(
+            tmp_path / "second",
+            where,
+            "--resume",
+            str(tmp_path / "first" / "record.mcap"),
+        )
         assert player.wait(120) == 0
         time.sleep(1.0)
         live.send_signal(signal.SIGINT)
@@ -74,19 +87,34 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     finally:
         player.kill()
     assert live.returncode == 0, output
-    subprocess.run([*COMMAND, "run", tmp_path / "second/record.mcap", "-o", tmp_path / "again"], check=True)
+    subprocess.run(
+        [*COMMAND, "run", tmp_path / "second/record.mcap", "-o", tmp_path / "again"],
+        check=True,
+    )
     for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
-        mine, theirs = ((tmp_path / folder / "runs/isam2" / name).read_bytes() for folder in ("second", "again"))
+        mine, theirs = (
+            (tmp_path / folder / "runs/isam2" / name).read_bytes()
+            for folder in ("second", "again")
+        )
         assert mine == theirs
         assert mine.count(b"\n") > 5
-    calibrations = [read_log(tmp_path / folder / "record.mcap").calibration for folder in ("first", "second")]
+    calibrations = [
+        read_log(tmp_path / folder / "record.mcap").calibration
+        for folder in ("first", "second")
+    ]
     assert calibrations[0] == calibrations[1]
-    assert calibrations[1].start.position_m == world.calibration.start.position_m != (0.0, 0.0, 0.0)
+    assert (
+        calibrations[1].start.position_m
+        == world.calibration.start.position_m
+        != (0.0, 0.0, 0.0)
+    )
 
 
 def begun(folder, where, *options):
     command = [*COMMAND, "live", "-o", str(folder), "--connect", where, *options]
-    live = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    live = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     for line in live.stdout:
         if "listening" in line:
             return live

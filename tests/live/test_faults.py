@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, run_estimator, write_log
-from sonar_graph.live import LiveOptions, LiveRun, Publisher, inbox, open_session, subscribe
+from sonar_graph.live import (
+    LiveOptions,
+    LiveRun,
+    Publisher,
+    inbox,
+    open_session,
+    subscribe,
+)
 from sonar_graph.live.outlets import ZenohOutlet
 from sonar_graph.live.zenoh_link import definition_of
 from sonar_graph.logs import LiveRecord
@@ -39,7 +46,10 @@ def endpoint():
 
 @pytest.fixture
 def messages(tmp_path):
-    write_log(tmp_path / "log.mcap", simulate_mission(MissionOptions(duration_s=20.0, frame_rate_hz=5.0)))
+    write_log(
+        tmp_path / "log.mcap",
+        simulate_mission(MissionOptions(duration_s=20.0, frame_rate_hz=5.0)),
+    )
     return messages_of(tmp_path / "log.mcap", np.random.default_rng(0), 0.0)
 
 
@@ -49,13 +59,21 @@ class Robot(threading.Thread):
     def __init__(self, endpoint, messages, pace_at=lambda _: PACE, breaks_at_s=None):
         super().__init__(daemon=True)
         self.is_heard, self.is_done = threading.Event(), threading.Event()
-        self._endpoint, self._messages, self._pace_at, self._breaks_at_s = endpoint, messages, pace_at, breaks_at_s
+        self._endpoint, self._messages, self._pace_at, self._breaks_at_s = (
+            endpoint,
+            messages,
+            pace_at,
+            breaks_at_s,
+        )
         self._open()
 
     def _open(self):
         self.session = open_session(listen=[self._endpoint])
         kinds = {m.topic: m.type_name for m in self._messages}
-        self._publishers = {topic: Publisher(self.session, 0, topic, kind) for topic, kind in kinds.items()}
+        self._publishers = {
+            topic: Publisher(self.session, 0, topic, kind)
+            for topic, kind in kinds.items()
+        }
 
     def run(self):
         self.is_heard.wait(30)
@@ -80,9 +98,14 @@ class Robot(threading.Thread):
 def lived(folder, endpoint, robot, listener=None):
     """A live run on what a robot sends: the run, its outcome, and what was said."""
     said, taken = [], {}
-    with open_session([endpoint]) as session, LiveRecord(folder / "record.mcap") as record:
+    with (
+        open_session([endpoint]) as session,
+        LiveRecord(folder / "record.mcap") as record,
+    ):
         options = LiveOptions("ekf-slam", lateness_s=1.0)
-        with LiveRun(record, definition_of, options, [ZenohOutlet(session, 0)], said.append) as run:
+        with LiveRun(
+            record, definition_of, options, [ZenohOutlet(session, 0)], said.append
+        ) as run:
             subscriptions = subscribe(session, 0, run.accept)
             if listener is not None:
                 taken["subscription"] = listener(endpoint)
@@ -110,7 +133,8 @@ def assert_equals_log(outcome, folder, at_least):
     assert len(common) >= at_least
     for name in ("positions", "quaternions_xyzw", "covariances"):
         mine, theirs = (
-            getattr(one, name)[np.searchsorted(one.stamps_ns, common)].tobytes() for one in (outcome.causal, again)
+            getattr(one, name)[np.searchsorted(one.stamps_ns, common)].tobytes()
+            for one in (outcome.causal, again)
         )
         assert mine == theirs, name
 
@@ -119,9 +143,18 @@ def at_s(messages, message):
     return (message.arrival_ns - messages[0].arrival_ns) * 1e-9
 
 
-def test_a_doppler_log_that_stops_and_returns_is_named_both_times(tmp_path, endpoint, messages, monkeypatch):
+def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
+    tmp_path, endpoint, messages, monkeypatch
+):
     monkeypatch.setattr(inbox, "SILENT_S", 0.5)
-    robot = Robot(endpoint, [m for m in messages if m.topic != "/dvl/data" or not 8 < at_s(messages, m) < 14])
+    robot = Robot(
+        endpoint,
+        [
+            m
+            for m in messages
+            if m.topic != "/dvl/data" or not 8 < at_s(messages, m) < 14
+        ],
+    )
     outcome, counts, said = lived(tmp_path, endpoint, robot)
     assert any(line.startswith("/dvl/data: nothing since") for line in said)
     assert any(line.startswith("/dvl/data comes again") for line in said)
@@ -141,29 +174,47 @@ def test_images_that_go_on_are_not_nothing():
 
 def test_a_sender_that_ends_is_missed(tmp_path, endpoint, messages, monkeypatch):
     monkeypatch.setattr(inbox, "SILENT_S", 0.5)
-    outcome, _, said = lived(tmp_path, endpoint, Robot(endpoint, [m for m in messages if at_s(messages, m) < 10]))
-    missed = [line for line in said if line.startswith("nothing comes any more") or " comes again, " in line]
+    outcome, _, said = lived(
+        tmp_path,
+        endpoint,
+        Robot(endpoint, [m for m in messages if at_s(messages, m) < 10]),
+    )
+    missed = [
+        line
+        for line in said
+        if line.startswith("nothing comes any more") or " comes again, " in line
+    ]
     assert missed[-1].startswith("nothing comes any more")
     for line, following in pairwise(missed):
         assert " comes again, " in line or " comes again, " in following
     assert_equals_log(outcome, tmp_path, 50)
 
 
-def test_a_clock_that_is_set_ahead_by_a_minute_costs_messages_by_name_only(tmp_path, endpoint, messages):
+def test_a_clock_that_is_set_ahead_by_a_minute_costs_messages_by_name_only(
+    tmp_path, endpoint, messages
+):
     def stepped(message):
         if at_s(messages, message) < 10 or message.topic == "/tf_static":
             return message
         seconds = struct.unpack_from("<i", message.payload, 4)[0] + 60
-        return message._replace(payload=message.payload[:4] + struct.pack("<i", seconds) + message.payload[8:])
+        return message._replace(
+            payload=message.payload[:4]
+            + struct.pack("<i", seconds)
+            + message.payload[8:]
+        )
 
-    outcome, counts, _ = lived(tmp_path, endpoint, Robot(endpoint, [stepped(m) for m in messages]))
+    outcome, counts, _ = lived(
+        tmp_path, endpoint, Robot(endpoint, [stepped(m) for m in messages])
+    )
     assert any("a clock was set" in reason for reason in counts["dropped"])
     assert not counts["lost"]
     assert_equals_log(outcome, tmp_path, 100)
 
 
 def test_a_burst_at_ten_times_the_pace_loses_nothing(tmp_path, endpoint, messages):
-    robot = Robot(endpoint, messages, pace_at=lambda at_s: 10 * PACE if 8 < at_s < 14 else PACE)
+    robot = Robot(
+        endpoint, messages, pace_at=lambda at_s: 10 * PACE if 8 < at_s < 14 else PACE
+    )
     outcome, counts, _ = lived(tmp_path, endpoint, robot)
     assert not counts["lost"]
     assert sum(counts["received"].values()) == len(messages)
@@ -174,7 +225,8 @@ def test_after_a_router_that_restarts_the_run_goes_on(tmp_path, endpoint, messag
     robot = Robot(endpoint, messages, breaks_at_s=10.0)
     outcome, counts, _ = lived(tmp_path, endpoint, robot)
     received = sum(counts["received"].values())
-    assert received > 0.9 * len(messages)  # what was sent while it looked for the router is missing
+    # what was sent while it looked for the router is missing
+    assert received > 0.9 * len(messages)
     assert outcome.causal.stamps_ns[-1] - outcome.causal.stamps_ns[0] > 18 * SECOND
     assert_equals_log(outcome, tmp_path, 150)
 
@@ -184,19 +236,24 @@ def test_a_viewer_that_stalls_delays_nobody(tmp_path, endpoint, messages):
     arrived = []
 
     def listener(where):
-        viewer = subprocess.Popen([sys.executable, "-c", STALLED, where], stdout=subprocess.PIPE, text=True)
+        viewer = subprocess.Popen(
+            [sys.executable, "-c", STALLED, where], stdout=subprocess.PIPE, text=True
+        )
         assert viewer.stdout.readline() == "listening\n"
         viewer.send_signal(signal.SIGSTOP)
         session = open_session([where])
         subscriber = session.declare_subscriber(
-            "0/sonar_graph/odometry/**", lambda s: arrived.append((time.monotonic(), s.payload.to_bytes()))
+            "0/sonar_graph/odometry/**",
+            lambda s: arrived.append((time.monotonic(), s.payload.to_bytes())),
         )
         stalled.append((viewer, session, subscriber))
         return subscriber
 
     stalled = []
     try:
-        outcome, counts, _ = lived(tmp_path, endpoint, Robot(endpoint, messages), listener)
+        outcome, counts, _ = lived(
+            tmp_path, endpoint, Robot(endpoint, messages), listener
+        )
     finally:
         for viewer, session, _ in stalled:
             viewer.kill()
@@ -209,14 +266,27 @@ def test_a_viewer_that_stalls_delays_nobody(tmp_path, endpoint, messages):
 
 
 @pytest.mark.parametrize("may_drop", [True, False])
-def test_only_a_publisher_that_may_drop_is_not_held_up_by_a_subscriber_that_stalls(endpoint, may_drop):
+def test_only_a_publisher_that_may_drop_is_not_held_up_by_a_subscriber_that_stalls(
+    endpoint, may_drop
+):
     with open_session(listen=[endpoint]) as router:
-        publisher = Publisher(router, 0, "/sonar_graph/odometry", "nav_msgs/msg/Odometry", may_drop=may_drop)
-        with subprocess.Popen([sys.executable, "-c", STALLED, endpoint], stdout=subprocess.PIPE, text=True) as viewer:
+        publisher = Publisher(
+            router,
+            0,
+            "/sonar_graph/odometry",
+            "nav_msgs/msg/Odometry",
+            may_drop=may_drop,
+        )
+        with subprocess.Popen(
+            [sys.executable, "-c", STALLED, endpoint], stdout=subprocess.PIPE, text=True
+        ) as viewer:
             assert viewer.stdout.readline() == "listening\n"
             time.sleep(0.5)
             viewer.send_signal(signal.SIGSTOP)
-            sender = threading.Thread(target=lambda: [publisher.put(bytes(1 << 20)) for _ in range(100)], daemon=True)
+            sender = threading.Thread(
+                target=lambda: [publisher.put(bytes(1 << 20)) for _ in range(100)],
+                daemon=True,
+            )
             sender.start()
             sender.join(3.0)
             assert sender.is_alive() == (not may_drop)

@@ -19,14 +19,32 @@ LOG_S = 40.0
 def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("images") / "basin.mcap"
     with pytest.raises(SystemExit):
-        main(["simulate", "basin", "-o", str(path), "--images", "--set", "laps=1", "--set", "duration_s=150"])
+        main(
+            [
+                "simulate",
+                "basin",
+                "-o",
+                str(path),
+                "--images",
+                "--set",
+                "laps=1",
+                "--set",
+                "duration_s=150",
+            ]
+        )
     return path
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("knows_floor", [False, True])
-def test_who_recognises_live_without_a_height_over_the_floor_is_told(tmp_path, log, knows_floor):
-    given = PartialCalibration.parse({"floor": {"z_m": 0.0, "sigma_m": 0.02}}, "a test") if knows_floor else None
+def test_who_recognises_live_without_a_height_over_the_floor_is_told(
+    tmp_path, log, knows_floor
+):
+    given = (
+        PartialCalibration.parse({"floor": {"z_m": 0.0, "sigma_m": 0.02}}, "a test")
+        if knows_floor
+        else None
+    )
     messages, said = messages_of(log, np.random.default_rng(0), 0.0), []
     options = LiveOptions("dead-reckoning", calibration=given)
     with (
@@ -39,14 +57,17 @@ def test_who_recognises_live_without_a_height_over_the_floor_is_told(tmp_path, l
             if message.topic != "/sonar/landmarks":
                 run.accept(message)
                 run.turn(0.0)
-    assert sum("floor" in line and "plane of the image" in line for line in said) == (not knows_floor)
+    assert sum("floor" in line and "plane of the image" in line for line in said) == (
+        not knows_floor
+    )
 
 
 @pytest.mark.slow
 def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path, log):
     """Each image is waited for; the images of the first two seconds, before the recogniser begins, are missing."""
     whole = recognise(log)
-    given = PartialCalibration.parse(read_log(log).calibration.model_dump(), "its log")  # messages do not say it
+    # messages do not say it
+    given = PartialCalibration.parse(read_log(log).calibration.model_dump(), "its log")
     messages = messages_of(log, np.random.default_rng(0), 0.0)
     last_ns = messages[0].arrival_ns + int(LOG_S * 1e9)
     with LiveRecord(tmp_path / "record.mcap") as record:
@@ -66,9 +87,13 @@ def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path, 
     assert len(outcome.causal) > 100
     recorded = read_log(tmp_path / "record.mcap")
     assert recorded.detections is not None
-    mine, theirs = recorded.detections, whole.detections.between(0, int(recorded.detections.stamps_ns[-1]))
+    mine, theirs = (
+        recorded.detections,
+        whole.detections.between(0, int(recorded.detections.stamps_ns[-1])),
+    )
     first = np.searchsorted(theirs.stamps_ns, mine.stamps_ns[0])
     assert len(mine) >= 5
     assert abs(len(mine) - (len(theirs) - first)) <= 2
-    common = np.intersect1d(mine.stamps_ns, theirs.stamps_ns)  # beliefs begin later live, so it may report others too
+    # beliefs begin later live, so it may report others too
+    common = np.intersect1d(mine.stamps_ns, theirs.stamps_ns)
     assert len(common) >= 0.8 * len(np.unique(theirs.stamps_ns[first:]))

@@ -11,7 +11,15 @@ import pytest
 
 from sonar_graph import Sequence, read_log, write_log
 from sonar_graph.errors import LogError
-from sonar_graph.live import LiveOptions, LiveRun, Message, Publisher, open_link, open_session, subscribe
+from sonar_graph.live import (
+    LiveOptions,
+    LiveRun,
+    Message,
+    Publisher,
+    open_link,
+    open_session,
+    subscribe,
+)
 from sonar_graph.live.foxglove_link import FoxgloveLink
 from sonar_graph.live.outlets import DETECTED, TOPICS, ZenohOutlet
 from sonar_graph.live.zenoh_link import definition_of, parse_key, topic_key, type_hash
@@ -63,18 +71,32 @@ def foreign_publisher(endpoint, messages, ready):
         ready["subscribed"].wait(60)
         first_ns, begun_s = messages[0].arrival_ns, time.monotonic()
         for number, message in enumerate(messages):
-            time.sleep(max(0.0, begun_s + (message.arrival_ns - first_ns) * 4e-10 - time.monotonic()))
+            time.sleep(
+                max(
+                    0.0,
+                    begun_s
+                    + (message.arrival_ns - first_ns) * 4e-10
+                    - time.monotonic(),
+                )
+            )
             package, _, name = message.type_name.split("/")
             key = f"0{message.topic}/{package}::msg::dds_::{name}_/RIHS01_{'0' * 64}"
             sender = message.topic.encode().ljust(16)[:16]
-            attachment = number.to_bytes(8, "little") + time.time_ns().to_bytes(8, "little") + b"\x10" + sender
+            attachment = (
+                number.to_bytes(8, "little")
+                + time.time_ns().to_bytes(8, "little")
+                + b"\x10"
+                + sender
+            )
             session.put(key, message.payload, attachment=attachment)
         ready["done"].set()
         ready["end"].wait(60)
 
 
 def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
-    ready = {name: threading.Event() for name in ("router", "subscribed", "done", "end")}
+    ready = {
+        name: threading.Event() for name in ("router", "subscribed", "done", "end")
+    }
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(0), 0.0)
     robot = threading.Thread(target=foreign_publisher, args=(endpoint, messages, ready))
     robot.start()
@@ -82,17 +104,27 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
     try:
         assert ready["router"].wait(10)
         config = zenoh.Config()
-        for key, value in (("mode", '"client"'), ("connect/endpoints", f'["{endpoint}"]')):
+        for key, value in (
+            ("mode", '"client"'),
+            ("connect/endpoints", f'["{endpoint}"]'),
+        ):
             config.insert_json5(key, value)
         with zenoh.open(config) as listener, open_session([endpoint]) as session:
             listener.declare_subscriber(
-                "0/**", lambda s: heard.setdefault(str(s.key_expr), []).append(s.payload.to_bytes())
+                "0/**",
+                lambda s: heard.setdefault(str(s.key_expr), []).append(
+                    s.payload.to_bytes()
+                ),
             )
             with LiveRecord(tmp_path / "record.mcap") as record, ExitStack() as stack:
-                given = PartialCalibration(mission.calibration.model_dump(mode="json"), "of the mission")
+                given = PartialCalibration(
+                    mission.calibration.model_dump(mode="json"), "of the mission"
+                )
                 options = LiveOptions("ekf-slam", lateness_s=1.0, calibration=given)
                 outlets = [ZenohOutlet(session, 0)]
-                run = stack.enter_context(LiveRun(record, definition_of, options, outlets, lambda _: None))
+                run = stack.enter_context(
+                    LiveRun(record, definition_of, options, outlets, lambda _: None)
+                )
                 subscriptions = subscribe(session, 0, run.accept)
                 time.sleep(0.5)
                 ready["subscribed"].set()
@@ -116,11 +148,20 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
             continue  # there are no images
         key = topic_key(0, topic, kind, type_hash(kind))
         assert key in heard, f"nothing was heard of {topic}"
-        decode = ros2.generate_dynamic(kind.replace("/msg/", "/"), definition_of(kind))[kind.replace("/msg/", "/")]
+        decode = ros2.generate_dynamic(kind.replace("/msg/", "/"), definition_of(kind))[
+            kind.replace("/msg/", "/")
+        ]
         read = [decode(payload) for payload in heard[key]]
         assert len(read) == len(heard[key])
-    odometry = ros2.generate_dynamic("nav_msgs/Odometry", definition_of("nav_msgs/msg/Odometry"))["nav_msgs/Odometry"]
-    key = topic_key(0, "/sonar_graph/odometry", "nav_msgs/msg/Odometry", type_hash("nav_msgs/msg/Odometry"))
+    odometry = ros2.generate_dynamic(
+        "nav_msgs/Odometry", definition_of("nav_msgs/msg/Odometry")
+    )["nav_msgs/Odometry"]
+    key = topic_key(
+        0,
+        "/sonar_graph/odometry",
+        "nav_msgs/msg/Odometry",
+        type_hash("nav_msgs/msg/Odometry"),
+    )
     last = odometry(heard[key][-1])
     at_ns = last.header.stamp.sec * 10**9 + last.header.stamp.nanosec
     place, truth = last.pose.pose.position, mission.truth.at(np.array([at_ns]))
@@ -137,10 +178,18 @@ def test_a_foxglove_bridge_feeds_it_and_may_break_off(tmp_path, mission):
         port = probe.getsockname()[1]
     context = foxglove.Context()
     channels = {}
-    for topic, kind in {message.topic: message.type_name for message in messages}.items():
-        schema = foxglove.Schema(name=kind, encoding="ros2msg", data=definition_of(kind).encode())
-        channels[topic] = foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=context)
-    server = foxglove.start_server(host="127.0.0.1", port=port, context=context, message_backlog_size=100_000)
+    for topic, kind in {
+        message.topic: message.type_name for message in messages
+    }.items():
+        schema = foxglove.Schema(
+            name=kind, encoding="ros2msg", data=definition_of(kind).encode()
+        )
+        channels[topic] = foxglove.Channel(
+            topic, schema=schema, message_encoding="cdr", context=context
+        )
+    server = foxglove.start_server(
+        host="127.0.0.1", port=port, context=context, message_backlog_size=100_000
+    )
     got: list[Message] = []
     try:
         with FoxgloveLink(f"ws://127.0.0.1:{port}") as link:
@@ -149,19 +198,31 @@ def test_a_foxglove_bridge_feeds_it_and_may_break_off(tmp_path, mission):
             half = len(messages) // 2
             for message in messages[:half]:
                 channels[message.topic].log(message.payload)
-            until(lambda: len(got) == sum(wanted(message) for message in messages[:half]))
+            until(
+                lambda: len(got) == sum(wanted(message) for message in messages[:half])
+            )
             server.stop()
-            server = foxglove.start_server(host="127.0.0.1", port=port, context=context, message_backlog_size=100_000)
+            server = foxglove.start_server(
+                host="127.0.0.1",
+                port=port,
+                context=context,
+                message_backlog_size=100_000,
+            )
             until(lambda: link.breaks == 1)
             time.sleep(2.0)
             for message in messages[half:]:
                 channels[message.topic].log(message.payload)
             until(lambda: len(got) == sum(wanted(message) for message in messages))
-            assert link.definition_of("sensor_msgs/msg/Imu") == definition_of("sensor_msgs/msg/Imu")
+            assert link.definition_of("sensor_msgs/msg/Imu") == definition_of(
+                "sensor_msgs/msg/Imu"
+            )
     finally:
         server.stop()
     assert [m.payload for m in got] == [m.payload for m in messages if wanted(m)]
-    assert {m.type_name for m in got} == {"sensor_msgs/msg/Imu", "marine_acoustic_msgs/msg/Dvl"}
+    assert {m.type_name for m in got} == {
+        "sensor_msgs/msg/Imu",
+        "marine_acoustic_msgs/msg/Dvl",
+    }
 
 
 def wanted(message):
@@ -189,7 +250,10 @@ def test_a_router_that_ends_and_comes_back_is_heard_again(endpoint):
         for round_number in (1, 2):
             publisher = Publisher(router, 0, "/imu/data", "sensor_msgs/msg/Imu")
             last_s = time.monotonic() + 20.0
-            while len({m.sender for m in got}) < round_number and time.monotonic() < last_s:
+            while (
+                len({m.sender for m in got}) < round_number
+                and time.monotonic() < last_s
+            ):
                 publisher.put(b"row")
                 time.sleep(0.05)
             router.close()

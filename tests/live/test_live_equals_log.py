@@ -54,7 +54,9 @@ def test_a_record_gives_the_steps_that_were_live(tmp_path, world, delay_s):
             same_blocks(getattr(mine, name), getattr(theirs, name))
 
 
-@pytest.mark.parametrize("name", ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"])
+@pytest.mark.parametrize(
+    "name", ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"]
+)
 def test_estimates_of_a_record_are_those_of_the_live_run_to_the_bit(tmp_path, name):
     write_log(tmp_path / "log.mcap", small_world())
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.4)
@@ -62,9 +64,17 @@ def test_estimates_of_a_record_are_those_of_the_live_run_to_the_bit(tmp_path, na
     record = read_log(tmp_path / "record.mcap")
     bits = []
     for given in (steps, record.replay(record.instants(10.0))):
-        estimator = load_estimator(name)(record.calibration, Odometry(record.calibration))
+        estimator = load_estimator(name)(
+            record.calibration, Odometry(record.calibration)
+        )
         estimates = [estimator.process(step) for step in given]
-        bits.append(b"".join(e.world_T_body.matrix().tobytes() + e.covariance.tobytes() for e in estimates if e))
+        bits.append(
+            b"".join(
+                e.world_T_body.matrix().tobytes() + e.covariance.tobytes()
+                for e in estimates
+                if e
+            )
+        )
     assert bits[0] == bits[1]
     assert bits[0]
 
@@ -100,8 +110,13 @@ def test_what_an_estimator_that_was_behind_did_not_get_is_not_in_the_record(tmp_
         steps = []
         for message in messages:
             engine.take(message)
-            steps += [engine.without_detections(s, message.arrival_ns) for s in engine.steps()]
-        steps += [engine.without_detections(s, messages[-1].arrival_ns) for s in engine.finish()]
+            steps += [
+                engine.without_detections(s, message.arrival_ns) for s in engine.steps()
+            ]
+        steps += [
+            engine.without_detections(s, messages[-1].arrival_ns)
+            for s in engine.finish()
+        ]
     assert all(step.detections is None for step in steps)
     assert sum(engine.counts.dropped.values()) >= 30
     assert read_log(tmp_path / "record.mcap").detections is None
@@ -137,7 +152,9 @@ def test_a_sensor_whose_first_message_comes_late_is_in_all_steps(tmp_path):
     assert engine.calibration.sonar.mounting.translation_m == pytest.approx(
         world.calibration.sonar.mounting.translation_m
     )
-    for mine, theirs in zip(steps, replayed.replay(replayed.instants(10.0)), strict=True):
+    for mine, theirs in zip(
+        steps, replayed.replay(replayed.instants(10.0)), strict=True
+    ):
         for name in ("imu", "dvl", "depth", "detections"):
             same_blocks(getattr(mine, name), getattr(theirs, name))
 
@@ -158,18 +175,28 @@ def damaged(message: Message, noise: np.random.Generator) -> Message:
 
 @pytest.mark.parametrize("fault", ["damaged", "twice", "in any order"])
 @pytest.mark.parametrize("world", [small_world, aided_world])
-def test_whatever_arrives_a_record_gives_the_steps_that_were_live(tmp_path, world, fault):
+def test_whatever_arrives_a_record_gives_the_steps_that_were_live(
+    tmp_path, world, fault
+):
     noise = np.random.default_rng(7)
     write_log(tmp_path / "log.mcap", world())
     messages = messages_of(tmp_path / "log.mcap", noise, 0.1)
     if fault == "damaged":
-        messages = [m if m.topic == "/tf_static" or noise.uniform() > 0.2 else damaged(m, noise) for m in messages]
+        messages = [
+            m if m.topic == "/tf_static" or noise.uniform() > 0.2 else damaged(m, noise)
+            for m in messages
+        ]
     elif fault == "twice":
-        messages = [again for m in messages for again in [m] * (1 + (noise.uniform() < 0.1))]
+        messages = [
+            again for m in messages for again in [m] * (1 + (noise.uniform() < 0.1))
+        ]
     else:
         order = np.argsort([m.arrival_ns + noise.uniform(0, 1e9) for m in messages])
         times_ns = [m.arrival_ns for m in messages]
-        messages = [messages[i]._replace(arrival_ns=at_ns) for i, at_ns in zip(order, times_ns, strict=True)]
+        messages = [
+            messages[i]._replace(arrival_ns=at_ns)
+            for i, at_ns in zip(order, times_ns, strict=True)
+        ]
     engine, steps = live(tmp_path / "record.mcap", messages)
     assert engine.counts.dropped
     record = read_log(tmp_path / "record.mcap")
@@ -186,7 +213,9 @@ def test_a_second_topic_of_a_sensor_that_comes_later_changes_nothing(tmp_path):
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
     middle = len(messages) // 2
     first = [m for m in messages[:middle] if m.topic != "/sonar/landmarks"]
-    second_imu = next(m for m in first if m.topic == "/imu/data")._replace(topic="/imu/other")
+    second_imu = next(m for m in first if m.topic == "/imu/data")._replace(
+        topic="/imu/other"
+    )
     later = second_imu._replace(arrival_ns=messages[middle].arrival_ns)
     engine, _ = live(tmp_path / "record.mcap", [*first, later, *messages[middle:]])
     assert engine.generation == 1
@@ -200,7 +229,10 @@ def test_a_topic_that_was_chosen_may_come_late(tmp_path):
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
     late_ns = messages[0].arrival_ns + 5 * NS
     with LiveRecord(tmp_path / "record.mcap") as record:
-        engine, waited_for = Engine(record, definition_of, wanted={"detections": "/sonar/landmarks"}), set()
+        engine, waited_for = (
+            Engine(record, definition_of, wanted={"detections": "/sonar/landmarks"}),
+            set(),
+        )
         for message in messages:
             if message.topic != "/sonar/landmarks" or message.arrival_ns > late_ns:
                 engine.take(message)
@@ -212,11 +244,17 @@ def test_a_topic_that_was_chosen_may_come_late(tmp_path):
         assert sum(1 for _ in engine.steps()) > 100
 
 
-def test_several_topics_for_one_role_are_recorded_with_advice_and_resumed_with_a_choice(tmp_path):
+def test_several_topics_for_one_role_are_recorded_with_advice_and_resumed_with_a_choice(
+    tmp_path,
+):
     write_log(tmp_path / "log.mcap", small_world())
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
     both = [
-        again for m in messages for again in ([m, m._replace(topic="/imu/other")] if m.topic == "/imu/data" else [m])
+        again
+        for m in messages
+        for again in (
+            [m, m._replace(topic="/imu/other")] if m.topic == "/imu/data" else [m]
+        )
     ]
     engine, steps = live(tmp_path / "first.mcap", both)
     assert not steps

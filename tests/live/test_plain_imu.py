@@ -15,7 +15,10 @@ KIND = "sensor_msgs/msg/Imu"
 USUAL = {"header.stamp.sec": 5, "header.frame_id": "imu", "linear_acceleration.z": 9.81}
 CHANGES = {
     "none": {},
-    "degrees and g": {"angular_velocity_scale": np.pi / 180, "linear_acceleration_scale": -9.80665},
+    "degrees and g": {
+        "angular_velocity_scale": np.pi / 180,
+        "linear_acceleration_scale": -9.80665,
+    },
     "forward, right, down": {"rotation": "frd"},
     "turned": {"rotation": (10.0, 20.0, 30.0)},
     "stamped at arrival": {"stamp_offset_s": -0.0123456789},
@@ -23,12 +26,18 @@ CHANGES = {
 
 
 def payload_of(**values):
-    return encode(parse_definition(KIND, definition_of(KIND)), 1, USUAL | values)[0].tobytes()
+    return encode(parse_definition(KIND, definition_of(KIND)), 1, USUAL | values)[
+        0
+    ].tobytes()
 
 
 def topic_of(payload):
-    topic = Topic(Path("x.mcap"), "/imu", KIND, "cdr", "ros2msg", definition_of(KIND), Keep.ALL)
-    topic.gather(payload, np.zeros(1, np.int64), np.array([len(payload)]), np.array([7]))
+    topic = Topic(
+        Path("x.mcap"), "/imu", KIND, "cdr", "ros2msg", definition_of(KIND), Keep.ALL
+    )
+    topic.gather(
+        payload, np.zeros(1, np.int64), np.array([len(payload)]), np.array([7])
+    )
     return topic
 
 
@@ -46,9 +55,17 @@ def test_rows_are_those_of_the_adapter_to_the_bit(change):
     form = form_of(adapter)
     for _ in range(100):
         values = {
-            f"{what}.{axis}": noise.normal() for what in ("angular_velocity", "linear_acceleration") for axis in "xyz"
+            f"{what}.{axis}": noise.normal()
+            for what in ("angular_velocity", "linear_acceleration")
+            for axis in "xyz"
         }
-        payload = payload_of(**values, **{"header.stamp.nanosec": int(noise.integers(10**9)), "orientation.w": 0.3})
+        payload = payload_of(
+            **values,
+            **{
+                "header.stamp.nanosec": int(noise.integers(10**9)),
+                "orientation.w": 0.3,
+            },
+        )
         expected, _ = adapter.read(adapter.table(topic_of(payload)))
         row = form.row(payload)
         for name, column in vars(expected).items():

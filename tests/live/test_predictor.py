@@ -20,7 +20,9 @@ EARTH_RAD = 7.3e-5
 def predicted():
     """Estimates of dead reckoning at epochs, where they are final, and predictions from the estimates before."""
     world = small_world()
-    estimator = load_estimator("dead-reckoning")(world.calibration, Odometry(world.calibration))
+    estimator = load_estimator("dead-reckoning")(
+        world.calibration, Odometry(world.calibration)
+    )
     predictor, pairs = Predictor(world.calibration), []
     for step in world.replay(world.instants(1.0)):
         predictor.add(step.imu, step.dvl)
@@ -36,7 +38,11 @@ def test_a_prediction_is_the_next_estimate_of_dead_reckoning():
     assert len(pairs) > 15
     for estimate, prediction in pairs:
         assert prediction.stamp_ns == estimate.stamp_ns
-        np.testing.assert_allclose(prediction.world_T_body, estimate.world_T_body.matrix(), atol=1.1 * EARTH_RAD)
+        np.testing.assert_allclose(
+            prediction.world_T_body,
+            estimate.world_T_body.matrix(),
+            atol=1.1 * EARTH_RAD,
+        )
 
 
 def test_frames_differ_by_the_newest_correction():
@@ -47,30 +53,49 @@ def test_frames_differ_by_the_newest_correction():
     for k, step in enumerate(world.replay(world.instants(10.0))):
         predictor.add(step.imu, step.dvl)
         if k in (20, 60):
-            predictor.correct(at := Estimate(step.end_ns, jump if k == 60 else gtsam.Pose3(), np.eye(6)))
-            assert np.allclose(predictor.predict().world_T_body, at.world_T_body.matrix())
+            predictor.correct(
+                at := Estimate(
+                    step.end_ns, jump if k == 60 else gtsam.Pose3(), np.eye(6)
+                )
+            )
+            assert np.allclose(
+                predictor.predict().world_T_body, at.world_T_body.matrix()
+            )
         if (now := predictor.predict()) is not None:
-            np.testing.assert_allclose(now.world_T_body, predictor.map_T_odom @ now.odom_T_body, atol=1e-12)
+            np.testing.assert_allclose(
+                now.world_T_body, predictor.map_T_odom @ now.odom_T_body, atol=1e-12
+            )
             if before is not None:
-                assert np.linalg.norm(now.odom_T_body[:3, 3] - before.odom_T_body[:3, 3]) < 0.5
+                assert (
+                    np.linalg.norm(now.odom_T_body[:3, 3] - before.odom_T_body[:3, 3])
+                    < 0.5
+                )
             before = now
     assert before is not None
 
 
-@pytest.mark.parametrize("turn", [(0.1, -0.2, 0.3), (3.1, 0.0, 0.0), (0.0, 3.1, 0.1), (0.2, 0.0, -3.1)])
+@pytest.mark.parametrize(
+    "turn", [(0.1, -0.2, 0.3), (3.1, 0.0, 0.0), (0.0, 3.1, 0.1), (0.2, 0.0, -3.1)]
+)
 def test_messages_say_the_numbers_of_a_prediction(turn):
     factor = np.random.default_rng(0).normal(size=(6, 6))
     pose = gtsam.Pose3(gtsam.Rot3.Rodrigues(*turn), np.array([1.0, -2.0, 3.0]))
     _, at = predicted()[5]
     matrix = np.ascontiguousarray(pose.matrix())
-    at = at._replace(world_T_body=matrix, odom_T_body=matrix, covariance=factor @ factor.T)
+    at = at._replace(
+        world_T_body=matrix, odom_T_body=matrix, covariance=factor @ factor.T
+    )
     forms = PoseForms()
     message = read(ODOMETRY, forms.odometry(at))
-    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == at.stamp_ns
+    assert (
+        message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == at.stamp_ns
+    )
     assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
     assert same_pose(message.pose.pose.position, message.pose.pose.orientation, pose)
     world_axes = body_to_ros(at.covariance[None], pose.rotation().matrix()[None])[0]
-    np.testing.assert_allclose(np.reshape(message.pose.covariance, (6, 6)), world_axes, atol=1e-12)
+    np.testing.assert_allclose(
+        np.reshape(message.pose.covariance, (6, 6)), world_axes, atol=1e-12
+    )
     velocity = message.twist.twist.linear
     assert np.array_equal([velocity.x, velocity.y, velocity.z], at.velocity_m_s)
     (frame,) = read(TF, forms.body(at)).transforms
@@ -83,5 +108,10 @@ def read(kind, payload):
 
 
 def same_pose(p, q, pose):
-    found = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), np.array([p.x, p.y, p.z]))
-    return found.equals(pose, 1e-12) and abs(q.w**2 + q.x**2 + q.y**2 + q.z**2 - 1.0) < 1e-12
+    found = gtsam.Pose3(
+        gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), np.array([p.x, p.y, p.z])
+    )
+    return (
+        found.equals(pose, 1e-12)
+        and abs(q.w**2 + q.x**2 + q.y**2 + q.z**2 - 1.0) < 1e-12
+    )

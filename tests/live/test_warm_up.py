@@ -32,7 +32,12 @@ print(json.dumps([len(before), sorted(compiled() - before)]))
 
 
 def compiled_late(*arguments: str) -> list[str]:
-    ran = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     count, late = json.loads(ran.stdout)
     assert count > 5
     return late

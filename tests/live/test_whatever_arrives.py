@@ -35,7 +35,9 @@ def stamp_of(message):
 
 def stamped(message, stamp_ns):
     return message._replace(
-        payload=message.payload[:4] + struct.pack("<iI", *divmod(stamp_ns, NS)) + message.payload[12:]
+        payload=message.payload[:4]
+        + struct.pack("<iI", *divmod(stamp_ns, NS))
+        + message.payload[12:]
     )
 
 
@@ -43,8 +45,17 @@ def message_of(topic, kind, stamp_ns, values, frame="", lengths=None):
     definition = parse_definition(kind, definition_of(kind))
     if kind != "tf2_msgs/msg/TFMessage":
         header = {"sec": stamp_ns // NS, "nanosec": stamp_ns % NS}
-        values = values | {f"header.stamp.{k}": v for k, v in header.items()} | {"header.frame_id": frame}
-    return Message(topic, kind, encode(definition, 1, values, lengths)[0].tobytes(), stamp_ns + 2_000_000)
+        values = (
+            values
+            | {f"header.stamp.{k}": v for k, v in header.items()}
+            | {"header.frame_id": frame}
+        )
+    return Message(
+        topic,
+        kind,
+        encode(definition, 1, values, lengths)[0].tobytes(),
+        stamp_ns + 2_000_000,
+    )
 
 
 def imu(message, force, rates=(0.0, 0.0, 0.1)):
@@ -56,19 +67,34 @@ def imu(message, force, rates=(0.0, 0.0, 0.1)):
 
 def dvl(message, beams, mode=1):
     values = {"velocity_mode": mode, "num_good_beams": beams, "velocity.x": 0.5}
-    made = message_of(DVL, "marine_acoustic_msgs/msg/Dvl", stamp_of(message), values, "dvl")
+    made = message_of(
+        DVL, "marine_acoustic_msgs/msg/Dvl", stamp_of(message), values, "dvl"
+    )
     return made._replace(arrival_ns=message.arrival_ns)
 
 
 def fix(stamp_ns, number, status=0, frame=""):
-    values = {"status.status": status, "latitude": 48 + 1e-6 * number, "longitude": 8 + 1e-5 * number, "altitude": 3.1}
+    values = {
+        "status.status": status,
+        "latitude": 48 + 1e-6 * number,
+        "longitude": 8 + 1e-5 * number,
+        "altitude": 3.1,
+    }
     return message_of("/gps/fix", "sensor_msgs/msg/NavSatFix", stamp_ns, values, frame)
 
 
 def transform(at_ns, child, turn=(0.0, 0.0, 1.0, 0.0)):
-    values = {"transforms.header.frame_id": ["base_link"], "transforms.child_frame_id": [child]}
-    values |= {f"transforms.transform.rotation.{a}": np.array([[q]]) for a, q in zip("xyzw", turn, strict=True)}
-    return message_of("/tf_static", "tf2_msgs/msg/TFMessage", at_ns, values, lengths={"transforms": 1})
+    values = {
+        "transforms.header.frame_id": ["base_link"],
+        "transforms.child_frame_id": [child],
+    }
+    values |= {
+        f"transforms.transform.rotation.{a}": np.array([[q]])
+        for a, q in zip("xyzw", turn, strict=True)
+    }
+    return message_of(
+        "/tf_static", "tf2_msgs/msg/TFMessage", at_ns, values, lengths={"transforms": 1}
+    )
 
 
 def compass(stamp_ns):
@@ -84,10 +110,18 @@ def compass(stamp_ns):
 def detections(stamp_ns, candidates, is_sound=True):
     values = {"range_m": np.array([[5.0, 6.0]])}
     if is_sound:
-        values |= {"azimuth_rad": np.array([[0.1, -0.2]]), "covariance": np.tile([0.01, 0.0, 0.0, 0.001], (1, 2))}
-        values |= {"candidate_ids": np.tile(np.arange(candidates), (1, 2)), "track": np.array([[0, 1]])}
+        values |= {
+            "azimuth_rad": np.array([[0.1, -0.2]]),
+            "covariance": np.tile([0.01, 0.0, 0.0, 0.001], (1, 2)),
+        }
+        values |= {
+            "candidate_ids": np.tile(np.arange(candidates), (1, 2)),
+            "track": np.array([[0, 1]]),
+        }
         values["id_probability"] = np.full((1, 2 * candidates), 0.9 / candidates)
-    return message_of(DETECTIONS, "sonar_graph_msgs/msg/LandmarkDetections", stamp_ns, values, "sonar")
+    return message_of(
+        DETECTIONS, "sonar_graph_msgs/msg/LandmarkDetections", stamp_ns, values, "sonar"
+    )
 
 
 def in_order(messages):
@@ -101,7 +135,10 @@ def without(messages, topic):
 def changed(messages, topic, change: Callable[[Message, float], Message]):
     """Messages of a topic changed; with seconds since the first message."""
     first_ns = messages[0].arrival_ns
-    return [change(m, (m.arrival_ns - first_ns) * 1e-9) if m.topic == topic else m for m in messages]
+    return [
+        change(m, (m.arrival_ns - first_ns) * 1e-9) if m.topic == topic else m
+        for m in messages
+    ]
 
 
 def doppler_stamps(messages):
@@ -119,14 +156,21 @@ def scrambled(messages, from_s):
     for message in messages:
         data, draw = bytearray(message.payload), noise.random()
         at = int(noise.integers(4, len(data)))
-        if message.topic != "/tf_static" and message.arrival_ns > first_ns + from_s * NS and draw < 0.1:
+        if (
+            message.topic != "/tf_static"
+            and message.arrival_ns > first_ns + from_s * NS
+            and draw < 0.1
+        ):
             data[at:] = noise.bytes(len(data) - at) if draw < 0.05 else b""
         found.append(message._replace(payload=bytes(data)))
     return found
 
 
 CASES: dict[str, Callable[[list[Message]], list[Message]]] = {
-    "a first stamp an hour ahead": lambda m: [stamped(first_imu(m), stamp_of(first_imu(m)) + 3600 * NS), *m],
+    "a first stamp an hour ahead": lambda m: [
+        stamped(first_imu(m), stamp_of(first_imu(m)) + 3600 * NS),
+        *m,
+    ],
     "a first stamp of 2038": lambda m: [stamped(first_imu(m), 2_147_480_000 * NS), *m],
     "a first stamp of 1970, and an IMU that begins late": lambda m: [
         stamped(first_imu(m), 5 * NS),
@@ -139,26 +183,47 @@ CASES: dict[str, Callable[[list[Message]], list[Message]]] = {
         for x in m
     ],
     "arrivals an hour back in the first second": lambda m: [
-        x._replace(arrival_ns=x.arrival_ns - 3600 * NS) if x.arrival_ns > m[0].arrival_ns + NS else x for x in m
+        x._replace(arrival_ns=x.arrival_ns - 3600 * NS)
+        if x.arrival_ns > m[0].arrival_ns + NS
+        else x
+        for x in m
     ],
     "broken messages from the first on": lambda m: scrambled(m, 0.0),
     "broken messages later": lambda m: scrambled(m, 5.0),
     "times of sending before 1970": lambda m: [x._replace(sent_ns=-5) for x in m],
     "accelerations that are zero at first, and again later": lambda m: changed(
-        m, IMU, lambda x, at_s: imu(x, (0.0, 0.0, 9.81 if at_s > 4 and int(at_s * 50) % 5 else 0.0))
+        m,
+        IMU,
+        lambda x, at_s: imu(
+            x, (0.0, 0.0, 9.81 if at_s > 4 and int(at_s * 50) % 5 else 0.0)
+        ),
     ),
     "accelerations that are zero now and then": lambda m: changed(
         m, IMU, lambda x, at_s: imu(x, (0.0, 0.0, 9.81 if int(at_s * 50) % 5 else 0.0))
     ),
-    "beams that are counted": lambda m: changed(m, DVL, lambda x, at_s: dvl(x, 4 if int(at_s * 5) % 3 else 0)),
-    "beams that are counted from eight seconds on": lambda m: changed(m, DVL, lambda x, at_s: dvl(x, 4 * (at_s > 8))),
-    "a Doppler log without bottom lock at first": lambda m: changed(m, DVL, lambda x, at_s: dvl(x, 4, int(at_s > 5))),
+    "beams that are counted": lambda m: changed(
+        m, DVL, lambda x, at_s: dvl(x, 4 if int(at_s * 5) % 3 else 0)
+    ),
+    "beams that are counted from eight seconds on": lambda m: changed(
+        m, DVL, lambda x, at_s: dvl(x, 4 * (at_s > 8))
+    ),
+    "a Doppler log without bottom lock at first": lambda m: changed(
+        m, DVL, lambda x, at_s: dvl(x, 4, int(at_s > 5))
+    ),
     "an IMU that is unreadable at first": lambda m: changed(
         m, IMU, lambda x, at_s: x if at_s > 4 else x._replace(payload=x.payload[:30])
     ),
-    "fixes on the Earth": lambda m: in_order([*m, *(fix(at, i) for i, at in enumerate(doppler_stamps(m)))]),
+    "fixes on the Earth": lambda m: in_order(
+        [*m, *(fix(at, i) for i, at in enumerate(doppler_stamps(m)))]
+    ),
     "fixes that begin late": lambda m: in_order(
-        [*m, *(fix(at, i, status=0 if i > 40 else -1) for i, at in enumerate(doppler_stamps(m)))]
+        [
+            *m,
+            *(
+                fix(at, i, status=0 if i > 40 else -1)
+                for i, at in enumerate(doppler_stamps(m))
+            ),
+        ]
     ),
     "a first fix that is late": lambda m: in_order(
         [*m]
@@ -168,20 +233,38 @@ CASES: dict[str, Callable[[list[Message]], list[Message]]] = {
         ]
     ),
     "a compass whose frame comes late": lambda m: in_order(
-        [*m, *map(compass, doppler_stamps(m)), transform(m[0].arrival_ns + 5 * NS, "ahrs")]
+        [
+            *m,
+            *map(compass, doppler_stamps(m)),
+            transform(m[0].arrival_ns + 5 * NS, "ahrs"),
+        ]
     ),
     "other numbers of candidates": lambda m: in_order(
         without(m, DETECTIONS)
-        + [detections(at + more, 1 + more % 3) for at in doppler_stamps(m) for more in (0, 7_000_000, 14_000_000)]
+        + [
+            detections(at + more, 1 + more % 3)
+            for at in doppler_stamps(m)
+            for more in (0, 7_000_000, 14_000_000)
+        ]
     ),
     "first detections that break their rules": lambda m: in_order(
-        without(m, DETECTIONS) + [detections(at, 2, is_sound=i > 3) for i, at in enumerate(doppler_stamps(m))]
+        without(m, DETECTIONS)
+        + [detections(at, 2, is_sound=i > 3) for i, at in enumerate(doppler_stamps(m))]
     ),
     "late detections of which the first break their rules": lambda m: in_order(
-        without(m, DETECTIONS) + [detections(at, 2, is_sound=i > 3) for i, at in enumerate(doppler_stamps(m)[50:])]
+        without(m, DETECTIONS)
+        + [
+            detections(at, 2, is_sound=i > 3)
+            for i, at in enumerate(doppler_stamps(m)[50:])
+        ]
     ),
     "a second Doppler log": lambda m: in_order(
-        m + [x._replace(topic="/dvl2/data") for x in m if x.topic == DVL and x.arrival_ns > m[0].arrival_ns + 8 * NS]
+        m
+        + [
+            x._replace(topic="/dvl2/data")
+            for x in m
+            if x.topic == DVL and x.arrival_ns > m[0].arrival_ns + 8 * NS
+        ]
     ),
     "a late sensor whose frame cannot be": lambda m: in_order(
         [*m, transform(m[0].arrival_ns + 5 * NS, "gps", (0.0, 0.0, 0.0, 0.0))]
@@ -214,8 +297,12 @@ def test_a_record_gives_the_steps_that_were_live(tmp_path, messages, case):
     assert_equal(engine, steps, tmp_path / "record.mcap")
 
 
-def test_rotated_axes_give_the_same_bits_for_one_message_and_for_all(tmp_path, messages):
-    config = LogConfig.parse({role: {"rotation": [10.0, 20.0, 30.0]} for role in ("imu", "dvl")}, "mine.toml")
+def test_rotated_axes_give_the_same_bits_for_one_message_and_for_all(
+    tmp_path, messages
+):
+    config = LogConfig.parse(
+        {role: {"rotation": [10.0, 20.0, 30.0]} for role in ("imu", "dvl")}, "mine.toml"
+    )
     engine, steps = live(tmp_path / "record.mcap", messages, config=config)
     assert_equal(engine, steps, tmp_path / "record.mcap")
 
@@ -227,31 +314,57 @@ def test_a_rate_that_is_no_short_number_is_recorded_to_the_bit(tmp_path, message
 
 def test_a_velocity_of_beams_does_not_depend_on_other_pings():
     noise = np.random.default_rng(0)
-    directions, along, valid = noise.normal(size=(4, 3)), noise.normal(size=(50, 4)), noise.random((50, 4)) < 0.9
+    directions, along, valid = (
+        noise.normal(size=(4, 3)),
+        noise.normal(size=(50, 4)),
+        noise.random((50, 4)) < 0.9,
+    )
     velocity, _ = velocity_of_beams(directions, along, valid, 0.01)
-    alone = [velocity_of_beams(directions, along[i : i + 1], valid[i : i + 1], 0.01)[0] for i in range(50)]
+    alone = [
+        velocity_of_beams(directions, along[i : i + 1], valid[i : i + 1], 0.01)[0]
+        for i in range(50)
+    ]
     assert velocity.tobytes() == np.concatenate(alone).tobytes()
 
 
 def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):
     """Unreadable first messages neither end the run nor cost the sensor."""
     engine, steps = live(
-        tmp_path / "record.mcap", CASES["late detections of which the first break their rules"](messages)
+        tmp_path / "record.mcap",
+        CASES["late detections of which the first break their rules"](messages),
     )
     assert engine.generation == 1
-    assert sum(len(step.detections) for step in steps if step.detections is not None) > 50
+    assert (
+        sum(len(step.detections) for step in steps if step.detections is not None) > 50
+    )
 
 
-def test_a_late_sensor_that_cannot_be_used_is_named_and_costs_nothing(tmp_path, messages):
-    engine, steps = live(tmp_path / "record.mcap", CASES["a late sensor whose frame cannot be"](messages))
+def test_a_late_sensor_that_cannot_be_used_is_named_and_costs_nothing(
+    tmp_path, messages
+):
+    engine, steps = live(
+        tmp_path / "record.mcap", CASES["a late sensor whose frame cannot be"](messages)
+    )
     assert engine.generation == 0
     assert len(steps) == 200
-    assert any("/gps/fix is not used" in line and "quaternion" in line for line in engine.remarks)
+    assert any(
+        "/gps/fix is not used" in line and "quaternion" in line
+        for line in engine.remarks
+    )
 
 
 def test_what_is_waited_for_is_said_once(tmp_path, messages):
-    engine, _ = live(tmp_path / "record.mcap", CASES["a Doppler log without bottom lock at first"](messages))
-    assert 1 <= sum("waiting:" in line and "velocity_mode" in line for line in engine.remarks) <= 4
+    engine, _ = live(
+        tmp_path / "record.mcap",
+        CASES["a Doppler log without bottom lock at first"](messages),
+    )
+    assert (
+        1
+        <= sum(
+            "waiting:" in line and "velocity_mode" in line for line in engine.remarks
+        )
+        <= 4
+    )
     assert not engine.waits_for
 
 
@@ -259,16 +372,33 @@ def test_rows_that_are_sound_count_beside_others_that_are_not(tmp_path, messages
     """One range of two that is not a number does not cost the other."""
     stamps = doppler_stamps(messages)
     half = [detections(at, 1) for at in stamps]
-    half = [m._replace(payload=m.payload.replace(struct.pack("<d", 6.0), struct.pack("<d", np.nan))) for m in half]
-    engine, steps = live(tmp_path / "record.mcap", in_order(without(messages, DETECTIONS) + half))
-    assert sum(len(step.detections) for step in steps if step.detections is not None) > 90
+    half = [
+        m._replace(
+            payload=m.payload.replace(struct.pack("<d", 6.0), struct.pack("<d", np.nan))
+        )
+        for m in half
+    ]
+    engine, steps = live(
+        tmp_path / "record.mcap", in_order(without(messages, DETECTIONS) + half)
+    )
+    assert (
+        sum(len(step.detections) for step in steps if step.detections is not None) > 90
+    )
     assert_equal(engine, steps, tmp_path / "record.mcap")
 
 
-def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_came(tmp_path, messages):
+def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_came(
+    tmp_path, messages
+):
     first_ns = messages[0].arrival_ns
-    late = [m for m in messages if m.topic != DETECTIONS or m.arrival_ns > first_ns + 9 * NS]
-    second = [m._replace(topic="/dvl2/data") for m in messages if m.topic == DVL and m.arrival_ns > first_ns + 5 * NS]
+    late = [
+        m for m in messages if m.topic != DETECTIONS or m.arrival_ns > first_ns + 9 * NS
+    ]
+    second = [
+        m._replace(topic="/dvl2/data")
+        for m in messages
+        if m.topic == DVL and m.arrival_ns > first_ns + 5 * NS
+    ]
     engine, steps = live(tmp_path / "record.mcap", in_order(late + second))
     assert engine.generation == 1
     assert any(step.detections is not None for step in steps)
@@ -279,7 +409,11 @@ def test_detections_that_were_dropped_for_being_behind_are_counted_once_and_stay
     tmp_path, messages
 ):
     """Also where all began anew before, with a sensor that came late."""
-    late = [m for m in messages if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS]
+    late = [
+        m
+        for m in messages
+        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
+    ]
     with LiveRecord(tmp_path / "first.mcap") as record:
         engine = Engine(record, definition_of)
         for message in late:

@@ -11,7 +11,9 @@ from sonar_graph.live import Message
 TRUTH = "/ground_truth"
 
 
-def messages_of(path: Path, noise: np.random.Generator, delay_s: float) -> list[Message]:
+def messages_of(
+    path: Path, noise: np.random.Generator, delay_s: float
+) -> list[Message]:
     """All messages but the truth, in order of arrival.
 
     Each is delayed by a time drawn evenly from 0 to ``delay_s``, and never overtakes one of its own topic.
@@ -20,9 +22,17 @@ def messages_of(path: Path, noise: np.random.Generator, delay_s: float) -> list[
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             if not channel.topic.startswith(TRUTH):
-                arrival_ns = message.log_time + int(noise.uniform(0.0, delay_s) * 1e9) + 1_000_000
-                newest_ns[channel.topic] = arrival_ns = max(arrival_ns, newest_ns.get(channel.topic, 0))
-                found.append(Message(channel.topic, schema.name, message.data, arrival_ns))
+                arrival_ns = (
+                    message.log_time
+                    + int(noise.uniform(0.0, delay_s) * 1e9)
+                    + 1_000_000
+                )
+                newest_ns[channel.topic] = arrival_ns = max(
+                    arrival_ns, newest_ns.get(channel.topic, 0)
+                )
+                found.append(
+                    Message(channel.topic, schema.name, message.data, arrival_ns)
+                )
     return sorted(found, key=lambda message: message.arrival_ns)
 
 

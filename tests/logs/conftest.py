@@ -19,7 +19,14 @@ from sonar_graph.logs.mcap.file_summary import TimeWindow
 from sonar_graph.logs.mcap.reader import Recording
 from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep, Topic
-from sonar_graph.measurements import Depth, Dvl, Heading, Imu, LandmarkDetections, PositionFixes
+from sonar_graph.measurements import (
+    Depth,
+    Dvl,
+    Heading,
+    Imu,
+    LandmarkDetections,
+    PositionFixes,
+)
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -58,37 +65,72 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def imu(self, ns: int, rate: tuple[float, ...] = (0, 0, 0.1), **other: Any) -> dict[str, Any]:
+    def imu(
+        self, ns: int, rate: tuple[float, ...] = (0, 0, 0.1), **other: Any
+    ) -> dict[str, Any]:
         message = {"header": header(ns, "imu_link"), "angular_velocity": vector(*rate)}
         message["linear_acceleration"] = vector(0.1, 0.2, 9.8)
         return message | other
 
-    def dvl(self, ns: int, velocity: tuple[float, ...] = (0.5, 0, 0), **other: Any) -> dict[str, Any]:
-        message = {"header": header(ns, "dvl_link"), "velocity": vector(*velocity), "velocity_mode": 1}
+    def dvl(
+        self, ns: int, velocity: tuple[float, ...] = (0.5, 0, 0), **other: Any
+    ) -> dict[str, Any]:
+        message = {
+            "header": header(ns, "dvl_link"),
+            "velocity": vector(*velocity),
+            "velocity_mode": 1,
+        }
         return message | {"num_good_beams": 4} | other
 
-    def pressure(self, ns: int, pascals: float, variance: float = 0.0) -> dict[str, Any]:
-        return {"header": header(ns, "pressure_link"), "fluid_pressure": pascals, "variance": variance}
+    def pressure(
+        self, ns: int, pascals: float, variance: float = 0.0
+    ) -> dict[str, Any]:
+        return {
+            "header": header(ns, "pressure_link"),
+            "fluid_pressure": pascals,
+            "variance": variance,
+        }
 
     def odometry(self, ns: int, x: float, **other: Any) -> dict[str, Any]:
-        pose = {"position": vector(x, 0, 0), "orientation": {**vector(0, 0, 0), "w": 1.0}}
+        pose = {
+            "position": vector(x, 0, 0),
+            "orientation": {**vector(0, 0, 0), "w": 1.0},
+        }
         return {"header": header(ns, "map"), "pose": {"pose": pose}} | other
 
-    def detections(self, ns: int, ranges: list[float], ids: list[int], track: tuple[int, ...] = ()) -> dict[str, Any]:
+    def detections(
+        self, ns: int, ranges: list[float], ids: list[int], track: tuple[int, ...] = ()
+    ) -> dict[str, Any]:
         count = len(ranges)
-        message = {"header": header(ns, "sonar_link"), "range_m": ranges, "azimuth_rad": [0.1] * count}
+        message = {
+            "header": header(ns, "sonar_link"),
+            "range_m": ranges,
+            "azimuth_rad": [0.1] * count,
+        }
         message |= {"covariance": [0.01, 0, 0, 0.02] * count, "candidate_ids": ids}
-        return message | {"id_probability": [min(0.5, len(ranges) / max(len(ids), 1))] * len(ids), "track": list(track)}
+        return message | {
+            "id_probability": [min(0.5, len(ranges) / max(len(ids), 1))] * len(ids),
+            "track": list(track),
+        }
 
-    def transform(self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0) -> dict[str, Any]:
+    def transform(
+        self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0
+    ) -> dict[str, Any]:
         rotation = {**vector(0, 0, np.sin(yaw_rad / 2)), "w": np.cos(yaw_rad / 2)}
         moved = {"translation": vector(*xyz), "rotation": rotation}
-        return {"header": header(0, parent), "child_frame_id": child, "transform": moved}
+        return {
+            "header": header(0, parent),
+            "child_frame_id": child,
+            "transform": moved,
+        }
 
     def basics(self, samples: int = 5) -> list[Entry]:
         """The topics that every log needs."""
         stamps = [T0_NS + i * 10**8 for i in range(samples)]
-        return [("/imu", "imu", [self.imu(s) for s in stamps]), ("/dvl", "dvl", [self.dvl(s) for s in stamps])]
+        return [
+            ("/imu", "imu", [self.imu(s) for s in stamps]),
+            ("/dvl", "dvl", [self.dvl(s) for s in stamps]),
+        ]
 
     def write(self, *entries: Entry, name: str = "log.mcap") -> Path:
         """A log of ten messages a second on each topic."""
@@ -96,11 +138,15 @@ class Bench:
             writer = Writer(stream)
             for topic, word, messages, *text in entries:
                 kind = TYPES.get(word, word)
-                said = text[0] if text else self.definitions.get(kind) or definition(kind)
+                said = (
+                    text[0] if text else self.definitions.get(kind) or definition(kind)
+                )
                 schema = writer.register_msgdef(kind, said)
                 for i, message in enumerate(messages):
                     time_ns = self.t0_ns + i * 10**8
-                    writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
+                    writer.write_message(
+                        topic, schema, message, log_time=time_ns, publish_time=time_ns
+                    )
             writer.finish()
         return self._folder / name
 
@@ -142,14 +188,26 @@ def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequ
     frames = np.sort(rng.choice(stamps, samples))
     quaternions = rng.normal(size=(samples, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    calibration = Calibration(imu=ImuCalibration(mounting=Mounting(translation_m=(0.1, 0.2, 0.3), rpy_rad=(0.1, 0, 1))))
+    calibration = Calibration(
+        imu=ImuCalibration(
+            mounting=Mounting(translation_m=(0.1, 0.2, 0.3), rpy_rad=(0.1, 0, 1))
+        )
+    )
     return Sequence(
         name="a name with spaces and ψ",
         calibration=calibration,
         imu=Imu(stamps, rng.normal(size=(samples, 3)), force),
         dvl=Dvl(stamps, rng.normal(size=(samples, 3)), covs),
-        depth=Depth(stamps, rng.normal(size=samples), np.where(np.arange(samples) % 2, np.nan, 0.01)),
-        heading=Heading(stamps, 10 * rng.normal(size=samples), np.where(np.arange(samples) % 3, 0.1, np.nan)),
+        depth=Depth(
+            stamps,
+            rng.normal(size=samples),
+            np.where(np.arange(samples) % 2, np.nan, 0.01),
+        ),
+        heading=Heading(
+            stamps,
+            10 * rng.normal(size=samples),
+            np.where(np.arange(samples) % 3, 0.1, np.nan),
+        ),
         positions=PositionFixes(stamps, rng.normal(size=(samples, 3)), covs),
         detections=LandmarkDetections(
             frames,
@@ -160,8 +218,12 @@ def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequ
             rng.uniform(0, 1 / candidates, (samples, candidates)),
             np.arange(samples) % 4 - 1 + 10**12 * (np.arange(samples) % 2),
         ),
-        truth=Trajectory.without_covariances(stamps, rng.normal(size=(samples, 3)), quaternions),
-        true_landmarks=LandmarkMap(np.array([3, 7]), rng.normal(size=(2, 3)), np.full((2, 3, 3), np.nan)),
+        truth=Trajectory.without_covariances(
+            stamps, rng.normal(size=(samples, 3)), quaternions
+        ),
+        true_landmarks=LandmarkMap(
+            np.array([3, 7]), rng.normal(size=(2, 3)), np.full((2, 3, 3), np.nan)
+        ),
         notes={"source": "made up", "seed": str(seed)},
     )
 
@@ -172,7 +234,9 @@ BYTES_TEXT = b"uint8[] data\n"
 
 
 @contextmanager
-def writing(path: Path, profile: str = "ros2", **settings: Any) -> Iterator[ContainerWriter]:
+def writing(
+    path: Path, profile: str = "ros2", **settings: Any
+) -> Iterator[ContainerWriter]:
     """A started file of mcap's own writer, finished at the end."""
     with path.open("wb") as stream:
         writer = ContainerWriter(stream, **settings)
@@ -182,12 +246,19 @@ def writing(path: Path, profile: str = "ros2", **settings: Any) -> Iterator[Cont
 
 
 def channel_for(
-    writer: ContainerWriter, topic: str, kind: str = "test_msgs/msg/Bytes", text: bytes = BYTES_TEXT
+    writer: ContainerWriter,
+    topic: str,
+    kind: str = "test_msgs/msg/Bytes",
+    text: bytes = BYTES_TEXT,
 ) -> int:
-    return writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+    return writer.register_channel(
+        topic, "cdr", writer.register_schema(kind, "ros2msg", text)
+    )
 
 
-def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: Any) -> list[Stored]:
+def write(
+    path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: Any
+) -> list[Stored]:
     """Messages of three lengths on /bytes, 1 ns apart, between others in JSON; what was written on /bytes."""
     rng = np.random.default_rng(0)
     written = [(1000 + i, rng.bytes([20, 50, 80][i % 3])) for i in range(count)]
@@ -208,7 +279,10 @@ def write_apart(path: Path, count: int = 100) -> None:
     """/a and /b in chunks of their own, by turns, a second apart from second 1 on; /tf_static is in the first chunk."""
     with writing(path) as writer:
         kinds = {"/a": "A", "/b": "B", "/tf_static": "Static"}
-        channels = [channel_for(writer, name, f"test_msgs/msg/{kind}") for name, kind in kinds.items()]
+        channels = [
+            channel_for(writer, name, f"test_msgs/msg/{kind}")
+            for name, kind in kinds.items()
+        ]
         writer.add_message(channels[2], 10**9, b"static", 10**9)
         for i in range(count):
             writer.add_message(channels[i % 2], (1 + i) * 10**9, bytes([i]), 10**9)
@@ -218,7 +292,9 @@ def write_apart(path: Path, count: int = 100) -> None:
 def entries(topic: Topic) -> list[Stored]:
     """Log times and payloads, in order."""
     stacks = [part for stack in topic.stacks.values() for part in stack]
-    payloads = {row: p.tobytes() for rows, ps in stacks for row, p in zip(rows, ps, strict=True)}
+    payloads = {
+        row: p.tobytes() for rows, ps in stacks for row, p in zip(rows, ps, strict=True)
+    }
     return [(int(time), payloads[row]) for row, time in enumerate(topic.log_times_ns)]
 
 

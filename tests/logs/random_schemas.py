@@ -12,14 +12,29 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.interfaces import Typestore
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sonar_graph.logs.cdr.definitions import PRIMITIVES, STRING, Struct, parse_definition
+from sonar_graph.logs.cdr.definitions import (
+    PRIMITIVES,
+    STRING,
+    Struct,
+    parse_definition,
+)
 from sonar_graph.logs.cdr.messages import Messages, decode, encode
 
 ROOT = "fuzz_msgs/msg/Root"
 TEXTS = ["", "a", "base_link", "ψ → 深い", "with \0 inside", "\U0001f420", "x" * 40]
-CONSTANTS = ["uint8 A=1", "float64 B = -1.5", 'string C="a # b"', "  # a comment: float64 no", "", "bool D=true"]
+CONSTANTS = [
+    "uint8 A=1",
+    "float64 B = -1.5",
+    'string C="a # b"',
+    "  # a comment: float64 no",
+    "",
+    "bool D=true",
+]
 DEFAULTS = {"bool": "true", "string": '"a b"', "float32": "-1.5", "float64": "1e-3"}
-BUILTIN = dict.fromkeys(["builtin_interfaces/Time", "builtin_interfaces/Duration"], "int32 sec\nuint32 nanosec")
+BUILTIN = dict.fromkeys(
+    ["builtin_interfaces/Time", "builtin_interfaces/Duration"],
+    "int32 sec\nuint32 nanosec",
+)
 
 
 class RandomTypes:
@@ -46,20 +61,30 @@ class RandomTypes:
         default = ""
         if not array and kind in {*PRIMITIVES, STRING} and self._rng.random() < 0.2:
             default = " " + DEFAULTS.get(kind, "7")
-        comment = "  # [m] float64 x" if self._rng.random() < 0.2 and kind != STRING else ""
+        comment = (
+            "  # [m] float64 x" if self._rng.random() < 0.2 and kind != STRING else ""
+        )
         return f"{kind}{array} {name}{default}{comment}"
 
     def _kind(self, depth: int) -> str:
         draw = self._rng.random()
         if draw < 0.3 and depth:
             return self.draw(f"fuzz_msgs/T{len(self.texts)}x{depth}", depth - 1)
-        kind = str(self._rng.choice(list(BUILTIN) if draw < 0.4 else [*PRIMITIVES, STRING, STRING]))
+        kind = str(
+            self._rng.choice(
+                list(BUILTIN) if draw < 0.4 else [*PRIMITIVES, STRING, STRING]
+            )
+        )
         self.texts |= {kind: BUILTIN[kind]} if kind in BUILTIN else {}
         return kind
 
     def schema(self) -> str:
         """The text of the root with all others."""
-        others = [f"{'=' * 80}\nMSG: {name}\n{text}\n" for name, text in self.texts.items() if name != "fuzz_msgs/Root"]
+        others = [
+            f"{'=' * 80}\nMSG: {name}\n{text}\n"
+            for name, text in self.texts.items()
+            if name != "fuzz_msgs/Root"
+        ]
         return self.texts["fuzz_msgs/Root"] + "\n" + "".join(others)
 
 
@@ -73,19 +98,32 @@ def typestore(texts: dict[str, str]) -> Typestore:
     return store
 
 
-def random_message(definition: Struct, store: Typestore, shape: np.random.Generator, rng: np.random.Generator) -> Any:
+def random_message(
+    definition: Struct,
+    store: Typestore,
+    shape: np.random.Generator,
+    rng: np.random.Generator,
+) -> Any:
     """A message as rosbags has it: lengths and strings by the first generator, numbers by the second."""
     values = []
     for entry in definition.fields:
-        count = entry.length if entry.length is not None else int(shape.choice([0, 1, 2, 4]))
+        count = (
+            entry.length
+            if entry.length is not None
+            else int(shape.choice([0, 1, 2, 4]))
+        )
         if isinstance(entry.kind, Struct):
-            value: Any = [random_message(entry.kind, store, shape, rng) for _ in range(count)]
+            value: Any = [
+                random_message(entry.kind, store, shape, rng) for _ in range(count)
+            ]
         elif entry.kind == STRING:
             value = [str(shape.choice(TEXTS)) for _ in range(count)]
         else:
             value = random_numbers(PRIMITIVES[entry.kind], count, rng)
             if entry.kind == "byte" and not entry.is_array:
-                value &= 0x7F  # rosbags packs a single byte as signed, unlike a list of them
+                value &= (
+                    0x7F  # rosbags packs a single byte as signed, unlike a list of them
+                )
         values.append(value if entry.is_array else value[0])
     if not definition.fields:
         values = [0]
@@ -103,7 +141,9 @@ def random_numbers(kind: str, count: int, rng: np.random.Generator) -> np.ndarra
     return numbers
 
 
-def leaves_of(message: Any, definition: Struct, prefix: str, found: dict[str, list[Any]]) -> dict[str, list[Any]]:
+def leaves_of(
+    message: Any, definition: Struct, prefix: str, found: dict[str, list[Any]]
+) -> dict[str, list[Any]]:
     """All values by path, in order, of a message as mcap-ros2-support decodes it; of arrays their lengths too."""
     for entry in definition.fields:
         path, value = prefix + entry.name, getattr(message, entry.name)
@@ -114,7 +154,9 @@ def leaves_of(message: Any, definition: Struct, prefix: str, found: dict[str, li
             for element in elements:
                 leaves_of(element, entry.kind, path + ".", found)
         else:
-            found.setdefault(path, []).extend(x % 256 if entry.kind == "char" else x for x in elements)
+            found.setdefault(path, []).extend(
+                x % 256 if entry.kind == "char" else x for x in elements
+            )
     return found
 
 
@@ -132,14 +174,26 @@ def paths_of(definition: Struct, prefix: str = "") -> tuple[dict[str, bool], lis
     return values, arrays
 
 
-def differences(group: Messages, at: int, definition: Struct, expected: dict[str, list[Any]]) -> list[str]:
+def differences(
+    group: Messages, at: int, definition: Struct, expected: dict[str, list[Any]]
+) -> list[str]:
     """Paths at which a message of ours differs from the one that mcap-ros2-support decoded."""
     values, arrays = paths_of(definition)
-    found = [path for path in arrays if group.lengths(path) != expected.get(f"len {path}", [])]
+    found = [
+        path
+        for path in arrays
+        if group.lengths(path) != expected.get(f"len {path}", [])
+    ]
     for path, is_text in values.items():
-        ours = group.strings(path)[at] if is_text else np.atleast_1d(group[path][at]).tolist()
+        ours = (
+            group.strings(path)[at]
+            if is_text
+            else np.atleast_1d(group[path][at]).tolist()
+        )
         theirs = expected.get(path, [])
-        same = (a == b or (a != a and b != b) for a, b in zip(ours, theirs, strict=False))
+        same = (
+            a == b or (a != a and b != b) for a, b in zip(ours, theirs, strict=False)
+        )
         found += [] if len(ours) == len(theirs) and all(same) else [path]
     return found
 
@@ -147,8 +201,13 @@ def differences(group: Messages, at: int, definition: Struct, expected: dict[str
 def encoded_again(group: Messages, at: int, definition: Struct) -> bytes:
     """A decoded message written from its columns and lengths."""
     paths, arrays = paths_of(definition)
-    values: dict[str, Any] = {p: group.strings(p)[at] if text else group[p][at : at + 1] for p, text in paths.items()}
-    return encode(definition, 1, values, {path: group.lengths(path) for path in arrays})[0].tobytes()
+    values: dict[str, Any] = {
+        p: group.strings(p)[at] if text else group[p][at : at + 1]
+        for p, text in paths.items()
+    }
+    return encode(
+        definition, 1, values, {path: group.lengths(path) for path in arrays}
+    )[0].tobytes()
 
 
 @dataclass
@@ -165,7 +224,10 @@ def stacked(payloads: list[bytes]) -> list[tuple[np.ndarray, np.ndarray]]:
     """What the container hands over: payloads stacked by length."""
     sizes = np.array([len(p) for p in payloads])
     rows = [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
-    return [(some, np.array([np.frombuffer(payloads[row], np.uint8) for row in some])) for some in rows]
+    return [
+        (some, np.array([np.frombuffer(payloads[row], np.uint8) for row in some]))
+        for some in rows
+    ]
 
 
 def check(schemas: int, messages: int, seed: int = 0) -> Tally:
@@ -178,16 +240,25 @@ def check(schemas: int, messages: int, seed: int = 0) -> Tally:
         schema = types.schema()
         definition, store = parse_definition(ROOT, schema), typestore(types.texts)
         oracle = generate_dynamic(ROOT, schema)[ROOT]
-        shapes = [np.random.default_rng([number, i // 2]) for i in range(messages)]  # two each share a layout
+        # two each share a layout
+        shapes = [np.random.default_rng([number, i // 2]) for i in range(messages)]
         drawn = [random_message(definition, store, shape, rng) for shape in shapes]
         little = [bytes(store.serialize_cdr(message, ROOT)) for message in drawn]
-        big = [bytes(store.serialize_cdr(message, ROOT, little_endian=False)) for message in drawn]
+        big = [
+            bytes(store.serialize_cdr(message, ROOT, little_endian=False))
+            for message in drawn
+        ]
         padded = [payload + bytes(-len(payload) % 4) for payload in little + big]
         decoded = decode(definition, stacked(padded))
         tally.unsound += sum(map(len, decoded.unsound.values()))
         for group in decoded.groups:
             for at, row in enumerate(group.rows.tolist()):
-                wrong = differences(group, at, definition, leaves_of(oracle(padded[row]), definition, "", {}))
+                wrong = differences(
+                    group,
+                    at,
+                    definition,
+                    leaves_of(oracle(padded[row]), definition, "", {}),
+                )
                 example = f"seed {number}, message {row}: {wrong}\n{schema}"
                 tally.messages += 1
                 tally.decoded_differently += [example] if wrong else []

@@ -24,20 +24,32 @@ IMU_TEXT = b"float64 x"
 BINARY_SCHEMA = bytes(range(256))
 
 
-def foreign_log(path: Path, count: int = 400, profile: str = "ros2", tick_ns: int = 10) -> Path:
+def foreign_log(
+    path: Path, count: int = 400, profile: str = "ros2", tick_ns: int = 10
+) -> Path:
     """A log of another program: two encodings, publish times that differ, metadata and an attachment."""
     with writing(path, profile, chunk_size=2000, enable_data_crcs=True) as writer:
         text = writer.register_schema("a/msg/B", "ros2msg", IMU_TEXT)
         binary = writer.register_schema("c.D", "protobuf", BINARY_SCHEMA)
-        one = writer.register_channel("/one", "cdr", text, {"offered_qos_profiles": "- {durability: 1}"})
+        one = writer.register_channel(
+            "/one", "cdr", text, {"offered_qos_profiles": "- {durability: 1}"}
+        )
         other = writer.register_channel("/other", "protobuf", binary)
         bare = writer.register_channel("/bare", "json", 0)
         writer.add_metadata("about", {"ship": "Vessel"})
         writer.add_attachment(1, 2, "notes.txt", "text/plain", b"of the dive")
         for k in range(count):
             at_ns = tick_ns * k
-            writer.add_message(one, at_ns, struct.pack("<Id", 256, k), at_ns - (3 if k else 0), k)
-            writer.add_message((other, bare)[k % 2], at_ns + 1, bytes([k % 256]) * (k % 50), at_ns + 1, 7)
+            writer.add_message(
+                one, at_ns, struct.pack("<Id", 256, k), at_ns - (3 if k else 0), k
+            )
+            writer.add_message(
+                (other, bare)[k % 2],
+                at_ns + 1,
+                bytes([k % 256]) * (k % 50),
+                at_ns + 1,
+                7,
+            )
     return path
 
 
@@ -48,10 +60,22 @@ def content(path: Path) -> dict[str, list]:
         reader = make_reader(stream)
         for schema, channel, message in reader.iter_messages():
             described = (schema.name, schema.encoding, schema.data) if schema else None
-            entry = (message.log_time, message.publish_time, message.sequence, message.data)
-            found.setdefault(channel.topic, [(described, channel.message_encoding, channel.metadata)]).append(entry)
-        found["metadata"] = [(record.name, record.metadata) for record in reader.iter_metadata()]
-        found["attachments"] = [(a.name, a.media_type, a.log_time, a.data) for a in reader.iter_attachments()]
+            entry = (
+                message.log_time,
+                message.publish_time,
+                message.sequence,
+                message.data,
+            )
+            found.setdefault(
+                channel.topic, [(described, channel.message_encoding, channel.metadata)]
+            ).append(entry)
+        found["metadata"] = [
+            (record.name, record.metadata) for record in reader.iter_metadata()
+        ]
+        found["attachments"] = [
+            (a.name, a.media_type, a.log_time, a.data)
+            for a in reader.iter_attachments()
+        ]
     return found
 
 
@@ -61,9 +85,16 @@ def landmarks(time_ns: int, topic: str = "/map") -> Outgoing:
 
 
 @pytest.mark.parametrize("profile", ["ros2", "", "x" * 40])
-def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_added(tmp_path, profile):
+def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_added(
+    tmp_path, profile
+):
     source = foreign_log(tmp_path / "a.mcap", profile=profile)
-    amended = write_amended(source, tmp_path / "b.mcap", [landmarks(2005)], metadata={"more": {"key": "value"}})
+    amended = write_amended(
+        source,
+        tmp_path / "b.mcap",
+        [landmarks(2005)],
+        metadata={"more": {"key": "value"}},
+    )
     before, after = content(source), content(tmp_path / "b.mcap")
     assert after.pop("/map")[1][:2] == (2005, 2005)
     (name, record) = after["metadata"].pop()
@@ -73,27 +104,47 @@ def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_adde
     with (tmp_path / "b.mcap").open("rb") as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == profile
-        times_ns = [m.log_time for _, _, m in reader.iter_messages(log_time_order=False)]
+        times_ns = [
+            m.log_time for _, _, m in reader.iter_messages(log_time_order=False)
+        ]
     assert times_ns == sorted(times_ns)
     assert is_own_log(tmp_path / "b.mcap")
     assert not is_own_log(source)
 
 
-def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(tmp_path):
+def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(
+    tmp_path,
+):
     """Two topics in one chunk, whose times go to and fro."""
     times_ns = [70, 10, 40, 40, 90, 10, 40]
     with writing(tmp_path / "a.mcap") as writer:
-        channels = [writer.register_channel(topic, "json", 0) for topic in ("/one", "/other")]
+        channels = [
+            writer.register_channel(topic, "json", 0) for topic in ("/one", "/other")
+        ]
         for number, time_ns in enumerate(times_ns):
             writer.add_message(channels[number % 2], time_ns, b"{}", time_ns, number)
     write_amended(tmp_path / "a.mcap", tmp_path / "b.mcap", [landmarks(50)])
     with (tmp_path / "b.mcap").open("rb") as stream:
-        messages = [(m.log_time, m.sequence) for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
-    assert messages == [(10, 1), (10, 5), (40, 2), (40, 3), (40, 6), (50, 0), (70, 0), (90, 4)]
+        messages = [
+            (m.log_time, m.sequence)
+            for _, _, m in make_reader(stream).iter_messages(log_time_order=False)
+        ]
+    assert messages == [
+        (10, 1),
+        (10, 5),
+        (40, 2),
+        (40, 3),
+        (40, 6),
+        (50, 0),
+        (70, 0),
+        (90, 4),
+    ]
 
 
 @pytest.mark.parametrize("share", [0.3, 0.77])
-def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(tmp_path, share):
+def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
+    tmp_path, share
+):
     """The length of what is there is counted from its first message."""
     whole = foreign_log(tmp_path / "a.mcap", tick_ns=100_000_000).read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -103,12 +154,23 @@ def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(t
     assert len(after["/map"]) == 2
     for topic in ("/one", "/other", "/bare"):
         assert after[topic] == before[topic][: len(after[topic])]
-        assert len(after[topic]) == 1 + len(scan(cut, lambda _: Keep.NONE).topics[topic])
+        assert len(after[topic]) == 1 + len(
+            scan(cut, lambda _: Keep.NONE).topics[topic]
+        )
     assert 0.5 * share < (len(after["/one"]) - 1) / 400 < 1.5 * share
-    assert (after["metadata"], after["attachments"]) == (before["metadata"], before["attachments"])
+    assert (after["metadata"], after["attachments"]) == (
+        before["metadata"],
+        before["attachments"],
+    )
     assert scan(tmp_path / "b.mcap", lambda _: Keep.NONE).ending is None
-    last_ns = max(message[0] for topic in ("/one", "/other", "/bare") for message in after[topic][1:])
-    (span_s,) = re.findall(r"cut off.*what is there spans ([0-9.]+) s", amended.notes["log.ending"])
+    last_ns = max(
+        message[0]
+        for topic in ("/one", "/other", "/bare")
+        for message in after[topic][1:]
+    )
+    (span_s,) = re.findall(
+        r"cut off.*what is there spans ([0-9.]+) s", amended.notes["log.ending"]
+    )
     assert float(span_s) == pytest.approx(last_ns * 1e-9, abs=1e-3)
 
 
@@ -120,21 +182,29 @@ def test_a_hole_is_refused_and_with_salvage_what_is_whole_is_copied(tmp_path):
     with pytest.raises(LogError, match=r"hole.mcap is damaged.*--salvage"):
         write_amended(tmp_path / "hole.mcap", tmp_path / "b.mcap", [])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "hole.mcap"]
-    amended = write_amended(tmp_path / "hole.mcap", tmp_path / "b.mcap", [], salvage=True)
+    amended = write_amended(
+        tmp_path / "hole.mcap", tmp_path / "b.mcap", [], salvage=True
+    )
     assert "lost" in amended.notes["log.damage"]
     before, after = content(source), content(tmp_path / "b.mcap")
     assert 300 < len(after["/one"]) < len(before["/one"])
     assert all(message in before["/one"] for message in after["/one"])
 
 
-def test_the_log_itself_and_topics_that_are_there_are_refused_unless_these_are_written_anew(tmp_path):
+def test_the_log_itself_and_topics_that_are_there_are_refused_unless_these_are_written_anew(
+    tmp_path,
+):
     source = foreign_log(tmp_path / "a.mcap")
     once, twice = tmp_path / "once.mcap", tmp_path / "twice.mcap"
     write_amended(source, once, [landmarks(5)])
     with pytest.raises(LogError, match=r"/map .* is in the log already"):
         write_amended(once, twice, [landmarks(6)])
-    with pytest.raises(LogError, match=r"/one \(a/msg/B\) is in the log already"):  # of another type
-        write_amended(source, twice, [replace(landmarks(5), topic="/one")], anew={"/one": MAP})
+    with pytest.raises(
+        LogError, match=r"/one \(a/msg/B\) is in the log already"
+    ):  # of another type
+        write_amended(
+            source, twice, [replace(landmarks(5), topic="/one")], anew={"/one": MAP}
+        )
     amended = write_amended(once, twice, [landmarks(6)], anew={"/map": MAP})
     assert amended.replaced == {"/map": 1}
     assert [message[0] for message in content(twice)["/map"][1:]] == [6]
@@ -146,13 +216,19 @@ def test_the_log_itself_and_topics_that_are_there_are_refused_unless_these_are_w
 
 def test_a_damaged_attachment_is_left_out_and_named(tmp_path):
     source = foreign_log(tmp_path / "a.mcap")
-    (tmp_path / "bad.mcap").write_bytes(source.read_bytes().replace(b"of the dive", b"of the dove"))
-    amended = write_amended(tmp_path / "bad.mcap", tmp_path / "b.mcap", [], salvage=True)
+    (tmp_path / "bad.mcap").write_bytes(
+        source.read_bytes().replace(b"of the dive", b"of the dove")
+    )
+    amended = write_amended(
+        tmp_path / "bad.mcap", tmp_path / "b.mcap", [], salvage=True
+    )
     assert "damaged and left out" in amended.notes["log.attachments"]
     assert content(tmp_path / "b.mcap")["attachments"] == []
 
 
-def test_messages_that_come_piece_by_piece_are_merged_and_their_topic_must_be_new(tmp_path):
+def test_messages_that_come_piece_by_piece_are_merged_and_their_topic_must_be_new(
+    tmp_path,
+):
     source = foreign_log(tmp_path / "source.mcap")
     plain, streamed = tmp_path / "plain.mcap", tmp_path / "streamed.mcap"
     entries = [landmarks(time_ns) for time_ns in (5, 1005, 2005)]

@@ -50,12 +50,21 @@ def folder(whole, tmp_path) -> Path:
             channels: dict[str, int] = {}
             for schema, channel, message in messages[first:last]:
                 if channel.topic not in channels:
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    number = writer.register_schema(
+                        schema.name, schema.encoding, schema.data
+                    )
                     channels[channel.topic] = writer.register_channel(
-                        channel.topic, channel.message_encoding, number, channel.metadata
+                        channel.topic,
+                        channel.message_encoding,
+                        number,
+                        channel.metadata,
                     )
                 writer.add_message(
-                    channels[channel.topic], message.log_time, message.data, message.publish_time, message.sequence
+                    channels[channel.topic],
+                    message.log_time,
+                    message.data,
+                    message.publish_time,
+                    message.sequence,
                 )
             for record in records if first == 0 else []:
                 writer.add_metadata(record.name, record.metadata)
@@ -63,9 +72,13 @@ def folder(whole, tmp_path) -> Path:
     return folder
 
 
-def with_metadata(folder: Path, names: list[str] = NAMES, storage: str = "mcap") -> Path:
+def with_metadata(
+    folder: Path, names: list[str] = NAMES, storage: str = "mcap"
+) -> Path:
     listed = "\n".join(f"    - {name}" for name in names)
-    (folder / "metadata.yaml").write_text(METADATA.format(storage=storage, names=listed))
+    (folder / "metadata.yaml").write_text(
+        METADATA.format(storage=storage, names=listed)
+    )
     return folder
 
 
@@ -73,9 +86,15 @@ def contents(path: Path) -> dict[str, list[tuple[int, bytes]]]:
     """Times and payloads by topic, in the order of the log."""
     found: dict[str, list[tuple[int, bytes]]] = {}
     for name, topic in scan(path, lambda _: Keep.ALL).topics.items():
-        rows = [(r, p) for stack in topic.stacks.values() for rows, ps in stack for r, p in zip(rows, ps, strict=True)]
+        rows = [
+            (r, p)
+            for stack in topic.stacks.values()
+            for rows, ps in stack
+            for r, p in zip(rows, ps, strict=True)
+        ]
         found[name] = [
-            (int(topic.log_times_ns[row]), payload.tobytes()) for row, payload in sorted(rows, key=lambda x: x[0])
+            (int(topic.log_times_ns[row]), payload.tobytes())
+            for row, payload in sorted(rows, key=lambda x: x[0])
         ]
     return found
 
@@ -97,15 +116,23 @@ def test_a_folder_is_the_single_file(whole, folder, is_listed):
             np.testing.assert_array_equal(getattr(getattr(several, role), name), column)
     np.testing.assert_array_equal(several.truth.positions, one.truth.positions)
     told, expected = inspect_log(folder), inspect_log(whole)
-    assert (told.topics, told.damage, told.warnings) == (expected.topics, expected.damage, expected.warnings)
+    assert (told.topics, told.damage, told.warnings) == (
+        expected.topics,
+        expected.damage,
+        expected.warnings,
+    )
     assert list(recorded_messages(folder)) == list(recorded_messages(whole))
 
 
 def test_a_part_of_the_time_is_counted_from_the_first_file(whole, folder):
     for window in (TimeWindow.parse("5", "12.5"), TimeWindow(Instant(seconds=14.0))):
-        one, several = (scan(path, lambda _: Keep.ALL, window) for path in (whole, folder))
+        one, several = (
+            scan(path, lambda _: Keep.ALL, window) for path in (whole, folder)
+        )
         assert several.part == one.part or "of the recording" in several.part
-        assert {n: len(t) for n, t in several.topics.items()} == {n: len(t) for n, t in one.topics.items()}
+        assert {n: len(t) for n, t in several.topics.items()} == {
+            n: len(t) for n, t in one.topics.items()
+        }
     with pytest.raises(LogError, match=r"dive: nothing was recorded from"):
         scan(folder, lambda _: Keep.ALL, TimeWindow.parse("50", None))
 
@@ -126,14 +153,25 @@ def cut(path: Path) -> None:
 
 
 FAULTS = {
-    "missing": (lambda path: path.unlink(), r"dive is damaged: dive_4\.mcap: is missing"),
-    "empty": (lambda path: path.write_bytes(b""), r"dive is damaged: dive_4\.mcap: is not an MCAP file but empty"),
-    "cut": (cut, r"dive is damaged: dive_4\.mcap: bytes \d+ to \d+: the file is cut off"),
+    "missing": (
+        lambda path: path.unlink(),
+        r"dive is damaged: dive_4\.mcap: is missing",
+    ),
+    "empty": (
+        lambda path: path.write_bytes(b""),
+        r"dive is damaged: dive_4\.mcap: is not an MCAP file but empty",
+    ),
+    "cut": (
+        cut,
+        r"dive is damaged: dive_4\.mcap: bytes \d+ to \d+: the file is cut off",
+    ),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_part_that_is_missing_or_damaged_is_named_and_the_rest_is_read_if_asked_for(folder, fault):
+def test_a_part_that_is_missing_or_damaged_is_named_and_the_rest_is_read_if_asked_for(
+    folder, fault
+):
     with_metadata(folder)
     spoil, said = FAULTS[fault]
     spoil(folder / NAMES[4])
@@ -157,20 +195,29 @@ def test_a_last_part_that_is_cut_off_is_read_as_far_as_it_goes(folder):
 
 def test_other_folders_are_refused_with_what_to_do(folder, tmp_path):
     with_metadata(folder, storage="sqlite3")
-    with pytest.raises(LogError, match=r"dive: is a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag"):
+    with pytest.raises(
+        LogError,
+        match=r"dive: is a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag",
+    ):
         read_log(folder)
     with_metadata(folder, ["dive_0.mcap.zstd"])
     with pytest.raises(LogError, match=r"dive_0\.mcap\.zstd is no \.mcap file; unpack"):
         read_log(folder)
     (folder / "metadata.yaml").write_text("nothing: here\n")
-    with pytest.raises(LogError, match=r"metadata\.yaml: names no files under relative_file_paths; `ros2 bag reindex`"):
+    with pytest.raises(
+        LogError,
+        match=r"metadata\.yaml: names no files under relative_file_paths; `ros2 bag reindex`",
+    ):
         read_log(folder)
     (folder / "metadata.yaml").unlink()
     (folder / "other.mcap").write_bytes((folder / NAMES[3]).read_bytes())
     with pytest.raises(
-        LogError, match=r"dive: (other|dive_3)\.mcap begins before (dive_3|other)\.mcap ends: these are two"
+        LogError,
+        match=r"dive: (other|dive_3)\.mcap begins before (dive_3|other)\.mcap ends: these are two",
     ):
         read_log(folder)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(LogError, match=r"empty: is a folder without metadata\.yaml and \.mcap files"):
+    with pytest.raises(
+        LogError, match=r"empty: is a folder without metadata\.yaml and \.mcap files"
+    ):
         read_log(tmp_path / "empty")

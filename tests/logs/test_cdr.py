@@ -14,7 +14,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import layout as plan
-from sonar_graph.logs.cdr.definitions import DEFINITIONS, STRING, Struct, definition, parse_definition
+from sonar_graph.logs.cdr.definitions import (
+    DEFINITIONS,
+    STRING,
+    Struct,
+    definition,
+    parse_definition,
+)
 from sonar_graph.logs.cdr.layout import Layout
 from sonar_graph.logs.cdr.messages import Decoder, decode, encode
 
@@ -28,24 +34,37 @@ TEXTS = st.text(st.characters(codec="utf-8"), max_size=9)
 
 def parsed(text: str, **used: str) -> Struct:
     """A type by the text of its fields, and those of the types that it uses."""
-    others = (f"{RULE}\nMSG: test_msgs/{name}\n{fields}\n" for name, fields in used.items())
+    others = (
+        f"{RULE}\nMSG: test_msgs/{name}\n{fields}\n" for name, fields in used.items()
+    )
     return parse_definition(NAME, "\n".join([text, *others]))
 
 
 def column(groups: Any, path: str) -> dict[int, Any]:
     """Values of a field by the row of their message."""
-    return {int(row): value for g in groups for row, value in zip(g.rows, g[path].tolist(), strict=True)}
+    return {
+        int(row): value
+        for g in groups
+        for row, value in zip(g.rows, g[path].tolist(), strict=True)
+    }
 
 
 # ---- definitions
 
 
 def names_within(struct: Struct) -> list[str]:
-    return [struct.name] + [n for f in struct.fields if isinstance(f.kind, Struct) for n in names_within(f.kind)]
+    return [struct.name] + [
+        n
+        for f in struct.fields
+        if isinstance(f.kind, Struct)
+        for n in names_within(f.kind)
+    ]
 
 
 @pytest.mark.parametrize("name", DEFINITIONS)
-def test_definitions_have_the_fields_of_ros_jazzy_and_travel_with_all_that_they_use(name: str) -> None:
+def test_definitions_have_the_fields_of_ros_jazzy_and_travel_with_all_that_they_use(
+    name: str,
+) -> None:
     long_name = name.replace("/", "/msg/")
     if not name.startswith(("sonar_graph_msgs", "marine")):
         jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs[long_name][1]
@@ -72,20 +91,38 @@ def test_constants_comments_defaults_and_bounds_are_understood() -> None:
         ("fixed", "int32", 4, True),
         ("open", "float32", None, True),
     ]
-    for own in ("Part", "test_msgs/Part", "test_msgs/msg/Part"):  # of the own package, with or without a prefix
-        part, stamp = parsed(f"{own} part\nbuiltin_interfaces/Time stamp", Part="float64 x").fields
-        assert (part.kind.name, stamp.kind.name) == ("test_msgs/Part", "builtin_interfaces/Time")
-        assert [f.name for f in stamp.kind.fields] == ["sec", "nanosec"]  # needs no definition
+    for own in (
+        "Part",
+        "test_msgs/Part",
+        "test_msgs/msg/Part",
+    ):  # of the own package, with or without a prefix
+        part, stamp = parsed(
+            f"{own} part\nbuiltin_interfaces/Time stamp", Part="float64 x"
+        ).fields
+        assert (part.kind.name, stamp.kind.name) == (
+            "test_msgs/Part",
+            "builtin_interfaces/Time",
+        )
+        # needs no definition
+        assert [f.name for f in stamp.kind.fields] == [
+            "sec",
+            "nanosec",
+        ]
 
 
 def doubling(levels: int) -> str:
     """Types of which each has two of the next: a few lines with as many fields as 2 to the power of their number."""
     names = [f"test_msgs/T{i}" for i in range(levels)] + ["float64"]
-    parts = [f"MSG: {name}\n{names[i + 1]} a\n{names[i + 1]} b\n" for i, name in enumerate(names[:-1])]
+    parts = [
+        f"MSG: {name}\n{names[i + 1]} a\n{names[i + 1]} b\n"
+        for i, name in enumerate(names[:-1])
+    ]
     return f"T0 root\n{RULE}\n" + f"{RULE}\n".join(parts)
 
 
-CHAIN = "T0 first\n" + "".join(f"{RULE}\nMSG: test_msgs/T{i}\nT{i + 1} next\n" for i in range(3000))
+CHAIN = "T0 first\n" + "".join(
+    f"{RULE}\nMSG: test_msgs/T{i}\nT{i + 1} next\n" for i in range(3000)
+)
 
 
 REFUSED = {
@@ -121,9 +158,12 @@ def fresh_plans() -> Any:
 
 
 @pytest.mark.parametrize(
-    ("schemas", "messages", "seed"), [(40, 5, 1000), pytest.param(300, 10, 0, marks=pytest.mark.slow)]
+    ("schemas", "messages", "seed"),
+    [(40, 5, 1000), pytest.param(300, 10, 0, marks=pytest.mark.slow)],
 )
-def test_random_messages_decode_and_encode_as_with_two_other_libraries(schemas: int, messages: int, seed: int) -> None:
+def test_random_messages_decode_and_encode_as_with_two_other_libraries(
+    schemas: int, messages: int, seed: int
+) -> None:
     tally = check(schemas, messages, seed)
     assert tally == Tally(schemas * messages * 2)  # in both byte orders
 
@@ -140,8 +180,16 @@ def swapped(layout: Layout, path: str) -> Any:
 @pytest.mark.parametrize(
     ("where", "name", "wrong"),
     [
-        (plan, "padding", lambda at, size: -(at - plan.HEADER_BYTES) % min(size, 4)),  # the rule of XCDR2
-        (plan, "padding", lambda at, size: -at % size),  # counted from before the header
+        (
+            plan,
+            "padding",
+            lambda at, size: -(at - plan.HEADER_BYTES) % min(size, 4),
+        ),  # the rule of XCDR2
+        (
+            plan,
+            "padding",
+            lambda at, size: -at % size,
+        ),  # counted from before the header
         (plan, "padding", lambda *_: 0),
         (Layout, "column", swapped),
     ],
@@ -178,7 +226,11 @@ def test_writing_then_reading_is_the_identity_to_the_bit(data: st.DataObject) ->
     for path in ("a", "parts.d", "z"):
         np.testing.assert_array_equal(group[path], values[path])
     assert group["z"].dtype == bool
-    for path, texts in (("s", [values["s"]]), ("names", values["names"]), ("parts.name", values["parts.name"])):
+    for path, texts in (
+        ("s", [values["s"]]),
+        ("names", values["names"]),
+        ("parts.name", values["parts.name"]),
+    ):
         assert group.strings(path) == [texts] * n
     assert group.lengths("parts.d") == each
     assert not group["parts.e"].any()
@@ -199,7 +251,9 @@ BY_HAND: dict[str, tuple[str, bytes, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("case", BY_HAND)
-def test_messages_written_by_hand_are_read_and_those_in_little_endian_written_the_same(case: str) -> None:
+def test_messages_written_by_hand_are_read_and_those_in_little_endian_written_the_same(
+    case: str,
+) -> None:
     text, by_hand, values = BY_HAND[case]
     definition = parsed(text, Nothing="# no fields")
     (group,) = decode(definition, stacked([by_hand, by_hand])).groups
@@ -212,48 +266,87 @@ def test_messages_written_by_hand_are_read_and_those_in_little_endian_written_th
         assert group["c"].tolist() == [[-3, 4]] * 2
 
 
-def test_messages_of_one_length_but_another_layout_or_byte_order_are_kept_apart() -> None:
-    payloads = [START + struct.pack("<d", 1.5), bytes(4) + struct.pack(">d", 2.5), START + struct.pack("<d", 3.5)]
+def test_messages_of_one_length_but_another_layout_or_byte_order_are_kept_apart() -> (
+    None
+):
+    payloads = [
+        START + struct.pack("<d", 1.5),
+        bytes(4) + struct.pack(">d", 2.5),
+        START + struct.pack("<d", 3.5),
+    ]
     groups = decode(parsed("float64 a"), stacked(payloads)).groups
     assert column(groups, "a") == {0: 1.5, 1: 2.5, 2: 3.5}
     assert len(groups) == 2
     # 1 + 5 and 5 + 1 bytes make payloads of the same length with the second length word elsewhere
     first = START + struct.pack("<IB3xI5s", 1, 9, 5, b"abcde")
     second = START + struct.pack("<I5s3xIB", 5, b"abcde", 1, 9)
-    groups = decode(parsed("uint8[] a\nuint8[] b"), stacked([first, second, first])).groups
-    assert sorted((group.rows.tolist(), group["a"].shape[1]) for group in groups) == [([0, 2], 1), ([1], 5)]
+    groups = decode(
+        parsed("uint8[] a\nuint8[] b"), stacked([first, second, first])
+    ).groups
+    assert sorted((group.rows.tolist(), group["a"].shape[1]) for group in groups) == [
+        ([0, 2], 1),
+        ([1], 5),
+    ]
 
 
-def test_messages_with_a_layout_each_are_read_like_those_that_share_one_and_byte_orders_told_apart() -> None:
+def test_messages_with_a_layout_each_are_read_like_those_that_share_one_and_byte_orders_told_apart() -> (
+    None
+):
     splits = [(i, j) for i in range(1, 40) for j in range(1, 41 - i)] * 2
     lists = [["x" * i, "y" * j, "z" * (41 - i - j)] for i, j in splits]
     definition = parsed("string[] names\nfloat64 a")
     values = [{"names": names, "a": float(row)} for row, names in enumerate(lists)]
-    groups = decode(definition, stacked([encode(definition, 1, value)[0].tobytes() for value in values])).groups
-    names = {row: found for g in groups for row, found in zip(g.rows.tolist(), g.strings("names"), strict=True)}
+    groups = decode(
+        definition,
+        stacked([encode(definition, 1, value)[0].tobytes() for value in values]),
+    ).groups
+    names = {
+        row: found
+        for g in groups
+        for row, found in zip(g.rows.tolist(), g.strings("names"), strict=True)
+    }
     assert names == dict(enumerate(lists))
     assert column(groups, "a") == {row: float(row) for row in range(len(lists))}
     sizes = [(4 * i, 160 - 4 * i) for i in range(41) for _ in "<>"]
     payloads = [
-        bytes([0, order == "<", 0, 0]) + struct.pack(f"{order}I{a}sI{b}si", a, b"a" * a, b, b"b" * b, row)
+        bytes([0, order == "<", 0, 0])
+        + struct.pack(f"{order}I{a}sI{b}si", a, b"a" * a, b, b"b" * b, row)
         for row, ((a, b), order) in enumerate(zip(sizes, "<>" * 41, strict=True))
     ]
     groups = decode(parsed("uint8[] a\nuint8[] b\nint32 c"), stacked(payloads)).groups
     assert column(groups, "c") == {row: row for row in range(82)}
 
 
-def test_layouts_met_earlier_give_the_same_columns_and_one_that_lies_evenly_is_a_view() -> None:
+def test_layouts_met_earlier_give_the_same_columns_and_one_that_lies_evenly_is_a_view() -> (
+    None
+):
     definition = parsed("string s\nfloat64[] v")
     payloads = encode(definition, 6, {"s": "abc", "v": np.arange(12.0).reshape(6, 2)})
     decoder, rows = Decoder(definition), np.arange(6)
-    parts = [decoder.decode([(rows[part], payloads[part])]).groups[0] for part in (slice(2), slice(2, 5), slice(5, 6))]
-    np.testing.assert_array_equal(np.concatenate([part["v"] for part in parts]), np.arange(12.0).reshape(6, 2))
+    parts = [
+        decoder.decode([(rows[part], payloads[part])]).groups[0]
+        for part in (slice(2), slice(2, 5), slice(5, 6))
+    ]
+    np.testing.assert_array_equal(
+        np.concatenate([part["v"] for part in parts]), np.arange(12.0).reshape(6, 2)
+    )
     assert parts[0].layout is parts[1].layout is parts[2].layout
-    definition = parsed("float32[] image\nP[] points\nQ[] ragged", P="float64 x\nfloat64 y", Q="string name\nfloat64 x")
-    values = {"image": np.ones((2, 5)), "points.y": np.ones((2, 3)), "ragged.name": ["a", "b" * 9, "c"]}
+    definition = parsed(
+        "float32[] image\nP[] points\nQ[] ragged",
+        P="float64 x\nfloat64 y",
+        Q="string name\nfloat64 x",
+    )
+    values = {
+        "image": np.ones((2, 5)),
+        "points.y": np.ones((2, 3)),
+        "ragged.name": ["a", "b" * 9, "c"],
+    }
     payloads = encode(definition, 2, values, {"points": 3, "ragged": 3})
     (group,) = decode(definition, [(np.arange(2), payloads)]).groups
-    assert all(np.shares_memory(found, payloads) for found in (group.payloads, group["image"], group["points.y"]))
+    assert all(
+        np.shares_memory(found, payloads)
+        for found in (group.payloads, group["image"], group["points.y"])
+    )
     assert not np.shares_memory(group["ragged.x"], payloads)
     assert group["ragged.x"].shape == (2, 3)
 
@@ -261,7 +354,13 @@ def test_layouts_met_earlier_give_the_same_columns_and_one_that_lies_evenly_is_a
 def test_what_does_not_fit_or_exist_is_neither_written_nor_read() -> None:
     definition = parsed("uint8 a\nint32[] b\nP[] points", P="int16 x\nstring s")
     assert encode(definition, 2, {"a": np.array([0, 255])})[:, 4].tolist() == [0, 255]
-    for values in ({"a": np.array([256])}, {"a": -1}, {"b": np.array([[1 << 31]])}, {"a": 1.5}, {"a": np.nan}):
+    for values in (
+        {"a": np.array([256])},
+        {"a": -1},
+        {"b": np.array([[1 << 31]])},
+        {"a": 1.5},
+        {"a": np.nan},
+    ):
         with pytest.raises(ValueError, match="does not fit"):
             encode(definition, 1, values)
     with pytest.raises(ValueError, match="nonsense"):
@@ -281,7 +380,12 @@ DEFINITION = parsed(FIELDS)
 
 
 def whole(**values: Any) -> bytes:
-    given = {"s": "abc", "flags": np.array([[True, False]]), "values": np.array([[1.5, 2.5]]), "last": 7}
+    given = {
+        "s": "abc",
+        "flags": np.array([[True, False]]),
+        "values": np.array([[1.5, 2.5]]),
+        "last": 7,
+    }
     return encode(DEFINITION, 1, given | values)[0].tobytes()
 
 
@@ -291,7 +395,10 @@ def poked(at: int, *octets: int) -> bytes:
     return bytes(payload)
 
 
-BOOLEAN, TEXT = "with a boolean flags that is neither 0 nor 1", "with a string s that is not UTF-8 closed by a NUL"
+BOOLEAN, TEXT = (
+    "with a boolean flags that is neither 0 nor 1",
+    "with a string s that is not UTF-8 closed by a NUL",
+)
 # fmt: off
 # 0 header, 4 length of s, 8 "abc\0", 12 length of flags, 16 flags, 20 length of values, 28 values, 44 last, 46 end
 BROKEN: dict[str, tuple[bytes, str]] = {
@@ -316,12 +423,16 @@ BROKEN: dict[str, tuple[bytes, str]] = {
 
 @pytest.mark.parametrize("kind", BROKEN)
 @pytest.mark.parametrize("place", [0, 1, 3], ids=["first", "among", "last"])
-def test_a_broken_message_is_named_and_those_around_it_are_read(kind: str, place: int) -> None:
+def test_a_broken_message_is_named_and_those_around_it_are_read(
+    kind: str, place: int
+) -> None:
     payload, fault = BROKEN[kind]
     payloads = [whole(last=i) for i in range(3)]
     payloads.insert(place, payload)
     decoded = decode(DEFINITION, stacked(payloads))
-    assert {name: rows.tolist() for name, rows in decoded.unsound.items()} == {fault: [place]}
+    assert {name: rows.tolist() for name, rows in decoded.unsound.items()} == {
+        fault: [place]
+    }
     others = (row for row in range(4) if row != place)
     assert column(decoded.groups, "last") == {row: i for i, row in enumerate(others)}
 
@@ -334,13 +445,17 @@ def test_padding_and_text_that_is_not_ascii_or_empty_are_no_faults() -> None:
     for text in ("ψ → 深い", "\U0001f420", "with \0 inside", "ends in \0"):
         (group,) = decode(DEFINITION, stacked([whole(s=text), whole(s=text)])).groups
         assert group.strings("s") == [[text], [text]]
-    (group,) = decode(DEFINITION, stacked([START + struct.pack("<IIIH", 0, 0, 0, 7)])).groups
+    (group,) = decode(
+        DEFINITION, stacked([START + struct.pack("<IIIH", 0, 0, 0, 7)])
+    ).groups
     assert group.strings("s") == [[""]], "a string of no bytes at all"
     assert group["last"].tolist() == [7]
 
 
 @given(st.binary(max_size=80), st.integers(0, 46), st.integers(0, 46))
-def test_no_bytes_crash_and_what_is_sound_is_what_another_library_reads(noise: bytes, start: int, end: int) -> None:
+def test_no_bytes_crash_and_what_is_sound_is_what_another_library_reads(
+    noise: bytes, start: int, end: int
+) -> None:
     payload = whole()[:start] + noise + whole()[end:]
     decoded = decode(DEFINITION, stacked([payload]))
     assert len(decoded.groups) + len(decoded.unsound) == 1
@@ -359,12 +474,25 @@ NAMES, ENDLESS = parsed("string[4] names"), parsed("P[4000000000] points", P="st
 MANY: dict[str, tuple[Struct, list[bytes]]] = {
     "cut": (DEFINITION, [whole()[:45]] * 21_000),
     "boolean": (DEFINITION, [poked(17, 2)] * 21_000),
-    "length": (DEFINITION, [START + struct.pack("<I", 16 + i % 3) + bytes(40) for i in range(300)] * 70),
-    "many layouts": (DEFINITION, [whole(s="a" * (4 * i), flags=np.zeros((1, 4 * (300 - i)))) for i in range(300)] * 70),
-    "an array without end": (ENDLESS, [START + bytes(80)]),  # found out before it is walked
+    "length": (
+        DEFINITION,
+        [START + struct.pack("<I", 16 + i % 3) + bytes(40) for i in range(300)] * 70,
+    ),
+    "many layouts": (
+        DEFINITION,
+        [whole(s="a" * (4 * i), flags=np.zeros((1, 4 * (300 - i)))) for i in range(300)]
+        * 70,
+    ),
+    "an array without end": (
+        ENDLESS,
+        [START + bytes(80)],
+    ),  # found out before it is walked
     "one layout each": (
         NAMES,
-        [START + b"".join(struct.pack(f"<I{n}s", n, b"x" * (n - 1)) for n in lengths) for lengths in LENGTHS],
+        [
+            START + b"".join(struct.pack(f"<I{n}s", n, b"x" * (n - 1)) for n in lengths)
+            for lengths in LENGTHS
+        ],
     ),
 }
 
@@ -378,4 +506,6 @@ def test_many_messages_that_are_broken_or_hardly_share_a_layout_take_no_longer_t
     decoded = decode(definition, stacks)
     assert time.process_time() - start < 3.0
     assert definition is not NAMES or (len(stacks), len(decoded.groups)) == (1, 12_000)
-    assert definition is not ENDLESS or list(decoded.unsound) == ["that end before their definition does"]
+    assert definition is not ENDLESS or list(decoded.unsound) == [
+        "that end before their definition does"
+    ]

@@ -5,7 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
 from sonar_graph.logs.checks import (
@@ -30,7 +36,11 @@ def stamps(times_s: Floats) -> Any:
 
 
 def imu(times_s: Floats = SAMPLES, force: tuple[float, ...] = (0, 0, 9.8)) -> Imu:
-    return Imu(stamps(times_s), np.zeros((len(times_s), 3)), np.tile(force, (len(times_s), 1)).astype(float))
+    return Imu(
+        stamps(times_s),
+        np.zeros((len(times_s), 3)),
+        np.tile(force, (len(times_s), 1)).astype(float),
+    )
 
 
 def dvl(times_s: Floats = PINGS, partial: Any = False) -> Dvl:
@@ -53,7 +63,9 @@ STILL = Calibration(imu=ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0)))
 HELD = Calibration(odometry_interpolation="hold-past")
 HOLED, LATE = imu(without(SAMPLES, (100, 110))), dvl(without(PINGS, (100, 220)))
 HOLES = imu(without(SAMPLES, *((10.0 * k, 10.1 * k) for k in range(1, 7))))
-SLOWER = np.concatenate([SAMPLES[:10000], 100 + 0.2 * np.arange(250), 150 + SAMPLES[:15000]])
+SLOWER = np.concatenate(
+    [SAMPLES[:10000], 100 + 0.2 * np.arange(250), 150 + SAMPLES[:15000]]
+)
 """100 Hz, 5 Hz for 50 s, 100 Hz: a hole until more than four of the eight intervals before are slow."""
 # fmt: off
 GAPS: dict[str, tuple[Imu, Dvl, Calibration, list[str]]] = {
@@ -88,16 +100,22 @@ GAPS: dict[str, tuple[Imu, Dvl, Calibration, list[str]]] = {
 # fmt: on
 
 
-@pytest.mark.parametrize(("inertial", "doppler", "calibration", "expected"), GAPS.values(), ids=GAPS)
+@pytest.mark.parametrize(
+    ("inertial", "doppler", "calibration", "expected"), GAPS.values(), ids=GAPS
+)
 def test_each_gap_is_named_with_its_times_and_the_assumption_in_it(
     inertial: Imu, doppler: Dvl, calibration: Calibration, expected: list[str]
 ) -> None:
     found = list(gap_warnings(inertial, doppler, calibration))
     assert len(found) == len(expected)
-    assert all(text.startswith(start) for text, start in zip(found, expected, strict=True))
+    assert all(
+        text.startswith(start) for text, start in zip(found, expected, strict=True)
+    )
 
 
-@pytest.mark.parametrize(("gap_s", "first_s", "is_told"), [(1.4, 0.9, False), (1.6, 1.1, True)])
+@pytest.mark.parametrize(
+    ("gap_s", "first_s", "is_told"), [(1.4, 0.9, False), (1.6, 1.1, True)]
+)
 def test_a_gap_begins_at_its_limit(gap_s: float, first_s: float, is_told: bool) -> None:
     later = np.concatenate([PINGS[:500], PINGS[500:] - 0.2 + gap_s])
     for inertial, doppler, calibration in (
@@ -119,7 +137,11 @@ def test_the_holes_named_are_those_that_estimators_count_with(seed: int) -> None
     lengths = [hole_ns(ns, len(ns), row, int(ns[row])) for row in range(1, len(ns))]
     count, sum_s = np.count_nonzero(lengths), sum(lengths) * 1e-9
     assert count > 3
-    found = [text for text in gap_warnings(rows, pings, Calibration()) if text.startswith("imu")]
+    found = [
+        text
+        for text in gap_warnings(rows, pings, Calibration())
+        if text.startswith("imu")
+    ]
     assert f"in {count} gaps of {sum_s:.1f} s together" in found[0]
 
 
@@ -135,17 +157,35 @@ FIRST = np.arange(100)
     [
         (EVEN, EVEN + SECOND // 20, None),
         (FIRST * SECOND, FIRST * SECOND, None),  # recorded at 0, a stamp of 0 is right
-        (np.where(FIRST < 3, 0, EVEN), EVEN, "3 messages without a stamp: the time of recording is used"),
+        (
+            np.where(FIRST < 3, 0, EVEN),
+            EVEN,
+            "3 messages without a stamp: the time of recording is used",
+        ),
         (np.where(FIRST < 1, 0, EVEN), EVEN, "1 message without a stamp"),
         (EVEN[np.r_[:50, 52, 50:52, 53:100]], EVEN, "once backwards, by 0.2 s at most"),
-        (EVEN[np.r_[1, 0, 2:50, 51, 50, 52:100]], EVEN, "2 times backwards, by 0.1 s at most"),
-        (np.where(FIRST == 7, EVEN[6], EVEN), EVEN, "1 message with the stamp of another"),
+        (
+            EVEN[np.r_[1, 0, 2:50, 51, 50, 52:100]],
+            EVEN,
+            "2 times backwards, by 0.1 s at most",
+        ),
+        (
+            np.where(FIRST == 7, EVEN[6], EVEN),
+            EVEN,
+            "1 message with the stamp of another",
+        ),
         (EVEN - 5 * SECOND, EVEN, "stamped 5 s before recording"),
         (EVEN + 5 * SECOND, EVEN, "stamped 5 s after recording"),
-        (EVEN + np.where(FIRST < 60, 0, SECOND * 9 // 10), EVEN, "stamps and recording drift apart by 0.9 s"),
+        (
+            EVEN + np.where(FIRST < 60, 0, SECOND * 9 // 10),
+            EVEN,
+            "stamps and recording drift apart by 0.9 s",
+        ),
     ],
 )
-def test_each_fault_of_stamps_is_told_alone(stamps_ns: Any, log_times_ns: Any, expected: str | None) -> None:
+def test_each_fault_of_stamps_is_told_alone(
+    stamps_ns: Any, log_times_ns: Any, expected: str | None
+) -> None:
     found = list(stamp_faults(stamps_ns, log_times_ns))
     assert len(found) == (expected is not None)
     assert expected is None or found[0].startswith(expected)
@@ -180,19 +220,32 @@ SHAKING = 2.0 * np.random.default_rng(3).standard_normal((3000, 3))
     ],
 )  # fmt: skip
 def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -> None:
-    found = spike_warning(EVEN[0] + np.arange(len(rate)) * SECOND // 100, rate, "angular rate")
+    found = spike_warning(
+        EVEN[0] + np.arange(len(rate)) * SECOND // 100, rate, "angular rate"
+    )
     assert (found or "").startswith(expected or "")
     assert (found is None) == (expected is None)
 
 
 def test_a_single_wild_force_is_a_spike_and_unmeasured_ones_are_none() -> None:
-    stamps_ns, force = EVEN[0] + np.arange(3000) * SECOND // 100, turning(((2000, 1), -500.0)) + np.array([0, 0, 9.81])
+    stamps_ns, force = (
+        EVEN[0] + np.arange(3000) * SECOND // 100,
+        turning(((2000, 1), -500.0)) + np.array([0, 0, 9.81]),
+    )
     expected = "1 specific force stands out from both neighbours, by 500 m/s2 at most, 20.000 s"
-    assert (spike_warning(stamps_ns, force, "specific force") or "").startswith(expected)
-    assert spike_warning(stamps_ns, turning(((2000, 1), -20.0)), "specific force") is None
+    assert (spike_warning(stamps_ns, force, "specific force") or "").startswith(
+        expected
+    )
+    assert (
+        spike_warning(stamps_ns, turning(((2000, 1), -20.0)), "specific force") is None
+    )
     force[100:200] = np.nan
-    assert (spike_warning(stamps_ns, force, "specific force") or "").startswith(expected)
-    assert spike_warning(stamps_ns, np.full_like(force, np.nan), "specific force") is None
+    assert (spike_warning(stamps_ns, force, "specific force") or "").startswith(
+        expected
+    )
+    assert (
+        spike_warning(stamps_ns, np.full_like(force, np.nan), "specific force") is None
+    )
 
 
 def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
@@ -202,13 +255,23 @@ def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
         height = np.round(fine / step_m) * step_m
         assert stuck_warning(stamps_ns, height, "height", is_coarse=True) is None
         height[500 : 500 + round(5 * hangs_s)] = height[500]
-        assert "height the same to the last bit" in (stuck_warning(stamps_ns, height, "height", is_coarse=True) or "")
-    assert "in 1500 rows" in (stuck_warning(stamps_ns, 0 * fine + 3.0, "height", is_coarse=True) or "")
+        assert "height the same to the last bit" in (
+            stuck_warning(stamps_ns, height, "height", is_coarse=True) or ""
+        )
+    assert "in 1500 rows" in (
+        stuck_warning(stamps_ns, 0 * fine + 3.0, "height", is_coarse=True) or ""
+    )
 
 
 @pytest.mark.parametrize(
     ("z_m", "stated", "is_told"),
-    [(-3.0, -3.0, False), (-4.5, -3.0, False), (3.0, -3.0, True), (-3000.0, -3.0, True), (-50.0, None, False)],
+    [
+        (-3.0, -3.0, False),
+        (-4.5, -3.0, False),
+        (3.0, -3.0, True),
+        (-3000.0, -3.0, True),
+        (-50.0, None, False),
+    ],
 )
 def test_heights_that_do_not_begin_at_the_stated_start_are_told(
     z_m: float, stated: float | None, is_told: bool
@@ -216,8 +279,12 @@ def test_heights_that_do_not_begin_at_the_stated_start_are_told(
     start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
     rows = Depth(stamps(PINGS), np.full(len(PINGS), -90.0), np.full(len(PINGS), np.nan))
     rows.z_m[98:104] = z_m
-    found = start_depth_warning(rows, int(rows.stamps_ns[100]), Calibration(start=start))
-    assert (found or "").startswith(f"the height begins at {z_m:.2f} m" if is_told else "")
+    found = start_depth_warning(
+        rows, int(rows.stamps_ns[100]), Calibration(start=start)
+    )
+    assert (found or "").startswith(
+        f"the height begins at {z_m:.2f} m" if is_told else ""
+    )
     assert (found is not None) == is_told
 
 
@@ -232,15 +299,29 @@ def test_heights_that_do_not_begin_at_the_stated_start_are_told(
         (0.9 * np.eye(3), None),
     ],
 )
-def test_rates_about_other_axes_are_told_by_how_gravity_turns(change: Floats, told: str | None) -> None:
+def test_rates_about_other_axes_are_told_by_how_gravity_turns(
+    change: Floats, told: str | None
+) -> None:
     world = simulate_mission(MissionOptions(duration_s=90.0))
-    mounted = world.calibration.imu.model_copy(update={"mounting": Mounting(rpy_rad=(0.3, -0.2, 1.0))})
+    mounted = world.calibration.imu.model_copy(
+        update={"mounting": Mounting(rpy_rad=(0.3, -0.2, 1.0))}
+    )
     sensor_R_body = mounted.mounting.pose().rotation().matrix().T
-    rate, force = world.imu.angular_velocity @ change.T @ sensor_R_body.T, world.imu.specific_force @ sensor_R_body.T
+    rate, force = (
+        world.imu.angular_velocity @ change.T @ sensor_R_body.T,
+        world.imu.specific_force @ sensor_R_body.T,
+    )
     known = world.calibration.model_copy(update={"imu": mounted})
     found = gyro_warning(Imu(world.imu.stamps_ns, rate, force), world.dvl, known)
     assert (found is None) if told is None else (told in (found or ""))
-    assert gyro_warning(Imu(world.imu.stamps_ns, rate, np.full_like(force, np.nan)), world.dvl, known) is None
+    assert (
+        gyro_warning(
+            Imu(world.imu.stamps_ns, rate, np.full_like(force, np.nan)),
+            world.dvl,
+            known,
+        )
+        is None
+    )
 
 
 def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:
@@ -289,7 +370,9 @@ def test_measurements_with_which_no_estimator_could_begin_are_refused() -> None:
     spans = r"log\.mcap: IMU from 1000\.000 to 1004\.000 s, DVL from 4600\.000 to 4604\.000 s: no common time"
     with pytest.raises(LogError, match=spans):
         require_use("log.mcap", imu(five), dvl(five + 3600))
-    with pytest.raises(LogError, match=r"log\.mcap: DVL: too few valid beams in all 5 rows"):
+    with pytest.raises(
+        LogError, match=r"log\.mcap: DVL: too few valid beams in all 5 rows"
+    ):
         require_use("log.mcap", imu(five), dvl(five, True))
 
 
@@ -297,19 +380,28 @@ def test_rows_that_do_not_say_their_noise_are_counted() -> None:
     five = np.arange(5.0)
     doppler, depth = dvl(five), Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
     known, ones = np.tile(np.eye(2), (5, 1, 1)), np.ones((5, 1))
-    detections = LandmarkDetections(stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones)
+    detections = LandmarkDetections(
+        stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones
+    )
     blocks = {"dvl": doppler, "depth": depth, "heading": None, "detections": detections}
     assert list(unsaid_noise(blocks)) == []
-    doppler.velocity_cov[1:3, 2, 2] = depth.variance_m2[0] = detections.range_azimuth_cov[:] = np.nan
+    doppler.velocity_cov[1:3, 2, 2] = depth.variance_m2[
+        0
+    ] = detections.range_azimuth_cov[:] = np.nan
     assert list(unsaid_noise(blocks)) == [
         "dvl: 2 of 5 rows say no covariance, dvl.velocity_sigma_m_s of the calibration count",
         "depth: 1 of 5 rows say no covariance, depth.sigma_m of the calibration count",
         "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",
     ]
-    assert [text.partition(":")[0] for text in unsaid_noise(blocks, only_partly=True)] == ["dvl", "depth"]
+    assert [
+        text.partition(":")[0] for text in unsaid_noise(blocks, only_partly=True)
+    ] == ["dvl", "depth"]
 
 
 def test_stamps_of_another_year_are_of_a_log_that_was_played_or_of_a_wrong_clock_not_late():
     log_times_ns = np.arange(100) * 10_000_000 + 400 * 86_400 * 10**9
     (said,) = stamp_faults(np.arange(1, 101) * 10_000_000, log_times_ns)
-    assert said == "stamped 400 days before recording: a log was played, or a clock was not set"
+    assert (
+        said
+        == "stamped 400 days before recording: a log was played, or a clock was not set"
+    )

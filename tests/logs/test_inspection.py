@@ -34,16 +34,34 @@ def topic(summary: LogSummary, name: str) -> TopicSummary:
     return next(t for t in summary.topics if t.name == name)
 
 
-def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(bench: Bench) -> None:
+def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(
+    bench: Bench,
+) -> None:
     _, dvl = bench.basics()
     imu = ("/imu", "imu", [bench.imu(bench.t0_ns + s * 10**9) for s in (0, 1, 2, 5)])
-    tree = ("/tf_static", "tf", [{"transforms": [bench.transform("base_link", "imu_link", (1, 0, 0))]}])
+    tree = (
+        "/tf_static",
+        "tf",
+        [{"transforms": [bench.transform("base_link", "imu_link", (1, 0, 0))]}],
+    )
     summary = inspect_log(bench.write(imu, dvl, tree))
     found = topic(summary, "/imu")
-    assert (found.type_name, found.encoding, found.messages) == ("sensor_msgs/msg/Imu", "cdr", 4)
-    assert (found.first_stamp_ns, found.last_stamp_ns) == (bench.t0_ns, bench.t0_ns + 5 * 10**9)
-    assert (found.rate_hz, found.largest_gap_s, summary.duration_s) == pytest.approx((3 / 5, 3, 5))
-    assert (found.stamps_from, topic(summary, "/tf_static").stamps_from) == ("header", "log")
+    assert (found.type_name, found.encoding, found.messages) == (
+        "sensor_msgs/msg/Imu",
+        "cdr",
+        4,
+    )
+    assert (found.first_stamp_ns, found.last_stamp_ns) == (
+        bench.t0_ns,
+        bench.t0_ns + 5 * 10**9,
+    )
+    assert (found.rate_hz, found.largest_gap_s, summary.duration_s) == pytest.approx(
+        (3 / 5, 3, 5)
+    )
+    assert (found.stamps_from, topic(summary, "/tf_static").stamps_from) == (
+        "header",
+        "log",
+    )
     assert "mountings of /tf_static (imu: imu_link)" in summary.calibration
 
 
@@ -53,7 +71,10 @@ def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
     path = bench.write(imu, dvl, ("/second", "imu", imu[2]), odometry)
     summary = inspect_log(path)
     assert role(summary, "imu") == (None, "2 topics fit: /imu, /second")
-    assert role(summary, "dvl") == ("/dvl", "the only marine_acoustic_msgs/msg/Dvl that fits")
+    assert role(summary, "dvl") == (
+        "/dvl",
+        "the only marine_acoustic_msgs/msg/Dvl that fits",
+    )
     assert role(summary, "truth")[0] is None
     assert "/odom only if chosen: --topic truth=/odom" in role(summary, "truth")[1]
     assert summary.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
@@ -62,25 +83,41 @@ def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
     assert '# [imu]  # one of\n# topic = "/imu"\n# topic = "/second"' in summary.toml
     assert '# [truth]  # one of\n# topic = "/odom"' in summary.toml
     assert 'rotation = "flu"' in summary.toml
-    assert inspect_log(bench.write(odometry, name="other.mcap")).obstacles == ("no IMU", "no DVL")
-    assert role(inspect_log(path, topics={"imu": "/second"}), "imu") == ("/second", "chosen by name")
-    config = LogConfig.parse({"imu": {"topic": "/imu"}, "dvl": {"use": False}}, "my.toml")
+    assert inspect_log(bench.write(odometry, name="other.mcap")).obstacles == (
+        "no IMU",
+        "no DVL",
+    )
+    assert role(inspect_log(path, topics={"imu": "/second"}), "imu") == (
+        "/second",
+        "chosen by name",
+    )
+    config = LogConfig.parse(
+        {"imu": {"topic": "/imu"}, "dvl": {"use": False}}, "my.toml"
+    )
     said = inspect_log(path, config)
     assert role(said, "imu") == ("/imu", "chosen in my.toml")
     assert role(said, "dvl") == (None, "switched off in my.toml")
 
 
-def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Path) -> None:
+def test_the_roles_are_those_that_reading_uses(
+    make_sequence: Any, tmp_path: Path
+) -> None:
     sequence = make_sequence()
     write_log(tmp_path / "a.mcap", sequence)
     summary = inspect_log(tmp_path / "a.mcap")
     used = read_log(tmp_path / "a.mcap").notes["log.topics"]
     assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles if r.topic)
-    assert (summary.calibration, summary.name, summary.notes) == ("in the log", sequence.name, sequence.notes)
+    assert (summary.calibration, summary.name, summary.notes) == (
+        "in the log",
+        sequence.name,
+        sequence.notes,
+    )
     assert (summary.damage, summary.obstacles) == ((), ())
 
 
-def test_damage_is_reported_instead_of_raised(make_sequence: Any, tmp_path: Path) -> None:
+def test_damage_is_reported_instead_of_raised(
+    make_sequence: Any, tmp_path: Path
+) -> None:
     path = tmp_path / "a.mcap"
     write_log(path, make_sequence(samples=20_000))
     content, chunk = path.read_bytes(), chunk_indexes(path)[0]
@@ -97,15 +134,26 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
     counts = {t.name: t.messages for t in summary.topics}
     assert counts == {"/amcl_pose": 135, "/odom": 2639, "/tf": 5422, "/tf_static": 1}
     assert all(r.topic is None for r in summary.roles)
-    assert summary.duration_s == pytest.approx(101.394)  # by the robot's clock, not the recorder's
+    # by the robot's clock, not the recorder's
+    assert summary.duration_s == pytest.approx(101.394)
     assert summary.damage == ()
 
 
 def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> None:
     imu, _ = bench.basics()
-    sideways = [message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}} for message in imu[2]]
+    sideways = [
+        message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}}
+        for message in imu[2]
+    ]
     sideways[0] |= {"header": bench.imu(0)["header"]}
-    dvl = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i * 10**8, velocity_mode=1 + (i == 2)) for i in range(5)])
+    dvl = (
+        "/dvl",
+        "dvl",
+        [
+            bench.dvl(bench.t0_ns + i * 10**8, velocity_mode=1 + (i == 2))
+            for i in range(5)
+        ],
+    )
     path = bench.write(("/imu", "imu", sideways), dvl)
     summary = inspect_log(path)
     notes = read_log(path).notes
@@ -120,21 +168,37 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> No
 
 def test_stuck_sensors_are_named(bench: Bench) -> None:
     """The bench's rows are all alike."""
-    assert not any("as measured" in text for text in inspect_log(bench.write(*bench.basics(10))).warnings)
+    assert not any(
+        "as measured" in text
+        for text in inspect_log(bench.write(*bench.basics(10))).warnings
+    )
     warnings = inspect_log(bench.write(*bench.basics(30), name="long.mcap")).warnings
-    for start in ("dvl: velocity the same to the last bit", "imu: angular rate the same to the last bit"):
-        assert any(text.startswith(f"{start} in 30 rows, 0.000 to 2.900 s") for text in warnings)
+    for start in (
+        "dvl: velocity the same to the last bit",
+        "imu: angular rate the same to the last bit",
+    ):
+        assert any(
+            text.startswith(f"{start} in 30 rows, 0.000 to 2.900 s")
+            for text in warnings
+        )
 
 
 def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
     write_log(tmp_path / "a.mcap", read_victoria_park())
-    write_log(tmp_path / "b.mcap", simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)))
+    write_log(
+        tmp_path / "b.mcap",
+        simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)),
+    )
     for name in ("a.mcap", "b.mcap"):
         summary = inspect_log(tmp_path / name)
         assert summary.warnings == ()
-        assert [topic.stamp_faults for topic in summary.topics if topic.stamp_faults] == []
+        assert [
+            topic.stamp_faults for topic in summary.topics if topic.stamp_faults
+        ] == []
         assert summary.damage == ()
-        assert not {"log.stamps", "log.warnings"} & read_log(tmp_path / name).notes.keys()
+        assert (
+            not {"log.stamps", "log.warnings"} & read_log(tmp_path / name).notes.keys()
+        )
 
 
 # --- topics that cannot be read, and broken messages -----------------------------------------------------------------
@@ -142,13 +206,55 @@ def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
 IMU = "sensor_msgs/msg/Imu"
 IDL = "module sensor_msgs { module msg { struct Imu { double x; }; }; };"
 FOREIGN = {
-    "/json": ("Some", "jsonschema", b"{}", "json", "has messages in json; only ROS 2 CDR is read"),
-    "/protobuf": ("pkg.Some", "protobuf", b"\x0a\xff", "protobuf", "has messages in protobuf; only ROS 2 CDR is read"),
-    "/idl": (IMU, "ros2idl", IDL.encode(), "cdr", "has a definition in ros2idl; only ros2msg is read: record it again"),
-    "/flat": (IMU, "flatbuffer", b"\0", "cdr", "has a definition in flatbuffer; only ros2msg is read"),
-    "/wide": ("a/msg/B", "ros2msg", b"wstring s\n", "cdr", "cannot be read: the definition of a/B uses wstring"),
-    "/loop": ("a/msg/B", "ros2msg", b"B[] b\n", "cdr", "cannot be read: the definition of a/B uses a/B within itself"),
-    "/noise": (IMU, "ros2msg", b"\xff\xfe{", "cdr", "has a definition that cannot be read: the definition of"),
+    "/json": (
+        "Some",
+        "jsonschema",
+        b"{}",
+        "json",
+        "has messages in json; only ROS 2 CDR is read",
+    ),
+    "/protobuf": (
+        "pkg.Some",
+        "protobuf",
+        b"\x0a\xff",
+        "protobuf",
+        "has messages in protobuf; only ROS 2 CDR is read",
+    ),
+    "/idl": (
+        IMU,
+        "ros2idl",
+        IDL.encode(),
+        "cdr",
+        "has a definition in ros2idl; only ros2msg is read: record it again",
+    ),
+    "/flat": (
+        IMU,
+        "flatbuffer",
+        b"\0",
+        "cdr",
+        "has a definition in flatbuffer; only ros2msg is read",
+    ),
+    "/wide": (
+        "a/msg/B",
+        "ros2msg",
+        b"wstring s\n",
+        "cdr",
+        "cannot be read: the definition of a/B uses wstring",
+    ),
+    "/loop": (
+        "a/msg/B",
+        "ros2msg",
+        b"B[] b\n",
+        "cdr",
+        "cannot be read: the definition of a/B uses a/B within itself",
+    ),
+    "/noise": (
+        IMU,
+        "ros2msg",
+        b"\xff\xfe{",
+        "cdr",
+        "has a definition that cannot be read: the definition of",
+    ),
     "/bare": ("", "", b"", "cdr", "has no definition of its messages"),
     "/nothing": ("", "", b"", "", "has messages in no named encoding"),
 }
@@ -172,8 +278,12 @@ def copied(source: Path, change: Change, *, beside: bool = False) -> Path:
             if data is None:
                 continue
             if channel.topic not in channels:
-                channels[channel.topic] = channel_for(writer, channel.topic, schema.name, schema.data)
-            writer.add_message(channels[channel.topic], message.log_time, data, message.publish_time)
+                channels[channel.topic] = channel_for(
+                    writer, channel.topic, schema.name, schema.data
+                )
+            writer.add_message(
+                channels[channel.topic], message.log_time, data, message.publish_time
+            )
             for other in others if seen.total() <= 2 else ():
                 writer.add_message(other, message.log_time, b"{}", message.publish_time)
     return target
@@ -193,9 +303,15 @@ def test_topics_that_cannot_be_decoded_are_counted_and_listed_with_the_reason_an
         assert topics[name].refusal == refusal(scanned[name])
     alone, beside = read_log(path), read_log(mixed)
     np.testing.assert_array_equal(alone.imu.stamps_ns, beside.imu.stamps_ns)
-    np.testing.assert_array_equal(alone.imu.angular_velocity, beside.imu.angular_velocity)
-    without = copied(path, lambda topic, _, data: None if topic == "/imu" else data, beside=True)
-    with pytest.raises(MissingTopicError, match=r"nothing for imu: .*/idl has a definition in ros2idl"):
+    np.testing.assert_array_equal(
+        alone.imu.angular_velocity, beside.imu.angular_velocity
+    )
+    without = copied(
+        path, lambda topic, _, data: None if topic == "/imu" else data, beside=True
+    )
+    with pytest.raises(
+        MissingTopicError, match=r"nothing for imu: .*/idl has a definition in ros2idl"
+    ):
         read_log(without)
 
 
@@ -213,18 +329,39 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
 ) -> None:
     path = bench.write(
         *bench.basics(9),
-        ("/pressure", "pressure", [bench.pressure(bench.t0_ns + i, 2e5) for i in range(9)]),
-        ("/landmarks", "detections", [bench.detections(bench.t0_ns + i, [1.0 + i], [3]) for i in range(9)]),
+        (
+            "/pressure",
+            "pressure",
+            [bench.pressure(bench.t0_ns + i, 2e5) for i in range(9)],
+        ),
+        (
+            "/landmarks",
+            "detections",
+            [bench.detections(bench.t0_ns + i, [1.0 + i], [3]) for i in range(9)],
+        ),
     )
     whole = getattr(read_log(path), role)
-    broken = read_log(copied(path, lambda name, i, data: data[:-8] if name == topic and i in (0, 4, 5) else data))
+    broken = read_log(
+        copied(
+            path,
+            lambda name, i, data: (
+                data[:-8] if name == topic and i in (0, 4, 5) else data
+            ),
+        )
+    )
     kept = [1, 2, 3, 6, 7, 8]
-    np.testing.assert_array_equal(getattr(broken, role).stamps_ns, whole.stamps_ns[kept])
-    np.testing.assert_array_equal(getattr(getattr(broken, role), column), getattr(whole, column)[kept])
+    np.testing.assert_array_equal(
+        getattr(broken, role).stamps_ns, whole.stamps_ns[kept]
+    )
+    np.testing.assert_array_equal(
+        getattr(getattr(broken, role), column), getattr(whole, column)[kept]
+    )
     assert broken.notes["log.dropped"] == f"{role}: 3 that end before {end}"
     wholly = copied(path, lambda name, _, data: data[:-8] if name == topic else data)
     if role == "imu":
-        with pytest.raises(LogError, match=rf"topic /imu: no message .* 9 that end before {end}"):
+        with pytest.raises(
+            LogError, match=rf"topic /imu: no message .* 9 that end before {end}"
+        ):
             read_log(wholly)
     else:
         sequence = read_log(wholly)
@@ -238,17 +375,26 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
 def choices(path: Path, config: LogConfig) -> dict[str, object]:
     """For each role the topic, others that fit, and the adapter but for the topic that the text names."""
     recording = scan(path, lambda _: Keep.STAMP)
-    found = {name: choose_topic(role, recording, config) for name, role in ROLES.items()}
-    adapters = {name: c.adapter and c.adapter.model_copy(update={"topic": None}) for name, c in found.items()}
+    found = {
+        name: choose_topic(role, recording, config) for name, role in ROLES.items()
+    }
+    adapters = {
+        name: c.adapter and c.adapter.model_copy(update={"topic": None})
+        for name, c in found.items()
+    }
     return {name: (c.topic, c.candidates, adapters[name]) for name, c in found.items()}
 
 
-def test_read_back_unchanged_it_makes_the_same_choices(bench: Bench, make_sequence: Any, tmp_path: Path) -> None:
+def test_read_back_unchanged_it_makes_the_same_choices(
+    bench: Bench, make_sequence: Any, tmp_path: Path
+) -> None:
     imu, dvl = bench.basics()
     poses = [bench.odometry(bench.t0_ns, 0.0)]
     pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns, 2e5)])
     logs = [
-        bench.write(imu, dvl, pressure, ("/odom", "odometry", poses), name="plain.mcap"),
+        bench.write(
+            imu, dvl, pressure, ("/odom", "odometry", poses), name="plain.mcap"
+        ),
         bench.write(imu, dvl, ("/second", "imu", imu[2]), name="two.mcap"),
         bench.write(imu, name="half.mcap"),
         tmp_path / "own.mcap",
@@ -257,7 +403,10 @@ def test_read_back_unchanged_it_makes_the_same_choices(bench: Bench, make_sequen
     said: list[dict[str, Any]] = [
         {},
         {"dvl": {"rotation": [1, 2, 3], "covariance": False}, "depth": {"use": False}},
-        {"truth": {"topic": "/odom"}, "imu": {"frame_id": 'a "frame"', "stamp_offset_s": -0.04}},
+        {
+            "truth": {"topic": "/odom"},
+            "imu": {"frame_id": 'a "frame"', "stamp_offset_s": -0.04},
+        },
     ]
     for path, tables in product(logs, said):
         config = LogConfig.parse(tables, "x")
@@ -268,12 +417,22 @@ def test_read_back_unchanged_it_makes_the_same_choices(bench: Bench, make_sequen
 def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench) -> None:
     own = "float64 time\nfloat64[3] speed\nfloat32[] beams\n"
     rows = [{"time": 0.0, "speed": [1.0, 2.0, 3.0], "beams": []}] * 3
-    path = bench.write(bench.basics()[0], ("/my_dvl", "my_msgs/msg/Velocity", rows, own))
+    path = bench.write(
+        bench.basics()[0], ("/my_dvl", "my_msgs/msg/Velocity", rows, own)
+    )
     text = inspect_log(path).toml
-    assert '# topic = "/my_dvl"\n# type = "my_msgs/msg/Velocity"\n# stamp = "log"' in text
+    assert (
+        '# topic = "/my_dvl"\n# type = "my_msgs/msg/Velocity"\n# stamp = "log"' in text
+    )
     assert "#   time\n#   speed[3]\n#   beams[]" in text
-    filled = "\n".join(line.removeprefix("# ") for line in text.splitlines() if "my_dvl is" not in line)
-    table = filled[filled.index("[dvl]") : filled.index("[depth]")].replace('"..."', '"speed[{}]"').format(0, 1, 2)
+    filled = "\n".join(
+        line.removeprefix("# ") for line in text.splitlines() if "my_dvl is" not in line
+    )
+    table = (
+        filled[filled.index("[dvl]") : filled.index("[depth]")]
+        .replace('"..."', '"speed[{}]"')
+        .format(0, 1, 2)
+    )
     sequence = read_log(path, config=LogConfig.parse(tomllib.loads(table), "x"))
     assert sequence.dvl.velocity.tolist() == [[1, 2, 3]] * 3
 

@@ -31,22 +31,39 @@ from sonar_graph.logs.vehicle_setup import PartialCalibration, encode_mountings
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 
 LIMIT = 1 << 16
-PACK: dict[str, Callable[[bytes], bytes]] = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
+PACK: dict[str, Callable[[bytes], bytes]] = {
+    "zstd": zstandard.compress,
+    "lz4": lz4.frame.compress,
+    "": bytes,
+}
 
 
 def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> Path:
     packed = PACK[compression](content)
     letters = compression.encode()
-    head = struct.pack("<QQQII", 1, 2, size, 0, len(letters)) + letters + struct.pack("<Q", len(packed))
+    head = (
+        struct.pack("<QQQII", 1, 2, size, 0, len(letters))
+        + letters
+        + struct.pack("<Q", len(packed))
+    )
     chunk = struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed
-    path.write_bytes(MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + chunk + struct.pack("<BQI", 15, 4, 0))
+    path.write_bytes(
+        MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + chunk + struct.pack("<BQI", 15, 4, 0)
+    )
     return path
 
 
 @pytest.mark.parametrize("compression", PACK)
-@pytest.mark.parametrize(("size", "stated"), [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)])
+@pytest.mark.parametrize(
+    ("size", "stated"),
+    [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)],
+)
 def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_is_unpacked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str, size: int, stated: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    compression: str,
+    size: int,
+    stated: int,
 ) -> None:
     for module in (chunks, records):
         monkeypatch.setattr(module, "LARGEST_BYTES", LIMIT)
@@ -62,7 +79,9 @@ def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_a_chunk_that_is_cut_off_is_unpacked_no_further_than_its_stated_size_and_a_piece(compression: str) -> None:
+def test_a_chunk_that_is_cut_off_is_unpacked_no_further_than_its_stated_size_and_a_piece(
+    compression: str,
+) -> None:
     size = 1 << 28
     packed = PACK[compression](bytes(size))
     chunk = records.ChunkRecord(6, 0, 0, 0, 0, 1000, 0, compression, 0, len(packed))
@@ -72,22 +91,33 @@ def test_a_chunk_that_is_cut_off_is_unpacked_no_further_than_its_stated_size_and
     tracemalloc.stop()
 
 
-def test_messages_far_larger_than_their_file_are_refused(tmp_path: Path, monkeypatch: Any, make_sequence: Any) -> None:
-    write_recording(tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {})
+def test_messages_far_larger_than_their_file_are_refused(
+    tmp_path: Path, monkeypatch: Any, make_sequence: Any
+) -> None:
+    write_recording(
+        tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {}
+    )
     size = (tmp_path / "log.mcap").stat().st_size
     monkeypatch.setattr(scanning, "LARGEST_BYTES", 10)
     scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
     monkeypatch.setattr(scanning, "LARGEST_RATIO", 1 / size)
-    with pytest.raises(LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"):
+    with pytest.raises(
+        LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"
+    ):
         scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(tmp_path: Path, kind: str) -> None:
+def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(
+    tmp_path: Path, kind: str
+) -> None:
     path = tmp_path / "in.mcap"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
     for read in (read_log, inspect_log):
-        with pytest.raises(LogError, match=r"in\.mcap cannot be read: it is a pipe, a socket or a device"):
+        with pytest.raises(
+            LogError,
+            match=r"in\.mcap cannot be read: it is a pipe, a socket or a device",
+        ):
             read(path)
     with pytest.raises(CalibrationError, match="it is a pipe"):
         PartialCalibration.read(path)
@@ -111,7 +141,9 @@ SLOW: dict[str, str] = {
 
 
 @pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
-def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(text: str) -> None:
+def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(
+    text: str,
+) -> None:
     began = time.process_time()
     for kind in ("p/msg/A", "p/msg/B"):
         for _ in range(5):
@@ -123,20 +155,30 @@ def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(text: str
 def test_sections_apart_by_blank_lines_and_spaces_are_the_same_definition() -> None:
     plain = "q/B b\n" + "=" * 80 + "\nMSG: q/B\nint32 c\n"
     spaced = plain.replace("\n", "  \r\n\n\t\n")
-    found = [parse_definition(f"p/msg/{name}", text).fields[0] for name, text in (("A", plain), ("C", spaced))]
-    assert [(one.name, one.kind.name, one.kind.fields[0].name) for one in found if not isinstance(one.kind, str)] == [
-        ("b", "q/B", "c")
-    ] * 2
+    found = [
+        parse_definition(f"p/msg/{name}", text).fields[0]
+        for name, text in (("A", plain), ("C", spaced))
+    ]
+    assert [
+        (one.name, one.kind.name, one.kind.fields[0].name)
+        for one in found
+        if not isinstance(one.kind, str)
+    ] == [("b", "q/B", "c")] * 2
 
 
 def test_many_ends_of_the_data_are_no_more_work_than_a_few(tmp_path: Path) -> None:
     end = struct.pack("<BQI", 15, 4, 0)
     footer = struct.pack("<BQQQI", 2, 20, 30, 0, zlib.crc32(b"other"))
-    (tmp_path / "log.mcap").write_bytes(MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + end * 200_000 + footer + MAGIC)
+    (tmp_path / "log.mcap").write_bytes(
+        MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + end * 200_000 + footer + MAGIC
+    )
     began = time.process_time()
     with LogFile(tmp_path / "log.mcap") as file:
         summary, fault = read_summary(file)
-    assert (summary, str(fault)) == (None, "its summary is damaged: the CRC does not fit")
+    assert (summary, str(fault)) == (
+        None,
+        "its summary is damaged: the CRC does not fit",
+    )
     assert time.process_time() - began < 2.0
 
 
@@ -161,15 +203,28 @@ def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
     sequence, path = make_sequence(), tmp_path / "log.mcap"
     payload = bytearray(encode_mountings(Calibration())[0].tobytes())
     ends = [
-        at for at in range(4, len(payload) - 8, 4) if struct.unpack_from("<d", payload, at)[0] == 1.0 and at % 8 == 4
+        at
+        for at in range(4, len(payload) - 8, 4)
+        if struct.unpack_from("<d", payload, at)[0] == 1.0 and at % 8 == 4
     ]
-    w = ends[1]  # of the second transform, the Doppler log's: x, y, z, then the quaternion's x, y, z, w
+    # of the second transform, the Doppler log's: x, y, z, then the quaternion's x, y, z, w
+    w = ends[1]
     for at in (w - 24, w - 16, w - 8, w) if of == "rotation" else (w - 48,):
         struct.pack_into("<d", payload, at, value)
-    tree = static_message("/tf_static", TF, 0, np.frombuffer(bytes(payload), np.uint8)[None])
-    write_recording(path, [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)], {})
-    with pytest.raises(LogError, match=rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"):
+    tree = static_message(
+        "/tf_static", TF, 0, np.frombuffer(bytes(payload), np.uint8)[None]
+    )
+    write_recording(
+        path,
+        [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)],
+        {},
+    )
+    with pytest.raises(
+        LogError, match=rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"
+    ):
         read_log(path)
     assert any("--calibration" in text for text in inspect_log(path).unusable)
     stated = PartialCalibration.parse({"dvl": {"mounting": {}}}, "vehicle.toml")
-    assert read_log(path, calibration=stated).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
+    assert read_log(
+        path, calibration=stated
+    ).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)

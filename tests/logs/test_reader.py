@@ -26,7 +26,18 @@ from sonar_graph.logs.mcap.scanning import scan, stream
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 from sonar_graph.logs.reading import read_log
 
-from .conftest import Stored, channel_for, chunk_indexes, entries, flip, read, scan_all, write, write_apart, writing
+from .conftest import (
+    Stored,
+    channel_for,
+    chunk_indexes,
+    entries,
+    flip,
+    read,
+    scan_all,
+    write,
+    write_apart,
+    writing,
+)
 
 NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
 
@@ -38,9 +49,15 @@ def chunk_end(chunk: ChunkIndex) -> int:
 def chunk_of(path: Path, number: int, channel: int = 1) -> list[Stored]:
     """Messages of a chunk as mcap's own reader finds them."""
     index = chunk_indexes(path)[number]
-    content = path.read_bytes()[index.chunk_start_offset + 9 :][: index.chunk_length - 9]
+    content = path.read_bytes()[index.chunk_start_offset + 9 :][
+        : index.chunk_length - 9
+    ]
     records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))))
-    return [(r.log_time, r.data) for r in records if isinstance(r, Message) and r.channel_id == channel]
+    return [
+        (r.log_time, r.data)
+        for r in records
+        if isinstance(r, Message) and r.channel_id == channel
+    ]
 
 
 @pytest.fixture
@@ -53,32 +70,55 @@ CONTAINERS: dict[str, dict[str, Any]] = {
     "lz4": {"compression": LZ4},
     "none": {"compression": NONE},
     "unchunked": {"use_chunking": False},
-    "no index": {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
+    "no index": {
+        "index_types": IndexType.NONE,
+        "use_statistics": False,
+        "use_summary_offsets": False,
+    },
     "no summary": {"repeat_channels": False, "repeat_schemas": False},
 }
 
 
 @pytest.mark.parametrize("options", CONTAINERS.values(), ids=CONTAINERS)
-def test_every_message_is_found_whatever_the_container(path: Path, options: dict[str, Any]) -> None:
+def test_every_message_is_found_whatever_the_container(
+    path: Path, options: dict[str, Any]
+) -> None:
     written = write(path, **options)
     assert read(path) == written
     calls: list[tuple[int, int]] = []
-    recording = scan(path, lambda _: Keep.STAMP, progress=lambda done, total: calls.append((done, total)))
+    recording = scan(
+        path,
+        lambda _: Keep.STAMP,
+        progress=lambda done, total: calls.append((done, total)),
+    )
     assert list(recording.topics) == ["/bytes", "/json"]
     assert recording.metadata == {"sonar_graph": {"name": "x"}}
-    assert (recording.ending, recording.corrupt, recording.damage.remarks) == (None, [], [])
+    assert (recording.ending, recording.corrupt, recording.damage.remarks) == (
+        None,
+        [],
+        [],
+    )
     assert len(recording.topics["/bytes"]) == len(written)
-    assert list(recording.topics["/bytes"].stacks) == [12]  # only the stamps were wanted
+    # only the stamps were wanted
+    assert list(recording.topics["/bytes"].stacks) == [12]
     assert calls == sorted(calls)
     assert {total for _, total in calls} <= {path.stat().st_size}
-    assert len(calls) == len(chunk_indexes(path)) or "use_chunking" in options or "index_types" in options
+    assert (
+        len(calls) == len(chunk_indexes(path))
+        or "use_chunking" in options
+        or "index_types" in options
+    )
     pieces: dict[str, list[Stored]] = {}
     for piece in stream(path, lambda _: Keep.ALL):
         pieces.setdefault(piece.name, []).extend(entries(piece))
-    assert pieces == {name: entries(topic) for name, topic in scan_all(path).topics.items()}
+    assert pieces == {
+        name: entries(topic) for name, topic in scan_all(path).topics.items()
+    }
 
 
-def test_messages_outside_chunks_may_be_larger_than_what_is_read_at_a_time(path: Path) -> None:
+def test_messages_outside_chunks_may_be_larger_than_what_is_read_at_a_time(
+    path: Path,
+) -> None:
     payloads = [bytes([i]) * (3 << 20) for i in range(3)]
     with writing(path, use_chunking=False) as writer:
         channel = channel_for(writer, "/a")
@@ -92,7 +132,9 @@ def test_messages_outside_chunks_may_be_larger_than_what_is_read_at_a_time(path:
 
 def in_chunk(number: int, offset: int, bit: int = 4) -> Callable[[Path], None]:
     """A bit at an offset from the beginning of a chunk."""
-    return lambda path: flip(path, chunk_indexes(path)[number].chunk_start_offset + offset, bit)
+    return lambda path: flip(
+        path, chunk_indexes(path)[number].chunk_start_offset + offset, bit
+    )
 
 
 def at_text(text: bytes, offset: int = 0, bit: int = 1) -> Callable[[Path], None]:
@@ -108,7 +150,10 @@ def both_lengths(path: Path, number: int = 1) -> None:
 
 def missing_in_chunk(number: int, count: int) -> Callable[[Path], object]:
     def cut_out(path: Path) -> None:
-        at, content = chunk_indexes(path)[number].chunk_start_offset + 200, path.read_bytes()
+        at, content = (
+            chunk_indexes(path)[number].chunk_start_offset + 200,
+            path.read_bytes(),
+        )
         path.write_bytes(content[:at] + content[at + count :])
 
     return cut_out
@@ -122,7 +167,9 @@ def huge_size(path: Path) -> None:
 
 def in_index(offset: int) -> Callable[[Path], None]:
     """A bit of the message index of the third chunk."""
-    return lambda path: flip(path, min(chunk_indexes(path)[2].message_index_offsets.values()) + offset, 1)
+    return lambda path: flip(
+        path, min(chunk_indexes(path)[2].message_index_offsets.values()) + offset, 1
+    )
 
 
 def shorter_index(path: Path) -> None:
@@ -140,7 +187,9 @@ def shorter_index(path: Path) -> None:
 def message_200(offset: int, bit: int) -> Callable[[Path], None]:
     """A bit at an offset from the head of a message outside chunks."""
     rng = np.random.default_rng(0)
-    return at_text([rng.bytes([20, 50, 80][i % 3]) for i in range(201)][200], offset - 31, bit)
+    return at_text(
+        [rng.bytes([20, 50, 80][i % 3]) for i in range(201)][200], offset - 31, bit
+    )
 
 
 def in_bare_summary(text: bytes) -> Callable[[Path], None]:
@@ -163,7 +212,9 @@ class Fault(NamedTuple):
     """Damage to a file, and the account that is expected of it."""
 
     damage: Callable[[Path], object]
-    lost: int | None = None  # the chunk whose messages are lost; without chunks, the message
+    lost: int | None = (
+        None  # the chunk whose messages are lost; without chunks, the message
+    )
     corrupt: str = ""  # what the losses must say; empty: there must be none
     remark: str = ""
     options: Mapping[str, Any] = MappingProxyType({})
@@ -171,42 +222,83 @@ class Fault(NamedTuple):
 
 PLAIN: dict[str, Any] = {"compression": NONE}
 LOOSE: dict[str, Any] = {"use_chunking": False}
-UNREPEATED = LOOSE | {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False}
-SECOND, COUNTED = "chunk 2 is lost: .*; lost: 35 of /bytes, 35 of /json$", "lost: 35 of /bytes, 35 of /json$"
-MOVED, INDEX, ENDING = "bytes are missing or doubled in it", "message index of chunk 3", "does not end as an MCAP file"
+UNREPEATED = LOOSE | {
+    "use_statistics": False,
+    "repeat_channels": False,
+    "repeat_schemas": False,
+}
+SECOND, COUNTED = (
+    "chunk 2 is lost: .*; lost: 35 of /bytes, 35 of /json$",
+    "lost: 35 of /bytes, 35 of /json$",
+)
+MOVED, INDEX, ENDING = (
+    "bytes are missing or doubled in it",
+    "message index of chunk 3",
+    "does not end as an MCAP file",
+)
 TWICE = r"schema 1 \(test_msgs/msg/Bytes\) is described in two ways; the one under a CRC holds"
 FAULTS = {
     "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
-    "a bit in a chunk without compression": Fault(in_chunk(1, 900), 1, SECOND, "", PLAIN),
+    "a bit in a chunk without compression": Fault(
+        in_chunk(1, 900), 1, SECOND, "", PLAIN
+    ),
     "a chunk's opcode": Fault(in_chunk(1, 0, 0x80)),
-    "a chunk's size beyond all memory": Fault(huge_size),  # the frame within tells its size, and the CRC fits
+    "a chunk's size beyond all memory": Fault(
+        huge_size
+    ),  # the frame within tells its size, and the CRC fits
     "both lengths of a chunk": Fault(both_lengths, 1, COUNTED, "", PLAIN),
-    "more bytes missing than an index takes": Fault(missing_in_chunk(1, 1500), 1, SECOND, MOVED),
-    "the same without compression": Fault(missing_in_chunk(1, 1500), 1, SECOND, MOVED, PLAIN),
-    "the first chunk, with the descriptions": Fault(in_chunk(0, 100), 0, "chunk 1 is lost"),
-    "bytes missing in the first chunk": Fault(missing_in_chunk(0, 10), 0, "chunk 1 is lost", MOVED),
+    "more bytes missing than an index takes": Fault(
+        missing_in_chunk(1, 1500), 1, SECOND, MOVED
+    ),
+    "the same without compression": Fault(
+        missing_in_chunk(1, 1500), 1, SECOND, MOVED, PLAIN
+    ),
+    "the first chunk, with the descriptions": Fault(
+        in_chunk(0, 100), 0, "chunk 1 is lost"
+    ),
+    "bytes missing in the first chunk": Fault(
+        missing_in_chunk(0, 10), 0, "chunk 1 is lost", MOVED
+    ),
     "an index's channel": Fault(in_index(9), None, "", INDEX, PLAIN),
     "an index's time": Fault(in_index(15), None, "", INDEX, PLAIN),
     "an index's offset": Fault(in_index(23), None, "", INDEX, PLAIN),
     "an index without an entry": Fault(shorter_index, None, "", INDEX, PLAIN),
-    "a longer message outside chunks": Fault(message_200(1, 1), 200, "1 of /bytes", "", LOOSE),
-    "a shorter message outside chunks": Fault(message_200(1, 64), 200, "no valid record", "", LOOSE),
-    "a type's name outside chunks": Fault(at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE),
-    "a topic's name outside chunks": Fault(at_text(b"/bytes"), None, "", r"channel 1 \(/bytes\) is desc", LOOSE),
+    "a longer message outside chunks": Fault(
+        message_200(1, 1), 200, "1 of /bytes", "", LOOSE
+    ),
+    "a shorter message outside chunks": Fault(
+        message_200(1, 64), 200, "no valid record", "", LOOSE
+    ),
+    "a type's name outside chunks": Fault(
+        at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE
+    ),
+    "a topic's name outside chunks": Fault(
+        at_text(b"/bytes"), None, "", r"channel 1 \(/bytes\) is desc", LOOSE
+    ),
     "a topic's name in a bare summary": Fault(
         in_bare_summary(b"/bytes"), None, "", r"1 \(/cytes\) .* under a CRC holds"
     ),
     # of 13 bytes it claims 29, of which 13 are there
-    "a length in a description": Fault(at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED),
-    "the length of metadata": Fault(at_text(b"sonar_graph", -12, 64), None, "a metadata record is lost"),
+    "a length in a description": Fault(
+        at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED
+    ),
+    "the length of metadata": Fault(
+        at_text(b"sonar_graph", -12, 64), None, "a metadata record is lost"
+    ),
     "zeros after the end": Fault(tail(bytes(5000)), None, "", ENDING),
     "opcodes after the end": Fault(tail(b"\x05" * 5000), None, "", ENDING),
     "noise after the end": Fault(tail(bytes(range(256)) * 20), None, "", ENDING),
-} | {f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit)) for at in (1, 2, 5, 8) for bit in (1, 8, 128)}
+} | {
+    f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit))
+    for at in (1, 2, 5, 8)
+    for bit in (1, 8, 128)
+}
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: Path, name: str) -> None:
+def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(
+    path: Path, name: str
+) -> None:
     fault = FAULTS[name]
     written = write(path, **fault.options)
     chunks = chunk_indexes(path)
@@ -220,11 +312,16 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: 
     if not chunks:  # without a CRC a message that became shorter is read
         found = [entry for entry in found if entry in written]
     assert found == [entry for entry in written if entry not in lost]
-    for told, expected in ((recording.corrupt, fault.corrupt), (recording.damage.remarks, fault.remark)):
+    for told, expected in (
+        (recording.corrupt, fault.corrupt),
+        (recording.damage.remarks, fault.remark),
+    ):
         assert bool(told) == bool(expected)
         assert any(re.search(expected, text) for text in told or [""])
     assert recording.ending is None
-    assert recording.topics["/bytes"].type_name == ("test_msgs/msg/Bytes" if fault.options != UNREPEATED else "")
+    assert recording.topics["/bytes"].type_name == (
+        "test_msgs/msg/Bytes" if fault.options != UNREPEATED else ""
+    )
     if lost and not chunks:
         (loss,) = recording.damage.losses
         assert (loss.start_ns or 0) <= lost[0][0] <= (loss.end_ns or 0)
@@ -241,11 +338,17 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: 
         assert (loss.end, loss.start_ns, loss.end_ns) == (chunk_end(chunk), *times_ns)
 
 
-RANDOM = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+RANDOM = settings(
+    max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 @RANDOM
-@given(st.sampled_from(["flip", "remove", "insert", "zero", "cut"]), st.floats(0, 1), st.integers(1, 3000))
+@given(
+    st.sampled_from(["flip", "remove", "insert", "zero", "cut"]),
+    st.floats(0, 1),
+    st.integers(1, 3000),
+)
 @pytest.mark.parametrize("compression", [ZSTD, NONE])
 def test_no_damage_makes_up_a_message_or_loses_one_silently(
     path: Path, compression: CompressionType, how: str, part: float, count: int
@@ -254,7 +357,9 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
     content = path.read_bytes()
     at = 8 + int(part * (len(content) - 9))
     damaged = {
-        "flip": content[:at] + bytes([content[at] ^ (1 << count % 8)]) + content[at + 1 :],
+        "flip": content[:at]
+        + bytes([content[at] ^ (1 << count % 8)])
+        + content[at + 1 :],
         "remove": content[:at] + content[at + count :],
         "insert": content[:at] + bytes(count) + content[at:],
         "zero": (content[:at] + bytes(count))[: len(content)] + content[at + count :],
@@ -268,7 +373,9 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
         assert recording.corrupt or recording.ending
 
 
-def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(path: Path) -> None:
+def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
+    path: Path,
+) -> None:
     """Without a CRC that could be checked, those of an uncompressed chunk are no messages outside chunks either."""
     write(path, chunk_size=1 << 20, compression=NONE)
     (chunk,) = chunk_indexes(path)
@@ -281,14 +388,25 @@ def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(path: 
     flip(path, first.chunk_start_offset + 100)
     recording = scan_all(path)
     assert recording.topics == {}
-    assert sum(sum((loss.messages or {}).values()) for loss in recording.damage.losses) > len(written) / 10
+    assert (
+        sum(sum((loss.messages or {}).values()) for loss in recording.damage.losses)
+        > len(written) / 10
+    )
     assert "whose description is lost" in recording.corrupt[1]
 
 
-def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(path: Path) -> None:
+def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
+    path: Path,
+) -> None:
     for options, named in (
-        ({"use_chunking": False}, "messages lie outside chunks, metadata record 'sonar_graph'"),
-        ({"enable_crcs": False}, "12 chunks carry no CRC, metadata record 'sonar_graph'"),
+        (
+            {"use_chunking": False},
+            "messages lie outside chunks, metadata record 'sonar_graph'",
+        ),
+        (
+            {"enable_crcs": False},
+            "12 chunks carry no CRC, metadata record 'sonar_graph'",
+        ),
         ({}, "metadata record 'sonar_graph'"),
     ):
         write(path, **options)
@@ -297,7 +415,10 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(path: 
     assert scan_all(path).damage == Damage()
     at_text(written[200][1], 3)(path)
     (loss,) = scan_all(path).damage.losses
-    assert "the CRC over all data does not fit, and messages lie outside chunks" in loss.reason
+    assert (
+        "the CRC over all data does not fit, and messages lie outside chunks"
+        in loss.reason
+    )
     with writing(path) as writer:
         writer.add_metadata("sonar_graph", seal({"calibration": "0.05", "name": "x"}))
     recording = scan_all(path)
@@ -311,14 +432,24 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(path: 
 
 def test_losses_are_counted_by_the_statistics_or_else_estimated_from_rates() -> None:
     times_ns = np.delete(np.arange(1000) * 10_000_000, slice(400, 450))
-    topics = {name: Topic(Path("x"), name, "", "cdr", "ros2msg", "", Keep.ALL) for name in ("/imu", "/over")}
-    for topic, count in zip(topics.values(), (950, 400), strict=True):  # of /over there is nothing after the loss
-        topic.gather(bytes(10), np.zeros(count, np.int64), np.full(count, 10), times_ns[:count])
+    topics = {
+        name: Topic(Path("x"), name, "", "cdr", "ros2msg", "", Keep.ALL)
+        for name in ("/imu", "/over")
+    }
+    for topic, count in zip(
+        topics.values(), (950, 400), strict=True
+    ):  # of /over there is nothing after the loss
+        topic.gather(
+            bytes(10), np.zeros(count, np.int64), np.full(count, 10), times_ns[:count]
+        )
     loss = Loss(0, 100, "no valid record", int(times_ns[399]), int(times_ns[400]))
     settle(Damage([loss]), topics, None)
     assert loss.messages == {"/imu": 50}
     assert loss.is_estimate
-    assert loss.describe(0) == "bytes 0 to 100: no valid record; 3.990 s to 4.500 s of the log; lost: about 50 of /imu"
+    assert (
+        loss.describe(0)
+        == "bytes 0 to 100: no valid record; 3.990 s to 4.500 s of the log; lost: about 50 of /imu"
+    )
     settle(counted := Damage(), {}, {"/imu": 3})
     assert counted.losses[0].messages == {"/imu": 3}
     settle(sound := Damage(), {}, {})
@@ -328,7 +459,9 @@ def test_losses_are_counted_by_the_statistics_or_else_estimated_from_rates() -> 
 # ---- files that are cut off
 
 
-def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(path: Path) -> None:
+def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(
+    path: Path,
+) -> None:
     written = write(path)
     chunks, content = chunk_indexes(path), path.read_bytes()
     for kept in (0.3, 0.6, 0.8):
@@ -336,15 +469,23 @@ def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(path
         found, recording = read(path), scan_all(path)
         assert 0 < len(found) < len(written)
         assert found == written[: len(found)]
-        assert re.search(r"^the file is cut off: .* spans 0\.000 s$", recording.ending or "")
+        assert re.search(
+            r"^the file is cut off: .* spans 0\.000 s$", recording.ending or ""
+        )
         recording.require_sound()
     path.write_bytes(content[: chunk_end(chunks[-1])])
-    assert (scan_all(path).ending or "").startswith("the file is cut off: it ends after a whole record")
+    assert (scan_all(path).ending or "").startswith(
+        "the file is cut off: it ends after a whole record"
+    )
     flip(path, chunks[-1].chunk_start_offset + 1)  # the outer length of the last chunk
     assert read(path) == written
     path.write_bytes(content[: chunks[0].chunk_start_offset + 3])
-    assert re.search(r"^the file is cut off: .*; no message is there$", scan_all(path).ending or "")
-    with pytest.raises(MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "):
+    assert re.search(
+        r"^the file is cut off: .*; no message is there$", scan_all(path).ending or ""
+    )
+    with pytest.raises(
+        MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "
+    ):
         read_log(path)
 
 
@@ -360,11 +501,17 @@ def test_zeros_after_a_cut_are_not_taken_for_a_message(path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", [ZSTD, LZ4, NONE])
-def test_half_a_chunk_gives_its_whole_messages(path: Path, compression: CompressionType) -> None:
+def test_half_a_chunk_gives_its_whole_messages(
+    path: Path, compression: CompressionType
+) -> None:
     written = write(path, 60_000, chunk_size=1 << 20, compression=compression)
     second = chunk_indexes(path)[1]
-    before = int(np.searchsorted([time for time, _ in written], second.message_start_time))
-    path.write_bytes(path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2])
+    before = int(
+        np.searchsorted([time for time, _ in written], second.message_start_time)
+    )
+    path.write_bytes(
+        path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2]
+    )
     found = read(path)
     assert found == written[: len(found)]
     assert len(found) > before + 0.2 * before
@@ -379,7 +526,10 @@ def test_half_a_chunk_gives_its_whole_messages(path: Path, compression: Compress
 OTHER_FILES = {
     b"#ROSBAG V2.0\n": r"a ROS 1 bag; `sonar-graph convert rosbag .*log\.bag -o log\.mcap`",
     b"SQLite format 3\0": "a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag",
-    b"DDF\x05" + bytes(60): r"an ARIS' recording; `sonar-graph convert aris .*log\.bag -o log\.mcap` makes one",
+    b"DDF\x05"
+    + bytes(
+        60
+    ): r"an ARIS' recording; `sonar-graph convert aris .*log\.bag -o log\.mcap` makes one",
     b"DDF\x03" + bytes(60): "a DIDSON's recording; `sonar-graph convert didson ",
     b"SO\x01\0\0\0\x23\0": "an Oculus' recording; `sonar-graph convert oculus ",
     b"DDF SO": "a text that begins with 'DDF SO'",
@@ -400,9 +550,14 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
             scan_all(path)
     viewer = tmp_path / "dive.oculus"
     viewer.write_bytes(b"\x44\x33\x22\x11")
-    with pytest.raises(LogError, match="a file of the Oculus viewer, which is not read"):
+    with pytest.raises(
+        LogError, match="a file of the Oculus viewer, which is not read"
+    ):
         scan_all(viewer)
-    for path, kind in ((tmp_path, "is a folder"), (tmp_path / "none.mcap", "No such file")):
+    for path, kind in (
+        (tmp_path, "is a folder"),
+        (tmp_path / "none.mcap", "No such file"),
+    ):
         with pytest.raises(LogError, match=kind):
             scan_all(path)
 
@@ -415,13 +570,20 @@ def test_pieces_of_a_damaged_file_end_in_an_error(path: Path) -> None:
     in_chunk(1, 100)(path)
     pieces, found = stream(path, lambda _: Keep.ALL), list[Stored]()
     with pytest.raises(LogError, match="damaged: bytes"):
-        found.extend(entry for piece in pieces if piece.name == "/bytes" for entry in entries(piece))
+        found.extend(
+            entry
+            for piece in pieces
+            if piece.name == "/bytes"
+            for entry in entries(piece)
+        )
     assert set(found) < set(written)
 
 
 def test_chunks_without_a_wanted_topic_are_not_even_read(path: Path) -> None:
     write_apart(path)
-    for index in chunk_indexes(path)[1::2]:  # those of /b: damage there goes unnoticed, and the recording says so
+    for index in chunk_indexes(path)[
+        1::2
+    ]:  # those of /b: damage there goes unnoticed, and the recording says so
         flip(path, chunk_end(index) - 1)
     assert len(scan_all(path).corrupt) == 50
     recording = scan(path, lambda kind: Keep.NONE if kind.endswith("/B") else Keep.ALL)
@@ -434,14 +596,20 @@ def test_chunks_without_a_wanted_topic_are_not_even_read(path: Path) -> None:
 def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -> None:
     write_apart(path)
     recording = scan_all(path, TimeWindow(Instant.parse("10"), Instant.parse("20")))
-    times_s = sorted(t for name in ("/a", "/b") for t in (recording.topics[name].log_times_ns // 10**9).tolist())
+    times_s = sorted(
+        t
+        for name in ("/a", "/b")
+        for t in (recording.topics[name].log_times_ns // 10**9).tolist()
+    )
     assert times_s == list(range(11, 21))
     assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
     assert recording.skipped_chunks == 89
     assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
     absolute = TimeWindow(Instant.parse("1970-01-01T00:01:31Z"))
     assert sum(len(t) for t in scan_all(path, absolute).topics.values()) == 11
-    with pytest.raises(LogError, match=r"nothing was recorded from 1000\.000 s to the end"):
+    with pytest.raises(
+        LogError, match=r"nothing was recorded from 1000\.000 s to the end"
+    ):
         scan_all(path, TimeWindow(Instant.parse("1000")))
 
 
@@ -449,8 +617,12 @@ def test_a_window_is_the_same_without_summary(path: Path) -> None:
     written = write(path)
     for kept in (path.stat().st_size, chunk_indexes(path)[-1].chunk_start_offset):
         path.write_bytes(path.read_bytes()[:kept])
-        recording = scan_all(path, TimeWindow(Instant.parse("100e-9"), Instant.parse("150e-9")))
-        assert entries(recording.topics["/bytes"]) == [entry for entry in written if 1100 <= entry[0] < 1150]
+        recording = scan_all(
+            path, TimeWindow(Instant.parse("100e-9"), Instant.parse("150e-9"))
+        )
+        assert entries(recording.topics["/bytes"]) == [
+            entry for entry in written if 1100 <= entry[0] < 1150
+        ]
         assert (recording.skipped_chunks > 0) == (recording.ending is None)
 
 
@@ -464,30 +636,44 @@ def test_a_summary_that_lies_about_chunks_is_not_used_to_skip(path: Path) -> Non
     entry = struct.pack("<IHQ", 10, 1, index.message_index_offsets[1])
     assert content.count(entry) == 1
     at = content.index(entry)
-    content[at : at + len(entry)] = struct.pack("<IHQ", 10, 2, index.message_index_offsets[1])
+    content[at : at + len(entry)] = struct.pack(
+        "<IHQ", 10, 2, index.message_index_offsets[1]
+    )
     path.write_bytes(content)
     recording = scan_all(path, TimeWindow(Instant.parse("3"), Instant.parse("7")))
     assert (recording.topics["/a"].log_times_ns // 10**9).tolist() == [5, 7]
-    assert any("the summary's index does not fit chunk 5" in remark for remark in recording.damage.remarks)
+    assert any(
+        "the summary's index does not fit chunk 5" in remark
+        for remark in recording.damage.remarks
+    )
     assert recording.skipped_chunks == 0
 
 
 BEGINNING_NS = 1_700_000_000_000_000_001
 
 
-@given(st.datetimes(min_value=datetime(1971, 1, 1), max_value=datetime(2200, 1, 1)), st.integers(-12, 14))
+@given(
+    st.datetimes(min_value=datetime(1971, 1, 1), max_value=datetime(2200, 1, 1)),
+    st.integers(-12, 14),
+)
 def test_a_date_is_absolute_in_its_zone(when: datetime, hours: int) -> None:
     zoned = when.replace(tzinfo=timezone(timedelta(hours=hours)))
-    expected_us = (zoned - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
+    expected_us = (zoned - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(
+        microseconds=1
+    )
     assert Instant.parse(zoned.isoformat()).resolve(BEGINNING_NS) == expected_us * 1000
 
 
 @pytest.mark.parametrize("text", ["-1", "nan", "inf", "x", "", "12:30", "1e30"])
-def test_a_number_is_seconds_from_the_beginning_a_date_without_a_zone_in_utc_and_all_else_refused(text: str) -> None:
+def test_a_number_is_seconds_from_the_beginning_a_date_without_a_zone_in_utc_and_all_else_refused(
+    text: str,
+) -> None:
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
     assert Instant.parse("1.5").resolve(BEGINNING_NS) == BEGINNING_NS + 1_500_000_000
     assert Instant.parse("1700000000").resolve(0) == 1_700_000_000 * 10**9
-    with pytest.raises(LogError, match=r"no time in a log: give seconds from its beginning"):
+    with pytest.raises(
+        LogError, match=r"no time in a log: give seconds from its beginning"
+    ):
         Instant.parse(text)
     with pytest.raises(LogError, match="ends before it starts"):
         TimeWindow(Instant.parse("2"), Instant.parse("2")).resolve(BEGINNING_NS)
@@ -502,7 +688,12 @@ def test_a_long_log_is_read_in_bounded_memory(path: Path) -> None:
             writer.add_message(images, i, image, 0)
             writer.add_message(numbers, i, b"12345678", 0)
     tracemalloc.start()
-    total = sum(part.nbytes for t in stream(path, lambda _: Keep.ALL) for s in t.stacks.values() for _, part in s)
+    total = sum(
+        part.nbytes
+        for t in stream(path, lambda _: Keep.ALL)
+        for s in t.stacks.values()
+        for _, part in s
+    )
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert total == 60 * ((1 << 20) + 8)

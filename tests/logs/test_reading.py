@@ -10,7 +10,10 @@ import pytest
 
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
-from sonar_graph.logs.adapters.landmark_messages import LandmarkMapAdapter, detection_warnings
+from sonar_graph.logs.adapters.landmark_messages import (
+    LandmarkMapAdapter,
+    detection_warnings,
+)
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
@@ -44,16 +47,25 @@ REFUSED_CHOICES: list[tuple[str, dict[str, str], type[Exception], str]] = [
 # fmt: on
 
 
-def test_the_topic_that_is_chosen_is_read_and_choices_that_cannot_be_are_refused(bench: Bench) -> None:
+def test_the_topic_that_is_chosen_is_read_and_choices_that_cannot_be_are_refused(
+    bench: Bench,
+) -> None:
     fast = [bench.imu(T0_NS + i * STEP_NS, (0, 0, 7.0)) for i in range(5)]
     entries = [*bench.basics(), ("/other", "imu", fast)]
     for there, topics, error, message in REFUSED_CHOICES:
         path = bench.write(*(entry for entry in entries if entry[0] in there.split()))
         with pytest.raises(error, match=message):
             read_log(path, topics=topics)
-    lacking = definition("sensor_msgs/msg/Imu").replace("geometry_msgs/Vector3 angular_velocity\n", "")
-    without = [{key: value for key, value in m.items() if key != "angular_velocity"} for m in fast]
-    with pytest.raises(LogError, match=r"nothing for imu: /imu has no field angular_velocity\.x"):
+    lacking = definition("sensor_msgs/msg/Imu").replace(
+        "geometry_msgs/Vector3 angular_velocity\n", ""
+    )
+    without = [
+        {key: value for key, value in m.items() if key != "angular_velocity"}
+        for m in fast
+    ]
+    with pytest.raises(
+        LogError, match=r"nothing for imu: /imu has no field angular_velocity\.x"
+    ):
         read_log(bench.write(("/imu", "imu", without, lacking), entries[1]))
     path = bench.write(*entries)
     assert read_log(path, topics={"imu": "/imu"}).imu.angular_velocity[0, 2] == 0.1
@@ -62,7 +74,9 @@ def test_the_topic_that_is_chosen_is_read_and_choices_that_cannot_be_are_refused
     assert "imu: /other" in chosen.notes["log.topics"]
 
 
-def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(bench: Bench, tmp_path: Path) -> None:
+def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(
+    bench: Bench, tmp_path: Path
+) -> None:
     path = bench.write(*bench.basics())
     setup = tmp_path / "setup.toml"
     setup.write_text("[imu]\ngyro_bias_sigma = 0.25")
@@ -70,15 +84,29 @@ def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(bench: Bench
     assert sequence.calibration.imu.gyro_bias_sigma == 0.25
     write_log(str(tmp_path / "copy.mcap"), sequence)
     assert inspect_log(str(tmp_path / "copy.mcap")).name == sequence.name
-    with pytest.raises(CalibrationError, match=r"absent\.toml: cannot be read: No such file"):
+    with pytest.raises(
+        CalibrationError, match=r"absent\.toml: cannot be read: No such file"
+    ):
         read_log(path, calibration=tmp_path / "absent.toml")
     wrong, text = (sequence, str(path))  # type: Any, Any
     for call, message in (
-        (lambda: read_log(wrong), r"read_log\(path\): expected a path, a str or Path, not Sequence"),
+        (
+            lambda: read_log(wrong),
+            r"read_log\(path\): expected a path, a str or Path, not Sequence",
+        ),
         (lambda: inspect_log(wrong), r"inspect_log\(path\): expected a path"),
-        (lambda: read_log(path, calibration=wrong), "calibration=FILE or Calibration.: expected a path"),
-        (lambda: write_log(wrong, wrong), r"write_log\(path, sequence\): expected a path.*not Sequence"),
-        (lambda: write_log(path, text), r"write_log\(path, sequence\): expected a Sequence, not str"),
+        (
+            lambda: read_log(path, calibration=wrong),
+            "calibration=FILE or Calibration.: expected a path",
+        ),
+        (
+            lambda: write_log(wrong, wrong),
+            r"write_log\(path, sequence\): expected a path.*not Sequence",
+        ),
+        (
+            lambda: write_log(path, text),
+            r"write_log\(path, sequence\): expected a Sequence, not str",
+        ),
     ):
         with pytest.raises(TypeError, match=message):
             call()
@@ -89,20 +117,37 @@ def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(bench: Bench
 
 def test_stamps_are_the_headers_sorted_and_once(bench: Bench) -> None:
     _, dvl = bench.basics()
-    imu = [bench.imu(T0_NS + k * STEP_NS, (float(i), 0, 0)) for i, k in enumerate((0, 2, 1, 2, 3))]
+    imu = [
+        bench.imu(T0_NS + k * STEP_NS, (float(i), 0, 0))
+        for i, k in enumerate((0, 2, 1, 2, 3))
+    ]
     sequence = read_log(bench.write(("/imu", "imu", imu), dvl))
     assert sequence.imu.stamps_ns.tolist() == [T0_NS + i * STEP_NS for i in range(4)]
     assert sequence.imu.angular_velocity[:, 0].tolist() == [0, 2, 1, 4]
     assert sequence.notes["log.dropped"] == "imu: 1 with the stamp of another"
     unset = read_log(bench.write(("/imu", "imu", [bench.imu(0)] * 3), dvl))
-    assert unset.imu.stamps_ns.tolist() == [T0_NS + i * STEP_NS for i in range(3)], "the time of recording"
+    assert unset.imu.stamps_ns.tolist() == [T0_NS + i * STEP_NS for i in range(3)], (
+        "the time of recording"
+    )
 
 
 ROWS: dict[str, tuple[str, dict[str, Any], str | None]] = {
-    "rate not finite": ("imu", {"angular_velocity": {"x": np.nan, "y": 0.0, "z": 0.0}}, "values that are not finite"),
-    "rate not measured": ("imu", {"angular_velocity_covariance": UNKNOWN}, "without angular rate"),
+    "rate not finite": (
+        "imu",
+        {"angular_velocity": {"x": np.nan, "y": 0.0, "z": 0.0}},
+        "values that are not finite",
+    ),
+    "rate not measured": (
+        "imu",
+        {"angular_velocity_covariance": UNKNOWN},
+        "without angular rate",
+    ),
     "force not measured": ("imu", {"linear_acceleration_covariance": UNKNOWN}, None),
-    "velocity not finite": ("dvl", {"velocity": {"x": np.inf, "y": 0.0, "z": 0.0}}, "with values that are not finite"),
+    "velocity not finite": (
+        "dvl",
+        {"velocity": {"x": np.inf, "y": 0.0, "z": 0.0}},
+        "with values that are not finite",
+    ),
     "through the water": ("dvl", {"velocity_mode": 2}, "with velocity_mode not 1"),
     "no good beam": ("dvl", {"num_good_beams": 0}, "without a good beam"),
     "unknown covariance": ("dvl", {"velocity_covar": UNKNOWN}, None),
@@ -120,28 +165,41 @@ def test_rows_that_cannot_be_used_are_left_out_and_counted(
     assert ((getattr(sequence, role).stamps_ns - T0_NS) // STEP_NS).tolist() == kept
     assert (account is None) == ("log.dropped" not in sequence.notes)
     assert account is None or account in sequence.notes["log.dropped"]
-    unmeasured = np.flatnonzero(np.isnan(sequence.imu.specific_force).all(axis=1)).tolist()
+    unmeasured = np.flatnonzero(
+        np.isnan(sequence.imu.specific_force).all(axis=1)
+    ).tolist()
     assert unmeasured == ([2] if "linear_acceleration_covariance" in change else [])
 
 
-def test_a_role_of_which_nothing_is_left_is_an_error_and_uncounted_beams_are_believed(bench: Bench) -> None:
+def test_a_role_of_which_nothing_is_left_is_an_error_and_uncounted_beams_are_believed(
+    bench: Bench,
+) -> None:
     imu, _ = bench.basics()
     water = [bench.dvl(T0_NS + i, velocity_mode=2) for i in range(3)]
-    with pytest.raises(LogError, match=r"/dvl: none of its 3 messages can be used: 3 with velocity_mode not 1"):
+    with pytest.raises(
+        LogError,
+        match=r"/dvl: none of its 3 messages can be used: 3 with velocity_mode not 1",
+    ):
         read_log(bench.write(imu, ("/dvl", "dvl", water)))
     uncounted = [bench.dvl(T0_NS + i, num_good_beams=0) for i in range(3)]
     assert len(read_log(bench.write(imu, ("/dvl", "dvl", uncounted))).dvl) == 3
 
 
-def test_sensors_of_two_clocks_are_refused_and_stamps_beside_the_log_are_in_the_notes(bench: Bench) -> None:
+def test_sensors_of_two_clocks_are_refused_and_stamps_beside_the_log_are_in_the_notes(
+    bench: Bench,
+) -> None:
     _, dvl = bench.basics()
     late = [T0_NS + i * STEP_NS - 60 * 10**9 for i in (0, 2, 1, 3)] + [T0_NS]
-    notes = read_log(bench.write(("/imu", "imu", [bench.imu(s) for s in late]), dvl)).notes
+    notes = read_log(
+        bench.write(("/imu", "imu", [bench.imu(s) for s in late]), dvl)
+    ).notes
     assert "imu: once backwards, by 0.1 s" in notes["log.stamps"]
     assert "imu: stamped 60 s before recording" in notes["log.stamps"]
     assert "dvl" not in notes["log.stamps"]
     path = bench.write(("/imu", "imu", [bench.imu(s) for s in late[:4]]), dvl)
-    with pytest.raises(LogError, match=rf"{path.name}: IMU from .* DVL from .*: no common time"):
+    with pytest.raises(
+        LogError, match=rf"{path.name}: IMU from .* DVL from .*: no common time"
+    ):
         read_log(path)
 
 
@@ -152,7 +210,9 @@ def detected(bench: Bench, *frames: dict[str, Any]) -> Path:
     return bench.write(*bench.basics(), ("/landmarks", "detections", list(frames)))
 
 
-def test_detections_are_padded_to_the_most_candidates_and_keep_their_tracks(bench: Bench) -> None:
+def test_detections_are_padded_to_the_most_candidates_and_keep_their_tracks(
+    bench: Bench,
+) -> None:
     """Also when messages of one log differ in having tracks."""
     frames = [
         bench.detections(T0_NS, [1.0, 2.0], [5, 6], (4, 3)),
@@ -165,12 +225,20 @@ def test_detections_are_padded_to_the_most_candidates_and_keep_their_tracks(benc
     assert found is not None
     assert (found.stamps_ns - T0_NS).tolist() == [0, 0, 2, 3, 4]
     assert found.range_m.tolist() == [1, 2, 3, 4, 6]
-    assert found.candidate_ids.tolist() == [[5, -1, -1], [6, -1, -1], [7, 8, 9], [2, -1, -1], [5, -1, -1]]
+    assert found.candidate_ids.tolist() == [
+        [5, -1, -1],
+        [6, -1, -1],
+        [7, 8, 9],
+        [2, -1, -1],
+        [5, -1, -1],
+    ]
     assert found.id_probability[0].tolist() == [0.5, 0, 0]
     np.testing.assert_array_equal(found.range_azimuth_cov[0], [[0.01, 0], [0, 0.02]])
     assert found.track.tolist() == [4, 3, -1, -1, 7]
     # logs older than tracks
-    lines = definition("sonar_graph_msgs/msg/LandmarkDetections").splitlines(keepends=True)
+    lines = definition("sonar_graph_msgs/msg/LandmarkDetections").splitlines(
+        keepends=True
+    )
     old = "".join(line for line in lines if "track" not in line)
     frame = {key: value for key, value in frames[0].items() if key != "track"}
     path = bench.write(*bench.basics(), ("/landmarks", "detections", [frame], old))
@@ -180,11 +248,17 @@ def test_detections_are_padded_to_the_most_candidates_and_keep_their_tracks(benc
 def test_the_last_map_counts_whatever_the_lengths_of_those_before(bench: Bench) -> None:
     for last in ([4], [4, 5], [4, 5, 6]):
         maps = [
-            {"header": header(T0_NS, "map"), "ids": ids, "position": [0.5] * 3 * len(ids)}
+            {
+                "header": header(T0_NS, "map"),
+                "ids": ids,
+                "position": [0.5] * 3 * len(ids),
+            }
             | {"covariance": [0.0] * 9 * len(ids)}
             for ids in ([1, 2], [3], last)
         ]
-        topic = scan(bench.write(("/truth/landmarks", "map", maps)), lambda _: Keep.ALL).topics["/truth/landmarks"]
+        topic = scan(
+            bench.write(("/truth/landmarks", "map", maps)), lambda _: Keep.ALL
+        ).topics["/truth/landmarks"]
         found, _ = LandmarkMapAdapter(type=topic.type_name).read(topic)
         assert found is not None
         assert found.ids.tolist() == last
@@ -192,22 +266,42 @@ def test_the_last_map_counts_whatever_the_lengths_of_those_before(bench: Bench) 
 
 def one_of(bench: Bench, **changed: Any) -> Path:
     """A log with a sound frame of one detection, and a changed one of two."""
-    frames = [bench.detections(T0_NS, [3.0], [5]), bench.detections(T0_NS + STEP_NS, [1.0, 2.0], [5, 6]) | changed]
+    frames = [
+        bench.detections(T0_NS, [3.0], [5]),
+        bench.detections(T0_NS + STEP_NS, [1.0, 2.0], [5, 6]) | changed,
+    ]
     return detected(bench, *frames)
 
 
 MESSAGE = r"topic /landmarks: message 1 has "
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "lists": ({"azimuth_rad": [0.1]}, MESSAGE + "2 ranges, 1 azimuths, 8 covariance elements, 2 identities"),
-    "candidates": ({"candidate_ids": [5, 6, 7], "id_probability": [0.1] * 3}, MESSAGE + "2 ranges.* 3 identities"),
-    "tracks": ({"track": [1]}, MESSAGE + "2 ranges and 1 tracks; expected as many, or none"),
-    "2^56": ({"candidate_ids": [5, 2**56]}, MESSAGE + r"an identity of 2\^56 or more; number"),
-    "2^63": ({"candidate_ids": [5, 2**63 - 1]}, MESSAGE + r"an identity of 2\^56 or more; number"),
+    "lists": (
+        {"azimuth_rad": [0.1]},
+        MESSAGE + "2 ranges, 1 azimuths, 8 covariance elements, 2 identities",
+    ),
+    "candidates": (
+        {"candidate_ids": [5, 6, 7], "id_probability": [0.1] * 3},
+        MESSAGE + "2 ranges.* 3 identities",
+    ),
+    "tracks": (
+        {"track": [1]},
+        MESSAGE + "2 ranges and 1 tracks; expected as many, or none",
+    ),
+    "2^56": (
+        {"candidate_ids": [5, 2**56]},
+        MESSAGE + r"an identity of 2\^56 or more; number",
+    ),
+    "2^63": (
+        {"candidate_ids": [5, 2**63 - 1]},
+        MESSAGE + r"an identity of 2\^56 or more; number",
+    ),
 }
 
 
 @pytest.mark.parametrize(("changed", "message"), REFUSED.values(), ids=REFUSED)
-def test_a_message_that_breaks_its_rules_is_named(bench: Bench, changed: dict[str, Any], message: str) -> None:
+def test_a_message_that_breaks_its_rules_is_named(
+    bench: Bench, changed: dict[str, Any], message: str
+) -> None:
     path = one_of(bench, **changed)
     with pytest.raises(LogError, match=message) as caught:
         read_log(path)
@@ -216,22 +310,53 @@ def test_a_message_that_breaks_its_rules_is_named(bench: Bench, changed: dict[st
 
 
 POSTERIOR = "1 with probabilities that are not between 0 and 1 or more than 1 in sum"
-RANGE, COVARIANCE = "a range that is not above 0 and at most 100 km", "a covariance that is not positive definite"
+RANGE, COVARIANCE = (
+    "a range that is not above 0 and at most 100 km",
+    "a covariance that is not positive definite",
+)
 TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
     "sound": ({}, 3, ""),
     "largest identity": ({"candidate_ids": [5, 2**56 - 1]}, 3, ""),
-    "unknown covariance": ({"covariance": [np.nan] * 8, "track": [3, 4]}, 3, "2 of 3 rows say no covariance"),
-    "degrees": ({"azimuth_rad": [-40.0, 1.0]}, 3, "1 of 3 rows have an azimuth beyond ±3.14 rad (up to 40)"),
+    "unknown covariance": (
+        {"covariance": [np.nan] * 8, "track": [3, 4]},
+        3,
+        "2 of 3 rows say no covariance",
+    ),
+    "degrees": (
+        {"azimuth_rad": [-40.0, 1.0]},
+        3,
+        "1 of 3 rows have an azimuth beyond ±3.14 rad (up to 40)",
+    ),
     "97 %": ({"id_probability": [97.0, 0.5]}, 2, POSTERIOR),
     "negative": ({"id_probability": [0.5, -0.1]}, 2, POSTERIOR),
     "above 1": ({"id_probability": [1.1, 0.5]}, 2, POSTERIOR),
     "range": ({"range_m": [-1.0, 2.0]}, 3, f"1 of 3 rows have {RANGE}"),
     "far": ({"range_m": [1e10, 1e14]}, 3, f"2 of 3 rows have {RANGE}"),
-    "no covariance": ({"covariance": [0.0] * 4 + [0.01, 0, 0, 0.02]}, 3, f"1 of 3 rows have {COVARIANCE}"),
-    "singular": ({"covariance": [1.0, 1, 1, 1] * 2}, 3, f"2 of 3 rows have {COVARIANCE}"),
-    "track": ({"track": [7, 7]}, 3, "1 of 3 rows have the track number of another row of their frame, in 1 frames"),
-    "early": ({"header": header(T0_NS - 5 * 10**9)}, 3, "2 of 3 rows have a stamp before the first odometry"),
-    "late": ({"header": header(T0_NS + 60 * 10**9)}, 3, "2 of 3 rows have a stamp after the last odometry"),
+    "no covariance": (
+        {"covariance": [0.0] * 4 + [0.01, 0, 0, 0.02]},
+        3,
+        f"1 of 3 rows have {COVARIANCE}",
+    ),
+    "singular": (
+        {"covariance": [1.0, 1, 1, 1] * 2},
+        3,
+        f"2 of 3 rows have {COVARIANCE}",
+    ),
+    "track": (
+        {"track": [7, 7]},
+        3,
+        "1 of 3 rows have the track number of another row of their frame, in 1 frames",
+    ),
+    "early": (
+        {"header": header(T0_NS - 5 * 10**9)},
+        3,
+        "2 of 3 rows have a stamp before the first odometry",
+    ),
+    "late": (
+        {"header": header(T0_NS + 60 * 10**9)},
+        3,
+        "2 of 3 rows have a stamp after the last odometry",
+    ),
 }
 
 
@@ -243,17 +368,25 @@ def test_detections_that_estimators_do_not_use_are_told_and_impossible_ones_left
     sequence, summary = read_log(path), inspect_log(path)
     assert sequence.detections is not None
     assert len(sequence.detections) == rows
-    told = [text for text in (*summary.warnings, *summary.left_out) if text.startswith("detections")]
+    told = [
+        text
+        for text in (*summary.warnings, *summary.left_out)
+        if text.startswith("detections")
+    ]
     assert len(told) == bool(account)
     assert all(text.startswith(f"detections: {account}") for text in told)
-    notes = sequence.notes.get("log.warnings", "") + sequence.notes.get("log.dropped", "")
+    notes = sequence.notes.get("log.warnings", "") + sequence.notes.get(
+        "log.dropped", ""
+    )
     assert all(text in notes for text in told)
 
 
 def test_odometry_lasts_while_there_are_both_sensors(bench: Bench) -> None:
     imu, (topic, kind, messages) = bench.basics(9)
     frames = [bench.detections(T0_NS + k * STEP_NS, [2.0], [5]) for k in (0, 4, 8)]
-    path = bench.write(imu, (topic, kind, messages[2:7]), ("/landmarks", "detections", frames))
+    path = bench.write(
+        imu, (topic, kind, messages[2:7]), ("/landmarks", "detections", frames)
+    )
     said = read_log(path).notes["log.warnings"]
     for side in ("before the first", "after the last"):
         assert f"detections: 1 of 3 rows have a stamp {side} odometry" in said
@@ -261,9 +394,23 @@ def test_odometry_lasts_while_there_are_both_sensors(bench: Bench) -> None:
 
 @pytest.mark.parametrize("cross", [0.0, 0.9, -1.1, np.inf, np.nan])
 def test_a_covariance_is_told_of_where_estimators_refuse_it(cross: float) -> None:
-    for variances in ((1.0, 1.0), (-1.0, -1.0), (0.0, 1.0), (np.inf, 1.0), (1.0, np.inf), (np.nan, 1.0)):
+    for variances in (
+        (1.0, 1.0),
+        (-1.0, -1.0),
+        (0.0, 1.0),
+        (np.inf, 1.0),
+        (1.0, np.inf),
+        (np.nan, 1.0),
+    ):
         cov = np.array([[[variances[0], cross], [cross, variances[1]]]])
-        row = LandmarkDetections(np.array([5]), np.ones(1), np.zeros(1), cov, np.array([[1]]), np.array([[0.9]]))
+        row = LandmarkDetections(
+            np.array([5]),
+            np.ones(1),
+            np.zeros(1),
+            cov,
+            np.array([[1]]),
+            np.array([[0.9]]),
+        )
         assert bool(list(detection_warnings(row, 0, 9))) == (not row.are_sound()[0])
 
 
@@ -271,10 +418,14 @@ def test_a_covariance_is_told_of_where_estimators_refuse_it(cross: float) -> Non
 
 
 @pytest.fixture(scope="module")
-def long(make_sequence: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
+def long(
+    make_sequence: Any, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Any, Path]:
     """A sequence of several chunks and its log, which is not to be written to."""
     sequence = make_sequence(samples=20_000)
-    stated = sequence.calibration.model_copy(update={"start": Start(position_m=(0.0, 0.0, 0.0))})
+    stated = sequence.calibration.model_copy(
+        update={"start": Start(position_m=(0.0, 0.0, 0.0))}
+    )
     sequence = replace(sequence, calibration=stated)
     path = tmp_path_factory.mktemp("long") / "a.mcap"
     write_log(path, sequence)
@@ -299,11 +450,15 @@ def test_a_cut_is_noted_a_hole_refused_unless_salvaged_and_a_wrong_calibration_n
     found = read_log(path, salvage=True)
     is_there = np.isin(sequence.imu.stamps_ns, found.imu.stamps_ns)
     assert 0 < np.count_nonzero(~is_there) < len(sequence.imu)
-    np.testing.assert_array_equal(found.imu.angular_velocity, sequence.imu.angular_velocity[is_there])
+    np.testing.assert_array_equal(
+        found.imu.angular_velocity, sequence.imu.angular_velocity[is_there]
+    )
     assert f"{np.count_nonzero(~is_there)} of /imu/data" in found.notes["log.damage"]
     write_log(path, make_sequence())
     flip(path, path.read_bytes().index(b"gravity_m_s2") + len("gravity_m_s2") + 2, 1)
-    with pytest.raises(LogError, match="a metadata record is lost: its CRC does not fit"):
+    with pytest.raises(
+        LogError, match="a metadata record is lost: its CRC does not fit"
+    ):
         read_log(path)
 
 
@@ -320,9 +475,13 @@ def test_a_window_is_the_same_part_of_every_block(long: tuple[Any, Path]) -> Non
     assert found.notes["log.part"] == "2.000 s to 4.000 s of the recording"
 
 
-def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(long: tuple[Any, Path]) -> None:
+def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(
+    long: tuple[Any, Path],
+) -> None:
     later = TimeWindow(Instant.parse("2"))
-    start = PartialCalibration.parse({"start": {"position_m": [1.0, 0.0, 0.0]}}, "x.toml")
+    start = PartialCalibration.parse(
+        {"start": {"position_m": [1.0, 0.0, 0.0]}}, "x.toml"
+    )
     other = PartialCalibration.parse({"gravity_m_s2": 9.8}, "x.toml")
     for settings, is_told in (
         ({"window": later}, True),
@@ -340,20 +499,28 @@ def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(lon
 def test_what_is_found_in_this_reading_counts_and_not_what_an_earlier_one_found(
     make_sequence: Any, tmp_path: Path
 ) -> None:
-    found = dict.fromkeys(("log.gaps", "log.warnings", "log.noise", "log.sensors"), "of yesterday")
+    found = dict.fromkeys(
+        ("log.gaps", "log.warnings", "log.noise", "log.sensors"), "of yesterday"
+    )
     whole = replace(make_sequence(), notes=found | {"vehicle": "of yesterday"})
     write_log(tmp_path / "a.mcap", whole)
     notes = read_log(tmp_path / "a.mcap").notes
     assert [name for name, note in notes.items() if "yesterday" in note] == ["vehicle"]
     rows = whole.dvl.stamps_ns
     sparse = whole.dvl.rows((rows == rows[0]) | (rows == rows[-1]))
-    few = Calibration.model_validate(whole.calibration.model_dump() | {"dvl": {"gap_s": 1e-3}})
+    few = Calibration.model_validate(
+        whole.calibration.model_dump() | {"dvl": {"gap_s": 1e-3}}
+    )
     write_log(tmp_path / "b.mcap", replace(whole, dvl=sparse, calibration=few))
-    assert "dvl: no velocity 0.000 to" in read_log(tmp_path / "b.mcap").notes["log.gaps"]
+    assert (
+        "dvl: no velocity 0.000 to" in read_log(tmp_path / "b.mcap").notes["log.gaps"]
+    )
 
 
 @pytest.mark.recording
-def test_recordings_of_other_kinds_are_refused_with_what_is_in_them(recordings: Path) -> None:
+def test_recordings_of_other_kinds_are_refused_with_what_is_in_them(
+    recordings: Path,
+) -> None:
     for name, message in {
         "nav2_turtlebot.mcap": r"nothing for imu.*/amcl_pose \(.*/odom \(nav_msgs.*/tf \(.*/tf_static",
         "husky.bag": r"a ROS 1 bag; `sonar-graph convert rosbag",

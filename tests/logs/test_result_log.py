@@ -45,7 +45,9 @@ from sonar_graph.states import LandmarkMap, Trajectory
 from .conftest import decode
 
 T0_NS = 1_700_000_000_000_000_000
-EMPTY = Trajectory.without_covariances(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 4)))
+EMPTY = Trajectory.without_covariances(
+    np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 4))
+)
 NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
@@ -58,10 +60,14 @@ def straight(offset_m: float, n: int = 100) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def result(make_sequence: Any, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+def result(
+    make_sequence: Any, tmp_path_factory: pytest.TempPathFactory
+) -> SimpleNamespace:
     """A result with its layouts, and its messages as another library decodes them."""
     covariances = np.tile(np.diag([1, 4, 9.0]), (2, 1, 1))
-    landmarks = LandmarkMap(np.array([6, 20]), np.array([[1.0, 2, 0], [3, 4, 0]]), covariances)
+    landmarks = LandmarkMap(
+        np.array([6, 20]), np.array([[1.0, 2, 0], [3, 4, 0]]), covariances
+    )
     estimates = {
         "ekf-slam": (straight(0), straight(0), landmarks),
         "isam2": (straight(10), straight(20), landmarks),
@@ -70,15 +76,36 @@ def result(make_sequence: Any, tmp_path_factory: pytest.TempPathFactory) -> Simp
     path = tmp_path_factory.mktemp("result") / "result.mcap"
     write_result(path, make_sequence(), estimates)
     layout = json.loads(path.with_suffix(".foxglove.json").read_text("utf-8"))
-    rviz, messages = YAML(typ="safe").load(path.with_suffix(".rviz"))["Visualization Manager"], decode(path)
-    types, view = {topic: type(ms[0]).__name__ for topic, ms in messages.items()}, layout["configById"]["3D!result"]
-    return SimpleNamespace(path=path, messages=messages, types=types, layout=layout, view=view, rviz=rviz)
+    rviz, messages = (
+        YAML(typ="safe").load(path.with_suffix(".rviz"))["Visualization Manager"],
+        decode(path),
+    )
+    types, view = (
+        {topic: type(ms[0]).__name__ for topic, ms in messages.items()},
+        layout["configById"]["3D!result"],
+    )
+    return SimpleNamespace(
+        path=path, messages=messages, types=types, layout=layout, view=view, rviz=rviz
+    )
 
 
-def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_and_identities(result):
-    each = ("odometry", "pose", "pose_ellipsoid", "smoothed", "path", "landmarks", "landmark_cloud")
+def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_and_identities(
+    result,
+):
+    each = (
+        "odometry",
+        "pose",
+        "pose_ellipsoid",
+        "smoothed",
+        "path",
+        "landmarks",
+        "landmark_cloud",
+    )
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
-    expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks", "landmark_cloud")}
+    expected |= {
+        f"/ground_truth/{kind}"
+        for kind in ("odometry", "path", "landmarks", "landmark_cloud")
+    }
     assert set(result.messages) == expected | {"/tf", "/tf_static"}
     (array,) = result.messages["/isam2/landmarks"]
     spheres = [m for m in array.markers if m.type == 2]
@@ -86,60 +113,106 @@ def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_an
     assert [m.text for m in texts] == ["6", "20"]
     assert [(m.pose.position.x, m.pose.position.y) for m in spheres] == [(1, 2), (3, 4)]
     scale = spheres[0].scale
-    assert sorted([scale.x, scale.y, scale.z]) == pytest.approx(2 * 2.7954834829151074 * np.array([1, 2, 3]))
+    assert sorted([scale.x, scale.y, scale.z]) == pytest.approx(
+        2 * 2.7954834829151074 * np.array([1, 2, 3])
+    )
     assert len({(m.ns, m.id) for m in array.markers}) == 4
 
 
-def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_path_smoothed(result):
-    assert [m.pose.pose.position.x for m in result.messages["/isam2/odometry"]] == list(np.arange(100) + 10.0)
+def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_path_smoothed(
+    result,
+):
+    assert [m.pose.pose.position.x for m in result.messages["/isam2/odometry"]] == list(
+        np.arange(100) + 10.0
+    )
     *so_far, last = result.messages["/isam2/path"]
     assert [len(path.poses) for path in so_far] == [31, 61, 91]
     assert [p.poses[0].pose.position.x for p in so_far] == [10, 10, 10]
     assert [p.pose.position.x for p in last.poses] == list(np.arange(100) + 20.0)
-    assert [p.header.stamp.sec for p in last.poses] == list(range(1_700_000_000, 1_700_000_100))
-    pose, odometry = result.messages["/isam2/pose"][0], result.messages["/isam2/odometry"][0]
+    assert [p.header.stamp.sec for p in last.poses] == list(
+        range(1_700_000_000, 1_700_000_100)
+    )
+    pose, odometry = (
+        result.messages["/isam2/pose"][0],
+        result.messages["/isam2/odometry"][0],
+    )
     for message in (pose, odometry):
         # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
-        assert np.diag(np.reshape(message.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
+        assert np.diag(np.reshape(message.pose.covariance, (6, 6))) == pytest.approx(
+            [5, 4, 6, 2, 1, 3]
+        )
     assert (pose.header.frame_id, odometry.child_frame_id) == ("map", "isam2/base_link")
 
 
-def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_message(result):
+def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_message(
+    result,
+):
     """The sensors follow the first estimator."""
     parents: dict[str, set[str]] = {}
     xs: dict[str, list[float]] = {}
-    for transform in [t for m in result.messages["/tf"] + result.messages["/tf_static"] for t in m.transforms]:
-        parents.setdefault(transform.child_frame_id, set()).add(transform.header.frame_id)
-        xs.setdefault(transform.child_frame_id, []).append(transform.transform.translation.x)
-    sensors = {sensor: {"base_link"} for sensor in ("imu", "dvl", "depth", "sonar", "positions")}
-    bodies = ("base_link", "ekf_slam/base_link", "isam2/base_link", "ground_truth/base_link")
+    for transform in [
+        t
+        for m in result.messages["/tf"] + result.messages["/tf_static"]
+        for t in m.transforms
+    ]:
+        parents.setdefault(transform.child_frame_id, set()).add(
+            transform.header.frame_id
+        )
+        xs.setdefault(transform.child_frame_id, []).append(
+            transform.transform.translation.x
+        )
+    sensors = {
+        sensor: {"base_link"}
+        for sensor in ("imu", "dvl", "depth", "sonar", "positions")
+    }
+    bodies = (
+        "base_link",
+        "ekf_slam/base_link",
+        "isam2/base_link",
+        "ground_truth/base_link",
+    )
     assert parents == sensors | {body: {"map"} for body in bodies}
-    assert {m.child_frame_id for m in result.messages["/isam2/odometry"]} <= parents.keys()
+    assert {
+        m.child_frame_id for m in result.messages["/isam2/odometry"]
+    } <= parents.keys()
     assert xs["base_link"] == xs["ekf_slam/base_link"] == list(np.arange(100.0))
     assert xs["isam2/base_link"] == list(np.arange(100.0) + 10)
-    instants = [{(t.header.stamp.sec, t.header.stamp.nanosec) for t in m.transforms} for m in result.messages["/tf"]]
+    instants = [
+        {(t.header.stamp.sec, t.header.stamp.nanosec) for t in m.transforms}
+        for m in result.messages["/tf"]
+    ]
     assert {len(stamps) for stamps in instants} == {1}
     assert len(set.union(*instants)) == len(instants)
 
 
-def test_rosbags_re_encodes_all_messages_of_logs_and_results_to_the_same_bytes(result, make_sequence, tmp_path):
+def test_rosbags_re_encodes_all_messages_of_logs_and_results_to_the_same_bytes(
+    result, make_sequence, tmp_path
+):
     write_log(tmp_path / "log.mcap", make_sequence())
     for path in (result.path, tmp_path / "log.mcap"):
         count = 0
         with AnyReader([path]) as reader:
             for connection, _, raw in reader.messages():
                 message = reader.typestore.deserialize_cdr(raw, connection.msgtype)
-                assert bytes(reader.typestore.serialize_cdr(message, connection.msgtype)) == raw
+                assert (
+                    bytes(reader.typestore.serialize_cdr(message, connection.msgtype))
+                    == raw
+                )
                 count += 1
         assert count > 80
 
 
 def test_paths_stay_small_on_long_runs(make_sequence, tmp_path):
     long = straight(0, 20_000)
-    write_result(tmp_path / "r.mcap", make_sequence(), {"isam2": (long, long, NO_LANDMARKS)})
+    write_result(
+        tmp_path / "r.mcap", make_sequence(), {"isam2": (long, long, NO_LANDMARKS)}
+    )
     with (tmp_path / "r.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        lengths = [len(path.poses) for _, _, _, path in reader.iter_decoded_messages(["/isam2/path"])]
+        lengths = [
+            len(path.poses)
+            for _, _, _, path in reader.iter_decoded_messages(["/isam2/path"])
+        ]
     assert sum(lengths[:-1]) < 12_000
     assert 4_000 < lengths[-1] <= 5_001
 
@@ -150,28 +223,53 @@ def turning(seed: int, n: int = 60) -> Trajectory:
     stamps_ns = T0_NS + np.cumsum(rng.integers(1, 10**9, n))
     root = rng.normal(size=(n, 6, 6))
     covariances = root @ root.transpose(0, 2, 1)
-    return Trajectory(stamps_ns, rng.normal(size=(n, 3)), Rotation.random(n, rng).as_quat(), covariances)
+    return Trajectory(
+        stamps_ns,
+        rng.normal(size=(n, 3)),
+        Rotation.random(n, rng).as_quat(),
+        covariances,
+    )
 
 
-def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoids(make_sequence, tmp_path):
-    sequence, causal, smoothed, path = make_sequence(), turning(1), turning(2), straight(0)
-    unsure = Trajectory.without_covariances(path.stamps_ns, path.positions, path.quaternions_xyzw)
-    estimates = {"a": (causal, smoothed, NO_LANDMARKS), "unsure": (unsure, unsure, NO_LANDMARKS)}
+def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoids(
+    make_sequence, tmp_path
+):
+    sequence, causal, smoothed, path = (
+        make_sequence(),
+        turning(1),
+        turning(2),
+        straight(0),
+    )
+    unsure = Trajectory.without_covariances(
+        path.stamps_ns, path.positions, path.quaternions_xyzw
+    )
+    estimates = {
+        "a": (causal, smoothed, NO_LANDMARKS),
+        "unsure": (unsure, unsure, NO_LANDMARKS),
+    }
     write_result(tmp_path / "r.mcap", sequence, estimates)
     messages = decode(tmp_path / "r.mcap")
     topics = {"/a/odometry": causal, "/a/pose": causal, "/a/smoothed": smoothed}
-    for topic, expected in (topics | {"/ground_truth/odometry": sequence.truth}).items():
+    for topic, expected in (
+        topics | {"/ground_truth/odometry": sequence.truth}
+    ).items():
         stamps = [m.header.stamp for m in messages[topic]]
         poses = [m.pose.pose for m in messages[topic]]
-        assert [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps] == expected.stamps_ns.tolist(), topic
+        assert [
+            stamp.sec * 10**9 + stamp.nanosec for stamp in stamps
+        ] == expected.stamps_ns.tolist(), topic
         positions = [(p.position.x, p.position.y, p.position.z) for p in poses]
         np.testing.assert_array_equal(positions, expected.positions, topic)
         quaternions = [(q.x, q.y, q.z, q.w) for q in (p.orientation for p in poses)]
         np.testing.assert_array_equal(quaternions, expected.quaternions_xyzw, topic)
-    centres = [array.markers[0].pose.position for array in messages["/a/pose_ellipsoid"]]
+    centres = [
+        array.markers[0].pose.position for array in messages["/a/pose_ellipsoid"]
+    ]
     np.testing.assert_array_equal([(c.x, c.y, c.z) for c in centres], causal.positions)
     last = messages["/a/path"][-1].header.stamp
-    assert last.sec * 10**9 + last.nanosec == max(causal.stamps_ns[-1], smoothed.stamps_ns[-1])
+    assert last.sec * 10**9 + last.nanosec == max(
+        causal.stamps_ns[-1], smoothed.stamps_ns[-1]
+    )
     assert not np.any([m.pose.covariance for m in messages["/unsure/pose"]])
     assert "/unsure/pose_ellipsoid" not in messages
     for layout in ("r.foxglove.json", "r.rviz"):
@@ -181,31 +279,57 @@ def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoid
 
 
 @given(st.lists(st.text(max_size=6), max_size=6))
-def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(estimators):
+def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(
+    estimators,
+):
     names = source_names(estimators)
     assert len(names) == len(set(names)) == len(estimators)
     assert not {"ground_truth", "tf", "tf_static"} & set(names)
-    assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) for name in names)
+    assert all(
+        re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) for name in names
+    )
     close = source_names(["ekf-slam", "ekf_slam", "isam2", "2d", "ground-truth"])
-    assert close == ["ekf_slam", "ekf_slam_2", "isam2", "estimator_2d", "ground_truth_2"]
+    assert close == [
+        "ekf_slam",
+        "ekf_slam_2",
+        "isam2",
+        "estimator_2d",
+        "ground_truth_2",
+    ]
 
 
 def test_the_command_of_evo_reads_every_trajectory(result, tmp_path):
     kinds = ("odometry", "pose", "smoothed")
     topics = [f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in kinds]
-    command = [Path(sys.executable).with_name("evo_traj"), "mcap", result.path.name, *topics]
+    command = [
+        Path(sys.executable).with_name("evo_traj"),
+        "mcap",
+        result.path.name,
+        *topics,
+    ]
     home = {**os.environ, "HOME": str(tmp_path)}
-    done = subprocess.run(command, cwd=result.path.parent, capture_output=True, text=True, env=home, timeout=120)
+    done = subprocess.run(
+        command,
+        cwd=result.path.parent,
+        capture_output=True,
+        text=True,
+        env=home,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stderr
     assert re.findall(r"name:\s+(\S+)", done.stdout) == topics
-    assert re.findall(r"infos:\s+(\d+) poses, ([\d.]+)m", done.stdout) == [("100", "99.000")] * len(topics)
+    assert re.findall(r"infos:\s+(\d+) poses, ([\d.]+)m", done.stdout) == [
+        ("100", "99.000")
+    ] * len(topics)
 
 
 # --- ellipsoids -----------------------------------------------------------------------------------------------------
 
 
 @given(st.integers(0, 10_000))
-def test_points_on_the_drawn_ellipsoid_have_the_same_mahalanobis_distance(seed: int) -> None:
+def test_points_on_the_drawn_ellipsoid_have_the_same_mahalanobis_distance(
+    seed: int,
+) -> None:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(1, 3, 3)) + 2 * np.eye(3)
     covariances = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
@@ -214,10 +338,13 @@ def test_points_on_the_drawn_ellipsoid_have_the_same_mahalanobis_distance(seed: 
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
     points = Rotation.from_quat(quaternions[0]).apply(sphere * diameters[0] / 2)
     squared = np.einsum("ni,ij,nj->n", points, np.linalg.inv(covariances[0]), points)
-    np.testing.assert_allclose(squared, 7.814727903251179)  # chi-square table: 3 degrees of freedom, 0.95
+    # chi-square table: 3 degrees of freedom, 0.95
+    np.testing.assert_allclose(squared, 7.814727903251179)
 
 
-def test_unknown_covariances_are_small_spheres_and_landmarks_known_exactly_can_still_be_seen() -> None:
+def test_unknown_covariances_are_small_spheres_and_landmarks_known_exactly_can_still_be_seen() -> (
+    None
+):
     diameters, _ = ellipsoids(np.array([np.full((3, 3), np.nan), np.zeros((3, 3))]))
     np.testing.assert_allclose(diameters[0], UNKNOWN_DIAMETER_M)
     assert (diameters[1] > 0).all()
@@ -243,23 +370,47 @@ def test_landmarks_are_drawn_as_ellipsoids_that_lie_as_their_covariances_where_k
     tmp_path: Path,
 ) -> None:
     """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
-    along, across = np.array([1.0, 1, 0]) / np.sqrt(2), np.array([1.0, -1, 0]) / np.sqrt(2)
-    stick = np.outer(along, along) + 0.04 * np.outer(across, across) + 0.01 * np.diag([0, 0, 1.0])
-    positions, covariances = np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([stick, np.full((3, 3), np.nan)])
+    along, across = (
+        np.array([1.0, 1, 0]) / np.sqrt(2),
+        np.array([1.0, -1, 0]) / np.sqrt(2),
+    )
+    stick = (
+        np.outer(along, along)
+        + 0.04 * np.outer(across, across)
+        + 0.01 * np.diag([0, 0, 1.0])
+    )
+    positions, covariances = (
+        np.array([[1.0, 2, 3], [4, 5, 6]]),
+        np.array([stick, np.full((3, 3), np.nan)]),
+    )
     landmarks = LandmarkMap(np.array([7, 2**40]), positions, covariances)
     (array,) = drawn(tmp_path, landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))
     spaces, texts = [m.ns for m in array.markers], [m.text for m in array.markers]
-    assert spaces == ["ellipsoid_95_percent", "covariance_unknown", "identity", "identity"]
+    assert spaces == [
+        "ellipsoid_95_percent",
+        "covariance_unknown",
+        "identity",
+        "identity",
+    ]
     assert texts == ["", "", "7", "1099511627776"]
-    assert [(m.pose.position.z, m.scale.z) for m in array.markers[2:]] == [(3.5, 0.5), (6.5, 0.5)]
-    assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {("map", 0, 0)}
+    assert [(m.pose.position.z, m.scale.z) for m in array.markers[2:]] == [
+        (3.5, 0.5),
+        (6.5, 0.5),
+    ]
+    assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {
+        ("map", 0, 0)
+    }
     diameters = xyz(array.markers[0].scale)
     longest = axes(array.markers[0]).as_matrix()[:, np.argmax(diameters)]
     np.testing.assert_allclose(np.abs(longest @ along), 1)
-    np.testing.assert_allclose(np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0]))
+    np.testing.assert_allclose(
+        np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0])
+    )
 
 
-def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(tmp_path: Path) -> None:
+def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(
+    tmp_path: Path,
+) -> None:
     """Its covariance is in the body's axes, the ellipsoid is drawn in those of the map."""
     rng = np.random.default_rng(5)
     root = rng.normal(size=(3, 6, 6))
@@ -267,13 +418,20 @@ def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(tmp_path:
     covariances[1] = np.nan
     rotations = Rotation.random(3, rng)
     positions = rng.normal(size=(3, 3))
-    trajectory = Trajectory(np.array([10, 20, 30]), positions, rotations.as_quat(), covariances)
-    markers = [array.markers[0] for array in drawn(tmp_path, position_ellipsoids("/pose", trajectory, GREY))]
+    trajectory = Trajectory(
+        np.array([10, 20, 30]), positions, rotations.as_quat(), covariances
+    )
+    markers = [
+        array.markers[0]
+        for array in drawn(tmp_path, position_ellipsoids("/pose", trajectory, GREY))
+    ]
     assert [marker.header.stamp.nanosec for marker in markers] == [10, 30]
     for marker, row in zip(markers, (0, 2), strict=True):
         samples = rng.multivariate_normal(np.zeros(6), covariances[row], 50_000)[:, 3:]
         sampled = rotations[row].apply(samples) + positions[row]
-        within = axes(marker).inv().apply(sampled - xyz(marker.pose.position)) / (xyz(marker.scale) / 2)
+        within = axes(marker).inv().apply(sampled - xyz(marker.pose.position)) / (
+            xyz(marker.scale) / 2
+        )
         assert abs(np.mean(np.sum(within**2, axis=1) < 1) - 0.95) < 0.005
 
 
@@ -283,24 +441,49 @@ FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 """By sensor_msgs/PointField."""
 
 
-def test_a_reader_of_the_fields_finds_position_identity_and_covariance(tmp_path: Path) -> None:
+def test_a_reader_of_the_fields_finds_position_identity_and_covariance(
+    tmp_path: Path,
+) -> None:
     ids, positions = [3, 2**40 + 1], np.array([[1.5, -2.25, 0.1], [4000.0, 5.0, -6.0]])
-    covariances = np.array([[[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 3]], np.full((3, 3), np.nan)])
-    (cloud,) = drawn(tmp_path, landmark_cloud("/cloud", LandmarkMap(np.array(ids), positions, covariances), 5))
-    places = {f.name: (f.offset, f.offset + struct.calcsize(FORMATS[f.datatype])) for f in cloud.fields}
+    covariances = np.array(
+        [[[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 3]], np.full((3, 3), np.nan)]
+    )
+    (cloud,) = drawn(
+        tmp_path,
+        landmark_cloud("/cloud", LandmarkMap(np.array(ids), positions, covariances), 5),
+    )
+    places = {
+        f.name: (f.offset, f.offset + struct.calcsize(FORMATS[f.datatype]))
+        for f in cloud.fields
+    }
     first, second = (
         {
-            f.name: struct.unpack_from("<" + FORMATS[f.datatype], bytes(cloud.data), start + f.offset)[0]
+            f.name: struct.unpack_from(
+                "<" + FORMATS[f.datatype], bytes(cloud.data), start + f.offset
+            )[0]
             for f in cloud.fields
         }
         for start in (0, cloud.point_step)
     )
     upper = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-    assert list(first.values()) == [1.5, -2.25, np.float32(0.1), 3, 1, 0.1, 0.2, 2, 0.3, 3]
+    assert list(first.values()) == [
+        1.5,
+        -2.25,
+        np.float32(0.1),
+        3,
+        1,
+        0.1,
+        0.2,
+        2,
+        0.3,
+        3,
+    ]
     assert list(second.values())[:4] == [4000, 5, -6, ids[1]]
     assert all(np.isnan(second[name]) for name in upper)
     assert list(first) == ["x", "y", "z", "id", *upper]
-    assert {f.datatype for f in cloud.fields if f.name in "xyz"} == {7}, "RViz reads float32 only"
+    assert {f.datatype for f in cloud.fields if f.name in "xyz"} == {7}, (
+        "RViz reads float32 only"
+    )
     # the rules of the type
     assert (cloud.height, cloud.width, cloud.is_bigendian) == (1, 2, False)
     assert cloud.row_step == cloud.width * cloud.point_step == len(cloud.data)
@@ -313,18 +496,34 @@ def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) 
     """Of different sizes, as JPEG files are."""
     images = [np.full((20, 30 + 40 * k), 90 * k, np.uint8) for k in range(3)]
     contents = [cv2.imencode(".jpg", image)[1].tobytes() for image in images]
-    pictures = [Picture(1_700_000_000_000_000_001 + k * 10**9, content) for k, content in enumerate(contents)]
+    pictures = [
+        Picture(1_700_000_000_000_000_001 + k * 10**9, content)
+        for k, content in enumerate(contents)
+    ]
     write_recording(tmp_path / "log.mcap", picture_messages(PICTURES, pictures), {})
     with (tmp_path / "log.mcap").open("rb") as stream:
-        found = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+        found = list(
+            make_reader(
+                stream, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
+        )
     assert [entry.channel.topic for entry in found] == ["/sonar/recognised"] * 3
     assert {entry.schema.name for entry in found} == {"sensor_msgs/msg/CompressedImage"}
     for entry, picture, image in zip(found, pictures, images, strict=True):
         message = entry.decoded_message
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         assert stamp_ns == entry.message.log_time == picture.stamp_ns
-        assert (message.header.frame_id, message.format, bytes(message.data)) == ("sonar", "jpeg", picture.jpeg)
-        assert cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_GRAYSCALE).shape == image.shape
+        assert (message.header.frame_id, message.format, bytes(message.data)) == (
+            "sonar",
+            "jpeg",
+            picture.jpeg,
+        )
+        assert (
+            cv2.imdecode(
+                np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_GRAYSCALE
+            ).shape
+            == image.shape
+        )
     assert picture_messages(PICTURES, []) == []
 
 
@@ -346,13 +545,23 @@ def value_at(message: Any, path: str) -> Any:
     return message
 
 
-def test_foxglove_layout_shows_what_the_panel_can_draw_of_this_result_in_its_frames(result: Any) -> None:
+def test_foxglove_layout_shows_what_the_panel_can_draw_of_this_result_in_its_frames(
+    result: Any,
+) -> None:
     topics = result.view["topics"]
-    assert set(topics) == {topic for topic, kind in result.types.items() if kind in DRAWN_BY_FOXGLOVE}
+    assert set(topics) == {
+        topic for topic, kind in result.types.items() if kind in DRAWN_BY_FOXGLOVE
+    }
     shown = {topic for topic, settings in topics.items() if settings["visible"] is True}
     assert set(topics) - shown == {"/isam2/smoothed", "/ekf_slam/smoothed"}
-    transforms = [t for m in result.messages["/tf"] + result.messages["/tf_static"] for t in m.transforms]
-    frames = {t.child_frame_id for t in transforms} | {t.header.frame_id for t in transforms}
+    transforms = [
+        t
+        for m in result.messages["/tf"] + result.messages["/tf_static"]
+        for t in m.transforms
+    ]
+    frames = {t.child_frame_id for t in transforms} | {
+        t.header.frame_id for t in transforms
+    }
     named = {result.view["followTf"], result.view["layers"]["grid"]["frameId"]}
     named |= {name.removeprefix("frame:") for name in result.view["transforms"]}
     assert named <= frames
@@ -373,9 +582,26 @@ def test_every_panel_of_the_foxglove_layout_is_placed_once_and_every_plotted_pat
     configs = result.layout["configById"]
     assert sorted(panels(result.layout["layout"])) == sorted(configs)
     assert {name.split("!")[0] for name in configs} == {"3D", "Plot"}
-    assert {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"} == set(result.layout)
-    plotted = [path for name, panel in configs.items() if name[:4] == "Plot" for path in panel["paths"]]
-    assert [path["label"] for path in plotted] == ["ground_truth", "ekf_slam", "isam2", "ekf_slam", "isam2"]
+    assert {
+        "configById",
+        "globalVariables",
+        "userNodes",
+        "playbackConfig",
+        "layout",
+    } == set(result.layout)
+    plotted = [
+        path
+        for name, panel in configs.items()
+        if name[:4] == "Plot"
+        for path in panel["paths"]
+    ]
+    assert [path["label"] for path in plotted] == [
+        "ground_truth",
+        "ekf_slam",
+        "isam2",
+        "ekf_slam",
+        "isam2",
+    ]
     for path in plotted:
         topic, field = re.fullmatch(r"(/[\w/]+)\.(.*)", path["value"]).groups()  # type: ignore[union-attr]
         assert isinstance(value_at(result.messages[topic][0], field), float)
@@ -385,42 +611,73 @@ def test_an_estimator_has_one_colour_everywhere(result: Any) -> None:
     topics, seen = result.view["topics"], set()
     for name in ("isam2", "ekf_slam", "ground_truth"):
         marker = result.messages[f"/{name}/landmarks"][0].markers[0].color
-        colour = "#" + "".join(f"{round(255 * part):02x}" for part in (marker.r, marker.g, marker.b))
-        of_layers = [topics[f"/{name}/path"]["gradient"][0], topics[f"/{name}/landmark_cloud"]["flatColor"]]
-        assert all(COLOUR.fullmatch(layer) and layer[:7] == colour for layer in of_layers)
+        colour = "#" + "".join(
+            f"{round(255 * part):02x}" for part in (marker.r, marker.g, marker.b)
+        )
+        of_layers = [
+            topics[f"/{name}/path"]["gradient"][0],
+            topics[f"/{name}/landmark_cloud"]["flatColor"],
+        ]
+        assert all(
+            COLOUR.fullmatch(layer) and layer[:7] == colour for layer in of_layers
+        )
         seen.add(colour)
     assert len(seen) == 3
 
 
-def test_rviz_has_one_display_of_the_right_kind_for_each_topic_in_the_frame_of_its_messages(result: Any) -> None:
+def test_rviz_has_one_display_of_the_right_kind_for_each_topic_in_the_frame_of_its_messages(
+    result: Any,
+) -> None:
     displays = result.rviz["Displays"]
-    drawn = {d["Topic"]["Value"]: DRAWN_BY_RVIZ[d["Class"]] for d in displays if "Topic" in d}
-    assert drawn == {topic: kind for topic, kind in result.types.items() if kind != "TFMessage"}
+    drawn = {
+        d["Topic"]["Value"]: DRAWN_BY_RVIZ[d["Class"]] for d in displays if "Topic" in d
+    }
+    assert drawn == {
+        topic: kind for topic, kind in result.types.items() if kind != "TFMessage"
+    }
     others = {d["Class"] for d in displays if "Topic" not in d}
     assert others == {"rviz_default_plugins/Grid", "rviz_default_plugins/TF"}
     assert all(d["Enabled"] is d["Value"] for d in displays)
     assert len({d["Name"] for d in displays}) == len(displays)
-    headers = {m.header.frame_id for topic, ms in result.messages.items() if topic.endswith("/path") for m in ms}
+    headers = {
+        m.header.frame_id
+        for topic, ms in result.messages.items()
+        if topic.endswith("/path")
+        for m in ms
+    }
     assert headers == {result.rviz["Global Options"]["Fixed Frame"]}
 
 
 def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
     """A subscriber that asks for more than is offered gets nothing at all."""
     with AnyReader([result.path]) as reader:
-        offered = {c.topic: [q.durability.name for q in c.ext.offered_qos_profiles] for c in reader.connections}
-    asked = {d["Topic"]["Value"]: d["Topic"]["Durability Policy"] for d in result.rviz["Displays"] if "Topic" in d}
+        offered = {
+            c.topic: [q.durability.name for q in c.ext.offered_qos_profiles]
+            for c in reader.connections
+        }
+    asked = {
+        d["Topic"]["Value"]: d["Topic"]["Durability Policy"]
+        for d in result.rviz["Displays"]
+        if "Topic" in d
+    }
     assert set(asked.values()) == {"Volatile", "Transient Local"}
     for topic, durability in asked.items():
-        assert offered[topic] == (["TRANSIENT_LOCAL"] if durability == "Transient Local" else [])
+        assert offered[topic] == (
+            ["TRANSIENT_LOCAL"] if durability == "Transient Local" else []
+        )
     assert (offered["/tf_static"], offered["/tf"]) == (["TRANSIENT_LOCAL"], [])
 
 
 # --- size -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(result: Any) -> None:
+def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(
+    result: Any,
+) -> None:
     """The last pose, at (119, 0, 0), is farthest from the noise of the truth around the origin."""
-    scene = Scene.around([np.array([[100.0, 20, -5], [-3, 0, 0]]), np.array([[np.nan, 1e9, 0]])])
+    scene = Scene.around(
+        [np.array([[100.0, 20, -5], [-3, 0, 0]]), np.array([[np.nan, 1e9, 0]])]
+    )
     assert scene.centre_m == (48.5, 10.0, -2.5)
     assert scene.size_m == 103
     camera = result.view["cameraState"]
@@ -430,7 +687,9 @@ def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(re
     view = result.rviz["Views"]["Current"]
     assert view["Focal Point"]["X"] == camera["targetOffset"][0]
     assert view["Distance"] == camera["distance"]
-    heights = {m.scale.z for m in result.messages["/isam2/landmarks"][0].markers if m.text}
+    heights = {
+        m.scale.z for m in result.messages["/isam2/landmarks"][0].markers if m.text
+    }
     assert heights
     assert all(0.01 < height_m / camera["distance"] < 0.05 for height_m in heights)
 
@@ -447,10 +706,20 @@ def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_trut
 ) -> None:
     layer = Layer("/a/path", "nav_msgs/msg/Path", (1, 0, 0, 1))
     layout = foxglove_layout([layer], Scene.around([np.empty((0, 3))]))
-    assert json.loads(json.dumps(layout, allow_nan=False))["configById"]["3D!result"]["topics"]["/a/path"]["visible"]
+    assert json.loads(json.dumps(layout, allow_nan=False))["configById"]["3D!result"][
+        "topics"
+    ]["/a/path"]["visible"]
     write_result(tmp_path / "result.mcap", make_sequence(), {})
     layout = json.loads((tmp_path / "result.foxglove.json").read_text("utf-8"))
-    topics = {"/ground_truth/path", "/ground_truth/landmarks", "/ground_truth/landmark_cloud"}
+    topics = {
+        "/ground_truth/path",
+        "/ground_truth/landmarks",
+        "/ground_truth/landmark_cloud",
+    }
     assert set(layout["configById"]["3D!result"]["topics"]) == topics
-    children = {t.child_frame_id for m in decode(tmp_path / "result.mcap")["/tf"] for t in m.transforms}
+    children = {
+        t.child_frame_id
+        for m in decode(tmp_path / "result.mcap")["/tf"]
+        for t in m.transforms
+    }
     assert children == {"base_link", "ground_truth/base_link"}

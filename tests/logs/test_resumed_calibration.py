@@ -10,18 +10,25 @@ def test_a_resumed_run_has_the_fields_of_its_record_but_of_sensors_that_it_did_n
     """A depth sensor that did not come may still bring its place; the floor stays, and the user moves the start."""
     start = Start(position_m=(1.0, 2.0, -0.7))
     calibration = Calibration(
-        start=start, floor=FloorPrior(z_m=-1.7, sigma_m=0.01), depth=DepthCalibration(sigma_m=0.3)
+        start=start,
+        floor=FloorPrior(z_m=-1.7, sigma_m=0.01),
+        depth=DepthCalibration(sigma_m=0.3),
     )
     for is_used in (True, False):
         path = tmp_path / f"{is_used}.mcap"
         with LiveRecord(path) as record:
-            tables = {"imu": {"topic": "/imu"}, "depth": {"topic": "/depth"} if is_used else {"use": False}}
+            tables = {
+                "imu": {"topic": "/imu"},
+                "depth": {"topic": "/depth"} if is_used else {"use": False},
+            }
             record.describe("dive", calibration, tables, {}, 0)
         found = LiveRecord.resumed_calibration(path, None).values
         assert found["start"]["position_m"] == [1.0, 2.0, -0.7]
         assert found["floor"]["z_m"] == -1.7
         assert ("depth" in found) == is_used
-        given = PartialCalibration.parse({"start": {"position_m": [5.0, 5.0, 5.0]}}, "mine.toml")
+        given = PartialCalibration.parse(
+            {"start": {"position_m": [5.0, 5.0, 5.0]}}, "mine.toml"
+        )
         moved = LiveRecord.resumed_calibration(path, given)
         assert moved.values["start"]["position_m"] == [5.0, 5.0, 5.0]
         assert moved.values["floor"]["z_m"] == -1.7

@@ -9,17 +9,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.trajectory_files import decimal_ns, read_landmarks_csv, read_tum, write_landmarks_csv, write_tum
+from sonar_graph.logs.trajectory_files import (
+    decimal_ns,
+    read_landmarks_csv,
+    read_tum,
+    write_landmarks_csv,
+    write_tum,
+)
 from sonar_graph.states import LandmarkMap, Trajectory
 
-STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20, unique=True).map(sorted)
+STAMPS = st.lists(
+    st.integers(-(2**62), 2**62), min_size=1, max_size=20, unique=True
+).map(sorted)
 
 
 @given(STAMPS, st.integers(0, 99))
 def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory, stamps, seed):
     rng = np.random.default_rng(seed)
     n = len(stamps)
-    written = Trajectory.without_covariances(np.array(stamps), rng.normal(size=(n, 3)), rng.normal(size=(n, 4)))
+    written = Trajectory.without_covariances(
+        np.array(stamps), rng.normal(size=(n, 3)), rng.normal(size=(n, 4))
+    )
     path = tmp_path_factory.mktemp("tum") / "t.tum"
     write_tum(path, written)
     found = read_tum(path)
@@ -28,19 +38,33 @@ def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory, stamps, seed):
     np.testing.assert_array_equal(found.quaternions_xyzw, written.quaternions_xyzw)
 
 
-def test_lines_are_those_that_tum_describes_with_comments_blank_lines_and_exponents(tmp_path):
-    pose = Trajectory.without_covariances(np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:])
+def test_lines_are_those_that_tum_describes_with_comments_blank_lines_and_exponents(
+    tmp_path,
+):
+    pose = Trajectory.without_covariances(
+        np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:]
+    )
     write_tum(tmp_path / "t.tum", pose)
     assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1 2 3.5 0 0 0 1\n"
-    (tmp_path / "t.tum").write_text("# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
-    assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
+    (tmp_path / "t.tum").write_text(
+        "# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n"
+    )
+    assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [
+        1_500_000_000,
+        2_000_000_000,
+    ]
 
 
 def test_decimal_seconds_keep_their_nanoseconds_whatever_the_precision_of_the_caller():
     with decimal.localcontext() as context:
         context.prec = 28
         assert decimal_ns("1.00250626566416034242424242") == 1002506266
-        assert decimal_ns("1248444175.103") == 1248444175103000000 != int(1248444175.103 * 1e9)  # lost by a double
+        # lost by a double
+        assert (
+            decimal_ns("1248444175.103")
+            == 1248444175103000000
+            != int(1248444175.103 * 1e9)
+        )
     for text in ("nan", "inf", "-Infinity", "soon", ""):
         with pytest.raises(ValueError, match="no finite decimal"):
             decimal_ns(text)
@@ -51,7 +75,9 @@ def test_evo_reads_the_same_poses(make_sequence, tmp_path):
     write_tum(tmp_path / "t.tum", truth)
     theirs = file_interface.read_tum_trajectory_file(tmp_path / "t.tum")
     np.testing.assert_array_equal(theirs.positions_xyz, truth.positions)
-    np.testing.assert_array_equal(theirs.orientations_quat_wxyz, truth.quaternions_xyzw[:, [3, 0, 1, 2]])
+    np.testing.assert_array_equal(
+        theirs.orientations_quat_wxyz, truth.quaternions_xyzw[:, [3, 0, 1, 2]]
+    )
 
 
 MISTAKES: list[tuple[Callable[[Path], object], str | None, str]] = [
@@ -66,7 +92,9 @@ MISTAKES: list[tuple[Callable[[Path], object], str | None, str]] = [
 
 
 @pytest.mark.parametrize(("read", "text", "message"), MISTAKES)
-def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(tmp_path, read, text, message):
+def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(
+    tmp_path, read, text, message
+):
     path = tmp_path / "table.txt"
     if text is not None:
         path.write_text(text)
@@ -85,7 +113,9 @@ def test_landmarks_come_back_from_their_table_and_an_empty_map_is_a_header(tmp_p
         write_landmarks_csv(tmp_path / "l.csv", landmarks)
         header, *lines = (tmp_path / "l.csv").read_text().splitlines()
         assert header == "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
-        assert [float(line.split(",")[8]) for line in lines[:1]] == covariances[: min(count, 1), 1, 2].tolist()
+        assert [float(line.split(",")[8]) for line in lines[:1]] == covariances[
+            : min(count, 1), 1, 2
+        ].tolist()
         found = read_landmarks_csv(tmp_path / "l.csv")
         assert found.ids.tolist() == landmarks.ids.tolist()
         np.testing.assert_array_equal(found.positions, landmarks.positions)

@@ -38,7 +38,13 @@ from sonar_graph.logs.vehicle_setup import (
     mounting_of,
     static_frames,
 )
-from sonar_graph.logs.writing import dvl_messages, imu_messages, sonar_image_messages, static_message, write_log
+from sonar_graph.logs.writing import (
+    dvl_messages,
+    imu_messages,
+    sonar_image_messages,
+    static_message,
+    write_log,
+)
 
 TREE_M = (1.0, 2.0, 3.0)
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
@@ -48,7 +54,12 @@ def said(**values: Any) -> PartialCalibration:
     return PartialCalibration.parse(values, "vehicle.toml")
 
 
-def written(path: Path, sequence: Any, tree: Calibration | None, record: dict[str, str] | None = None) -> Path:
+def written(
+    path: Path,
+    sequence: Any,
+    tree: Calibration | None,
+    record: dict[str, str] | None = None,
+) -> Path:
     """A log of IMU and DVL with the mountings of a calibration and a metadata record."""
     messages = [imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)]
     if tree is not None:
@@ -65,66 +76,125 @@ OFFSETS = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-5, 5))
 
 @given(ANGLES, OFFSETS, OFFSETS)
 def test_mountings_survive_tf_static(
-    make_sequence: Any, tmp_path_factory: Any, rpy: tuple[float, ...], lever: tuple[float, ...], port: tuple[float, ...]
+    make_sequence: Any,
+    tmp_path_factory: Any,
+    rpy: tuple[float, ...],
+    lever: tuple[float, ...],
+    port: tuple[float, ...],
 ) -> None:
     mounting = Mounting(translation_m=lever, rpy_rad=rpy)
-    tree = Calibration(dvl=DvlCalibration(mounting=mounting), depth=DepthCalibration(port_m=port))
+    tree = Calibration(
+        dvl=DvlCalibration(mounting=mounting), depth=DepthCalibration(port_m=port)
+    )
     path = written(tmp_path_factory.mktemp("log") / "a.mcap", make_sequence(), tree)
     found = read_log(path).calibration
     assert found.dvl.mounting.pose().equals(mounting.pose(), 1e-9)
     assert found.imu.mounting.pose().equals(gtsam.Pose3(), 1e-9)
-    assert mounting_of("depth", static_frames(scan(path, lambda _: Keep.ALL))).translation_m == port
+    assert (
+        mounting_of(
+            "depth", static_frames(scan(path, lambda _: Keep.ALL))
+        ).translation_m
+        == port
+    )
 
 
 def test_the_sonar_of_images_is_mounted_where_tf_static_says_without_detections(
     make_sequence: Any, tmp_path: Path
 ) -> None:
-    sequence, mounting = replace(make_sequence(), detections=None), Mounting(rpy_rad=(0.0, 0.5, 0.0))
+    sequence, mounting = (
+        replace(make_sequence(), detections=None),
+        Mounting(rpy_rad=(0.0, 0.5, 0.0)),
+    )
     frames = SonarFrames(
-        sequence.imu.stamps_ns[:2], np.zeros((2, 3, 4), np.uint8), np.arange(1.0, 5), np.array([0.1, 0.0, -0.1])
+        sequence.imu.stamps_ns[:2],
+        np.zeros((2, 3, 4), np.uint8),
+        np.arange(1.0, 5),
+        np.array([0.1, 0.0, -0.1]),
     )
     messages = [
-        static_message("/tf_static", TF, 0, encode_mountings(Calibration(sonar=SonarCalibration(mounting=mounting)))),
+        static_message(
+            "/tf_static",
+            TF,
+            0,
+            encode_mountings(Calibration(sonar=SonarCalibration(mounting=mounting))),
+        ),
         imu_messages("/imu", sequence.imu),
         dvl_messages("/dvl", sequence.dvl),
         sonar_image_messages("/sonar/image", frames),
     ]
     write_recording(tmp_path / "a.mcap", messages, {})
     found = read_log(tmp_path / "a.mcap")
-    np.testing.assert_allclose(found.calibration.sonar.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12)
-    assert found.notes["log.calibration"].startswith("defaults; mountings from /tf_static: imu, dvl, sonar")
-    assert inspect_log(tmp_path / "a.mcap").calibration.endswith("mountings of /tf_static (imu, dvl, sonar)")
+    np.testing.assert_allclose(
+        found.calibration.sonar.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12
+    )
+    assert found.notes["log.calibration"].startswith(
+        "defaults; mountings from /tf_static: imu, dvl, sonar"
+    )
+    assert inspect_log(tmp_path / "a.mcap").calibration.endswith(
+        "mountings of /tf_static (imu, dvl, sonar)"
+    )
     alone = read_images_alone(tmp_path / "a.mcap").calibration.sonar
     np.testing.assert_allclose(alone.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12)
-    stated = read_images_alone(tmp_path / "a.mcap", calibration=said(sonar={"mounting": {"rpy_rad": [0.0, 0.0, 1.0]}}))
+    stated = read_images_alone(
+        tmp_path / "a.mcap",
+        calibration=said(sonar={"mounting": {"rpy_rad": [0.0, 0.0, 1.0]}}),
+    )
     assert stated.calibration.sonar.mounting.rpy_rad == (0.0, 0.0, 1.0)
 
 
 def test_a_frame_that_does_not_hang_on_the_body_has_no_mounting() -> None:
     step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0, 0]))
-    frames = {"a": ("base_link", step), "b": ("elsewhere", step), "c": ("d", step), "d": ("c", step)}
-    assert mounting_of("a", frames) == mounting_of("/a", frames) == Mounting(translation_m=(1, 0, 0))
+    frames = {
+        "a": ("base_link", step),
+        "b": ("elsewhere", step),
+        "c": ("d", step),
+        "d": ("c", step),
+    }
+    assert (
+        mounting_of("a", frames)
+        == mounting_of("/a", frames)
+        == Mounting(translation_m=(1, 0, 0))
+    )
     assert mounting_of("base_link", frames) == Mounting()
     assert mounting_of("b", frames) is None
     assert mounting_of("c", frames) is None, "a loop ends"
 
 
-def test_mountings_come_from_tf_static_through_frames_in_between_and_after_a_file(bench: Any) -> None:
+def test_mountings_come_from_tf_static_through_frames_in_between_and_after_a_file(
+    bench: Any,
+) -> None:
     first = bench.transform("base_link", "frame", (1, 0, 0), np.pi / 2)
     second = bench.transform("frame", "imu_link", (0.5, 0, 0), np.pi / 2)
-    log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}]))
+    log = bench.write(
+        *bench.basics(),
+        ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}]),
+    )
     sequence = read_log(log)
     # half a metre along the frame's x, which points along the body's y
-    np.testing.assert_allclose(sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12)
-    np.testing.assert_allclose(np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12)
+    np.testing.assert_allclose(
+        sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12
+    )
     assert sequence.calibration.dvl == Calibration().dvl
-    assert "mountings from /tf_static: imu; not in the tree" in sequence.notes["log.calibration"]
-    tree = [bench.transform("base_link", "imu_link", (1, 0, 0)), bench.transform("base_link", "dvl_link", (0, 2, 0), 1)]
+    assert (
+        "mountings from /tf_static: imu; not in the tree"
+        in sequence.notes["log.calibration"]
+    )
+    tree = [
+        bench.transform("base_link", "imu_link", (1, 0, 0)),
+        bench.transform("base_link", "dvl_link", (0, 2, 0), 1),
+    ]
     log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": tree}]))
-    found = read_log(log, calibration=said(dvl={"mounting": {"translation_m": [0, 3, 0]}}))
+    found = read_log(
+        log, calibration=said(dvl={"mounting": {"translation_m": [0, 3, 0]}})
+    )
     assert found.calibration.imu.mounting.translation_m == (1, 0, 0)
     assert found.calibration.dvl.mounting.translation_m == (0, 3, 0)
-    np.testing.assert_allclose(found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(
+        found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12
+    )
     expected = "from vehicle.toml: dvl.mounting.translation_m; else defaults; mountings from /tf_static: imu, dvl"
     assert found.notes["log.calibration"] == expected
 
@@ -148,7 +218,11 @@ SOME = st.fixed_dictionaries({}, optional=FIELDS)
 def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     found = {}
     for name, value in values.items():
-        found |= leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        found |= (
+            leaves(value, f"{prefix}{name}.")
+            if isinstance(value, dict)
+            else {prefix + name: value}
+        )
     return found
 
 
@@ -156,7 +230,9 @@ def nested(flat: dict[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for path, value in flat.items():
         *sections, name = path.split(".")
-        reduce(lambda at, section: at.setdefault(section, {}), sections, tree)[name] = value
+        reduce(lambda at, section: at.setdefault(section, {}), sections, tree)[name] = (
+            value
+        )
     return tree
 
 
@@ -169,7 +245,10 @@ def test_every_field_comes_from_the_first_that_says_it(
     found = leaves(gathered(said(**nested(of_file)), recorded, tree).model_dump())
     expected = leaves(Calibration().model_dump())
     for name in in_tree - {"depth"}:
-        expected |= {f"{name}.mounting.translation_m": TREE_M, f"{name}.mounting.rpy_rad": (0, 0, 1)}
+        expected |= {
+            f"{name}.mounting.translation_m": TREE_M,
+            f"{name}.mounting.rpy_rad": (0, 0, 1),
+        }
     expected |= {"depth.port_m": TREE_M} if "depth" in in_tree else {}
     assert found == expected | of_record | of_file
 
@@ -180,19 +259,33 @@ def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything
     sequence = make_sequence()
     write_log(tmp_path / "a.mcap", sequence)
     assert read_log(tmp_path / "a.mcap").calibration == sequence.calibration
-    found = read_log(tmp_path / "a.mcap", calibration=said(imu={"gyro_noise_density": 0.5}, gravity_m_s2=9.7))
+    found = read_log(
+        tmp_path / "a.mcap",
+        calibration=said(imu={"gyro_noise_density": 0.5}, gravity_m_s2=9.7),
+    )
     imu = sequence.calibration.imu.model_copy(update={"gyro_noise_density": 0.5})
     assert imu.mounting != Mounting()
-    assert found.calibration == sequence.calibration.model_copy(update={"imu": imu, "gravity_m_s2": 9.7})
-    expected = "from vehicle.toml: imu.gyro_noise_density, gravity_m_s2; else from the log"
+    assert found.calibration == sequence.calibration.model_copy(
+        update={"imu": imu, "gravity_m_s2": 9.7}
+    )
+    expected = (
+        "from vehicle.toml: imu.gyro_noise_density, gravity_m_s2; else from the log"
+    )
     assert found.notes["log.calibration"] == expected
     given = read_log(tmp_path / "a.mcap", calibration=Calibration(), name="mine")
     assert (given.calibration, given.name) == (Calibration(), "mine")
     assert given.notes["log.calibration"] == "given by the caller"
     mounting = Mounting(translation_m=TREE_M)
-    tree = Calibration(imu=ImuCalibration(mounting=mounting), dvl=DvlCalibration(mounting=mounting))
-    record = {"calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})}  # says little
-    calibration = read_log(written(tmp_path / "b.mcap", sequence, tree, record)).calibration
+    tree = Calibration(
+        imu=ImuCalibration(mounting=mounting), dvl=DvlCalibration(mounting=mounting)
+    )
+    # says little
+    record = {
+        "calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})
+    }
+    calibration = read_log(
+        written(tmp_path / "b.mcap", sequence, tree, record)
+    ).calibration
     assert calibration.imu.mounting.translation_m == (7, 8, 9)
     assert calibration.dvl.mounting.translation_m == TREE_M
 
@@ -200,41 +293,69 @@ def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything
 def test_a_sensor_mounted_by_the_file_is_not_told_to_be_missing(bench: Any) -> None:
     log = bench.write(*bench.basics())
     other = said(gravity_m_s2=9.81)  # says nothing of how the instrument sits
-    for calibration, is_said in ((None, False), (said(dvl={"mounting": {"rpy_rad": [0, 0, 1]}}), True), (other, False)):
+    for calibration, is_said in (
+        (None, False),
+        (said(dvl={"mounting": {"rpy_rad": [0, 0, 1]}}), True),
+        (other, False),
+    ):
         notes = read_log(log, calibration=calibration).notes
         assert ("dvl (dvl_link)" in notes["log.calibration"]) is not is_said
         assert ("z downwards" in notes.get("log.warnings", "")) is not is_said
         assert "imu (imu_link)" in notes["log.calibration"]
 
 
-@pytest.mark.parametrize("calibration", [Calibration(), Calibration(start=Start())], ids=["no start", "the default"])
+@pytest.mark.parametrize(
+    "calibration",
+    [Calibration(), Calibration(start=Start())],
+    ids=["no start", "the default"],
+)
 def test_a_start_is_stated_in_a_log_that_was_read_where_somebody_stated_it(
     make_sequence: Any, tmp_path: Path, calibration: Calibration
 ) -> None:
     write_log(tmp_path / "log.mcap", replace(make_sequence(), calibration=calibration))
     again = read_log(tmp_path / "log.mcap").calibration
     assert again == calibration
-    assert ("start" in again.model_fields_set) == ("start" in calibration.model_fields_set)
-    assert ("position_m" in again.start.model_fields_set) == ("start" in calibration.model_fields_set)
+    assert ("start" in again.model_fields_set) == (
+        "start" in calibration.model_fields_set
+    )
+    assert ("position_m" in again.start.model_fields_set) == (
+        "start" in calibration.model_fields_set
+    )
 
 
 def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:
     floor = gathered(said(floor={"z_m": -2}), FLOOR, {}).floor
     assert floor is not None
     assert (floor.z_m, floor.sigma_m) == (-2, 0.1)
-    assert gathered(said(floor=False, use_gravity=False), FLOOR, {}) == Calibration(use_gravity=False)
-    with pytest.raises(CalibrationError, match=r"^vehicle\.toml: floor\.sigma_m: is missing$"):
+    assert gathered(said(floor=False, use_gravity=False), FLOOR, {}) == Calibration(
+        use_gravity=False
+    )
+    with pytest.raises(
+        CalibrationError, match=r"^vehicle\.toml: floor\.sigma_m: is missing$"
+    ):
         gathered(said(floor={"z_m": -2}), None, {})
 
 
 MISTAKES: list[tuple[dict[str, Any], str]] = [
-    ({"imu": {"gyro_sigma": 1}}, r"^vehicle\.toml: imu\.gyro_sigma: there is no such field"),
+    (
+        {"imu": {"gyro_sigma": 1}},
+        r"^vehicle\.toml: imu\.gyro_sigma: there is no such field",
+    ),
     ({"floor": {"z": 1}}, r"^vehicle\.toml: .*floor\.z: there is no such field"),
-    ({"start": {"position_m": [1, 2]}}, r"start\.position_m: expected 3 values, not \[1, 2\]"),
+    (
+        {"start": {"position_m": [1, 2]}},
+        r"start\.position_m: expected 3 values, not \[1, 2\]",
+    ),
     ({"depth": {"sigma_m": -1}}, r"depth\.sigma_m: .* greater than 0"),
     ({"imu": False}, r"imu: expected a section, \[imu\] in TOML, not false$"),
-    ({"heading": False}, r"heading: .* not false; to leave heading unused: use = false under \[heading\] in the log"),
-    ({"heading": {"bias_sigma_rad": False}}, r"heading\.bias_sigma_rad: expected a number, not false$"),
+    (
+        {"heading": False},
+        r"heading: .* not false; to leave heading unused: use = false under \[heading\] in the log",
+    ),
+    (
+        {"heading": {"bias_sigma_rad": False}},
+        r"heading\.bias_sigma_rad: expected a number, not false$",
+    ),
 ]
 BROKEN_RECORDS: list[tuple[dict[str, str], type[Exception], str]] = [
     ({"calibration": "{"}, LogError, "calibration is not JSON"),
@@ -243,7 +364,9 @@ BROKEN_RECORDS: list[tuple[dict[str, str], type[Exception], str]] = [
 ]
 
 
-def test_mistakes_are_found_before_a_log_is_read_and_broken_records_named(make_sequence: Any, tmp_path: Path) -> None:
+def test_mistakes_are_found_before_a_log_is_read_and_broken_records_named(
+    make_sequence: Any, tmp_path: Path
+) -> None:
     for values, message in MISTAKES:
         with pytest.raises(CalibrationError, match=message):
             said(**values)

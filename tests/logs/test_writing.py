@@ -23,17 +23,36 @@ from sonar_graph.files import written_whole
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap.file_summary import read_summary
 from sonar_graph.logs.mcap.records import LogFile, open_seal
-from sonar_graph.logs.mcap.writer import Attachment, Outgoing, recording, write_recording
+from sonar_graph.logs.mcap.writer import (
+    Attachment,
+    Outgoing,
+    recording,
+    write_recording,
+)
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.sonar_images import read_sonar_frames
-from sonar_graph.logs.writing import pose_messages, sonar_image_messages, static_message, write_log
+from sonar_graph.logs.writing import (
+    pose_messages,
+    sonar_image_messages,
+    static_message,
+    write_log,
+)
 from sonar_graph.measurements import Imu
 from sonar_graph.states import Trajectory
 
 from .conftest import chunk_indexes, decode, flip, scan_all
 
 T0_NS = 1_700_000_000_000_000_000
-BLOCKS = ("imu", "dvl", "depth", "heading", "positions", "detections", "truth", "true_landmarks")
+BLOCKS = (
+    "imu",
+    "dvl",
+    "depth",
+    "heading",
+    "positions",
+    "detections",
+    "truth",
+    "true_landmarks",
+)
 
 
 @settings(max_examples=25)
@@ -43,8 +62,12 @@ BLOCKS = ("imu", "dvl", "depth", "heading", "positions", "detections", "truth", 
     candidates=st.integers(1, 4),
     left_out=st.sets(st.sampled_from(BLOCKS[2:])),
 )
-def test_reading_what_was_written_is_the_identity(make_sequence, tmp_path_factory, seed, samples, candidates, left_out):
-    sequence = replace(make_sequence(seed, samples, candidates), **dict.fromkeys(left_out))
+def test_reading_what_was_written_is_the_identity(
+    make_sequence, tmp_path_factory, seed, samples, candidates, left_out
+):
+    sequence = replace(
+        make_sequence(seed, samples, candidates), **dict.fromkeys(left_out)
+    )
     path = tmp_path_factory.mktemp("log") / "log.mcap"
     write_log(path, sequence)
     found = read_log(path)
@@ -53,7 +76,9 @@ def test_reading_what_was_written_is_the_identity(make_sequence, tmp_path_factor
         assert (expected is None) == (actual is None), name
         for field in fields(expected) if expected is not None else ():
             np.testing.assert_array_equal(
-                getattr(actual, field.name), getattr(expected, field.name), f"{name}.{field.name}"
+                getattr(actual, field.name),
+                getattr(expected, field.name),
+                f"{name}.{field.name}",
             )
     assert (found.name, found.calibration) == (sequence.name, sequence.calibration)
     assert found.notes.items() >= sequence.notes.items()
@@ -69,18 +94,34 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
     imu = messages["/imu/data"]
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in imu]
     assert stamps == sequence.imu.stamps_ns.tolist()
-    rates = [[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in imu]
+    rates = [
+        [m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in imu
+    ]
     assert rates == sequence.imu.angular_velocity.tolist()
-    assert [m.linear_acceleration_covariance[0] for m in imu] == [-1.0 if i % 4 == 0 else 0.0 for i in range(20)]
+    assert [m.linear_acceleration_covariance[0] for m in imu] == [
+        -1.0 if i % 4 == 0 else 0.0 for i in range(20)
+    ]
     assert [m.velocity_mode for m in messages["/dvl/data"]] == [1] * 20
-    assert [m.pose.pose.position.z for m in messages["/depth/pose"]] == sequence.depth.z_m.tolist()
-    assert [m.yaw_rad for m in messages["/heading"]] == sequence.heading.yaw_rad.tolist()
-    assert [m.pose.pose.position.y for m in messages["/fixes/pose"]] == sequence.positions.position_m[:, 1].tolist()
+    assert [
+        m.pose.pose.position.z for m in messages["/depth/pose"]
+    ] == sequence.depth.z_m.tolist()
+    assert [
+        m.yaw_rad for m in messages["/heading"]
+    ] == sequence.heading.yaw_rad.tolist()
+    assert [
+        m.pose.pose.position.y for m in messages["/fixes/pose"]
+    ] == sequence.positions.position_m[:, 1].tolist()
     ranges = [r for m in messages["/sonar/landmarks"] for r in m.range_m]
     assert ranges == sequence.detections.range_m.tolist()
     assert list(messages["/ground_truth/landmarks"][0].ids) == [3, 7]
     (tree,) = messages["/tf_static"]
-    assert [t.child_frame_id for t in tree.transforms] == ["imu", "dvl", "depth", "sonar", "positions"]
+    assert [t.child_frame_id for t in tree.transforms] == [
+        "imu",
+        "dvl",
+        "depth",
+        "sonar",
+        "positions",
+    ]
     assert tree.transforms[0].transform.translation.y == 0.2
 
 
@@ -88,7 +129,10 @@ def test_a_stamp_or_sample_that_ros_cannot_express_and_a_file_that_cannot_be_wri
     make_sequence, tmp_path
 ):
     for stamp_ns in (2**31 * 10**9, -(2**31) * 10**9 - 1):
-        sequence = replace(make_sequence(), imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))))
+        sequence = replace(
+            make_sequence(),
+            imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))),
+        )
         with pytest.raises(LogError, match="32-bit seconds"):
             write_log(tmp_path / "a.mcap", sequence)
         assert list(tmp_path.iterdir()) == []
@@ -105,17 +149,27 @@ def test_a_stamp_or_sample_that_ros_cannot_express_and_a_file_that_cannot_be_wri
 KINDS = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
 
 
-def frames(kind: str = "u1", count: int = 3, first: int = 0, beams: int = 4, bins: int = 5) -> SonarFrames:
+def frames(
+    kind: str = "u1", count: int = 3, first: int = 0, beams: int = 4, bins: int = 5
+) -> SonarFrames:
     intensity = np.arange(count * beams * bins).reshape(count, beams, bins) % 97 + first
     stamps_ns = 1_700_000_000_000_000_123 + (first + np.arange(count)) * 10**8
     azimuths_rad = np.radians(np.linspace(14.0, -15.0, beams))
-    return SonarFrames(stamps_ns, intensity.astype(kind), np.linspace(1.26, 2.51, bins), azimuths_rad)
+    return SonarFrames(
+        stamps_ns, intensity.astype(kind), np.linspace(1.26, 2.51, bins), azimuths_rad
+    )
 
 
 def write_frames(path: Path, *blocks: SonarFrames) -> Path:
     with recording(path, {}) as out:
         for block in blocks:
-            out.write([sonar_image_messages("/sonar/image", block, frequency_hz=1.8e6, sound_speed_m_s=1480)])
+            out.write(
+                [
+                    sonar_image_messages(
+                        "/sonar/image", block, frequency_hz=1.8e6, sound_speed_m_s=1480
+                    )
+                ]
+            )
     return path
 
 
@@ -135,27 +189,52 @@ def test_another_library_sees_what_the_message_defines(tmp_path):
     (messages,) = decode(write_frames(tmp_path / "log.mcap", written)).values()
     assert [m.header.stamp.nanosec for m in messages] == [123, 100_000_123, 200_000_123]
     first = messages[0]
-    assert (first.ping_info.frequency, first.ping_info.sound_speed) == (np.float32(1.8e6), 1480)
-    assert (first.image.dtype, first.image.beam_count, first.image.is_bigendian) == (0, 4, False)
-    assert bytes(first.image.data) == written.intensity[0].T.tobytes()  # all beams of the first range first
+    assert (first.ping_info.frequency, first.ping_info.sound_speed) == (
+        np.float32(1.8e6),
+        1480,
+    )
+    assert (first.image.dtype, first.image.beam_count, first.image.is_bigendian) == (
+        0,
+        4,
+        False,
+    )
+    # all beams of the first range first
+    assert bytes(first.image.data) == written.intensity[0].T.tobytes()
     left, right = first.beam_directions[0], first.beam_directions[-1]
     assert (left.x, right.x) == (0, 0)
     assert left.y < 0 < right.y  # y is to the right
     np.testing.assert_allclose([left.z, right.z], np.cos(np.radians([14, 15])))
 
 
-def test_messages_and_images_that_are_made_one_by_one_lie_in_the_order_of_their_times(make_sequence, tmp_path):
+def test_messages_and_images_that_are_made_one_by_one_lie_in_the_order_of_their_times(
+    make_sequence, tmp_path
+):
     sequence = make_sequence()
-    blocks = [replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1]) for row in (4, 12)]
+    blocks = [
+        replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1])
+        for row in (4, 12)
+    ]
     write_log(tmp_path / "a.mcap", sequence)
-    write_log(tmp_path / "b.mcap", sequence, (sonar_image_messages("/sonar/image", block) for block in blocks))
+    write_log(
+        tmp_path / "b.mcap",
+        sequence,
+        (sonar_image_messages("/sonar/image", block) for block in blocks),
+    )
     times: list[list[int]] = []
     for name in ("a.mcap", "b.mcap"):
         with (tmp_path / name).open("rb") as stream:
-            times.append([r.log_time for r in StreamReader(stream).records if isinstance(r, Message)])
+            times.append(
+                [
+                    r.log_time
+                    for r in StreamReader(stream).records
+                    if isinstance(r, Message)
+                ]
+            )
     assert len(times[0]) > 80
     assert times[0] == sorted(times[0])
-    assert times[1] == sorted([*times[0], *(int(block.stamps_ns[0]) for block in blocks)])
+    assert times[1] == sorted(
+        [*times[0], *(int(block.stamps_ns[0]) for block in blocks)]
+    )
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -167,7 +246,9 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recorder") / "a.mcap"
     positions = np.random.default_rng(0).normal(size=(20_000, 3))
     stamps_ns = T0_NS + np.arange(20_000) * 10**7
-    truth = Trajectory.without_covariances(stamps_ns, positions, np.tile([0, 0, 0, 1.0], (20_000, 1)))
+    truth = Trajectory.without_covariances(
+        stamps_ns, positions, np.tile([0, 0, 0, 1.0], (20_000, 1))
+    )
     poses = pose_messages("/pose", truth)
     still = static_message("/start", poses.type_name, T0_NS, poses.payloads[:1])
     file = Attachment("notes/a.json", "application/json", b'{"a": 1}')
@@ -175,31 +256,54 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_profile_index_counts_metadata_and_attachments_are_those_of_a_ros_2_recording(long_log: Path) -> None:
+def test_profile_index_counts_metadata_and_attachments_are_those_of_a_ros_2_recording(
+    long_log: Path,
+) -> None:
     with long_log.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
-        assert summary.statistics.message_count == sum(1 for _ in reader.iter_messages()) == 20_001
+        assert (
+            summary.statistics.message_count
+            == sum(1 for _ in reader.iter_messages())
+            == 20_001
+        )
         assert len(summary.chunk_indexes) > 3
-        assert all(index.message_index_length > 0 and index.compression for index in summary.chunk_indexes)
+        assert all(
+            index.message_index_length > 0 and index.compression
+            for index in summary.chunk_indexes
+        )
         assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
         assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
         about = {m.name: m.metadata for m in reader.iter_metadata()}["about"]
         assert open_seal(about) == ({"key": "value ψ"}, True)
         (file,) = reader.iter_attachments()
-    assert (file.name, file.media_type, file.data) == ("notes/a.json", "application/json", b'{"a": 1}')
+    assert (file.name, file.media_type, file.data) == (
+        "notes/a.json",
+        "application/json",
+        b'{"a": 1}',
+    )
 
 
-def test_messages_lie_in_the_order_of_their_times_and_those_of_one_instant_in_that_of_the_list(tmp_path: Path) -> None:
+def test_messages_lie_in_the_order_of_their_times_and_those_of_one_instant_in_that_of_the_list(
+    tmp_path: Path,
+) -> None:
     times_ns = np.repeat([20, 10], 50)
-    first, second = (Outgoing(n, "std_msgs/msg/Header", times_ns, np.zeros((100, 9), np.uint8)) for n in ("/a", "/b"))
+    first, second = (
+        Outgoing(n, "std_msgs/msg/Header", times_ns, np.zeros((100, 9), np.uint8))
+        for n in ("/a", "/b")
+    )
     write_recording(tmp_path / "a.mcap", [first, second], {})
     with (tmp_path / "a.mcap").open("rb") as stream:
-        found = [(m.log_time, c.topic) for _, c, m in make_reader(stream).iter_messages(log_time_order=False)]
-    assert found == [(time, topic) for time in (10, 20) for topic in ("/a", "/b") for _ in range(50)]
+        found = [
+            (m.log_time, c.topic)
+            for _, c, m in make_reader(stream).iter_messages(log_time_order=False)
+        ]
+    assert found == [
+        (time, topic) for time in (10, 20) for topic in ("/a", "/b") for _ in range(50)
+    ]
 
 
 def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> None:
@@ -210,11 +314,16 @@ def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> N
     chunk, damaged = chunk_indexes(long_log)[1], tmp_path / "damaged.mcap"
     damaged.write_bytes(long_log.read_bytes())
     flip(damaged, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
-    with damaged.open("rb") as stream, pytest.raises((McapError, ValueError, RuntimeError)):
+    with (
+        damaged.open("rb") as stream,
+        pytest.raises((McapError, ValueError, RuntimeError)),
+    ):
         list(make_reader(stream, validate_crcs=True).iter_messages())
 
 
-def test_latched_topics_offer_transient_local_in_numbers_that_all_rosbag2_read(long_log: Path) -> None:
+def test_latched_topics_offer_transient_local_in_numbers_that_all_rosbag2_read(
+    long_log: Path,
+) -> None:
     """Versions that would expect words read numbers when the record ``rosbag2`` has no metadata of theirs."""
     with AnyReader([long_log]) as reader:
         offered = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
@@ -225,9 +334,13 @@ def test_latched_topics_offer_transient_local_in_numbers_that_all_rosbag2_read(l
     assert offered["/pose"] == []
     with long_log.open("rb") as stream:
         reader = make_reader(stream)
-        (channel,) = [c for c in reader.get_summary().channels.values() if c.topic == "/start"]  # type: ignore[union-attr]
+        (channel,) = [
+            c for c in reader.get_summary().channels.values() if c.topic == "/start"
+        ]  # type: ignore[union-attr]
         assert "durability: 1," in channel.metadata["offered_qos_profiles"]
-        assert {m.name: m.metadata for m in reader.iter_metadata()}["rosbag2"] == {"serialized_metadata": ""}
+        assert {m.name: m.metadata for m in reader.iter_metadata()}["rosbag2"] == {
+            "serialized_metadata": ""
+        }
 
 
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
@@ -271,7 +384,9 @@ write_recording(Path(sys.argv[1]), [Outgoing("/n", "std_msgs/msg/Header", np.ara
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL here")
 def test_a_killed_writer_loses_at_most_its_open_chunk(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as writer:
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE
+    ) as writer:
         assert writer.stdout is not None
         told = 0
         while told < 3000:

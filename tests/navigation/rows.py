@@ -25,14 +25,24 @@ def at(seconds: float) -> int:
     return T0_NS + round(seconds * NS)
 
 
-def imu(stamps_ns: Ints, rate: ArrayLike, force: ArrayLike = (0.0, 0.0, 9.80665)) -> Imu:
+def imu(
+    stamps_ns: Ints, rate: ArrayLike, force: ArrayLike = (0.0, 0.0, 9.80665)
+) -> Imu:
     shape = (len(stamps_ns), 3)
-    return Imu(stamps_ns, np.broadcast_to(rate, shape).copy(), np.broadcast_to(force, shape).copy())
+    return Imu(
+        stamps_ns,
+        np.broadcast_to(rate, shape).copy(),
+        np.broadcast_to(force, shape).copy(),
+    )
 
 
 def dvl(stamps_ns: Ints, velocity: ArrayLike, cov: ArrayLike = np.nan) -> Dvl:
     n = len(stamps_ns)
-    return Dvl(stamps_ns, np.broadcast_to(velocity, (n, 3)).copy(), np.broadcast_to(cov, (n, 3, 3)).copy())
+    return Dvl(
+        stamps_ns,
+        np.broadcast_to(velocity, (n, 3)).copy(),
+        np.broadcast_to(cov, (n, 3, 3)).copy(),
+    )
 
 
 def odometry_at_rest(*blocks: Dvl, calibration: Calibration | None = None) -> Odometry:
@@ -49,7 +59,11 @@ def waves(stamps_ns: Ints, seed: int, amplitude: float) -> Floats:
     rng = np.random.default_rng(seed)
     t = (stamps_ns - T0_NS)[:, None] * 1e-9
     phase, period = rng.uniform(0, 2 * np.pi, (2, 3)), rng.uniform(1, 5, (2, 3))
-    return amplitude * np.sin(2 * np.pi * t / period[0] + phase[0]) * np.cos(2 * np.pi * t / period[1] + phase[1])
+    return (
+        amplitude
+        * np.sin(2 * np.pi * t / period[0] + phase[0])
+        * np.cos(2 * np.pi * t / period[1] + phase[1])
+    )
 
 
 class Steps(NamedTuple):
@@ -62,7 +76,9 @@ class Steps(NamedTuple):
     force: Floats
 
 
-def steps_of(imu: Imu, dvl: Dvl, start_ns: int, end_ns: int, known_ns: int, hold_past: bool) -> Steps:
+def steps_of(
+    imu: Imu, dvl: Dvl, start_ns: int, end_ns: int, known_ns: int, hold_past: bool
+) -> Steps:
     """Cut at every known stamp of either sensor, by numpy's interpolation at the middles.
 
     Doppler noise: half of either end's covariance over the interval about a step; past the rows that of the last one.
@@ -83,23 +99,42 @@ def steps_of(imu: Imu, dvl: Dvl, start_ns: int, end_ns: int, known_ns: int, hold
         last = min(k, len(log) - 1)
         ends = (last, last) if hold_past or k >= len(log) else (last, last - 1)
         if last > 0:
-            psd[n] = np.diff(log.stamps_ns)[last - 1] * 1e-9 * log.velocity_cov[list(ends)].mean(axis=0)
-    rate, force = (sampled(inertial.stamps_ns, c) for c in (inertial.angular_velocity, inertial.specific_force))
-    return Steps(np.diff(cuts) * 1e-9, rate, sampled(log.stamps_ns, log.velocity), psd, force)
+            psd[n] = (
+                np.diff(log.stamps_ns)[last - 1]
+                * 1e-9
+                * log.velocity_cov[list(ends)].mean(axis=0)
+            )
+    rate, force = (
+        sampled(inertial.stamps_ns, c)
+        for c in (inertial.angular_velocity, inertial.specific_force)
+    )
+    return Steps(
+        np.diff(cuts) * 1e-9, rate, sampled(log.stamps_ns, log.velocity), psd, force
+    )
 
 
 def dead_reckoned(steps: Steps, bias: Floats, lever: Floats) -> list[gtsam.Pose3]:
     """Poses after every step: a constant twist for each, by GTSAM's exponential."""
     poses = [gtsam.Pose3()]
-    for dt, w, v in zip(steps.duration_s, steps.rate - bias, steps.velocity, strict=True):
-        poses.append(poses[-1].compose(gtsam.Pose3.Expmap(dt * np.concatenate([w, v - np.cross(w, lever)]))))
+    for dt, w, v in zip(
+        steps.duration_s, steps.rate - bias, steps.velocity, strict=True
+    ):
+        poses.append(
+            poses[-1].compose(
+                gtsam.Pose3.Expmap(dt * np.concatenate([w, v - np.cross(w, lever)]))
+            )
+        )
     return poses
 
 
-def derivative(function: Callable[[Floats], ArrayLike], size: int, step: float = 1e-6) -> Floats:
+def derivative(
+    function: Callable[[Floats], ArrayLike], size: int, step: float = 1e-6
+) -> Floats:
     """Central differences of a function at zero, one column an argument."""
     columns = [
-        (np.asarray(function(step * axis)) - np.asarray(function(-step * axis))) / (2 * step) for axis in np.eye(size)
+        (np.asarray(function(step * axis)) - np.asarray(function(-step * axis)))
+        / (2 * step)
+        for axis in np.eye(size)
     ]
     return np.column_stack(columns)
 
@@ -109,21 +144,33 @@ def nees(errors: ArrayLike, covariance: Floats) -> Floats:
     return np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors)
 
 
-def dense_covariance(steps: Steps, bias: Floats, lever: Floats, gyro_density: float) -> tuple[Floats, Floats]:
+def dense_covariance(
+    steps: Steps, bias: Floats, lever: Floats, gyro_density: float
+) -> tuple[Floats, Floats]:
     """Covariance (6, 6) and bias derivative (6, 3) at the end, step by step with differentiated exponentials."""
     P, D = np.zeros((6, 6)), np.zeros((6, 3))
     poses = dead_reckoned(steps, bias, lever)
     for k, (before, after) in enumerate(pairwise(poses)):
-        dt, w, v, motion = steps.duration_s[k], steps.rate[k] - bias, steps.velocity[k], before.between(after)
+        dt, w, v, motion = (
+            steps.duration_s[k],
+            steps.rate[k] - bias,
+            steps.velocity[k],
+            before.between(after),
+        )
 
         def off(error: Floats, dt=dt, w=w, v=v, motion=motion) -> Floats:
             wrong = w + error[:3]
             twist = np.concatenate([wrong, v + error[3:] - np.cross(wrong, lever)])
-            return gtsam.Pose3.Logmap(motion.inverse().compose(gtsam.Pose3.Expmap(dt * twist)))
+            return gtsam.Pose3.Logmap(
+                motion.inverse().compose(gtsam.Pose3.Expmap(dt * twist))
+            )
 
         G = derivative(off, 6)
         Q = np.zeros((6, 6))
-        Q[:3, :3], Q[3:, 3:] = np.eye(3) * gyro_density**2 / dt, steps.velocity_psd[k] / dt
+        Q[:3, :3], Q[3:, 3:] = (
+            np.eye(3) * gyro_density**2 / dt,
+            steps.velocity_psd[k] / dt,
+        )
         F = motion.inverse().AdjointMap()
         P, D = F @ P @ F.T + G @ Q @ G.T, F @ D - G[:, :3]
     return P, D

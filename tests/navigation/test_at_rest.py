@@ -10,13 +10,24 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from baselines.invariant_ekf import InvariantEkf
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu, Measurements
 from sonar_graph.models.aiding import gravity_direction
 from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.navigation import Odometry, PreintegratedMotion
-from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
+from sonar_graph.navigation.alignment.allan import (
+    allan_deviation,
+    degrees_of_freedom,
+    density,
+    noise_densities,
+)
 from sonar_graph.navigation.alignment.at_rest import (
     InitialTilt,
     align_at_rest,
@@ -35,7 +46,10 @@ from .ways import acceleration_at, attitude, rate_at, velocity_at
 G, HZ, REST_S = 9.80665, 50, 20.0
 EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)
 SENSORS = ImuCalibration(
-    gyro_noise_density=2e-5, gyro_bias_walk_density=0.0, accel_noise_density=2e-3, accel_bias_sigma=5e-3
+    gyro_noise_density=2e-5,
+    gyro_bias_walk_density=0.0,
+    accel_noise_density=2e-3,
+    accel_bias_sigma=5e-3,
 )
 ROLL, PITCH = 0.3, -0.4
 GYRO_BIAS = np.array([2e-4, -1e-4, 3e-4])
@@ -48,19 +62,34 @@ def rest(rng, yaw=0.0, earth=0.0, noise=1.0, rest_s=REST_S) -> Imu:
     """What sensors with a noise say of a body with the attitude above."""
     n = round(rest_s * HZ)
     world_R_body = Rotation.from_euler("ZYX", [yaw, PITCH, ROLL])
-    rate = world_R_body.inv().apply(earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])) + GYRO_BIAS
-    force = world_R_body.inv().apply([0, 0, G]) + noise * SENSORS.accel_bias_sigma * rng.standard_normal(3)
+    rate = (
+        world_R_body.inv().apply(
+            earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])
+        )
+        + GYRO_BIAS
+    )
+    force = world_R_body.inv().apply(
+        [0, 0, G]
+    ) + noise * SENSORS.accel_bias_sigma * rng.standard_normal(3)
     white = noise * np.sqrt(HZ) * rng.standard_normal((2, n, 3))
     stamps_ns = np.arange(n) * (10**9 // HZ)
-    return Imu(stamps_ns, rate + SENSORS.gyro_noise_density * white[0], force + SENSORS.accel_noise_density * white[1])
+    return Imu(
+        stamps_ns,
+        rate + SENSORS.gyro_noise_density * white[0],
+        force + SENSORS.accel_noise_density * white[1],
+    )
 
 
 def changed(imu: Imu, rate=0.0, force=0.0, times=1.0) -> Imu:
-    return Imu(imu.stamps_ns, imu.angular_velocity + rate, times * imu.specific_force + force)
+    return Imu(
+        imu.stamps_ns, imu.angular_velocity + rate, times * imu.specific_force + force
+    )
 
 
 def error_of(found: InitialTilt) -> np.ndarray:
-    return np.array([found.roll_rad - ROLL, found.pitch_rad - PITCH, *(found.gyro_bias - GYRO_BIAS)])
+    return np.array(
+        [found.roll_rad - ROLL, found.pitch_rad - PITCH, *(found.gyro_bias - GYRO_BIAS)]
+    )
 
 
 def nees(found: InitialTilt) -> float:
@@ -77,34 +106,53 @@ def test_a_noiseless_rest_gives_what_was_put_in():
 @pytest.mark.parametrize("latitude", [None, LATITUDE])
 def test_what_is_claimed_is_what_many_rests_err_by(latitude):
     """With the Earth, at headings all around: its level part is in the covariance alone."""
-    rng, known = np.random.default_rng(3), Calibration(imu=SENSORS, earth_rate_latitude_rad=latitude)
+    rng, known = (
+        np.random.default_rng(3),
+        Calibration(imu=SENSORS, earth_rate_latitude_rad=latitude),
+    )
     earth = 0.0 if latitude is None else EARTH
-    found = [align_at_rest(rest(rng, rng.uniform(-np.pi, np.pi), earth), known) for _ in range(400)]
+    found = [
+        align_at_rest(rest(rng, rng.uniform(-np.pi, np.pi), earth), known)
+        for _ in range(400)
+    ]
     check_consistent([nees(one) for one in found], 5, confidence=0.999)
 
 
 def test_the_earth_left_in_the_bias_is_noticed():
     rng = np.random.default_rng(4)
-    found = [align_at_rest(rest(rng, rng.uniform(-np.pi, np.pi), EARTH), KNOWN) for _ in range(50)]
+    found = [
+        align_at_rest(rest(rng, rng.uniform(-np.pi, np.pi), EARTH), KNOWN)
+        for _ in range(50)
+    ]
     assert np.mean([nees(one) for one in found]) / 5 > 5.0
 
 
 def test_at_the_pole_the_earth_hides_nothing():
     """There its axis is vertical, so that all of it is known without a heading."""
-    level = align_at_rest(rest(NOISELESS, noise=0.0), Calibration(imu=SENSORS, earth_rate_latitude_rad=np.pi / 2))
+    level = align_at_rest(
+        rest(NOISELESS, noise=0.0),
+        Calibration(imu=SENSORS, earth_rate_latitude_rad=np.pi / 2),
+    )
     without = align_at_rest(rest(NOISELESS, noise=0.0), KNOWN)
     assert without.gyro_bias - level.gyro_bias == pytest.approx(EARTH * UP, abs=1e-15)
-    assert np.diag(level.covariance) == pytest.approx(np.diag(without.covariance), rel=2e-3)
+    assert np.diag(level.covariance) == pytest.approx(
+        np.diag(without.covariance), rel=2e-3
+    )
 
 
 def test_covariance_of_a_level_body_is_what_the_sensors_say():
     """By hand: sigma^2 / g^2 for both angles, N^2 / T + K^2 T / 3 for the biases, half of the Earth's level part."""
     sensors = ImuCalibration(
-        gyro_noise_density=1e-4, gyro_bias_walk_density=1e-5, accel_noise_density=1e-3, accel_bias_sigma=1e-2
+        gyro_noise_density=1e-4,
+        gyro_bias_walk_density=1e-5,
+        accel_noise_density=1e-3,
+        accel_bias_sigma=1e-2,
     )
     force = np.tile([0, 0, G], (200, 1))
     imu = Imu(np.arange(200) * 50_000_000, np.zeros((200, 3)), force)
-    found = align_at_rest(imu, Calibration(imu=sensors, earth_rate_latitude_rad=LATITUDE)).covariance
+    found = align_at_rest(
+        imu, Calibration(imu=sensors, earth_rate_latitude_rad=LATITUDE)
+    ).covariance
     tilt = (1e-4 + 1e-6 / 10) / G**2
     up, level = EARTH * np.sin(LATITUDE), EARTH * np.cos(LATITUDE)
     bias = 1e-8 / 10 + 1e-10 * 10 / 3
@@ -120,20 +168,35 @@ def test_an_unknown_accelerometer_bias_spreads_as_it_moves_what_is_found(latitud
     still = Calibration(imu=SENSORS, earth_rate_latitude_rad=latitude)
     quiet = {"gyro_noise_density": 0.0, "accel_noise_density": 0.0}
     imu = rest(NOISELESS, noise=0.0)
-    J = derivative(lambda shift: error_of(align_at_rest(changed(imu, force=shift), still)), 3, 1e-4)
+    J = derivative(
+        lambda shift: error_of(align_at_rest(changed(imu, force=shift), still)), 3, 1e-4
+    )
     of_earth = np.zeros((5, 5))
-    of_earth[2:, 2:] = 0.5 * (EARTH * np.cos(latitude)) ** 2 * (np.eye(3) - np.outer(UP, UP))
-    expected, size = SENSORS.accel_bias_sigma**2 * J @ J.T, np.array([1.0, 1.0, EARTH, EARTH, EARTH])
+    of_earth[2:, 2:] = (
+        0.5 * (EARTH * np.cos(latitude)) ** 2 * (np.eye(3) - np.outer(UP, UP))
+    )
+    expected, size = (
+        SENSORS.accel_bias_sigma**2 * J @ J.T,
+        np.array([1.0, 1.0, EARTH, EARTH, EARTH]),
+    )
     known = still.model_copy(update={"imu": SENSORS.model_copy(update=quiet)})
     covariance = covariance_at_rest(UP, REST_S, known) - of_earth
-    assert covariance / np.outer(size, size) == pytest.approx(expected / np.outer(size, size), rel=1e-6, abs=1e-13)
+    assert covariance / np.outer(size, size) == pytest.approx(
+        expected / np.outer(size, size), rel=1e-6, abs=1e-13
+    )
 
 
 def test_scale_and_mounting_of_the_accelerometers_do_not_matter():
     """A scale error of all three, and readings of an IMU that is mounted on its side."""
-    mounted = SENSORS.model_copy(update={"mounting": Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))})
+    mounted = SENSORS.model_copy(
+        update={"mounting": Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))}
+    )
     imu, turn = rest(NOISELESS, noise=0.0), Rotation.from_euler("z", -np.pi / 2)
-    turned = Imu(imu.stamps_ns, turn.apply(imu.angular_velocity), 1.04 * turn.apply(imu.specific_force))
+    turned = Imu(
+        imu.stamps_ns,
+        turn.apply(imu.angular_velocity),
+        1.04 * turn.apply(imu.specific_force),
+    )
     found, expected = (
         align_at_rest(rows, Calibration(imu=sensors, earth_rate_latitude_rad=LATITUDE))
         for rows, sensors in ((turned, mounted), (imu, SENSORS))
@@ -149,15 +212,27 @@ def sway(imu: Imu) -> np.ndarray:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda imu: changed(imu, force=0.02 * sway(imu)), "Imu.specific_force: varies"),
-        (lambda imu: changed(imu, rate=0.001 * sway(imu) * [1, 0, 0]), "Imu.angular_velocity: varies"),
+        (
+            lambda imu: changed(imu, force=0.02 * sway(imu)),
+            "Imu.specific_force: varies",
+        ),
+        (
+            lambda imu: changed(imu, rate=0.001 * sway(imu) * [1, 0, 0]),
+            "Imu.angular_velocity: varies",
+        ),
         (lambda imu: changed(imu, rate=[0, 0, 0.05]), "turns at 0.05"),
         (lambda imu: changed(imu, times=1 / G), "check its unit"),
         (lambda imu: changed(imu, force=np.nan), "needs accelerometers"),
-        (lambda imu: imu.rows((imu.stamps_ns < 5e9) | (imu.stamps_ns > 7e9)), "without a row"),
+        (
+            lambda imu: imu.rows((imu.stamps_ns < 5e9) | (imu.stamps_ns > 7e9)),
+            "without a row",
+        ),
         (lambda imu: imu.rows(slice(0, 50)), "too short"),
         (lambda imu: imu.rows(slice(0, 1)), "too short"),
-        (lambda imu: changed(imu, force=np.array([-G, 0, 0]) - imu.specific_force), "nose points straight"),
+        (
+            lambda imu: changed(imu, force=np.array([-G, 0, 0]) - imu.specific_force),
+            "nose points straight",
+        ),
     ],
 )
 def test_what_is_no_rest_is_refused(spoil, message):
@@ -188,7 +263,9 @@ def test_two_seconds_are_enough_and_less_are_not():
 def test_a_quarter_of_a_second_without_a_row_is_no_hole_and_more_is():
     imu, seconds = noisy(1), noisy(1).stamps_ns * 1e-9
     assert not refusal(imu.rows((seconds < 5.01) | (seconds > 5.23)))
-    assert "0.28 s without a row" in refusal(imu.rows((seconds < 5.01) | (seconds > 5.27)))
+    assert "0.28 s without a row" in refusal(
+        imu.rows((seconds < 5.01) | (seconds > 5.27))
+    )
 
 
 def test_half_more_noise_than_known_is_let_pass_even_where_chance_adds_to_it():
@@ -215,7 +292,13 @@ def test_a_rest_turns_by_a_bias_at_most_and_feels_gravity_but_for_a_twentieth():
     imu = rest(NOISELESS, noise=0.0)
     for rate, rests in ((0.019, True), (0.021, False), (-0.021, False)):
         assert (not refusal(changed(imu, rate=[0.0, rate, 0.0] - GYRO_BIAS))) == rests
-    for share, rests in ((0.96, True), (1.04, True), (0.94, False), (1.06, False), (9.8, False)):
+    for share, rests in (
+        (0.96, True),
+        (1.04, True),
+        (0.94, False),
+        (1.06, False),
+        (9.8, False),
+    ):
         assert (not refusal(changed(imu, times=share))) == rests
 
 
@@ -226,18 +309,32 @@ def doppler(seconds: list[float], velocity: object) -> Dvl:
 def test_a_speed_is_none_within_five_sigmas_of_its_mean():
     """By hand: 0.02 + 5 sqrt(3) 0.05 / sqrt(n) m/s is 0.27 of three rows and 0.145 of twelve."""
     known = Calibration(imu=SENSORS, dvl=DvlCalibration(velocity_sigma_m_s=(0.05,) * 3))
-    for rows, speed, rests in ((3, 0.26, True), (3, 0.28, False), (12, 0.14, True), (12, 0.15, False)):
-        log = doppler(np.linspace(1, 9, rows).tolist(), [0.6 * speed, 0.0, -0.8 * speed])
+    for rows, speed, rests in (
+        (3, 0.26, True),
+        (3, 0.28, False),
+        (12, 0.14, True),
+        (12, 0.15, False),
+    ):
+        log = doppler(
+            np.linspace(1, 9, rows).tolist(), [0.6 * speed, 0.0, -0.8 * speed]
+        )
         assert (not refusal(noisy(3), known, log)) == rests
 
 
 def test_velocities_count_from_the_first_to_the_last_of_the_rest():
     for second, rests in ((-0.01, True), (0.0, False), (19.98, False), (19.99, True)):
-        assert (not refusal(noisy(3), KNOWN, doppler([second], [0.5, 0.0, 0.0]))) == rests
+        assert (
+            not refusal(noisy(3), KNOWN, doppler([second], [0.5, 0.0, 0.0]))
+        ) == rests
 
 
 GRAVITY = np.array([0.0, 0.0, G])
-IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3, gyro_noise_density=2e-3, gyro_bias_sigma=1e-3)
+IMU = ImuCalibration(
+    accel_noise_density=2e-3,
+    accel_bias_sigma=5e-3,
+    gyro_noise_density=2e-3,
+    gyro_bias_sigma=1e-3,
+)
 MOVING = Calibration(imu=IMU, gravity_m_s2=G)
 """A gyro that drifts so fast that directions a second apart share next to nothing."""
 T, N, FROM_S = 1.0, 2000, 2.0
@@ -250,14 +347,26 @@ def accelerated() -> tuple[PreintegratedMotion, Floats, Floats, Rotation]:
     force = attitude(t).inv().apply(acceleration_at(t) + GRAVITY)
     log = dvl(stamps_ns, attitude(t).inv().apply(velocity_at(t)))
     agile = Calibration(dvl=DvlCalibration(velocity_walk_density=10.0))
-    motion = ways.motion(Imu(stamps_ns, rate_at(t), force), log, agile, FROM_S, FROM_S + T)
+    motion = ways.motion(
+        Imu(stamps_ns, rate_at(t), force), log, agile, FROM_S, FROM_S + T
+    )
     ends = np.array([FROM_S, FROM_S + T])
     return motion, *attitude(ends).inv().apply(velocity_at(ends)), attitude(ends)[1]
 
 
-def tilt_sigma_at_rest(duration_s: float, velocity_sigma: float, imu: ImuCalibration) -> float:
-    still = PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, GRAVITY)
-    return gravity_direction(still, np.zeros(3), np.zeros(3), velocity_sigma, Calibration(imu=imu, gravity_m_s2=G))[1]
+def tilt_sigma_at_rest(
+    duration_s: float, velocity_sigma: float, imu: ImuCalibration
+) -> float:
+    still = PreintegratedMotion(
+        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, GRAVITY
+    )
+    return gravity_direction(
+        still,
+        np.zeros(3),
+        np.zeros(3),
+        velocity_sigma,
+        Calibration(imu=imu, gravity_m_s2=G),
+    )[1]
 
 
 def test_up_is_found_in_a_moving_vehicle():
@@ -274,23 +383,43 @@ def test_up_is_found_in_a_moving_vehicle():
 def test_a_filter_at_rest_lies_level_whatever_bias_its_gyros_have():
     """To a milliradian, a tenth of what a bias turns the sum of forces in each second by."""
     known = Calibration(
-        imu=ImuCalibration(gyro_bias_sigma=0.02, accel_bias_sigma=0), start=Start(rpy_sigma_rad=(0.1,) * 3)
+        imu=ImuCalibration(gyro_bias_sigma=0.02, accel_bias_sigma=0),
+        start=Start(rpy_sigma_rad=(0.1,) * 3),
     )
-    rows = imu(stamps(50, 100.0), [0.02, -0.01, 0.0]), dvl(stamps(5, 100.0), 0.0, 1e-6 * np.eye(3))
+    rows = (
+        imu(stamps(50, 100.0), [0.02, -0.01, 0.0]),
+        dvl(stamps(5, 100.0), 0.0, 1e-6 * np.eye(3)),
+    )
     found = InvariantEkf(known, Odometry(known)).process(Measurements(at(100.0), *rows))
-    assert found.world_T_body.rotation().rpy()[:2] == pytest.approx([0.0, 0.0], abs=1e-3)
+    assert found.world_T_body.rotation().rpy()[:2] == pytest.approx(
+        [0.0, 0.0], abs=1e-3
+    )
 
 
 def test_stated_sigma_is_that_of_many_noisy_intervals():
     """Two-sided, about both horizontal axes, with noise in force, bias, both velocities, and gyros."""
     motion, v_i, v_j, end = accelerated()
-    level, rng, velocity_sigma, squares = end.inv().apply(np.eye(3)[:2]), np.random.default_rng(1), 0.004, []
-    by_gyros = np.hypot(IMU.gyro_noise_density * np.sqrt(T / 3), IMU.gyro_bias_sigma * T / 2)
+    level, rng, velocity_sigma, squares = (
+        end.inv().apply(np.eye(3)[:2]),
+        np.random.default_rng(1),
+        0.004,
+        [],
+    )
+    by_gyros = np.hypot(
+        IMU.gyro_noise_density * np.sqrt(T / 3), IMU.gyro_bias_sigma * T / 2
+    )
     for _ in range(1500):
-        force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(T) * rng.standard_normal(3)
-        noisy = replace(motion, mean_specific_force=force + IMU.accel_bias_sigma * rng.standard_normal(3))
+        force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(
+            T
+        ) * rng.standard_normal(3)
+        noisy = replace(
+            motion,
+            mean_specific_force=force + IMU.accel_bias_sigma * rng.standard_normal(3),
+        )
         scatter = velocity_sigma * rng.standard_normal((2, 3))
-        up, sigma = gravity_direction(noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, MOVING)
+        up, sigma = gravity_direction(
+            noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, MOVING
+        )
         up = up + np.cross(by_gyros * rng.standard_normal(3), up)
         squares.append(np.sum((level @ up / sigma) ** 2))
     check_consistent(squares, 2, confidence=0.999)
@@ -298,19 +427,28 @@ def test_stated_sigma_is_that_of_many_noisy_intervals():
 
 @given(st.floats(0.2, 5.0), st.floats(0.0, 0.05))
 @settings(max_examples=30)
-def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velocity_sigma):
+def test_each_source_of_tilt_noise_falls_with_time_as_it_should(
+    duration_s, velocity_sigma
+):
     """White force as 1 / sqrt(T), velocities as 1 / T, the bias not at all; the gyros' rises."""
     parts = [2e-3 / np.sqrt(duration_s), np.sqrt(2) * velocity_sigma / duration_s, 5e-3]
-    by_gyros = IMU.gyro_noise_density * np.sqrt(duration_s / 3), IMU.gyro_bias_sigma * duration_s / 2
+    by_gyros = (
+        IMU.gyro_noise_density * np.sqrt(duration_s / 3),
+        IMU.gyro_bias_sigma * duration_s / 2,
+    )
     expected = np.linalg.norm([np.linalg.norm(parts) / G, *by_gyros])
-    assert tilt_sigma_at_rest(duration_s, velocity_sigma, IMU) == pytest.approx(expected)
+    assert tilt_sigma_at_rest(duration_s, velocity_sigma, IMU) == pytest.approx(
+        expected
+    )
 
 
 @pytest.mark.parametrize("duration_s", [1.0, 5.0])
 @pytest.mark.parametrize("gyro_density", [3.6e-5, 1.2e-4])
 def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_density):
     """A scalar Kalman filter fed with many directions; as fresh noise the bias would be claimed several times less."""
-    imu = ImuCalibration(accel_noise_density=1e-5, accel_bias_sigma=1e-2, gyro_noise_density=gyro_density)
+    imu = ImuCalibration(
+        accel_noise_density=1e-5, accel_bias_sigma=1e-2, gyro_noise_density=gyro_density
+    )
     settled = []
     for sigma in (tilt_sigma_at_rest(duration_s, 1e-6, imu), 1e-2 / G):
         variance = 1.0
@@ -326,7 +464,9 @@ def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_den
 def test_what_the_gyros_do_meanwhile_is_in_the_tilt(duration_s):
     """Tilts that walk, and drift by a bias: at the end less their mean, which is what the accelerometers felt."""
     rng, steps, runs, density, bias = np.random.default_rng(2), 200, 20_000, 2e-4, 3e-5
-    walk = np.cumsum(rng.normal(0, density * np.sqrt(duration_s / steps), (runs, steps)), axis=1)
+    walk = np.cumsum(
+        rng.normal(0, density * np.sqrt(duration_s / steps), (runs, steps)), axis=1
+    )
     tilt = walk + rng.normal(0, bias, (runs, 1)) * np.linspace(0, duration_s, steps)
     noise = {"accel_noise_density": 1e-9, "accel_bias_sigma": 0.0}
     imu = ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias, **noise)
@@ -339,13 +479,20 @@ def test_without_forces_there_is_no_direction():
     assert gravity_direction(unfelt, np.zeros(3), np.zeros(3), 0.01, MOVING) is None
 
 
-@pytest.mark.parametrize(("latitude_deg", "rate"), [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])])
-def test_the_earth_turns_north_at_the_equator_and_up_at_the_north_pole(latitude_deg, rate):
+@pytest.mark.parametrize(
+    ("latitude_deg", "rate"),
+    [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])],
+)
+def test_the_earth_turns_north_at_the_equator_and_up_at_the_north_pole(
+    latitude_deg, rate
+):
     """Degrees an hour; once a sidereal day."""
     known = Calibration(earth_rate_latitude_rad=np.radians(latitude_deg))
     found = np.degrees(earth_rate_in_world(known)) * 3600
     assert found == pytest.approx(rate, abs=1e-3)
-    assert earth_up_and_level(known) == pytest.approx(earth_rate_in_world(known)[[2, 1]])
+    assert earth_up_and_level(known) == pytest.approx(
+        earth_rate_in_world(known)[[2, 1]]
+    )
     assert 360 / np.linalg.norm(found) == pytest.approx(23.9345, abs=1e-4)
     assert earth_rate_in_world(Calibration()) is None
     assert earth_up_and_level(Calibration()) == (0.0, 0.0)
@@ -413,14 +560,20 @@ def test_deviation_of_the_handbooks_thousand_points():
     found = [float(allan_deviation(points, m)[0]) for m in (1, 10, 100)]
     assert found == pytest.approx([2.922319e-01, 9.159953e-02, 3.241343e-02], rel=1e-6)
     ramp = 0.3 * np.arange(500)[:, None] / RATE_HZ
-    assert allan_deviation(ramp, 50) == pytest.approx([0.3 / np.sqrt(2)])  # sigma(tau) = slope tau / sqrt(2)
+    # sigma(tau) = slope tau / sqrt(2)
+    assert allan_deviation(ramp, 50) == pytest.approx([0.3 / np.sqrt(2)])
 
 
 def test_interval_holds_the_density_at_its_stated_rate():
     """However many samples make a second: at 2.4 Hz two last 0.83 s."""
     true, held = 1.7e-3, []
     for seed in range(200):
-        found = density(true * np.sqrt(RATE_HZ) * np.random.default_rng(seed).standard_normal((3000, 1)), RATE_HZ)
+        found = density(
+            true
+            * np.sqrt(RATE_HZ)
+            * np.random.default_rng(seed).standard_normal((3000, 1)),
+            RATE_HZ,
+        )
         held.append(abs(found.value - true) < 1.96 * found.sigma)
         assert found.sigma < 0.15 * true
     assert 0.90 <= np.mean(held) <= 0.99
@@ -435,13 +588,19 @@ def test_degrees_of_freedom_are_those_of_the_quadratic_form(count, together):
     means = (sums[together:] - sums[:-together]) / together
     steps = means[together:] - means[:-together]
     Q = steps @ steps.T
-    assert degrees_of_freedom(count, together) == pytest.approx(np.trace(Q) ** 2 / np.trace(Q @ Q), rel=0.02)
+    assert degrees_of_freedom(count, together) == pytest.approx(
+        np.trace(Q) ** 2 / np.trace(Q @ Q), rel=0.02
+    )
 
 
 def imu_of(still_s: float, moving_s: float, seed: int = 0) -> Imu:
     rng = np.random.default_rng(seed)
     n, still = round((still_s + moving_s) * RATE_HZ), round(still_s * RATE_HZ)
-    swaying = 0.2 * np.sin(2 * np.pi * 0.21 * np.arange(n) / RATE_HZ) * (np.arange(n) >= still)
+    swaying = (
+        0.2
+        * np.sin(2 * np.pi * 0.21 * np.arange(n) / RATE_HZ)
+        * (np.arange(n) >= still)
+    )
     rate = 1e-3 * np.sqrt(RATE_HZ) * rng.standard_normal((n, 3)) + swaying[:, None]
     force = [0, 0, 9.81] + 2e-3 * np.sqrt(RATE_HZ) * rng.standard_normal((n, 3))
     return Imu((np.arange(n) / RATE_HZ * 1e9).astype(np.int64), rate, force)

@@ -10,7 +10,12 @@ from scipy.stats import chi2
 from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Depth, Dvl
-from sonar_graph.navigation.dvl_screening.depth_gate import DEPTH_GATE, FEWEST, UNSTATED_M, VERTICAL_M_S
+from sonar_graph.navigation.dvl_screening.depth_gate import (
+    DEPTH_GATE,
+    FEWEST,
+    UNSTATED_M,
+    VERTICAL_M_S,
+)
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
     LONG_NS,
@@ -47,13 +52,21 @@ def judged(
     cov = COVS[np.arange(len(stamps_ns)) % 2].copy()
     cov[list(partial)] += np.diag([0.0, UNMEASURED_M_S**2, UNMEASURED_M_S**2])
     n = len(known)
-    before = VelocityRows(np.array(known, np.int64), np.zeros((n, 3)), np.tile(COVS[1], (n, 1, 1)))
-    return gate_velocities(VelocityRows(np.array(stamps_ns), np.array(velocity), cov), before, WALK, gate)
+    before = VelocityRows(
+        np.array(known, np.int64), np.zeros((n, 3)), np.tile(COVS[1], (n, 1, 1))
+    )
+    return gate_velocities(
+        VelocityRows(np.array(stamps_ns), np.array(velocity), cov), before, WALK, gate
+    )
 
 
-def after_half_a_second(u: np.ndarray, Q_u: np.ndarray, v: np.ndarray, Q_v: np.ndarray) -> float:
+def after_half_a_second(
+    u: np.ndarray, Q_u: np.ndarray, v: np.ndarray, Q_v: np.ndarray
+) -> float:
     before = VelocityRows(np.array([0]), u[None], Q_u[None])
-    (distance,) = gate_velocities(VelocityRows(np.array([NS // 2]), v[None], Q_v[None]), before, WALK, GATE).distance
+    (distance,) = gate_velocities(
+        VelocityRows(np.array([NS // 2]), v[None], Q_v[None]), before, WALK, GATE
+    ).distance
     return distance
 
 
@@ -61,7 +74,9 @@ def after_half_a_second(u: np.ndarray, Q_u: np.ndarray, v: np.ndarray, Q_v: np.n
 def test_the_distance_is_that_of_the_formula(seconds):
     """A true velocity's passes the gate but once in a billion."""
     u, v = [0.6, -0.2, 0.3], [0.9, 0.4, -0.2]
-    assert judged([0, round(seconds * NS)], [u, v]).distance == pytest.approx([0.0, expected(seconds, u, v)])
+    assert judged([0, round(seconds * NS)], [u, v]).distance == pytest.approx(
+        [0.0, expected(seconds, u, v)]
+    )
     assert chi2(3).isf(1e-9) == pytest.approx(GATE, abs=0.05)
 
 
@@ -71,7 +86,9 @@ def test_correlated_noise_counts_as_such():
         Q_u, Q_v = (1e-4 * (root @ root.T) for root in rng.standard_normal((2, 3, 3)))
         u, v = 0.1 * rng.standard_normal((2, 3))
         S = Q_u + Q_v + np.eye(3) * (WALK**2 * 0.5 + 0.15**2 * (u @ u))
-        assert after_half_a_second(u, Q_u, v, Q_v) == pytest.approx((v - u) @ np.linalg.solve(S, v - u))
+        assert after_half_a_second(u, Q_u, v, Q_v) == pytest.approx(
+            (v - u) @ np.linalg.solve(S, v - u)
+        )
 
 
 def test_one_beam_of_any_direction_is_compared_along_it():
@@ -95,7 +112,10 @@ def test_rows_are_compared_with_the_last_one_believed():
     """The second is not believed; the third is like the first, the fourth like the third."""
     velocity = [[0.5, 0.0, 0.0], [9.0, 0.0, 0.0], [0.6, 0.0, 0.0], [0.7, 0.0, 0.0]]
     d = judged([0, NS // 10, 2 * NS // 10, 3 * NS // 10], velocity).distance
-    variances = [2e-4 + WALK**2 * 0.2 + (0.06 * 0.5) ** 2, 5e-4 + WALK**2 * 0.1 + (0.03 * 0.6) ** 2]
+    variances = [
+        2e-4 + WALK**2 * 0.2 + (0.06 * 0.5) ** 2,
+        5e-4 + WALK**2 * 0.1 + (0.03 * 0.6) ** 2,
+    ]
     assert d[1] > GATE
     assert d[2] == pytest.approx(0.1**2 / variances[0])
     assert d[3] == pytest.approx(0.1**2 / variances[1])
@@ -106,12 +126,18 @@ def test_a_distance_at_the_gate_is_believed():
     spread = np.sqrt(1e-4 + 4e-4 + WALK**2 * 0.1)
     for factor, believed in ((1 - 1e-9, True), (1 + 1e-9, False)):
         jump = factor * np.sqrt(GATE) * spread
-        d = judged([0, NS // 10, 2 * NS // 10], [[0.0] * 3, [jump, 0.0, 0.0], [jump, 0.0, 0.0]]).distance
+        d = judged(
+            [0, NS // 10, 2 * NS // 10], [[0.0] * 3, [jump, 0.0, 0.0], [jump, 0.0, 0.0]]
+        ).distance
         assert (d[2] == 0.0) == believed
 
 
 def test_rows_are_plain_where_none_is_an_outlier_or_measured_a_part():
-    at, calm, jump = [0, NS // 10], [[0.5, 0.0, 0.0]] * 2, [[0.5, 0.0, 0.0], [9.0, 0.0, 0.0]]
+    at, calm, jump = (
+        [0, NS // 10],
+        [[0.5, 0.0, 0.0]] * 2,
+        [[0.5, 0.0, 0.0], [9.0, 0.0, 0.0]],
+    )
     assert judged(at, calm).is_plain
     for verdict, outlier, partial in (
         (judged(at, jump), [False, True], [False, False]),
@@ -128,7 +154,9 @@ HZ, WRONG = 7.0, [5.0, 0.0, 0.0]
 
 def told(rows: Dvl, calls: int = 1) -> Odometry:
     """Odometry that was given the rows in so many blocks."""
-    return odometry_at_rest(*(rows.rows(block) for block in np.array_split(np.arange(len(rows)), calls)))
+    return odometry_at_rest(
+        *(rows.rows(block) for block in np.array_split(np.arange(len(rows)), calls))
+    )
 
 
 def start(wrong: dict[int, list[float]], speed=0.3, hz=HZ, seconds=3.0) -> Dvl:
@@ -143,13 +171,20 @@ FASTER = [[5.0, 0.0, 0.0], [-3.0, 1.0, 0.0], [2.0, -2.0, 2.0]]
 
 def refused(odometry: Odometry, rows: Dvl) -> list[int]:
     stamps_ns = rows.stamps_ns.tolist()
-    return sorted(stamps_ns.index(row.stamp_ns) for row in odometry.refused if row.reason == Refusal.OUTLIER)
+    return sorted(
+        stamps_ns.index(row.stamp_ns)
+        for row in odometry.refused
+        if row.reason == Refusal.OUTLIER
+    )
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        *(dict.fromkeys(rows, WRONG) for rows in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2))),
+        *(
+            dict.fromkeys(rows, WRONG)
+            for rows in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2))
+        ),
         *(dict(enumerate(FASTER)), {0: [1.5, 0.0, 0.0]}, {0: [0.3, 0.0, -1.2]}),
     ],
 )
@@ -170,7 +205,9 @@ def test_a_vehicle_that_moves_from_the_start_is_believed_with_its_first_row(spee
     assert enough <= min(10, 2 + speed**2 / 4)
     assert not len(told(rows.rows(slice(0, enough - 1))).rows()[3])
     columns = told(rows.rows(slice(0, enough))).rows()[3:6]
-    for column, own in zip(columns, (rows.stamps_ns, rows.velocity, rows.velocity_cov), strict=True):
+    for column, own in zip(
+        columns, (rows.stamps_ns, rows.velocity, rows.velocity_cov), strict=True
+    ):
         assert np.array_equal(column, own[:enough])
 
 
@@ -182,12 +219,16 @@ def test_the_start_stays_a_node_with_the_velocity_of_the_first_row_believed():
     assert np.array_equal(velocity, np.tile([0.3, 0.0, 0.0], (len(rows), 1)))
     t = (rows.stamps_ns[2] - rows.stamps_ns[0]) * 1e-9
     walk = Calibration().dvl.velocity_walk_density
-    assert cov[0] == pytest.approx(np.eye(3) * (1e-4 + walk**2 * t + (0.3 * t * 0.3) ** 2))
+    assert cov[0] == pytest.approx(
+        np.eye(3) * (1e-4 + walk**2 * t + (0.3 * t * 0.3) ** 2)
+    )
     assert cov[2] == pytest.approx(1e-4 * np.eye(3))
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.permutations(range(12)), st.sets(st.integers(1, 11)))
+@given(
+    st.integers(0, 2**32 - 1), st.permutations(range(12)), st.sets(st.integers(1, 11))
+)
 def test_blocks_out_of_order_are_believed_as_in_order(seed, order, cuts):
     """Gaps, wrong rows and slow stretches; blocks of any sizes come in any order, before any motion is used."""
     rng = np.random.default_rng(seed)
@@ -209,7 +250,11 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
     t = (ns - T0_NS) * 1e-9
     wrong = (t > 10.0) & (t < 30.0)
     directions = np.random.default_rng(0).standard_normal((len(ns), 3))
-    velocity = np.where(wrong[:, None], 5.0 * directions / np.linalg.norm(directions, axis=1)[:, None], [0.5, 0.0, 0.0])
+    velocity = np.where(
+        wrong[:, None],
+        5.0 * directions / np.linalg.norm(directions, axis=1)[:, None],
+        [0.5, 0.0, 0.0],
+    )
     rows = dvl(ns, velocity, 1e-4 * np.eye(3))
     for calls in (1, 7, len(ns)):
         used = np.isin(ns, told(rows, calls).rows()[3])
@@ -218,7 +263,12 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
 
 
 def test_a_slow_log_is_not_in_doubt_for_ever():
-    for seconds, hz, calls in ((76.0, 0.25, 1), (76.0, 0.25, 20), (190.0, 0.1, 1), (190.0, 0.1, 20)):
+    for seconds, hz, calls in (
+        (76.0, 0.25, 1),
+        (76.0, 0.25, 20),
+        (190.0, 0.1, 1),
+        (190.0, 0.1, 20),
+    ):
         rows = start({}, speed=1.0, hz=hz, seconds=seconds)
         assert told(rows, calls).rows()[3].tolist() == rows.stamps_ns.tolist()
 
@@ -231,7 +281,9 @@ def test_rows_that_confirm_each_other_here_and_there_are_no_majority():
 
 def test_not_more_than_so_many_rows_wait():
     ns = stamps(HZ, 30.0)
-    cov = np.tile(np.diag([UNMEASURED_M_S**2, UNMEASURED_M_S**2, 1e-4]), (len(ns), 1, 1))
+    cov = np.tile(
+        np.diag([UNMEASURED_M_S**2, UNMEASURED_M_S**2, 1e-4]), (len(ns), 1, 1)
+    )
     cov[0] = 1e-4 * np.eye(3)
     odometry = told(Dvl(ns, np.tile([0.3, 0.0, 0.0], (len(ns), 1)), cov))
     assert odometry.start_by(2**62) is None
@@ -239,7 +291,9 @@ def test_not_more_than_so_many_rows_wait():
     assert len(odometry._intake._confirmation.waiting_ns) == MOST_WAITING
 
 
-def after_gap(gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3) -> tuple[Dvl, int]:
+def after_gap(
+    gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3
+) -> tuple[Dvl, int]:
     """A log with a gap after 10 s, and its first row after that."""
     ns = stamps(HZ, 10.0 + gap_s + 5.0)
     ns = ns[(ns <= at(10.0)) | (ns > at(10.0 + gap_s))]
@@ -250,7 +304,10 @@ def after_gap(gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3) -
     return dvl(ns, velocity, 1e-4 * np.eye(3)), first
 
 
-@pytest.mark.parametrize("wrong", [{0: WRONG}, {1: WRONG}, {0: WRONG, 1: WRONG, 2: WRONG}, {0: [2.0, 1.0, 0.0]}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{0: WRONG}, {1: WRONG}, {0: WRONG, 1: WRONG, 2: WRONG}, {0: [2.0, 1.0, 0.0]}],
+)
 @pytest.mark.parametrize("gap_s", [10.0, 60.0])
 def test_wrong_rows_after_a_long_gap_are_refused_and_no_others(gap_s, wrong):
     rows, first = after_gap(gap_s, wrong)
@@ -265,7 +322,9 @@ def test_a_gap_lasts_until_its_end_is_confirmed_and_after_a_shorter_one_a_row_is
     assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first
     ended = told(rows.rows(slice(0, first + 2)))
     assert ended.rows()[3][first:].tolist() == [rows.stamps_ns[first + 1]]
-    assert [(row.stamp_ns, row.reason) for row in ended.refused] == [(rows.stamps_ns[first], Refusal.WAITED)]
+    assert [(row.stamp_ns, row.reason) for row in ended.refused] == [
+        (rows.stamps_ns[first], Refusal.WAITED)
+    ]
     rows, first = after_gap(LONG_NS / NS - 0.3, {})
     assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first + 1
 
@@ -277,25 +336,39 @@ def test_rows_of_few_beams_wait_with_the_first_whole_ones():
     cov[[0, 2]] += np.diag([0.0, UNMEASURED_M_S**2, UNMEASURED_M_S**2])
     odometry = told(Dvl(rows.stamps_ns, rows.velocity, cov))
     assert np.array_equal(odometry.rows()[3], rows.stamps_ns[1:])
-    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(rows.stamps_ns[0], Refusal.INCOMPLETE)]
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [
+        (rows.stamps_ns[0], Refusal.INCOMPLETE)
+    ]
 
 
-DEPTHS = Calibration(start=Start(position_m=(0.0, 0.0, -5.0)), depth=DepthCalibration(sigma_m=0.1))
+DEPTHS = Calibration(
+    start=Start(position_m=(0.0, 0.0, -5.0)), depth=DepthCalibration(sigma_m=0.1)
+)
 NOISE_M = np.sqrt(0.1**2 + 0.1**2 + UNSTATED_M**2)
 
 
-def depths(seconds: list[float], z_m: list[float], variance_m2: float = np.nan) -> Depth:
-    return Depth(np.array([at(s) for s in seconds]), np.array(z_m), np.full(len(z_m), variance_m2))
+def depths(
+    seconds: list[float], z_m: list[float], variance_m2: float = np.nan
+) -> Depth:
+    return Depth(
+        np.array([at(s) for s in seconds]),
+        np.array(z_m),
+        np.full(len(z_m), variance_m2),
+    )
 
 
-def used(seconds: list[float], z_m: list[float], calibration: Calibration = DEPTHS) -> list[int]:
+def used(
+    seconds: list[float], z_m: list[float], calibration: Calibration = DEPTHS
+) -> list[int]:
     """Rows that are used; the others are named, and the same whether they come at once or one by one."""
     rows, found = depths(seconds, z_m), []
     whole, single = Odometry(calibration), Odometry(calibration)
     for k in range(len(rows)):
         found += [k] * (single.used_depths(rows.rows(slice(k, k + 1))) is not None)
     kept = whole.used_depths(rows)
-    assert ([] if kept is None else kept.stamps_ns.tolist()) == rows.stamps_ns[found].tolist()
+    assert ([] if kept is None else kept.stamps_ns.tolist()) == rows.stamps_ns[
+        found
+    ].tolist()
     assert whole.refused == single.refused
     refused_ns = np.delete(rows.stamps_ns, found).tolist()
     assert [(row.sensor, row.stamp_ns, row.reason) for row in whole.refused] == [
@@ -337,7 +410,9 @@ def test_first_depths_far_from_the_start_are_used_when_enough_agree_unless_it_is
 def test_a_depth_that_hangs_stays_refused_and_the_first_right_ones_after_that_are_found_by_their_agreement():
     seconds = np.arange(1000.0)
     for calibration in (DEPTHS, UNSTATED):
-        assert used(seconds.tolist(), [-5.0] * 5 + [-900.0] * 5 + [-5.0] * 990, calibration)[4:6] == [4, 10]
+        assert used(
+            seconds.tolist(), [-5.0] * 5 + [-900.0] * 5 + [-5.0] * 990, calibration
+        )[4:6] == [4, 10]
     hangs = np.where(seconds < 900.0, -900.0, -25.0)
     hangs[:5] = -5.0
     assert used(seconds.tolist(), hangs.tolist()) == [*range(5), *range(902, 1000)]
@@ -358,12 +433,16 @@ def test_a_chain_of_wrong_depths_is_overruled_by_a_longer_one():
     for calibration in (DEPTHS, UNSTATED):
         assert used(seconds, [-5.0] * 8 + [-900.0] * 4, calibration) == [*range(8)]
         assert used(seconds, [-5.0, -900.0, -900.0] * 4, calibration) == [0, 3, 6, 9]
-    assert used([0.0, 1.0, 2.0, 10.0], [-100.0, -130.0, -130.0, -115.0], UNSTATED) == [3]
+    assert used([0.0, 1.0, 2.0, 10.0], [-100.0, -130.0, -130.0, -115.0], UNSTATED) == [
+        3
+    ]
 
 
 def test_depths_are_in_order_each_stamp_once_and_sound():
     odometry = Odometry(DEPTHS)
-    assert odometry.used_depths(depths([1.0, 1.0, 2.0], [-5.0, -6.0, -5.0])).z_m.tolist() == [-5.0, -5.0]
+    assert odometry.used_depths(
+        depths([1.0, 1.0, 2.0], [-5.0, -6.0, -5.0])
+    ).z_m.tolist() == [-5.0, -5.0]
     assert odometry.used_depths(depths([1.5], [-5.0])) is None
     assert odometry.used_depths(depths([3.0], [-5.0], 0.0)) is None
     assert odometry.used_depths(depths([4.0], [-5.0], np.inf)) is None

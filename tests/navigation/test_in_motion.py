@@ -8,7 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.errors import AlignmentError
 from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.measurements import Dvl, Floats, Imu
@@ -43,7 +48,9 @@ def calibration(
             accel_bias_sigma=accel_bias,
             mounting=Mounting(translation_m=tuple(IMU_AT), rpy_rad=imu_rpy),
         ),
-        dvl=DvlCalibration(velocity_sigma_m_s=(0.005, 0.005, 0.005), mounting=dvl or Mounting()),
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=(0.005, 0.005, 0.005), mounting=dvl or Mounting()
+        ),
         earth_rate_latitude_rad=latitude,
     )
 
@@ -56,21 +63,29 @@ COARSE = calibration(1e-3, 1e-3, 1e-3, 1e-2)
 """Gyros whose noise matters more than all else."""
 
 
-def exact_readings(t: Floats, known: Calibration, yaw: float, earth: float) -> tuple[Floats, Floats, Floats]:
+def exact_readings(
+    t: Floats, known: Calibration, yaw: float, earth: float
+) -> tuple[Floats, Floats, Floats]:
     """Rates, forces and velocities at the times of the IMU, in body axes, the last of the Doppler log's point."""
     body_R_world, rate = attitude(t, yaw).inv(), rate_at(t)
     world_rate = earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])
     coriolis = 2.0 * np.cross(world_rate, velocity_at(t))
     lever = IMU_AT - known.dvl.mounting.translation_m
     force = body_R_world.apply(acceleration_at(t) + coriolis + [0, 0, G])
-    return rate + body_R_world.apply(world_rate), force, body_R_world.apply(velocity_at(t)) - np.cross(rate, lever)
+    return (
+        rate + body_R_world.apply(world_rate),
+        force,
+        body_R_world.apply(velocity_at(t)) - np.cross(rate, lever),
+    )
 
 
 def run(rng, yaw=0.0, earth=0.0, noise=1.0, known=KNOWN) -> tuple[Imu, Dvl, np.ndarray]:
     """Readings, and what they should give: roll, pitch, gyro bias."""
     sensors, (rate, force, at_dvl) = known.imu, exact_readings(T, known, yaw, earth)
     gyro_bias, accel_bias = (
-        noise * np.array([[sensors.gyro_bias_sigma], [sensors.accel_bias_sigma]]) * (rng.standard_normal((2, 3)))
+        noise
+        * np.array([[sensors.gyro_bias_sigma], [sensors.accel_bias_sigma]])
+        * (rng.standard_normal((2, 3)))
     )
     white = noise * np.sqrt(HZ) * rng.standard_normal((2, len(T), 3))
     stamps_ns = np.round(T * 1e9).astype(np.int64)
@@ -82,7 +97,11 @@ def run(rng, yaw=0.0, earth=0.0, noise=1.0, known=KNOWN) -> tuple[Imu, Dvl, np.n
     at_dvl = at_dvl[::DVL_EVERY]
     at_dvl = at_dvl + noise * 0.005 * rng.standard_normal(at_dvl.shape)
     _, pitch, roll = attitude(np.zeros(1), yaw).as_euler("ZYX")[0]
-    return imu, dvl_rows(stamps_ns[::DVL_EVERY], at_dvl), np.array([roll, pitch, *gyro_bias])
+    return (
+        imu,
+        dvl_rows(stamps_ns[::DVL_EVERY], at_dvl),
+        np.array([roll, pitch, *gyro_bias]),
+    )
 
 
 def error_of(found: InitialTilt, truth: np.ndarray | float = 0.0) -> np.ndarray:
@@ -102,13 +121,18 @@ def squared_errors(known: Calibration, earth: float, runs: int) -> list[float]:
 
 def test_a_noiseless_run_gives_what_was_put_in():
     imu, dvl, truth = run(np.random.default_rng(0), noise=0.0)
-    assert error_of(align_in_motion(imu, dvl, KNOWN), truth) == pytest.approx(np.zeros(5), abs=2e-6)
+    assert error_of(align_in_motion(imu, dvl, KNOWN), truth) == pytest.approx(
+        np.zeros(5), abs=2e-6
+    )
 
 
 def test_large_biases_are_found_as_exactly_as_small_ones():
     """One step from nothing leaves what is not linear in them."""
     wide = {"gyro_bias_sigma": 0.5, "accel_bias_sigma": 1e-6}
-    known, bias = KNOWN.model_copy(update={"imu": KNOWN.imu.model_copy(update=wide)}), np.array([0.04, -0.03, 0.05])
+    known, bias = (
+        KNOWN.model_copy(update={"imu": KNOWN.imu.model_copy(update=wide)}),
+        np.array([0.04, -0.03, 0.05]),
+    )
     imu, dvl, truth = run(np.random.default_rng(0), noise=0.0)
     biased = replace(imu, angular_velocity=imu.angular_velocity + bias)
     error = error_of(align_in_motion(biased, dvl, known), truth + np.r_[0.0, 0.0, bias])
@@ -116,7 +140,10 @@ def test_large_biases_are_found_as_exactly_as_small_ones():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("known", "earth"), [(KNOWN, 0.0), (COARSE, 0.0), (WITH_EARTH, EARTH), (FIBRE, EARTH)])
+@pytest.mark.parametrize(
+    ("known", "earth"),
+    [(KNOWN, 0.0), (COARSE, 0.0), (WITH_EARTH, EARTH), (FIBRE, EARTH)],
+)
 def test_what_is_claimed_is_what_many_runs_err_by(known, earth):
     check_consistent(squared_errors(known, earth, 100), 5, confidence=0.999)
 
@@ -139,7 +166,8 @@ def test_a_bias_of_which_nothing_is_told_keeps_its_prior():
     sigma = np.sqrt(np.diag(found.covariance))
     assert found.bias_is_observed.tolist() == [True, True, False]
     assert sigma[4] == pytest.approx(1e-3, rel=1e-3)
-    assert sigma[:2] == pytest.approx([1e-2 / G] * 2, rel=0.05)  # the accelerometers' bias: it did not turn
+    # the accelerometers' bias: it did not turn
+    assert sigma[:2] == pytest.approx([1e-2 / G] * 2, rel=0.05)
 
 
 def test_ten_samples_over_two_seconds_are_enough():
@@ -156,7 +184,10 @@ def spoilt(dvl: Dvl, rows: np.ndarray) -> Dvl:
 
 
 def same(one: InitialTilt, other: InitialTilt) -> bool:
-    numbers = ([found.roll_rad, found.pitch_rad, *found.gyro_bias, *found.covariance.ravel()] for found in (one, other))
+    numbers = (
+        [found.roll_rad, found.pitch_rad, *found.gyro_bias, *found.covariance.ravel()]
+        for found in (one, other)
+    )
     return np.array_equal(*numbers)
 
 
@@ -172,14 +203,21 @@ def test_of_a_long_stretch_the_first_minute_counts():
 def test_rows_beside_the_imu_repeated_or_of_few_beams_do_not_count():
     imu, dvl = still(4.0)
     expected, k = align_in_motion(imu, dvl, KNOWN), len(dvl)
-    early, late = (dvl_rows(np.sort(np.r_[dvl.stamps_ns, stamp]), 0.0) for stamp in (-200_000_000, 4_200_000_000))
+    early, late = (
+        dvl_rows(np.sort(np.r_[dvl.stamps_ns, stamp]), 0.0)
+        for stamp in (-200_000_000, 4_200_000_000)
+    )
     twice = dvl.rows(np.sort(np.r_[np.arange(k), 7]))
     for more, row in ((early, 0), (twice, 8), (late, k)):
-        assert same(align_in_motion(imu, spoilt(more, np.arange(k + 1) == row), KNOWN), expected)
+        assert same(
+            align_in_motion(imu, spoilt(more, np.arange(k + 1) == row), KNOWN), expected
+        )
     cov = dvl.velocity_cov.copy()
     cov[7] = np.diag([1e-4, np.inf, np.inf])
     few_beams, without = replace(dvl, velocity_cov=cov), dvl.rows(np.arange(k) != 7)
-    assert same(align_in_motion(imu, few_beams, KNOWN), align_in_motion(imu, without, KNOWN))
+    assert same(
+        align_in_motion(imu, few_beams, KNOWN), align_in_motion(imu, without, KNOWN)
+    )
     imu, dvl, _ = run(np.random.default_rng(7))
     twice = imu.rows(np.sort(np.r_[np.arange(len(imu)), 300]))
     assert same(align_in_motion(twice, dvl, KNOWN), align_in_motion(imu, dvl, KNOWN))
@@ -201,16 +239,26 @@ def test_the_misfit_that_is_named_is_that_of_the_noise():
 @pytest.mark.recording
 def test_at_sea_it_finds_the_tilt_that_the_reference_has(unpacked):
     """A-KIT, eight stretches of each run, whose reference was moved in time to where it turns as the gyros do."""
-    folder, errors, inside = next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, [], 0
+    folder, errors, inside = (
+        next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent,
+        [],
+        0,
+    )
     for trajectory in range(1, 8):
         sea = read_akit(folder, trajectory)
         for row in range(20, 340, 40):
             at_ns = int(sea.truth.stamps_ns[row])
             span = (at_ns - 1, at_ns + 60 * 10**9)
-            found = align_in_motion(sea.imu.between(*span), sea.dvl.between(*span), sea.calibration)
-            _, pitch, roll = Rotation.from_quat(sea.truth.quaternions_xyzw[row]).as_euler("ZYX")
+            found = align_in_motion(
+                sea.imu.between(*span), sea.dvl.between(*span), sea.calibration
+            )
+            _, pitch, roll = Rotation.from_quat(
+                sea.truth.quaternions_xyzw[row]
+            ).as_euler("ZYX")
             errors.append(error_of(found, np.array([roll, pitch, 0, 0, 0]))[:2])
-            inside += errors[-1] @ np.linalg.solve(found.covariance[:2, :2], errors[-1]) < chi2.ppf(0.99, 2)
+            inside += errors[-1] @ np.linalg.solve(
+                found.covariance[:2, :2], errors[-1]
+            ) < chi2.ppf(0.99, 2)
     roll_deg, pitch_deg = np.degrees(np.sqrt(np.mean(np.square(errors), axis=0)))
     assert len(errors) == 56
     assert inside >= 45
@@ -222,13 +270,18 @@ def test_what_comes_after_a_hole_of_the_imu_is_not_used(monkeypatch):
     """2 s without a row of a turning vehicle: the same to the bit as rows that end there."""
     imu, dvl, truth = run(np.random.default_rng(3), noise=0.0)
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    holed, before = imu.rows((seconds <= 9.0) | (seconds >= 11.0)), imu.rows(seconds <= 9.0)
+    holed, before = (
+        imu.rows((seconds <= 9.0) | (seconds >= 11.0)),
+        imu.rows(seconds <= 9.0),
+    )
     found = align_in_motion(holed, dvl, KNOWN)
     assert same(found, align_in_motion(before, dvl, KNOWN))
     assert [found.roll_rad, found.pitch_rad] == pytest.approx(truth[:2], abs=1e-3)
     with pytest.raises(AlignmentError, match="Doppler samples beside the IMU"):
         align_in_motion(imu.rows((seconds <= 1.0) | (seconds >= 3.0)), dvl, KNOWN)
-    monkeypatch.setattr("sonar_graph.navigation.alignment.in_motion.row_after_hole", lambda *_: -1)
+    monkeypatch.setattr(
+        "sonar_graph.navigation.alignment.in_motion.row_after_hole", lambda *_: -1
+    )
     with pytest.raises(AlignmentError, match="differ"):
         align_in_motion(holed, dvl, KNOWN)
 
@@ -271,21 +324,38 @@ def error_spread(known: Calibration, earth: float) -> Floats:
     unmoved, share = found_from(*base, known), 0.1
 
     def spread(column: int, delta: Floats, truth: Floats | float = 0.0) -> Floats:
-        moved = [values + (share * delta if k == column else 0.0) for k, values in enumerate(base)]
-        error = (error_of(found_from(*moved, known)) - error_of(unmoved)) / share - truth
+        moved = [
+            values + (share * delta if k == column else 0.0)
+            for k, values in enumerate(base)
+        ]
+        error = (
+            error_of(found_from(*moved, known)) - error_of(unmoved)
+        ) / share - truth
         return np.outer(error, error)
 
     body_R_dvl = Rotation.from_euler("xyz", DVL_RPY).as_matrix()
     white = np.eye(3) * np.sqrt(SHORT_HZ)
-    roots = (sensors.gyro_noise_density * white, sensors.accel_noise_density * white, body_R_dvl @ ROOT)
+    roots = (
+        sensors.gyro_noise_density * white,
+        sensors.accel_noise_density * white,
+        body_R_dvl @ ROOT,
+    )
     total = np.zeros((5, 5))
     for column, root in enumerate(roots):
-        for row, direction in product(range(len(base[column])), root.T[root.any(axis=0)]):
-            total += spread(column, np.outer(np.arange(len(base[column])) == row, direction))
+        for row, direction in product(
+            range(len(base[column])), root.T[root.any(axis=0)]
+        ):
+            total += spread(
+                column, np.outer(np.arange(len(base[column])) == row, direction)
+            )
     level = earth * np.cos(LATITUDE) / np.sqrt(2)
     body_R_world, always = attitude(SHORT_T, YAW).inv(), np.ones((len(SHORT_T), 1))
     for axis in np.eye(3):
-        total += spread(0, sensors.gyro_bias_sigma * axis * always, np.r_[0, 0, sensors.gyro_bias_sigma * axis])
+        total += spread(
+            0,
+            sensors.gyro_bias_sigma * axis * always,
+            np.r_[0, 0, sensors.gyro_bias_sigma * axis],
+        )
         total += spread(1, sensors.accel_bias_sigma * axis * always)
         total += spread(0, body_R_world.apply(level * axis * [1, 1, 0]))
     return total
@@ -295,13 +365,20 @@ def error_spread(known: Calibration, earth: float) -> Floats:
     ("known", "earth", "tolerance"),
     [
         (calibration(1e-3, 1e-3, 0.0, 1e-5, **IN_PLACE), 0.0, 0.05),
-        (calibration(1e-3, 1e-3, 0.0, 1e-5, **APART), 0.0, 0.07),  # that a rate's noise also turns the path is left out
+        (
+            calibration(1e-3, 1e-3, 0.0, 1e-5, **APART),
+            0.0,
+            0.07,
+        ),  # that a rate's noise also turns the path is left out
         (calibration(0.0, 1e-2, 2e-3, 1e-2, **APART), 0.0, 0.003),
         (calibration(0.0, 1e-7, 0.0, 1e-5, LATITUDE, **APART), EARTH, 0.003),
     ],
     ids=["gyros in one place", "gyros at a lever", "accelerometers", "the Earth"],
 )
 def test_the_covariance_is_that_of_every_reading_and_bias(known, earth, tolerance):
-    truth, found = error_spread(known, earth), found_from(*short_readings(known, earth), known)
+    truth, found = (
+        error_spread(known, earth),
+        found_from(*short_readings(known, earth), known),
+    )
     size = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
     assert found.covariance / size == pytest.approx(truth / size, abs=tolerance)

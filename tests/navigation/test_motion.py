@@ -11,13 +11,41 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import Odometry
 
 from . import ways
-from .rows import NS, T0_NS, Steps, at, dead_reckoned, dense_covariance, dvl, imu, stamps, steps_of, waves
-from .ways import WAYS, Way, attitude, blinded, change_of, motion, moved_by, rows, spoilt, velocity_at
+from .rows import (
+    NS,
+    T0_NS,
+    Steps,
+    at,
+    dead_reckoned,
+    dense_covariance,
+    dvl,
+    imu,
+    stamps,
+    steps_of,
+    waves,
+)
+from .ways import (
+    WAYS,
+    Way,
+    attitude,
+    blinded,
+    change_of,
+    motion,
+    moved_by,
+    rows,
+    spoilt,
+    velocity_at,
+)
 
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
@@ -33,7 +61,9 @@ def same_pose(a: gtsam.Pose3, b: gtsam.Pose3, tolerance: float = 1e-10) -> bool:
 def sensors(interpolation: str = "linear", **options) -> Calibration:
     """Bold enough for any velocity, with a lever arm."""
     imu = ImuCalibration(gyro_noise_density=GYRO_DENSITY, **options)
-    dvl = DvlCalibration(velocity_walk_density=10.0, mounting=Mounting(translation_m=tuple(LEVER)))
+    dvl = DvlCalibration(
+        velocity_walk_density=10.0, mounting=Mounting(translation_m=tuple(LEVER))
+    )
     return Calibration(imu=imu, dvl=dvl, odometry_interpolation=interpolation)
 
 
@@ -41,41 +71,62 @@ def brisk(seed: int) -> tuple[Imu, Dvl]:
     """Stamps in no relation, each sample with its own covariance, none before the first velocity."""
     rng = np.random.default_rng(seed)
     quick = stamps(40, 2.5) + rng.integers(-5_000_000, 5_000_000, 101)
-    slow = T0_NS + np.sort(rng.choice(np.arange(20, 2300), 9, replace=False)) * 1_000_000
+    slow = (
+        T0_NS + np.sort(rng.choice(np.arange(20, 2300), 9, replace=False)) * 1_000_000
+    )
     root = 0.01 * rng.standard_normal((9, 3, 3))
     force = np.array([0.3, -0.2, 9.8]) + waves(quick, seed + 1, 1.0)
     velocity = np.array([0.5, 0.1, 0.0]) + waves(slow, seed + 2, 0.3)
-    return imu(quick, waves(quick, seed, 0.8), force), dvl(slow, velocity, root @ np.swapaxes(root, 1, 2))
+    return imu(quick, waves(quick, seed, 0.8), force), dvl(
+        slow, velocity, root @ np.swapaxes(root, 1, 2)
+    )
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold-past"])
 @given(seeds, st.lists(st.integers(0, 2400), min_size=3, max_size=3).map(sorted))
 @settings(max_examples=15)
-def test_motions_are_dead_reckoning_and_a_dense_recursion_over_steps_cut_by_hand(interpolation, seed, ends_ms):
+def test_motions_are_dead_reckoning_and_a_dense_recursion_over_steps_cut_by_hand(
+    interpolation, seed, ends_ms
+):
     """From the first velocity on, and from any instant to another by what is known at a third; one by one alike."""
     (inertial, log), gapless = brisk(seed % 2**31), {"gap_s": 10.0}
     calibration = sensors(interpolation)
-    odometry = Odometry(calibration.model_copy(update={"dvl": calibration.dvl.model_copy(update=gapless)}))
+    odometry = Odometry(
+        calibration.model_copy(
+            update={"dvl": calibration.dvl.model_copy(update=gapless)}
+        )
+    )
     odometry.add(inertial, log)
     first_ns = int(log.stamps_ns[0])
     start, end, known = (max(T0_NS + ms * 1_000_000, first_ns) for ms in ends_ms)
     known = max(known, odometry.reached_ns(first_ns))
-    intervals = np.array([(first_ns, int(log.stamps_ns[-1]), int(inertial.stamps_ns[-1])), (start, end, known)])
+    intervals = np.array(
+        [
+            (first_ns, int(log.stamps_ns[-1]), int(inertial.stamps_ns[-1])),
+            (start, end, known),
+        ]
+    )
     found = odometry.motions(*intervals.T.copy(), BIAS)
     for e, (begin_ns, end_ns, known_ns) in enumerate(intervals.tolist()):
-        steps = steps_of(inertial, log, begin_ns, end_ns, known_ns, interpolation == "hold-past")
+        steps = steps_of(
+            inertial, log, begin_ns, end_ns, known_ns, interpolation == "hold-past"
+        )
         expected, D = dense_covariance(steps, BIAS, LEVER, GYRO_DENSITY)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected))).max() + 1e-30
         poses = dead_reckoned(steps, BIAS, LEVER)
         turned = [
             p.rotation().matrix() @ exp_mean(dt * (w - BIAS)) @ f * dt
-            for p, dt, w, f in zip(poses, steps.duration_s, steps.rate, steps.force, strict=False)
+            for p, dt, w, f in zip(
+                poses, steps.duration_s, steps.rate, steps.force, strict=False
+            )
         ]
         assert same_pose(gtsam.Pose3(gtsam.Rot3(found.dR[e]), found.dp[e]), poses[-1])
         assert np.abs((found.C[e] - expected) / scale).max() < 1e-3
         assert np.array_equal(found.C[e], found.C[e].T)
         assert found.D[e] == pytest.approx(D, abs=1e-3 * np.abs(D).max() + 1e-15)
-        assert found.impulse[e] == pytest.approx(np.sum(turned, axis=0) if turned else np.zeros(3), abs=1e-9)
+        assert found.impulse[e] == pytest.approx(
+            np.sum(turned, axis=0) if turned else np.zeros(3), abs=1e-9
+        )
         one = odometry.motion(begin_ns, end_ns, BIAS, None, known_ns)
         assert same_pose(one.i_T_j, poses[-1])
         assert np.allclose(one.covariance, found.C[e], rtol=0, atol=1e-9 * scale)
@@ -85,15 +136,23 @@ def test_motions_are_dead_reckoning_and_a_dense_recursion_over_steps_cut_by_hand
 def exp_mean(phi: np.ndarray) -> np.ndarray:
     """Mean of Exp(s phi) over s in [0, 1], by quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(10)
-    return sum(w / 2 * gtsam.Rot3.Expmap((1 + s) / 2 * phi).matrix() for s, w in zip(nodes, weights, strict=True))
+    return sum(
+        w / 2 * gtsam.Rot3.Expmap((1 + s) / 2 * phi).matrix()
+        for s, w in zip(nodes, weights, strict=True)
+    )
 
 
 def test_a_held_twist_is_the_exact_planar_exponential():
     """Wheel odometry: v and w hold until their stamp; an arc of radius v / w."""
     v, w, seconds = 0.7, 1.3, 0.9
     ns = np.array([at(0.0), at(seconds)])
-    rows = imu(ns, [[9.0, 9.0, 9.0], [0.0, 0.0, w]]), dvl(ns, [[9.0, 9.0, 9.0], [v, 0.0, 0.0]])
-    found = motion(*rows, Calibration(odometry_interpolation="hold-past"), 0.0, seconds).i_T_j
+    rows = (
+        imu(ns, [[9.0, 9.0, 9.0], [0.0, 0.0, w]]),
+        dvl(ns, [[9.0, 9.0, 9.0], [v, 0.0, 0.0]]),
+    )
+    found = motion(
+        *rows, Calibration(odometry_interpolation="hold-past"), 0.0, seconds
+    ).i_T_j
     arc = [v / w * np.sin(w * seconds), v / w * (1 - np.cos(w * seconds)), 0.0]
     assert np.allclose(found.translation(), arc, atol=1e-12)
     assert found.rotation().yaw() == pytest.approx(w * seconds)
@@ -102,17 +161,27 @@ def test_a_held_twist_is_the_exact_planar_exponential():
 def displacement_error_m(interpolation: str, dvl_hz: float) -> float:
     """After 4 s of swaying, against steps of 0.5 ms."""
     fine, slow, quick = stamps(2000, 4.0), stamps(dvl_hz, 4.0), stamps(400, 4.0)
-    means, n = [0.5 * (w[1:] + w[:-1]) for w in (waves(fine, 1, 0.2), waves(fine, 2, 0.1))], len(fine) - 1
+    means, n = (
+        [0.5 * (w[1:] + w[:-1]) for w in (waves(fine, 1, 0.2), waves(fine, 2, 0.1))],
+        len(fine) - 1,
+    )
     exact = Steps(np.full(n, 5e-4), *means, np.zeros((n, 3, 3)), means[0])
     truth = dead_reckoned(exact, np.zeros(3), np.zeros(3))[-1]
     known = Calibration(odometry_interpolation=interpolation)
     rows = imu(quick, waves(quick, 1, 0.2)), dvl(slow, waves(slow, 2, 0.1))
-    return float(np.linalg.norm(motion(*rows, known, 0.0, 4.0).i_T_j.translation() - truth.translation()))
+    return float(
+        np.linalg.norm(
+            motion(*rows, known, 0.0, 4.0).i_T_j.translation() - truth.translation()
+        )
+    )
 
 
 def test_linear_interpolation_is_of_second_order_and_a_hold_of_first():
     """Twice as many velocities: a quarter of the error, where a hold halves it."""
-    linear, held = ([displacement_error_m(name, hz) for hz in (10, 20, 40)] for name in ("linear", "hold-past"))
+    linear, held = (
+        [displacement_error_m(name, hz) for hz in (10, 20, 40)]
+        for name in ("linear", "hold-past")
+    )
     assert all(3.3 < coarse / fine < 5.0 for coarse, fine in pairwise(linear))
     assert all(1.5 < coarse / fine < 2.6 for coarse, fine in pairwise(held))
     assert linear[0] < 0.2 * held[0]
@@ -120,7 +189,9 @@ def test_linear_interpolation_is_of_second_order_and_a_hold_of_first():
 
 def test_an_unmeasured_force_does_not_touch_the_motion():
     imu, dvl = rows()
-    measured, unmeasured = (moved_by(WAYS["linear"], one, dvl, BIAS) for one in (imu, blinded(imu)))
+    measured, unmeasured = (
+        moved_by(WAYS["linear"], one, dvl, BIAS) for one in (imu, blinded(imu))
+    )
     assert same_pose(measured.i_T_j, unmeasured.i_T_j, 1e-15)
     assert np.array_equal(measured.covariance, unmeasured.covariance)
     assert np.isnan(unmeasured.mean_specific_force).all()
@@ -132,11 +203,18 @@ def test_the_bias_derivative_and_correction_are_those_of_integrating_again(way):
     """To first order; uncorrected, or corrected with the opposite sign, the motion is far off."""
     imu, dvl = rows()
     base, step, change = moved_by(way, imu, dvl), 1e-6, np.array([4e-4, -3e-4, 5e-4])
-    J = [change_of(base, moved_by(way, *spoilt(imu, dvl, "rate", -step * axis))) / step for axis in np.eye(3)]
-    assert base.D_bias == pytest.approx(np.transpose(J), rel=1e-3, abs=max(0.02, 1e-3 * np.abs(J).max()))
+    J = [
+        change_of(base, moved_by(way, *spoilt(imu, dvl, "rate", -step * axis))) / step
+        for axis in np.eye(3)
+    ]
+    assert base.D_bias == pytest.approx(
+        np.transpose(J), rel=1e-3, abs=max(0.02, 1e-3 * np.abs(J).max())
+    )
     again = moved_by(way, imu, dvl, change).i_T_j
     poses = (base.corrected(change), base.i_T_j, base.corrected(-change))
-    corrected, uncorrected, opposite = (np.abs(gtsam.Pose3.Logmap(pose.between(again))).max() for pose in poses)
+    corrected, uncorrected, opposite = (
+        np.abs(gtsam.Pose3.Logmap(pose.between(again))).max() for pose in poses
+    )
     assert corrected < 0.01 * uncorrected < 0.006 * opposite
     assert same_pose(base.corrected(base.bias), base.i_T_j)
 
@@ -160,9 +238,18 @@ def test_earths_rotation_is_removed_as_if_it_stood_still(way):
     """Exaggerated twentyfold, and known in the frame of the first node."""
     imu, dvl = rows()
     world_earth = np.array([0.0, 1e-3, 8e-4])
-    felt = spoilt(imu, dvl, "rate", attitude((imu.stamps_ns - T0_NS) * 1e-9).inv().apply(world_earth))
+    felt = spoilt(
+        imu,
+        dvl,
+        "rate",
+        attitude((imu.stamps_ns - T0_NS) * 1e-9).inv().apply(world_earth),
+    )
     earth = attitude(np.array([way.start_s])).inv().apply(world_earth)[0]
-    still, found, left_in = moved_by(way, imu, dvl), moved_by(way, *felt, earth=earth), moved_by(way, *felt)
+    still, found, left_in = (
+        moved_by(way, imu, dvl),
+        moved_by(way, *felt, earth=earth),
+        moved_by(way, *felt),
+    )
     assert found.i_T_j.equals(still.i_T_j, 8e-3 if way.until_s == ways.OPEN_S else 2e-3)
     assert found.i_T_j.rotation().equals(still.i_T_j.rotation(), 4e-4)
     assert not left_in.i_T_j.rotation().equals(still.i_T_j.rotation(), 1e-3)
@@ -173,9 +260,15 @@ def test_rows_stamped_later_than_the_covering_one_change_nothing(way):
     imu, dvl = rows()
     is_open = way.until_s == ways.OPEN_S
     way = way._replace(until_s=way.until_s + 0.03 * is_open)
-    noise = {"velocity_sigma_m_s": ways.SIGMA_M_S, "imu": {"gyro_noise_density": 1e-3, "accel_noise_density": 1e-2}}
+    noise = {
+        "velocity_sigma_m_s": ways.SIGMA_M_S,
+        "imu": {"gyro_noise_density": 1e-3, "accel_noise_density": 1e-2},
+    }
     part = imu.between(-1, at(way.until_s) + (0 if is_open else NS // 10))
-    whole, cut = moved_by(way, imu, dvl, known=noise), moved_by(way, part, dvl.between(0, at(way.until_s)), known=noise)
+    whole, cut = (
+        moved_by(way, imu, dvl, known=noise),
+        moved_by(way, part, dvl.between(0, at(way.until_s)), known=noise),
+    )
     assert np.array_equal(whole.i_T_j.matrix(), cut.i_T_j.matrix())
     assert np.array_equal(whole.covariance, cut.covariance)
 
@@ -186,10 +279,14 @@ def test_the_motion_is_that_of_the_vehicle(name):
     seconds = np.linspace(way.start_s, way.until_s, 20001)
     track = np.trapezoid(velocity_at(seconds), seconds, axis=0)
     start, end = attitude(np.array([way.start_s, way.until_s]))
-    truth = start.inv().apply(track - (end.apply(ways.BODY_P_IMU) - start.apply(ways.BODY_P_IMU)))
+    truth = start.inv().apply(
+        track - (end.apply(ways.BODY_P_IMU) - start.apply(ways.BODY_P_IMU))
+    )
     found = moved_by(way, *rows())
     assert found.i_T_j.translation() == pytest.approx(truth, abs=0.03)
-    assert found.i_T_j.rotation().matrix() == pytest.approx((start.inv() * end).as_matrix(), abs=2e-3)
+    assert found.i_T_j.rotation().matrix() == pytest.approx(
+        (start.inv() * end).as_matrix(), abs=2e-3
+    )
 
 
 ONE_PLACE = {"body_p_imu": ways.BODY_P_DVL}
@@ -200,31 +297,77 @@ ISOTROPIC = {"velocity_sigma_m_s": (0.01, 0.01, 0.01)}
     ("way", "column", "sensors", "measured", "tolerance"),
     [
         (WAYS["linear"], "rate", ONE_PLACE, {"lever": np.zeros(3)}, 0.03),
-        (WAYS["linear"], "velocity", {}, {}, 0.1),  # of few rows, the ends as if whole: 1 / (2 n) too large
+        (
+            WAYS["linear"],
+            "velocity",
+            {},
+            {},
+            0.1,
+        ),  # of few rows, the ends as if whole: 1 / (2 n) too large
         (WAYS["held"], "velocity", {}, {}, 0.002),
         # IMU and Doppler log in one place: how noise of single rates acts on the lever between them is left out.
         (WAYS["closed gap"], "rate", ONE_PLACE, {"lever": np.zeros(3)}, 0.02),
-        (WAYS["open gap"], "rate", ONE_PLACE, {"lever": np.zeros(3), "dvl_hz": 10.0}, 0.03),
+        (
+            WAYS["open gap"],
+            "rate",
+            ONE_PLACE,
+            {"lever": np.zeros(3), "dvl_hz": 10.0},
+            0.03,
+        ),
         (WAYS["closed gap"], "force", {}, {}, 0.04),
         (WAYS["open gap"], "force", {}, {"dvl_hz": 10.0}, 0.03),
         (WAYS["open gap"], "velocity", ISOTROPIC, {}, 1e-6),
         (WAYS["open walk"], "velocity", ISOTROPIC, {}, 0.15),
-        (Way(5.0, 12.0), "velocity", {}, {}, 0.02),  # what the gap's ends share with their neighbours included
+        (
+            Way(5.0, 12.0),
+            "velocity",
+            {},
+            {},
+            0.02,
+        ),  # what the gap's ends share with their neighbours included
         (Way(5.0, 12.0, is_blind=True), "velocity", {}, {}, 0.08),
-        (Way(5.0, 11.5), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 7.0, 9.0, 11.5)}, 0.02),
-        (Way(5.0, 12.0), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 11.0, 12.0)}, 0.02),
-        (Way(5.0, 11.5), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 5.5, 8.0, 8.5, 11.5)}, 0.15),
+        (
+            Way(5.0, 11.5),
+            "velocity",
+            {"gap_s": 0.9},
+            {"pings_s": (5.0, 7.0, 9.0, 11.5)},
+            0.02,
+        ),
+        (
+            Way(5.0, 12.0),
+            "velocity",
+            {"gap_s": 0.9},
+            {"pings_s": (5.0, 11.0, 12.0)},
+            0.02,
+        ),
+        (
+            Way(5.0, 11.5),
+            "velocity",
+            {"gap_s": 0.9},
+            {"pings_s": (5.0, 5.5, 8.0, 8.5, 11.5)},
+            0.15,
+        ),
     ],
 )
-def test_noise_spreads_as_noise_of_every_sample_does(way, column, sensors, measured, tolerance):
+def test_noise_spreads_as_noise_of_every_sample_does(
+    way, column, sensors, measured, tolerance
+):
     """``J Q J^T`` of white noise of every number of a column, J by differences; of pings alone too.
 
     What gaps that follow each other share counts once; intervals of samples at their ends count as if they went on.
     """
     imu, dvl = rows(**measured)
     sigma, values, noise = {
-        "rate": ([1e-3 * np.sqrt(ways.IMU_HZ)] * 3, imu.angular_velocity, {"imu": {"gyro_noise_density": 1e-3}}),
-        "force": ([1e-2 * np.sqrt(ways.IMU_HZ)] * 3, imu.specific_force, {"imu": {"accel_noise_density": 1e-2}}),
+        "rate": (
+            [1e-3 * np.sqrt(ways.IMU_HZ)] * 3,
+            imu.angular_velocity,
+            {"imu": {"gyro_noise_density": 1e-3}},
+        ),
+        "force": (
+            [1e-2 * np.sqrt(ways.IMU_HZ)] * 3,
+            imu.specific_force,
+            {"imu": {"accel_noise_density": 1e-2}},
+        ),
         "velocity": (
             sensors.get("velocity_sigma_m_s", ways.SIGMA_M_S),
             dvl.velocity,
@@ -236,11 +379,18 @@ def test_noise_spreads_as_noise_of_every_sample_does(way, column, sensors, measu
     for row, axis in np.ndindex(values.shape):
         delta = np.zeros_like(values)
         delta[row, axis] = step
-        j = change_of(base, moved_by(way, *spoilt(imu, dvl, column, delta), known=known)) / step
+        j = (
+            change_of(
+                base, moved_by(way, *spoilt(imu, dvl, column, delta), known=known)
+            )
+            / step
+        )
         truth += np.outer(j, j) * sigma[axis] ** 2
     deviation = np.sqrt(np.diag(truth))
     used = deviation > 1e-6
-    off = (base.covariance - truth)[np.ix_(used, used)] / np.outer(deviation[used], deviation[used])
+    off = (base.covariance - truth)[np.ix_(used, used)] / np.outer(
+        deviation[used], deviation[used]
+    )
     assert np.abs(off).max() < tolerance
 
 
@@ -248,5 +398,10 @@ def test_noise_spreads_as_noise_of_every_sample_does(way, column, sensors, measu
 def test_an_unknown_accelerometer_bias_spreads_as_moving_all_forces_does(name):
     (imu, dvl), way, step = rows(), WAYS[name], 1e-4
     base = moved_by(way, imu, dvl, known={"imu": {"accel_bias_sigma": 0.02}})
-    J = [change_of(base, moved_by(way, *spoilt(imu, dvl, "force", step * a)))[3:] / step for a in np.eye(3)]
-    assert base.covariance[3:, 3:] == pytest.approx(0.02**2 * np.transpose(J) @ J, rel=2e-3, abs=1e-8)
+    J = [
+        change_of(base, moved_by(way, *spoilt(imu, dvl, "force", step * a)))[3:] / step
+        for a in np.eye(3)
+    ]
+    assert base.covariance[3:, 3:] == pytest.approx(
+        0.02**2 * np.transpose(J) @ J, rel=2e-3, abs=1e-8
+    )

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
-from sonar_graph.calibration import ROWS_BEFORE, Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    ROWS_BEFORE,
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
@@ -29,15 +35,25 @@ HELD = Calibration(odometry_interpolation="hold-past")
 
 
 def recorded(
-    imu_hz: float = 50, dvl_hz: float = 7, dvl_offset_s: float = 0.013, seconds: float = SECONDS
+    imu_hz: float = 50,
+    dvl_hz: float = 7,
+    dvl_offset_s: float = 0.013,
+    seconds: float = SECONDS,
 ) -> tuple[Imu, Dvl]:
-    imu_ns, dvl_ns = stamps(imu_hz, seconds), stamps(dvl_hz, seconds - 0.5, dvl_offset_s)
+    imu_ns, dvl_ns = (
+        stamps(imu_hz, seconds),
+        stamps(dvl_hz, seconds - 0.5, dvl_offset_s),
+    )
     rng = np.random.default_rng(0)
     cov = 1e-4 * (1 + rng.random((len(dvl_ns), 1, 1))) * np.eye(3)
-    return imu(imu_ns, waves(imu_ns, 1, 0.5), waves(imu_ns, 3, 1.0)), dvl(dvl_ns, waves(dvl_ns, 2, 0.3), cov)
+    return imu(imu_ns, waves(imu_ns, 1, 0.5), waves(imu_ns, 3, 1.0)), dvl(
+        dvl_ns, waves(dvl_ns, 2, 0.3), cov
+    )
 
 
-def odometry_of(imu_rows: Imu | None, dvl_rows: Dvl | None, calibration: Calibration | None = None) -> Odometry:
+def odometry_of(
+    imu_rows: Imu | None, dvl_rows: Dvl | None, calibration: Calibration | None = None
+) -> Odometry:
     odometry = Odometry(calibration or Calibration())
     odometry.add(imu_rows, dvl_rows)
     return odometry
@@ -47,7 +63,8 @@ def same(one: PreintegratedMotion, other: PreintegratedMotion) -> bool:
     """To the last bit."""
     columns = ("covariance", "D_bias", "bias", "duration_s", "mean_specific_force")
     return one.i_T_j.equals(other.i_T_j, 0.0) and all(
-        np.array_equal(getattr(one, c), getattr(other, c), equal_nan=True) for c in columns
+        np.array_equal(getattr(one, c), getattr(other, c), equal_nan=True)
+        for c in columns
     )
 
 
@@ -58,7 +75,9 @@ def assert_same(one: PreintegratedMotion, other: PreintegratedMotion) -> None:
     assert np.abs(one.covariance - other.covariance).max() <= 1e-9 * scale.max()
     assert np.allclose(one.D_bias, other.D_bias, rtol=0, atol=1e-12)
     assert one.duration_s == pytest.approx(other.duration_s, abs=1e-12)
-    assert np.allclose(one.mean_specific_force, other.mean_specific_force, equal_nan=True, atol=1e-12)
+    assert np.allclose(
+        one.mean_specific_force, other.mean_specific_force, equal_nan=True, atol=1e-12
+    )
 
 
 @given(
@@ -66,13 +85,18 @@ def assert_same(one: PreintegratedMotion, other: PreintegratedMotion) -> None:
     st.just(list(range(9))) | st.permutations(range(9)),
 )
 @settings(max_examples=60)
-def test_motion_does_not_depend_on_how_rows_are_cut_into_blocks_and_in_what_order_they_come(cuts, order):
+def test_motion_does_not_depend_on_how_rows_are_cut_into_blocks_and_in_what_order_they_come(
+    cuts, order
+):
     imu_rows, dvl_rows = recorded()
     agile = Calibration(dvl=DvlCalibration(velocity_walk_density=2.0))
     whole, pieces = odometry_of(imu_rows, dvl_rows, agile), Odometry(agile)
     edges = [0, *(T0_NS + cut for cut in cuts), T0_NS + 10 * NS]
     for k in order:
-        pieces.add(imu_rows.between(edges[k], edges[k + 1]), dvl_rows.between(edges[k], edges[k + 1]))
+        pieces.add(
+            imu_rows.between(edges[k], edges[k + 1]),
+            dvl_rows.between(edges[k], edges[k + 1]),
+        )
     epochs = whole.epochs(T0_NS, T0_NS + 10 * NS)
     first, last = (int(epochs[k]) for k in (0, -1))
     assert not pieces.refused
@@ -91,10 +115,15 @@ def test_later_rows_change_nothing(offset_ns):
     epochs = everything.epochs(T0_NS, until_ns).tolist()
     assert epochs == so_far.epochs(T0_NS, until_ns).tolist()
     for start_ns in [*epochs, epochs[0] + 1_000_000]:
-        here, there = (odometry.motion(start_ns, until_ns, BIAS) for odometry in (everything, so_far))
+        here, there = (
+            odometry.motion(start_ns, until_ns, BIAS)
+            for odometry in (everything, so_far)
+        )
         assert same(here, there)
         intervals = (np.array([start_ns]), np.array([until_ns]), np.array([until_ns]))
-        for column, other in zip(*(o.motions(*intervals, BIAS) for o in (everything, so_far)), strict=True):
+        for column, other in zip(
+            *(o.motions(*intervals, BIAS) for o in (everything, so_far)), strict=True
+        ):
             assert np.array_equal(column, other)
 
 
@@ -103,10 +132,16 @@ def test_velocity_at_an_epoch_is_that_of_the_imus_point_of_a_rigid_body():
     imu_rows, dvl_rows = recorded()
     arm = np.array([0.5, -0.1, 0.3])
     known = Calibration(imu=ImuCalibration(mounting=Mounting(translation_m=tuple(arm))))
-    velocity, variance = odometry_of(imu_rows, dvl_rows, known).velocity_at_imu(int(dvl_rows.stamps_ns[5]))
+    velocity, variance = odometry_of(imu_rows, dvl_rows, known).velocity_at_imu(
+        int(dvl_rows.stamps_ns[5])
+    )
     t = (np.r_[imu_rows.stamps_ns, dvl_rows.stamps_ns[5]] - T0_NS) * 1e-9
-    rate = np.array([np.interp(t[-1], t[:-1], column) for column in imu_rows.angular_velocity.T])
-    moved = gtsam.Pose3.Expmap(1e-6 * np.concatenate([rate, dvl_rows.velocity[5]])).transformFrom(arm)
+    rate = np.array(
+        [np.interp(t[-1], t[:-1], column) for column in imu_rows.angular_velocity.T]
+    )
+    moved = gtsam.Pose3.Expmap(
+        1e-6 * np.concatenate([rate, dvl_rows.velocity[5]])
+    ).transformFrom(arm)
     assert velocity == pytest.approx((moved - arm) / 1e-6, abs=1e-5)
     assert variance == pytest.approx(np.trace(dvl_rows.velocity_cov[5]) / 3.0)
     with pytest.raises(MeasurementError, match=rf"epoch_ns: {at(0.25)} is none of the"):
@@ -114,17 +149,36 @@ def test_velocity_at_an_epoch_is_that_of_the_imus_point_of_a_rigid_body():
 
 
 def test_a_node_is_reached_only_when_an_imu_row_covers_it():
-    imu_ns, dvl_ns = T0_NS + np.array([0, 100, 200]), T0_NS + np.array([-50, 0, 50, 150, 250])
+    imu_ns, dvl_ns = (
+        T0_NS + np.array([0, 100, 200]),
+        T0_NS + np.array([-50, 0, 50, 150, 250]),
+    )
     odometry = odometry_of(imu(imu_ns, 0.0), dvl(dvl_ns, 0.0))
-    reached = [(odometry.epochs(0, T0_NS + until) - T0_NS).tolist() for until in (-1, 0, 99, 100, 160, 200, 300)]
-    assert reached == [[], [-50, 0], [-50, 0], [-50, 0, 50], [-50, 0, 50], [-50, 0, 50, 150], [-50, 0, 50, 150]]
+    reached = [
+        (odometry.epochs(0, T0_NS + until) - T0_NS).tolist()
+        for until in (-1, 0, 99, 100, 160, 200, 300)
+    ]
+    assert reached == [
+        [],
+        [-50, 0],
+        [-50, 0],
+        [-50, 0, 50],
+        [-50, 0, 50],
+        [-50, 0, 50, 150],
+        [-50, 0, 50, 150],
+    ]
     assert odometry.start_by(T0_NS) == T0_NS
     assert (odometry.epochs(T0_NS + 50, T0_NS + 300) - T0_NS).tolist() == [150]
 
 
 @pytest.mark.parametrize(
     ("imu_s", "dvl_s", "start_ns"),
-    [(0.0, 1.05, None), (5.0, 0.0, None), (0.0, -0.33, T0_NS + 70_000_000), (0.0, 1.0, T0_NS + NS)],
+    [
+        (0.0, 1.05, None),
+        (5.0, 0.0, None),
+        (0.0, -0.33, T0_NS + 70_000_000),
+        (0.0, 1.0, T0_NS + NS),
+    ],
 )
 def test_there_is_no_start_before_imu_rows_cover_a_node(imu_s, dvl_s, start_ns):
     imu_rows, dvl_rows = imu(stamps(10, 1, imu_s), 0.0), dvl(stamps(10, 1, dvl_s), 0.0)
@@ -143,46 +197,89 @@ def test_forgetting_changes_nothing_afterwards(calibration):
     for k, epoch_ns in enumerate(epochs[1:-1], 1):
         forgetful.forget_before(epoch_ns)
         for until_ns in (epochs[k + 1], epoch_ns + 10_000_000):
-            assert same(forgetful.motion(epoch_ns, until_ns, BIAS), full.motion(epoch_ns, until_ns, BIAS))
-        for mine, theirs in zip(forgetful.velocity_at_imu(epoch_ns), full.velocity_at_imu(epoch_ns), strict=True):
+            assert same(
+                forgetful.motion(epoch_ns, until_ns, BIAS),
+                full.motion(epoch_ns, until_ns, BIAS),
+            )
+        for mine, theirs in zip(
+            forgetful.velocity_at_imu(epoch_ns),
+            full.velocity_at_imu(epoch_ns),
+            strict=True,
+        ):
             assert np.array_equal(mine, theirs)
-        assert np.array_equal(forgetful.epochs(epoch_ns, T0_NS + 20 * NS), epochs[k + 1 :])
+        assert np.array_equal(
+            forgetful.epochs(epoch_ns, T0_NS + 20 * NS), epochs[k + 1 :]
+        )
     with pytest.raises(MeasurementError, match="lies before the rows"):
         forgetful.motion(epochs[0], epochs[-1], BIAS)
 
 
-@given(st.lists(st.floats(0.05, 0.4), min_size=3, max_size=30), st.integers(0, 2**32 - 1))
+@given(
+    st.lists(st.floats(0.05, 0.4), min_size=3, max_size=30), st.integers(0, 2**32 - 1)
+)
 @settings(max_examples=30)
-def test_a_chain_has_the_variance_of_its_doppler_samples_wherever_the_imu_cuts(intervals_s, seed):
+def test_a_chain_has_the_variance_of_its_doppler_samples_wherever_the_imu_cuts(
+    intervals_s, seed
+):
     """A sample's weight is half its two intervals, a and b: it adds ((a + b) / 2)^2 of its variance.
 
     Splitting it into halves adds (a^2 + b^2) / 2 instead: more by ((a - b) / 2)^2, and by (a / 2)^2 at either end.
     """
-    at = T0_NS + np.concatenate([[0], np.cumsum(np.round(np.array(intervals_s) * NS))]).astype(np.int64)
+    at = T0_NS + np.concatenate(
+        [[0], np.cumsum(np.round(np.array(intervals_s) * NS))]
+    ).astype(np.int64)
     variance = 1e-4 * (0.5 + np.random.default_rng(seed).random(len(at)))
     a, b = np.concatenate([[0], intervals_s]), np.concatenate([intervals_s, [0]])
-    true, excess = np.sum(((a + b) / 2) ** 2 * variance), np.sum(((a - b) / 2) ** 2 * variance)
+    true, excess = (
+        np.sum(((a + b) / 2) ** 2 * variance),
+        np.sum(((a - b) / 2) ** 2 * variance),
+    )
     for imu_ns in (at, stamps(97, 13.0, -0.01)):
-        odometry = odometry_of(imu(imu_ns, 0.0), dvl(at, 0.0, variance[:, None, None] * np.eye(3)))
-        along_x = sum(odometry.motion(int(i), int(j), ZERO).covariance[3, 3] for i, j in pairwise(at))
+        odometry = odometry_of(
+            imu(imu_ns, 0.0), dvl(at, 0.0, variance[:, None, None] * np.eye(3))
+        )
+        along_x = sum(
+            odometry.motion(int(i), int(j), ZERO).covariance[3, 3]
+            for i, j in pairwise(at)
+        )
         assert along_x == pytest.approx(true + excess, rel=1e-6)
 
 
 def test_what_bounds_no_motion_is_named():
-    odometry = odometry_of(imu(stamps(50, 1.35, 0.15), 0.0), dvl(stamps(10, 2.0), [0.5, 0, 0]))
+    odometry = odometry_of(
+        imu(stamps(50, 1.35, 0.15), 0.0), dvl(stamps(10, 2.0), [0.5, 0, 0])
+    )
     for (start_s, end_s), message in (
         ((1.0, 0.2), "before its start"),
-        ((0.14, 1.0), rf"start_ns: {at(0.14)} lies before the rows; begin at {at(0.15)} or later"),
+        (
+            (0.14, 1.0),
+            rf"start_ns: {at(0.14)} lies before the rows; begin at {at(0.15)} or later",
+        ),
     ):
         with pytest.raises(MeasurementError, match=message):
             odometry.motion(at(start_s), at(end_s), ZERO)
-    with pytest.raises(MeasurementError, match="end_ns: expected integer nanoseconds, not "):
+    with pytest.raises(
+        MeasurementError, match="end_ns: expected integer nanoseconds, not "
+    ):
         odometry.motion(at(0.2), float(at(1.0)), ZERO)
-    for bias, message in ((np.zeros(6), r"expected shape \(3,\), not \(6,\)"), ([0, np.nan, 0], "expected finite")):
+    for bias, message in (
+        (np.zeros(6), r"expected shape \(3,\), not \(6,\)"),
+        ([0, np.nan, 0], "expected finite"),
+    ):
         with pytest.raises(MeasurementError, match=f"bias: {message}"):
             odometry.motion(at(0.2), at(1.0), bias)
-    for start_s, end_s in ((0.2, 0.3), (0.2, 0.2), (0.2, 0.25), (0.42, 1.0), (0.15, 0.2), (1.0, 1.0), (1.0, 1.4)):
-        assert odometry.motion(at(start_s), at(end_s), ZERO).duration_s == pytest.approx(end_s - start_s)
+    for start_s, end_s in (
+        (0.2, 0.3),
+        (0.2, 0.2),
+        (0.2, 0.25),
+        (0.42, 1.0),
+        (0.15, 0.2),
+        (1.0, 1.0),
+        (1.0, 1.4),
+    ):
+        assert odometry.motion(
+            at(start_s), at(end_s), ZERO
+        ).duration_s == pytest.approx(end_s - start_s)
 
 
 def test_rows_that_are_missing_or_of_another_kind_are_named():
@@ -195,20 +292,33 @@ def test_rows_that_are_missing_or_of_another_kind_are_named():
         with pytest.raises(MeasurementError, match=message):
             Odometry(Calibration()).add(*blocks)
     for blocks in ((None, None), (imu_rows, None), (None, dvl_rows)):
-        with pytest.raises(MeasurementError, match="needs rows of IMU and Doppler log; add them first"):
+        with pytest.raises(
+            MeasurementError, match="needs rows of IMU and Doppler log; add them first"
+        ):
             odometry_of(*blocks).motion(1, 2, ZERO)
 
 
-@pytest.mark.parametrize(("calibration", "kept_s"), [(HELD, 0.0), (Calibration(), 5.0)], ids=["held", "linear"])
-def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration, kept_s):
+@pytest.mark.parametrize(
+    ("calibration", "kept_s"),
+    [(HELD, 0.0), (Calibration(), 5.0)],
+    ids=["held", "linear"],
+)
+def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(
+    calibration, kept_s
+):
     """A gap that opens later is bridged by a line through the five seconds before it; held velocities need one row.
 
     What counts as a hole of the IMU is told from some rows more.
     """
-    odometry = odometry_of(imu(stamps(10, 20.0), 0.0), dvl(stamps(2, 20.0), 0.0), calibration)
+    odometry = odometry_of(
+        imu(stamps(10, 20.0), 0.0), dvl(stamps(2, 20.0), 0.0), calibration
+    )
     odometry.forget_before(at(15.0))
     rows = odometry.rows()
-    for stamps_ns, earliest_s in ((rows.imu_ns, 15.0 - ROWS_BEFORE / 10), (rows.dvl_ns, 14.5)):
+    for stamps_ns, earliest_s in (
+        (rows.imu_ns, 15.0 - ROWS_BEFORE / 10),
+        (rows.dvl_ns, 14.5),
+    ):
         assert at(earliest_s - kept_s - 0.1) <= stamps_ns[0] <= at(15.0 - kept_s)
         assert stamps_ns[-1] == at(20.0)
 
@@ -216,9 +326,15 @@ def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration,
 def test_a_row_at_the_very_instant_is_used_and_none_after_it():
     """Rates are linear from 10 on and held after the newest row; so are velocities from 0.1 on."""
     quick, slow = stamps(10, 3.0), stamps(2, 3.0)
-    rate, velocity = (np.outer((t - T0_NS) / (NS / 10), [0, 0, 1.0]) for t in (quick, slow))
+    rate, velocity = (
+        np.outer((t - T0_NS) / (NS / 10), [0, 0, 1.0]) for t in (quick, slow)
+    )
     odometry = odometry_of(imu(quick, rate), dvl(slow, 0.01 * velocity))
-    for until_s, turn, way in ((1.2, 2.2, 0.02), (1.25, 2.2 + 0.6, 0.025), (1.5, 6.25, 0.0625)):
+    for until_s, turn, way in (
+        (1.2, 2.2, 0.02),
+        (1.25, 2.2 + 0.6, 0.025),
+        (1.5, 6.25, 0.0625),
+    ):
         found = odometry.motion(at(1.0), at(until_s), ZERO).i_T_j
         assert np.exp(1j * found.rotation().yaw()) == pytest.approx(np.exp(1j * turn))
         assert found.translation()[2] == pytest.approx(way)
@@ -228,15 +344,32 @@ def test_a_gap_is_longer_than_the_calibration_says():
     """Between nodes that follow each other; held samples leave none."""
     calibration = Calibration(dvl=DvlCalibration(gap_s=0.5))
     assert longest_interval_ns(calibration) == NS // 2
-    rows = imu(stamps(10, 5.0), 0.0), dvl(T0_NS + np.array([0, 500, 1001, 1501, 4000]) * 1_000_000, 0.0)
-    odometry, held = (odometry_of(*rows, c) for c in (calibration, HELD.model_copy(update={"dvl": calibration.dvl})))
+    rows = (
+        imu(stamps(10, 5.0), 0.0),
+        dvl(T0_NS + np.array([0, 500, 1001, 1501, 4000]) * 1_000_000, 0.0),
+    )
+    odometry, held = (
+        odometry_of(*rows, c)
+        for c in (calibration, HELD.model_copy(update={"dvl": calibration.dvl}))
+    )
     assert not odometry.is_gap(at(0.0), at(0.5))
     assert odometry.is_gap(at(0.0), at(0.5) + 1)
     assert not held.is_gap(at(0.0), at(1e6))
-    ends_s = [(0.0, 0.5), (0.5, 1.001), (1.001, 1.501), (1.501, 4.0), (0.0, 1.501), (1.501, 2.0), (1.501, 2.1)]
+    ends_s = [
+        (0.0, 0.5),
+        (0.5, 1.001),
+        (1.001, 1.501),
+        (1.501, 4.0),
+        (0.0, 1.501),
+        (1.501, 2.0),
+        (1.501, 2.1),
+    ]
     starts, ends = (np.array([at(s[k]) for s in ends_s]) for k in (0, 1))
     is_gap = [False, True, False, True, True, False, True]
-    assert np.isnan(odometry.motions(starts, ends, ends, ZERO).C[:, 0, 0]).tolist() == is_gap
+    assert (
+        np.isnan(odometry.motions(starts, ends, ends, ZERO).C[:, 0, 0]).tolist()
+        == is_gap
+    )
     for column in odometry.motions(starts, ends, ends, ZERO):
         assert [np.isnan(value).all() for value in column] == is_gap
         assert [np.isnan(value).any() for value in column] == is_gap
@@ -244,17 +377,33 @@ def test_a_gap_is_longer_than_the_calibration_says():
 
 
 @pytest.mark.parametrize(("speed_m_s", "reached"), [(0.0, 20), (3.0, 60)])
-def test_the_start_is_reached_at_the_same_time_however_the_log_is_cut(speed_m_s, reached):
+def test_the_start_is_reached_at_the_same_time_however_the_log_is_cut(
+    speed_m_s, reached
+):
     """When its velocity is confirmed: at 3 m/s by two rows more than at rest."""
-    imu_rows, dvl_rows = imu(stamps(100, 3), 0.0), dvl(stamps(5, 3), (speed_m_s, 0, 0), 1e-4 * np.eye(3))
+    imu_rows, dvl_rows = (
+        imu(stamps(100, 3), 0.0),
+        dvl(stamps(5, 3), (speed_m_s, 0, 0), 1e-4 * np.eye(3)),
+    )
     at_once, by_and_by = odometry_of(imu_rows, dvl_rows), Odometry(Calibration())
     for row, until_ns in enumerate(imu_rows.stamps_ns.tolist()):
-        by_and_by.add(*(rows.between(until_ns - NS // 100, until_ns) for rows in (imu_rows, dvl_rows)))
-        assert by_and_by.start_by(until_ns) == at_once.start_by(until_ns) == (T0_NS if row >= reached else None)
+        by_and_by.add(
+            *(
+                rows.between(until_ns - NS // 100, until_ns)
+                for rows in (imu_rows, dvl_rows)
+            )
+        )
+        assert (
+            by_and_by.start_by(until_ns)
+            == at_once.start_by(until_ns)
+            == (T0_NS if row >= reached else None)
+        )
 
 
 def swaying(interpolation: str = "linear", earth: np.ndarray | None = None) -> Odometry:
-    odometry = odometry_of(*recorded(dvl_offset_s=0.0), Calibration(odometry_interpolation=interpolation))
+    odometry = odometry_of(
+        *recorded(dvl_offset_s=0.0), Calibration(odometry_interpolation=interpolation)
+    )
     odometry._earth = earth
     return odometry
 
@@ -262,33 +411,56 @@ def swaying(interpolation: str = "linear", earth: np.ndarray | None = None) -> O
 def without(rows, *spans_s: tuple[float, float]):
     """Rows but those within some spans."""
     t = (rows.stamps_ns - T0_NS) * 1e-9
-    return rows.rows(np.all([(t <= begin) | (t >= end) for begin, end in spans_s], axis=0))
+    return rows.rows(
+        np.all([(t <= begin) | (t >= end) for begin, end in spans_s], axis=0)
+    )
 
 
 def flickering(rows: Dvl, *spans_s: tuple[float, float]) -> Dvl:
     """Rows of which those within some spans measured the vertical velocity alone."""
     whole = np.isin(rows.stamps_ns, without(rows, *spans_s).stamps_ns)[:, None]
     cov = np.where(whole[:, :, None], 1e-4 * np.eye(3), np.diag([1e4, 1e4, 1e-4]))
-    return Dvl(rows.stamps_ns, np.where(whole, rows.velocity, rows.velocity * [0.0, 0.0, 1.0]), cov)
+    return Dvl(
+        rows.stamps_ns,
+        np.where(whole, rows.velocity, rows.velocity * [0.0, 0.0, 1.0]),
+        cov,
+    )
 
 
 SURGING = Vehicle().rows()
 EVERYWHERE = Vehicle().imu(stamps(50.0, 12.1)), Vehicle().dvl(stamps(5.0, 12.0, 0.003))
-UNFELT = Imu(EVERYWHERE[0].stamps_ns, EVERYWHERE[0].angular_velocity, np.full((606, 3), np.nan))
+UNFELT = Imu(
+    EVERYWHERE[0].stamps_ns, EVERYWHERE[0].angular_velocity, np.full((606, 3), np.nan)
+)
 CUT = {
     "plain": EVERYWHERE,
     "a long gap, whose end is confirmed": SURGING,
     "two short gaps": (EVERYWHERE[0], without(EVERYWHERE[1], (3.1, 5.3), (6.5, 8.9))),
     "gaps without force": (UNFELT, without(EVERYWHERE[1], (3.1, 5.3), (6.5, 8.9))),
-    "holes of the IMU": (without(EVERYWHERE[0], (2.0, 2.4), (5.0, 7.2)), without(EVERYWHERE[1], (6.5, 8.9))),
-    "few beams": (EVERYWHERE[0], flickering(EVERYWHERE[1], (0.3, 0.7), (2.0, 2.7), (4.0, 6.6), (7.0, 7.3))),
-    "few beams about a gap": (SURGING[0], flickering(SURGING[1], (4.9, 6.3), (15.0, 17.1))),
+    "holes of the IMU": (
+        without(EVERYWHERE[0], (2.0, 2.4), (5.0, 7.2)),
+        without(EVERYWHERE[1], (6.5, 8.9)),
+    ),
+    "few beams": (
+        EVERYWHERE[0],
+        flickering(EVERYWHERE[1], (0.3, 0.7), (2.0, 2.7), (4.0, 6.6), (7.0, 7.3)),
+    ),
+    "few beams about a gap": (
+        SURGING[0],
+        flickering(SURGING[1], (4.9, 6.3), (15.0, 17.1)),
+    ),
     "fast, so that ten velocities confirm": (
         EVERYWHERE[0],
-        Dvl(EVERYWHERE[1].stamps_ns, EVERYWHERE[1].velocity + np.array([5.0, 0, 0]), EVERYWHERE[1].velocity_cov),
+        Dvl(
+            EVERYWHERE[1].stamps_ns,
+            EVERYWHERE[1].velocity + np.array([5.0, 0, 0]),
+            EVERYWHERE[1].velocity_cov,
+        ),
     ),
 }
-INSTANTS_MS = st.integers(0, 20_200) | st.integers(0, 100).map(lambda ping: 200 * ping + 3)
+INSTANTS_MS = st.integers(0, 20_200) | st.integers(0, 100).map(
+    lambda ping: 200 * ping + 3
+)
 """Any, and those of the Doppler log, which no IMU row shares."""
 
 
@@ -301,9 +473,23 @@ def answers(odometry: Odometry, until_ns: int, asked_ns: int) -> list[np.ndarray
     asked_ns = min(max(asked_ns, reached_ns[0]), until_ns)
     starts_ns = first_ns, middle_ns, (newest_ns + until_ns) // 2
     found = [odometry.motion(first_ns, asked_ns, BIAS, np.eye(3), asked_ns)]
-    found += [odometry.motion(start_ns, until_ns, BIAS, np.eye(3)) for start_ns in starts_ns]
-    found += [odometry.motion(start_ns, newest_ns, BIAS, np.eye(3), until_ns) for start_ns in (middle_ns, first_ns)]
-    parts = [(m.i_T_j.matrix(), m.covariance, m.D_bias, m.mean_specific_force, [m.duration_s]) for m in found]
+    found += [
+        odometry.motion(start_ns, until_ns, BIAS, np.eye(3)) for start_ns in starts_ns
+    ]
+    found += [
+        odometry.motion(start_ns, newest_ns, BIAS, np.eye(3), until_ns)
+        for start_ns in (middle_ns, first_ns)
+    ]
+    parts = [
+        (
+            m.i_T_j.matrix(),
+            m.covariance,
+            m.D_bias,
+            m.mean_specific_force,
+            [m.duration_s],
+        )
+        for m in found
+    ]
     many = odometry.motions(
         np.append(epochs_ns[:-1], newest_ns),
         np.append(epochs_ns[1:], until_ns),
@@ -314,10 +500,16 @@ def answers(odometry: Odometry, until_ns: int, asked_ns: int) -> list[np.ndarray
 
 
 @pytest.mark.parametrize("rows", CUT.values(), ids=CUT.keys())
-@pytest.mark.parametrize("earth", [None, np.array([0.02, -0.03, 0.05])], ids=["no Earth", "Earth"])
-@given(st.lists(st.tuples(INSTANTS_MS, INSTANTS_MS, st.booleans()), min_size=1, max_size=8))
+@pytest.mark.parametrize(
+    "earth", [None, np.array([0.02, -0.03, 0.05])], ids=["no Earth", "Earth"]
+)
+@given(
+    st.lists(st.tuples(INSTANTS_MS, INSTANTS_MS, st.booleans()), min_size=1, max_size=8)
+)
 @settings(max_examples=25)
-def test_how_rows_are_cut_and_what_is_asked_in_between_change_no_bit(rows, earth, calls):
+def test_how_rows_are_cut_and_what_is_asked_in_between_change_no_bit(
+    rows, earth, calls
+):
     """Also what comes in long before it is asked for, and what is kept of another question."""
     calibration = Calibration(imu=NOISY, dvl=DVL)
     pieces, after_ns = Odometry(calibration), 0
@@ -329,7 +521,10 @@ def test_how_rows_are_cut_and_what_is_asked_in_between_change_no_bit(rows, earth
         if is_asked:
             whole = odometry_of(*rows, calibration)
             whole._earth = earth
-            told, known = answers(pieces, until_ns, asked_ns), answers(whole, until_ns, asked_ns)
+            told, known = (
+                answers(pieces, until_ns, asked_ns),
+                answers(whole, until_ns, asked_ns),
+            )
             assert len(told) == len(known)
             for one, other in zip(told, known, strict=True):
                 assert np.array_equal(one, other, equal_nan=True)
@@ -338,7 +533,10 @@ def test_how_rows_are_cut_and_what_is_asked_in_between_change_no_bit(rows, earth
 def test_rows_of_both_sensors_that_come_later_change_nothing_in_a_gap():
     """So motions that follow each other in it add up, between inertial rows too."""
     odometry = odometry_of(*SURGING, Calibration(imu=NOISY, dvl=DVL))
-    first, later = (odometry.motion(at(6.0), at(9.107), BIAS, None, at(known_s)) for known_s in (9.107, 9.5))
+    first, later = (
+        odometry.motion(at(6.0), at(9.107), BIAS, None, at(known_s))
+        for known_s in (9.107, 9.5)
+    )
     assert same(first, later)
     assert not same(first, odometry.motion(at(6.0), at(9.108), BIAS))
 
@@ -346,7 +544,10 @@ def test_rows_of_both_sensors_that_come_later_change_nothing_in_a_gap():
 def test_a_row_that_is_completed_later_is_not_known_before():
     """Nor is what it changes; and two motions composed differ from the one in the last bits."""
     odometry = odometry_of(*CUT["few beams"], Calibration(imu=NOISY, dvl=DVL))
-    found = [odometry.motion(at(3.803), at(5.5), ZERO, None, at(known_s)) for known_s in (5.5, 6.602, 6.7, 8.0)]
+    found = [
+        odometry.motion(at(3.803), at(5.5), ZERO, None, at(known_s))
+        for known_s in (5.5, 6.602, 6.7, 8.0)
+    ]
     assert same(found[0], found[1])
     assert not found[1].i_T_j.equals(found[2].i_T_j, 1e-6)
     assert same(found[2], found[3])
@@ -354,7 +555,8 @@ def test_a_row_that_is_completed_later_is_not_known_before():
     assert at(4.403) not in odometry.epochs(0, at(6.602))
     assert at(4.403) in odometry.epochs(0, at(6.603))
     one, first, second = (
-        odometry.motion(at(a), at(b), BIAS) for a, b in ((1.003, 3.003), (1.003, 2.803), (2.803, 3.003))
+        odometry.motion(at(a), at(b), BIAS)
+        for a, b in ((1.003, 3.003), (1.003, 2.803), (2.803, 3.003))
     )
     assert_same(first.then(second), one)
     assert not same(first.then(second), one)
@@ -367,20 +569,45 @@ def test_an_estimate_is_the_same_to_the_bit_however_the_log_is_cut(kind):
     mission = simulate_mission(options)
     offset_ns = T0_NS - mission.start_ns
     moved = replace(mission.dvl, stamps_ns=mission.dvl.stamps_ns + offset_ns)
-    log = flickering(without(moved, (12.0, 16.0), (20.0, 22.5)), (5.0, 7.0), (10.0, 12.1), (25.0, 25.6))
-    inertial = without(replace(mission.imu, stamps_ns=mission.imu.stamps_ns + offset_ns), (8.0, 8.3), (28.0, 30.2))
-    log, inertial = (replace(rows, stamps_ns=rows.stamps_ns - offset_ns) for rows in (log, inertial))
+    log = flickering(
+        without(moved, (12.0, 16.0), (20.0, 22.5)),
+        (5.0, 7.0),
+        (10.0, 12.1),
+        (25.0, 25.6),
+    )
+    inertial = without(
+        replace(mission.imu, stamps_ns=mission.imu.stamps_ns + offset_ns),
+        (8.0, 8.3),
+        (28.0, 30.2),
+    )
+    log, inertial = (
+        replace(rows, stamps_ns=rows.stamps_ns - offset_ns) for rows in (log, inertial)
+    )
     mission = replace(mission, imu=inertial, dvl=log)
     ends_ns = mission.start_ns + np.array([11, 14, 24, 33]) * NS + 7_000_000
     rng, found = np.random.default_rng(0), []
     for cuts in (0, 5, 60):
-        instants = np.union1d(ends_ns, mission.start_ns + rng.integers(0, 33 * NS, cuts))
+        instants = np.union1d(
+            ends_ns, mission.start_ns + rng.integers(0, 33 * NS, cuts)
+        )
         estimator = kind(mission.calibration, Odometry(mission.calibration))
-        told = {window.end_ns: estimator.process(window) for window in mission.replay(instants)}
-        found.append([(told[t].world_T_body.matrix(), told[t].covariance) for t in ends_ns.tolist()])
+        told = {
+            window.end_ns: estimator.process(window)
+            for window in mission.replay(instants)
+        }
+        found.append(
+            [
+                (told[t].world_T_body.matrix(), told[t].covariance)
+                for t in ends_ns.tolist()
+            ]
+        )
     for other in found[1:]:
-        assert np.array_equal(np.array([P for _, P in found[0]]), np.array([P for _, P in other]))
-        assert np.array_equal(np.array([T for T, _ in found[0]]), np.array([T for T, _ in other]))
+        assert np.array_equal(
+            np.array([P for _, P in found[0]]), np.array([P for _, P in other])
+        )
+        assert np.array_equal(
+            np.array([T for T, _ in found[0]]), np.array([T for T, _ in other])
+        )
 
 
 def test_what_is_kept_is_not_used_for_another_bias_or_start_or_after_earlier_rows():
@@ -396,7 +623,9 @@ def test_what_is_kept_is_not_used_for_another_bias_or_start_or_after_earlier_row
         odometry.motion(int(part.stamps_ns[1]), until_ns, BIAS, np.eye(3)),
         odometry.motion(T0_NS, until_ns, BIAS, turned),
     ]
-    assert odometry.motion(T0_NS, until_ns, BIAS, np.eye(3)).i_T_j.equals(first.i_T_j, 0.0)
+    assert odometry.motion(T0_NS, until_ns, BIAS, np.eye(3)).i_T_j.equals(
+        first.i_T_j, 0.0
+    )
     odometry.add(None, dvl_rows.rows(slice(5, 6)))
     for other in [*others, odometry.motion(T0_NS, until_ns, BIAS, np.eye(3))]:
         assert not other.i_T_j.equals(first.i_T_j, 1e-6)
@@ -425,19 +654,28 @@ def test_a_chain_is_the_motion_of_the_whole_wherever_it_is_cut(cut, other_cut):
     """At any inertial rows, with what is known at the end: mean, covariance, bias derivative and mean force."""
     odometry, until_ns = swaying(earth=np.array([0.02, -0.03, 0.05])), T0_NS + 2 * NS
     known_ns = until_ns + NS // 10
-    cuts = [T0_NS, *sorted({T0_NS + cut * 20_000_000, T0_NS + other_cut * 20_000_000}), until_ns]
+    cuts = [
+        T0_NS,
+        *sorted({T0_NS + cut * 20_000_000, T0_NS + other_cut * 20_000_000}),
+        until_ns,
+    ]
     chained = first = odometry.motion(cuts[0], cuts[1], BIAS, np.eye(3), known_ns)
     for a, b in pairwise(cuts[1:]):
         last = odometry.motion(a, b, BIAS, chained.i_T_j.rotation().matrix(), known_ns)
         chained = chained.then(last)
     assert_same(chained, odometry.motion(T0_NS, until_ns, BIAS, np.eye(3), known_ns))
-    assert np.abs(gtsam.Pose3.Logmap(chained.i_T_j.between(last.then(first).i_T_j))).max() > 1e-6
+    assert (
+        np.abs(gtsam.Pose3.Logmap(chained.i_T_j.between(last.then(first).i_T_j))).max()
+        > 1e-6
+    )
 
 
 def ready(until_s=20.0, imu=QUIET):
     """What was measured until an instant."""
     calibration = Calibration(imu=imu, dvl=DVL)
-    return odometry_of(*(rows.between(0, at(until_s)) for rows in Vehicle().rows()), calibration)
+    return odometry_of(
+        *(rows.between(0, at(until_s)) for rows in Vehicle().rows()), calibration
+    )
 
 
 def moved(start_s, end_s, until_s=20.0, imu=QUIET):
@@ -447,7 +685,16 @@ def moved(start_s, end_s, until_s=20.0, imu=QUIET):
 @pytest.mark.parametrize(
     ("start_s", "end_s"),
     [
-        *((1.03, 1.17), (5.9, 6.0), (5.93, 8.31), (6.0, 12.0), (6.0, 16.0), (6.0, 17.3), (8.07, 8.36), (13.0, 15.9)),
+        *(
+            (1.03, 1.17),
+            (5.9, 6.0),
+            (5.93, 8.31),
+            (6.0, 12.0),
+            (6.0, 16.0),
+            (6.0, 17.3),
+            (8.07, 8.36),
+            (13.0, 15.9),
+        ),
         *((5.03, 16.53), (16.0, 16.1)),
     ],
 )
@@ -468,20 +715,25 @@ def test_motions_that_follow_each_other_in_a_gap_add_up_to_that_since_the_epoch(
     assert total.i_T_j.equals(whole.i_T_j, 1e-9)
     assert total.covariance == pytest.approx(whole.covariance, rel=1e-3, abs=1e-9)
     assert total.D_bias == pytest.approx(whole.D_bias, rel=1e-6, abs=1e-9)
-    assert total.mean_specific_force == pytest.approx(whole.mean_specific_force, abs=1e-9)
+    assert total.mean_specific_force == pytest.approx(
+        whole.mean_specific_force, abs=1e-9
+    )
     assert total.duration_s == pytest.approx(whole.duration_s)
 
 
 def test_a_gap_that_has_ended_is_bridged_with_both_its_ends():
     odometry = ready(imu=NOISY)
-    epochs, longer = (odometry.motion(at(a), at(b), ZERO) for a, b in ((5.0, 17.0), (4.91, 17.09)))
+    epochs, longer = (
+        odometry.motion(at(a), at(b), ZERO) for a, b in ((5.0, 17.0), (4.91, 17.09))
+    )
     seen_from_within = moved(5.0, 15.7, 15.7, NOISY)
     assert np.trace(epochs.covariance) < 0.5 * np.trace(seen_from_within.covariance)
     assert np.trace(longer.covariance) > np.trace(epochs.covariance)
 
 
 @pytest.mark.parametrize(
-    ("start_s", "end_s"), [(1.03, 1.17), (5.0, 9.0), (8.0, 9.0), (15.0, Vehicle.FOUND_S + 0.2), (15.0, 16.3)]
+    ("start_s", "end_s"),
+    [(1.03, 1.17), (5.0, 9.0), (8.0, 9.0), (15.0, Vehicle.FOUND_S + 0.2), (15.0, 16.3)],
 )
 def test_nothing_stamped_after_the_second_instant_is_used(start_s, end_s):
     here, there = (moved(start_s, end_s, until_s, NOISY) for until_s in (20.0, end_s))
@@ -491,7 +743,12 @@ def test_nothing_stamped_after_the_second_instant_is_used(start_s, end_s):
 
 def test_no_variance_is_negative_and_from_an_instant_to_itself_nothing_moves():
     for start_s in np.arange(6.0, 15.0, 0.37):
-        assert np.linalg.eigvalsh(moved(start_s, start_s + 0.05, 15.9, NOISY).covariance)[0] >= -1e-18
+        assert (
+            np.linalg.eigvalsh(moved(start_s, start_s + 0.05, 15.9, NOISY).covariance)[
+                0
+            ]
+            >= -1e-18
+        )
     for found in (moved(instant_s, instant_s) for instant_s in (1.1, 3.0, 9.0)):
         assert found.i_T_j.equals(gtsam.Pose3(), 0.0)
         assert not found.covariance.any()

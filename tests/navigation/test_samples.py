@@ -11,7 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl
@@ -29,11 +34,21 @@ def kept(*blocks: list[int]) -> samples.StampedRows:
     rows = samples.StampedRows(np.empty((0, 3)), np.empty((0, 3, 3)))
     for number, block in enumerate(blocks):
         n = len(block)
-        rows.insert(np.array(block), np.full((n, 3), float(number)), np.full((n, 3, 3), float(-number)))
+        rows.insert(
+            np.array(block),
+            np.full((n, 3), float(number)),
+            np.full((n, 3, 3), float(-number)),
+        )
     return rows
 
 
-@given(st.lists(st.lists(st.integers(0, 40), min_size=1, unique=True).map(sorted), min_size=1, max_size=5))
+@given(
+    st.lists(
+        st.lists(st.integers(0, 40), min_size=1, unique=True).map(sorted),
+        min_size=1,
+        max_size=5,
+    )
+)
 def test_rows_are_those_of_all_blocks_in_order_and_the_first_of_equal_stamps(blocks):
     rows, first = kept(*blocks), {}
     for number, block in enumerate(blocks):
@@ -41,17 +56,36 @@ def test_rows_are_those_of_all_blocks_in_order_and_the_first_of_equal_stamps(blo
             first.setdefault(stamp, number)
     assert rows.stamps_ns.tolist() == sorted(first)
     assert rows.values[0][:, 1].tolist() == [first[stamp] for stamp in sorted(first)]
-    assert rows.values[1][:, 2, 0].tolist() == [-first[stamp] for stamp in sorted(first)]
+    assert rows.values[1][:, 2, 0].tolist() == [
+        -first[stamp] for stamp in sorted(first)
+    ]
 
 
 def test_inserting_says_whether_rows_were_there_at_or_after_the_first():
     rows = kept([10, 20])
-    for stamp, is_before in ((21, False), (20, True), (15, True), (22, False), (22, True)):
-        assert rows.insert(np.array([stamp]), np.zeros((1, 3)), np.zeros((1, 3, 3))) == is_before
+    for stamp, is_before in (
+        (21, False),
+        (20, True),
+        (15, True),
+        (22, False),
+        (22, True),
+    ):
+        assert (
+            rows.insert(np.array([stamp]), np.zeros((1, 3)), np.zeros((1, 3, 3)))
+            == is_before
+        )
 
 
 def test_the_row_at_or_before_a_stamp_is_kept_and_those_after():
-    for stamp, left in ((9, 10), (10, 10), (11, 10), (20, 10), (21, 20), (31, 30), (99, 30)):
+    for stamp, left in (
+        (9, 10),
+        (10, 10),
+        (11, 10),
+        (20, 10),
+        (21, 20),
+        (31, 30),
+        (99, 30),
+    ):
         rows = kept([10, 20, 30])
         rows.forget_before(stamp)
         assert rows.stamps_ns[0] == left
@@ -70,34 +104,49 @@ AT = np.array([10, 20, 30, 40, 50]) * 1_000_000_000
         ([0, np.nan, 0], "bias: expected finite numbers"),
     ],
 )
-def test_a_vector_of_another_shape_or_without_numbers_is_refused_by_name(values, message):
+def test_a_vector_of_another_shape_or_without_numbers_is_refused_by_name(
+    values, message
+):
     assert samples.finite_vector("bias", [1, 2, 3], 3).tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(MeasurementError, match=message):
         samples.finite_vector("bias", values, 3)
 
 
-@pytest.mark.parametrize(("instant_s", "nearest_s"), [(1, 10), (24, 20), (26, 30), (99, 50)])
+@pytest.mark.parametrize(
+    ("instant_s", "nearest_s"), [(1, 10), (24, 20), (26, 30), (99, 50)]
+)
 def test_the_nearest_doppler_stamp_is_named(instant_s, nearest_s):
     error = samples.no_doppler_stamp("epoch_ns", instant_s * NS, AT)
     assert str(error).endswith(f"the nearest is {nearest_s * NS}")
-    assert "there are no Doppler rows" in str(samples.no_doppler_stamp("epoch_ns", instant_s * NS, AT[:0]))
+    assert "there are no Doppler rows" in str(
+        samples.no_doppler_stamp("epoch_ns", instant_s * NS, AT[:0])
+    )
 
 
 DVL_HZ, SECONDS, SIGMA = 5, 6.0, 0.01
 BLIND, WHOLE = np.diag([SIGMA**2, 100.0**2, 100.0**2]), np.eye(3) * SIGMA**2
 
 
-def driven(partial: tuple[int, ...] = (), outliers: tuple[int, ...] = (), blind: np.ndarray = BLIND) -> Dvl:
+def driven(
+    partial: tuple[int, ...] = (),
+    outliers: tuple[int, ...] = (),
+    blind: np.ndarray = BLIND,
+) -> Dvl:
     """Straight ahead at 0.8 m/s; some rows measure the surge alone, some are wrong by 3 m/s."""
     at = stamps(DVL_HZ, SECONDS)
-    velocity, cov = np.tile([0.8, 0.0, 0.0], (len(at), 1)), np.tile(WHOLE, (len(at), 1, 1))
+    velocity, cov = (
+        np.tile([0.8, 0.0, 0.0], (len(at), 1)),
+        np.tile(WHOLE, (len(at), 1, 1)),
+    )
     cov[list(partial)] = blind
     velocity[list(outliers), 0] += 3.0
     return dvl(at, velocity, cov)
 
 
 def told(odometry: Odometry) -> list[tuple[int, Refusal]]:
-    return sorted(((row.stamp_ns - T0_NS) * DVL_HZ // NS, row.reason) for row in odometry.refused)
+    return sorted(
+        ((row.stamp_ns - T0_NS) * DVL_HZ // NS, row.reason) for row in odometry.refused
+    )
 
 
 @given(st.lists(st.integers(0, round(SECONDS * NS)), max_size=5))
@@ -107,7 +156,10 @@ def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
     outliers = (0, 1, 5, 10, 12, 21)
     rows = driven(partial=(8, 9, 10, 11, 20), outliers=outliers)
     edges = [0, *(T0_NS + cut for cut in sorted(cuts)), T0_NS + 10 * NS]
-    whole, pieces = odometry_at_rest(rows), odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges)))
+    whole, pieces = (
+        odometry_at_rest(rows),
+        odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges))),
+    )
     assert told(whole) == [(k, Refusal.OUTLIER) for k in outliers]
     assert sorted(pieces.refused) == sorted(whole.refused)
     for one, other in zip(pieces.rows()[:6], whole.rows()[:6], strict=True):
@@ -117,8 +169,12 @@ def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
 def test_what_a_row_with_one_beam_did_not_measure_hides_no_outlier():
     """Compared with a row that is blind to the side, any velocity to the side would pass."""
     rows = driven(partial=(8,))
-    velocity = rows.velocity + 3.0 * np.outer(np.arange(len(rows)) == 9, [0.0, 1.0, 0.0])
-    assert told(odometry_at_rest(replace(rows, velocity=velocity))) == [(9, Refusal.OUTLIER)]
+    velocity = rows.velocity + 3.0 * np.outer(
+        np.arange(len(rows)) == 9, [0.0, 1.0, 0.0]
+    )
+    assert told(odometry_at_rest(replace(rows, velocity=velocity))) == [
+        (9, Refusal.OUTLIER)
+    ]
 
 
 def test_rows_of_few_beams_are_named_until_they_are_completed():
@@ -136,7 +192,9 @@ def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
     ns = T0_NS + np.array([0, NS, LONGEST_STRETCH_NS + more_ns])
     odometry = Odometry(Calibration())
     odometry.add(imu(ns[[0, 2]], 0.0), dvl(ns, 0.8, np.array([WHOLE, BLIND, WHOLE])))
-    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)] * more_ns
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [
+        (T0_NS + NS, Refusal.INCOMPLETE)
+    ] * more_ns
     assert len(odometry.rows()[3]) == 3 - more_ns
 
 
@@ -145,7 +203,9 @@ def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
     [(3, ([2, 4], [3], [5]), [2, 4, 5]), (25, ([0, 1, 25],), [0, 1])],
     ids=["overtaken", "after a long gap"],
 )
-def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(partial, blocks, used):
+def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(
+    partial, blocks, used
+):
     rows = driven(partial=(partial,))
     odometry = odometry_at_rest(*(rows.rows(np.array(block)) for block in blocks))
     assert told(odometry) == [(partial, Refusal.INCOMPLETE)]
@@ -169,8 +229,13 @@ def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_ne
 
 
 def test_of_equal_stamps_the_first_counts():
-    one, other = dvl(stamps(5, 1.0), [0.8, 0.0, 0.0]), dvl(stamps(5, 1.0), [0.81, 0.0, 0.0])
-    within = dvl(np.repeat(stamps(5, 1.0), 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1)))
+    one, other = (
+        dvl(stamps(5, 1.0), [0.8, 0.0, 0.0]),
+        dvl(stamps(5, 1.0), [0.81, 0.0, 0.0]),
+    )
+    within = dvl(
+        np.repeat(stamps(5, 1.0), 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1))
+    )
     across, inside = odometry_at_rest(one), odometry_at_rest(within)
     assert across.add(None, other)
     for odometry in (across, inside):
@@ -179,7 +244,8 @@ def test_of_equal_stamps_the_first_counts():
 
 
 @pytest.mark.parametrize(
-    ("offsets", "kept"), [([0, 0], [0]), ([0, 1, 1], [0, 1]), ([0, 0, 1], [0, 1]), ([0, 1], [0, 1])]
+    ("offsets", "kept"),
+    [([0, 0], [0]), ([0, 1, 1], [0, 1]), ([0, 0, 1], [0, 1]), ([0, 1], [0, 1])],
 )
 def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
     odometry = Odometry(Calibration())
@@ -188,24 +254,39 @@ def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
 
 
 @pytest.mark.parametrize("missing", range(1, 9))
-def test_a_row_that_comes_after_later_ones_is_an_epoch_from_the_instant_on_at_which_it_is_reached(missing):
+def test_a_row_that_comes_after_later_ones_is_an_epoch_from_the_instant_on_at_which_it_is_reached(
+    missing,
+):
     """Nor is one of several that are known at once with the row that confirmed them."""
     rows = driven()
-    rows, inertial = replace(rows, velocity=rows.velocity * 5.0), imu(stamps(50, SECONDS), 0.0)
+    rows, inertial = (
+        replace(rows, velocity=rows.velocity * 5.0),
+        imu(stamps(50, SECONDS), 0.0),
+    )
     odometry = Odometry(Calibration())
     odometry.add(inertial, rows.rows(np.arange(len(rows)) != missing))
     odometry.add(None, rows.rows(slice(missing, missing + 1)))
     epochs_ns, reached_ns = odometry.epochs_reached(0, T0_NS + 10 * NS)
     assert np.array_equal(epochs_ns, rows.stamps_ns)
-    assert [part.tolist() for part in odometry.epochs_reached(T0_NS + 10 * NS, T0_NS)] == [[], []]
-    assert reached_ns.tolist() == [odometry.reached_ns(epoch_ns) for epoch_ns in epochs_ns.tolist()]
+    assert [
+        part.tolist() for part in odometry.epochs_reached(T0_NS + 10 * NS, T0_NS)
+    ] == [[], []]
+    assert reached_ns.tolist() == [
+        odometry.reached_ns(epoch_ns) for epoch_ns in epochs_ns.tolist()
+    ]
     for until_ns in np.unique(reached_ns).tolist():
         for instant_ns in (until_ns - 1, until_ns):
-            assert np.array_equal(odometry.epochs(0, instant_ns), epochs_ns[reached_ns <= instant_ns])
+            assert np.array_equal(
+                odometry.epochs(0, instant_ns), epochs_ns[reached_ns <= instant_ns]
+            )
 
 
-@pytest.mark.parametrize(("ratio", "is_sound"), [(1e-11, True), (1e-12, True), (0.0, False), (-1e-12, False)])
-def test_a_covariance_is_sound_where_it_is_positive_definite_but_for_rounding(ratio, is_sound):
+@pytest.mark.parametrize(
+    ("ratio", "is_sound"), [(1e-11, True), (1e-12, True), (0.0, False), (-1e-12, False)]
+)
+def test_a_covariance_is_sound_where_it_is_positive_definite_but_for_rounding(
+    ratio, is_sound
+):
     """In axes of which none is the log's."""
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
     rows = driven()
@@ -244,8 +325,13 @@ def test_held_velocities_may_jump():
 
 def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
     turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
-    logs = [driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured])) for unmeasured in (100.0**2, np.inf)]
-    one, other = (odometry_at_rest(rows, calibration=turned).rows()[:6] for rows in logs)
+    logs = [
+        driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured]))
+        for unmeasured in (100.0**2, np.inf)
+    ]
+    one, other = (
+        odometry_at_rest(rows, calibration=turned).rows()[:6] for rows in logs
+    )
     for column, same in zip(one, other, strict=True):
         np.testing.assert_array_equal(column, same)
     assert len(one[3]) == len(logs[0])
@@ -260,7 +346,9 @@ def test_an_infinite_variance_is_that_of_a_direction_not_measured_and_nan_is_not
     whole[2, 1] = 7.0
     found = samples.in_numbers(cov, unsaid)
     np.testing.assert_array_equal(found[0], whole)
-    np.testing.assert_array_equal(found[1], [[2.0, 0.0, 0.1], [0.0, UNMEASURED_M_S**2, 0.0], [0.1, 0.0, 4.0]])
+    np.testing.assert_array_equal(
+        found[1], [[2.0, 0.0, 0.1], [0.0, UNMEASURED_M_S**2, 0.0], [0.1, 0.0, 4.0]]
+    )
     np.testing.assert_array_equal(found[2], unsaid)
     np.testing.assert_array_equal(samples.is_partial(cov), [False, True, False])
 
@@ -275,4 +363,7 @@ def test_a_row_is_partial_by_the_directions_that_it_leaves_whatever_its_axes():
         ((0.16 * UNMEASURED_M_S**2,) * 3, False),
         ((np.nan,) * 3, False),
     ):
-        assert samples.is_partial((turn * np.array(variances) @ turn.T)[None])[0] == partial
+        assert (
+            samples.is_partial((turn * np.array(variances) @ turn.T)[None])[0]
+            == partial
+        )

@@ -32,11 +32,20 @@ def stretch_of(seed: int, walks: tuple[bool, bool, bool]) -> SampleSeries:
     return SampleSeries(y, A, np.tile(np.eye(3), (m, 1, 1)), np.ones(m), walks)
 
 
-def dense_covariance(m: int, walks: bool, ratios: np.ndarray = RATIOS, duration_s: float = 1.0) -> np.ndarray:
+def dense_covariance(
+    m: int, walks: bool, ratios: np.ndarray = RATIOS, duration_s: float = 1.0
+) -> np.ndarray:
     """Of differences of white samples, plus a rate's white noise, plus the walk of a rate from the beginning."""
-    difference, middle = np.diff(np.eye(m + 1), axis=0), duration_s * (np.arange(m) + 0.5)
+    difference, middle = (
+        np.diff(np.eye(m + 1), axis=0),
+        duration_s * (np.arange(m) + 0.5),
+    )
     walk = duration_s**2 * np.minimum.outer(middle, middle)
-    return difference @ difference.T + ratios[0] * duration_s * np.eye(m) + ratios[1] * walk * walks
+    return (
+        difference @ difference.T
+        + ratios[0] * duration_s * np.eye(m)
+        + ratios[1] * walk * walks
+    )
 
 
 def by_axis(matrices: np.ndarray) -> np.ndarray:
@@ -54,7 +63,11 @@ def one_problem(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
 def textbook(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
     """Common parameters and their covariance."""
     (columns, y), m = one_problem(stretches), len(stretches[0].y)
-    weight = np.linalg.inv(block_diag(*[dense_covariance(m, walks) for s in stretches for walks in s.walks]))
+    weight = np.linalg.inv(
+        block_diag(
+            *[dense_covariance(m, walks) for s in stretches for walks in s.walks]
+        )
+    )
     information = columns.T @ weight @ columns
     found = np.linalg.solve(information, columns.T @ weight @ y)
     left = y - columns @ found
@@ -62,7 +75,9 @@ def textbook(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
     return found[:2], variance * np.linalg.inv(information)[:2, :2]
 
 
-@pytest.mark.parametrize("walks", [(True, True, True), (True, True, False), (False, False, False)])
+@pytest.mark.parametrize(
+    "walks", [(True, True, True), (True, True, False), (False, False, False)]
+)
 def test_fit_is_generalised_least_squares_with_a_walk_on_the_axes_that_walk(walks):
     stretches = [stretch_of(seed, walks) for seed in range(4)]
     parameters, covariance = textbook(stretches)
@@ -83,7 +98,9 @@ def whitened_power(stretch: SampleSeries) -> float:
 
 def test_power_of_the_rates_noise_is_the_trace_with_dense_matrices():
     stretches = [stretch_of(0, (True, True, False)), stretch_of(1, (True, True, True))]
-    assert rate_noise_power(stretches, RATIOS) == pytest.approx(sum(map(whitened_power, stretches)), rel=1e-9)
+    assert rate_noise_power(stretches, RATIOS) == pytest.approx(
+        sum(map(whitened_power, stretches)), rel=1e-9
+    )
 
 
 def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
@@ -91,14 +108,20 @@ def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
     rng = np.random.default_rng(5)
     m, found, corrected = 20, [], []
     signal = rng.standard_normal((m, 3, 1))
-    factor = np.linalg.cholesky(dense_covariance(m, True) - dense_covariance(m, False) + RATIOS[0] * np.eye(m))
+    factor = np.linalg.cholesky(
+        dense_covariance(m, True) - dense_covariance(m, False) + RATIOS[0] * np.eye(m)
+    )
     for _ in range(400):
         rates = factor @ rng.standard_normal((m, 3))
         y = np.diff(rng.standard_normal((m + 1, 3)), axis=0) + rates
-        stretch = SampleSeries(y, 4 * signal + rates[:, :, None], np.tile(np.eye(3), (m, 1, 1)), np.ones(m))
+        stretch = SampleSeries(
+            y, 4 * signal + rates[:, :, None], np.tile(np.eye(3), (m, 1, 1)), np.ones(m)
+        )
         result = fit([stretch], WIDE[:1], RATIOS)
         found.append(result.parameters[0])
-        corrected.append(found[-1] - result.covariance[0, 0] * rate_noise_power([stretch], RATIOS))
+        corrected.append(
+            found[-1] - result.covariance[0, 0] * rate_noise_power([stretch], RATIOS)
+        )
     of_mean = np.std(found) / np.sqrt(len(found))
     assert np.mean(found) > 8 * of_mean
     assert abs(np.mean(corrected)) < 3 * of_mean
@@ -110,7 +133,9 @@ def test_a_narrow_prior_holds_a_parameter_that_the_data_do_not_see():
     assert np.sqrt(np.diag(found.covariance)) == pytest.approx([0.1, 3.0])
 
 
-def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0) -> SampleSeries:
+def noisy_stretch(
+    rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0
+) -> SampleSeries:
     """Samples of sigma 0.1, a rate's white noise and its walk, with a constant as the stretch's own parameter."""
     m = 20
     middle = duration_s * (np.arange(m) + 0.5)
@@ -119,12 +144,16 @@ def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duratio
     y = y + np.sqrt(ratios[0] * duration_s) * rng.standard_normal((m, 3))
     y = y + np.sqrt(ratios[1]) * duration_s * walk @ rng.standard_normal((m, 3))
     own = duration_s * np.tile(np.eye(3), (m, 1, 1))
-    return SampleSeries(0.1 * y, rng.standard_normal((m, 3, 2)), own, np.full(m, duration_s))
+    return SampleSeries(
+        0.1 * y, rng.standard_normal((m, 3, 2)), own, np.full(m, duration_s)
+    )
 
 
 def restricted_likelihood(stretches: list[SampleSeries], ratios: np.ndarray) -> float:
     """``-2 log L`` but for a constant: Harville's formula with one dense covariance of everything."""
-    one = dense_covariance(len(stretches[0].y), True, ratios, float(stretches[0].duration_s[0]))
+    one = dense_covariance(
+        len(stretches[0].y), True, ratios, float(stretches[0].duration_s[0])
+    )
     K = block_diag(*[one] * (3 * len(stretches)))
     (X, y), weight = one_problem(stretches), np.linalg.inv(K)
     left = y - X @ np.linalg.solve(X.T @ weight @ X, X.T @ weight @ y)
@@ -135,13 +164,26 @@ def restricted_likelihood(stretches: list[SampleSeries], ratios: np.ndarray) -> 
 def test_the_criterion_is_the_restricted_likelihood_with_one_dense_covariance_and_the_ratios_have_the_highest():
     rng = np.random.default_rng(3)
     stretches = [noisy_stretch(rng, (0.8, 0.3), 0.5) for _ in range(4)]
-    tried = [np.array(ratios) for ratios in ((0.8, 0.3), (0.2, 0.3), (0.8, 0.02), (3.0, 1.0))]
+    tried = [
+        np.array(ratios) for ratios in ((0.8, 0.3), (0.2, 0.3), (0.8, 0.02), (3.0, 1.0))
+    ]
     ours = [NormalEquations.of(stretches, ratios).criterion(WIDE) for ratios in tried]
-    assert np.diff(ours) == pytest.approx(np.diff([restricted_likelihood(stretches, r) for r in tried]), rel=1e-6)
+    assert np.diff(ours) == pytest.approx(
+        np.diff([restricted_likelihood(stretches, r) for r in tried]), rel=1e-6
+    )
     stretches = [noisy_stretch(rng, (0.8, 0.3)) for _ in range(12)]
     found = fit(stretches, WIDE).ratios
-    for step in ((1.5, 1.0), (1 / 1.5, 1.0), (1.0, 1.5), (1.0, 1 / 1.5), (1.3, 1.3), (1 / 1.3, 1.3)):
-        assert restricted_likelihood(stretches, found * step) > restricted_likelihood(stretches, found)
+    for step in (
+        (1.5, 1.0),
+        (1 / 1.5, 1.0),
+        (1.0, 1.5),
+        (1.0, 1 / 1.5),
+        (1.3, 1.3),
+        (1 / 1.3, 1.3),
+    ):
+        assert restricted_likelihood(stretches, found * step) > restricted_likelihood(
+            stretches, found
+        )
 
 
 def test_ratios_are_those_of_the_noise_that_was_simulated():
@@ -154,50 +196,84 @@ def test_ratios_are_those_of_the_noise_that_was_simulated():
 def test_a_stretch_own_parameter_that_is_there_twice_counts_once():
     """As gravity and its turning do in a stretch of one difference: a basis of all columns would take rows away."""
     stretches = [stretch_of(seed, (True, True, False)) for seed in range(3)]
-    twice = [replace(s, B=np.concatenate([s.B, 3 * s.B[:, :, ::-1]], axis=2)) for s in stretches]
+    twice = [
+        replace(s, B=np.concatenate([s.B, 3 * s.B[:, :, ::-1]], axis=2))
+        for s in stretches
+    ]
     once, again = (fit(s, WIDE, RATIOS) for s in (stretches, twice))
     assert again.parameters == pytest.approx(once.parameters, rel=1e-9)
     assert again.covariance == pytest.approx(once.covariance, rel=1e-9)
-    assert rate_noise_power(twice, RATIOS) == pytest.approx(rate_noise_power(stretches, RATIOS), rel=1e-9)
+    assert rate_noise_power(twice, RATIOS) == pytest.approx(
+        rate_noise_power(stretches, RATIOS), rel=1e-9
+    )
 
 
 def test_what_fits_nearly_exactly_is_told_as_exactly():
     """Differences that are the model's but for a ten thousandth: the variance is that of the little left over."""
     rng, p = np.random.default_rng(6), np.array([2.0, -3.0])
-    exact = [replace(s, y=s.A @ p + s.B @ np.ones(3)) for s in (stretch_of(seed, (True,) * 3) for seed in range(3))]
-    noisy = [replace(s, y=s.y + 1e-4 * np.diff(rng.standard_normal((21, 3)), axis=0)) for s in exact]
+    exact = [
+        replace(s, y=s.A @ p + s.B @ np.ones(3))
+        for s in (stretch_of(seed, (True,) * 3) for seed in range(3))
+    ]
+    noisy = [
+        replace(s, y=s.y + 1e-4 * np.diff(rng.standard_normal((21, 3)), axis=0))
+        for s in exact
+    ]
     found = fit(noisy, WIDE, np.array([1e-6, 1e-6]))
     assert found.parameters == pytest.approx(p, abs=1e-3)
     assert found.variance == pytest.approx(1e-8, rel=0.5)
 
 
 T_S, NOISE = np.arange(200.0), 0.01
-NOTHING, STEADY = np.empty((len(T_S) - 1, 3, 0)), np.tile(np.eye(3), (len(T_S) - 1, 1, 1))
+NOTHING, STEADY = (
+    np.empty((len(T_S) - 1, 3, 0)),
+    np.tile(np.eye(3), (len(T_S) - 1, 1, 1)),
+)
 
 
-def searched(signal: Signal, offset_s: float, seed=0, noise=NOISE, scale: float | None = None) -> OffsetFit:
+def searched(
+    signal: Signal, offset_s: float, seed=0, noise=NOISE, scale: float | None = None
+) -> OffsetFit:
     """With a scale, the signal is longer too, by a factor that is common to all and found beside the offset."""
     measured = (1 + (scale or 0.0)) * signal(T_S + offset_s)
-    measured = measured + noise * np.random.default_rng(seed).standard_normal(measured.shape)
+    measured = measured + noise * np.random.default_rng(seed).standard_normal(
+        measured.shape
+    )
 
     def line_up(at_s: float) -> list[SampleSeries]:
         expected = signal(T_S + at_s)
         longer = NOTHING if scale is None else np.diff(expected, axis=0)[:, :, None]
-        return [SampleSeries(np.diff(measured - expected, axis=0), longer, STEADY, np.diff(T_S))]
+        return [
+            SampleSeries(
+                np.diff(measured - expected, axis=0), longer, STEADY, np.diff(T_S)
+            )
+        ]
 
     return search_offset(line_up, np.ones(0 if scale is None else 1))
 
 
 def swaying(t_s: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.sin(0.31 * t_s + 0.002 * t_s**2), np.cos(0.23 * t_s + 0.003 * t_s**2), 0.2 * t_s])
+    return np.column_stack(
+        [
+            np.sin(0.31 * t_s + 0.002 * t_s**2),
+            np.cos(0.23 * t_s + 0.003 * t_s**2),
+            0.2 * t_s,
+        ]
+    )
 
 
-def textbook_covariance(offset_s: float, noise: float, scale: float | None = None) -> np.ndarray:
+def textbook_covariance(
+    offset_s: float, noise: float, scale: float | None = None
+) -> np.ndarray:
     """Of the offset, and of a scale: white noise on samples, whose own constant and slope are fitted too."""
     slope = (swaying(T_S + offset_s + 1e-4) - swaying(T_S + offset_s - 1e-4)) / 2e-4
-    columns = [slope] if scale is None else [(1 + scale) * slope, swaying(T_S + offset_s)]
+    columns = (
+        [slope] if scale is None else [(1 + scale) * slope, swaying(T_S + offset_s)]
+    )
     own = np.vander(T_S, 2)
-    left = np.array([(c - own @ np.linalg.lstsq(own, c, rcond=None)[0]).ravel() for c in columns])
+    left = np.array(
+        [(c - own @ np.linalg.lstsq(own, c, rcond=None)[0]).ravel() for c in columns]
+    )
     return noise**2 * np.linalg.inv(left @ left.T)
 
 
@@ -205,7 +281,9 @@ def textbook_covariance(offset_s: float, noise: float, scale: float | None = Non
 def test_sigma_is_the_textbooks_wherever_the_offset_lies_between_grid_points(offset_s):
     found = searched(swaying, offset_s).offset()
     assert found.is_known
-    assert found.sigma == pytest.approx(np.sqrt(textbook_covariance(offset_s, NOISE)[0, 0]), rel=0.15)
+    assert found.sigma == pytest.approx(
+        np.sqrt(textbook_covariance(offset_s, NOISE)[0, 0]), rel=0.15
+    )
     assert abs(found.value - offset_s) < 4 * found.sigma
 
 
@@ -227,7 +305,12 @@ def test_an_offset_that_still_moves_after_the_last_step_is_not_known(monkeypatch
 def test_a_motion_that_repeats_is_named_with_two_of_its_places():
     """A turn in 1.2 s."""
     phase = 2 * np.pi / 1.2
-    reason = searched(lambda t_s: np.column_stack([np.sin(phase * t_s), np.cos(phase * t_s), 0 * t_s]), 0.3).reason
+    reason = searched(
+        lambda t_s: np.column_stack(
+            [np.sin(phase * t_s), np.cos(phase * t_s), 0 * t_s]
+        ),
+        0.3,
+    ).reason
     one, other = (float(part.split(" s")[0]) for part in reason.split(" and "))
     assert one != other
     assert {one, other} <= {-0.9, 0.3, 1.5}
@@ -248,15 +331,28 @@ def test_another_place_within_four_sigmas_of_the_best_is_a_rival(at, worse, is_r
     misfit = 500.0 * np.abs(GRID_S - 0.3) + 100.0
     misfit[np.argmin(np.abs(GRID_S - at))] = 100.0 + worse
     reason = reason_not_unique(GRID_S, misfit, int(np.argmin(misfit)))
-    assert reason == (f"+0.3 s and {at:+.1f} s fit as well: too little changes in the motion" if is_rival else "")
+    assert reason == (
+        f"+0.3 s and {at:+.1f} s fit as well: too little changes in the motion"
+        if is_rival
+        else ""
+    )
 
 
 @pytest.mark.parametrize(
     ("sigma", "reason", "limited"),
-    [(0.2, "", ""), (0.3, "", "too little"), (0.1, "no motion", "no motion"), (0.3, "no motion", "no motion")],
+    [
+        (0.2, "", ""),
+        (0.3, "", "too little"),
+        (0.1, "no motion", "no motion"),
+        (0.3, "no motion", "no motion"),
+    ],
 )
-def test_what_is_too_unsure_is_not_known_and_keeps_the_first_reason(sigma, reason, limited):
-    assert Estimate1D(1.0, sigma, reason).limited(0.2, "too little") == Estimate1D(1.0, sigma, limited)
+def test_what_is_too_unsure_is_not_known_and_keeps_the_first_reason(
+    sigma, reason, limited
+):
+    assert Estimate1D(1.0, sigma, reason).limited(0.2, "too little") == Estimate1D(
+        1.0, sigma, limited
+    )
 
 
 def test_where_nothing_tells_the_offset_stays_in_the_range():
@@ -272,7 +368,9 @@ class SearchBegunError(Exception):
 
 
 def blas_threads() -> int:
-    return max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+    return max(
+        pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"
+    )
 
 
 @pytest.mark.parametrize("module", [dvl_imu, reference_offset])
@@ -282,7 +380,11 @@ def test_offsets_are_searched_by_one_thread(module, monkeypatch: pytest.MonkeyPa
 
     run = simulate_basin(BasinOptions(duration_s=120.0, laps=1, speed_m_s=0.4))
     monkeypatch.setattr(module, "search_offset", stop_and_tell)
-    match, other = ("match_dvl_to_imu", run.dvl) if module is dvl_imu else ("match_reference_to_imu", run.truth)
+    match, other = (
+        ("match_dvl_to_imu", run.dvl)
+        if module is dvl_imu
+        else ("match_reference_to_imu", run.truth)
+    )
     with threadpool_limits(2, user_api="blas"):
         assert blas_threads() == 2
         with pytest.raises(SearchBegunError, match=r"^1$"):

@@ -18,7 +18,11 @@ from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
 from sonar_graph.simulation.detections import world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, frame_stamps, record
-from sonar_graph.simulation.sonar_image.frames import FrameSimulator, FrameTruth, image_along
+from sonar_graph.simulation.sonar_image.frames import (
+    FrameSimulator,
+    FrameTruth,
+    image_along,
+)
 from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
 from sonar_graph.simulation.sonar_image.scene import place_landmark, scattered_objects
 from sonar_graph.simulation.vehicle import VehiclePath, drive, follow, smooth_noise
@@ -41,14 +45,20 @@ class Lane:
 
     def write(self, log: Path, frames: Iterable[SonarFrames] | None = None) -> Path:
         """As a log, with images in the order given, whatever their stamps say."""
-        blocks = [self.one(row) for row in range(len(self.frames))] if frames is None else frames
+        blocks = (
+            [self.one(row) for row in range(len(self.frames))]
+            if frames is None
+            else frames
+        )
         write_log(log, self.sequence, _in_this_order(blocks))
         return log
 
     def one(self, row: int) -> SonarFrames:
         """A block of one frame."""
         frames, only = self.frames, slice(row, row + 1)
-        return replace(frames, stamps_ns=frames.stamps_ns[only], intensity=frames.intensity[only])
+        return replace(
+            frames, stamps_ns=frames.stamps_ns[only], intensity=frames.intensity[only]
+        )
 
 
 def _in_this_order(blocks: Iterable[SonarFrames]) -> Iterator[Outgoing]:
@@ -56,7 +66,9 @@ def _in_this_order(blocks: Iterable[SonarFrames]) -> Iterator[Outgoing]:
     time_ns = 0
     for block in blocks:
         time_ns = max(time_ns + 1, int(block.stamps_ns[0]))
-        message = sonar_image_messages(TOPIC, block, frequency_hz=1.8e6, sound_speed_m_s=1480)
+        message = sonar_image_messages(
+            TOPIC, block, frequency_hz=1.8e6, sound_speed_m_s=1480
+        )
         yield replace(message, log_times_ns=np.array([time_ns]))
 
 
@@ -66,22 +78,40 @@ def lane_path(rng: np.random.Generator) -> VehiclePath:
     seconds = np.linspace(0, piece.duration_s, round(2 * piece.duration_s) + 1)
     x, y, yaw = follow((0.0, 0.0, 0.0), [piece], seconds).T
     level = np.zeros_like(seconds)
-    sway = smooth_noise(seconds, np.array([0.03, 0.06, 0.02, *np.radians([2.0, 2.0, 3.0])]), 4.0, 6, rng)
-    return VehiclePath.through(seconds, np.column_stack([x, y, level + BODY_Z_M, level, level, yaw]) + sway)
+    sway = smooth_noise(
+        seconds, np.array([0.03, 0.06, 0.02, *np.radians([2.0, 2.0, 3.0])]), 4.0, 6, rng
+    )
+    return VehiclePath.through(
+        seconds, np.column_stack([x, y, level + BODY_Z_M, level, level, yaw]) + sway
+    )
 
 
 def lane_run(seed: int) -> Lane:
     """The run of a seed."""
     options, streams = SimulationOptions(seed=seed, frame_rate_hz=5.0), Streams.of(seed)
-    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    world = world_on_floor(
+        LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world
+    )
     path = lane_path(streams.path)
-    sequence = replace(record("lane", options, YSHARK, path, world, streams, {"ours": "a lane"}), detections=None)
+    sequence = replace(
+        record("lane", options, YSHARK, path, world, streams, {"ours": "a lane"}),
+        detections=None,
+    )
     yaw_rad = streams.seabed.uniform(-np.pi, np.pi, len(DEFAULT_DESIGNS))
     placed = zip(DEFAULT_DESIGNS, world.landmark_positions, yaw_rad, strict=True)
-    objects = [place_landmark(*each, FLOOR_Z_M) for each in placed] + scattered_objects(OTHERS_M, 1, streams.seabed)
+    objects = [place_landmark(*each, FLOOR_Z_M) for each in placed] + scattered_objects(
+        OTHERS_M, 1, streams.seabed
+    )
     simulator = FrameSimulator(ImageOptions(), objects, FLOOR_Z_M, seed)
-    blocks = list(image_along(path, YSHARK.sonar, frame_stamps(5.0, path.duration_s), simulator, 1))
-    columns = (np.concatenate([getattr(b.frames, name) for b in blocks]) for name in ("stamps_ns", "intensity"))
+    blocks = list(
+        image_along(
+            path, YSHARK.sonar, frame_stamps(5.0, path.duration_s), simulator, 1
+        )
+    )
+    columns = (
+        np.concatenate([getattr(b.frames, name) for b in blocks])
+        for name in ("stamps_ns", "intensity")
+    )
     first = blocks[0].frames
     frames = SonarFrames(*columns, first.ranges_m, first.azimuths_rad)
     return Lane(sequence, frames, [block.truth for block in blocks], path)

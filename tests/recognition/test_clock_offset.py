@@ -9,7 +9,11 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.measurements import Floats
-from sonar_graph.recognition.clock_offset import ClockOffset, NavigationMotion, estimate_offset
+from sonar_graph.recognition.clock_offset import (
+    ClockOffset,
+    NavigationMotion,
+    estimate_offset,
+)
 from sonar_graph.recognition.image_motion import ImageMotions, PlanarStep
 from tests.recognition.imaged_lane import Lane
 
@@ -20,25 +24,46 @@ RANGE_M, NOISE = 1.9, np.array([0.003, 0.002, 0.001])
 @pytest.fixture(scope="module")
 def steps(lane: Lane) -> list[PlanarStep]:
     """True motion of the lane in the sonar's plane, with the noise of motion from images."""
-    body_T_sonar, rng = lane.sequence.calibration.sonar.mounting.pose(), np.random.default_rng(3)
-    stamps = lane.frames.stamps_ns[lane.frames.stamps_ns <= lane.sequence.truth.stamps_ns[-1]]
+    body_T_sonar, rng = (
+        lane.sequence.calibration.sonar.mounting.pose(),
+        np.random.default_rng(3),
+    )
+    stamps = lane.frames.stamps_ns[
+        lane.frames.stamps_ns <= lane.sequence.truth.stamps_ns[-1]
+    ]
     poses = lane.sequence.truth.at(stamps)
-    sonar = [gtsam.Pose3(gtsam.Rot3(R), t) * body_T_sonar for R, t in zip(poses.matrices, poses.positions, strict=True)]
+    sonar = [
+        gtsam.Pose3(gtsam.Rot3(R), t) * body_T_sonar
+        for R, t in zip(poses.matrices, poses.positions, strict=True)
+    ]
     found = []
     for k in range(1, len(sonar)):
         tangent = gtsam.Pose3.Logmap(sonar[k - 1].inverse() * sonar[k])
         yaw, ahead, across = NOISE * rng.standard_normal(3)
         motion = tangent[[2, 3, 4]] + np.array([yaw, ahead, across - RANGE_M * yaw])
-        found.append(PlanarStep(int(stamps[k - 1]), int(stamps[k]), motion, np.diag(NOISE**2), is_measured=True))
+        found.append(
+            PlanarStep(
+                int(stamps[k - 1]),
+                int(stamps[k]),
+                motion,
+                np.diag(NOISE**2),
+                is_measured=True,
+            )
+        )
     return found
 
 
 def moved(steps: list[PlanarStep], offset_s: float) -> list[PlanarStep]:
     shift = round(offset_s * 1e9)
-    return [replace(step, start_ns=step.start_ns - shift, end_ns=step.end_ns - shift) for step in steps]
+    return [
+        replace(step, start_ns=step.start_ns - shift, end_ns=step.end_ns - shift)
+        for step in steps
+    ]
 
 
-def estimated(lane: Lane, steps: list[PlanarStep], offset_s: float, **search: float) -> ClockOffset:
+def estimated(
+    lane: Lane, steps: list[PlanarStep], offset_s: float, **search: float
+) -> ClockOffset:
     return estimate_offset(moved(steps, offset_s), lane.sequence, RANGE_M, **search)
 
 
@@ -47,7 +72,9 @@ def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s):
     found = estimated(lane, steps, offset_s)
     assert abs(found.seconds - offset_s) < 3 * found.sigma_s + 0.01
     assert found.sigma_s < 0.1
-    assert re.match(r"[+-]\d\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found))
+    assert re.match(
+        r"[+-]\d\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found)
+    )
 
 
 def test_an_offset_is_searched_about_what_was_stated(lane, steps):
@@ -59,7 +86,8 @@ def test_motion_of_stretches_adds_up_to_the_end_of_the_log_and_is_unknown_beyond
     first_ns = lane.sequence.start_ns
     motion = NavigationMotion(lane.sequence, first_ns, first_ns + round(2e9))
     first, second, both, beyond, before = motion.over(
-        np.array([0.33, 1.21, 0.33, 1.21, -0.01]), np.array([1.21, 1.99, 1.99, 2.01, 1.0])
+        np.array([0.33, 1.21, 0.33, 1.21, -0.01]),
+        np.array([1.21, 1.99, 1.99, 2.01, 1.0]),
     )
     assert np.abs(both).max() > 0.1
     assert first + second == pytest.approx(both, abs=1e-12)
@@ -75,29 +103,49 @@ def test_steps_that_err_wildly_are_left_out(lane, steps):
 
 
 def replaced(steps: list[PlanarStep], motions: Floats) -> list[PlanarStep]:
-    return [replace(step, motion=motion) for step, motion in zip(steps, motions, strict=True)]
+    return [
+        replace(step, motion=motion)
+        for step, motion in zip(steps, motions, strict=True)
+    ]
 
 
 def test_images_that_cannot_tell_are_refused_with_the_reason(lane, steps):
     noise = NOISE * np.random.default_rng(4).standard_normal((len(steps), 3))
-    with pytest.raises(LogError, match=r"cannot tell .*; state it with --offset SECONDS"):
+    with pytest.raises(
+        LogError, match=r"cannot tell .*; state it with --offset SECONDS"
+    ):
         estimated(lane, replaced(steps, noise), 0.0)
-    with pytest.raises(LogError, match=r"\d+ of \d+ steps between them could be measured"):
+    with pytest.raises(
+        LogError, match=r"\d+ of \d+ steps between them could be measured"
+    ):
         estimated(lane, [replace(step, is_measured=False) for step in steps], 0.0)
-    with pytest.raises(LogError, match=r"fewer than 50 steps between them lie in IMU and"):
+    with pytest.raises(
+        LogError, match=r"fewer than 50 steps between them lie in IMU and"
+    ):
         estimated(lane, steps, 500.0)
-    with pytest.raises(LogError, match=r"is at the end of the search; give a longer --search"):
+    with pytest.raises(
+        LogError, match=r"is at the end of the search; give a longer --search"
+    ):
         estimated(lane, steps, 1.5, search_s=1.4)
 
 
 def test_the_motion_of_images_tells_the_offset(lane):
     motions = ImageMotions(lane.sequence.calibration.model_copy(update={"floor": None}))
-    seen = [step for row in range(len(lane.frames)) if (step := motions.look(lane.one(row))) is not None]
+    seen = [
+        step
+        for row in range(len(lane.frames))
+        if (step := motions.look(lane.one(row))) is not None
+    ]
     found = estimated(lane, seen, -0.8)
     assert abs(found.seconds + 0.8) < 3 * found.sigma_s + 0.01
     assert min(found.correlations) > 0.9
 
 
-def test_an_offset_between_those_that_are_tried_is_found_to_a_tenth_of_their_distance(lane, steps):
-    off_s = [estimated(lane, steps, 1.37 + d, around_s=1.4, search_s=1.5).seconds - d for d in (0.0, 0.006)]
+def test_an_offset_between_those_that_are_tried_is_found_to_a_tenth_of_their_distance(
+    lane, steps
+):
+    off_s = [
+        estimated(lane, steps, 1.37 + d, around_s=1.4, search_s=1.5).seconds - d
+        for d in (0.0, 0.006)
+    ]
     assert off_s[1] == pytest.approx(off_s[0], abs=0.002)

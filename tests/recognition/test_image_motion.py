@@ -9,7 +9,11 @@ import pytest
 from sonar_graph.calibration import Calibration
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.sonar_images import ImagesAlone, lacking_navigation, read_images_alone
+from sonar_graph.logs.sonar_images import (
+    ImagesAlone,
+    lacking_navigation,
+    read_images_alone,
+)
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats
 from sonar_graph.recognition.image_motion import ImageMotions
@@ -24,7 +28,9 @@ SURE, RANGE_M = 0.9, 1.9
 def true_steps(lane: Lane, rows: range, body_T_sonar: gtsam.Pose3) -> list[gtsam.Pose3]:
     poses = lane.sequence.truth.at(lane.frames.stamps_ns[rows.start : rows.stop])
     pairs = zip(poses.matrices, poses.positions, strict=True)
-    sonar = [gtsam.Pose3(gtsam.Rot3(matrix), place) * body_T_sonar for matrix, place in pairs]
+    sonar = [
+        gtsam.Pose3(gtsam.Rot3(matrix), place) * body_T_sonar for matrix, place in pairs
+    ]
     return [before.inverse() * now for before, now in pairwise(sonar)]
 
 
@@ -49,13 +55,20 @@ def test_steps_are_the_true_ones_within_their_covariance(lane, is_floor_known):
     assert (motions.view is not None) == is_floor_known
     assert motions.measured == motions.steps == len(rows) - 1
     level_R_sonar = np.eye(3) if motions.view is None else motions.view.level_R_sonar
-    true = in_plane(true_steps(lane, rows, calibration.sonar.mounting.pose()), level_R_sonar)
+    true = in_plane(
+        true_steps(lane, rows, calibration.sonar.mounting.pose()), level_R_sonar
+    )
     found = np.array([step.motion for step in steps])
     errors = found - true
     across = errors[:, 2] + RANGE_M * errors[:, 0]
     assert np.sqrt(np.mean(errors[:, 1] ** 2)) < 0.2 * np.sqrt(np.mean(true[:, 1] ** 2))
     assert np.sqrt(np.mean(across**2)) < 0.004
-    nees = np.array([e @ np.linalg.solve(step.covariance, e) for e, step in zip(errors, steps, strict=True)])
+    nees = np.array(
+        [
+            e @ np.linalg.solve(step.covariance, e)
+            for e, step in zip(errors, steps, strict=True)
+        ]
+    )
     assert 0.3 < nees.mean() / 3 < 3.0
 
 
@@ -64,10 +77,14 @@ def test_a_frame_of_another_scene_is_not_laid_upon_the_one_before(lane):
     look_at_all(lane, motions, range(3))
     rng, other = np.random.default_rng(1), lane.one(3)
     noise = rng.rayleigh(40.0, other.intensity.shape).astype(np.uint8)
-    step = motions.look(SonarFrames(other.stamps_ns, noise, other.ranges_m, other.azimuths_rad))
+    step = motions.look(
+        SonarFrames(other.stamps_ns, noise, other.ranges_m, other.azimuths_rad)
+    )
     assert not step.is_measured
     assert step.covariance[1, 1] > (0.05) ** 2 * step.duration_s
-    assert motions.notes()["detections.motion"] == "from the images: 2 of 3 steps measured"
+    assert (
+        motions.notes()["detections.motion"] == "from the images: 2 of 3 steps measured"
+    )
 
 
 def test_a_fixed_sonar_does_not_move_whatever_its_images_show(lane):
@@ -92,7 +109,9 @@ def test_landmarks_are_recognised_by_images_alone(lane, lane_recognition):
     assert set(named[probability > SURE].tolist()) == {1, 2, 3, 4}
     expected = lane_recognition.detections
     stamps = set(expected.stamps_ns[expected.most_probable()[1] > SURE].tolist())
-    assert len(stamps & set(found.detections.stamps_ns[probability > SURE].tolist())) > 0.5 * len(stamps)
+    assert len(
+        stamps & set(found.detections.stamps_ns[probability > SURE].tolist())
+    ) > 0.5 * len(stamps)
     assert found.notes["detections.motion"].startswith("from the images")
 
 

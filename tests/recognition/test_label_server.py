@@ -20,30 +20,46 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from sonar_graph.recognition.label_server import LabelDesk, LabelServer, ShownFrame, shown_frames
+from sonar_graph.recognition.label_server import (
+    LabelDesk,
+    LabelServer,
+    ShownFrame,
+    shown_frames,
+)
 from sonar_graph.recognition.labels import Labels, read_labels
 from sonar_graph.recognition.session import one_by_one
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+    None,
+)
 IDS = [1, 2, 3, 4]
 
 
 @pytest.fixture(scope="module")
 def frames(lane) -> list[ShownFrame]:
     blocks = [lane.one(row) for row in range(20)]
-    return shown_frames(blocks, lane.sequence.calibration.sonar, 500_000_000, lambda _: None)
+    return shown_frames(
+        blocks, lane.sequence.calibration.sonar, 500_000_000, lambda _: None
+    )
 
 
 @pytest.fixture
 def server(frames, tmp_path) -> Iterator[LabelServer]:
     desk = LabelDesk(frames, Labels(log="lane.mcap"), tmp_path / "labels.json")
-    with LabelServer(desk, lambda nonce: f"<script nonce={nonce}></script>", IDS) as made:
-        Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    with LabelServer(
+        desk, lambda nonce: f"<script nonce={nonce}></script>", IDS
+    ) as made:
+        Thread(
+            target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True
+        ).start()
         yield made
         made.shutdown()
 
 
-def ask(server: LabelServer, path: str, content: object = None, **headers: str) -> tuple[int, bytes]:
+def ask(
+    server: LabelServer, path: str, content: object = None, **headers: str
+) -> tuple[int, bytes]:
     """Status and body of an answer."""
     address = path if path.startswith("http") else server.address + path
     body = None if content is None else json.dumps(content).encode()
@@ -57,7 +73,9 @@ def ask(server: LabelServer, path: str, content: object = None, **headers: str) 
             return error.code, error.read()
 
 
-def test_frames_are_a_period_apart_and_their_pixels_are_where_ranges_and_azimuths_are(frames, lane):
+def test_frames_are_a_period_apart_and_their_pixels_are_where_ranges_and_azimuths_are(
+    frames, lane
+):
     stamps = np.array([frame.stamp_ns for frame in frames])
     assert stamps[0] == lane.frames.stamps_ns[0]
     assert np.diff(stamps).min() >= 500_000_000
@@ -69,15 +87,21 @@ def test_frames_are_a_period_apart_and_their_pixels_are_where_ranges_and_azimuth
 
 def test_of_many_frames_those_that_are_shown_are_spread_over_the_log(lane, monkeypatch):
     monkeypatch.setattr("sonar_graph.recognition.label_server.MOST_FRAMES", 10)
-    shown = shown_frames(one_by_one(lane.frames), lane.sequence.calibration.sonar, 0, lambda _: None)
+    shown = shown_frames(
+        one_by_one(lane.frames), lane.sequence.calibration.sonar, 0, lambda _: None
+    )
     assert 4 <= len(shown) <= 10
     assert shown[-1].stamp_ns > lane.frames.stamps_ns[-1] - 10_000_000_000
     gaps_ns = np.diff([frame.stamp_ns for frame in shown])
     assert gaps_ns.max() < 1.5 * gaps_ns.min()
 
 
-def test_frames_of_the_same_beams_and_bins_share_one_fan_whichever_block_they_come_in(lane):
-    blocks = [replace(lane.one(row), ranges_m=lane.frames.ranges_m.copy()) for row in range(4)]
+def test_frames_of_the_same_beams_and_bins_share_one_fan_whichever_block_they_come_in(
+    lane,
+):
+    blocks = [
+        replace(lane.one(row), ranges_m=lane.frames.ranges_m.copy()) for row in range(4)
+    ]
     shown = shown_frames(blocks, lane.sequence.calibration.sonar, 0, lambda _: None)
     assert len({id(frame.fan) for frame in shown}) == 1 < len(shown)
 
@@ -117,7 +141,12 @@ def test_requests_that_make_no_sense_are_refused(server):
         assert ask(server, "label", click | changed)[0] == 400
     assert ask(server, "label", [1])[0] == 400
     assert ask(server, "label", {"frame": "1" * 20_000})[0] == 400
-    assert ask(server, "frame/99")[0] == ask(server, "frame/-1")[0] == ask(server, "labels", click)[0] == 404
+    assert (
+        ask(server, "frame/99")[0]
+        == ask(server, "frame/-1")[0]
+        == ask(server, "labels", click)[0]
+        == 404
+    )
     assert server.desk.labels == ()
 
 
@@ -130,10 +159,19 @@ def test_each_click_is_saved_and_can_be_taken_back(server, tmp_path):
     saved = read_labels(tmp_path / "labels.json", Path("lane.mcap"))
     assert [label.id for label in saved.labels] == [2, None]
     assert saved.labels[0].stamp_ns == server.desk.frames[1].stamp_ns
-    assert json.loads(ask(server, "label", click | {"column": 0, "row": 600})[1])["fault"] == "outside of the image"
+    assert (
+        json.loads(ask(server, "label", click | {"column": 0, "row": 600})[1])["fault"]
+        == "outside of the image"
+    )
     assert json.loads(ask(server, "take-back", {"frame": 2})[1])["total"] == 1
-    assert json.loads(ask(server, "take-back", {"frame": 2})[1])["fault"] == "no label in this frame"
-    assert [label.id for label in read_labels(tmp_path / "labels.json", Path("lane.mcap")).labels] == [2]
+    assert (
+        json.loads(ask(server, "take-back", {"frame": 2})[1])["fault"]
+        == "no label in this frame"
+    )
+    assert [
+        label.id
+        for label in read_labels(tmp_path / "labels.json", Path("lane.mcap")).labels
+    ] == [2]
 
 
 def test_the_last_label_of_a_frame_is_taken_back(server):
@@ -146,8 +184,16 @@ def test_the_last_label_of_a_frame_is_taken_back(server):
 
 def test_a_label_on_one_of_the_same_frame_takes_its_place(server):
     desk = server.desk
-    for frame, landmark, range_m in ((1, 2, 1.5), (1, 3, 1.8), (2, 4, 1.5), (1, 1, 1.52)):
-        assert desk.add(frame, *desk.frames[frame].fan.pixel(range_m, 0.0), landmark) is None
+    for frame, landmark, range_m in (
+        (1, 2, 1.5),
+        (1, 3, 1.8),
+        (2, 4, 1.5),
+        (1, 1, 1.52),
+    ):
+        assert (
+            desk.add(frame, *desk.frames[frame].fan.pixel(range_m, 0.0), landmark)
+            is None
+        )
     assert [label.id for label in desk.labels] == [3, 4, 1]
 
 
@@ -156,25 +202,47 @@ def test_what_cannot_be_saved_is_said_and_not_kept(server, monkeypatch):
         raise OSError("no space left")
 
     monkeypatch.setattr(Labels, "write", full)
-    answer = json.loads(ask(server, "label", {"frame": 1, "column": 300, "row": 300, "id": 2})[1])
+    answer = json.loads(
+        ask(server, "label", {"frame": 1, "column": 300, "row": 300, "id": 2})[1]
+    )
     assert answer["fault"] == "not saved: no space left"
     assert answer["total"] == 0
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")
-def test_landmarks_are_clicked_in_a_browser_and_the_command_ends_by_ctrl_c_and_goes_on_later(lane_log, tmp_path):
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+def test_landmarks_are_clicked_in_a_browser_and_the_command_ends_by_ctrl_c_and_goes_on_later(
+    lane_log, tmp_path
+):
+    sync_api = pytest.importorskip(
+        "playwright.sync_api",
+        reason="playwright is not installed: pip install playwright",
+    )
     out = tmp_path / "labels.json"
     for before in (0, 2):
-        words = [sys.executable, "-m", "sonar_graph", "label", str(lane_log), "-o", str(out), "--no-browser"]
-        command = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        words = [
+            sys.executable,
+            "-m",
+            "sonar_graph",
+            "label",
+            str(lane_log),
+            "-o",
+            str(out),
+            "--no-browser",
+        ]
+        command = subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         try:
             line = command.stdout.readline()
             assert f"{before} labels so far" in line
             with sync_api.sync_playwright() as playwright:
-                browser = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
-                click_two(browser, re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)[0], before)
+                browser = playwright.chromium.launch(
+                    executable_path=BROWSER, args=["--no-sandbox"]
+                )
+                click_two(
+                    browser, re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)[0], before
+                )
                 browser.close()
             command.send_signal(signal.SIGINT)
             said, complaints = command.communicate(timeout=20)
@@ -219,7 +287,8 @@ def click_two(browser, address: str, before: int) -> None:
     assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
     assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
     held: list = []
-    page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))  # a picture that is long in coming
+    # a picture that is long in coming
+    page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))
     page.keyboard.press("ArrowRight")
     until(lambda: page.locator("#frame").input_value() == f"{frame + 1}")
     page.keyboard.press("3")

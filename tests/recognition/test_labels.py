@@ -31,22 +31,47 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
     for stamp_ns in lane.frames.stamps_ns[::6].tolist():
         if not run.truth.stamps_ns[0] <= stamp_ns <= run.truth.stamps_ns[-1]:
             continue
-        rows = zip(run.true_landmarks.ids.tolist(), *true_ranges_azimuths(run, stamp_ns), strict=True)
+        rows = zip(
+            run.true_landmarks.ids.tolist(),
+            *true_ranges_azimuths(run, stamp_ns),
+            strict=True,
+        )
         for landmark, range_m, azimuth_rad in rows:
             if 1.5 < range_m < 2.3 and abs(azimuth_rad) < 0.17:
                 off = CLICK_PIXELS_M * rng.standard_normal(2)
                 place = range_m + off[0], azimuth_rad + off[1] / range_m
-                given.append(Label(stamp_ns=stamp_ns, range_m=place[0], azimuth_rad=place[1], id=landmark))
+                given.append(
+                    Label(
+                        stamp_ns=stamp_ns,
+                        range_m=place[0],
+                        azimuth_rad=place[1],
+                        id=landmark,
+                    )
+                )
     found = lane_recognition.detections
     none = found.rows(1 - found.id_probability.sum(axis=1) > 0.5)
-    for stamp_ns, range_m, azimuth_rad in zip(none.stamps_ns, none.range_m, none.azimuth_rad, strict=True):
+    for stamp_ns, range_m, azimuth_rad in zip(
+        none.stamps_ns, none.range_m, none.azimuth_rad, strict=True
+    ):
         ranges_m, azimuths_rad = true_ranges_azimuths(run, stamp_ns)
-        if np.hypot(ranges_m - range_m, ranges_m * (azimuths_rad - azimuth_rad)).min() > 0.5:
-            given.append(Label(stamp_ns=int(stamp_ns), range_m=range_m, azimuth_rad=azimuth_rad, id=None))
+        if (
+            np.hypot(ranges_m - range_m, ranges_m * (azimuths_rad - azimuth_rad)).min()
+            > 0.5
+        ):
+            given.append(
+                Label(
+                    stamp_ns=int(stamp_ns),
+                    range_m=range_m,
+                    azimuth_rad=azimuth_rad,
+                    id=None,
+                )
+            )
     return Labels(log=lane_log.name, labels=tuple(given))
 
 
-def test_a_few_labels_measure_what_the_whole_truth_does(lane, lane_log, clicks, monkeypatch):
+def test_a_few_labels_measure_what_the_whole_truth_does(
+    lane, lane_log, clicks, monkeypatch
+):
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
     by_truth = confusion_fit.calibrate([(lane_log, lane.sequence)])
     first = clicks.labels[0]
@@ -59,33 +84,53 @@ def test_a_few_labels_measure_what_the_whole_truth_does(lane, lane_log, clicks, 
         first.model_copy(update={"range_m": float(frame.ranges_m[-1]) + 0.3}),
     ]
     given = Labels(log=clicks.log, labels=(*vain, *clicks.labels))
-    by_labels = calibrate_by_labels([LabelledLog(lane_log, lane.sequence, given, Path("out.csv"))])
+    by_labels = calibrate_by_labels(
+        [LabelledLog(lane_log, lane.sequence, given, Path("out.csv"))]
+    )
     assert by_labels.ids == by_truth.ids
     np.testing.assert_allclose(by_labels.matrix, by_truth.matrix, atol=0.1)
-    for name in ("frames of landmark 1", "frames of landmark 3", "tracks of landmark 2"):
+    for name in (
+        "frames of landmark 1",
+        "frames of landmark 3",
+        "tracks of landmark 2",
+    ):
         assert int(by_labels.provenance[name]) >= 0.8 * int(by_truth.provenance[name])
     assert by_labels.range_sigma_m < 0.02
     said = by_labels.provenance["labels 1"]
     assert re.match(rf"out\.csv: \d+ of {len(given.labels)} labels met a track", said)
     assert "; rows 1, 5: outside of the image;" in said
-    assert "; row 3: outside of the image, but not if the azimuth is in degrees; expected radians" in said
+    assert (
+        "; row 3: outside of the image, but not if the azimuth is in degrees; expected radians"
+        in said
+    )
     assert "; row 2: no such frame" in said
     assert re.search("; rows? 4[^;]*: no track there", said)
 
 
 def test_labels_of_other_frames_designs_or_too_few_are_refused(lane, lane_log, clicks):
     def refusal(*given: Label) -> str:
-        own = LabelledLog(lane_log, lane.sequence, Labels(log="lane.mcap", labels=given), Path("out.csv"), "images")
+        own = LabelledLog(
+            lane_log,
+            lane.sequence,
+            Labels(log="lane.mcap", labels=given),
+            Path("out.csv"),
+            "images",
+        )
         with pytest.raises(CalibrationError) as refused:
             calibrate_by_labels([own])
         assert str(refused.value).startswith("out.csv: ")
         return str(refused.value)
 
     first = clicks.labels[0]
-    assert "name landmark 17, the designs are 1, 2, 3, 4" in refusal(first.model_copy(update={"id": 17}))
-    assert "no frame of lane.mcap has the stamp of any label" in refusal(first.model_copy(update={"stamp_ns": 5}))
-    assert "0 of 1 labels met a track of the recogniser; row 1: outside of the image; too few" in refusal(
-        first.model_copy(update={"range_m": 9.0})
+    assert "name landmark 17, the designs are 1, 2, 3, 4" in refusal(
+        first.model_copy(update={"id": 17})
+    )
+    assert "no frame of lane.mcap has the stamp of any label" in refusal(
+        first.model_copy(update={"stamp_ns": 5})
+    )
+    assert (
+        "0 of 1 labels met a track of the recogniser; row 1: outside of the image; too few"
+        in refusal(first.model_copy(update={"range_m": 9.0}))
     )
     assert "; rows 1, 2: contradicts other labels of its track, so left out" in refusal(
         first, first.model_copy(update={"id": None})
@@ -96,13 +141,20 @@ def test_labels_of_other_frames_designs_or_too_few_are_refused(lane, lane_log, c
 def test_labels_are_read_as_they_were_written_and_from_csv(clicks, lane_log, tmp_path):
     clicks.write(tmp_path / "labels.json")
     assert read_labels(tmp_path / "labels.json", lane_log) == clicks
-    assert json.loads((tmp_path / "labels.json").read_text())["labels"][0]["id"] in (1, 2, 3, 4)
+    assert json.loads((tmp_path / "labels.json").read_text())["labels"][0]["id"] in (
+        1,
+        2,
+        3,
+        4,
+    )
     rows = [
         f"{one.stamp_ns},{one.range_m!r},{one.azimuth_rad!r},{'' if one.id is None else one.id}"
         for one in clicks.labels
     ]
     for encoding in ("utf-8", "utf-8-sig"):  # spreadsheets begin with a byte-order mark
-        (tmp_path / "labels.csv").write_text("\n".join(["stamp_ns,range_m,azimuth_rad,id", *rows]), encoding)
+        (tmp_path / "labels.csv").write_text(
+            "\n".join(["stamp_ns,range_m,azimuth_rad,id", *rows]), encoding
+        )
         assert read_labels(tmp_path / "labels.csv", lane_log) == clicks
 
 
@@ -115,16 +167,26 @@ def test_labels_are_read_as_they_were_written_and_from_csv(clicks, lane_log, tmp
             "expected JSON as `sonar-graph label` writes it, or CSV with stamp_ns, range_m, azimuth_rad, id",
         ),
         ("a.csv", "stamp_ns,range_m\n1,2", "no column azimuth_rad, id"),
-        ("a.json", '{"log": "other.mcap", "labels": []}', "its labels are of other.mcap, not of lane.mcap"),
+        (
+            "a.json",
+            '{"log": "other.mcap", "labels": []}',
+            "its labels are of other.mcap, not of lane.mcap",
+        ),
         (
             "a.json",
             '{"log": "lane.mcap", "labels": [{"stamp_ns": 1, "range_m": -1, "azimuth_rad": 0, "id": 1}]}',
             "range_m",
         ),
-        ("a.csv", "stamp_ns,range_m,azimuth_rad,id\n1,two,0,1", "range_m: expected a number"),
+        (
+            "a.csv",
+            "stamp_ns,range_m,azimuth_rad,id\n1,two,0,1",
+            "range_m: expected a number",
+        ),
     ],
 )
-def test_a_wrong_file_is_named_with_what_was_expected(name, text, said, lane_log, tmp_path):
+def test_a_wrong_file_is_named_with_what_was_expected(
+    name, text, said, lane_log, tmp_path
+):
     (tmp_path / name).write_text(text)
     with pytest.raises(CalibrationError) as refused:
         read_labels(tmp_path / name, lane_log)
@@ -142,9 +204,17 @@ def test_a_wrong_file_is_named_with_what_was_expected(name, text, said, lane_log
         ([(1, 1), (1, 2)], [1, 2]),
     ],
 )
-def test_of_contradicting_labels_of_a_track_only_those_go_that_most_others_contradict(said, dropped):
-    given = [Label(stamp_ns=stamp_ns, range_m=2.0, azimuth_rad=0.0, id=landmark) for stamp_ns, landmark in said]
-    track = LabelledTrack(labels=list(enumerate(given, 1)), labelled=[np.full(3, row) for row in range(len(given))])
+def test_of_contradicting_labels_of_a_track_only_those_go_that_most_others_contradict(
+    said, dropped
+):
+    given = [
+        Label(stamp_ns=stamp_ns, range_m=2.0, azimuth_rad=0.0, id=landmark)
+        for stamp_ns, landmark in said
+    ]
+    track = LabelledTrack(
+        labels=list(enumerate(given, 1)),
+        labelled=[np.full(3, row) for row in range(len(given))],
+    )
     assert track.drop_contradictions() == dropped
     kept = [row for row in range(1, len(given) + 1) if row not in dropped]
     assert [row for row, _ in track.labels] == kept
@@ -152,12 +222,20 @@ def test_of_contradicting_labels_of_a_track_only_those_go_that_most_others_contr
     assert len(track.ids) == bool(kept)
 
 
-@pytest.mark.parametrize(("bias_m", "least", "most"), [(0.0, 0.0, 0.35), (0.05, 0.9, 1.0)])
-def test_labels_tell_an_error_of_the_sightings_as_far_as_it_exceeds_their_own(bias_m, least, most):
+@pytest.mark.parametrize(
+    ("bias_m", "least", "most"), [(0.0, 0.0, 0.35), (0.05, 0.9, 1.0)]
+)
+def test_labels_tell_an_error_of_the_sightings_as_far_as_it_exceeds_their_own(
+    bias_m, least, most
+):
     rng = np.random.default_rng(5)
     tracks = [
         LabelledTrack(
-            seen=[np.zeros(3)], labelled=[np.array([bias_m, 0, 0]) + 0.01 * rng.standard_normal(3) for _ in range(4)]
+            seen=[np.zeros(3)],
+            labelled=[
+                np.array([bias_m, 0, 0]) + 0.01 * rng.standard_normal(3)
+                for _ in range(4)
+            ],
         )
         for _ in range(30)
     ]

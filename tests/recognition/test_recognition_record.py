@@ -20,7 +20,9 @@ JPEG = b"\xff\xd8 a picture \xff\xd9"
 def drawn(stamp_ns: int, **probability_of: float) -> DrawnFrame:
     """A frame with detections such as ``id3=0.9``."""
     ids = tuple(int(name.removeprefix("id")) for name in probability_of)
-    return DrawnFrame(stamp_ns, JPEG + bytes([stamp_ns]), ids, tuple(probability_of.values()))
+    return DrawnFrame(
+        stamp_ns, JPEG + bytes([stamp_ns]), ids, tuple(probability_of.values())
+    )
 
 
 @pytest.fixture
@@ -29,53 +31,98 @@ def recognition() -> Recognition:
         frames=7,
         outcomes=Counter({"not reported: rare": 1, "reported": 4}),
         warnings=[(12, "frame not used: saturated"), (15, 'frame not used: "ä" & <b>')],
-        pictures=[drawn(1, id2=0.6), drawn(2, id2=0.9, id4=0.7), drawn(3, id1=0.4), drawn(4, id2=0.8)],
+        pictures=[
+            drawn(1, id2=0.6),
+            drawn(2, id2=0.9, id4=0.7),
+            drawn(3, id1=0.4),
+            drawn(4, id2=0.8),
+        ],
         notes={"detections.rule": "jeffrey"},
     )
 
 
-def test_the_surest_picture_of_each_landmark_is_shown_in_order(recognition: Recognition) -> None:
-    assert [picture.stamp_ns for picture in recognition.shown()] == [2, 2]  # of landmark 2, and of landmark 4
+def test_the_surest_picture_of_each_landmark_is_shown_in_order(
+    recognition: Recognition,
+) -> None:
+    # of landmark 2, and of landmark 4
+    assert [picture.stamp_ns for picture in recognition.shown()] == [
+        2,
+        2,
+    ]
     recognition.pictures.append(drawn(5, id4=0.95, id1=0.51))
     assert [picture.stamp_ns for picture in recognition.shown()] == [5, 2, 5]
     recognition.pictures += [drawn(10 + k, **{f"id{10 + k}": 0.9}) for k in range(8)]
     assert len(recognition.shown()) == 6
 
 
-def test_what_was_written_is_read_again_and_the_commonest_outcome_comes_first(recognition, tmp_path: Path) -> None:
+def test_what_was_written_is_read_again_and_the_commonest_outcome_comes_first(
+    recognition, tmp_path: Path
+) -> None:
     write_recognition(recognition, tmp_path)
     read = read_recognition(tmp_path)
-    assert (read.frames, read.outcomes, read.notes) == (7, recognition.outcomes, recognition.notes)
+    assert (read.frames, read.outcomes, read.notes) == (
+        7,
+        recognition.outcomes,
+        recognition.notes,
+    )
     assert list(read.outcomes) == ["reported", "not reported: rare"]
     assert read.warnings == recognition.warnings
-    assert [p.__dict__ for p in read.pictures] == [p.__dict__ for p in recognition.shown()]
+    assert [p.__dict__ for p in read.pictures] == [
+        p.__dict__ for p in recognition.shown()
+    ]
     assert read.detections is None
 
 
-def test_nothing_of_an_earlier_recognition_is_left(recognition: Recognition, tmp_path: Path) -> None:
-    for pictures, files in ((recognition.pictures, ["2.jpg"]), ([drawn(9, id1=0.8)], ["9.jpg"]), (None, [])):
-        write_recognition(None if pictures is None else replace(recognition, pictures=pictures), tmp_path)
+def test_nothing_of_an_earlier_recognition_is_left(
+    recognition: Recognition, tmp_path: Path
+) -> None:
+    for pictures, files in (
+        (recognition.pictures, ["2.jpg"]),
+        ([drawn(9, id1=0.8)], ["9.jpg"]),
+        (None, []),
+    ):
+        write_recognition(
+            None if pictures is None else replace(recognition, pictures=pictures),
+            tmp_path,
+        )
         assert [path.name for path in tmp_path.glob("recognised/*")] == files
     assert read_recognition(tmp_path) is None
 
 
 @pytest.mark.parametrize(
-    ("unlike", "is_doubted"), [((6, 10), True), ((5, 10), False), ((9, 9), False), ((0, 0), False)]
+    ("unlike", "is_doubted"),
+    [((6, 10), True), ((5, 10), False), ((9, 9), False), ((0, 0), False)],
 )
-def test_a_floor_of_another_roughness_is_told_where_most_of_ten_tracks_show_it(recognition, unlike, is_doubted):
-    lines = [line for line in replace(recognition, unlike=unlike).naming() if "rougher or smoother" in line]
+def test_a_floor_of_another_roughness_is_told_where_most_of_ten_tracks_show_it(
+    recognition, unlike, is_doubted
+):
+    lines = [
+        line
+        for line in replace(recognition, unlike=unlike).naming()
+        if "rougher or smoother" in line
+    ]
     assert len(lines) == is_doubted
     assert all(line.startswith("Warning: 6 of 10 tracks") for line in lines)
 
 
-@pytest.mark.parametrize(("off", "other", "is_doubted"), [(60, 40, True), (40, 60, False), (9, 0, False)])
+@pytest.mark.parametrize(
+    ("off", "other", "is_doubted"), [(60, 40, True), (40, 60, False), (9, 0, False)]
+)
 def test_a_wrong_floor_is_doubted_where_nothing_is_named_and_most_candidates_lie_off_it(
     recognition, off, other, is_doubted
 ):
-    outcomes = Counter({CANDIDATE_OFF_FLOOR: off, "candidate rejected: too small": other})
-    lines = [line for line in replace(recognition, outcomes=outcomes).naming() if "where no floor can be" in line]
+    outcomes = Counter(
+        {CANDIDATE_OFF_FLOOR: off, "candidate rejected: too small": other}
+    )
+    lines = [
+        line
+        for line in replace(recognition, outcomes=outcomes).naming()
+        if "where no floor can be" in line
+    ]
     assert len(lines) == is_doubted
-    assert all(line.startswith("Warning: 60 of 100 rejected candidates") for line in lines)
+    assert all(
+        line.startswith("Warning: 60 of 100 rejected candidates") for line in lines
+    )
 
 
 def test_the_words_of_a_candidate_off_the_floor_are_those_of_the_recogniser():

@@ -14,7 +14,13 @@ from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, recognise_images, with_detections
+from sonar_graph.recognition.session import (
+    RecognitionSession,
+    one_by_one,
+    recognise,
+    recognise_images,
+    with_detections,
+)
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
@@ -41,21 +47,28 @@ def accepted(lane: Lane, found: LandmarkDetections) -> set[tuple[int, int]]:
     """Pairs of true identity and the one that was named with certainty."""
     named, probability = found.most_probable()
     sure = probability > SURE
-    return set(zip(truth_of(lane, found)[0][sure].tolist(), named[sure].tolist(), strict=True))
+    return set(
+        zip(truth_of(lane, found)[0][sure].tolist(), named[sure].tolist(), strict=True)
+    )
 
 
-def recognised(lane: Lane, frames: Iterable[SonarFrames] | None = None, **settings: object) -> Recognition:
+def recognised(
+    lane: Lane, frames: Iterable[SonarFrames] | None = None, **settings: object
+) -> Recognition:
     session = RecognitionSession(lane.sequence, pictures=False, **settings)
     for frame in one_by_one(lane.frames) if frames is None else frames:
         session.take(frame)
     return session.finish()
 
 
-def test_every_landmark_is_recognised_by_its_name_and_nothing_else_is(lane, lane_recognition):
+def test_every_landmark_is_recognised_by_its_name_and_nothing_else_is(
+    lane, lane_recognition
+):
     found = lane_recognition.detections
     ids, _ = truth_of(lane, found)
     assert accepted(lane, found) == {(1, 1), (2, 2), (3, 3), (4, 4)}
-    assert {-1, -2} <= set(ids.tolist())  # stone and patch were tracked, and are named by nothing
+    # stone and patch were tracked, and are named by nothing
+    assert {-1, -2} <= set(ids.tolist())
     assert lane_recognition.outcomes[REPORTED] == len(found)
     assert lane_recognition.warnings == []
     named, probability = found.most_probable()
@@ -71,34 +84,61 @@ def test_range_and_azimuth_are_as_accurate_as_their_covariance_says(lane):
     found = recognised(lane, params=EVERY).detections
     ids, errors = truth_of(lane, found)
     sure = (ids > 0) & (found.most_probable()[1] > SURE)
-    fitted = sure & (found.range_azimuth_cov[:, 0, 0] < 0.03**2)  # the others are about to leave the beam
+    # the others are about to leave the beam
+    fitted = sure & (found.range_azimuth_cov[:, 0, 0] < 0.03**2)
     assert fitted.sum() > 40
     assert np.sqrt(np.mean(errors[fitted, 0] ** 2)) < 0.010
     range_rms_m, azimuth_rms_rad = np.sqrt(np.mean(errors[sure] ** 2, axis=0))
     assert (range_rms_m < 0.025, np.degrees(azimuth_rms_rad) < 0.5) == (True, True)
-    nis = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(found.range_azimuth_cov), errors)[sure]
+    nis = np.einsum(
+        "ni,nij,nj->n", errors, np.linalg.inv(found.range_azimuth_cov), errors
+    )[sure]
     assert 0.5 < nis.mean() / 2 < 2.2
     assert np.mean(nis < 9.21) > 0.93
 
 
-def test_detections_are_a_part_of_those_of_every_frame_as_often_as_the_model_says(lane, lane_recognition):
-    found, every = lane_recognition.detections, recognised(lane, params=EVERY).detections
+def test_detections_are_a_part_of_those_of_every_frame_as_often_as_the_model_says(
+    lane, lane_recognition
+):
+    found, every = (
+        lane_recognition.detections,
+        recognised(lane, params=EVERY).detections,
+    )
     interval_ns = confusion_for(DEFAULT_DESIGNS).report_interval_s * 1e9
-    rows = {(stamp, track): row for row, (stamp, track) in enumerate(zip(every.stamps_ns, every.track, strict=True))}
-    chosen = np.array([rows[key] for key in zip(found.stamps_ns, found.track, strict=True)])
+    rows = {
+        (stamp, track): row
+        for row, (stamp, track) in enumerate(
+            zip(every.stamps_ns, every.track, strict=True)
+        )
+    }
+    chosen = np.array(
+        [rows[key] for key in zip(found.stamps_ns, found.track, strict=True)]
+    )
     assert_same_detections(found, every.rows(chosen))
     for track in np.unique(every.track):
-        reported, seen = (block.stamps_ns[block.track == track] for block in (found, every))
-        due = [stamp for stamp in seen if not ((reported <= stamp) & (reported > stamp - interval_ns)).any()]
+        reported, seen = (
+            block.stamps_ns[block.track == track] for block in (found, every)
+        )
+        due = [
+            stamp
+            for stamp in seen
+            if not ((reported <= stamp) & (reported > stamp - interval_ns)).any()
+        ]
         assert not due, "every track, and never more rarely"
     assert len(found) < 0.4 * len(every)
 
 
 def test_designs_under_other_names_give_other_names(lane):
     """Negative control: names come from the designs and from nothing else."""
-    turned = sorted((replace(d, id=d.id % 4 + 1) for d in DEFAULT_DESIGNS), key=lambda d: d.id)
-    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"designs": confusion_for(turned).designs})
-    found = recognised(lane, designs=turned, params=RecogniserParams(confusion=model)).detections
+    turned = sorted(
+        (replace(d, id=d.id % 4 + 1) for d in DEFAULT_DESIGNS), key=lambda d: d.id
+    )
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(
+        update={"designs": confusion_for(turned).designs}
+    )
+    found = recognised(
+        lane, designs=turned, params=RecogniserParams(confusion=model)
+    ).detections
     pairs = accepted(lane, found)
     assert len(pairs) >= 3
     assert all(named == true % 4 + 1 for true, named in pairs)
@@ -110,7 +150,13 @@ def test_landmarks_of_other_designs_are_not_accepted(lane):
     bar[26:34] = 12.0
     away = np.hypot(*np.meshgrid(*2 * [np.arange(60) - 29.5]))
     ring[(away < 29) & (away > 20)] = 12.0
-    found = recognised(lane, designs=[LandmarkDesign(7, "bar", 0.5, bar), LandmarkDesign(8, "ring", 0.5, ring)])
+    found = recognised(
+        lane,
+        designs=[
+            LandmarkDesign(7, "bar", 0.5, bar),
+            LandmarkDesign(8, "ring", 0.5, ring),
+        ],
+    )
     assert set(np.unique(found.detections.candidate_ids).tolist()) == {7, 8}
     assert np.mean(found.detections.most_probable()[1] > SURE) < 0.05
 
@@ -118,7 +164,9 @@ def test_landmarks_of_other_designs_are_not_accepted(lane):
 def test_a_lane_without_landmarks_yields_none(lane):
     """Negative control: the same frames with the order of their beams shuffled hold nothing that persists."""
     order = np.random.default_rng(0).permutation(len(lane.frames.azimuths_rad))
-    shuffled = replace(lane.frames, intensity=np.ascontiguousarray(lane.frames.intensity[:, order]))
+    shuffled = replace(
+        lane.frames, intensity=np.ascontiguousarray(lane.frames.intensity[:, order])
+    )
     found = recognised(lane, one_by_one(shuffled)).detections
     assert found is None or not accepted(lane, found)
 
@@ -128,23 +176,43 @@ def test_a_log_gives_what_its_images_give(lane, lane_log, lane_recognition):
     assert sequence.detections is None
     result = recognise_images(lane_log, sequence, progress=counts.append)
     assert counts == list(range(1, len(lane.frames) + 1))
-    assert (result.frames, result.outcomes) == (len(lane.frames), lane_recognition.outcomes)
-    for name in ("stamps_ns", "range_m", "azimuth_rad", "range_azimuth_cov", "candidate_ids", "id_probability"):
+    assert (result.frames, result.outcomes) == (
+        len(lane.frames),
+        lane_recognition.outcomes,
+    )
+    for name in (
+        "stamps_ns",
+        "range_m",
+        "azimuth_rad",
+        "range_azimuth_cov",
+        "candidate_ids",
+        "id_probability",
+    ):
         expected = getattr(lane_recognition.detections, name)
-        np.testing.assert_allclose(getattr(result.detections, name), expected, atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(result.detections, name), expected, atol=1e-4, err_msg=name
+        )
 
 
-def test_recognise_gives_the_sequence_with_the_detections_of_its_log_or_frames(lane, tmp_path):
+def test_recognise_gives_the_sequence_with_the_detections_of_its_log_or_frames(
+    lane, tmp_path
+):
     frames = first_frames(lane)
     expected = with_detections(lane.sequence, recognised(lane, frames))
     log = lane.write(tmp_path / "lane.mcap", frames)
-    for found in (recognise(frames, lane.sequence), recognise(log), recognise(str(log), topics={"sonar": TOPIC})):
+    for found in (
+        recognise(frames, lane.sequence),
+        recognise(log),
+        recognise(str(log), topics={"sonar": TOPIC}),
+    ):
         assert_same_detections(found.detections, expected.detections)
         assert found.notes["detections"] == f"recognised in {FRAMES} sonar images"
         np.testing.assert_array_equal(found.imu.stamps_ns, lane.sequence.imu.stamps_ns)
     write_log(tmp_path / "bare.mcap", lane.sequence)
     assert recognise_images(tmp_path / "bare.mcap", lane.sequence) is None
-    with pytest.raises(LogError, match=r"bare\.mcap: has no sonar images; `sonar-graph inspect"):
+    with pytest.raises(
+        LogError, match=r"bare\.mcap: has no sonar images; `sonar-graph inspect"
+    ):
         recognise(tmp_path / "bare.mcap")
     with pytest.raises(LogError, match="no sonar frame"):
         recognise([], lane.sequence)
@@ -152,7 +220,9 @@ def test_recognise_gives_the_sequence_with_the_detections_of_its_log_or_frames(l
         recognise(frames)
 
 
-def test_estimators_are_given_the_block_that_was_recognised_beside_an_unchanged_sequence(lane, lane_recognition):
+def test_estimators_are_given_the_block_that_was_recognised_beside_an_unchanged_sequence(
+    lane, lane_recognition
+):
     sequence = with_detections(lane.sequence, lane_recognition)
     assert sequence.detections is lane_recognition.detections
     assert sequence.imu is lane.sequence.imu
@@ -160,10 +230,15 @@ def test_estimators_are_given_the_block_that_was_recognised_beside_an_unchanged_
     result = compare(sequence, ["isam2", "ekf-slam"], {}, rate_hz=2.0)
     assert [run.status for run in result.runs] == ["ok", "ok"]
     assert result.sequence.detections is lane_recognition.detections
-    assert all(scores["detections.used"].value > 0.5 * len(sequence.detections) for scores in result.scores.values())
+    assert all(
+        scores["detections.used"].value > 0.5 * len(sequence.detections)
+        for scores in result.scores.values()
+    )
 
 
-def test_pictures_come_once_a_second_and_show_what_was_recognised(lane, lane_recognition):
+def test_pictures_come_once_a_second_and_show_what_was_recognised(
+    lane, lane_recognition
+):
     pictures, detections = lane_recognition.pictures, lane_recognition.detections
     assert len(pictures) > 20
     assert np.diff([picture.stamp_ns for picture in pictures]).min() >= 10**9
@@ -171,7 +246,9 @@ def test_pictures_come_once_a_second_and_show_what_was_recognised(lane, lane_rec
     shown = [picture for picture in pictures if picture.landmark_ids]
     assert len(shown) > 5
     for picture in shown:
-        ids, probability = detections.rows(detections.stamps_ns == picture.stamp_ns).most_probable()
+        ids, probability = detections.rows(
+            detections.stamps_ns == picture.stamp_ns
+        ).most_probable()
         assert picture.landmark_ids == tuple(ids.tolist())
         assert picture.probabilities == tuple(probability.tolist())
 
@@ -192,10 +269,16 @@ def bad_frames(lane: Lane, at: int) -> dict[str, SonarFrames]:
     """Frames that must not be used, each to come instead of frame ``at``; by words of the reason."""
     frame, image = lane.one(at), lane.one(at).intensity
     return {
-        "wrong size": replace(frame, intensity=image[:, :, :500], ranges_m=frame.ranges_m[:500]),
+        "wrong size": replace(
+            frame, intensity=image[:, :, :500], ranges_m=frame.ranges_m[:500]
+        ),
         "zero": replace(frame, intensity=np.zeros_like(image)),
-        "saturated": replace(frame, intensity=np.where(np.arange(512) < 300, 255, image).astype(np.uint8)),
-        "not finite": replace(frame, intensity=np.where(np.arange(512) == 3, np.nan, image)),
+        "saturated": replace(
+            frame, intensity=np.where(np.arange(512) < 300, 255, image).astype(np.uint8)
+        ),
+        "not finite": replace(
+            frame, intensity=np.where(np.arange(512) == 3, np.nan, image)
+        ),
         "out of order": lane.one(at - 10),
         "duplicated": lane.one(at - 1),
     }
@@ -212,10 +295,14 @@ def first_frames(lane: Lane) -> list[SonarFrames]:
 @pytest.fixture(scope="module")
 def without(lane) -> LandmarkDetections:
     """What is recognised when frame `AT` is not there at all."""
-    return recognised(lane, [frame for k, frame in enumerate(first_frames(lane)) if k != AT]).detections
+    return recognised(
+        lane, [frame for k, frame in enumerate(first_frames(lane)) if k != AT]
+    ).detections
 
 
-def assert_same_detections(found: LandmarkDetections, expected: LandmarkDetections) -> None:
+def assert_same_detections(
+    found: LandmarkDetections, expected: LandmarkDetections
+) -> None:
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
     np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
     np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-2)
@@ -223,7 +310,9 @@ def assert_same_detections(found: LandmarkDetections, expected: LandmarkDetectio
 
 @pytest.mark.parametrize("is_from_log", [False, True], ids=["given", "in a log"])
 @pytest.mark.parametrize("reason", BAD)
-def test_a_bad_frame_is_named_in_a_warning_and_not_used(lane, without, reason, is_from_log, tmp_path):
+def test_a_bad_frame_is_named_in_a_warning_and_not_used(
+    lane, without, reason, is_from_log, tmp_path
+):
     frames = first_frames(lane)
     frames[AT] = bad = bad_frames(lane, AT)[reason]
     if reason == "not finite":  # all frames of a log have one type of samples
@@ -241,10 +330,15 @@ def test_a_bad_frame_is_named_in_a_warning_and_not_used(lane, without, reason, i
     assert_same_detections(result.detections, without)
 
 
-def test_the_notes_say_how_detections_came_about_and_warnings_are_counted_although_not_all_are_kept(lane, monkeypatch):
+def test_the_notes_say_how_detections_came_about_and_warnings_are_counted_although_not_all_are_kept(
+    lane, monkeypatch
+):
     monkeypatch.setattr("sonar_graph.recognition.session.MOST_WARNINGS", 3)
     params = RecogniserParams(identity=IdentityParams(rule="jeffrey"))
-    zero = [replace(lane.one(FRAMES + k), intensity=np.zeros_like(lane.one(0).intensity)) for k in range(10)]
+    zero = [
+        replace(lane.one(FRAMES + k), intensity=np.zeros_like(lane.one(0).intensity))
+        for k in range(10)
+    ]
     result = recognised(lane, [*first_frames(lane), *zero], params=params)
     assert len(result.warnings) == 3
     assert result.outcomes["frame not used: all samples are zero"] == 10
@@ -260,17 +354,27 @@ def test_the_notes_say_how_detections_came_about_and_warnings_are_counted_althou
 
 def test_a_bad_first_frame_costs_hardly_more_than_itself(lane):
     """The first frame must not become the measure of all others."""
-    result = recognised(lane, [bad_frames(lane, 11)["wrong size"], *(lane.one(k) for k in range(12, FRAMES))])
+    result = recognised(
+        lane,
+        [bad_frames(lane, 11)["wrong size"], *(lane.one(k) for k in range(12, FRAMES))],
+    )
     assert 1 <= len(result.warnings) <= 3
     assert all("window" in reason for _, reason in result.warnings)
     assert accepted(lane, result.detections) >= {(1, 1)}
 
 
 def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
-    good, ends_ns = first_frames(lane)[:30], [lane.sequence.start_ns - 1, lane.sequence.end_ns + 1]
-    early, late = (replace(lane.one(0), stamps_ns=np.array([stamp_ns])) for stamp_ns in ends_ns)
+    good, ends_ns = (
+        first_frames(lane)[:30],
+        [lane.sequence.start_ns - 1, lane.sequence.end_ns + 1],
+    )
+    early, late = (
+        replace(lane.one(0), stamps_ns=np.array([stamp_ns])) for stamp_ns in ends_ns
+    )
     result = recognised(lane, [early, *good[:20], late, *good[20:]])
-    assert result.warnings == [(ns, "frame not used: no IMU and Doppler log at its stamp") for ns in ends_ns]
+    assert result.warnings == [
+        (ns, "frame not used: no IMU and Doppler log at its stamp") for ns in ends_ns
+    ]
     assert_same_detections(result.detections, recognised(lane, good).detections)
 
 
@@ -291,8 +395,12 @@ def test_tracks_on_a_rougher_or_smoother_floor_than_the_models_are_counted(lane)
     shipped = confusion_for(DEFAULT_DESIGNS)
     counts = []
     for roughness in (None, (-20.0, 20.0), (-20.0, -10.0), (10.0, 20.0)):
-        params = RecogniserParams(confusion=shipped.model_copy(update={"roughness": roughness}))
-        counts.append(recognise_images([lane.frames], lane.sequence, params=params).unlike)
+        params = RecogniserParams(
+            confusion=shipped.model_copy(update={"roughness": roughness})
+        )
+        counts.append(
+            recognise_images([lane.frames], lane.sequence, params=params).unlike
+        )
     tracks = counts[1][1]
     assert tracks > 0
     assert counts == [(0, 0), (0, tracks), (tracks, tracks), (tracks, tracks)]

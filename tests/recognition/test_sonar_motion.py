@@ -19,17 +19,31 @@ from sonar_graph.calibration import (
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu
 from sonar_graph.recognition.sonar_motion import SonarMotions, level_from_up
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.sensors import dvl_readings, imu_readings, regular_stamps, seconds_since_start
+from sonar_graph.simulation.sensors import (
+    dvl_readings,
+    imu_readings,
+    regular_stamps,
+    seconds_since_start,
+)
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation, smooth_noise
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.tracker import SonarStep
 
 FLOOR_Z_M = -1.7
 MOUNTED = Calibration(
-    imu=ImuCalibration(gyro_bias_sigma=0.0, mounting=Mounting(translation_m=(0.1, 0.05, 0.0), rpy_rad=(0.0, 0.0, 0.3))),
-    dvl=DvlCalibration(mounting=Mounting(translation_m=(-0.2, 0.0, -0.15), rpy_rad=(0.0, 0.0, 0.7))),
+    imu=ImuCalibration(
+        gyro_bias_sigma=0.0,
+        mounting=Mounting(translation_m=(0.1, 0.05, 0.0), rpy_rad=(0.0, 0.0, 0.3)),
+    ),
+    dvl=DvlCalibration(
+        mounting=Mounting(translation_m=(-0.2, 0.0, -0.15), rpy_rad=(0.0, 0.0, 0.7))
+    ),
     depth=DepthCalibration(sigma_m=0.01, port_m=(0.3, 0.05, 0.1)),
-    sonar=SonarCalibration(mounting=Mounting(translation_m=(0.4, 0.1, -0.05), rpy_rad=(0.1, np.radians(30), 0.2))),
+    sonar=SonarCalibration(
+        mounting=Mounting(
+            translation_m=(0.4, 0.1, -0.05), rpy_rad=(0.1, np.radians(30), 0.2)
+        )
+    ),
     floor=FloorPrior(z_m=FLOOR_Z_M, sigma_m=0.01),
 )
 
@@ -40,10 +54,17 @@ SECOND_NS = 10**9
 
 def exact_run(path: VehiclePath, calibration: Calibration = MOUNTED) -> Sequence:
     """Sensors without any noise, and a start that is true."""
-    imu_ns, dvl_ns, depth_ns = (regular_stamps(rate, path.duration_s) for rate in (100.0, 20.0, 10.0))
-    imu, dvl, depth, start = (path.at(seconds_since_start(ns)) for ns in (imu_ns, dvl_ns, depth_ns, imu_ns[:1]))
+    imu_ns, dvl_ns, depth_ns = (
+        regular_stamps(rate, path.duration_s) for rate in (100.0, 20.0, 10.0)
+    )
+    imu, dvl, depth, start = (
+        path.at(seconds_since_start(ns))
+        for ns in (imu_ns, dvl_ns, depth_ns, imu_ns[:1])
+    )
     rpy_rad = rpy_from_rotation(start.world_R_body)[0]
-    begin = Start(position_m=tuple(start.position[0].tolist()), rpy_rad=tuple(rpy_rad.tolist()))
+    begin = Start(
+        position_m=tuple(start.position[0].tolist()), rpy_rad=tuple(rpy_rad.tolist())
+    )
     calibration = calibration.model_copy(update={"start": begin})
     port = depth.position + depth.world_R_body.apply(np.array(calibration.depth.port_m))
     velocity_cov = np.tile(np.eye(3) * 1e-6, (len(dvl_ns), 1, 1))
@@ -60,7 +81,13 @@ def exact_run(path: VehiclePath, calibration: Calibration = MOUNTED) -> Sequence
 def path() -> VehiclePath:
     """It wanders by decimetres and sways by degrees."""
     seconds = np.linspace(0, 20, 41)
-    sway = smooth_noise(seconds, np.array([0.6, 0.6, 0.2, 0.1, 0.1, 0.6]), 4.0, 6, np.random.default_rng(4))
+    sway = smooth_noise(
+        seconds,
+        np.array([0.6, 0.6, 0.2, 0.1, 0.1, 0.6]),
+        4.0,
+        6,
+        np.random.default_rng(4),
+    )
     return VehiclePath.through(seconds, sway + np.array([0, 0, -0.7, 0, 0, 0]))
 
 
@@ -73,7 +100,10 @@ def sonar_poses(path: VehiclePath, stamps_ns: list[int]) -> list[gtsam.Pose3]:
     """world_T_sonar by the simulator's truth."""
     motion = path.at(seconds_since_start(np.array(stamps_ns)))
     bodies = zip(motion.world_R_body.as_matrix(), motion.position, strict=True)
-    return [gtsam.Pose3(gtsam.Rot3(rotation), position).compose(BODY_T_SONAR) for rotation, position in bodies]
+    return [
+        gtsam.Pose3(gtsam.Rot3(rotation), position).compose(BODY_T_SONAR)
+        for rotation, position in bodies
+    ]
 
 
 def frames_of(sequence: Sequence, count: int = 40) -> list[int]:
@@ -81,7 +111,9 @@ def frames_of(sequence: Sequence, count: int = 40) -> list[int]:
     return (sequence.start_ns + 37_100_000 + 230_000_000 * np.arange(count)).tolist()
 
 
-def along(sequence: Sequence, stamps_ns: list[int]) -> tuple[list[SonarStep | None], list[FloorView | None]]:
+def along(
+    sequence: Sequence, stamps_ns: list[int]
+) -> tuple[list[SonarStep | None], list[FloorView | None]]:
     motions = SonarMotions(sequence)
     steps, views = zip(*(motions.at(stamp_ns) for stamp_ns in stamps_ns), strict=True)
     return list(steps), list(views)
@@ -89,7 +121,9 @@ def along(sequence: Sequence, stamps_ns: list[int]) -> tuple[list[SonarStep | No
 
 def views_after(sequence: Sequence, *seconds: float) -> list[FloorView]:
     """Views of the floor at these times since the start."""
-    return along(sequence, [sequence.start_ns + round(s * SECOND_NS) for s in seconds])[1]
+    return along(sequence, [sequence.start_ns + round(s * SECOND_NS) for s in seconds])[
+        1
+    ]
 
 
 def joined(steps: list[SonarStep]) -> gtsam.Pose3:
@@ -103,8 +137,13 @@ def test_motion_tilt_and_height_are_those_of_the_simulators_truth(path, exact):
     poses = sonar_poses(path, frames_of(exact))
     (first, *steps), views = along(exact, frames_of(exact))
     assert first is None
-    for before, here, step, found in zip(poses, poses[1:], steps, views[1:], strict=False):
-        assert np.abs(before.between(here).localCoordinates(step.previous_T_sonar)).max() < 1e-3
+    for before, here, step, found in zip(
+        poses, poses[1:], steps, views[1:], strict=False
+    ):
+        assert (
+            np.abs(before.between(here).localCoordinates(step.previous_T_sonar)).max()
+            < 1e-3
+        )
         view = FloorView.from_pose(here, FLOOR_Z_M)
         np.testing.assert_allclose(found.level_R_sonar, view.level_R_sonar, atol=2e-3)
         assert found.height_m == pytest.approx(view.height_m, abs=5e-3)
@@ -115,14 +154,22 @@ def test_motion_tilt_and_height_are_those_of_the_simulators_truth(path, exact):
 
 def numbers(steps: list[SonarStep | None], views: list[FloorView]) -> Floats:
     """Everything that is told about each frame but the motion of the first, one row a frame."""
-    moved = [np.append(s.previous_T_sonar.matrix(), s.covariance) if s else np.zeros(52) for s in steps]
-    seen = [[*v.level_R_sonar.ravel(), v.height_m, v.height_sigma_m, v.tilt_sigma_rad] for v in views]
+    moved = [
+        np.append(s.previous_T_sonar.matrix(), s.covariance) if s else np.zeros(52)
+        for s in steps
+    ]
+    seen = [
+        [*v.level_R_sonar.ravel(), v.height_m, v.height_sigma_m, v.tilt_sigma_rad]
+        for v in views
+    ]
     return np.hstack([moved, seen])
 
 
 def test_nothing_stamped_after_a_frame_influences_it(exact):
     """Also of one that falls on a Doppler stamp, between rows of the IMU."""
-    exact = replace(exact, imu=replace(exact.imu, stamps_ns=exact.imu.stamps_ns + 3_000_000))
+    exact = replace(
+        exact, imu=replace(exact.imu, stamps_ns=exact.imu.stamps_ns + 3_000_000)
+    )
     stamps_ns = [*frames_of(exact, 12), *exact.dvl.stamps_ns[60:63].tolist()]
     expected = numbers(*along(exact, stamps_ns))
     for k in (0, 5, 12, 14):
@@ -139,21 +186,37 @@ def _spoiled_after(run: Sequence, stamp_ns: int) -> Sequence:
             values[later] += 3.0
         return replace(block, **changed)
 
-    imu, dvl = wrong(run.imu, "angular_velocity", "specific_force"), wrong(run.dvl, "velocity", "velocity_cov")
+    imu, dvl = (
+        wrong(run.imu, "angular_velocity", "specific_force"),
+        wrong(run.dvl, "velocity", "velocity_cov"),
+    )
     return replace(run, imu=imu, dvl=dvl, depth=wrong(run.depth, "z_m"))
 
 
 def test_frames_that_are_left_out_leave_their_motion_to_the_next(exact):
     stamps_ns = frames_of(exact, 9)
-    (every, views), (some, fewer) = along(exact, stamps_ns), along(exact, stamps_ns[::4])
-    assert np.abs(joined(every[1:5]).localCoordinates(some[1].previous_T_sonar)).max() < 2e-3
-    np.testing.assert_allclose(fewer[2].level_R_sonar, views[8].level_R_sonar, atol=1e-6)
+    (every, views), (some, fewer) = (
+        along(exact, stamps_ns),
+        along(exact, stamps_ns[::4]),
+    )
+    assert (
+        np.abs(joined(every[1:5]).localCoordinates(some[1].previous_T_sonar)).max()
+        < 2e-3
+    )
+    np.testing.assert_allclose(
+        fewer[2].level_R_sonar, views[8].level_R_sonar, atol=1e-6
+    )
 
 
-def at_rest(rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0), **calibration: object) -> Sequence:
+def at_rest(
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0), **calibration: object
+) -> Sequence:
     """A vehicle that does not move."""
     poses = np.tile(np.array([1.0, 2.0, -0.7, *rpy_rad]), (41, 1))
-    return exact_run(VehiclePath.through(np.linspace(0, 20, 41), poses), MOUNTED.model_copy(update=calibration))
+    return exact_run(
+        VehiclePath.through(np.linspace(0, 20, 41), poses),
+        MOUNTED.model_copy(update=calibration),
+    )
 
 
 def with_start(run: Sequence, **changes: object) -> Sequence:
@@ -164,11 +227,23 @@ def with_start(run: Sequence, **changes: object) -> Sequence:
 @pytest.mark.parametrize("is_force_measured", [True, False])
 def test_gravity_corrects_a_start_that_is_tilted_wrongly(is_force_measured: bool):
     """Without accelerometers (negative control) the error stays."""
-    run = with_start(at_rest((0.05, -0.1, 1.0)), rpy_rad=(0.0, 0.0, 1.0), rpy_sigma_rad=(0.1, 0.1, 0.1))
+    run = with_start(
+        at_rest((0.05, -0.1, 1.0)),
+        rpy_rad=(0.0, 0.0, 1.0),
+        rpy_sigma_rad=(0.1, 0.1, 0.1),
+    )
     if not is_force_measured:
-        run = replace(run, imu=replace(run.imu, specific_force=np.full_like(run.imu.specific_force, np.nan)))
+        run = replace(
+            run,
+            imu=replace(
+                run.imu, specific_force=np.full_like(run.imu.specific_force, np.nan)
+            ),
+        )
     first, _, last = views_after(run, 0, 2, 10)
-    up = BODY_T_SONAR.rotation().matrix().T @ gtsam.Rot3.RzRyRx(0.05, -0.1, 0.0).matrix().T[:, 2]
+    up = (
+        BODY_T_SONAR.rotation().matrix().T
+        @ gtsam.Rot3.RzRyRx(0.05, -0.1, 0.0).matrix().T[:, 2]
+    )
     off = [np.linalg.norm(view.level_R_sonar[2] - up) for view in (first, last)]
     assert off[0] == pytest.approx(np.hypot(0.05, 0.1), rel=0.02)
     assert first.tilt_sigma_rad == pytest.approx(0.1, rel=0.01)
@@ -181,33 +256,49 @@ def test_gravity_corrects_a_start_that_is_tilted_wrongly(is_force_measured: bool
 
 
 def test_gravity_is_left_alone_where_the_calibration_says_so():
-    run = with_start(at_rest(use_gravity=False), rpy_rad=(0.05, 0.0, 0.0), rpy_sigma_rad=(0.1, 0.1, 0.1))
+    run = with_start(
+        at_rest(use_gravity=False),
+        rpy_rad=(0.05, 0.0, 0.0),
+        rpy_sigma_rad=(0.1, 0.1, 0.1),
+    )
     first, last = views_after(run, 0, 8)
     np.testing.assert_allclose(last.level_R_sonar, first.level_R_sonar, atol=1e-12)
 
 
 def test_tilt_is_as_uncertain_as_gyros_make_it():
     """Between two looks at gravity: white noise and a bias, from the start's variance."""
-    imu = MOUNTED.imu.model_copy(update={"gyro_bias_sigma": 0.003, "gyro_noise_density": 0.002})
-    run = with_start(at_rest(imu=imu, use_gravity=False), rpy_sigma_rad=(0.01, 0.02, 0.5))
+    imu = MOUNTED.imu.model_copy(
+        update={"gyro_bias_sigma": 0.003, "gyro_noise_density": 0.002}
+    )
+    run = with_start(
+        at_rest(imu=imu, use_gravity=False), rpy_sigma_rad=(0.01, 0.02, 0.5)
+    )
     (view,) = views_after(run, 0.8)
-    assert view.tilt_sigma_rad**2 == pytest.approx(0.02**2 + 0.002**2 * 0.8 + (0.003 * 0.8) ** 2, rel=1e-6)
+    assert view.tilt_sigma_rad**2 == pytest.approx(
+        0.02**2 + 0.002**2 * 0.8 + (0.003 * 0.8) ** 2, rel=1e-6
+    )
 
 
 def test_depth_corrects_a_start_that_is_too_high_by_the_variances_of_both():
     """By hand; a sample may state its own variance."""
-    run = with_start(at_rest(), position_m=(1.0, 2.0, -0.4), position_sigma_m=(0.1, 0.1, 0.1))
+    run = with_start(
+        at_rest(), position_m=(1.0, 2.0, -0.4), position_sigma_m=(0.1, 0.1, 0.1)
+    )
     before, after = views_after(run, 0, 1e-9)
     start_m = -0.4 + BODY_T_SONAR.translation()[2] - FLOOR_Z_M
     assert before.height_m == pytest.approx(start_m, abs=1e-9)
     assert before.height_sigma_m == pytest.approx(np.hypot(0.1, 0.01), rel=1e-6)
     assert after.height_m == before.height_m  # no sample since
-    loose = replace(run, depth=replace(run.depth, variance_m2=np.full(len(run.depth), 1.0)))
+    loose = replace(
+        run, depth=replace(run.depth, variance_m2=np.full(len(run.depth), 1.0))
+    )
     for sequence, depth_variance in ((run, 0.01**2), (loose, 1.0)):
         (later,) = views_after(sequence, 0.1)
         gain = 0.1**2 / (0.1**2 + depth_variance)
         assert later.height_m == pytest.approx(start_m - gain * 0.3, abs=1e-4)
-        assert later.height_sigma_m == pytest.approx(np.sqrt(0.1**2 * (1 - gain) + 0.01**2), rel=1e-2)
+        assert later.height_sigma_m == pytest.approx(
+            np.sqrt(0.1**2 * (1 - gain) + 0.01**2), rel=1e-2
+        )
 
 
 @pytest.mark.parametrize("every", [1, 12])
@@ -227,23 +318,39 @@ def test_the_doppler_log_makes_height_and_steps_uncertain_and_the_gyros_only_ste
     The lever arm from body to sonar turns with the gyros' error.
     """
     gyro, doppler = 0.004**2, 1e-3**2 / 20
-    imu = MOUNTED.imu.model_copy(update={"gyro_noise_density": 0.004, "gyro_bias_sigma": 0.0})
+    imu = MOUNTED.imu.model_copy(
+        update={"gyro_noise_density": 0.004, "gyro_bias_sigma": 0.0}
+    )
     run = at_rest(imu=imu, dvl=MOUNTED.dvl.model_copy(update={"mounting": Mounting()}))
     run = replace(run, depth=run.depth.rows(slice(0, 2)))
-    (_, step), (before, after) = along(run, [run.start_ns + SECOND_NS, run.start_ns + 2 * SECOND_NS])
-    assert after.height_sigma_m**2 - before.height_sigma_m**2 == pytest.approx(doppler, rel=0.1)
+    (_, step), (before, after) = along(
+        run, [run.start_ns + SECOND_NS, run.start_ns + 2 * SECOND_NS]
+    )
+    assert after.height_sigma_m**2 - before.height_sigma_m**2 == pytest.approx(
+        doppler, rel=0.1
+    )
     assert gyro > 300 * doppler
     R, lever = BODY_T_SONAR.rotation().matrix(), BODY_T_SONAR.translation()
-    skew = np.array([[0, -lever[2], lever[1]], [lever[2], 0, -lever[0]], [-lever[1], lever[0], 0]])
+    skew = np.array(
+        [[0, -lever[2], lever[1]], [lever[2], 0, -lever[0]], [-lever[1], lever[0], 0]]
+    )
     turning = np.vstack([R.T, R.T @ skew.T])
     moving = np.vstack([np.zeros((3, 3)), R.T])
     expected = gyro * turning @ turning.T + doppler * moving @ moving.T
-    np.testing.assert_allclose(step.covariance, expected, atol=0.03 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        step.covariance, expected, atol=0.03 * np.abs(expected).max()
+    )
 
 
 def test_without_a_floor_below_or_depth_there_is_no_view(exact):
-    above, unknown = (exact.calibration.model_copy(update={"floor": f}) for f in (FloorPrior(z_m=1, sigma_m=1), None))
-    for run in (replace(exact, depth=None), *(replace(exact, calibration=told) for told in (above, unknown))):
+    above, unknown = (
+        exact.calibration.model_copy(update={"floor": f})
+        for f in (FloorPrior(z_m=1, sigma_m=1), None)
+    )
+    for run in (
+        replace(exact, depth=None),
+        *(replace(exact, calibration=told) for told in (above, unknown)),
+    ):
         assert along(run, frames_of(run, 1))[1] == [None]
 
 
@@ -260,17 +367,29 @@ def test_depth_that_begins_after_the_images_gives_the_view_from_then_on(exact):
 
 
 @pytest.mark.parametrize("is_live", [True, False])
-def test_depth_gives_no_view_before_its_first_sample_where_the_start_is_at_an_unknown_height(exact, is_live):
+def test_depth_gives_no_view_before_its_first_sample_where_the_start_is_at_an_unknown_height(
+    exact, is_live
+):
     """A recogniser that is behind its images has rows from the future, and a log has all; the height is off by 1 m."""
     start = exact.calibration.start
     wrong = (*start.position_m[:2], start.position_m[2] + 1.0)
-    unknown = start.model_copy(update={"position_m": wrong, "position_sigma_m": (0.01, 0.01, 1.0)})
-    stamps_ns, calibration = frames_of(exact, 4), exact.calibration.model_copy(update={"start": unknown})
+    unknown = start.model_copy(
+        update={"position_m": wrong, "position_sigma_m": (0.01, 0.01, 1.0)}
+    )
+    stamps_ns, calibration = (
+        frames_of(exact, 4),
+        exact.calibration.model_copy(update={"start": unknown}),
+    )
     depth = exact.depth.between(stamps_ns[1], exact.end_ns)
-    motions = SonarMotions(replace(exact, calibration=calibration, depth=None if is_live else depth))
+    motions = SonarMotions(
+        replace(exact, calibration=calibration, depth=None if is_live else depth)
+    )
     if is_live:
         motions.extend(None, None, depth)
-    heights = [view and view.height_m for view in (motions.at(stamp_ns)[1] for stamp_ns in stamps_ns)]
+    heights = [
+        view and view.height_m
+        for view in (motions.at(stamp_ns)[1] for stamp_ns in stamps_ns)
+    ]
     assert heights[:2] == [None, None]
     for found, whole in zip(heights[2:], along(exact, stamps_ns)[1][2:], strict=True):
         assert found == pytest.approx(whole.height_m, abs=0.02)
@@ -279,7 +398,12 @@ def test_depth_gives_no_view_before_its_first_sample_where_the_start_is_at_an_un
 def test_only_instants_with_odometry_and_in_order_are_covered(exact):
     motions, stamps_ns = SonarMotions(exact), frames_of(exact, 3)
     ends_ns = [exact.start_ns - 1, exact.start_ns, exact.end_ns, exact.end_ns + 1]
-    assert [motions.covers(stamp_ns) for stamp_ns in ends_ns] == [False, True, True, False]
+    assert [motions.covers(stamp_ns) for stamp_ns in ends_ns] == [
+        False,
+        True,
+        True,
+        False,
+    ]
     motions.at(stamps_ns[1])
     assert motions.passed(stamps_ns[0])
     assert [motions.covers(stamp_ns) for stamp_ns in stamps_ns] == [False, True, True]
@@ -289,18 +413,32 @@ def test_only_instants_with_odometry_and_in_order_are_covered(exact):
 def test_level_axes_follow_from_up_alone(roll: float, pitch: float, yaw: float):
     up = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix()[2]
     found = level_from_up(up)
-    np.testing.assert_allclose(found, gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix(), atol=1e-9)
+    np.testing.assert_allclose(
+        found, gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix(), atol=1e-9
+    )
     np.testing.assert_allclose(found @ up, [0, 0, 1], atol=1e-9)
 
 
 def test_a_gap_of_the_doppler_log_is_carried_by_the_accelerometers(path, exact):
     """Seven seconds without bottom lock: a held velocity is wrong by decimetres."""
     stamps_ns = frames_of(exact)
-    poses, seconds = sonar_poses(path, stamps_ns), (exact.dvl.stamps_ns - exact.start_ns) * 1e-9
-    lost = replace(exact, dvl=exact.dvl.rows(np.flatnonzero((seconds < 2.0) | (seconds > 9.0))))
-    holding = lost.calibration.model_copy(update={"dvl": MOUNTED.dvl.model_copy(update={"gap_s": 100.0})})
+    poses, seconds = (
+        sonar_poses(path, stamps_ns),
+        (exact.dvl.stamps_ns - exact.start_ns) * 1e-9,
+    )
+    lost = replace(
+        exact, dvl=exact.dvl.rows(np.flatnonzero((seconds < 2.0) | (seconds > 9.0)))
+    )
+    holding = lost.calibration.model_copy(
+        update={"dvl": MOUNTED.dvl.model_copy(update={"gap_s": 100.0})}
+    )
     carried, held = (
-        np.linalg.norm(poses[0].between(poses[-1]).between(joined(along(run, stamps_ns)[0][1:])).translation())
+        np.linalg.norm(
+            poses[0]
+            .between(poses[-1])
+            .between(joined(along(run, stamps_ns)[0][1:]))
+            .translation()
+        )
         for run in (lost, replace(lost, calibration=holding))
     )
     assert carried < 0.01

@@ -21,9 +21,14 @@ NAMES = ["1: disc", "2: square", "3: triangle", "4: cross"]
 
 @pytest.fixture(scope="module")
 def told(lane: Lane) -> tuple[Recognition, TrackStories]:
-    recogniser, stories = Recogniser(lane.sequence.calibration), TrackStories(lane.sequence.calibration.sonar.image)
+    recogniser, stories = (
+        Recogniser(lane.sequence.calibration),
+        TrackStories(lane.sequence.calibration.sonar.image),
+    )
     see = lambda frame: stories.see(frame, recogniser)  # noqa: E731
-    session = RecognitionSession(lane.sequence, recogniser=recogniser, pictures=False, seen=see)
+    session = RecognitionSession(
+        lane.sequence, recogniser=recogniser, pictures=False, seen=see
+    )
     for row in range(len(lane.frames)):
         session.take(lane.one(row))
     return session.finish(), stories
@@ -36,13 +41,19 @@ def test_every_track_and_candidate_is_told_once_for_each_frame(told):
         outcomes.update(story.outcomes)
     outcomes.update({reason: found.count for reason, found in stories.rejected.items()})
     assert outcomes == recognition.outcomes
-    assert all(1 <= len(found.examples) <= MOST_EXAMPLES for found in stories.rejected.values())
+    assert all(
+        1 <= len(found.examples) <= MOST_EXAMPLES for found in stories.rejected.values()
+    )
 
 
 def test_a_track_ends_with_the_probabilities_of_its_last_detection(told):
     recognition, stories = told
     found = recognition.detections
-    sure = {int(track): int(i) for track, i, p in zip(found.track, *found.most_probable(), strict=True) if p > 0.9}
+    sure = {
+        int(track): int(i)
+        for track, i, p in zip(found.track, *found.most_probable(), strict=True)
+        if p > 0.9
+    }
     assert set(sure.values()) == {1, 2, 3, 4}
     for track, landmark in sure.items():
         story = stories.tracks[track]
@@ -54,7 +65,14 @@ def test_a_track_ends_with_the_probabilities_of_its_last_detection(told):
 
 def test_the_page_shows_every_track_with_picture_and_reasons(told, lane, tmp_path):
     recognition, stories = told
-    write_track_page(tmp_path / "page.html", "<lane>", recognition, stories, NAMES, lane.sequence.start_ns)
+    write_track_page(
+        tmp_path / "page.html",
+        "<lane>",
+        recognition,
+        stories,
+        NAMES,
+        lane.sequence.start_ns,
+    )
     text = (tmp_path / "page.html").read_text("utf-8")
     assert "<h1>&lt;lane&gt;</h1>" in text
     assert "http" not in re.sub(r'src="data:[^"]*"', "", text)
@@ -65,7 +83,9 @@ def test_the_page_shows_every_track_with_picture_and_reasons(told, lane, tmp_pat
     assert re.search(r"<strong>(0\.9\d|1\.00)</strong> 3: triangle", text)
 
 
-def test_the_page_does_not_send_to_itself_and_counts_one_in_the_singular(told, lane, tmp_path):
+def test_the_page_does_not_send_to_itself_and_counts_one_in_the_singular(
+    told, lane, tmp_path
+):
     recognition = replace(of_tracks(told[0], 20, 20), frames=1)
     stories = TrackStories(lane.sequence.calibration.sonar.image)
     number, story = next(iter(told[1].tracks.items()))
@@ -83,26 +103,44 @@ def of_tracks(recognition: Recognition, count: int, none: int) -> Recognition:
     """Detections of some tracks, of which some are of no landmark."""
     row = recognition.detections.rows(np.zeros(1, np.int64))
     blocks = [
-        replace(row, track=np.array([k]), id_probability=np.full((1, 4), 0.01 if k < none else 0.25))
+        replace(
+            row,
+            track=np.array([k]),
+            id_probability=np.full((1, 4), 0.01 if k < none else 0.25),
+        )
         for k in range(count)
     ]
     return Recognition(frames=9, detections=LandmarkDetections.concatenate(blocks))
 
 
 @pytest.mark.parametrize(
-    ("count", "none", "is_doubted"), [(20, 20, True), (20, 18, True), (20, 17, False), (9, 9, False), (10, 10, True)]
+    ("count", "none", "is_doubted"),
+    [(20, 20, True), (20, 18, True), (20, 17, False), (9, 9, False), (10, 10, True)],
 )
-def test_images_of_which_nearly_all_tracks_are_none_are_doubted(told, count, none, is_doubted):
+def test_images_of_which_nearly_all_tracks_are_none_are_doubted(
+    told, count, none, is_doubted
+):
     lines = of_tracks(told[0], count, none).naming()
-    doubts = [line for line in lines if "the images may be unlike those that the model was measured on" in line]
+    doubts = [
+        line
+        for line in lines
+        if "the images may be unlike those that the model was measured on" in line
+    ]
     assert len(doubts) == is_doubted
     if doubts:
-        assert doubts[0].startswith(f"Warning: {none} of {count} tracks are of no landmark")
+        assert doubts[0].startswith(
+            f"Warning: {none} of {count} tracks are of no landmark"
+        )
     assert told[0].unlike_the_model() is None
 
 
 def test_a_log_of_other_landmarks_is_the_only_reason_given_for_tracks_of_none(told):
-    others = LandmarkMap(np.array([11, 12]), np.zeros((2, 3)), np.full((2, 3, 3), np.nan))
+    others = LandmarkMap(
+        np.array([11, 12]), np.zeros((2, 3)), np.full((2, 3, 3), np.nan)
+    )
     lines = of_tracks(told[0], 20, 20).naming(others)
-    assert any("the log has landmarks 11, 12, of which there is no design" in line for line in lines)
+    assert any(
+        "the log has landmarks 11, 12, of which there is no design" in line
+        for line in lines
+    )
     assert not any("may be unlike" in line for line in lines)

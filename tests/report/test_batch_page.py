@@ -15,10 +15,23 @@ from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.errors import EvaluationError
 from sonar_graph.report.batch_figures import folded, log_panels, spread_out
 from sonar_graph.report.batch_page import render_batch, write_batch_report
-from sonar_graph.report.batch_summary import absent_told, lost_told, marked, missing_told
+from sonar_graph.report.batch_summary import (
+    absent_told,
+    lost_told,
+    marked,
+    missing_told,
+)
 from sonar_graph.report.batch_tables import all_tests, failure_table
 from sonar_graph.report.figure_style import PAGE_WIDTH_IN, colour, sized
-from tests.recorded_batches import ESTIMATORS, LOGS, drawn_batch, failed, with_failures, with_missing, write_batch
+from tests.recorded_batches import (
+    ESTIMATORS,
+    LOGS,
+    drawn_batch,
+    failed,
+    with_failures,
+    with_missing,
+    write_batch,
+)
 
 ATE = "causal.ate_se2_m"
 
@@ -35,22 +48,47 @@ def html(batch) -> str:
 
 def test_every_figure_has_its_data(html, batch):
     figures = re.findall(r'<figure id="figure-([^"]+)"', html)
-    addresses = dict(re.findall(r'href="(data:text/csv[^"]+)" download="([^"]+)\.csv"', html))
+    addresses = dict(
+        re.findall(r'href="(data:text/csv[^"]+)" download="([^"]+)\.csv"', html)
+    )
     by_name = {name: address for address, name in addresses.items()}
-    assert {"failures", "spread-ate-se2-m", "difference-ate-se2-m", "anees-position", "costs"} <= set(figures)
+    assert {
+        "failures",
+        "spread-ate-se2-m",
+        "difference-ate-se2-m",
+        "anees-position",
+        "costs",
+    } <= set(figures)
     assert set(figures) <= set(by_name)
-    text = base64.b64decode(by_name["spread-ate-se2-m"].partition("base64,")[2]).decode()
+    text = base64.b64decode(
+        by_name["spread-ate-se2-m"].partition("base64,")[2]
+    ).decode()
     rows = list(csv.DictReader(io.StringIO(text)))
-    recorded = {(run.key, key): run.value(key) for run in batch.runs for key in (ATE, "smoothed.ate_se2_m")}
+    recorded = {
+        (run.key, key): run.value(key)
+        for run in batch.runs
+        for key in (ATE, "smoothed.ate_se2_m")
+    }
     assert {(row["key"], row["column"]) for row in rows} == set(recorded)
-    assert all(float(row["value"] or "inf") == recorded[row["key"], row["column"]] for row in rows)
+    assert all(
+        float(row["value"] or "inf") == recorded[row["key"], row["column"]]
+        for row in rows
+    )
 
 
 def test_reading_comes_before_numbers_and_protocol_and_counts_are_told(html):
     assert html.index("How to read this page") < html.index("<figure")
     text = " ".join(html.split())
     for said in (
-        *("Wilcoxon", "Holm (1979)", "Hall 1992", "Wilson", "chi-square", "Lachin 1999", ATE),
+        *(
+            "Wilcoxon",
+            "Holm (1979)",
+            "Hall 1992",
+            "Wilson",
+            "chi-square",
+            "Lachin 1999",
+            ATE,
+        ),
         "from 6 pairs on, and only where both runs of every pair have a value",
         "No test of fewer than 6 pairs, or seeds.",
         "All logs together have one difference a seed",
@@ -70,20 +108,30 @@ def test_few_runs_and_runs_that_all_failed_make_a_page(count):
     assert "not complete" not in html.lower()
     html = render_batch(replace(batch, runs=[failed(run) for run in batch.runs]))
     assert "no run has an error to compare" in html
-    assert "nan" not in re.sub(r"<svg.*?</svg>|base64,[^\"]*", "", html, flags=re.DOTALL).lower().split()
+    assert (
+        "nan"
+        not in re.sub(r"<svg.*?</svg>|base64,[^\"]*", "", html, flags=re.DOTALL)
+        .lower()
+        .split()
+    )
 
 
 @pytest.fixture
 def incomplete() -> RecordedBatch:
     """Of 60 runs four of isam2 and all ten of ekf-slam on one log are not done; one more run failed."""
     batch = with_failures(drawn_batch(10), "isam2", LOGS[0], 1)
-    return with_missing(with_missing(batch, "isam2", LOGS[0], 4), "ekf-slam", LOGS[0], 10)
+    return with_missing(
+        with_missing(batch, "isam2", LOGS[0], 4), "ekf-slam", LOGS[0], 10
+    )
 
 
 def rows(batch: RecordedBatch) -> dict[tuple[str, str], dict[str, object]]:
     table = failure_table(batch)
     keys = [column.key for column in table.columns]
-    cells = [dict(zip(keys, [cell.numbers[0] for cell in row], strict=True)) for row in table.rows]
+    cells = [
+        dict(zip(keys, [cell.numbers[0] for cell in row], strict=True))
+        for row in table.rows
+    ]
     return {(str(row["log"]), str(row["contestant"])): row for row in cells}
 
 
@@ -91,7 +139,12 @@ def test_missing_runs_are_counted_and_are_no_failures(incomplete):
     counted = rows(incomplete)
     assert len(counted) == 6
     some, none = counted[LOGS[0], "isam2"], counted[LOGS[0], "ekf-slam"]
-    assert (some["runs"], some["ended"], some["failure_rate"], some["not_run"]) == (6, 5, 1 / 6, 4)
+    assert (some["runs"], some["ended"], some["failure_rate"], some["not_run"]) == (
+        6,
+        5,
+        1 / 6,
+        4,
+    )
     assert (none["runs"], none["not_run"]) == (0, 10)
     assert np.isnan(none["failure_rate"])
     assert counted[LOGS[1], "isam2"]["not_run"] == 0
@@ -102,10 +155,19 @@ def test_missing_runs_are_counted_and_are_no_failures(incomplete):
 
 
 def test_logs_whose_data_was_absent_are_named_with_their_source():
-    suite = "".join(f'[[logs]]\nname = "{name}"\nobtain = "the source"\n' for name in (LOGS[0], "elsewhere"))
+    suite = "".join(
+        f'[[logs]]\nname = "{name}"\nobtain = "the source"\n'
+        for name in (LOGS[0], "elsewhere")
+    )
     batch = replace(drawn_batch(1), suite=suite)
-    assert absent_told(batch) == ["Left out, because its data was not there: elsewhere. Get the source."]
-    assert absent_told(replace(batch, suite="")) == absent_told(replace(batch, suite="no toml [")) == []
+    assert absent_told(batch) == [
+        "Left out, because its data was not there: elsewhere. Get the source."
+    ]
+    assert (
+        absent_told(replace(batch, suite=""))
+        == absent_told(replace(batch, suite="no toml ["))
+        == []
+    )
 
 
 def test_missing_runs_make_no_pairs_and_no_values(incomplete):
@@ -115,10 +177,16 @@ def test_missing_runs_make_no_pairs_and_no_values(incomplete):
     complete = with_failures(drawn_batch(10), "isam2", LOGS[0], 1)
     dropped = replace(incomplete, missing=[])
     metrics = metrics_of(complete.metrics)
-    assert str(all_tests(incomplete, metrics)) == str(all_tests(dropped, metrics)) != str(all_tests(complete, metrics))
+    assert (
+        str(all_tests(incomplete, metrics))
+        == str(all_tests(dropped, metrics))
+        != str(all_tests(complete, metrics))
+    )
 
 
-def test_a_table_with_missing_runs_is_read_as_one_in_the_order_of_the_plan(incomplete, tmp_path):
+def test_a_table_with_missing_runs_is_read_as_one_in_the_order_of_the_plan(
+    incomplete, tmp_path
+):
     lacks_first = with_missing(incomplete, "dead-reckoning", LOGS[0], 10)
     assert lacks_first.contestants == list(ESTIMATORS)
     back = read_batch(write_batch(lacks_first, tmp_path))
@@ -129,27 +197,43 @@ def test_a_table_with_missing_runs_is_read_as_one_in_the_order_of_the_plan(incom
     for name in ESTIMATORS:
         none = with_missing(none, name, LOGS[0], 1)
     write_batch(none, tmp_path)
-    with pytest.raises(EvaluationError, match=r"none of its 3 runs has been done yet; give the bench command"):
+    with pytest.raises(
+        EvaluationError,
+        match=r"none of its 3 runs has been done yet; give the bench command",
+    ):
         read_batch(tmp_path)
 
 
-def test_page_and_tables_say_how_many_runs_are_missing_whose_where_and_how_to_go_on(incomplete, tmp_path):
+def test_page_and_tables_say_how_many_runs_are_missing_whose_where_and_how_to_go_on(
+    incomplete, tmp_path
+):
     (told,) = missing_told(incomplete)
-    assert told.startswith("This batch is not complete: 14 of 60 runs have not been done (isam2 4 of 20, ekf-slam")
+    assert told.startswith(
+        "This batch is not complete: 14 of 60 runs have not been done (isam2 4 of 20, ekf-slam"
+    )
     assert "on basin. All numbers are of the other runs" in told
     assert "give the bench command that began it again" in told
-    page = write_batch_report(read_batch(write_batch(incomplete, tmp_path)), tmp_path)  # from results alone
+    # from results alone
+    page = write_batch_report(read_batch(write_batch(incomplete, tmp_path)), tmp_path)
     assert page == tmp_path / "report.html"
     html = page.read_text("utf-8")
     assert html.startswith("<!DOCTYPE html>")
     first = html.index('<p class="warning">')
-    assert html[first:].startswith('<p class="warning">This batch is not complete: 14 of 60 runs')
+    assert html[first:].startswith(
+        '<p class="warning">This batch is not complete: 14 of 60 runs'
+    )
     assert first < html.index("<table")
     assert "that was done ended well" not in html, "one did not"
     assert {path.suffix for path in (tmp_path / "tables").iterdir()} == {".csv", ".tex"}
     for path in (tmp_path / "tables").glob("*.tex"):
-        assert "Not complete: 14 of 60 runs have not been done." in path.read_text("utf-8"), path
-    counted = list(csv.DictReader(io.StringIO((tmp_path / "tables" / "failures.csv").read_text("utf-8"))))
+        assert "Not complete: 14 of 60 runs have not been done." in path.read_text(
+            "utf-8"
+        ), path
+    counted = list(
+        csv.DictReader(
+            io.StringIO((tmp_path / "tables" / "failures.csv").read_text("utf-8"))
+        )
+    )
     assert sum(int(row["not_run"]) for row in counted) == 14
 
 
@@ -165,7 +249,10 @@ def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone):
 
 def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete, tmp_path):
     reference = tmp_path / "reference.json"
-    with pytest.raises(EvaluationError, match=r"the batch 'drawn' cannot become a reference, 14 of 60 runs"):
+    with pytest.raises(
+        EvaluationError,
+        match=r"the batch 'drawn' cannot become a reference, 14 of 60 runs",
+    ):
         bless(incomplete, reference)
     assert not reference.exists()
     bless(drawn_batch(9), reference)
@@ -174,7 +261,10 @@ def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete, tmp_
         gate(extended, reference)
 
 
-@pytest.mark.parametrize(("count", "named"), [(3, "log 0; log 1; log 2."), (5, "log 0; log 1; log 2 and 2 more.")])
+@pytest.mark.parametrize(
+    ("count", "named"),
+    [(3, "log 0; log 1; log 2."), (5, "log 0; log 1; log 2 and 2 more.")],
+)
 def test_the_warning_names_three_logs_and_counts_the_others(count, named):
     logs = tuple(f"log {place}" for place in range(count))
     batch = drawn_batch(2, logs=logs)
@@ -191,14 +281,23 @@ def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
         (tmp_path / run.log_file).parent.mkdir(parents=True)
         (tmp_path / run.log_file).write_text("")
     back = read_batch(tmp_path)
-    assert [run.log_file for run in back.runs] == ["", *(run.log_file for run in batch.runs[1:])]
+    assert [run.log_file for run in back.runs] == [
+        "",
+        *(run.log_file for run in batch.runs[1:]),
+    ]
     (sentence,) = lost_told(back)
-    assert sentence.startswith(f"The table has 1 run whose folder is not here, first {batch.runs[0].key}")
+    assert sentence.startswith(
+        f"The table has 1 run whose folder is not here, first {batch.runs[0].key}"
+    )
     assert lost_told(batch) == []
 
 
-@pytest.mark.parametrize(("logs", "shape"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (4, (2, 3)), (9, (3, 3))])
-def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_headings(logs, shape):
+@pytest.mark.parametrize(
+    ("logs", "shape"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (4, (2, 3)), (9, (3, 3))]
+)
+def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_headings(
+    logs, shape
+):
     names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(logs))
     batch = drawn_batch(1, logs=names)
     with sized(PAGE_WIDTH_IN):
@@ -207,9 +306,17 @@ def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_hea
     assert [heading.replace("\n", " ") for heading in headings] == list(names)
     assert ["\n" in heading for heading in headings] == [logs > 2] * logs
     grid = panels[0].get_subplotspec().get_gridspec()
-    assert (len(figure.axes), figure.get_figwidth(), (grid.nrows, grid.ncols)) == (logs, PAGE_WIDTH_IN, shape)
-    shown = [[label.get_text() for label in panel.get_yticklabels()] for panel in panels]
-    assert shown == [[""] * 3 if place % shape[1] else batch.contestants for place in range(logs)]
+    assert (len(figure.axes), figure.get_figwidth(), (grid.nrows, grid.ncols)) == (
+        logs,
+        PAGE_WIDTH_IN,
+        shape,
+    )
+    shown = [
+        [label.get_text() for label in panel.get_yticklabels()] for panel in panels
+    ]
+    assert shown == [
+        [""] * 3 if place % shape[1] else batch.contestants for place in range(logs)
+    ]
     colours = [label.get_color() for label in panels[0].get_yticklabels()]
     assert colours == [colour(place) for place in range(3)]
     assert len(set(colours)) == 3
@@ -217,11 +324,17 @@ def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_hea
     assert top < 0 < 2 < bottom, "the first contestant is on top"
 
 
-@pytest.mark.parametrize("name", ["isam2/identity.policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40])
+@pytest.mark.parametrize(
+    "name",
+    ["isam2/identity.policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40],
+)
 def test_folding_loses_no_letter(name):
     lines = folded(name, 18).split("\n")
     assert "".join(lines).replace(" ", "") == name.replace(" ", "")
-    assert all(len(line) <= 18 or not any(sign in line[:-1] for sign in "/=,") for line in lines)
+    assert all(
+        len(line) <= 18 or not any(sign in line[:-1] for sign in "/=,")
+        for line in lines
+    )
 
 
 def test_a_spread_out_scale_has_numbers_at_one_two_and_five():

@@ -14,12 +14,24 @@ from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.tables import score_keys, score_table
 from sonar_graph.recognition.session import with_detections
-from sonar_graph.report.comparison_page import recognition_content, render_report, write_page, write_report
+from sonar_graph.report.comparison_page import (
+    recognition_content,
+    render_report,
+    write_page,
+    write_report,
+)
 from sonar_graph.report.figures import reliability_figure
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import Outcome
 from sonar_graph.table import Table
-from tests.synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
+from tests.synthetic import (
+    REFUSALS,
+    basin_comparison,
+    only,
+    with_failure,
+    with_run,
+    with_score,
+)
 
 from .test_pages import Page
 
@@ -46,30 +58,59 @@ def test_every_run_score_protocol_and_file_appears(comparison, page):
     assert len(cells) > 20
     assert all(cell in page.text for cell in cells)
     addresses = {attrs["href"] for attrs in page.named("a")}
-    assert {"comparison.json", "result.mcap", "runs/isam2/causal.tum", "runs/ekf-slam/result.json"} <= addresses
+    assert {
+        "comparison.json",
+        "result.mcap",
+        "runs/isam2/causal.tum",
+        "runs/ekf-slam/result.json",
+    } <= addresses
     assert "runs/dead-reckoning/landmarks.csv" not in addresses
 
 
 def test_every_reason_of_refusal_is_counted(comparison, page):
     log = comparison.runs[0].detections
     for outcome in [Outcome.USED, Outcome.NEW, *REFUSALS]:
-        assert re.search(rf"{re.escape(outcome.value.capitalize())} {log.outcomes.count(outcome)} \(", page.text)
+        assert re.search(
+            rf"{re.escape(outcome.value.capitalize())} {log.outcomes.count(outcome)} \(",
+            page.text,
+        )
     assert f"All detections {len(log)}" in page.text
 
 
-def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the_top(comparison):
-    odd = with_score(comparison, "isam2", "energy.used_j", Score(12.5, "J", "Read from the meter."))
-    odd = with_score(odd, "isam2", "causal.nees_position", Score(3.0, "1", "Mean.", (0.9, 1.1), "inside"))
-    notes = {"log.gaps": "imu: no sample 3.000 to 9.000 s after the start", "log.noise": "dvl: 5 of 5 rows"}
+def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the_top(
+    comparison,
+):
+    odd = with_score(
+        comparison, "isam2", "energy.used_j", Score(12.5, "J", "Read from the meter.")
+    )
+    odd = with_score(
+        odd,
+        "isam2",
+        "causal.nees_position",
+        Score(3.0, "1", "Mean.", (0.9, 1.1), "inside"),
+    )
+    notes = {
+        "log.gaps": "imu: no sample 3.000 to 9.000 s after the start",
+        "log.noise": "dvl: 5 of 5 rows",
+    }
     html = render_report(replace(odd, sequence=replace(odd.sequence, notes=notes)))
-    assert all(word in Page(html).text for word in ("energy.used_j", "12.5", "Read from the meter."))
+    assert all(
+        word in Page(html).text
+        for word in ("energy.used_j", "12.5", "Read from the meter.")
+    )
     rows = dict(zip(score_keys(odd), score_table(odd).rows, strict=True))
     assert rows["landmarks.nees"][-1].text == "1 is consistent"
-    assert rows["causal.nees_position"][2].note == "over-confident; expected 0.900 to 1.10"
+    assert (
+        rows["causal.nees_position"][2].note == "over-confident; expected 0.900 to 1.10"
+    )
     top = html[: html.index('class="summary"')]
     assert "Warning: imu: no sample 3.000 to 9.000 s after the start" in top
     assert "5 of 5 rows" not in top
-    assert html.index('href="#warnings">1 warning</a>') < html.index('class="headline"') < html.index('id="figure-map"')
+    assert (
+        html.index('href="#warnings">1 warning</a>')
+        < html.index('class="headline"')
+        < html.index('id="figure-map"')
+    )
 
 
 def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
@@ -79,11 +120,16 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     assert page.text.count(REASON) == 2, "in the finding and in the table of failures"
     assert page.text.index("ekf-slam failed") < page.text.index("Causal position error")
     assert {"runs/ekf-slam/result.json"} == {
-        attrs["href"] for attrs in page.named("a") if "ekf-slam" in (attrs["href"] or "")
+        attrs["href"]
+        for attrs in page.named("a")
+        if "ekf-slam" in (attrs["href"] or "")
     }
 
 
-UNMEASURED, ENDLESS = Score(float("nan"), "MB", "Not measured."), Score(float("inf"), "m", "Diverged.")
+UNMEASURED, ENDLESS = (
+    Score(float("nan"), "MB", "Not measured."),
+    Score(float("inf"), "m", "Diverged."),
+)
 
 
 @pytest.mark.parametrize(
@@ -91,13 +137,24 @@ UNMEASURED, ENDLESS = Score(float("nan"), "MB", "Not measured."), Score(float("i
     [
         lambda c: only(c, "isam2"),
         lambda c: with_failure(only(c, "isam2"), "isam2", "no odometry"),
-        lambda c: with_run(c, replace(c.runs[0], update_s=np.empty(0), detections=None, landmarks=None)),
+        lambda c: with_run(
+            c, replace(c.runs[0], update_s=np.empty(0), detections=None, landmarks=None)
+        ),
         lambda c: with_score(
-            with_score(c, "isam2", "memory.peak_mb", UNMEASURED), "isam2", "causal.ate_se2_m", ENDLESS
+            with_score(c, "isam2", "memory.peak_mb", UNMEASURED),
+            "isam2",
+            "causal.ate_se2_m",
+            ENDLESS,
         ),
         lambda c: replace(c, scores={run.estimator: {} for run in c.runs}, errors={}),
     ],
-    ids=["one run", "all failed", "empty blocks", "nan and infinite scores", "no scores"],
+    ids=[
+        "one run",
+        "all failed",
+        "empty blocks",
+        "nan and infinite scores",
+        "no scores",
+    ],
 )
 def test_page_is_whole_whatever_is_missing(comparison, change):
     page = Page(render_report(change(comparison)))
@@ -112,11 +169,25 @@ def test_without_landmarks_no_figure_of_them_is_announced(comparison):
     for shown, is_announced in ((alone, True), (blind, False), (unmapped, False)):
         html = render_report(shown)
         figures = re.findall(r'<figure id="figure-(\w+)"', html)
-        assert figures == ["map", "errors", "bounds", "own_map", "yaw", "nees", "timing"]
-        assert html.count("No run reports what became of") == html.count('<a href="#detections">') == is_announced
+        assert figures == [
+            "map",
+            "errors",
+            "bounds",
+            "own_map",
+            "yaw",
+            "nees",
+            "timing",
+        ]
+        assert (
+            html.count("No run reports what became of")
+            == html.count('<a href="#detections">')
+            == is_announced
+        )
         assert ("Ellipses hold" in html) == (shown is not unmapped)
     assert "The log has no landmark detections" in html
-    assert {"growth", "innovations", "nis"} <= set(re.findall(r'<figure id="figure-(\w+)"', render_report(comparison)))
+    assert {"growth", "innovations", "nis"} <= set(
+        re.findall(r'<figure id="figure-(\w+)"', render_report(comparison))
+    )
 
 
 def test_truth_that_ends_before_the_measurements_is_shown_as_far_as_it_goes():
@@ -146,12 +217,18 @@ def test_a_long_mission_still_makes_a_small_page(tmp_path):
 
 
 def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
-    same = replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    same = replace(
+        comparison,
+        sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]),
+    )
     for shown, is_repeated in ((comparison, False), (same, True)):
         text = Page(render_report(shown)).text
         assert ("2014 paper" in text) == is_repeated
         assert ("4.81 (\N{MINUS SIGN}0.19)" in text) == is_repeated
-        assert "Positions in the map at the end, metres; in brackets estimate minus truth" in text
+        assert (
+            "Positions in the map at the end, metres; in brackets estimate minus truth"
+            in text
+        )
 
 
 def texts(table: Table) -> dict[str, list[str]]:
@@ -166,33 +243,48 @@ def recognised(lane, lane_recognition) -> Comparison:
     return replace(basin_comparison(), sequence=sequence, recognition=lane_recognition)
 
 
-def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_recognition):
+def test_the_section_shows_pictures_counts_and_reliability(
+    recognised, lane_recognition
+):
     content = recognition_content(recognised)
     assert content["frames"] == lane_recognition.frames
-    assert texts(content["outcomes"]) == {outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()}
+    assert texts(content["outcomes"]) == {
+        outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()
+    }
     assert len(content["pictures"]) == len(lane_recognition.shown()) == 4
     first, shown = content["pictures"][0], lane_recognition.shown()[0]
     address = first["address"].removeprefix("data:image/jpeg;base64,")
     assert base64.b64decode(address) == shown.jpeg
     seconds = (shown.stamp_ns - recognised.sequence.start_ns) * 1e-9
     assert first["caption"].startswith(f"T = {seconds:.1f} s: ")
-    for landmark, probability in zip(shown.landmark_ids, shown.probabilities, strict=True):
+    for landmark, probability in zip(
+        shown.landmark_ids, shown.probabilities, strict=True
+    ):
         assert f"ID {landmark} ({probability:.2f})" in first["caption"]
     judged = reliability_of(recognised.sequence)
     assert content["expected_error"] == f"{judged.expected_error:.3f}"
     assert "<svg" in content["reliability"]
-    blind = recognition_content(replace(recognised, sequence=replace(recognised.sequence, truth=None)))
+    blind = recognition_content(
+        replace(recognised, sequence=replace(recognised.sequence, truth=None))
+    )
     assert (blind["expected_error"], blind["reliability"]) == (None, "")
-    assert recognition_content(basin_comparison()) is None, "a comparison without images"
+    assert recognition_content(basin_comparison()) is None, (
+        "a comparison without images"
+    )
 
 
 def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
     warnings = [(recognised.sequence.start_ns + 1_250_000_000, "<b> & so on")]
-    warned = replace(recognised, recognition=replace(recognised.recognition, warnings=warnings))
+    warned = replace(
+        recognised, recognition=replace(recognised.recognition, warnings=warnings)
+    )
     content = recognition_content(warned)
     assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
     page = render_report(warned).split('<h2 id="recognition"')[1].split("</section>")[0]
-    assert all(shown in page for shown in ("1.25", "&lt;b&gt; &amp; so on", content["expected_error"]))
+    assert all(
+        shown in page
+        for shown in ("1.25", "&lt;b&gt; &amp; so on", content["expected_error"])
+    )
     assert "<b> & so on" not in page
     assert page.count("data:image/jpeg;base64,") == 4
 
@@ -206,7 +298,9 @@ def test_the_figure_shows_shares_over_confidence_and_counts():
     assert x[known].tolist() == pytest.approx([0.55, 0.95])
     assert y[known].tolist() == [1.0, 0.5]
     assert [bar.get_height() for bar in counts.patches] == judged.count.tolist()
-    assert counts.patches[9].get_x() + counts.patches[9].get_width() / 2 == pytest.approx(0.95)
+    assert counts.patches[9].get_x() + counts.patches[
+        9
+    ].get_width() / 2 == pytest.approx(0.95)
 
 
 def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognition):
@@ -215,7 +309,9 @@ def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognit
     assert content["detections"] == len(lane_recognition.detections)
     named = texts(content["named"])
     assert list(named)[:5] == [*(f"landmark {k}" for k in (1, 2, 3, 4)), "no landmark"]
-    counts = np.array([[int(n) if n.isdigit() else 0 for n in row] for row in named.values()])
+    counts = np.array(
+        [[int(n) if n.isdigit() else 0 for n in row] for row in named.values()]
+    )
     assert counts.sum() == content["detections"]
     assert (counts[:4, 0] > 1).all()
     assert (counts[:4, 1] == 0).all()
@@ -227,7 +323,9 @@ def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised):
     detections = recognised.sequence.detections
     swapped = replace(detections, candidate_ids=detections.candidate_ids % 4 + 1)
     before = recognition_content(recognised)
-    after = recognition_content(replace(recognised, sequence=replace(recognised.sequence, detections=swapped)))
+    after = recognition_content(
+        replace(recognised, sequence=replace(recognised.sequence, detections=swapped))
+    )
     for what in (f"landmark {k}" for k in (1, 2, 3, 4)):
         right, wrong, none = texts(before["named"])[what]
         assert texts(after["named"])[what] == [wrong, right, none]
@@ -235,5 +333,8 @@ def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised):
 
 def test_a_folder_that_cannot_be_written_is_named_in_one_line(tmp_path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(EvaluationError, match=r"file/deeper: cannot be written: Not a directory; choose another"):
+    with pytest.raises(
+        EvaluationError,
+        match=r"file/deeper: cannot be written: Not a directory; choose another",
+    ):
         write_report(basin_comparison(60), str(tmp_path / "file" / "deeper"))

@@ -17,7 +17,14 @@ from scipy.stats import chi2
 from sonar_graph.evaluation.results import Comparison, MapSoFar
 from sonar_graph.evaluation.scored_instants import map_instants, published_maps
 from sonar_graph.report import figures
-from sonar_graph.report.figure_style import arrange, colour, evenly, inline_svg, sized, thinned
+from sonar_graph.report.figure_style import (
+    arrange,
+    colour,
+    evenly,
+    inline_svg,
+    sized,
+    thinned,
+)
 from sonar_graph.report.figures.error_figures import errors_cut_off
 from sonar_graph.report.figures.illustrations import illustrations
 from sonar_graph.report.figures.maps import (
@@ -35,18 +42,26 @@ TIME, DISTANCE = "time since start (s)", "distance travelled (m)"
 FIGURES = {
     map_figure: ({"world x (m)"}, {"world y (m)"}),
     figures.error_figure: ({TIME, DISTANCE}, {"position error (m)", "yaw error (°)"}),
-    figures.bounds_figure: ({TIME}, {"error in x (m)", "error in y (m)", "yaw error (°)"}),
+    figures.bounds_figure: (
+        {TIME},
+        {"error in x (m)", "error in y (m)", "yaw error (°)"},
+    ),
     figures.yaw_figure: ({TIME}, {"yaw (°)"}),
     figures.nees_figure: ({TIME}, {"position NEES / dof", "yaw NEES / dof"}),
     figures.innovation_figure: ({TIME}, {"range (m)", "azimuth (°)"}),
     figures.nis_figure: ({"NIS"}, {"detections below (%)"}),
-    figures.timing_figure: ({"duration of an update (ms)"}, {"updates at most as long (%)"}),
+    figures.timing_figure: (
+        {"duration of an update (ms)"},
+        {"updates at most as long (%)"},
+    ),
 }
 """Every figure, with the labels of its axes."""
 
 
 @pytest.mark.parametrize("draw", FIGURES)
-def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_of_the_page(comparison, draw):
+def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_of_the_page(
+    comparison, draw
+):
     figure, (x, y) = draw(comparison), FIGURES[draw]
     assert {panel.get_xlabel() for panel in figure.axes} - {""} == x
     assert {panel.get_ylabel() for panel in figure.axes} - {""} == y
@@ -54,9 +69,14 @@ def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_
     root = ElementTree.fromstring(svg)
     assert root.attrib["aria-label"] == 'says "<x>" & more'
     assert "var(--ink)" in svg
-    assert re.findall(r"#[0-9a-f]{6}\b", svg) == [], "a fixed colour would not follow dark and light"
+    assert re.findall(r"#[0-9a-f]{6}\b", svg) == [], (
+        "a fixed colour would not follow dark and light"
+    )
     assert "http" not in svg
-    empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None, true_landmarks=None))
+    empty = replace(
+        only(comparison),
+        sequence=replace(comparison.sequence, truth=None, true_landmarks=None),
+    )
     assert draw(empty) is None
 
 
@@ -71,14 +91,19 @@ def test_height_is_drawn_of_three_dimensional_runs_and_no_error_without_truth():
 
 def test_two_inline_svgs_share_no_identifier(comparison):
     both = [figures.yaw_figure(comparison), figures.timing_figure(comparison)]
-    first, second = (inline_svg(figure, name, "") for figure, name in zip(both, ("a", "b"), strict=True))
+    first, second = (
+        inline_svg(figure, name, "")
+        for figure, name in zip(both, ("a", "b"), strict=True)
+    )
     own = [set(re.findall(r'\sid="([^"]+)"', svg)) for svg in (first, second)]
     assert own[0]
     assert not own[0] & own[1]
     assert set(re.findall(r"url\(#([^)]+)\)", first)) <= own[0]
 
 
-def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its_view(comparison):
+def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its_view(
+    comparison,
+):
     panel = map_figure(comparison).axes[0]
     assert panel.get_aspect() == 1
     assert {text.get_text() for text in panel.texts} == {"1", "2", "3", "4"}
@@ -113,20 +138,32 @@ def test_errors_and_their_band_are_drawn_in_their_units(comparison):
 
 def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
     errors = comparison.errors["isam2"]["causal"]
-    unknown = {name: np.nan * getattr(errors, name) for name in ("position_sigma_m", "yaw_sigma_rad")}
-    silent = replace(only(comparison, "isam2"), errors={"isam2": {"causal": replace(errors, **unknown)}})
+    unknown = {
+        name: np.nan * getattr(errors, name)
+        for name in ("position_sigma_m", "yaw_sigma_rad")
+    }
+    silent = replace(
+        only(comparison, "isam2"),
+        errors={"isam2": {"causal": replace(errors, **unknown)}},
+    )
     assert not any(panel.collections for panel in figures.bounds_figure(silent).axes)
     assert any(panel.collections for panel in figures.bounds_figure(comparison).axes)
 
 
-def test_errors_of_all_runs_share_their_axes_and_grow_over_the_distance_travelled(comparison):
+def test_errors_of_all_runs_share_their_axes_and_grow_over_the_distance_travelled(
+    comparison,
+):
     figure = figures.error_figure(comparison)
     over_time, over_distance = figure.axes[:2]
     truth = comparison.sequence.truth
-    travelled = np.linalg.norm(np.diff(truth.at(comparison.instants_ns).positions, axis=0), axis=1).sum()
+    travelled = np.linalg.norm(
+        np.diff(truth.at(comparison.instants_ns).positions, axis=0), axis=1
+    ).sum()
     for line, run in zip(over_distance.lines, comparison.runs, strict=True):
         errors = comparison.errors[run.estimator]["causal"]
-        np.testing.assert_allclose(line.get_ydata().max(), np.hypot(*errors.position_m[:, :2].T).max())
+        np.testing.assert_allclose(
+            line.get_ydata().max(), np.hypot(*errors.position_m[:, :2].T).max()
+        )
         np.testing.assert_allclose(line.get_xdata()[-1], travelled)
     assert over_time.get_ylim() == over_distance.get_ylim()
     assert figure.axes[2].get_ylim()[1] >= 0
@@ -138,7 +175,9 @@ def test_a_run_that_is_far_worse_leaves_the_picture_and_is_named(comparison):
         (errors := comparison.errors["dead-reckoning"]["causal"]),
         position_m=errors.position_m + np.array([100.0, 0, 0]),
     )
-    far = replace(comparison, errors={**comparison.errors, "dead-reckoning": {"causal": lost}})
+    far = replace(
+        comparison, errors={**comparison.errors, "dead-reckoning": {"causal": lost}}
+    )
     assert errors_cut_off(far) == ["dead-reckoning"]
     best = np.hypot(*comparison.errors["isam2"]["causal"].position_m[:, :2].T).max()
     assert best < figures.error_figure(far).axes[0].get_ylim()[1] < 20 * best
@@ -157,12 +196,22 @@ def test_nothing_overlaps_and_nothing_leaves_the_figure(comparison, draw):
     for panel, box in zip(figure.axes, boxes, strict=True):
         assert -1 <= box.x0 < box.x1 <= width + 1
         assert -1 <= box.y0 < box.y1 <= height + 1
-        written = [text.get_window_extent() for text in panel.get_yticklabels() if text.get_text()]
-        numbers = [one for one in written if panel.bbox.y0 <= (one.y0 + one.y1) / 2 <= panel.bbox.y1]
+        written = [
+            text.get_window_extent()
+            for text in panel.get_yticklabels()
+            if text.get_text()
+        ]
+        numbers = [
+            one
+            for one in written
+            if panel.bbox.y0 <= (one.y0 + one.y1) / 2 <= panel.bbox.y1
+        ]
         assert numbers or not panel.get_subplotspec().is_first_col()
         label = panel.yaxis.label
         if label.get_text() and panel.get_subplotspec().is_first_col():
-            assert all(label.get_window_extent().x1 <= number.x0 + 1 for number in numbers)
+            assert all(
+                label.get_window_extent().x1 <= number.x0 + 1 for number in numbers
+            )
     for one, other in combinations(boxes, 2):
         assert not one.overlaps(other)
     for legend in figure.legends:
@@ -183,18 +232,26 @@ def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
     ellipses = [patch for patch in panel.patches if isinstance(patch, Ellipse)]
     assert len(ellipses) == len(run.landmarks)
     rng = np.random.default_rng(3)
-    for ellipse, mean, cov in zip(ellipses, run.landmarks.positions, run.landmarks.covariances, strict=True):
+    for ellipse, mean, cov in zip(
+        ellipses, run.landmarks.positions, run.landmarks.covariances, strict=True
+    ):
         draws = rng.multivariate_normal(mean[:2], cov[:2, :2], 20_000)
         turn = np.radians(ellipse.angle)
-        along = (draws - ellipse.center) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        along = (draws - ellipse.center) @ np.array(
+            [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        )
         inside = np.sum((2 * along / [ellipse.width, ellipse.height]) ** 2, axis=1) <= 1
         assert inside.mean() == pytest.approx(0.95, abs=0.01)
 
 
-@pytest.mark.parametrize("draw", [map_figure, figures.yaw_figure, figures.timing_figure])
+@pytest.mark.parametrize(
+    "draw", [map_figure, figures.yaw_figure, figures.timing_figure]
+)
 def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
     failed = with_failure(comparison, "isam2", "lost")
-    used = {to_hex(line.get_color()) for panel in draw(failed).axes for line in panel.lines}
+    used = {
+        to_hex(line.get_color()) for panel in draw(failed).axes for line in panel.lines
+    }
     assert colour(0) not in used
     assert {colour(1), colour(2)} <= used
 
@@ -203,7 +260,10 @@ def test_every_nees_stays_in_view(comparison):
     figure = figures.nees_figure(comparison)
     for run in comparison.runs:
         errors = comparison.errors[run.estimator]["causal"]
-        assert figure.axes[0].get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
+        assert (
+            figure.axes[0].get_ylim()[1]
+            > np.nanmax(errors.nees_position) / errors.position_dof
+        )
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(4, 60))
@@ -240,7 +300,10 @@ def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
             known = replace(run.landmarks, covariances=covariances)
             rows = [slice(0, 2), slice(0, 3), slice(0, 4)]
             maps = [
-                MapSoFar(stamp, LandmarkMap(known.ids[r], known.positions[r], known.covariances[r]))
+                MapSoFar(
+                    stamp,
+                    LandmarkMap(known.ids[r], known.positions[r], known.covariances[r]),
+                )
                 for stamp, r in zip(stamps, rows, strict=True)
             ]
         runs.append(replace(run, maps=maps))
@@ -253,22 +316,32 @@ def test_each_panel_shows_what_was_known_then():
     panels = np.array(figure.axes).reshape(2, 3)
     stamps = sorted({known.stamp_ns for run in comparison.runs for known in run.maps})
     for row, run in enumerate(comparison.runs[:2]):
-        for column, (panel, stamp_ns) in enumerate(zip(panels[row], stamps, strict=True)):
+        for column, (panel, stamp_ns) in enumerate(
+            zip(panels[row], stamps, strict=True)
+        ):
             lines = {line.get_label(): line for line in panel.get_lines()}
             until = run.causal.positions[run.causal.stamps_ns <= stamp_ns]
             path = np.column_stack(lines["causal estimate"].get_data())
             np.testing.assert_allclose(path, until[:, :2])
             assert len(lines["estimated landmarks"].get_xdata()) == 2 + column
-            assert sum(isinstance(patch, Ellipse) for patch in panel.patches) == 2 + column
+            assert (
+                sum(isinstance(patch, Ellipse) for patch in panel.patches) == 2 + column
+            )
 
 
 def test_ellipses_are_as_large_as_the_caption_says():
     comparison = grown(sigma_m=0.02)
     figure, factor = growth_figure(comparison), enlargement(comparison)
     assert factor > 1
-    ellipse = next(patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse))
-    assert ellipse.width == pytest.approx(2 * factor * 0.02 * np.sqrt(chi2.ppf(0.95, 2)))
-    assert f"drawn {factor} times as large" in illustrations(comparison)["growth"].caption
+    ellipse = next(
+        patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)
+    )
+    assert ellipse.width == pytest.approx(
+        2 * factor * 0.02 * np.sqrt(chi2.ppf(0.95, 2))
+    )
+    assert (
+        f"drawn {factor} times as large" in illustrations(comparison)["growth"].caption
+    )
 
 
 @pytest.mark.parametrize("sigma_m", [1e-4, 0.01, 0.1, 3.0])
@@ -291,8 +364,13 @@ def test_without_maps_on_the_way_the_page_says_so_and_a_failed_run_has_no_row():
 @pytest.mark.slow
 def test_only_the_repeated_experiment_names_the_papers_figures():
     other = grown(60)
-    same = replace(other, sequence=replace(other.sequence, true_landmarks=published_maps()[1]))
+    same = replace(
+        other, sequence=replace(other.sequence, true_landmarks=published_maps()[1])
+    )
     for name, counterpart in (("growth", "Fig. 4"), ("yaw", "Fig. 5")):
         assert counterpart in illustrations(same)[name].caption
         assert "paper" not in illustrations(other)[name].caption
-    assert "same fractions of this run as its 833.1, 1369.4 and 2039.0 s" in illustrations(same)["growth"].caption
+    assert (
+        "same fractions of this run as its 833.1, 1369.4 and 2039.0 s"
+        in illustrations(same)["growth"].caption
+    )

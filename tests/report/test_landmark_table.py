@@ -5,7 +5,12 @@ import pytest
 
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.scored_instants import published_maps
-from sonar_graph.report.landmark_table import MOST_LANDMARKS, PAPER, landmark_table, landmarks_left_out
+from sonar_graph.report.landmark_table import (
+    MOST_LANDMARKS,
+    PAPER,
+    landmark_table,
+    landmarks_left_out,
+)
 from sonar_graph.states import LandmarkMap, Trajectory
 from sonar_graph.table import ABSENT
 from tests.synthetic import basin_comparison, only, with_run
@@ -17,12 +22,19 @@ UNKNOWN = np.full((3, 3), np.nan)
 def rows_of(comparison: Comparison) -> list[list[str]]:
     """The texts of the table, with hyphens for minus signs and dashes."""
     table = landmark_table(comparison)
-    return [[cell.text.replace(MINUS, "-").replace(ABSENT, "-") for cell in row] for row in table.rows]
+    return [
+        [cell.text.replace(MINUS, "-").replace(ABSENT, "-") for cell in row]
+        for row in table.rows
+    ]
 
 
 def mapped(*landmarks: tuple[int, float, float]) -> LandmarkMap:
     positions = np.array([[x, y, -1.0] for _, x, y in landmarks]).reshape(-1, 3)
-    return LandmarkMap(np.array([i for i, *_ in landmarks]), positions, np.tile(UNKNOWN, (len(landmarks), 1, 1)))
+    return LandmarkMap(
+        np.array([i for i, *_ in landmarks]),
+        positions,
+        np.tile(UNKNOWN, (len(landmarks), 1, 1)),
+    )
 
 
 def by_hand(estimated: LandmarkMap, true: LandmarkMap | None) -> Comparison:
@@ -35,7 +47,10 @@ def by_hand(estimated: LandmarkMap, true: LandmarkMap | None) -> Comparison:
 def repeated(instants: int = 60) -> Comparison:
     """The published landmarks in a synthetic run."""
     comparison = basin_comparison(instants)
-    return replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    return replace(
+        comparison,
+        sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]),
+    )
 
 
 @pytest.mark.parametrize(
@@ -44,22 +59,36 @@ def repeated(instants: int = 60) -> Comparison:
         (
             [(3, 1.5, -2.25)],
             [(3, 1.25, -2.0)],
-            [["ID 3, x", "1.250", "1.500 (0.250)"], ["ID 3, y", "-2.000", "-2.250 (-0.250)"]],
+            [
+                ["ID 3, x", "1.250", "1.500 (0.250)"],
+                ["ID 3, y", "-2.000", "-2.250 (-0.250)"],
+            ],
         ),
         (  # a landmark that is not mapped has a dash, one that is not true has no row
             [(1, 1.0, 1.0), (8, 4.0, 4.0)],
             [(1, 1.0, 1.0), (2, 2.0, 2.0)],
             [
-                *(["ID 1, x", "1.000", "1.000 (0.000)"], ["ID 1, y", "1.000", "1.000 (0.000)"]),
+                *(
+                    ["ID 1, x", "1.000", "1.000 (0.000)"],
+                    ["ID 1, y", "1.000", "1.000 (0.000)"],
+                ),
                 *(["ID 2, x", "2.000", "-"], ["ID 2, y", "2.000", "-"]),
             ],
         ),
-        ([(1, -1e-6, 0.0)], [(1, 0.0, 0.0)], [["ID 1, x", "0.000", "0.000 (0.000)"]]),  # zero has no sign
+        (
+            [(1, -1e-6, 0.0)],
+            [(1, 0.0, 0.0)],
+            [["ID 1, x", "0.000", "0.000 (0.000)"]],
+        ),  # zero has no sign
         ([(3, 1.5, -2.25)], None, [["ID 3, x", "1.500"], ["ID 3, y", "-2.250"]]),
     ],
 )
-def test_estimates_stand_beside_the_truth_with_their_difference(estimated, true, expected):
-    shown = rows_of(by_hand(mapped(*estimated), None if true is None else mapped(*true)))
+def test_estimates_stand_beside_the_truth_with_their_difference(
+    estimated, true, expected
+):
+    shown = rows_of(
+        by_hand(mapped(*estimated), None if true is None else mapped(*true))
+    )
     assert shown[: len(expected)] == expected
     assert len(shown) == (len(expected) if true is None else 2 * len(true) + 2)
 
@@ -69,32 +98,55 @@ def test_totals_are_the_scores_and_landmarks_beyond_what_a_page_holds_are_counte
     table = landmark_table(comparison)
     assert [column.heading for column in table.columns[2:]] == ["isam2", "ekf-slam"]
     (first,) = table.sections
-    for row, key in zip(table.rows[first:], ("landmarks.raw_m", "landmarks.se2_m"), strict=True):
-        expected = [f"{comparison.scores[name][key].value:.3f}" for name in ("isam2", "ekf-slam")]
+    for row, key in zip(
+        table.rows[first:], ("landmarks.raw_m", "landmarks.se2_m"), strict=True
+    ):
+        expected = [
+            f"{comparison.scores[name][key].value:.3f}"
+            for name in ("isam2", "ekf-slam")
+        ]
         assert [cell.text for cell in row[2:]] == expected
     many = mapped(*((i, float(i), 0.0) for i in range(MOST_LANDMARKS + 3)))
     assert len(rows_of(by_hand(many, many))) == 2 * MOST_LANDMARKS + 2
     assert landmarks_left_out(by_hand(many, many)) == 3
     assert landmarks_left_out(comparison) == 0
-    assert landmark_table(only(comparison, "dead-reckoning")) is None, "no map, no table"
+    assert landmark_table(only(comparison, "dead-reckoning")) is None, (
+        "no map, no table"
+    )
     assert landmark_table(by_hand(mapped(), mapped((1, 0.0, 0.0)))) is None
 
 
 def test_only_the_repeated_experiment_has_the_papers_column():
     other, same = landmark_table(basin_comparison(60)), landmark_table(repeated())
     assert PAPER not in [column.heading for column in other.columns]
-    assert [column.heading for column in same.columns[2:]] == ["isam2", "ekf-slam", "dead-reckoning", PAPER]
+    assert [column.heading for column in same.columns[2:]] == [
+        "isam2",
+        "ekf-slam",
+        "dead-reckoning",
+        PAPER,
+    ]
     rows = rows_of(repeated())
-    assert [row[-1] for row in rows[:4]] == ["4.81 (-0.19)", "-0.07 (-0.07)", "6.74 (-0.26)", "-5.01 (-0.01)"]
+    assert [row[-1] for row in rows[:4]] == [
+        "4.81 (-0.19)",
+        "-0.07 (-0.07)",
+        "6.74 (-0.26)",
+        "-5.01 (-0.01)",
+    ]
     assert [row[-1] for row in rows[8:]] == ["0.227", "0.093", "-0.3013", "-0.1758"]
-    assert {row[4] for row in rows[:8]} == {"-"}, "a dead reckoning has no map, but a path"
+    assert {row[4] for row in rows[:8]} == {"-"}, (
+        "a dead reckoning has no map, but a path"
+    )
 
 
 def test_the_return_is_told_without_a_truth_that_has_no_time_in_common_with_the_run():
     comparison = repeated()
     path = comparison.sequence.truth
-    later = Trajectory.without_covariances(path.stamps_ns + 10**15, path.positions, path.quaternions_xyzw)
-    *_, x_row, _ = rows_of(with_run(comparison, replace(comparison.runs[0], causal=later)))
+    later = Trajectory.without_covariances(
+        path.stamps_ns + 10**15, path.positions, path.quaternions_xyzw
+    )
+    *_, x_row, _ = rows_of(
+        with_run(comparison, replace(comparison.runs[0], causal=later))
+    )
     way = path.positions[-1, 0] - path.positions[0, 0]
     assert x_row[1:3] == ["-", f"{way:.3f}".replace("-0.000", "0.000")]
 
@@ -106,9 +158,15 @@ def test_the_return_is_told_against_the_truth_at_the_runs_own_ends(begins_later)
     truth = comparison.sequence.truth
     path = truth.rows(slice(begins_later, None))
     for drift_m, difference in ((0.0, "(0.000)"), (0.3, "(0.300)")):
-        away = path.positions + np.linspace([0.5, 0.5, 0.0], [0.5 + drift_m, 0.5 + drift_m, 0.0], len(path))
-        moved = Trajectory.without_covariances(path.stamps_ns, away, path.quaternions_xyzw)
-        *_, x_row, y_row = rows_of(with_run(comparison, replace(comparison.runs[0], causal=moved)))
+        away = path.positions + np.linspace(
+            [0.5, 0.5, 0.0], [0.5 + drift_m, 0.5 + drift_m, 0.0], len(path)
+        )
+        moved = Trajectory.without_covariances(
+            path.stamps_ns, away, path.quaternions_xyzw
+        )
+        *_, x_row, y_row = rows_of(
+            with_run(comparison, replace(comparison.runs[0], causal=moved))
+        )
         way = away[-1] - away[0]
         true = path.positions[-1] - path.positions[0]
         for axis, row in enumerate((x_row, y_row)):

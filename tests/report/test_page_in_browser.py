@@ -18,23 +18,40 @@ from sonar_graph.report.batch_page import write_batch_report
 from tests.recorded_batches import LOGS, drawn_batch, with_failures
 from tests.synthetic import basin_comparison
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-AXE = Path(os.environ.get("SONAR_GRAPH_AXE", Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js"))
+sync_api = pytest.importorskip(
+    "playwright.sync_api", reason="playwright is not installed: pip install playwright"
+)
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+    None,
+)
+AXE = Path(
+    os.environ.get(
+        "SONAR_GRAPH_AXE",
+        Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js",
+    )
+)
 PHONE, DESKTOP = 390, 1280
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium"),
+]
 
 
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("batch")
-    return write_batch_report(with_failures(drawn_batch(), "ekf-slam", LOGS[1], 2), folder)
+    return write_batch_report(
+        with_failures(drawn_batch(), "ekf-slam", LOGS[1], 2), folder
+    )
 
 
 @pytest.fixture(scope="module")
 def page_of_many_logs(tmp_path_factory) -> Path:
     logs = tuple(f"tracks, wrong_id_rate={rate}" for rate in range(9))
-    return write_batch_report(drawn_batch(6, logs=logs), tmp_path_factory.mktemp("many"))
+    return write_batch_report(
+        drawn_batch(6, logs=logs), tmp_path_factory.mktemp("many")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +62,21 @@ def comparison_file(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        chromium = playwright.chromium.launch(
+            executable_path=BROWSER, args=["--no-sandbox"]
+        )
         yield chromium
         chromium.close()
 
 
 @contextmanager
-def opened(browser: Any, file: Path, width: int, scheme: str = "light") -> Iterator[tuple[Any, list[str]]]:
+def opened(
+    browser: Any, file: Path, width: int, scheme: str = "light"
+) -> Iterator[tuple[Any, list[str]]]:
     """The page, and what its console says."""
-    page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page = browser.new_page(
+        viewport={"width": width, "height": 900}, color_scheme=scheme
+    )
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
@@ -69,15 +92,24 @@ def test_nothing_is_said_in_the_console_nothing_sticks_out_and_the_head_fits_a_s
     wide = "document.documentElement.scrollWidth"
     with opened(browser, page_of_many_logs, width) as (page, said):
         assert page.evaluate("document.documentElement.scrollHeight") < 25_000
-        assert page.evaluate("document.querySelector('#table-overview').getBoundingClientRect().bottom") <= 900
+        assert (
+            page.evaluate(
+                "document.querySelector('#table-overview').getBoundingClientRect().bottom"
+            )
+            <= 900
+        )
         assert page.evaluate(wide) <= width
         assert said == []
     with opened(browser, page_file, width) as (page, said):
-        page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        page.evaluate(
+            "document.querySelectorAll('details').forEach(one => one.open = true)"
+        )
         assert page.evaluate(wide) <= width
         assert said == []
     broken = tmp_path / "broken.html"
-    text = page_file.read_text("utf-8").replace("</main>", '<div style="width: 3000px">wide</div></main>')
+    text = page_file.read_text("utf-8").replace(
+        "</main>", '<div style="width: 3000px">wide</div></main>'
+    )
     broken.write_text(text.replace("<script>", "<script>nothing();"), "utf-8")
     with opened(browser, broken, width) as (page, said):  # the checks can fail
         assert page.evaluate(wide) > width
@@ -86,16 +118,24 @@ def test_nothing_is_said_in_the_console_nothing_sticks_out_and_the_head_fits_a_s
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
-def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(browser, comparison_file, width, scheme):
+def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(
+    browser, comparison_file, width, scheme
+):
     box = "document.querySelector('{}').getBoundingClientRect()"
     with opened(browser, comparison_file, width, scheme) as (page, said):
-        assert page.evaluate("document.querySelector('.headline').textContent").startswith(
-            "isam2 is nearest to the truth"
+        assert page.evaluate(
+            "document.querySelector('.headline').textContent"
+        ).startswith("isam2 is nearest to the truth")
+        beside = page.evaluate(box.format(".headline") + ".left") > page.evaluate(
+            box.format("#figure-map") + ".right"
         )
-        beside = page.evaluate(box.format(".headline") + ".left") > page.evaluate(box.format("#figure-map") + ".right")
         assert beside == (width == DESKTOP)
         bottom = page.evaluate(box.format(".headline") + ".bottom")
-        assert 0 < bottom < (900 if beside else page.evaluate(box.format("#figure-map svg") + ".top"))
+        assert (
+            0
+            < bottom
+            < (900 if beside else page.evaluate(box.format("#figure-map svg") + ".top"))
+        )
         assert page.evaluate(box.format("#figure-map svg") + ".bottom") <= 900
         assert page.evaluate(box.format("#figure-map svg") + ".right") <= width
         ink, paper = page.evaluate(
@@ -103,7 +143,9 @@ def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(b
             "getComputedStyle(document.body).backgroundColor]"
         )
         assert (sum(_rgb(ink)) > sum(_rgb(paper))) == (scheme == "dark")
-        page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        page.evaluate(
+            "document.querySelectorAll('details').forEach(one => one.open = true)"
+        )
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert said == []
 
@@ -117,16 +159,30 @@ def test_folded_chapters_of_a_comparison_stand_on_paper(browser, comparison_file
         assert page.evaluate(f"{folded}.every(one => one.checkVisibility())")
 
 
-def test_paper_has_folded_tables_no_buttons_and_light_colours(browser, page_file, page_of_many_logs, tmp_path):
+def test_paper_has_folded_tables_no_buttons_and_light_colours(
+    browser, page_file, page_of_many_logs, tmp_path
+):
     shown = "document.querySelector('#table-consistency').checkVisibility()"
     with opened(browser, page_of_many_logs, DESKTOP) as (page, _):
-        for event, is_shown in (("click", False), ("beforeprint", True), ("afterprint", False)):
+        for event, is_shown in (
+            ("click", False),
+            ("beforeprint", True),
+            ("afterprint", False),
+        ):
             page.evaluate(f"dispatchEvent(new Event('{event}'))")
             assert page.evaluate(shown) is is_shown
     with opened(browser, page_file, DESKTOP, "dark") as (page, _):
         page.emulate_media(media="print")
-        assert page.evaluate("getComputedStyle(document.querySelector('.downloads')).display") == "none"
-        assert sum(_rgb(page.evaluate("getComputedStyle(document.body).backgroundColor"))) == 3 * 255
+        assert (
+            page.evaluate(
+                "getComputedStyle(document.querySelector('.downloads')).display"
+            )
+            == "none"
+        )
+        assert (
+            sum(_rgb(page.evaluate("getComputedStyle(document.body).backgroundColor")))
+            == 3 * 255
+        )
         page.pdf(path=str(tmp_path / "page.pdf"), format="A4")
     assert (tmp_path / "page.pdf").stat().st_size > 10_000
 
@@ -149,7 +205,9 @@ def test_all_figures_are_drawn_in_the_colours_of_the_page(browser, page_file, sc
 
 def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
     rows = "document.querySelectorAll('#table-difference-ate-se2-m tbody tr')"
-    values = f"[...{rows}].map(row => row.children[3].dataset.sort).filter(text => text)"
+    values = (
+        f"[...{rows}].map(row => row.children[3].dataset.sort).filter(text => text)"
+    )
     last = f"[...{rows}].at(-1).children[3].dataset.sort"
     with opened(browser, page_file, DESKTOP) as (page, _):
         button = page.locator("#table-difference-ate-se2-m th button").nth(3)
@@ -165,28 +223,43 @@ def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
     assert list(map(float, downwards)) == sorted(map(float, downwards), reverse=True)
 
 
-def test_a_number_of_runs_opens_the_list_of_them_and_data_of_a_figure_can_be_downloaded(browser, page_file):
+def test_a_number_of_runs_opens_the_list_of_them_and_data_of_a_figure_can_be_downloaded(
+    browser, page_file
+):
     with opened(browser, page_file, DESKTOP) as (page, _):
         page.locator("#table-failures tbody a").first.click()
-        page.wait_for_function("document.querySelector('#runs-0-0').closest('details').open")
+        page.wait_for_function(
+            "document.querySelector('#runs-0-0').closest('details').open"
+        )
         opened_ones = "[...document.querySelectorAll('#runs ~ details[open], #runs ~ details details[open]')]"
-        assert page.evaluate(f"{opened_ones}.every(one => one.contains(document.querySelector('#runs-0-0')))")
-        assert page.evaluate(f"{opened_ones}.length") == 2, "the log's and the contestant's"
+        assert page.evaluate(
+            f"{opened_ones}.every(one => one.contains(document.querySelector('#runs-0-0')))"
+        )
+        assert page.evaluate(f"{opened_ones}.length") == 2, (
+            "the log's and the contestant's"
+        )
         with page.expect_download() as download:
             page.get_by_label("Data of this figure (CSV): spread-ate-se2-m").click()
         text = Path(download.value.path()).read_text("utf-8")
     assert text.startswith("log,contestant,seed,key,column,value\n")
 
 
-@pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: npm install axe-core, or set SONAR_GRAPH_AXE")
+@pytest.mark.skipif(
+    not AXE.is_file(),
+    reason="no axe-core: npm install axe-core, or set SONAR_GRAPH_AXE",
+)
 @pytest.mark.parametrize(("width", "scheme"), [(PHONE, "light"), (DESKTOP, "dark")])
 @pytest.mark.parametrize("kind", ["page_file", "comparison_file"])
 def test_axe_finds_nothing_serious(browser, request, kind, width, scheme):
     with opened(browser, request.getfixturevalue(kind), width, scheme) as (page, _):
-        page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        page.evaluate(
+            "document.querySelectorAll('details').forEach(one => one.open = true)"
+        )
         page.evaluate(AXE.read_text("utf-8"))
         found = _serious(page)
-        page.evaluate("document.querySelector('figure svg').removeAttribute('aria-label')")
+        page.evaluate(
+            "document.querySelector('figure svg').removeAttribute('aria-label')"
+        )
         assert found == []
         assert _serious(page), "a figure without a name is found: the check can fail"
 

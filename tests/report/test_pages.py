@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from sonar_graph import table
-from sonar_graph.evaluation import Score, comparison, digits, read_comparison, run, score_table
+from sonar_graph.evaluation import (
+    Score,
+    comparison,
+    digits,
+    read_comparison,
+    run,
+    score_table,
+)
 from sonar_graph.report import batch_figures, comparison_page
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.comparison_page import render_report
@@ -66,10 +73,26 @@ def test_what_a_log_or_an_estimator_says_is_escaped_everywhere():
     told = replace(compared.runs[0], estimator=HOSTILE, params={HOSTILE: HOSTILE})
     scores = {**compared.scores, HOSTILE: {HOSTILE: Score(1.0, HOSTILE, HOSTILE)}}
     runs = [told, *compared.runs[1:]]
-    hostile = replace(compared, sequence=sequence, runs=runs, scores=scores, environment={"x": HOSTILE})
+    hostile = replace(
+        compared,
+        sequence=sequence,
+        runs=runs,
+        scores=scores,
+        environment={"x": HOSTILE},
+    )
     lost = [failed(replace(run, log=HOSTILE), reason=HOSTILE) for run in batch.runs[:3]]
-    named = replace(batch, name=HOSTILE, description=HOSTILE, suite=HOSTILE, runs=[*lost, *batch.runs])
-    for text, scripts in ((render_report(hostile), 0), (render_batch(named), 1), (hostile._repr_html_(), 0)):
+    named = replace(
+        batch,
+        name=HOSTILE,
+        description=HOSTILE,
+        suite=HOSTILE,
+        runs=[*lost, *batch.runs],
+    )
+    for text, scripts in (
+        (render_report(hostile), 0),
+        (render_batch(named), 1),
+        (hostile._repr_html_(), 0),
+    ):
         Page(text)
         assert text.count("<script") == scripts
         assert "alert(1)" in text
@@ -82,7 +105,9 @@ def test_a_notebook_shows_every_score_under_its_run():
     text = Page(compared._repr_html_()).text
     every = score_table(compared)
     assert all(cell.text in text for row in every.rows for cell in row)
-    assert [column.heading for column in every.columns[2:-1]] == [run.estimator for run in compared.runs]
+    assert [column.heading for column in every.columns[2:-1]] == [
+        run.estimator for run in compared.runs
+    ]
 
 
 def test_a_notebook_shows_sequences_paths_and_maps_with_their_texts_escaped():
@@ -92,7 +117,10 @@ def test_a_notebook_shows_sequences_paths_and_maps_with_their_texts_escaped():
     text = Page(sequence._repr_html_()).text
     assert "<script" not in sequence._repr_html_()
     assert HOSTILE in text
-    assert all(word in text for word in ("imu 2 0.00", "detections 60", "truth 60", "true landmarks 4"))
+    assert all(
+        word in text
+        for word in ("imu 2 0.00", "detections 60", "truth 60", "true landmarks 4")
+    )
     path = compared.runs[0].causal
     text = Page(path._repr_html_()).text
     length_m = np.linalg.norm(np.diff(path.positions, axis=0), axis=1).sum()
@@ -129,19 +157,32 @@ def page(html) -> Page:
 
 
 def test_a_page_fetches_nothing_and_only_that_of_a_batch_has_a_script(page, html, kind):
-    addresses = [attrs[key] or "" for _, attrs in page.tags for key in ("src", "href", "xlink:href") if key in attrs]
+    addresses = [
+        attrs[key] or ""
+        for _, attrs in page.tags
+        for key in ("src", "href", "xlink:href")
+        if key in attrs
+    ]
     assert len(addresses) > 20
-    assert [address for address in addresses if re.match(r"(?!data:)[a-z]+:|//|/", address)] == []
+    assert [
+        address for address in addresses if re.match(r"(?!data:)[a-z]+:|//|/", address)
+    ] == []
     assert "@import" not in html
     assert re.findall(r"url\((?!#)", html) == []
     assert page.named("script") == ([{}] if kind == "batch" else [])
     assert page.named("iframe", "img") == []
 
 
-def test_links_within_the_page_lead_somewhere_and_ids_are_unique_and_the_same_results_make_the_same(page, kind, html):
+def test_links_within_the_page_lead_somewhere_and_ids_are_unique_and_the_same_results_make_the_same(
+    page, kind, html
+):
     ids = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
     assert len(ids) == len(set(ids))
-    targets = {attrs["href"] for attrs in page.named("a", "use") if (attrs["href"] or "").startswith("#")}
+    targets = {
+        attrs["href"]
+        for attrs in page.named("a", "use")
+        if (attrs["href"] or "").startswith("#")
+    }
     assert targets <= {f"#{identity}" for identity in ids}
     assert kind == "comparison" or drawn(kind) == html
 
@@ -156,7 +197,9 @@ def test_a_page_can_be_read_without_seeing_it(page, kind):
     assert all(len(attrs["aria-label"] or "") > 40 for attrs in page.named("svg"))
     assert len(page.named("svg")) == {"comparison": 8, "batch": 9}[kind]
     scrolling = [attrs for attrs in page.named("div") if attrs.get("class") == "scroll"]
-    assert all(attrs.get("aria-label") and attrs.get("tabindex") == "0" for attrs in scrolling)
+    assert all(
+        attrs.get("aria-label") and attrs.get("tabindex") == "0" for attrs in scrolling
+    )
 
 
 def contrast(first: str, second: str) -> float:
@@ -164,7 +207,9 @@ def contrast(first: str, second: str) -> float:
 
     def luminance(colour: str) -> float:
         parts = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-        linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+        linear = np.where(
+            parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4
+        )
         return float(linear @ [0.2126, 0.7152, 0.0722])
 
     lighter, darker = sorted([luminance(first), luminance(second)], reverse=True)
@@ -176,7 +221,12 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
     assert contrast("#000000", "#ffffff") == pytest.approx(21)
     block = re.findall(r":root \{(.*?)\}", html, flags=re.DOTALL)[scheme]
     colours = dict(re.findall(r"(--[\w-]+): (#[0-9a-f]{6})", block))
-    for name, least in {"--ink": 7, "--muted": 4.5, "--link": 4.5, "--warning": 4.5}.items():
+    for name, least in {
+        "--ink": 7,
+        "--muted": 4.5,
+        "--link": 4.5,
+        "--warning": 4.5,
+    }.items():
         assert contrast(colours[name], colours["--paper"]) >= least, name
     runs = [name for name in colours if name.startswith("--run-")]
     assert len(runs) == len(ESTIMATOR_COLOURS) == table.RUN_COLOURS
@@ -189,9 +239,19 @@ def test_examples_of_the_front_door_run(tmp_path):
         assert done.attempted > 0
         assert done.failed == 0, module.__name__
     compared = basin_comparison(60)
-    assert comparison_page.write_report(compared, str(tmp_path / "new")) == tmp_path / "new" / "report.html"
+    assert (
+        comparison_page.write_report(compared, str(tmp_path / "new"))
+        == tmp_path / "new" / "report.html"
+    )
     assert {path.name for path in (tmp_path / "new").iterdir()} == {
-        *("report.html", "comparison.json", "sequence.npz", "runs", ".sonar_graph.json", ".lock"),
+        *(
+            "report.html",
+            "comparison.json",
+            "sequence.npz",
+            "runs",
+            ".sonar_graph.json",
+            ".lock",
+        ),
         *("result.mcap", "result.foxglove.json", "result.rviz"),
     }
     assert list(read_comparison(tmp_path / "new").scores) == list(compared.scores)

@@ -23,31 +23,43 @@ KINDS = {"comparison": lambda: basin_comparison(60), "batch": drawn_batch}
 
 @pytest.fixture(scope="module", params=KINDS)
 def folder(request, tmp_path_factory) -> Path:
-    return write_paper(KINDS[request.param](), tmp_path_factory.mktemp("result") / "paper").parent
+    return write_paper(
+        KINDS[request.param](), tmp_path_factory.mktemp("result") / "paper"
+    ).parent
 
 
 def width_in(svg: Path) -> float:
     return float(re.search(r'width="([\d.]+)pt"', svg.read_text("utf-8"))[1]) / 72
 
 
-def test_every_figure_is_there_as_svg_and_pdf_in_the_widths_of_a_journal_with_its_fonts_inside(folder):
+def test_every_figure_is_there_as_svg_and_pdf_in_the_widths_of_a_journal_with_its_fonts_inside(
+    folder,
+):
     figures = sorted((folder / "figures").glob("*.svg"))
     assert len(figures) > 5
     for svg in figures:
-        assert min(abs(width_in(svg) - wanted) for wanted in (COLUMN_IN, PAGE_IN)) < 0.01, svg.name
+        assert (
+            min(abs(width_in(svg) - wanted) for wanted in (COLUMN_IN, PAGE_IN)) < 0.01
+        ), svg.name
         assert "<text" not in svg.read_text("utf-8"), "outlines need no font"
         pdf = svg.with_suffix(".pdf").read_bytes()
         assert b"/Type3" not in pdf
         assert b"/FontFile2" in pdf, "a TrueType font, embedded"
 
 
-def test_every_table_is_there_as_latex_and_csv_and_the_document_shows_all_with_the_protocol(folder):
-    document, protocol = ((folder / name).read_text("utf-8") for name in ("paper.tex", "protocol.txt"))
+def test_every_table_is_there_as_latex_and_csv_and_the_document_shows_all_with_the_protocol(
+    folder,
+):
+    document, protocol = (
+        (folder / name).read_text("utf-8") for name in ("paper.tex", "protocol.txt")
+    )
     tables = {path.stem for path in (folder / "tables").glob("*.tex")}
     assert tables == {path.stem for path in (folder / "tables").glob("*.csv")}
     assert set(re.findall(r"\\input\{tables/(.*?)\.tex\}", document)) == tables
     figures = {path.stem for path in (folder / "figures").glob("*.pdf")}
-    assert set(re.findall(r"\\includegraphics\{figures/(.*?)\.pdf\}", document)) == figures
+    assert (
+        set(re.findall(r"\\includegraphics\{figures/(.*?)\.pdf\}", document)) == figures
+    )
     assert "aligned by SE(2)" in protocol
     assert all(f"% {line}" in document for line in protocol.splitlines() if line)
 
@@ -55,17 +67,28 @@ def test_every_table_is_there_as_latex_and_csv_and_the_document_shows_all_with_t
 def test_the_same_result_gives_the_same_files_and_only_own_files_are_replaced(tmp_path):
     comparison = basin_comparison(60)
     write_paper(comparison, tmp_path)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if not path.name.startswith(".")}
+    before = {
+        path: path.read_bytes()
+        for path in tmp_path.rglob("*.*")
+        if not path.name.startswith(".")
+    }
     write_paper(comparison, tmp_path)
-    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.*") if not path.name.startswith(".")}
+    assert before == {
+        path: path.read_bytes()
+        for path in tmp_path.rglob("*.*")
+        if not path.name.startswith(".")
+    }
     assert kind_of(tmp_path) == PAPER
     (tmp_path / "protocol.txt").write_text("mine")
     with pytest.raises(
-        EvaluationError, match=r"holds protocol\.txt, which sonar-graph did not write or others changed"
+        EvaluationError,
+        match=r"holds protocol\.txt, which sonar-graph did not write or others changed",
     ):
         write_paper(comparison, tmp_path)
     write_paper(comparison, tmp_path, overwrite=True)
-    assert np.array_equal(before[tmp_path / "protocol.txt"], (tmp_path / "protocol.txt").read_bytes())
+    assert np.array_equal(
+        before[tmp_path / "protocol.txt"], (tmp_path / "protocol.txt").read_bytes()
+    )
 
 
 def test_without_landmarks_and_truth_what_is_left_is_written(tmp_path):
@@ -79,6 +102,8 @@ def test_without_landmarks_and_truth_what_is_left_is_written(tmp_path):
 @pytest.mark.skipif(LATEX is None, reason="no LaTeX: apt install texlive-latex-base")
 def test_latex_compiles_the_document(folder):
     words = [LATEX, "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, errors="replace", timeout=600)
+    done = subprocess.run(
+        words, cwd=folder, capture_output=True, text=True, errors="replace", timeout=600
+    )
     assert done.returncode == 0, done.stdout[-2000:]
     assert (folder / "paper.pdf").stat().st_size > 50_000

@@ -18,7 +18,13 @@ from sonar_graph.report import sentences
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.console import published_counterpart, summary
 from sonar_graph.report.landmark_table import landmark_table
-from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal
+from sonar_graph.states import (
+    FIRST_ANONYMOUS_ID,
+    DetectionLog,
+    LandmarkMap,
+    Outcome,
+    Refusal,
+)
 from sonar_graph.table import ABSENT
 from tests.synthetic import (
     IDS,
@@ -35,7 +41,11 @@ from tests.synthetic import (
 
 
 def printed(comparison: Comparison, width: int = 80, shown: Any = None) -> str:
-    options: dict[str, Any] = {"file": io.StringIO(), "width": width, "color_system": None}
+    options: dict[str, Any] = {
+        "file": io.StringIO(),
+        "width": width,
+        "color_system": None,
+    }
     console = Console(**options)
     console.print(summary(comparison) if shown is None else shown)
     return console.file.getvalue()
@@ -48,7 +58,13 @@ def nees(value: float, interval: tuple[float, float] | None = None) -> Score:
 def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
     comparison = basin_comparison(60)
     text = printed(comparison)
-    keys = ("causal.ate_se2_m", "smoothed.ate_se2_m", "causal.yaw_rmse_rad", "causal.nees_yaw", "time.update_max_ms")
+    keys = (
+        "causal.ate_se2_m",
+        "smoothed.ate_se2_m",
+        "causal.yaw_rmse_rad",
+        "causal.nees_yaw",
+        "time.update_max_ms",
+    )
     for name, scores in comparison.scores.items():
         row = next(line for line in text.splitlines() if name in line)
         assert all(scores[key].text() in row for key in keys)
@@ -58,7 +74,9 @@ def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
 
 def test_a_failure_is_told_with_its_reason_as_it_is_and_as_wide_as_the_terminal():
     reason = "no [bold] odometry covers the stamps of any of the sonar frames that the log holds"
-    text = printed(with_failure(basin_comparison(60, truth=False), "isam2", reason), width=100)
+    text = printed(
+        with_failure(basin_comparison(60, truth=False), "isam2", reason), width=100
+    )
     assert f"isam2 failed: {reason}" in text
     assert "causal" not in text, "without truth columns of errors are left out"
     assert "median" in text
@@ -71,8 +89,14 @@ def test_a_failure_is_told_with_its_reason_as_it_is_and_as_wide_as_the_terminal(
         *((1.3, (0.9, 1.1), "1.30 ▲"), (2.1, (0.9, 2.2), "2.10")),
     ],
 )
-def test_a_nees_is_marked_outside_its_interval_and_never_without(value, interval, shown):
-    text = printed(with_score(basin_comparison(60), "isam2", "causal.nees_yaw", nees(value, interval)))
+def test_a_nees_is_marked_outside_its_interval_and_never_without(
+    value, interval, shown
+):
+    text = printed(
+        with_score(
+            basin_comparison(60), "isam2", "causal.nees_yaw", nees(value, interval)
+        )
+    )
     row = next(line for line in text.splitlines() if "isam2" in line)
     assert shown in row
     assert any(mark in shown for mark in "▲▼") or not re.search(f"{shown} [▲▼]", row)
@@ -89,7 +113,13 @@ def test_what_is_lost_or_looks_wrong_in_a_log_is_told():
         "log.dropped": "dvl: 5 with values that are not finite",
         "log.noise": "dvl: 5 of 5 rows say no covariance",
     }
-    text = printed(replace(basin_comparison(60), sequence=replace(sequence, detections=None, notes=notes)), 120)
+    text = printed(
+        replace(
+            basin_comparison(60),
+            sequence=replace(sequence, detections=None, notes=notes),
+        ),
+        120,
+    )
     for line in (
         "Log: the file is cut off at byte 7",
         "Log: bytes 3 to 5: chunk 2 is lost",
@@ -105,7 +135,10 @@ def test_what_is_lost_or_looks_wrong_in_a_log_is_told():
 def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of_the_report():
     comparison = basin_comparison(60)
     assert published_counterpart(comparison) is None
-    same = replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    same = replace(
+        comparison,
+        sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]),
+    )
     text, table = printed(same, 80, published_counterpart(same)), landmark_table(same)
     assert "…" not in text
     for row in table.rows:
@@ -114,7 +147,10 @@ def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of
 
 
 def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does():
-    comparison, hint = basin_comparison(60), "sonar-graph inspect LOG compares reference"
+    comparison, hint = (
+        basin_comparison(60),
+        "sonar-graph inspect LOG compares reference",
+    )
     blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
     cases = [
         (comparison, "dead-reckoning", 30.0, True),
@@ -125,9 +161,14 @@ def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does(
     for case, name, value, is_told in cases:
         text = printed(with_score(case, name, "causal.nees_position", nees(value)), 200)
         assert (hint in text) == is_told, (name, value)
-    told = replace(blind, sequence=replace(blind.sequence, notes={"truth": "of the same sensors"}))
+    told = replace(
+        blind, sequence=replace(blind.sequence, notes={"truth": "of the same sensors"})
+    )
     text = printed(with_score(told, "isam2", "causal.nees_position", nees(30.0)), 200)
-    assert "stamps, start or reference (the log says: of the same sensors) may be off" in text
+    assert (
+        "stamps, start or reference (the log says: of the same sensors) may be off"
+        in text
+    )
 
 
 KEY = "causal.ate_se2_m"
@@ -138,24 +179,44 @@ WITHHELD = "landmark 3, from keyframe 1 at 1.000 s: 1 range; open: z; an elevati
 
 def scored(**values: float) -> Comparison:
     """Runs whose causal errors have these values, without runs that have none."""
-    comparison = only(basin_comparison(60), *(name.replace("_", "-") for name in values))
+    comparison = only(
+        basin_comparison(60), *(name.replace("_", "-") for name in values)
+    )
     for name, value in values.items():
-        comparison = with_score(comparison, name.replace("_", "-"), KEY, Score(value, "m", "By hand."))
+        comparison = with_score(
+            comparison, name.replace("_", "-"), KEY, Score(value, "m", "By hand.")
+        )
     return comparison
 
 
 @pytest.mark.parametrize(
     ("errors", "said"),
     [
-        ({"isam2": 0.1, "ekf_slam": 0.25, "dead_reckoning": 2.0}, "isam2 is 60 % below ekf-slam and 95 % below dead-r"),
-        ({"isam2": 0.25, "ekf_slam": 0.1, "dead_reckoning": 2.0}, "ekf-slam is 60 % below isam2 and 95 % below dead-r"),
-        ({"isam2": 0.100, "ekf_slam": 0.103}, "isam2 and ekf-slam differ by less than 5 %"),
+        (
+            {"isam2": 0.1, "ekf_slam": 0.25, "dead_reckoning": 2.0},
+            "isam2 is 60 % below ekf-slam and 95 % below dead-r",
+        ),
+        (
+            {"isam2": 0.25, "ekf_slam": 0.1, "dead_reckoning": 2.0},
+            "ekf-slam is 60 % below isam2 and 95 % below dead-r",
+        ),
+        (
+            {"isam2": 0.100, "ekf_slam": 0.103},
+            "isam2 and ekf-slam differ by less than 5 %",
+        ),
         ({"isam2": 0.0, "ekf_slam": 0.0}, "isam2 and ekf-slam differ by less than 5 %"),
-        ({"isam2": 0.1, "ekf_slam": 0.103, "dead_reckoning": 2.0}, "isam2 is 95 % below dead-reckoning; isam2 and ekf"),
+        (
+            {"isam2": 0.1, "ekf_slam": 0.103, "dead_reckoning": 2.0},
+            "isam2 is 95 % below dead-reckoning; isam2 and ekf",
+        ),
     ],
 )
 def test_the_smaller_error_is_named_only_where_the_difference_is_large(errors, said):
-    sentence = next(one for one in sentences.finding(scored(**errors)) if one.startswith("Causal position error"))
+    sentence = next(
+        one
+        for one in sentences.finding(scored(**errors))
+        if one.startswith("Causal position error")
+    )
     assert said in sentence
     assert ("below" in sentence) == ("below" in said)
 
@@ -164,19 +225,31 @@ def test_the_smaller_error_is_named_only_where_the_difference_is_large(errors, s
     ("score", "verdict"),
     [
         *((nees(value), "") for value in (0.01, 1.0, 99.0)),
-        *((nees(value, (0.0, 5.0)), said) for value, said in ((0.01, ""), (4.9, ""), (5.1, "over-confident"))),
-        *((nees(value, (0.9, 1.1)), said) for value, said in ((0.8, "over-cautious"), (1.0, "consistent"))),
+        *(
+            (nees(value, (0.0, 5.0)), said)
+            for value, said in ((0.01, ""), (4.9, ""), (5.1, "over-confident"))
+        ),
+        *(
+            (nees(value, (0.9, 1.1)), said)
+            for value, said in ((0.8, "over-cautious"), (1.0, "consistent"))
+        ),
         (nees(1.2, (0.9, 1.1)), "over-confident"),
         *((nees(math.nan), ""), (Score(40.0, "m", ""), "")),
     ],
 )
-def test_consistency_follows_the_interval_and_without_one_or_in_a_wide_one_nothing_is_said(score, verdict):
+def test_consistency_follows_the_interval_and_without_one_or_in_a_wide_one_nothing_is_said(
+    score, verdict
+):
     assert score.verdict == verdict
 
 
 def test_radians_are_shown_as_degrees():
     score = Score(math.pi / 2, "rad", "By hand.")
-    assert (score.text(), score.with_unit, Score(2.0, "m", "").with_unit) == ("90", "90°", "2\N{NO-BREAK SPACE}m")
+    assert (score.text(), score.with_unit, Score(2.0, "m", "").with_unit) == (
+        "90",
+        "90°",
+        "2\N{NO-BREAK SPACE}m",
+    )
 
 
 @pytest.mark.parametrize("truth", [True, False])
@@ -187,46 +260,91 @@ def test_finding_tells_another_smoothed_error_and_that_there_were_no_detections(
     assert all("isam2" in one and "ekf-slam" not in one for one in smoothed)
     assert sentences.NO_DETECTIONS not in sentences.finding(comparison)
     part = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
-    for notes, said in (({}, sentences.NO_DETECTIONS), ({"log.part": "the beginning to 10.000 s"}, part)):
+    for notes, said in (
+        ({}, sentences.NO_DETECTIONS),
+        ({"log.part": "the beginning to 10.000 s"}, part),
+    ):
         sequence = replace(comparison.sequence, detections=None, notes=notes)
-        assert sentences.finding(replace(comparison, sequence=sequence))[0].startswith(said)
-    aided = replace(comparison.sequence, detections=None, heading=Heading(np.zeros(1, int), np.zeros(1), np.ones(1)))
-    assert "only its headings limit" in sentences.finding(replace(comparison, sequence=aided))[0]
+        assert sentences.finding(replace(comparison, sequence=sequence))[0].startswith(
+            said
+        )
+    aided = replace(
+        comparison.sequence,
+        detections=None,
+        heading=Heading(np.zeros(1, int), np.zeros(1), np.ones(1)),
+    )
+    assert (
+        "only its headings limit"
+        in sentences.finding(replace(comparison, sequence=aided))[0]
+    )
 
 
 def test_finding_gives_the_nees_that_is_not_to_be_believed_before_one_that_is_farther_from_1_but_within_its_interval():
     comparison = basin_comparison(60, truth=True)
-    wrong, fine = (Score(v, "", "By hand.", better="inside", interval=(0.01, 2.0)) for v in (4.0, 0.05))
-    scores = {"isam2": comparison.scores["isam2"] | {"causal.nees_position": wrong, "causal.nees_yaw": fine}}
-    (said,) = [s for s in sentences.finding(replace(comparison, scores=comparison.scores | scores)) if "NEES" in s]
+    wrong, fine = (
+        Score(v, "", "By hand.", better="inside", interval=(0.01, 2.0))
+        for v in (4.0, 0.05)
+    )
+    scores = {
+        "isam2": comparison.scores["isam2"]
+        | {"causal.nees_position": wrong, "causal.nees_yaw": fine}
+    }
+    (said,) = [
+        s
+        for s in sentences.finding(
+            replace(comparison, scores=comparison.scores | scores)
+        )
+        if "NEES" in s
+    ]
     assert "isam2 4 (position, over-confident" in said
 
 
 def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
-    told_lines = sentences.finding(with_failure(basin_comparison(60), "ekf-slam", "no odometry."))
+    told_lines = sentences.finding(
+        with_failure(basin_comparison(60), "ekf-slam", "no odometry.")
+    )
     assert told_lines[0] == "ekf-slam failed: no odometry."
     assert "ekf-slam" not in " ".join(told_lines[1:])
     blind = basin_comparison(60, truth=False)
     assert "no ground truth" in " ".join(sentences.finding(blind))
-    assert "nothing to compare" in sentences.finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[-1]
+    assert (
+        "nothing to compare"
+        in sentences.finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[
+            -1
+        ]
+    )
     unscored = replace(basin_comparison(60), scores={})
-    assert sentences.finding(unscored) == ["No position error could be computed against the log's ground truth."]
-    told = sentences.finding(with_score(blind, "isam2", "detections.nis", nees(6.9, (0.9, 1.1))))[-1]
+    assert sentences.finding(unscored) == [
+        "No position error could be computed against the log's ground truth."
+    ]
+    told = sentences.finding(
+        with_score(blind, "isam2", "detections.nis", nees(6.9, (0.9, 1.1)))
+    )[-1]
     assert "isam2 6.90 (over-confident)" in told
 
 
 @pytest.mark.parametrize(
     ("position", "yaw", "told"),
     [
-        (nees(1.5), nees(6.0, (0.0, 5.0)), "isam2 6 (yaw, over-confident, 0 to 5 expected)"),
-        (nees(0.1, (0.4, 1.5)), nees(6.0), "isam2 0.100 (position, over-cautious, 0.400 to 1.50 expected)"),
+        (
+            nees(1.5),
+            nees(6.0, (0.0, 5.0)),
+            "isam2 6 (yaw, over-confident, 0 to 5 expected)",
+        ),
+        (
+            nees(0.1, (0.4, 1.5)),
+            nees(6.0),
+            "isam2 0.100 (position, over-cautious, 0.400 to 1.50 expected)",
+        ),
         (nees(1.5), nees(1.2), "isam2 1.50 (position)"),
         (nees(0.0), nees(6.0), "isam2 0 (position)"),
     ],
 )
 def test_the_nees_furthest_from_one_is_told(position, yaw, told):
     judged = with_score(scored(isam2=0.1), "isam2", "causal.nees_position", position)
-    assert sentences.finding(with_score(judged, "isam2", "causal.nees_yaw", yaw))[-1].endswith(f": {told}.")
+    assert sentences.finding(with_score(judged, "isam2", "causal.nees_yaw", yaw))[
+        -1
+    ].endswith(f": {told}.")
 
 
 @pytest.mark.parametrize(
@@ -234,21 +352,41 @@ def test_the_nees_furthest_from_one_is_told(position, yaw, told):
     [
         (19, {}, None),
         (21, {}, "identities are wrong, or noise is set far too small"),
-        (30, {"identity": {"policy": "gate"}}, 'wrong (try identity.policy = "max-mixture"), or noise is set far too'),
+        (
+            30,
+            {"identity": {"policy": "gate"}},
+            'wrong (try identity.policy = "max-mixture"), or noise is set far too',
+        ),
     ],
 )
-def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gated, params, advice):
+def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(
+    gated, params, advice
+):
     log = log_of([Outcome.GATED] * gated + [Outcome.USED] * (100 - gated), [0.1] * 100)
     comparison = basin_comparison(60)
-    lost = with_run(comparison, replace(comparison.runs[1], detections=log, params=params))
-    told = [sentence for sentence in sentences.finding(lost) if sentence.startswith("ekf-slam refused")]
+    lost = with_run(
+        comparison, replace(comparison.runs[1], detections=log, params=params)
+    )
+    told = [
+        sentence
+        for sentence in sentences.finding(lost)
+        if sentence.startswith("ekf-slam refused")
+    ]
     assert told == sentences.lost_runs(lost)
     assert len(told) == (advice is not None)
     for sentence in told:
-        assert sentence.startswith(f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its")
+        assert sentence.startswith(
+            f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its"
+        )
         assert advice in sentence
-    few = replace(log, innovations=np.full((100, 2), 0.1), innovation_covs=np.tile(np.eye(2), (100, 1, 1)))
-    assert detection_scores(few)["detections.nis"].verdict == ("" if told else "over-cautious")
+    few = replace(
+        log,
+        innovations=np.full((100, 2), 0.1),
+        innovation_covs=np.tile(np.eye(2), (100, 1, 1)),
+    )
+    assert detection_scores(few)["detections.nis"].verdict == (
+        "" if told else "over-cautious"
+    )
 
 
 def test_what_ekf_slam_used_beside_the_paper_is_named():
@@ -260,42 +398,70 @@ def test_what_ekf_slam_used_beside_the_paper_is_named():
         (gaps, {}, False),
         (comparison.sequence, run.params, False),
     ):
-        one = with_run(replace(comparison, sequence=sequence), replace(run, params=params))
+        one = with_run(
+            replace(comparison, sequence=sequence), replace(run, params=params)
+        )
         sentence = sentences.beside_the_paper(one)
         assert ("far_views" in sentence) == is_named
         assert ("in gaps" in sentence) == (sequence is gaps)
         assert "gravity" in sentence
-        bare = replace(sequence, depth=None, calibration=sequence.calibration.model_copy(update={"use_gravity": False}))
+        bare = replace(
+            sequence,
+            depth=None,
+            calibration=sequence.calibration.model_copy(update={"use_gravity": False}),
+        )
         assert "gravity" not in sentences.beside_the_paper(replace(one, sequence=bare))
     assert sentences.beside_the_paper(only(comparison, "isam2")) is None
 
 
 def with_map(
-    ids: np.ndarray, offsets_m: list[float], policy: str = "robust", *, has_truth: bool = True, **changes: object
+    ids: np.ndarray,
+    offsets_m: list[float],
+    policy: str = "robust",
+    *,
+    has_truth: bool = True,
+    **changes: object,
 ) -> Comparison:
     """One run whose landmarks are so far from the true ones along x, with a sigma of 2 cm."""
     comparison = only(basin_comparison(60), "isam2")
     positions = LANDMARKS + np.column_stack([offsets_m, np.zeros(4), np.zeros(4)])
     found = LandmarkMap(ids, positions, np.tile(SIGMA_M**2 * np.eye(3), (4, 1, 1)))
-    run = replace(comparison.runs[0], landmarks=found, params={"identity": {"policy": policy}}, **changes)
-    sequence = comparison.sequence if has_truth else replace(comparison.sequence, true_landmarks=None)
+    run = replace(
+        comparison.runs[0],
+        landmarks=found,
+        params={"identity": {"policy": policy}},
+        **changes,
+    )
+    sequence = (
+        comparison.sequence
+        if has_truth
+        else replace(comparison.sequence, true_landmarks=None)
+    )
     return replace(with_run(comparison, run), sequence=sequence)
 
 
-def log_of(outcomes: list[Outcome], innovations_m: list[float], landmark_id: int = 2) -> DetectionLog:
+def log_of(
+    outcomes: list[Outcome], innovations_m: list[float], landmark_id: int = 2
+) -> DetectionLog:
     n = len(outcomes)
     innovations = np.column_stack([innovations_m, np.zeros(n)])
     covs = np.tile(SIGMA_M**2 * np.eye(2), (n, 1, 1))
-    return DetectionLog(np.arange(n), np.full(n, landmark_id), innovations, covs, outcomes)
+    return DetectionLog(
+        np.arange(n), np.full(n, landmark_id), innovations, covs, outcomes
+    )
 
 
 def test_a_map_is_called_wrong_beyond_the_quantile_that_chance_exceeds_once_in_a_billion():
-    assert np.exp(-sentences.ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)  # of two degrees of freedom, in closed form
+    # of two degrees of freedom, in closed form
+    assert np.exp(-sentences.ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)
     limit_m, rng = SIGMA_M * np.sqrt(sentences.ABSURD), np.random.default_rng(1)
     assert sentences.doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
     (line,) = sentences.doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
     assert "landmarks 1, 2, 3 and 4 far outside" in line
-    assert not any(sentences.doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4)))) for _ in range(50))
+    assert not any(
+        sentences.doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4))))
+        for _ in range(50)
+    )
 
 
 def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
@@ -312,19 +478,32 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
 
 def test_without_true_landmarks_the_innovations_of_used_detections_tell():
     def doubts(log: DetectionLog, *, has_truth: bool = False) -> list[str]:
-        return sentences.doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=has_truth, detections=log))
+        return sentences.doubt_of_identities(
+            with_map(IDS, [0.0] * 4, has_truth=has_truth, detections=log)
+        )
 
     start = "Warning: isam2: sightings of landmark 2 contradict its map (mean NIS up to"
     for far, nis in ((2, None), (3, 375), (10, 1250)):  # (3 * 50² + 7 * 0.5²) / 10 / 2
         log = log_of([Outcome.USED] * 10, [1.0] * far + [0.01] * (10 - far))
-        assert [line.partition(");")[0] for line in doubts(log)] == ([f"{start} {nis}"] if nis else [])
+        assert [line.partition(");")[0] for line in doubts(log)] == (
+            [f"{start} {nis}"] if nis else []
+        )
         assert not doubts(log, has_truth=True)  # the truth says that all is well
     for outcome in (Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED):
         assert not doubts(log_of([outcome] * 10, [1.0] * 10))
     n, rng = 2000, np.random.default_rng(2)
-    unit = replace(log_of([Outcome.USED] * n, [0.0] * n), innovations=SIGMA_M * rng.standard_normal((n, 2)))
-    for factor, is_told in ((3.0, False), (4.0, True)):  # sigmas so many times too small
-        assert bool(doubts(replace(unit, innovations=factor * unit.innovations))) == is_told
+    unit = replace(
+        log_of([Outcome.USED] * n, [0.0] * n),
+        innovations=SIGMA_M * rng.standard_normal((n, 2)),
+    )
+    for factor, is_told in (
+        (3.0, False),
+        (4.0, True),
+    ):  # sigmas so many times too small
+        assert (
+            bool(doubts(replace(unit, innovations=factor * unit.innovations)))
+            == is_told
+        )
 
 
 LISTED = [(2, "1 and 2"), (5, "1, 2, 3, 4 and 5"), (6, "1, 2, 3, 4, 5 and 1 more")]
@@ -355,7 +534,9 @@ NAMELESS = [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNF
     ],
 )
 def test_a_log_without_any_identity_is_told_with_what_to_do(outcomes, count):
-    blind = with_map(IDS, [0.0] * 4, detections=log_of(outcomes, [np.nan] * len(outcomes)))
+    blind = with_map(
+        IDS, [0.0] * 4, detections=log_of(outcomes, [np.nan] * len(outcomes))
+    )
     line = (
         f"Warning: none of {count} detections has an identity that isam2 can use: no landmark is mapped; "
         'isam2 maps them by place with identity.unknown.policy = "associate"'
@@ -370,7 +551,9 @@ def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_wa
         blind = replace(run, detections=log_of([Outcome.NO_IDENTITY] * n, [np.nan] * n))
         comparison = with_run(comparison, blind)
     (line,) = sentences.doubt_of_identities(comparison)
-    assert line.startswith("Warning: none of 6 detections has an identity that isam2, ekf-slam can use")
+    assert line.startswith(
+        "Warning: none of 6 detections has an identity that isam2, ekf-slam can use"
+    )
     assert "associate" in line
     assert line.replace('"', "&#34;") in render_report(comparison)
     params = {"identity": {"unknown": {"policy": "associate"}}}
@@ -385,35 +568,58 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     assert sentence in printed(nameless, 200)
     assert sentence in render_report(nameless)
     table = landmark_table(nameless)
-    assert [row[2].text != ABSENT for row in table.rows[:8:2]] == [True, True, False, True]
+    assert [row[2].text != ABSENT for row in table.rows[:8:2]] == [
+        True,
+        True,
+        False,
+        True,
+    ]
     scores = landmark_scores(nameless.runs[0].landmarks, nameless.sequence)
-    assert scores["landmarks.raw_m"].value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
-    assert "3 landmarks matched by identity, 3 of them by place within 1 m" in scores["landmarks.raw_m"].protocol
-    off = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])  # the third is nobody's
+    assert scores["landmarks.raw_m"].value == pytest.approx(
+        np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3)
+    )
+    assert (
+        "3 landmarks matched by identity, 3 of them by place within 1 m"
+        in scores["landmarks.raw_m"].protocol
+    )
+    # the third is nobody's
+    off = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])
     (line,) = sentences.doubt_of_identities(off)
     assert "puts landmark 2 far outside its covariance" in line
-    unknown = with_map(np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False)
+    unknown = with_map(
+        np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False
+    )
     (line,) = sentences.nameless_landmarks(unknown)
-    assert line.startswith("isam2 found 1 landmark without a name (identity.unknown.policy); ")
+    assert line.startswith(
+        "isam2 found 1 landmark without a name (identity.unknown.policy); "
+    )
     assert line.endswith("; identities from 3000000000 on are made up.")
-    wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)  # merely wrong, and not named by place
+    # merely wrong, and not named by place
+    wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)
     assert sentences.nameless_landmarks(wrong) == []
     scores = landmark_scores(wrong.runs[0].landmarks, wrong.sequence)
-    assert "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
+    assert (
+        "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
+    )
 
 
 def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_warnings():
     said = {subject: f"<{subject}>" for subject in sentences.SAID_NOTES}
     notes = said | {"log.topics": "imu: /imu", "log.noise": "dvl"}
-    assert [line.partition(": ")[2] for line in sentences.doubt_lines(notes)] == list(said.values())
+    assert [line.partition(": ")[2] for line in sentences.doubt_lines(notes)] == list(
+        said.values()
+    )
     assert sentences.warning_lines(notes) == [
-        f"Warning: <log.{name}>" for name in ("sensors", "start_pose", "warnings", "gaps")
+        f"Warning: <log.{name}>"
+        for name in ("sensors", "start_pose", "warnings", "gaps")
     ]
 
 
 def test_a_line_names_sensor_stamp_reason_distance_and_runs():
     start_ns = basin_comparison(60).sequence.start_ns
-    comparison = refusing([outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam")
+    comparison = refusing(
+        [outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam"
+    )
     assert sentences.refusal_lines(comparison) == [
         f"Warning: dvl, 1.234 s: {Refusal.OUTLIER} (squared distance 513); isam2, ekf-slam",
         f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2, ekf-slam",
@@ -422,7 +628,10 @@ def test_a_line_names_sensor_stamp_reason_distance_and_runs():
     assert sentences.refusal_lines(many) == [
         f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
     ]
-    own, other = refusing([outlier(0)], "isam2"), refusing([outlier(0, 70.0)], "ekf-slam")
+    own, other = (
+        refusing([outlier(0)], "isam2"),
+        refusing([outlier(0, 70.0)], "ekf-slam"),
+    )
     both = sentences.refusal_lines(with_run(own, other.runs[1]))
     assert [line.rsplit("; ")[-1] for line in both] == ["isam2", "ekf-slam"]
 
@@ -430,35 +639,54 @@ def test_a_line_names_sensor_stamp_reason_distance_and_runs():
 def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_nothing_was():
     start_ns, calm = basin_comparison(60).sequence.start_ns, basin_comparison(60)
     refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
-    comparison, line = with_run(refused, replace(refused.runs[0], withheld=[WITHHELD])), f"Warning: isam2: {WITHHELD}"
+    comparison, line = (
+        with_run(refused, replace(refused.runs[0], withheld=[WITHHELD])),
+        f"Warning: isam2: {WITHHELD}",
+    )
     assert sentences.withheld_lines(comparison) == [line]
     below, page = printed(comparison, 200), render_report(comparison)
     assert all(line in below for line in [*sentences.refusal_lines(comparison), line])
     assert page.index(line) < page.index('<h2 id="numbers">')
     section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
-    for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
+    for word in (
+        "dvl",
+        "1.000",
+        Refusal.OUTLIER,
+        "513",
+        "imu",
+        "0.000",
+        Refusal.LATE,
+        "isam2",
+    ):
         assert word in section
     assert "ekf-slam" not in section
     assert 'id="refused"' not in render_report(calm)
     assert "Warning" not in printed(calm, 200)
     messages = [f"{WITHHELD} {k}" for k in range(MOST_ROWS_NAMED + 2)]
-    lines = sentences.withheld_lines(with_run(calm, replace(calm.runs[0], withheld=messages)))
+    lines = sentences.withheld_lines(
+        with_run(calm, replace(calm.runs[0], withheld=messages))
+    )
     assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
     assert sentences.withheld_lines(calm) == []
 
 
 def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
-    def said(far: int, outcome: Outcome = Outcome.USED, off_m: float = 1.0) -> list[str]:
-        log = log_of([Outcome.USED] * (100 - far) + [outcome] * far, [0.01] * (100 - far) + [off_m] * far)
+    def said(
+        far: int, outcome: Outcome = Outcome.USED, off_m: float = 1.0
+    ) -> list[str]:
+        log = log_of(
+            [Outcome.USED] * (100 - far) + [outcome] * far,
+            [0.01] * (100 - far) + [off_m] * far,
+        )
         return sentences.outliers(with_map(IDS, [0.0] * 4, detections=log))
 
     (line,) = said(6)
     told = "Warning: sonar, detections that were used although as far off as one in a billion should be: "
     assert line.startswith(f"{told}isam2 6 of 100: look at their ranges")
-    assert line in printed(with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)), 300).replace(
-        "9 of 9", "6 of 100"
-    )
+    assert line in printed(
+        with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)), 300
+    ).replace("9 of 9", "6 of 100")
     limit_m = SIGMA_M * np.sqrt(sentences.ABSURD)
     assert not said(5)
     assert not said(6, Outcome.GATED)
@@ -470,15 +698,28 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
 @pytest.mark.parametrize(
     ("params", "told"),
     [
-        ({"kernel": {"shape": "cauchy", "width": 1.5}}, ", with less weight by its kernel"),
-        ({"kernel": {"shape": "none"}}, ", with full weight (kernel.shape sets a kernel)"),
+        (
+            {"kernel": {"shape": "cauchy", "width": 1.5}},
+            ", with less weight by its kernel",
+        ),
+        (
+            {"kernel": {"shape": "none"}},
+            ", with full weight (kernel.shape sets a kernel)",
+        ),
         ({"kernel_width": 1.5}, ", with less weight by its kernel"),
         ({"kernel_width": 0.0}, ", with full weight (kernel_width sets a kernel)"),
     ],
 )
-def test_of_outliers_that_were_used_is_told_how_much_they_count_in_each_run(params, told):
-    comparison = with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9))
+def test_of_outliers_that_were_used_is_told_how_much_they_count_in_each_run(
+    params, told
+):
+    comparison = with_map(
+        IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)
+    )
     (run,) = comparison.runs
-    runs = [replace(run, estimator="no setting", params={}), replace(run, params=params)]
+    runs = [
+        replace(run, estimator="no setting", params={}),
+        replace(run, params=params),
+    ]
     (line,) = sentences.outliers(replace(comparison, runs=runs))
     assert f"no setting 9 of 9; isam2 9 of 9{told}: look" in line

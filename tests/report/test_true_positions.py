@@ -6,7 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from baselines.dead_reckoning import DeadReckoning
-from sonar_graph.evaluation import compare, run_estimator, write_comparison, write_viewer_files
+from sonar_graph.evaluation import (
+    compare,
+    run_estimator,
+    write_comparison,
+    write_viewer_files,
+)
 from sonar_graph.report import write_report
 from sonar_graph.report.console import summary
 from sonar_graph.states import Trajectory
@@ -23,17 +28,30 @@ def test_nothing_about_a_true_heading_is_written(tmp_path):
     page = write_report(comparison, tmp_path).read_text()
     assert "with true positions, but no true orientation" in page
     assert "yaw error" not in page
-    told = json.loads((tmp_path / "comparison.json").read_text())["runs"]["dead-reckoning"]["scores"]
+    told = json.loads((tmp_path / "comparison.json").read_text())["runs"][
+        "dead-reckoning"
+    ]["scores"]
     assert "causal.ate_se2_m" in told
     assert not any("yaw" in key.replace("ate_yaw", "") for key in told)
-    assert "yaw" not in [str(column.header).split("\n")[0] for column in summary(comparison).renderables[0].columns]
+    assert "yaw" not in [
+        str(column.header).split("\n")[0]
+        for column in summary(comparison).renderables[0].columns
+    ]
     topics = decode(tmp_path / "result.mcap")
     assert "/ground_truth/odometry" not in topics
     point = topics["/ground_truth/point"][-1].point
     assert [point.x, point.y, point.z] == world.truth.positions[-1].tolist()
-    poses = [pose.pose.orientation for path in topics["/ground_truth/path"] for pose in path.poses]
+    poses = [
+        pose.pose.orientation
+        for path in topics["/ground_truth/path"]
+        for pose in path.poses
+    ]
     assert {(q.x, q.y, q.z, q.w) for q in poses} == {(0.0, 0.0, 0.0, 1.0)}
-    assert not any(t.child_frame_id.startswith("ground_truth") for m in topics["/tf"] for t in m.transforms)
+    assert not any(
+        t.child_frame_id.startswith("ground_truth")
+        for m in topics["/tf"]
+        for t in m.transforms
+    )
     assert np.isnan(comparison.sequence.truth.quaternions_xyzw).all()
 
 
@@ -50,4 +68,7 @@ def test_headings_and_fixes_that_an_estimator_never_asks_for_are_named(monkeypat
     fixes = "positions: none of its 21 rows is used; this estimator takes no positions"
     assert run_estimator(world, "dead-reckoning").withheld == [fixes]
     assert run_estimator(unaided, "dead-reckoning").withheld == []
-    assert [run_estimator(world, name).withheld for name in ("ekf-slam", "invariant-ekf", "isam2")] == [[]] * 3
+    assert [
+        run_estimator(world, name).withheld
+        for name in ("ekf-slam", "invariant-ekf", "isam2")
+    ] == [[]] * 3

@@ -17,15 +17,24 @@ def published() -> Sequence:
 
 def test_landmarks_are_where_the_paper_puts_them(published: Sequence):
     assert published.true_landmarks.ids.tolist() == [1, 2, 3, 4]
-    np.testing.assert_array_equal(published.true_landmarks.positions[:, :2], [[5, 0], [7, -5], [2, -7], [0, -2]])
-    np.testing.assert_allclose(published.true_landmarks.positions[:, 2], -1.7, atol=0.05)
+    np.testing.assert_array_equal(
+        published.true_landmarks.positions[:, :2], [[5, 0], [7, -5], [2, -7], [0, -2]]
+    )
+    np.testing.assert_allclose(
+        published.true_landmarks.positions[:, 2], -1.7, atol=0.05
+    )
 
 
-def test_vehicle_turns_right_by_a_quarter_four_times_in_each_of_three_laps_of_the_published_time(published: Sequence):
+def test_vehicle_turns_right_by_a_quarter_four_times_in_each_of_three_laps_of_the_published_time(
+    published: Sequence,
+):
     truth = published.truth
     assert published.duration_s == pytest.approx(2039, abs=0.2)
     assert np.linalg.norm(truth.positions[-1] - truth.positions[0]) < 0.6
-    assert np.degrees((truth.rotations()[0].inv() * truth.rotations()[-1]).magnitude()) < 15
+    assert (
+        np.degrees((truth.rotations()[0].inv() * truth.rotations()[-1]).magnitude())
+        < 15
+    )
     yaw = np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
     assert yaw[-1] - yaw[0] == pytest.approx(-3 * 2 * np.pi, abs=0.3)
     quarter = np.rint(yaw / (np.pi / 2))
@@ -41,7 +50,9 @@ def test_vehicle_stays_in_the_water_and_moves_gently(published: Sequence):
     assert np.all((tilt > 0.5) & (tilt < 2))
 
 
-def test_every_landmark_is_seen_each_lap_mostly_from_the_published_distance(published: Sequence):
+def test_every_landmark_is_seen_each_lap_mostly_from_the_published_distance(
+    published: Sequence,
+):
     ids, probability = published.detections.most_probable()
     found, ids = published.detections.rows(probability > 0.9), ids[probability > 0.9]
     visits = np.concatenate([[0], np.flatnonzero(np.diff(ids)) + 1])
@@ -68,8 +79,13 @@ def test_speed_is_the_one_asked_for_where_time_allows_and_too_short_a_run_says_h
     assert cruise_speed(BasinOptions()) == 0.15
     assert cruise_speed(BasinOptions(duration_s=300, laps=1)) == 0.15
     # 28 m in what 4 turns (8 s) and 8 ramps (3 s) leave of 120 s.
-    assert cruise_speed(BasinOptions(duration_s=120, laps=1)) == pytest.approx(28 / (120 - 4 * 8 - 8 * 3))
-    with pytest.raises(SimulationError, match=r"duration_s = 100 is too short for laps = 1; give at least 119 s"):
+    assert cruise_speed(BasinOptions(duration_s=120, laps=1)) == pytest.approx(
+        28 / (120 - 4 * 8 - 8 * 3)
+    )
+    with pytest.raises(
+        SimulationError,
+        match=r"duration_s = 100 is too short for laps = 1; give at least 119 s",
+    ):
         simulate_basin(BasinOptions(duration_s=100, laps=1))
     simulate_basin(BasinOptions(duration_s=119, laps=1))
 

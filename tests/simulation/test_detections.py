@@ -21,22 +21,38 @@ SONAR = SonarCalibration(
     azimuth_sigma_rad=0.007,
 )
 FAN = simulated.FieldOfView(1.0, 6.0, 0.6, 0.3)
-WORLD = simulated.World(np.array([3, 7, 8]), np.array([[3.0, 0.5, -2.0], [4.0, -1.0, -2.1], [2.5, 0.0, -1.5]]), -2.0)
+WORLD = simulated.World(
+    np.array([3, 7, 8]),
+    np.array([[3.0, 0.5, -2.0], [4.0, -1.0, -2.1], [2.5, 0.0, -1.5]]),
+    -2.0,
+)
 STAMPS = regular_stamps(10.0, 600.0, 0.013)
 KNOTS_S, SWAY = np.linspace(0, 600, 1201), np.array([0.8, 0.8, 0.2, 0.1, 0.1, 0.5])
-PATH = VehiclePath.through(KNOTS_S, smooth_noise(KNOTS_S, SWAY, 6.0, 6, np.random.default_rng(11)))
+PATH = VehiclePath.through(
+    KNOTS_S, smooth_noise(KNOTS_S, SWAY, 6.0, 6, np.random.default_rng(11))
+)
 
 
-def detect(sonar: SonarCalibration = SONAR, world: simulated.World = WORLD, **rates: float) -> LandmarkDetections:
+def detect(
+    sonar: SonarCalibration = SONAR, world: simulated.World = WORLD, **rates: float
+) -> LandmarkDetections:
     recogniser = simulated.SimulatedRecogniser(**rates)
-    return simulated.simulate_detections(PATH, STAMPS, sonar, FAN, recogniser, world, np.random.default_rng(12))
+    return simulated.simulate_detections(
+        PATH, STAMPS, sonar, FAN, recogniser, world, np.random.default_rng(12)
+    )
 
 
 def seen_points(frames: int | None = None) -> Floats:
     """By another library: the landmarks in the sonar's frame at every instant, shape (n, m, 3)."""
-    motion, body_T_sonar = PATH.at(seconds_since_start(STAMPS[:frames])), SONAR.mounting.pose()
+    motion, body_T_sonar = (
+        PATH.at(seconds_since_start(STAMPS[:frames])),
+        SONAR.mounting.pose(),
+    )
     bodies = zip(motion.world_R_body.as_matrix(), motion.position, strict=True)
-    poses = [gtsam.Pose3(gtsam.Rot3(rotation), position) * body_T_sonar for rotation, position in bodies]
+    poses = [
+        gtsam.Pose3(gtsam.Rot3(rotation), position) * body_T_sonar
+        for rotation, position in bodies
+    ]
     return np.array([pose.transformTo(WORLD.landmark_positions.T).T for pose in poses])
 
 
@@ -44,8 +60,17 @@ def in_view() -> np.ndarray:
     """Which landmark each frame's fan holds, shape (n, m)."""
     x, y, z = np.moveaxis(seen_points(), -1, 0)
     level = np.hypot(x, y)
-    distance, azimuth, elevation = np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
-    return (distance >= 1.0) & (distance <= 6.0) & (np.abs(azimuth) <= 0.6) & (np.abs(elevation) <= 0.3)
+    distance, azimuth, elevation = (
+        np.hypot(level, z),
+        np.arctan2(y, x),
+        np.arctan2(z, level),
+    )
+    return (
+        (distance >= 1.0)
+        & (distance <= 6.0)
+        & (np.abs(azimuth) <= 0.6)
+        & (np.abs(elevation) <= 0.3)
+    )
 
 
 def assert_binomial(successes: int, trials: int, probability: float) -> None:
@@ -60,49 +85,99 @@ def test_points_in_the_sonars_frame_agree_with_gtsam():
 
 def point(distance: float, azimuth: float, elevation: float) -> Floats:
     across = distance * np.cos(elevation)
-    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), distance * np.sin(elevation)])
+    return np.array(
+        [
+            across * np.cos(azimuth),
+            across * np.sin(azimuth),
+            distance * np.sin(elevation),
+        ]
+    )
 
 
 @given(st.floats(0.2, 20), st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
-def test_polar_coordinates_invert_their_definition(distance: float, azimuth: float, elevation: float):
+def test_polar_coordinates_invert_their_definition(
+    distance: float, azimuth: float, elevation: float
+):
     found = simulated.range_azimuth_elevation(point(distance, azimuth, elevation))
-    np.testing.assert_allclose(found, [distance, azimuth, elevation], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        found, [distance, azimuth, elevation], rtol=1e-9, atol=1e-9
+    )
 
 
 def test_fan_ends_at_its_edges():
     within = [(3.0, 0.0, 0.0), (1.01, 0.59, 0.29), (5.99, -0.59, -0.29)]
-    outside = [(0.99, 0, 0), (6.01, 0, 0), (3, 0.61, 0), (3, -0.61, 0), (3, 0, 0.31), (3, 0, -0.31), (3, np.pi, 0)]
-    assert [bool(simulated.inside(FAN, point(*place))) for place in within + outside] == [True] * 3 + [False] * 7
+    outside = [
+        (0.99, 0, 0),
+        (6.01, 0, 0),
+        (3, 0.61, 0),
+        (3, -0.61, 0),
+        (3, 0, 0.31),
+        (3, 0, -0.31),
+        (3, np.pi, 0),
+    ]
+    assert [
+        bool(simulated.inside(FAN, point(*place))) for place in within + outside
+    ] == [True] * 3 + [False] * 7
 
 
 def test_a_perfect_recogniser_reports_exactly_what_is_in_view_and_another_misses_its_share():
     """Confidently, with room for none; where nothing is in view there is no block."""
     found, (rows, columns) = detect(), np.nonzero(in_view())
-    reported = zip(found.stamps_ns.tolist(), found.most_probable()[0].tolist(), strict=True)
-    assert set(reported) == set(zip(STAMPS[rows].tolist(), WORLD.landmark_ids[columns].tolist(), strict=True))
+    reported = zip(
+        found.stamps_ns.tolist(), found.most_probable()[0].tolist(), strict=True
+    )
+    assert set(reported) == set(
+        zip(STAMPS[rows].tolist(), WORLD.landmark_ids[columns].tolist(), strict=True)
+    )
     assert 0.1 < len(rows) / (3 * len(STAMPS)) < 0.9
     assert_binomial(len(detect(detection_probability=0.7)), len(rows), 0.7)
-    np.testing.assert_allclose(np.sort(found.id_probability, axis=1), np.tile([0.01, 0.01, 0.97], (len(found), 1)))
-    assert detect(world=simulated.World(np.array([1]), np.array([[500.0, 0.0, 0.0]]), 0.0)) is None
+    np.testing.assert_allclose(
+        np.sort(found.id_probability, axis=1),
+        np.tile([0.01, 0.01, 0.97], (len(found), 1)),
+    )
+    assert (
+        detect(world=simulated.World(np.array([1]), np.array([[500.0, 0.0, 0.0]]), 0.0))
+        is None
+    )
 
 
 def test_range_and_azimuth_carry_the_noise_of_their_covariance():
-    noisy, quiet = detect(), detect(SONAR.model_copy(update={"range_sigma_m": 1e-12, "azimuth_sigma_rad": 1e-12}))
+    noisy, quiet = (
+        detect(),
+        detect(
+            SONAR.model_copy(
+                update={"range_sigma_m": 1e-12, "azimuth_sigma_rad": 1e-12}
+            )
+        ),
+    )
     sigmas = np.sqrt(np.diagonal(noisy.range_azimuth_cov, axis1=1, axis2=2))
     np.testing.assert_allclose(sigmas, np.tile([0.015, 0.007], (len(noisy), 1)))
-    error = np.column_stack([noisy.range_m - quiet.range_m, noisy.azimuth_rad - quiet.azimuth_rad]) / sigmas
+    error = (
+        np.column_stack(
+            [noisy.range_m - quiet.range_m, noisy.azimuth_rad - quiet.azimuth_rad]
+        )
+        / sigmas
+    )
     low, high = stats.chi2.interval(0.9999, len(error))
     assert np.all((low < np.sum(error**2, axis=0)) & (np.sum(error**2, axis=0) < high))
     assert np.all(np.abs(error.mean(axis=0)) < 4 / np.sqrt(len(error)))
 
 
 def test_identities_are_mistaken_at_the_stated_rate_and_for_all_others_alike():
-    true_ids, ids = detect().most_probable()[0], detect(wrong_id_rate=0.2).most_probable()[0]
+    true_ids, ids = (
+        detect().most_probable()[0],
+        detect(wrong_id_rate=0.2).most_probable()[0],
+    )
     mistaken = true_ids != ids
     assert_binomial(int(mistaken.sum()), len(ids), 0.2)
     of_first = ids[mistaken & (true_ids == 3)]
     assert_binomial(int((of_first == 7).sum()), len(of_first), 0.5)
-    lone = detect(world=simulated.World(WORLD.landmark_ids[:1], WORLD.landmark_positions[:1], -2.0), wrong_id_rate=1.0)
+    lone = detect(
+        world=simulated.World(
+            WORLD.landmark_ids[:1], WORLD.landmark_positions[:1], -2.0
+        ),
+        wrong_id_rate=1.0,
+    )
     assert np.all(lone.most_probable()[0] == 3)
 
 
@@ -113,25 +188,38 @@ def test_false_detections_come_at_the_stated_rate_all_over_the_fan_and_say_none_
     assert stats.kstest(found.range_m, stats.uniform(1.0, 5.0).cdf).pvalue > 1e-4
     assert stats.kstest(found.azimuth_rad, stats.uniform(-0.6, 1.2).cdf).pvalue > 1e-4
     np.testing.assert_allclose(found.id_probability.sum(axis=1), 0.2)
-    confused = detect(detection_probability=0, false_detections_per_frame=0.5, confident_false_fraction=0.3)
+    confused = detect(
+        detection_probability=0,
+        false_detections_per_frame=0.5,
+        confident_false_fraction=0.3,
+    )
     assert_binomial(int((confused.most_probable()[1] > 0.9).sum()), len(confused), 0.3)
 
 
 def test_a_share_of_all_detections_names_nothing():
     """The others, and where all of them are, stay as they were."""
-    named, some = (detect(false_detections_per_frame=0.5, anonymous_share=share) for share in (0.0, 0.3))
+    named, some = (
+        detect(false_detections_per_frame=0.5, anonymous_share=share)
+        for share in (0.0, 0.3)
+    )
     is_anonymous = (some.candidate_ids < 0).all(axis=1)
     assert_binomial(int(is_anonymous.sum()), len(some), 0.3)
     assert np.all(some.id_probability[is_anonymous] == 0)
     for name in ("id_probability", "candidate_ids"):
-        assert np.array_equal(getattr(some, name)[~is_anonymous], getattr(named, name)[~is_anonymous])
-    assert np.array_equal([some.range_m, some.azimuth_rad], [named.range_m, named.azimuth_rad])
+        assert np.array_equal(
+            getattr(some, name)[~is_anonymous], getattr(named, name)[~is_anonymous]
+        )
+    assert np.array_equal(
+        [some.range_m, some.azimuth_rad], [named.range_m, named.azimuth_rad]
+    )
     assert (detect(anonymous_share=1.0).candidate_ids < 0).all()
 
 
 def test_landmarks_are_numbered_from_one_and_their_heights_obey_the_floor_prior():
     xy = np.arange(2000.0).reshape(1000, 2)
-    landmarks = simulated.world_on_floor(xy, -1.7, 0.03, np.random.default_rng(0)).landmark_map()
+    landmarks = simulated.world_on_floor(
+        xy, -1.7, 0.03, np.random.default_rng(0)
+    ).landmark_map()
     low, high = stats.chi2.interval(0.9999, 1000)
     assert low < np.sum(((landmarks.positions[:, 2] + 1.7) / 0.03) ** 2) < high
     np.testing.assert_array_equal(landmarks.positions[:, :2], xy)
@@ -143,14 +231,24 @@ NS = 1_000_000_000
 
 
 def basin(**options) -> LandmarkDetections:
-    return simulate_basin(BasinOptions(**{"duration_s": 260.0, "laps": 2, "seed": 5} | options)).detections
+    return simulate_basin(
+        BasinOptions(**{"duration_s": 260.0, "laps": 2, "seed": 5} | options)
+    ).detections
 
 
 def tracks_of(found: LandmarkDetections) -> list[LandmarkDetections]:
-    return [found.rows(found.track == number) for number in range(found.track.max() + 1)]
+    return [
+        found.rows(found.track == number) for number in range(found.track.max() + 1)
+    ]
 
 
-@given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 2_000_000_000)), min_size=1, max_size=40))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.integers(1, 2_000_000_000)),
+        min_size=1,
+        max_size=40,
+    )
+)
 def test_a_track_is_of_one_landmark_and_has_no_gap(steps: list[tuple[int, int]]):
     landmark = np.array([index for index, _ in steps])
     stamps_ns = np.cumsum([gap for _, gap in steps])
@@ -159,7 +257,9 @@ def test_a_track_is_of_one_landmark_and_has_no_gap(steps: list[tuple[int, int]])
         rows = np.flatnonzero(watched.track == number)
         assert set(landmark[rows].tolist()) == {true}
         assert (np.diff(stamps_ns[rows]) <= NS).all()
-        assert watched.age_s[rows] == pytest.approx((stamps_ns[rows] - stamps_ns[rows[0]]) / NS)
+        assert watched.age_s[rows] == pytest.approx(
+            (stamps_ns[rows] - stamps_ns[rows[0]]) / NS
+        )
         assert watched.lifetime_s[number] == pytest.approx(watched.age_s[rows].max())
     for index in range(3):
         rows = np.flatnonzero(landmark == index)
@@ -170,7 +270,13 @@ def test_a_track_is_of_one_landmark_and_has_no_gap(steps: list[tuple[int, int]])
 def test_without_tracks_nothing_is_of_one_and_tracks_alone_change_nothing_else():
     plain, tracked = basin(), basin(tracks=True)
     assert set(plain.track.tolist()) == {-1}
-    for name in ("stamps_ns", "range_m", "azimuth_rad", "candidate_ids", "id_probability"):
+    for name in (
+        "stamps_ns",
+        "range_m",
+        "azimuth_rad",
+        "candidate_ids",
+        "id_probability",
+    ):
         np.testing.assert_array_equal(getattr(plain, name), getattr(tracked, name))
     false = plain.id_probability.max(axis=1) < 0.9
     assert false.any()
@@ -181,19 +287,27 @@ def test_without_tracks_nothing_is_of_one_and_tracks_alone_change_nothing_else()
 def test_an_identity_comes_when_its_track_is_old_enough():
     for track in tracks_of(basin(tracks=True, id_delay_s=4.0)):
         sure = track.id_probability.max(axis=1) > 0.9
-        np.testing.assert_array_equal(sure, (track.stamps_ns - track.stamps_ns[0]) / NS >= 4.0)
+        np.testing.assert_array_equal(
+            sure, (track.stamps_ns - track.stamps_ns[0]) / NS >= 4.0
+        )
         assert track.id_probability[~sure] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
-def test_a_wrong_identity_is_that_of_one_other_landmark_for_a_share_of_the_track(share: float):
+def test_a_wrong_identity_is_that_of_one_other_landmark_for_a_share_of_the_track(
+    share: float,
+):
     right = [track.most_probable()[0][-1] for track in tracks_of(basin(tracks=True))]
-    wrong = tracks_of(basin(tracks=True, id_delay_s=2.0, wrong_id_rate=1.0, wrong_id_share=share))
+    wrong = tracks_of(
+        basin(tracks=True, id_delay_s=2.0, wrong_id_rate=1.0, wrong_id_share=share)
+    )
     for true, track in zip(right, wrong, strict=True):
         age_s = (track.stamps_ns - track.stamps_ns[0]) / NS
         ids, probability = track.most_probable()
         is_wrong = (ids != true) & (probability > 0.9)
-        expected = (age_s >= 2.0) & ((age_s < 2.0 + share * (age_s[-1] - 2.0)) | (share == 1))
+        expected = (age_s >= 2.0) & (
+            (age_s < 2.0 + share * (age_s[-1] - 2.0)) | (share == 1)
+        )
         np.testing.assert_array_equal(is_wrong, expected)
         assert len(set(ids[is_wrong].tolist())) <= 1
 
@@ -203,7 +317,10 @@ def test_the_share_of_wrong_tracks_is_as_asked():
     """Thirty runs of eight tracks or more: 0.3 give or take four standard errors."""
     wrong = []
     for seed in range(30):
-        plain, mixed = (basin(seed=seed, tracks=True, wrong_id_rate=rate, wrong_id_share=1.0) for rate in (0.0, 0.3))
+        plain, mixed = (
+            basin(seed=seed, tracks=True, wrong_id_rate=rate, wrong_id_share=1.0)
+            for rate in (0.0, 0.3)
+        )
         pairs = zip(tracks_of(plain), tracks_of(mixed), strict=True)
         wrong += [a.most_probable()[0][0] != b.most_probable()[0][0] for a, b in pairs]
     assert np.mean(wrong) == pytest.approx(0.3, abs=4 * np.sqrt(0.3 * 0.7 / len(wrong)))
@@ -211,8 +328,14 @@ def test_the_share_of_wrong_tracks_is_as_asked():
 
 def test_options_of_tracks_without_tracks_are_refused():
     for options, message in (
-        ({"id_delay_s": 5.0}, "id_delay_s = 5 is the age of a track; set tracks = true"),
-        ({"wrong_id_share": 0.3}, r"wrong_id_share = 0\.3 is a share of a track; set tracks = true"),
+        (
+            {"id_delay_s": 5.0},
+            "id_delay_s = 5 is the age of a track; set tracks = true",
+        ),
+        (
+            {"wrong_id_share": 0.3},
+            r"wrong_id_share = 0\.3 is a share of a track; set tracks = true",
+        ),
     ):
         with pytest.raises(SimulationError, match=message):
             basin(**options)

@@ -7,9 +7,17 @@ from sonar_graph.errors import SimulationError
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
-RECORDED = replace(simulate_mission(MissionOptions(seed=5, duration_s=120)), detections=None, true_landmarks=None)
+RECORDED = replace(
+    simulate_mission(MissionOptions(seed=5, duration_s=120)),
+    detections=None,
+    true_landmarks=None,
+)
 CLEAN = LandmarkOptions(
-    spacing_m=5.0, detection_probability=1.0, wrong_id_rate=0.0, false_detections_per_frame=0.0, height_sigma_m=0.2
+    spacing_m=5.0,
+    detection_probability=1.0,
+    wrong_id_rate=0.0,
+    false_detections_per_frame=0.0,
+    height_sigma_m=0.2,
 )
 
 
@@ -22,29 +30,47 @@ def residuals(run):
     place = run.true_landmarks.positions[np.searchsorted(run.true_landmarks.ids, ids)]
     seen = pose.rotations()[frame].inv().apply(place - pose.positions[frame])
     errors = np.column_stack(
-        [found.range_m - np.linalg.norm(seen, axis=1), found.azimuth_rad - np.arctan2(seen[:, 1], seen[:, 0])]
+        [
+            found.range_m - np.linalg.norm(seen, axis=1),
+            found.azimuth_rad - np.arctan2(seen[:, 1], seen[:, 0]),
+        ]
     )
-    return errors / [run.calibration.sonar.range_sigma_m, run.calibration.sonar.azimuth_sigma_rad]
+    return errors / [
+        run.calibration.sonar.range_sigma_m,
+        run.calibration.sonar.azimuth_sigma_rad,
+    ]
 
 
 def test_detections_fit_the_reference_to_their_noise_and_err_at_their_rates():
     clean = residuals(add_landmarks(RECORDED, CLEAN))
     assert len(clean) > 100
     assert clean.std(axis=0) == pytest.approx(1.0, abs=0.15)
-    wrong = residuals(add_landmarks(RECORDED, CLEAN.model_copy(update={"wrong_id_rate": 0.2})))
+    wrong = residuals(
+        add_landmarks(RECORDED, CLEAN.model_copy(update={"wrong_id_rate": 0.2}))
+    )
     assert 0.1 < np.mean(np.abs(wrong).max(axis=1) > 6) < 0.3
-    fewer = add_landmarks(RECORDED, CLEAN.model_copy(update={"detection_probability": 0.5}))
+    fewer = add_landmarks(
+        RECORDED, CLEAN.model_copy(update={"detection_probability": 0.5})
+    )
     assert 0.4 < len(fewer.detections) / len(clean) < 0.6
 
 
 def test_what_was_recorded_stays_and_the_seed_decides():
     run = add_landmarks(RECORDED)
-    assert all(getattr(run, name) is getattr(RECORDED, name) for name in ("imu", "dvl", "truth"))
+    assert all(
+        getattr(run, name) is getattr(RECORDED, name)
+        for name in ("imu", "dvl", "truth")
+    )
     assert run.calibration.imu == RECORDED.calibration.imu
     assert "simulated" in run.notes
-    first, again, other = (add_landmarks(RECORDED, LandmarkOptions(seed=s, spacing_m=5.0)) for s in (1, 1, 2))
+    first, again, other = (
+        add_landmarks(RECORDED, LandmarkOptions(seed=s, spacing_m=5.0))
+        for s in (1, 1, 2)
+    )
     assert np.array_equal(first.detections.range_m, again.detections.range_m)
-    assert not np.array_equal(first.true_landmarks.positions, other.true_landmarks.positions)
+    assert not np.array_equal(
+        first.true_landmarks.positions, other.true_landmarks.positions
+    )
 
 
 def test_what_cannot_be_done_is_said():

@@ -9,10 +9,14 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 @pytest.fixture(scope="module")
 def mission() -> Sequence:
-    return simulate_mission(MissionOptions(duration_s=400, landmarks=20, false_detections_per_frame=0))
+    return simulate_mission(
+        MissionOptions(duration_s=400, landmarks=20, false_detections_per_frame=0)
+    )
 
 
-def test_vehicle_goes_round_and_round_at_the_stated_speed_heading_along_its_path(mission: Sequence):
+def test_vehicle_goes_round_and_round_at_the_stated_speed_heading_along_its_path(
+    mission: Sequence,
+):
     positions = mission.truth.positions
     velocity = np.diff(positions, axis=0) * 50
     assert np.linalg.norm(velocity, axis=1).mean() == pytest.approx(0.5, rel=0.02)
@@ -21,7 +25,8 @@ def test_vehicle_goes_round_and_round_at_the_stated_speed_heading_along_its_path
     assert np.abs(forward[:, 1:]).max() < 0.15
     assert np.hypot(*positions[:, :2].T).max() < 8
     near_start = np.linalg.norm(positions - positions[0], axis=1) < 0.6
-    assert np.sum(np.diff(near_start.astype(int)) == 1) == int(400 * 0.5 / 41.5)  # arrivals
+    # arrivals
+    assert np.sum(np.diff(near_start.astype(int)) == 1) == int(400 * 0.5 / 41.5)
 
 
 def test_up_to_ten_landmarks_are_in_view_and_all_come_back(mission: Sequence):
@@ -36,7 +41,12 @@ def test_up_to_ten_landmarks_are_in_view_and_all_come_back(mission: Sequence):
 
 
 def test_sonar_options_bound_what_is_seen():
-    narrow = MissionOptions(duration_s=60, range_max_m=9.0, azimuth_aperture_rad=0.6, false_detections_per_frame=0)
+    narrow = MissionOptions(
+        duration_s=60,
+        range_max_m=9.0,
+        azimuth_aperture_rad=0.6,
+        false_detections_per_frame=0,
+    )
     found = simulate_mission(narrow).detections
     assert found.range_m.max() < 9 + 5 * narrow.range_sigma_m
     assert np.abs(found.azimuth_rad).max() < 0.3 + 5 * narrow.azimuth_sigma_rad

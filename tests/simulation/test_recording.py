@@ -14,7 +14,9 @@ from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
 
 
 def short(**options: object) -> Sequence:
-    return simulate_basin(BasinOptions.model_validate({"duration_s": 130, "laps": 1, **options}))
+    return simulate_basin(
+        BasinOptions.model_validate({"duration_s": 130, "laps": 1, **options})
+    )
 
 
 def columns(sequence: Sequence) -> list[Floats]:
@@ -26,30 +28,44 @@ def columns(sequence: Sequence) -> list[Floats]:
 
 
 def test_the_seed_decides_every_bit():
-    for first, second, other in zip(*(columns(short(seed=seed)) for seed in (4, 4, 5)), strict=True):
+    for first, second, other in zip(
+        *(columns(short(seed=seed)) for seed in (4, 4, 5)), strict=True
+    ):
         np.testing.assert_array_equal(first, second)
         assert not np.array_equal(first, other)
 
 
 def test_changing_the_sonar_leaves_all_other_noise_alone():
-    slow, fast = short(frame_rate_hz=2), short(frame_rate_hz=10, false_detections_per_frame=0.3)
+    slow, fast = (
+        short(frame_rate_hz=2),
+        short(frame_rate_hz=10, false_detections_per_frame=0.3),
+    )
     for first, second in zip(columns(slow)[:4], columns(fast)[:4], strict=True):
         np.testing.assert_array_equal(first, second)
 
 
 def test_stamps_begin_together_truth_covers_the_run_and_frames_fall_between_imu_samples():
     run = short(false_detections_per_frame=2.0)
-    assert run.imu.stamps_ns[0] == run.dvl.stamps_ns[0] == run.start_ns == run.truth.stamps_ns[0]
+    assert (
+        run.imu.stamps_ns[0]
+        == run.dvl.stamps_ns[0]
+        == run.start_ns
+        == run.truth.stamps_ns[0]
+    )
     assert run.truth.stamps_ns[-1] >= run.end_ns
     assert run.duration_s == pytest.approx(130, abs=0.2)
     assert np.isnan(run.truth.covariances).all()
     frames = np.unique(run.detections.stamps_ns)
     assert len(frames) < len(run.detections), "rows of a frame share a stamp"
     assert np.all(np.diff(frames) % 200_000_000 <= 1)
-    assert np.isin((frames - 1_400_000_000_000_000_000) % 10_000_000, [7_100_000, 7_100_001]).all()
+    assert np.isin(
+        (frames - 1_400_000_000_000_000_000) % 10_000_000, [7_100_000, 7_100_001]
+    ).all()
 
 
-@pytest.mark.parametrize(("imu", "dvl"), [("hg1700", "workhorse"), ("mti1", "explorer")])
+@pytest.mark.parametrize(
+    ("imu", "dvl"), [("hg1700", "workhorse"), ("mti1", "explorer")]
+)
 def test_calibration_carries_the_presets(imu: str, dvl: str):
     run = short(imu=imu, dvl=dvl)
     assert run.calibration.imu == IMU_PRESETS[imu]  # type: ignore[index]
@@ -68,21 +84,47 @@ def test_presets_are_the_data_sheets_figures():
 
 
 def test_no_bias_is_neither_simulated_nor_told():
-    none, large = short(gyro_bias_scale=0, accel_bias_scale=0), short(gyro_bias_scale=1000)
+    none, large = (
+        short(gyro_bias_scale=0, accel_bias_scale=0),
+        short(gyro_bias_scale=1000),
+    )
     told = none.calibration.imu
-    assert told.gyro_bias_sigma == told.gyro_bias_walk_density == told.accel_bias_sigma == 0
-    assert np.abs((large.imu.angular_velocity - none.imu.angular_velocity).mean(axis=0)).max() > 1e-3
-    assert large.calibration.imu.gyro_bias_sigma == pytest.approx(1000 * 4.848e-6, rel=1e-3)
+    assert (
+        told.gyro_bias_sigma
+        == told.gyro_bias_walk_density
+        == told.accel_bias_sigma
+        == 0
+    )
+    assert (
+        np.abs(
+            (large.imu.angular_velocity - none.imu.angular_velocity).mean(axis=0)
+        ).max()
+        > 1e-3
+    )
+    assert large.calibration.imu.gyro_bias_sigma == pytest.approx(
+        1000 * 4.848e-6, rel=1e-3
+    )
 
 
 def test_start_is_drawn_about_the_truth_with_its_own_sigmas():
     normalised = []
     for seed in range(60):
         run = short(seed=seed, frame_rate_hz=0.1)
-        true = gtsam.Pose3(gtsam.Rot3(run.truth.rotations()[0].as_matrix()), run.truth.positions[0])
+        true = gtsam.Pose3(
+            gtsam.Rot3(run.truth.rotations()[0].as_matrix()), run.truth.positions[0]
+        )
         told = run.calibration.start
-        turned = gtsam.Rot3.Logmap(true.rotation().between(told.pose().rotation())) / told.rpy_sigma_rad
-        normalised.append([turned, (told.pose().translation() - true.translation()) / told.position_sigma_m])
+        turned = (
+            gtsam.Rot3.Logmap(true.rotation().between(told.pose().rotation()))
+            / told.rpy_sigma_rad
+        )
+        normalised.append(
+            [
+                turned,
+                (told.pose().translation() - true.translation())
+                / told.position_sigma_m,
+            ]
+        )
     low, high = stats.chi2.interval(0.9999, 180)
     for kind in np.moveaxis(np.array(normalised), 1, 0):
         assert low < np.sum(kind**2) < high
@@ -96,6 +138,11 @@ def test_notes_say_what_was_simulated_and_credit_the_paper_for_what_it_published
     assert "130 s in all" in run.notes["ours"]
     assert "laps" not in run.notes["from the paper"]
     published = simulate_basin().notes
-    assert published["from the paper"].endswith("window, 2039 s in all, laps: 3, 0.150 m/s while driving")
+    assert published["from the paper"].endswith(
+        "window, 2039 s in all, laps: 3, 0.150 m/s while driving"
+    )
     assert "laps" not in published["ours"]
-    assert parse(Calibration, run.calibration.model_dump(mode="json"), "log") == run.calibration
+    assert (
+        parse(Calibration, run.calibration.model_dump(mode="json"), "log")
+        == run.calibration
+    )

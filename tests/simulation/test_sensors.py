@@ -7,7 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import (
+    DepthCalibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+)
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation import sensors
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
@@ -15,24 +20,42 @@ from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
 G = 9.80665
 SECONDS = np.linspace(0, 60, 121)
 EXACT_IMU = ImuCalibration(
-    gyro_noise_density=0, gyro_bias_sigma=0, gyro_bias_walk_density=0, accel_noise_density=0, accel_bias_sigma=0
+    gyro_noise_density=0,
+    gyro_bias_sigma=0,
+    gyro_bias_walk_density=0,
+    accel_noise_density=0,
+    accel_bias_sigma=0,
 )
 SKEWED = Mounting(translation_m=(0.3, -0.2, 0.1), rpy_rad=(0.3, -0.4, 0.8))
 
 
 def moving() -> VehiclePath:
-    wander = smooth_noise(SECONDS, np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.0]), 4.0, 6, np.random.default_rng(2))
+    wander = smooth_noise(
+        SECONDS,
+        np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.0]),
+        4.0,
+        6,
+        np.random.default_rng(2),
+    )
     return VehiclePath.through(SECONDS, wander)
 
 
-def still(rpy: tuple[float, float, float] = (0.0, 0.0, 0.0), duration_s: float = 60.0) -> VehiclePath:
-    return VehiclePath.through(np.linspace(0, duration_s, 121), np.tile([1.0, 2.0, -1.0, *rpy], (121, 1)))
+def still(
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0), duration_s: float = 60.0
+) -> VehiclePath:
+    return VehiclePath.through(
+        np.linspace(0, duration_s, 121), np.tile([1.0, 2.0, -1.0, *rpy], (121, 1))
+    )
 
 
-def imu_of(calibration: ImuCalibration, rate_hz: float, duration_s: float, seed: int) -> tuple[Floats, Floats]:
+def imu_of(
+    calibration: ImuCalibration, rate_hz: float, duration_s: float, seed: int
+) -> tuple[Floats, Floats]:
     """Errors of angular velocity and specific force at rest."""
     stamps_ns = sensors.regular_stamps(rate_hz, duration_s)
-    imu = sensors.simulate_imu(still(), stamps_ns, calibration, G, np.random.default_rng(seed))
+    imu = sensors.simulate_imu(
+        still(), stamps_ns, calibration, G, np.random.default_rng(seed)
+    )
     return imu.angular_velocity, imu.specific_force - [0, 0, G]
 
 
@@ -41,16 +64,23 @@ def test_stamps_begin_at_the_epoch_and_stay_within_the_run():
     assert stamps[0] == sensors.EPOCH_NS
     assert len(stamps) == 71
     assert np.abs(np.diff(stamps) - 1e9 / 7).max() <= 1
-    assert sensors.regular_stamps(5.0, 10.0, offset_s=0.03)[-1] <= sensors.EPOCH_NS + 10_000_000_000
+    assert (
+        sensors.regular_stamps(5.0, 10.0, offset_s=0.03)[-1]
+        <= sensors.EPOCH_NS + 10_000_000_000
+    )
 
 
 @given(st.tuples(st.floats(-3, 3), st.floats(-1.4, 1.4), st.floats(-3, 3)))
 @settings(max_examples=20)
-def test_a_vehicle_at_rest_feels_gravity_along_the_worlds_up(rpy: tuple[float, float, float]):
+def test_a_vehicle_at_rest_feels_gravity_along_the_worlds_up(
+    rpy: tuple[float, float, float],
+):
     omega, force = sensors.imu_readings(still().at(SECONDS), Mounting(), G)
     np.testing.assert_allclose(omega, 0, atol=1e-9)
     np.testing.assert_allclose(force, np.tile([0, 0, G], (121, 1)), atol=1e-8)
-    up_in_imu = (gtsam.Rot3.RzRyRx(*rpy) * gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad)).unrotate(np.array([0, 0, 1.0]))
+    up_in_imu = (gtsam.Rot3.RzRyRx(*rpy) * gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad)).unrotate(
+        np.array([0, 0, 1.0])
+    )
     _, force = sensors.imu_readings(still(rpy).at(SECONDS[:1]), SKEWED, G)
     np.testing.assert_allclose(force[0], G * up_in_imu, atol=1e-7)
 
@@ -61,7 +91,10 @@ def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
     # Its integrator holds rate and force over a step and turns the force by the attitude at the step's begin.
     omegas, _ = sensors.imu_readings(path.at(begins + step / 2), Mounting(), G)
     _, forces = sensors.imu_readings(path.at(begins), Mounting(), G)
-    params, no_bias = gtsam.PreintegrationParams.MakeSharedU(G), gtsam.imuBias.ConstantBias()
+    params, no_bias = (
+        gtsam.PreintegrationParams.MakeSharedU(G),
+        gtsam.imuBias.ConstantBias(),
+    )
     integrated = gtsam.PreintegratedImuMeasurements(params, no_bias)
     for omega, force in zip(omegas, forces, strict=True):
         integrated.integrateMeasurement(force, omega, step)
@@ -70,10 +103,14 @@ def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
     end = integrated.predict(gtsam.NavState(pose, first.velocity[0]), no_bias)
     np.testing.assert_allclose(end.position(), last.position[0], atol=2e-3)
     np.testing.assert_allclose(end.velocity(), last.velocity[0], atol=5e-4)
-    np.testing.assert_allclose(end.attitude().matrix(), last.world_R_body.as_matrix()[0], atol=1e-5)
+    np.testing.assert_allclose(
+        end.attitude().matrix(), last.world_R_body.as_matrix()[0], atol=1e-5
+    )
 
 
-def points_of_mounting(path: VehiclePath, seconds: Floats, lever: tuple[float, float, float]) -> Floats:
+def points_of_mounting(
+    path: VehiclePath, seconds: Floats, lever: tuple[float, float, float]
+) -> Floats:
     motion = path.at(seconds)
     return motion.position + motion.world_R_body.apply(lever)
 
@@ -81,13 +118,29 @@ def points_of_mounting(path: VehiclePath, seconds: Floats, lever: tuple[float, f
 def test_sensors_on_a_lever_arm_feel_that_points_velocity_and_acceleration():
     path, middle = moving(), np.linspace(5, 55, 31)
     motion, no_lever = path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad)
-    world_R_sensor = motion.world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
-    before, at, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-1e-3, 0, 1e-3))
+    world_R_sensor = (
+        motion.world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
+    )
+    before, at, after = (
+        points_of_mounting(path, middle + d, SKEWED.translation_m)
+        for d in (-1e-3, 0, 1e-3)
+    )
     acceleration = (after - 2 * at + before) / 1e-3**2 + np.array([0, 0, G])
-    before, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-1e-4, 1e-4))
+    before, after = (
+        points_of_mounting(path, middle + d, SKEWED.translation_m)
+        for d in (-1e-4, 1e-4)
+    )
     for exact, expected, atol in (
-        (lambda mounting: sensors.imu_readings(motion, mounting, G)[1], acceleration, 1e-5),
-        (lambda mounting: sensors.dvl_readings(motion, mounting), (after - before) / 2e-4, 1e-7),
+        (
+            lambda mounting: sensors.imu_readings(motion, mounting, G)[1],
+            acceleration,
+            1e-5,
+        ),
+        (
+            lambda mounting: sensors.dvl_readings(motion, mounting),
+            (after - before) / 2e-4,
+            1e-7,
+        ),
     ):
         expected = np.einsum("nji,nj->ni", world_R_sensor, expected)
         np.testing.assert_allclose(exact(SKEWED), expected, atol=atol)
@@ -105,15 +158,24 @@ def assert_sigma(samples: Floats, sigma: float, probability: float = 0.9999) -> 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 200.0])
 def test_imu_white_noise_has_the_stated_density_at_any_rate(rate_hz: float):
-    calibration = EXACT_IMU.model_copy(update={"gyro_noise_density": 2e-3, "accel_noise_density": 5e-3})
-    for errors, density in zip(imu_of(calibration, rate_hz, 60, 5), (2e-3, 5e-3), strict=True):
+    calibration = EXACT_IMU.model_copy(
+        update={"gyro_noise_density": 2e-3, "accel_noise_density": 5e-3}
+    )
+    for errors, density in zip(
+        imu_of(calibration, rate_hz, 60, 5), (2e-3, 5e-3), strict=True
+    ):
         for axis in errors.T:
             assert_sigma(axis, density * np.sqrt(rate_hz))
 
 
 def test_biases_are_drawn_with_their_sigmas_and_stay_constant_without_walk():
-    calibration = EXACT_IMU.model_copy(update={"gyro_bias_sigma": 3e-3, "accel_bias_sigma": 0.02})
-    gyro, accel = map(np.array, zip(*(imu_of(calibration, 10, 2, seed) for seed in range(200)), strict=True))
+    calibration = EXACT_IMU.model_copy(
+        update={"gyro_bias_sigma": 3e-3, "accel_bias_sigma": 0.02}
+    )
+    gyro, accel = map(
+        np.array,
+        zip(*(imu_of(calibration, 10, 2, seed) for seed in range(200)), strict=True),
+    )
     for bias, sigma in ((gyro, 3e-3), (accel, 0.02)):
         np.testing.assert_allclose(bias, bias[:, :1] + np.zeros_like(bias), atol=1e-8)
         assert_sigma(bias[:, 0].ravel(), sigma)
@@ -128,28 +190,46 @@ def test_gyro_bias_walks_with_the_root_of_time():
 
 
 def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_velocity():
-    calibration = DvlCalibration(velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED)
+    calibration = DvlCalibration(
+        velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED
+    )
     path, stamps = moving(), sensors.regular_stamps(100, 60)
     exact = sensors.dvl_readings(path.at(sensors.seconds_since_start(stamps)), SKEWED)
     dvl = sensors.simulate_dvl(path, stamps, calibration, np.random.default_rng(6))
     for axis in range(3):
-        assert_sigma((dvl.velocity - exact)[:, axis], float(np.sqrt(dvl.velocity_cov[0, axis, axis])))
-    np.testing.assert_allclose(np.sqrt(np.diag(dvl.velocity_cov[-1])), calibration.velocity_sigma_m_s)
+        assert_sigma(
+            (dvl.velocity - exact)[:, axis],
+            float(np.sqrt(dvl.velocity_cov[0, axis, axis])),
+        )
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(dvl.velocity_cov[-1])), calibration.velocity_sigma_m_s
+    )
     quiet = calibration.model_copy(update={"velocity_sigma_m_s": (1e-15, 1e-15, 1e-15)})
-    stretched = sensors.simulate_dvl(path, stamps, quiet, np.random.default_rng(0), scale_error=0.05)
+    stretched = sensors.simulate_dvl(
+        path, stamps, quiet, np.random.default_rng(0), scale_error=0.05
+    )
     np.testing.assert_allclose(stretched.velocity, 1.05 * exact, atol=1e-12)
 
 
 def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
     path, stamps = still(duration_s=3600.0), sensors.regular_stamps(7, 3600)
     faulty, whole, lost = (
-        sensors.simulate_dvl(path, stamps, DvlCalibration(), np.random.default_rng(8), **faults)
-        for faults in ({"dropouts_per_hour": 60, "dropout_s": 5.0}, {}, {"dropouts_per_hour": 1e5})
+        sensors.simulate_dvl(
+            path, stamps, DvlCalibration(), np.random.default_rng(8), **faults
+        )
+        for faults in (
+            {"dropouts_per_hour": 60, "dropout_s": 5.0},
+            {},
+            {"dropouts_per_hour": 1e5},
+        )
     )
     assert len(whole) == len(stamps)
-    assert lost.stamps_ns.tolist() == stamps[[0, -1]].tolist()  # the run covers the same time
+    # the run covers the same time
+    assert lost.stamps_ns.tolist() == stamps[[0, -1]].tolist()
     # A sample is lost when a Poisson event lies within the 5 s before it.
-    assert 1 - len(faulty) / len(stamps) == pytest.approx(1 - np.exp(-60 * 5 / 3600), abs=0.03)
+    assert 1 - len(faulty) / len(stamps) == pytest.approx(
+        1 - np.exp(-60 * 5 / 3600), abs=0.03
+    )
     gaps_s = np.diff(faulty.stamps_ns) * 1e-9
     assert gaps_s[gaps_s > 0.2].min() > 4.9
 

@@ -15,8 +15,15 @@ from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.sonar_image import scene
-from sonar_graph.simulation.sonar_image.frames import FrameSimulator, drawn_gain_error_db
-from sonar_graph.simulation.sonar_image.imaging_sonar import SONARS, ImageOptions, ImagingSonar
+from sonar_graph.simulation.sonar_image.frames import (
+    FrameSimulator,
+    drawn_gain_error_db,
+)
+from sonar_graph.simulation.sonar_image.imaging_sonar import (
+    SONARS,
+    ImageOptions,
+    ImagingSonar,
+)
 
 HEIGHT_M = 0.95
 TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
@@ -30,13 +37,18 @@ EVEN = SONARS["didson"].model_copy(update={"lens_cubic": None})
 
 
 @cache
-def floor_of(changes: tuple[tuple[str, object], ...], seed: int, sonar: ImagingSonar | None) -> FrameSimulator:
+def floor_of(
+    changes: tuple[tuple[str, object], ...], seed: int, sonar: ImagingSonar | None
+) -> FrameSimulator:
     options = ImageOptions.model_validate(PLAIN.model_dump() | dict(changes))
     return FrameSimulator(options, (), 0.0, seed, sonar)
 
 
 def simulator(
-    objects: list[scene.SeabedObject] | None = None, seed: int = 0, sonar: ImagingSonar | None = None, **changes: object
+    objects: list[scene.SeabedObject] | None = None,
+    seed: int = 0,
+    sonar: ImagingSonar | None = None,
+    **changes: object,
 ) -> FrameSimulator:
     """One floor for each set of options, with other objects on it at each call."""
     made = copy(floor_of(tuple(sorted(changes.items())), seed, sonar))
@@ -47,21 +59,34 @@ def simulator(
 def box_at(x_m: float, *size_and_level: float, y_m: float = 0.0) -> scene.SeabedObject:
     """A box on the floor; length, width, height and decibels over the floor."""
     radius_m = max(size_and_level[:2]) / 2 + 0.06
-    return scene.place(-1, "box", scene.block(*size_and_level), radius_m, np.array([x_m, y_m, 0.0]), 0.0)
+    return scene.place(
+        -1,
+        "box",
+        scene.block(*size_and_level),
+        radius_m,
+        np.array([x_m, y_m, 0.0]),
+        0.0,
+    )
 
 
-def level_db(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> Floats:
+def level_db(
+    made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0
+) -> Floats:
     return made.level_db(np.array([x_m, y_m, HEIGHT_M]), TILT, number)
 
 
-def intensity(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> Floats:
+def intensity(
+    made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0
+) -> Floats:
     return 10 ** (level_db(made, x_m, y_m, number).astype(float) / 10)
 
 
 def looks(count: int, **changes: object) -> Floats:
     """Intensities from places so far apart that their speckle is independent, shape (count, beams, bins)."""
     made = simulator(**changes)
-    return np.array([intensity(made, 0.31 * (k % 12), 0.33 * (k // 12), k) for k in range(count)])
+    return np.array(
+        [intensity(made, 0.31 * (k % 12), 0.33 * (k // 12), k) for k in range(count)]
+    )
 
 
 def bins_at(made: FrameSimulator, *ranges_m: float) -> np.ndarray:
@@ -73,7 +98,8 @@ def test_speckle_is_exponential_in_intensity_and_spreads_by_5_57_decibels():
     values = looks(24)
     level = 10 * np.log10(values[:, 30:66, first:last])
     level -= level.mean(axis=(0, 1))
-    assert level.std() == pytest.approx(5.57, rel=0.015)  # 1 % more: a cell holds a finite number of scatterers
+    # 1 % more: a cell holds a finite number of scatterers
+    assert level.std() == pytest.approx(5.57, rel=0.015)
     apart = values[:, 30:66:4, near:far:8]
     relative = (apart / apart.mean(axis=(0, 1))).reshape(-1)
     assert stats.kstest(relative, "expon").pvalue > 1e-3
@@ -83,22 +109,39 @@ def test_speckle_is_exponential_in_intensity_and_spreads_by_5_57_decibels():
 @pytest.mark.parametrize("shape", [1.0, 2.0])
 def test_texture_makes_the_floor_k_distributed(shape: float):
     first, last = bins_at(simulator(), 1.9, 2.1)
-    rough, even = (looks(30, texture_shape=s)[:, 20:76, first:last] for s in (shape, None))
+    rough, even = (
+        looks(30, texture_shape=s)[:, 20:76, first:last] for s in (shape, None)
+    )
     moments = [np.mean((x / x.mean(axis=(0, 1))) ** 2) for x in (rough, even)]
     assert moments[0] == pytest.approx(2 * (1 + 1 / shape), rel=0.12)
     assert moments[1] == pytest.approx(2, rel=0.03)
 
 
 @pytest.mark.parametrize(
-    ("moved_m", "speckle"), [(0.0, "world"), (0.018, "world"), (0.036, "world"), (0.07, "world"), (0.0, "frame")]
+    ("moved_m", "speckle"),
+    [
+        (0.0, "world"),
+        (0.018, "world"),
+        (0.036, "world"),
+        (0.07, "world"),
+        (0.0, "frame"),
+    ],
 )
-def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(moved_m: float, speckle: str):
+def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(
+    moved_m: float, speckle: str
+):
     """Of the same floor, seen from a sonar that moved across and turned back to it; "frame": drawn for each frame.
 
     Square of the autocorrelation of a two-way aperture (a triangle): the cubic B-spline, half of it after 3.6 cm.
     """
-    sonar = EVEN.model_copy(update={"beams": 9, "azimuth_span_rad": np.radians(0.3 * 9)})  # one looks straight ahead
-    made, across_m = simulator(sonar=sonar, speckle=speckle), np.sqrt(2.0**2 - HEIGHT_M**2)
+    # one looks straight ahead
+    sonar = EVEN.model_copy(
+        update={"beams": 9, "azimuth_span_rad": np.radians(0.3 * 9)}
+    )
+    made, across_m = (
+        simulator(sonar=sonar, speckle=speckle),
+        np.sqrt(2.0**2 - HEIGHT_M**2),
+    )
     turned = Rotation.from_euler("Z", -np.arctan2(moved_m, across_m)) * TILT
     shift_m = (np.hypot(across_m, moved_m) - across_m) * across_m / 2.0
     ranges_m = made.ranges_m()
@@ -107,12 +150,21 @@ def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(moved_m: f
     for k in range(100):
         x_m, y_m = 0.31 * (k % 12), 0.33 * (k // 12)
         here = intensity(made, x_m, y_m, 2 * k)[4]
-        there = made.level_db(np.array([x_m, y_m + moved_m, HEIGHT_M]), turned, 2 * k + 1)[4].astype(float)
-        pairs.append((here[near], np.interp(ranges_m[near] + shift_m, ranges_m, 10 ** (there / 10))))
+        there = made.level_db(
+            np.array([x_m, y_m + moved_m, HEIGHT_M]), turned, 2 * k + 1
+        )[4].astype(float)
+        pairs.append(
+            (
+                here[near],
+                np.interp(ranges_m[near] + shift_m, ranges_m, 10 ** (there / 10)),
+            )
+        )
     found = np.corrcoef(*np.array(pairs).transpose(1, 0, 2).reshape(2, -1))[0, 1]
     u = 2 * moved_m / (0.886 * 1480 / 1.8e6 / np.radians(0.3))
     spline = max(1 - 1.5 * u**2 + 0.75 * u**3 if u < 1 else (2 - u) ** 3 / 4, 0) ** 2
-    assert found == pytest.approx(spline if speckle == "world" else 0.0, abs=0.07 if speckle == "world" else 0.1)
+    assert found == pytest.approx(
+        spline if speckle == "world" else 0.0, abs=0.07 if speckle == "world" else 0.1
+    )
     assert moved_m != 0.036 or spline == pytest.approx(0.5, abs=0.02)
 
 
@@ -126,63 +178,105 @@ def test_level_over_range_is_that_of_spreading_absorption_and_gain():
     lift = np.arcsin(sine) - np.radians(30)
     pattern = np.sinc(0.886 * np.sin(lift) / np.sin(np.radians(14))) ** 4
     cell = r / np.sqrt(1 - sine**2)  # metres of floor in a beam, times those in a bin
-    echo = sine**2 * pattern * cell / r**4 * r**3  # Lambert, spreading, and gain of 30 log r
-    np.testing.assert_allclose(10 * np.log10(smooth / smooth[2]), 10 * np.log10(echo / echo[2]), atol=0.35)
-    assert 10 * np.log10(smooth[2]) == pytest.approx(40 + 10 * np.log10(pattern[2]), abs=0.3)
+    # Lambert, spreading, and gain of 30 log r
+    echo = sine**2 * pattern * cell / r**4 * r**3
+    np.testing.assert_allclose(
+        10 * np.log10(smooth / smooth[2]), 10 * np.log10(echo / echo[2]), atol=0.35
+    )
+    assert 10 * np.log10(smooth[2]) == pytest.approx(
+        40 + 10 * np.log10(pattern[2]), abs=0.3
+    )
 
 
 def test_absorption_is_what_gain_gives_back_and_noise_shows():
-    quiet, far = (simulator(noise_db=15.0, absorption_db_m=a, floor_db=-60.0) for a in (0.0, 0.8))
+    quiet, far = (
+        simulator(noise_db=15.0, absorption_db_m=a, floor_db=-60.0) for a in (0.0, 0.8)
+    )
     difference = level_db(far).mean(axis=0) - level_db(quiet).mean(axis=0)
     np.testing.assert_allclose(difference, 2 * 0.8 * (far.ranges_m() - 2.0), atol=1e-3)
     at_2_m = bins_at(far, 2.0)[0]
-    noise = np.mean([intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(10)])
+    noise = np.mean(
+        [intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(10)]
+    )
     assert 10 * np.log10(noise) == pytest.approx(15, abs=0.15)
 
 
 @pytest.mark.parametrize("height_m", [0.03, 0.06])
 def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
     near_m, far_m = 1.45, 1.55
-    made, open_ = (simulator([box_at(1.5, 0.1, 0.3, height_m, 0.0)], shadows=is_on) for is_on in (True, False))
+    made, open_ = (
+        simulator([box_at(1.5, 0.1, 0.3, height_m, 0.0)], shadows=is_on)
+        for is_on in (True, False)
+    )
     profile, lit = (level_db(one)[40:56].mean(axis=0) for one in (made, open_))
-    end_m = np.hypot(far_m * HEIGHT_M / (HEIGHT_M - height_m), HEIGHT_M)  # over the far upper edge
+    # over the far upper edge
+    end_m = np.hypot(far_m * HEIGHT_M / (HEIGHT_M - height_m), HEIGHT_M)
     ranges_m = made.ranges_m()
     dark = ranges_m[(profile < 0) & (ranges_m > 1.6)]
     assert dark[0] == pytest.approx(np.hypot(far_m, HEIGHT_M - height_m), abs=0.012)
     assert dark[-1] == pytest.approx(end_m, abs=0.012)
-    assert lit[(ranges_m > np.hypot(near_m + 0.11, HEIGHT_M)) & (ranges_m < end_m)].min() > 20
+    assert (
+        lit[(ranges_m > np.hypot(near_m + 0.11, HEIGHT_M)) & (ranges_m < end_m)].min()
+        > 20
+    )
 
 
-def polar_picture(design: LandmarkDesign, position: Floats, yaw_rad: float, made: FrameSimulator) -> np.ndarray:
+def polar_picture(
+    design: LandmarkDesign, position: Floats, yaw_rad: float, made: FrameSimulator
+) -> np.ndarray:
     """Beams and bins on which a point of a landmark's figure falls, by geometry alone."""
     x, y = np.meshgrid(*2 * [np.linspace(-design.size_m / 2, design.size_m / 2, 600)])
     foam = design.level_db(x, y) > 0
-    plane = Rotation.from_euler("Z", yaw_rad).apply(np.column_stack([x[foam], y[foam], 0 * x[foam]]))
+    plane = Rotation.from_euler("Z", yaw_rad).apply(
+        np.column_stack([x[foam], y[foam], 0 * x[foam]])
+    )
     q = TILT.inv().apply(position + plane - ABOVE)
     azimuths, ranges_m = made.sonar.azimuths_rad(), made.ranges_m()
     beam = np.abs(np.arctan2(q[:, 1], q[:, 0])[:, None] - azimuths).argmin(axis=1)
     picture = np.zeros((len(azimuths), len(ranges_m)), bool)
-    picture[beam, np.searchsorted(ranges_m + (ranges_m[1] - ranges_m[0]) / 2, np.linalg.norm(q, axis=1))] = True
+    picture[
+        beam,
+        np.searchsorted(
+            ranges_m + (ranges_m[1] - ranges_m[0]) / 2, np.linalg.norm(q, axis=1)
+        ),
+    ] = True
     return picture
 
 
 @pytest.mark.parametrize("index", [1, 2])
 def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
-    design, bearing, yaw_rad = DEFAULT_DESIGNS[index], np.radians((-9.0, 4.0)[index % 2]), 0.7
+    design, bearing, yaw_rad = (
+        DEFAULT_DESIGNS[index],
+        np.radians((-9.0, 4.0)[index % 2]),
+        0.7,
+    )
     position = np.array([1.7 * np.cos(bearing), 1.7 * np.sin(bearing), 0.02])
     flush = replace(design, height_m=0.0)  # the edge that faces the sonar would glint
-    made = simulator([scene.place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame")
-    mean_db = 10 * np.log10(np.mean([intensity(made, number=n) for n in range(24)], axis=0))
+    made = simulator(
+        [scene.place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame"
+    )
+    mean_db = 10 * np.log10(
+        np.mean([intensity(made, number=n) for n in range(24)], axis=0)
+    )
     seen, expected = mean_db > 45, polar_picture(design, position, yaw_rad, made)
     assert np.sum(seen & expected) / np.sum(seen | expected) > 0.85
     pixels = np.nonzero(seen), np.nonzero(expected)
-    one, other = ([made.azimuths_rad()[beam].mean(), made.ranges_m()[bin_].mean()] for beam, bin_ in pixels)
+    one, other = (
+        [made.azimuths_rad()[beam].mean(), made.ranges_m()[bin_].mean()]
+        for beam, bin_ in pixels
+    )
     assert np.abs(np.subtract(one, other)) == pytest.approx([0, 0], abs=0.002)
-    assert polar_picture(design, position, yaw_rad + 0.6, made)[seen].mean() < 0.97 or design.name == "disc"
+    assert (
+        polar_picture(design, position, yaw_rad + 0.6, made)[seen].mean() < 0.97
+        or design.name == "disc"
+    )
 
 
 def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
-    made, bare = simulator([box_at(1.7, 0.3, 0.3, 0.0, 12.0)], speckle="frame"), simulator(speckle="frame")
+    made, bare = (
+        simulator([box_at(1.7, 0.3, 0.3, 0.0, 12.0)], speckle="frame"),
+        simulator(speckle="frame"),
+    )
     first, last = bins_at(made, 1.9, 2.0)
     pairs = [(intensity(made, number=n), intensity(bare, number=n)) for n in range(8)]
     on, off = np.mean(pairs, axis=0)[:, 42:54, first:last].mean(axis=(1, 2))
@@ -191,7 +285,14 @@ def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
 
 def point_response(**changes: object) -> np.ndarray:
     """Level of every beam around a small strong object straight ahead, in dB below its own."""
-    dot = scene.place(-1, "dot", scene.block(0.005, 0.005, 0.0, 140.0), 0.02, np.array([1.75, 0.002, 0.0]), 0.0)
+    dot = scene.place(
+        -1,
+        "dot",
+        scene.block(0.005, 0.005, 0.0, 140.0),
+        0.02,
+        np.array([1.75, 0.002, 0.0]),
+        0.0,
+    )
     image = level_db(simulator([dot], **changes))
     column = int(np.argmax(image.max(axis=0)))
     return image[:, column] - image[:, column].max()
@@ -205,16 +306,27 @@ def test_first_side_lobe_lies_26_decibels_down_and_can_be_switched_off():
     pattern_db = 20 * np.log10(fine.two_way_pattern(offset, True))
     outside = offset > 1.0 * width_rad / 0.886
     assert pattern_db[outside].max() == pytest.approx(-26.5, abs=0.2)
-    assert offset[outside][np.argmax(pattern_db[outside])] == pytest.approx(first_lobe, rel=0.01)
-    with_lobes, without = np.sort(point_response())[::-1], np.sort(point_response(side_lobes=False))[::-1]
+    assert offset[outside][np.argmax(pattern_db[outside])] == pytest.approx(
+        first_lobe, rel=0.01
+    )
+    with_lobes, without = (
+        np.sort(point_response())[::-1],
+        np.sort(point_response(side_lobes=False))[::-1],
+    )
     assert with_lobes[20] > without[20] + 20
 
 
 @pytest.mark.parametrize("side_lobes", [True, False])
-def test_a_beam_is_down_by_half_power_at_half_its_width_and_seventy_decibels_where_it_leaves_columns_out(side_lobes):
+def test_a_beam_is_down_by_half_power_at_half_its_width_and_seventy_decibels_where_it_leaves_columns_out(
+    side_lobes,
+):
     half = np.array([EVEN.beam_width_rad / 2])
-    assert 20 * np.log10(EVEN.two_way_pattern(half, side_lobes)) == pytest.approx(-6.02, abs=0.05)
-    assert 20 * np.log10(EVEN.elevation_pattern(np.radians([7.0]))) == pytest.approx(-6.02, abs=0.2)
+    assert 20 * np.log10(EVEN.two_way_pattern(half, side_lobes)) == pytest.approx(
+        -6.02, abs=0.05
+    )
+    assert 20 * np.log10(EVEN.elevation_pattern(np.radians([7.0]))) == pytest.approx(
+        -6.02, abs=0.2
+    )
     made = simulator(side_lobes=side_lobes)
     column = np.arange(made._beam_matrix.shape[1])
     is_left_out = (column < made._bands[:, :1]) | (column >= made._bands[:, 1:])
@@ -223,32 +335,45 @@ def test_a_beam_is_down_by_half_power_at_half_its_width_and_seventy_decibels_whe
 
 
 def test_cross_talk_shows_every_eighth_beam_at_its_level():
-    quiet, loud = point_response(side_lobes=False), point_response(side_lobes=False, cross_talk_db=-25.0)
+    quiet, loud = (
+        point_response(side_lobes=False),
+        point_response(side_lobes=False, cross_talk_db=-25.0),
+    )
     strongest = int(np.argmax(loud))
     away = np.arange(96)
     away = away[np.abs(away - strongest) > 6]
     raised = away[loud[away] > quiet[away] + 10]
     ghosts = {int(b) for b in away if (b - strongest) % 8 == 0}
     assert ghosts <= set(raised.tolist())
-    assert 10 * np.log10(np.sum(10 ** (loud[list(ghosts)] / 10))) == pytest.approx(-25, abs=1.5)
+    assert 10 * np.log10(np.sum(10 ** (loud[list(ghosts)] / 10))) == pytest.approx(
+        -25, abs=1.5
+    )
 
 
 def test_echo_by_way_of_the_surface_is_as_late_and_as_strong_as_its_longer_way_makes_it():
     """The samples of a bright plate come again at the later bin: spreading (r / late)^4, gain (late / r)^3."""
     depth_m, surface_path_db, plate = 0.75, -9.0, box_at(1.35, 0.3, 0.4, 0.0, 60.0)
-    made = simulator([plate], multipath=True, surface_path_db=surface_path_db, absorption_db_m=0.0)
+    made = simulator(
+        [plate], multipath=True, surface_path_db=surface_path_db, absorption_db_m=0.0
+    )
     image = made.level_db(ABOVE, TILT, 0, HEIGHT_M + depth_m)[42:54].astype(float)
     r = made.ranges_m()
-    late_m = 0.5 * (r + np.sqrt(np.maximum(r**2 - HEIGHT_M**2, 0) + (HEIGHT_M + 2 * depth_m) ** 2))
+    late_m = 0.5 * (
+        r + np.sqrt(np.maximum(r**2 - HEIGHT_M**2, 0) + (HEIGHT_M + 2 * depth_m) ** 2)
+    )
     on = (r > np.hypot(1.25, HEIGHT_M)) & (r < np.hypot(1.45, HEIGHT_M))
     echo = image[:, np.abs(r - late_m[on, None]).argmin(axis=1)]
     expected = surface_path_db - 10 * np.log10(late_m[on] / r[on])
     assert np.mean(echo - image[:, on] - expected) == pytest.approx(0, abs=0.3)
-    assert np.mean(20 * np.log10(late_m[on] / r[on])) > 2  # by which it would be off without one of the spreadings
+    # by which it would be off without one of the spreadings
+    assert np.mean(20 * np.log10(late_m[on] / r[on])) > 2
 
 
 def test_steep_faces_echo_again_by_way_of_the_floor():
-    made = [simulator([box_at(1.6, 0.1, 0.3, 0.08, 0.0)], multipath=m) for m in (True, False)]
+    made = [
+        simulator([box_at(1.6, 0.1, 0.3, 0.08, 0.0)], multipath=m)
+        for m in (True, False)
+    ]
     with_, without = (intensity(one)[42:54].mean(axis=0) for one in made)
     ghost_m = 0.5 * (np.hypot(1.55, HEIGHT_M - 0.08) + np.hypot(1.55, HEIGHT_M + 0.08))
     ranges_m, grown = made[0].ranges_m(), 10 * np.log10(with_ / without)
@@ -272,51 +397,84 @@ def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
 
 def test_levels_err_by_the_error_of_the_gain_a_tilt_and_a_slow_wave_of_a_third_of_it():
     difference = level_db(simulator(tvg_error_db=1.5)) - level_db(simulator())
-    np.testing.assert_allclose(difference, np.tile(drawn_gain_error_db(1.5, 512, 0), (96, 1)), atol=1e-3)
+    np.testing.assert_allclose(
+        difference, np.tile(drawn_gain_error_db(1.5, 512, 0), (96, 1)), atol=1e-3
+    )
     along = np.linspace(-0.5, 0.5, 512)
-    basis = np.column_stack([along, np.sin(3 * np.pi * along), np.cos(3 * np.pi * along)])
+    basis = np.column_stack(
+        [along, np.sin(3 * np.pi * along), np.cos(3 * np.pi * along)]
+    )
     errors = np.array([drawn_gain_error_db(1.5, 512, seed) for seed in range(400)])
     fitted = np.linalg.lstsq(basis, errors.T, rcond=None)[0]
     np.testing.assert_allclose(basis @ fitted, errors.T, atol=1e-9)
     assert np.sqrt(np.mean(fitted[0] ** 2)) == pytest.approx(1.5, rel=0.15)
-    assert np.sqrt(np.mean(fitted[1] ** 2 + fitted[2] ** 2)) == pytest.approx(0.5, rel=0.15)
+    assert np.sqrt(np.mean(fitted[1] ** 2 + fitted[2] ** 2)) == pytest.approx(
+        0.5, rel=0.15
+    )
 
 
 def test_stamps_of_dropped_frames_are_drawn_at_their_rate():
     made = simulator(drop_probability=0.1)
-    assert np.mean([made.is_dropped(n) for n in range(3000)]) == pytest.approx(0.1, abs=0.02)
+    assert np.mean([made.is_dropped(n) for n in range(3000)]) == pytest.approx(
+        0.1, abs=0.02
+    )
     assert not any(simulator().is_dropped(n) for n in range(300))
 
 
 def test_same_seed_gives_same_bytes_another_seed_others_and_only_noise_differs_between_frames():
-    full = {"texture_shape": 5.0, "noise_db": 15.0, "cross_talk_db": -25.0, "multipath": True, "joints": True}
-    one, again, other = (simulator(seed=s, **full).frame(ABOVE, TILT, 5, 1.7) for s in (4, 4, 5))
+    full = {
+        "texture_shape": 5.0,
+        "noise_db": 15.0,
+        "cross_talk_db": -25.0,
+        "multipath": True,
+        "joints": True,
+    }
+    one, again, other = (
+        simulator(seed=s, **full).frame(ABOVE, TILT, 5, 1.7) for s in (4, 4, 5)
+    )
     np.testing.assert_array_equal(one, again)
     assert np.mean(one != other) > 0.9
     assert (one.dtype, one.shape) == (np.uint8, (96, 512))
     for made, is_still in ((simulator(noise_db=15.0), False), (simulator(), True)):
-        assert np.array_equal(level_db(made, number=0), level_db(made, number=1)) == is_still
+        assert (
+            np.array_equal(level_db(made, number=0), level_db(made, number=1))
+            == is_still
+        )
 
 
 def test_sonar_that_looks_up_or_lies_on_the_floor_sees_only_noise():
-    made, up = simulator(noise_db=15.0), Rotation.from_euler("ZYX", [0, -40, 0], degrees=True)
+    made, up = (
+        simulator(noise_db=15.0),
+        Rotation.from_euler("ZYX", [0, -40, 0], degrees=True),
+    )
     for position, rotation in ((ABOVE, up), (0 * ABOVE, TILT)):
         at_2_m = made.level_db(position, rotation, 0)[:, bins_at(made, 2.0)[0]]
         assert 10 * np.log10(np.mean(10 ** (at_2_m / 10))) == pytest.approx(15, abs=1.5)
 
 
 @pytest.mark.parametrize("name", sorted(SONARS))
-def test_every_sonar_makes_images_of_its_own_size_and_its_log_says_what_their_counts_span(name, monkeypatch):
+def test_every_sonar_makes_images_of_its_own_size_and_its_log_says_what_their_counts_span(
+    name, monkeypatch
+):
     sonar = SONARS[name]
     image = simulator(sonar=sonar, noise_db=15.0).frame(ABOVE, TILT, 0)
     assert image.shape == (sonar.beams, sonar.bins)
     middle = image[sonar.beams // 2 - 5 : sonar.beams // 2 + 5, 250:350]
-    assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)  # the mean of decibels: 2.5 below
+    # the mean of decibels: 2.5 below
+    assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)
     for span in (sonar.decibel_span, 64.0):
-        monkeypatch.setitem(SONARS, name, sonar.model_copy(update={"decibel_span": span}))
-        run = simulate_basin(BasinOptions(duration_s=120.0, laps=1, image=ImageOptions(sonar=name)))
+        monkeypatch.setitem(
+            SONARS, name, sonar.model_copy(update={"decibel_span": span})
+        )
+        run = simulate_basin(
+            BasinOptions(duration_s=120.0, laps=1, image=ImageOptions(sonar=name))
+        )
         said = run.calibration.sonar.image
-        assert (said.scale, said.decibel_span, said.full_scale) == ("decibel", span, 255)
+        assert (said.scale, said.decibel_span, said.full_scale) == (
+            "decibel",
+            span,
+            255,
+        )
 
 
 def test_a_longer_window_has_as_many_bins_and_the_same_floor():
@@ -326,18 +484,24 @@ def test_a_longer_window_has_as_many_bins_and_the_same_floor():
         assert len(ranges_m) == 512
         assert np.ptp(ranges_m) == pytest.approx((window_m or 1.25) * 511 / 512)
         near, far = bins_at(made, 1.8, 2.2)
-        power = np.mean([intensity(made, number=k)[40:56, near:far].mean() for k in range(2)])
+        power = np.mean(
+            [intensity(made, number=k)[40:56, near:far].mean() for k in range(2)]
+        )
         assert 10 * np.log10(power) == pytest.approx(40, abs=1.5)
 
 
 @pytest.mark.parametrize("span", [80.0, 100.0])
 def test_counts_are_decibels_over_the_span(span: float):
-    made = FrameSimulator(PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span}))
+    made = FrameSimulator(
+        PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span})
+    )
     counts = made.frame(ABOVE, TILT, 0)
     inside = (counts > 0) & (counts < 255)
     assert inside.mean() > 0.9
     found = decibels(counts, SonarImage(decibel_span=span))
-    np.testing.assert_allclose(found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4)
+    np.testing.assert_allclose(
+        found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4
+    )
 
 
 MIDDLE_M, FRAMES = 1.6, 16
@@ -350,14 +514,21 @@ def ramp(rise: float) -> scene.SeabedObject:
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         is_bright = (np.abs(x_m) < LENGTH_M / 2) & (np.abs(y_m) < WIDTH_M / 2)
         rises = (np.abs(x_m) < 0.08) & (np.abs(y_m) < 0.15)
-        return np.where(is_bright, 60.0, np.nan), np.where(rises, rise * (x_m + 0.08), 0.0)
+        return np.where(is_bright, 60.0, np.nan), np.where(
+            rises, rise * (x_m + 0.08), 0.0
+        )
 
     return scene.place(-1, "ramp", shape, 0.2, np.array([MIDDLE_M, 0.0, 0.0]), 0.0)
 
 
 def energy_of_ramp(rise: float, floor_reflection: float | None = None) -> float:
     """Mean sum over all samples; scatterers are drawn anew for each frame."""
-    changes = {"shadows": False, "absorption_db_m": 0.0, "speckle": "frame", "multipath": floor_reflection is not None}
+    changes = {
+        "shadows": False,
+        "absorption_db_m": 0.0,
+        "speckle": "frame",
+        "multipath": floor_reflection is not None,
+    }
     made = simulator([ramp(rise)], **changes, floor_reflection=floor_reflection or 0.0)
     return float(np.mean([np.sum(intensity(made, number=n)) for n in range(FRAMES)]))
 
@@ -372,7 +543,9 @@ def by_hand(rise: float, *, is_ghost: bool = False) -> float:
     area = np.hypot(1, rise)
     normal = np.array([-rise, 0.0, 1.0]) / area
     cos = -(to_face @ normal) / r
-    lift = np.arcsin(TILT.inv().apply(to_face.reshape(-1, 3))[:, 2].reshape(r.shape) / r)
+    lift = np.arcsin(
+        TILT.inv().apply(to_face.reshape(-1, 3))[:, 2].reshape(r.shape) / r
+    )
     pattern = np.sinc(0.886 * np.sin(lift) / np.sin(np.radians(14))) ** 4
     if is_ghost:
         r = 0.5 * (r + np.sqrt(x**2 + y**2 + (HEIGHT_M + top) ** 2))
@@ -382,7 +555,9 @@ def by_hand(rise: float, *, is_ghost: bool = False) -> float:
 @pytest.mark.parametrize("rise", [1.0, 1.5])
 def test_a_sloping_face_echoes_by_lamberts_rule_times_its_area(rise: float):
     ratio_db = 10 * np.log10(energy_of_ramp(rise) / energy_of_ramp(0.0))
-    assert ratio_db == pytest.approx(10 * np.log10(by_hand(rise) / by_hand(0.0)), abs=0.4)
+    assert ratio_db == pytest.approx(
+        10 * np.log10(by_hand(rise) / by_hand(0.0)), abs=0.4
+    )
 
 
 def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
@@ -390,15 +565,24 @@ def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
     rise, reflection = 1.5, 0.8
     steepness = 1 - 1 / np.hypot(1, rise)
     share = energy_of_ramp(rise, reflection) / energy_of_ramp(rise) - 1
-    expected = (2 * reflection * steepness) ** 2 * by_hand(rise, is_ghost=True) / by_hand(rise)
+    expected = (
+        (2 * reflection * steepness) ** 2 * by_hand(rise, is_ghost=True) / by_hand(rise)
+    )
     assert share == pytest.approx(expected, rel=0.2)
 
 
 def test_strength_of_the_floor_is_smooth_over_three_centimetres():
     """A Gaussian field whose correlation falls to 1/e at 3 cm; a Gamma of shape 50 is nearly one."""
-    strength = scene.scatterers(50.0, False, np.random.default_rng(3)).texture.astype(float) ** 2
+    strength = (
+        scene.scatterers(50.0, False, np.random.default_rng(3)).texture.astype(float)
+        ** 2
+    )
     power = np.mean(np.abs(np.fft.fft(strength - strength.mean(), axis=1)) ** 2, axis=0)
-    correlation, distance_m = np.fft.ifft(power).real, np.arange(scene.CELLS) * scene.CELL_M  # periodic, along x
+    # periodic, along x
+    correlation, distance_m = (
+        np.fft.ifft(power).real,
+        np.arange(scene.CELLS) * scene.CELL_M,
+    )
     near = distance_m < 0.08
     expected = np.exp(-((distance_m[near] / 0.03) ** 2))
     np.testing.assert_allclose(correlation[near] / correlation[0], expected, atol=0.05)
@@ -407,7 +591,10 @@ def test_strength_of_the_floor_is_smooth_over_three_centimetres():
 
 
 def test_amplitudes_are_of_a_complex_normal_law_and_joints_stand_out_of_an_even_floor_by_six_decibels():
-    even, jointed = (scene.scatterers(None, joints, np.random.default_rng(3)) for joints in (False, True))
+    even, jointed = (
+        scene.scatterers(None, joints, np.random.default_rng(3))
+        for joints in (False, True)
+    )
     np.testing.assert_array_equal(even.texture, 1.0)
     on = jointed.texture > 1
     np.testing.assert_allclose(20 * np.log10(jointed.texture[on]), 6.0, atol=1e-5)

@@ -3,10 +3,23 @@
 import gtsam
 import numpy as np
 
-from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mounting, SonarCalibration, Start
+from sonar_graph.calibration import (
+    Calibration,
+    FloorPrior,
+    ImuCalibration,
+    Mounting,
+    SonarCalibration,
+    Start,
+)
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import Odometry
-from sonar_graph.slam import GatedIdentity, GaussianKernel, KeyframeParams, MixtureIdentity, RobustKernel
+from sonar_graph.slam import (
+    GatedIdentity,
+    GaussianKernel,
+    KeyframeParams,
+    MixtureIdentity,
+    RobustKernel,
+)
 from sonar_graph.slam.frontend import Frontend
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.tracked import TrackedIdentity
@@ -18,7 +31,9 @@ from .made import detected, polar, smoother_with
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
 START_NS = T0_NS - 1
-POLICY = KeyframeParams(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
+POLICY = KeyframeParams(
+    max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0
+)
 TRUSTING = GatedIdentity(gate_probability=0.99)
 UNGATED = GatedIdentity(gate_probability=1.0)
 SONAR = SonarCalibration(
@@ -47,7 +62,9 @@ class Dive:
         smoother: Smoother | None = None,
     ) -> None:
         self.smoother = smoother or smoother_with(lag_s, 1e-6, 1e9)
-        self.keyframes = Keyframes(calibration, Odometry(calibration), POLICY, self.smoother)
+        self.keyframes = Keyframes(
+            calibration, Odometry(calibration), POLICY, self.smoother
+        )
         self.sightings = Frontend(identity, kernel, self.keyframes)
         stamps = T0_NS + np.arange(-1, 101) * NS // 10
         doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first
@@ -60,10 +77,20 @@ class Dive:
         )
 
     def see(
-        self, after_s: float, *rows: tuple[int, float, float], probability: float = 0.9, cov: Floats | None = None
+        self,
+        after_s: float,
+        *rows: tuple[int, float, float],
+        probability: float = 0.9,
+        cov: Floats | None = None,
     ) -> None:
         stamp = T0_NS + round(after_s * NS)
-        self.show(stamp, [row[1:] for row in rows], [[row[0]] for row in rows], [probability], cov=cov)
+        self.show(
+            stamp,
+            [row[1:] for row in rows],
+            [[row[0]] for row in rows],
+            [probability],
+            cov=cov,
+        )
 
     def show(self, stamp_ns: int, *rows, **more) -> None:
         """A frame as of `detected`."""
@@ -77,4 +104,9 @@ class Dive:
 
 def spherical(x: float, p: Floats) -> Floats:
     """Range and azimuth of a point from the mounted sonar of a level vehicle at (x, 0, 0)."""
-    return polar(gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])).compose(SONAR.mounting.pose()), p)
+    return polar(
+        gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])).compose(
+            SONAR.mounting.pose()
+        ),
+        p,
+    )

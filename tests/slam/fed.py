@@ -22,7 +22,9 @@ SONAR = gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([0.3, 0.0, -0.1]))
 class Fed:
     """A smoother, and on the side every factor that it was given."""
 
-    def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M, *, is_bounded: bool = False) -> None:
+    def __init__(
+        self, lag_s: float, stale_shift_m: float = NEVER_M, *, is_bounded: bool = False
+    ) -> None:
         self.smoother = smoother_with(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
         self.groups: dict[int, Factors] = {}
         self.live: list[gtsam.Pose3] = []
@@ -65,7 +67,9 @@ def on_the_rail(
     fed.add({"start prior": factors.start_prior(X(0), calibration())})
     cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
     for k in range(1, nodes):
-        moved = gtsam.Pose3(gtsam.Rot3(), np.array([numbers.displacements_m[k - 1], 0, 0]))
+        moved = gtsam.Pose3(
+            gtsam.Rot3(), np.array([numbers.displacements_m[k - 1], 0, 0])
+        )
         pose = fed.smoother.values.atPose3(X(k - 1)).compose(moved)
         fed.smoother.add_pose(X(k), pose, k * STEP_S)
         if held and X(k) in held:
@@ -73,28 +77,42 @@ def on_the_rail(
         fed.add({"odometry": factors.odometry(X(k - 1), X(k), motion_of(moved, cov))})
         for _, i, distance in (r for r in numbers.ranges if r[0] == k):
             if i not in seen:
-                fed.smoother.add_landmark(L(i), pose.translation() + distance * np.eye(3)[0])
+                fed.smoother.add_landmark(
+                    L(i), pose.translation() + distance * np.eye(3)[0]
+                )
             fed.add(ranged(k, i, distance, None if i in seen else 3e-4))
             seen.add(i)
         fed.smoother.update(k * STEP_S)
     return fed
 
 
-def ranged(k: int, i: int, distance: float, elevation_sigma: float | None = None) -> Factors:
+def ranged(
+    k: int, i: int, distance: float, elevation_sigma: float | None = None
+) -> Factors:
     """Factors of a range on the rail."""
     z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e-2])
-    return factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, elevation_sigma)
+    return factors.landmark_sighting(
+        X(k), L(i), gtsam.Pose3(), z, R, plain, elevation_sigma
+    )
 
 
-def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: tuple[int, ...] = (4, 7)) -> None:
+def assert_is_least_squares(
+    fed: Fed, numbers: Rail, nodes: int, landmarks: tuple[int, ...] = (4, 7)
+) -> None:
     """The window's newest pose and its landmarks along x, with their variances, are those of numpy."""
     mean, variance = numbers.solution(nodes)
     newest = X(nodes - 1)
-    assert fed.smoother.values.atPose3(newest).translation()[0] == pytest.approx(mean[f"x{nodes - 1}"], abs=1e-8)
+    assert fed.smoother.values.atPose3(newest).translation()[0] == pytest.approx(
+        mean[f"x{nodes - 1}"], abs=1e-8
+    )
     assert fed.joint(newest)[3, 3] == pytest.approx(variance[f"x{nodes - 1}"], abs=1e-8)
     for i in landmarks:
-        assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(mean[f"l{i}"], abs=1e-8)
-        assert fed.smoother.marginals.marginalCovariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
+        assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(
+            mean[f"l{i}"], abs=1e-8
+        )
+        assert fed.smoother.marginals.marginalCovariance(L(i))[0, 0] == pytest.approx(
+            variance[f"l{i}"], abs=1e-8
+        )
 
 
 def in_the_basin(
@@ -114,10 +132,17 @@ def in_the_basin(
     The landmarks lie about a height that the smoother is not told. ``roll_rad``: of the body's axes, by which sonar and
     path stay where they are.
     """
-    rng, rolled = np.random.default_rng(seed), gtsam.Pose3(gtsam.Rot3.Rx(roll_rad), np.zeros(3))
+    rng, rolled = (
+        np.random.default_rng(seed),
+        gtsam.Pose3(gtsam.Rot3.Rx(roll_rad), np.zeros(3)),
+    )
     sonar = rolled.inverse().compose(sonar)
     turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
-    landmarks = {3: np.array([3.0, 1.0, 0.0]), 5: np.array([2.0, 4.0, 0.2]), 8: np.array([-1.0, 2.5, -0.2])}
+    landmarks = {
+        3: np.array([3.0, 1.0, 0.0]),
+        5: np.array([2.0, 4.0, 0.2]),
+        8: np.array([-1.0, 2.5, -0.2]),
+    }
     landmarks = {i: p + height_m * np.eye(3)[2] for i, p in landmarks.items()}
     cov = np.diag([1e-4] * 3 + [4e-4] * 3)
     fed, truth, seen = Fed(lag_s, stale_shift_m), rolled, set()
@@ -128,21 +153,39 @@ def in_the_basin(
     fed.add({"bias prior": factors.bias_prior(B(0), np.full(11, 0.01))})
     for k in range(1, steps):
         truth = truth.compose(rolled.inverse()).compose(turn).compose(rolled)
-        moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
+        moved = turn.compose(
+            gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6))
+        )
         moved = rolled.inverse().compose(moved).compose(rolled)
         motion = motion_of(moved, cov, -np.eye(6, 11) * (np.arange(11) < 3))
-        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
-        fed.add({"odometry": OdometryWithBias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)})
+        fed.smoother.add_pose(
+            X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k)
+        )
+        fed.add(
+            {
+                "odometry": OdometryWithBias(
+                    X(k - 1), X(k), B((k - 1) // bias_steps), motion
+                )
+            }
+        )
         if k % bias_steps == 0:
             new = k // bias_steps
             fed.smoother.add_bias(B(new), fed.smoother.values.atVector(B(new - 1)))
-            fed.add({"bias walk": factors.bias_walk(B(new - 1), B(new), np.full(11, 0.003))})
+            fed.add(
+                {"bias walk": factors.bias_walk(B(new - 1), B(new), np.full(11, 0.003))}
+            )
         for i, p in landmarks.items():
             z = polar(truth.compose(sonar), p) + [0.02, 0.009] * rng.standard_normal(2)
             if i not in seen:
                 fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
             new = factors.landmark_sighting(
-                X(k), L(i), sonar, z, np.diag([4e-4, 8e-5]), kernel, None if i in seen else 0.3
+                X(k),
+                L(i),
+                sonar,
+                z,
+                np.diag([4e-4, 8e-5]),
+                kernel,
+                None if i in seen else 0.3,
             )
             fed.add(new)
             seen.add(i)

@@ -65,7 +65,12 @@ def on_the_rail(beliefs_of_7: list[list[float]], beliefs_of_4: list[float]) -> S
     for n, row in enumerate(np.flatnonzero(track == 70)):
         beliefs[row] = beliefs_of_7[min(n, len(beliefs_of_7) - 1)]
     ids = np.tile(IDS, (len(seen), 1))
-    return replace(sequence, detections=replace(seen, candidate_ids=ids, id_probability=beliefs, track=track))
+    return replace(
+        sequence,
+        detections=replace(
+            seen, candidate_ids=ids, id_probability=beliefs, track=track
+        ),
+    )
 
 
 class Watch(Dive):
@@ -77,6 +82,8 @@ class Watch(Dive):
         self.keyframes.update_if_due()
 
 
-def see(dive: Dive, after_s: float, belief: list[float], track: int = 3, off_m: float = 0.0) -> None:
+def see(
+    dive: Dive, after_s: float, belief: list[float], track: int = 3, off_m: float = 0.0
+) -> None:
     z = spherical(0.5 * after_s, OBJECTS[0]) + np.array([off_m, 0.0])
     dive.show(T0_NS + round(after_s * NS), [z], IDS, [belief], [track])

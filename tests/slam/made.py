@@ -16,30 +16,53 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
 from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.slam.prediction import PoseHistory
-from sonar_graph.slam.smoother import BoundedHistory, Smoother, SmootherParams, WholeHistory
+from sonar_graph.slam.smoother import (
+    BoundedHistory,
+    Smoother,
+    SmootherParams,
+    WholeHistory,
+)
 from sonar_graph.states import Estimate
 
 POSES = {
-    "random": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.6, 2.2), np.array([3.0, -2.0, 1.0])),
-    "near identity": gtsam.Pose3(gtsam.Rot3.RzRyRx(1e-9, -1e-9, 1e-9), np.array([1e-9, 0.0, 0.0])),
-    "yaw near pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.02, np.pi - 1e-8), np.array([-1.0, 5.0, 0.3])),
-    "yaw beyond -pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.0, -np.pi + 1e-8), np.array([-1.0, 5.0, 0.3])),
+    "random": gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(0.4, -0.6, 2.2), np.array([3.0, -2.0, 1.0])
+    ),
+    "near identity": gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(1e-9, -1e-9, 1e-9), np.array([1e-9, 0.0, 0.0])
+    ),
+    "yaw near pi": gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(0.05, 0.02, np.pi - 1e-8), np.array([-1.0, 5.0, 0.3])
+    ),
+    "yaw beyond -pi": gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(0.0, 0.0, -np.pi + 1e-8), np.array([-1.0, 5.0, 0.3])
+    ),
 }
 
 
 def isam2_params(**given: Any) -> Isam2Params:
     """By dotted names, with two underscores for a dot: ``smoother__lag_s``."""
-    return Isam2Params(**nested({name.replace("__", "."): value for name, value in given.items()}))
+    return Isam2Params(
+        **nested({name.replace("__", "."): value for name, value in given.items()})
+    )
 
 
-def ran(sequence: Sequence, rate_hz: float = 2.0, **params: Any) -> tuple[Isam2, list[Estimate]]:
+def ran(
+    sequence: Sequence, rate_hz: float = 2.0, **params: Any
+) -> tuple[Isam2, list[Estimate]]:
     """The estimator after a run, and its causal estimates."""
-    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), isam2_params(**params))
+    estimator = Isam2(
+        sequence.calibration, Odometry(sequence.calibration), isam2_params(**params)
+    )
     return estimator, estimates_of(estimator, sequence, rate_hz)
 
 
-def estimates_of(estimator: Isam2, sequence: Sequence, rate_hz: float = 2.0) -> list[Estimate]:
-    answers = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+def estimates_of(
+    estimator: Isam2, sequence: Sequence, rate_hz: float = 2.0
+) -> list[Estimate]:
+    answers = [
+        estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))
+    ]
     return [answer for answer in answers if answer is not None]
 
 
@@ -59,7 +82,9 @@ def smoother_with(
         stale_shift_m=stale_shift_m,
         waiting_gain=waiting_gain,
     )
-    return Smoother(params, BoundedHistory() if is_bounded else WholeHistory(), PoseHistory())
+    return Smoother(
+        params, BoundedHistory() if is_bounded else WholeHistory(), PoseHistory()
+    )
 
 
 def values_of(**named: Any) -> gtsam.Values:
@@ -70,12 +95,18 @@ def values_of(**named: Any) -> gtsam.Values:
     return values
 
 
-def scattered(values: gtsam.Values, rng: np.random.Generator, sigmas: dict[str, float]) -> gtsam.Values:
+def scattered(
+    values: gtsam.Values, rng: np.random.Generator, sigmas: dict[str, float]
+) -> gtsam.Values:
     """Every variable moved, by sigmas of its kind: x, l, b."""
     off = values.zeroVectors()
     for key in list(values.keys()):
         moved = gtsam.VectorValues()
-        moved.insert(key, sigmas[chr(gtsam.Symbol(key).chr())] * rng.standard_normal(len(off.at(key))))
+        moved.insert(
+            key,
+            sigmas[chr(gtsam.Symbol(key).chr())]
+            * rng.standard_normal(len(off.at(key))),
+        )
         off.update(moved)
     return values.retract(off)
 
@@ -93,11 +124,15 @@ def plain(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
 
 
 def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.0), noise)
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(1.0), noise
+    )
 
 
 def cauchy(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), noise)
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), noise
+    )
 
 
 def isotropic(size: int, sigma: float) -> gtsam.noiseModel.Base:
@@ -108,7 +143,9 @@ def pose_prior(key: int, pose: gtsam.Pose3, sigma: float) -> gtsam.NonlinearFact
     return gtsam.PriorFactorPose3(key, pose, isotropic(6, sigma))
 
 
-def point_prior(key: int, point: ArrayLike, sigma: float = 0.1) -> gtsam.NonlinearFactor:
+def point_prior(
+    key: int, point: ArrayLike, sigma: float = 0.1
+) -> gtsam.NonlinearFactor:
     return gtsam.PriorFactorPoint3(key, np.asarray(point, float), isotropic(3, sigma))
 
 
@@ -124,16 +161,24 @@ def random_covariance(n: int, sigma: float, seed: int = 0) -> Floats:
 
 
 def motion_of(
-    i_T_j: gtsam.Pose3, cov: Floats, D_bias: Floats | None = None, bias: Floats | None = None
+    i_T_j: gtsam.Pose3,
+    cov: Floats,
+    D_bias: Floats | None = None,
+    bias: Floats | None = None,
 ) -> PreintegratedMotion:
     """Motion of one second."""
-    D_bias, bias = (np.zeros((6, 11)) if D_bias is None else D_bias), (np.zeros(11) if bias is None else bias)
+    D_bias, bias = (
+        (np.zeros((6, 11)) if D_bias is None else D_bias),
+        (np.zeros(11) if bias is None else bias),
+    )
     return PreintegratedMotion(i_T_j, cov, D_bias, bias, 1.0, np.zeros(3))
 
 
 def some_motion(seed: int = 0, sigma: float = 0.01) -> PreintegratedMotion:
     rng = np.random.default_rng(seed)
-    i_T_j = gtsam.Pose3.Expmap(np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)]))
+    i_T_j = gtsam.Pose3.Expmap(
+        np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)])
+    )
     D_bias, bias = rng.standard_normal((6, 11)), 0.01 * rng.standard_normal(11)
     return motion_of(i_T_j, random_covariance(6, sigma, seed + 1), D_bias, bias)
 
@@ -142,7 +187,9 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> list[tupl
     """Arguments of each call of a function or method from now on."""
     calls: list[tuple] = []
     original = getattr(owner, name)
-    monkeypatch.setattr(owner, name, lambda *given: calls.append(given) or original(*given))
+    monkeypatch.setattr(
+        owner, name, lambda *given: calls.append(given) or original(*given)
+    )
     return calls
 
 

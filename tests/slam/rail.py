@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, SonarCalibration, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    SonarCalibration,
+    Start,
+)
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 
@@ -30,7 +36,9 @@ class Rail:
     def solution(self, nodes: int) -> tuple[dict[str, float], dict[str, float]]:
         """Mean and variance of x0, x1, ..., and of the landmarks seen, from what the first nodes measured."""
         ranges = [r for r in self.ranges if r[0] < nodes]
-        names = [f"x{k}" for k in range(nodes)] + [f"l{i}" for i in sorted({i for _, i, _ in ranges})]
+        names = [f"x{k}" for k in range(nodes)] + [
+            f"l{i}" for i in sorted({i for _, i, _ in ranges})
+        ]
         column = {name: k for k, name in enumerate(names)}
         A, b = [np.eye(len(names))[0] / START_SIGMA_M], [0.0]
         for k, moved in enumerate(self.displacements_m[: nodes - 1]):
@@ -38,11 +46,16 @@ class Rail:
             A.append((np.eye(len(names))[k + 1] - np.eye(len(names))[k]) / sigma)
             b.append(moved / sigma)
         for k, i, distance in ranges:
-            A.append((np.eye(len(names))[column[f"l{i}"]] - np.eye(len(names))[k]) / RANGE_SIGMA_M)
+            A.append(
+                (np.eye(len(names))[column[f"l{i}"]] - np.eye(len(names))[k])
+                / RANGE_SIGMA_M
+            )
             b.append(distance / RANGE_SIGMA_M)
         cov = np.linalg.inv(np.transpose(A) @ A)
         mean = cov @ np.transpose(A) @ b
-        return dict(zip(names, mean, strict=True)), dict(zip(names, np.diag(cov), strict=True))
+        return dict(zip(names, mean, strict=True)), dict(
+            zip(names, np.diag(cov), strict=True)
+        )
 
 
 def calibration() -> Calibration:
@@ -54,8 +67,14 @@ def calibration() -> Calibration:
     return Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-9, gyro_bias_sigma=0.0),
         dvl=DvlCalibration(velocity_sigma_m_s=(VELOCITY_SIGMA_M_S,) * 3),
-        sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=0.2, elevation_aperture_rad=1e-3),
-        start=Start(position_sigma_m=(START_SIGMA_M, 1e-3, 1e-3), rpy_sigma_rad=(1e-6,) * 3),
+        sonar=SonarCalibration(
+            range_sigma_m=RANGE_SIGMA_M,
+            azimuth_sigma_rad=0.2,
+            elevation_aperture_rad=1e-3,
+        ),
+        start=Start(
+            position_sigma_m=(START_SIGMA_M, 1e-3, 1e-3), rpy_sigma_rad=(1e-6,) * 3
+        ),
         use_gravity=False,
     )
 
@@ -77,10 +96,17 @@ def rail(nodes: int = 21, seed: int = 0) -> tuple[Sequence, Rail]:
     sequence = Sequence(
         name="rail",
         calibration=calibration(),
-        imu=Imu(imu_ns, np.zeros((len(imu_ns), 3)), np.tile([0, 0, 9.80665], (len(imu_ns), 1))),
+        imu=Imu(
+            imu_ns,
+            np.zeros((len(imu_ns), 3)),
+            np.tile([0, 0, 9.80665], (len(imu_ns), 1)),
+        ),
         dvl=Dvl(at, np.outer(velocity, [1.0, 0, 0]), np.full((nodes, 3, 3), np.nan)),
         detections=detected(
-            at[[k for k, _, _ in ranges]], [(r, 0.0) for _, _, r in ranges], [[i] for _, i, _ in ranges], [1.0]
+            at[[k for k, _, _ in ranges]],
+            [(r, 0.0) for _, _, r in ranges],
+            [[i] for _, i, _ in ranges],
+            [1.0],
         ),
     )
     return sequence, Rail(displacements, ranges)

@@ -27,28 +27,40 @@ BIAS = 1e-3 * np.arange(-5.0, 6.0) + some_motion(1, 5e-3).bias
 
 
 @pytest.mark.parametrize("bias_key", [None, B(0)], ids=["no bias", "bias"])
-def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(bias_key: int | None) -> None:
+def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(
+    bias_key: int | None,
+) -> None:
     """``J P J'`` with J by differences, P joint of keyframe and bias: what both share counts."""
     moved, P = some_motion(1, 5e-3), random_covariance(17, 0.01, 3)
     joint = JointCovariance(P, {B(0): 6, X(3): 0})
-    found = AnchoredPose(7, Tie(X(3), bias_key, moved)).carried_on(values_of(X3=KEYFRAME, B0=BIAS), joint)
+    found = AnchoredPose(7, Tie(X(3), bias_key, moved)).carried_on(
+        values_of(X3=KEYFRAME, B0=BIAS), joint
+    )
 
     def carried(state: Floats) -> gtsam.Pose3:
         pose = KEYFRAME.compose(gtsam.Pose3.Expmap(state[:6]))
         if bias_key is None:
             return pose.compose(moved.i_T_j)
-        return pose.compose(moved.i_T_j).compose(gtsam.Pose3.Expmap(moved.D_bias @ (BIAS - moved.bias + state[6:])))
+        return pose.compose(moved.i_T_j).compose(
+            gtsam.Pose3.Expmap(moved.D_bias @ (BIAS - moved.bias + state[6:]))
+        )
 
     mean = carried(np.zeros(17))
     assert found.world_T_body.equals(mean, 1e-9)
-    J = central_differences(lambda state: gtsam.Pose3.Logmap(mean.between(carried(state))), np.zeros(17))
+    J = central_differences(
+        lambda state: gtsam.Pose3.Logmap(mean.between(carried(state))), np.zeros(17)
+    )
     expected = J @ P @ J.T + moved.covariance
-    np.testing.assert_allclose(found.covariance, expected, rtol=1e-2, atol=1e-2 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        found.covariance, expected, rtol=1e-2, atol=1e-2 * np.abs(expected).max()
+    )
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     if bias_key is not None:
         apart = np.zeros((17, 17))
         apart[:6, :6] = apart[6:, 6:] = 1.0
-        assert np.abs(J @ (P * (1.0 - apart)) @ J.T).max() > 0.05 * np.abs(expected).max()
+        assert (
+            np.abs(J @ (P * (1.0 - apart)) @ J.T).max() > 0.05 * np.abs(expected).max()
+        )
 
 
 @cache
@@ -76,7 +88,10 @@ def test_over_the_history_it_is_the_inverse_of_the_whole_information():
     values, _ = estimator._smoother.solve_history()
     found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS, over="history")
     assert off_sigmas(found.matrix, dense(estimator, values, KEYS)) < 1e-6
-    assert np.array_equal(estimator.joint_covariance(landmarks=np.array([5])).matrix, estimator.marginal(landmark=5))
+    assert np.array_equal(
+        estimator.joint_covariance(landmarks=np.array([5])).matrix,
+        estimator.marginal(landmark=5),
+    )
     for key in KEYS:
         assert off_sigmas(found.at(key, key), dense(estimator, values, [key])) < 1e-6
     assert np.array_equal(found.at(L(5), X(2)), found.matrix[3:6, 12:18])
@@ -87,7 +102,9 @@ def test_over_the_window_it_is_the_same_where_variables_are_linearised_if_nothin
     found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS)
     linearised = estimator._smoother._window.linearised_at
     assert off_sigmas(found.matrix, dense(estimator, linearised, KEYS)) < 1e-6
-    assert 1e-4 < off_sigmas(found.matrix, dense(estimator, estimator.values, KEYS)) < 0.05
+    assert (
+        1e-4 < off_sigmas(found.matrix, dense(estimator, estimator.values, KEYS)) < 0.05
+    )
 
 
 def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
@@ -95,16 +112,28 @@ def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
     newest = len(estimator.keyframe_stamps()) - 1
     values, _ = estimator._smoother.solve_history()
     found = estimator.joint_covariance([newest], (), [5, 2], over="history")
-    assert off_sigmas(found.matrix, dense(estimator, values, [L(2), L(5), X(newest)])) < 1e-6
-    assert off_sigmas(estimator.joint_covariance([newest], (), [5, 2]).matrix, found.matrix) < 0.05
+    assert (
+        off_sigmas(found.matrix, dense(estimator, values, [L(2), L(5), X(newest)]))
+        < 1e-6
+    )
+    assert (
+        off_sigmas(
+            estimator.joint_covariance([newest], (), [5, 2]).matrix, found.matrix
+        )
+        < 0.05
+    )
 
 
 def test_a_keyframe_is_known_by_its_stamp_as_by_its_number():
     estimator = ran(5.0)
     stamps = estimator.keyframe_stamps()
     by_number = estimator.marginal(keyframe=3, over="history")
-    assert np.array_equal(estimator.marginal(stamp_ns=int(stamps[3]), over="history"), by_number)
-    assert not np.allclose(estimator.marginal(stamp_ns=int(stamps[2]), over="history"), by_number)
+    assert np.array_equal(
+        estimator.marginal(stamp_ns=int(stamps[3]), over="history"), by_number
+    )
+    assert not np.allclose(
+        estimator.marginal(stamp_ns=int(stamps[2]), over="history"), by_number
+    )
     assert by_number.shape == (6, 6)
     joint = estimator.joint_covariance([3], [int(stamps[3])], [2], over="history")
     assert joint.matrix.shape == (9, 9)
@@ -117,23 +146,43 @@ REFUSED = [
     ({"landmark": 77}, r"landmark 77 is not in the graph; it holds [\d, ]+$"),
     ({"landmark": -1}, r"landmark -1 is not in the graph"),
     ({"stamp_ns": 5}, r"no keyframe at 5 ns; the nearest are at \d+ ns"),
-    ({"stamp_ns": "after the second"}, r"no keyframe at \d+ ns; the nearest are at \d+ and \d+ ns"),
-    ({}, r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark"),
-    ({"keyframe": 1, "landmark": 2}, r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark"),
-    ({"keyframe": 0, "over": "history"}, "keyframe 0 has left the window, .*; none is known any more"),
+    (
+        {"stamp_ns": "after the second"},
+        r"no keyframe at \d+ ns; the nearest are at \d+ and \d+ ns",
+    ),
+    (
+        {},
+        r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark",
+    ),
+    (
+        {"keyframe": 1, "landmark": 2},
+        r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark",
+    ),
+    (
+        {"keyframe": 0, "over": "history"},
+        "keyframe 0 has left the window, .*; none is known any more",
+    ),
     ({"landmarks": ()}, "the covariance of nothing was asked for"),
-    ({"landmarks": 4}, r"landmarks: expected a list of integers, such as \[1, 2\], not 4"),
+    (
+        {"landmarks": 4},
+        r"landmarks: expected a list of integers, such as \[1, 2\], not 4",
+    ),
     ({"landmarks": ["4"]}, "landmarks: expected a list of integers"),
     ({"keyframes": 0.0}, "keyframes: expected a list of integers"),
     ({"keyframes": [0.5]}, "keyframes: expected a list of integers"),
     ({"stamps_ns": [1.5]}, "stamps_ns: expected a list of integers"),
-    ({"landmarks": [4], "over": "whole"}, 'over is \'whole\'; expected "window" or "history"'),
+    (
+        {"landmarks": [4], "over": "whole"},
+        'over is \'whole\'; expected "window" or "history"',
+    ),
 ]
 """Of a marginal, or of a joint covariance where lists are asked for; over a history of one that is bounded."""
 
 
 @pytest.mark.parametrize(("asked", "said"), REFUSED, ids=str)
-def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(asked: dict, said: str):
+def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(
+    asked: dict, said: str
+):
     estimator = ran(5.0, "bounded" if asked.get("over") == "history" else "whole")
     if asked.get("stamp_ns") == "after the second":
         asked = {"stamp_ns": int(estimator.keyframe_stamps()[1]) + 1}
@@ -146,22 +195,35 @@ def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(asked: dict, 
 def test_names_of_landmarks_without_names_are_refused_where_these_begin():
     sequence, _ = rail(8)
     ids = np.where(sequence.detections.candidate_ids == 4, FIRST_ANONYMOUS_ID, 7)
-    named = replace(sequence, detections=replace(sequence.detections, candidate_ids=ids))
-    with pytest.raises(EstimatorError, match=rf"has identity {FIRST_ANONYMOUS_ID}; with identity.unknown.policy = "):
+    named = replace(
+        sequence, detections=replace(sequence.detections, candidate_ids=ids)
+    )
+    with pytest.raises(
+        EstimatorError,
+        match=rf"has identity {FIRST_ANONYMOUS_ID}; with identity.unknown.policy = ",
+    ):
         run(named, 1 / STEP_S, identity__unknown__policy="associate")
     assert FIRST_ANONYMOUS_ID in run(named, 1 / STEP_S).landmarks().ids
 
 
 @pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture"])
 @pytest.mark.parametrize("range_m", [1.1e5, 1e10, 1e200])
-def test_a_range_beyond_any_sonar_is_refused_by_name_and_the_run_is_that_without_it(policy: str, range_m: float):
+def test_a_range_beyond_any_sonar_is_refused_by_name_and_the_run_is_that_without_it(
+    policy: str, range_m: float
+):
     sequence, _ = rail(8)
     seen = sequence.detections
     far = seen.range_m.copy()
     far[3] = range_m
-    estimator = run(replace(sequence, detections=replace(seen, range_m=far)), 1 / STEP_S, identity__policy=policy)
+    estimator = run(
+        replace(sequence, detections=replace(seen, range_m=far)),
+        1 / STEP_S,
+        identity__policy=policy,
+    )
     assert assert_outcomes_account(estimator, sequence)[Outcome.UNSOUND] == 1
     without = replace(sequence, detections=seen.rows(np.arange(len(seen)) != 3))
     known = run(without, 1 / STEP_S, identity__policy=policy)
     assert np.array_equal(estimator.landmarks().positions, known.landmarks().positions)
-    assert np.array_equal(estimator.trajectory().positions, known.trajectory().positions)
+    assert np.array_equal(
+        estimator.trajectory().positions, known.trajectory().positions
+    )

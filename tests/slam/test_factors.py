@@ -21,9 +21,19 @@ from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
 from sonar_graph.testing import check_consistent, check_jacobians
 
 from .graphs import information
-from .made import POSES, graph_of, huber, plain, random_covariance, some_motion, values_of
+from .made import (
+    POSES,
+    graph_of,
+    huber,
+    plain,
+    random_covariance,
+    some_motion,
+    values_of,
+)
 
-BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.05, -0.1]))
+BODY_T_SONAR = gtsam.Pose3(
+    gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.05, -0.1])
+)
 poses = pytest.mark.parametrize("pose", POSES.values(), ids=POSES)
 SIGMA = np.array([0.02, 0.009])
 """Noise of range and azimuth."""
@@ -35,17 +45,28 @@ def correlated(correlation: float) -> np.ndarray:
     return np.outer(SIGMA, SIGMA) * [[1, correlation], [correlation, 1]]
 
 
-def seen_from(pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range_m: float) -> np.ndarray:
+def seen_from(
+    pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range_m: float
+) -> np.ndarray:
     """The point at these spherical coordinates of the mounted sonar, by scipy."""
-    beam = Rotation.from_euler("ZY", [azimuth_rad, -elevation_rad]).apply([range_m, 0, 0])
+    beam = Rotation.from_euler("ZY", [azimuth_rad, -elevation_rad]).apply(
+        [range_m, 0, 0]
+    )
     return pose.transformFrom(BODY_T_SONAR.transformFrom(beam))
 
 
 def beginnings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     """GTSAM's priors and directions have the derivative of where they are fulfilled."""
     seen = np.array([2.0, 0.3, -0.4])
-    values = values_of(X0=pose, B0=rng.standard_normal(11), B1=rng.standard_normal(11), L0=pose.transformFrom(seen))
-    start = Start(position_m=tuple(pose.translation()), rpy_rad=tuple(pose.rotation().rpy()))
+    values = values_of(
+        X0=pose,
+        B0=rng.standard_normal(11),
+        B1=rng.standard_normal(11),
+        L0=pose.transformFrom(seen),
+    )
+    start = Start(
+        position_m=tuple(pose.translation()), rpy_rad=tuple(pose.rotation().rpy())
+    )
     yield factors.start_prior(X(0), Calibration(start=start)), values
     yield factors.bias_prior(B(0), np.linspace(0.0, 0.1, 11)), values
     yield factors.bias_walk(B(0), B(1), np.linspace(0.0, 0.1, 11)), values
@@ -56,10 +77,23 @@ def beginnings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
 def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     """Near no error, far off, and off by nearly half a turn."""
     for spread, turn in ((0.0, 0.0), (1.0, 0.0), (0.1, np.pi - 0.1)):
-        motion, bias = some_motion(int(rng.integers(99)), 0.05), spread * 0.03 * rng.standard_normal(11)
-        X_j = pose.compose(motion.corrected(bias)).compose(gtsam.Pose3.Expmap(0.3 * spread * rng.standard_normal(6)))
-        values = values_of(X0=pose, X1=X_j.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), np.zeros(3))), B0=bias)
-        up = X_j.rotation().matrix()[2] if spread else gtsam.Rot3.RzRyRx(*rng.uniform(-0.4, 0.4, 3)).matrix()[2]
+        motion, bias = (
+            some_motion(int(rng.integers(99)), 0.05),
+            spread * 0.03 * rng.standard_normal(11),
+        )
+        X_j = pose.compose(motion.corrected(bias)).compose(
+            gtsam.Pose3.Expmap(0.3 * spread * rng.standard_normal(6))
+        )
+        values = values_of(
+            X0=pose,
+            X1=X_j.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), np.zeros(3))),
+            B0=bias,
+        )
+        up = (
+            X_j.rotation().matrix()[2]
+            if spread
+            else gtsam.Rot3.RzRyRx(*rng.uniform(-0.4, 0.4, 3)).matrix()[2]
+        )
         yield OdometryWithBias(X(0), X(1), B(0), motion, up), values
         if spread == 0.0:  # GTSAM's has the derivative of no error
             values = values_of(X0=pose, X1=pose.compose(motion.i_T_j))
@@ -68,14 +102,27 @@ def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
 
 def sightings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     azimuth, elevation = rng.uniform([-1.13, -0.12], [1.13, 0.12])
-    z, values = np.array([2.0, azimuth + 0.02]), values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.1))
+    z, values = (
+        np.array([2.0, azimuth + 0.02]),
+        values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.1)),
+    )
     for cov in (correlated(0.0), correlated(0.5)):
-        for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07).values():
+        for factor in factors.landmark_sighting(
+            X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07
+        ).values():
             yield factor, values
-    for off in (np.pi - 0.01, 0.01 - np.pi):  # behind the sonar, where the azimuth's error jumps
+    for off in (
+        np.pi - 0.01,
+        0.01 - np.pi,
+    ):  # behind the sonar, where the azimuth's error jumps
         behind = values_of(X0=pose, L0=seen_from(pose, azimuth + off, elevation, 2.1))
         z = np.array([2.0, azimuth])
-        yield factors.CorrelatedSighting(X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(correlated(0.5)))), behind
+        yield (
+            factors.CorrelatedSighting(
+                X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(correlated(0.5)))
+            ),
+            behind,
+        )
 
 
 def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
@@ -88,10 +135,22 @@ def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
     tilted.insert(B(0), rng.standard_normal(11))
     A = rng.standard_normal((3, 3)) / 9.8
     yield factors.gravity_with_bias(X(0), B(0), 9.8 * up_in_body, A, 0.01), tilted
-    for yaw_rad in tilted.atPose3(X(0)).rotation().yaw() + np.array([0.0, 1.0, np.pi - 0.01, 0.01 - np.pi]):
-        yield factors.heading(X(0), B(0), yaw_rad + tilted.atVector(B(0))[9], 0.02, plain), tilted
+    for yaw_rad in tilted.atPose3(X(0)).rotation().yaw() + np.array(
+        [0.0, 1.0, np.pi - 0.01, 0.01 - np.pi]
+    ):
+        yield (
+            factors.heading(
+                X(0), B(0), yaw_rad + tilted.atVector(B(0))[9], 0.02, plain
+            ),
+            tilted,
+        )
     fix = pose.translation() + rng.standard_normal(3)
-    yield factors.position(X(0), fix, np.array([0.3, -0.2, 0.5]), random_covariance(3, 0.4), plain), values
+    yield (
+        factors.position(
+            X(0), fix, np.array([0.3, -0.2, 0.5]), random_covariance(3, 0.4), plain
+        ),
+        values,
+    )
 
 
 def fixes_over_gaps(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
@@ -104,45 +163,79 @@ def fixes_over_gaps(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
         bias = motion.bias + reach_rad / turn_rad * change
         fix = pose.translation() + rng.standard_normal(3)
         cov = random_covariance(3, 0.4)
-        factor = factors.position_with_biases((X(0), B(0)), fix, motion, antenna, cov, plain)
+        factor = factors.position_with_biases(
+            (X(0), B(0)), fix, motion, antenna, cov, plain
+        )
         yield factor, values_of(X0=pose, B0=bias)
 
 
-@pytest.mark.parametrize("made_at", [beginnings, odometries, sightings, attitudes_and_heights, fixes_over_gaps])
+@pytest.mark.parametrize(
+    "made_at",
+    [beginnings, odometries, sightings, attitudes_and_heights, fixes_over_gaps],
+)
 @poses
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
 def test_derivatives_are_those_of_differences(
-    made_at: Callable[[gtsam.Pose3, np.random.Generator], Made], pose: gtsam.Pose3, seed: int
+    made_at: Callable[[gtsam.Pose3, np.random.Generator], Made],
+    pose: gtsam.Pose3,
+    seed: int,
 ):
     for factor, values in made_at(pose, np.random.default_rng(seed)):
         check_jacobians(factor, values)
-        assert np.allclose(factor.linearize(values).jacobian()[1], -factor.whitenedError(values), rtol=1e-9)
+        assert np.allclose(
+            factor.linearize(values).jacobian()[1],
+            -factor.whitenedError(values),
+            rtol=1e-9,
+        )
 
 
 def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
-    motion, pose, bias = some_motion(2, 0.05), POSES["random"], 0.01 * np.arange(-5.0, 6.0)
+    motion, pose, bias = (
+        some_motion(2, 0.05),
+        POSES["random"],
+        0.01 * np.arange(-5.0, 6.0),
+    )
     perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
-    X_j = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias)))
+    X_j = pose.compose(motion.i_T_j).compose(
+        gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias))
+    )
     factor = OdometryWithBias(X(0), X(1), B(0), motion)
-    assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=bias)), 0, atol=1e-12)
+    assert np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=bias)), 0, atol=1e-12
+    )
     off = X_j.compose(gtsam.Pose3.Expmap(perturbation))
-    assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation)
-    assert not np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3)
+    assert np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation
+    )
+    assert not np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3
+    )
 
 
 def test_a_bias_of_the_heading_turns_about_the_vertical_wherever_the_estimate_has_it():
     """Where the tilt is estimated otherwise than when the motion was set, too: then it never is a tilt for gravity."""
     motion, pose, rng = some_motion(2, 0.05), POSES["random"], np.random.default_rng(5)
-    up_j, h, turned = np.array([0.1, -0.2, 0.97]), np.array([3.0, -1.0, 7.0]), np.zeros(11)
+    up_j, h, turned = (
+        np.array([0.1, -0.2, 0.97]),
+        np.array([3.0, -1.0, 7.0]),
+        np.zeros(11),
+    )
     D_bias = motion.D_bias.copy()
     up_j /= np.linalg.norm(up_j)
     D_bias[:, 3:6] = np.vstack((np.outer(up_j, h), np.zeros((3, 3))))
     factor = OdometryWithBias(X(0), X(1), B(0), replace(motion, D_bias=D_bias), up_j)
-    X_j, bias = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(0.2 * rng.standard_normal(6))), motion.bias
+    X_j, bias = (
+        pose.compose(motion.i_T_j).compose(
+            gtsam.Pose3.Expmap(0.2 * rng.standard_normal(6))
+        ),
+        motion.bias,
+    )
     turned[3:6] = 0.05 * rng.standard_normal(3)
-    about_vertical = gtsam.Pose3(gtsam.Rot3.Rz(h @ turned[3:6]).compose(X_j.rotation()), X_j.translation())
+    about_vertical = gtsam.Pose3(
+        gtsam.Rot3.Rz(h @ turned[3:6]).compose(X_j.rotation()), X_j.translation()
+    )
     errors = [
         factor.unwhitenedError(values_of(X0=pose, X1=x, B0=bias + b))
         for x, b in ((X_j, 0.0 * bias), (about_vertical, turned))
@@ -154,28 +247,54 @@ def test_a_bias_of_the_heading_turns_about_the_vertical_wherever_the_estimate_ha
 @pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
 def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     """GTSAM's own choice drops them where all are below 1e-9."""
-    motion, pose = replace(some_motion(3), covariance=random_covariance(6, sigma)), POSES["random"]
+    motion, pose = (
+        replace(some_motion(3), covariance=random_covariance(6, sigma)),
+        POSES["random"],
+    )
     off = sigma * np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0])
-    values = values_of(X0=pose, X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)), B0=motion.bias)
+    values = values_of(
+        X0=pose,
+        X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)),
+        B0=motion.bias,
+    )
     expected = 0.5 * off @ np.linalg.solve(motion.covariance, off)
-    for factor in factors.odometry(X(0), X(1), motion), OdometryWithBias(X(0), X(1), B(0), motion):
+    for factor in (
+        factors.odometry(X(0), X(1), motion),
+        OdometryWithBias(X(0), X(1), B(0), motion),
+    ):
         assert factor.error(values) == pytest.approx(expected, rel=1e-5)
-    start = Start(position_sigma_m=(2e-5, 1e-5, 3e-5), rpy_sigma_rad=(1e-5,) * 3, rpy_rad=(0.4, -0.6, 2.2))
-    moved = start.pose().compose(gtsam.Pose3(gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))))
+    start = Start(
+        position_sigma_m=(2e-5, 1e-5, 3e-5),
+        rpy_sigma_rad=(1e-5,) * 3,
+        rpy_rad=(0.4, -0.6, 2.2),
+    )
+    moved = start.pose().compose(
+        gtsam.Pose3(
+            gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))
+        )
+    )
     prior = factors.start_prior(X(0), Calibration(start=start))
     assert prior.error(values_of(X0=moved)) == pytest.approx(0.5, rel=1e-5)
 
 
 @poses
-@given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12), range_m=st.floats(0.5, 15))
+@given(
+    azimuth=st.floats(-1.13, 1.13),
+    elevation=st.floats(-0.12, 0.12),
+    range_m=st.floats(0.5, 15),
+)
 @settings(max_examples=15)
-def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(pose, azimuth, elevation, range_m):
+def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(
+    pose, azimuth, elevation, range_m
+):
     """Errors in sigmas are (predicted - measured) / sigma; azimuth's by half a per cent less at the fan's edge."""
     off = np.array([0.03, np.radians(1.0)])
     shrunk = elevation / np.tan(elevation) if elevation else 1.0
     z = np.array([range_m, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, range_m))
-    camera, distance = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag(SIGMA**2), plain).values()
+    camera, distance = factors.landmark_sighting(
+        X(0), L(0), BODY_T_SONAR, z, np.diag(SIGMA**2), plain
+    ).values()
     across, up = camera.whitenedError(values)
     assert across == pytest.approx(off[1] / SIGMA[1] * shrunk, rel=1.1e-4)
     assert shrunk > 0.995
@@ -192,20 +311,32 @@ def test_an_azimuth_is_an_angle_however_wrong_it_is(azimuth, off):
     pose = POSES["random"]
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, 0.0, 2.0))
     z, cov = np.array([2.0, azimuth - off]), np.diag([4e-4, 8e-5])
-    camera = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)["azimuth"]
-    model = factors.CorrelatedSighting(X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov)))
-    assert camera.unwhitenedError(values)[0] == pytest.approx(model.unwhitenedError(values)[1], abs=1e-7)
+    camera = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)[
+        "azimuth"
+    ]
+    model = factors.CorrelatedSighting(
+        X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov))
+    )
+    assert camera.unwhitenedError(values)[0] == pytest.approx(
+        model.unwhitenedError(values)[1], abs=1e-7
+    )
 
 
 @given(st.floats(-1.13, 1.13), st.floats(-0.12, 0.12), st.floats(-0.9, 0.9))
 @settings(max_examples=20)
-def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, elevation, correlation):
+def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(
+    azimuth, elevation, correlation
+):
     pose, off, cov = POSES["random"], np.array([0.03, -0.01]), correlated(correlation)
     z = np.array([2.0, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
-    sighting = factors.CorrelatedSighting(X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov)))
+    sighting = factors.CorrelatedSighting(
+        X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov))
+    )
     assert np.allclose(sighting.unwhitenedError(values), off, atol=1e-9)
-    assert sighting.error(values) == pytest.approx(0.5 * off @ np.linalg.solve(cov, off), rel=1e-6)
+    assert sighting.error(values) == pytest.approx(
+        0.5 * off @ np.linalg.solve(cov, off), rel=1e-6
+    )
 
 
 def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
@@ -214,16 +345,26 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     point = seen_from(pose, 0.2, 0.05, 2.0)
     upwards = seen_from(pose, 0.2, 0.05 + 1e-6, 2.0) - point
     upwards /= np.linalg.norm(upwards)
-    values, z, cov = values_of(X0=pose, L0=point), np.array([2.0, 0.2]), np.diag(SIGMA**2)
+    values, z, cov = (
+        values_of(X0=pose, L0=point),
+        np.array([2.0, 0.2]),
+        np.diag(SIGMA**2),
+    )
     silent, told = (
         information(
-            factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, s).values(), values, [L(0), X(0)]
+            factors.landmark_sighting(
+                X(0), L(0), BODY_T_SONAR, z, cov, plain, s
+            ).values(),
+            values,
+            [L(0), X(0)],
         )[:3, :3]
         for s in (None, 0.07)
     )
     assert upwards @ silent @ upwards < 1e-6
     assert upwards @ told @ upwards == pytest.approx(1 / (2.0 * 0.07) ** 2, rel=0.02)
-    assert np.sort(np.linalg.eigvalsh(silent))[1:] == pytest.approx([1 / 0.02**2, 1 / (0.009 * 2) ** 2], rel=0.02)
+    assert np.sort(np.linalg.eigvalsh(silent))[1:] == pytest.approx(
+        [1 / 0.02**2, 1 / (0.009 * 2) ** 2], rel=0.02
+    )
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
@@ -231,7 +372,11 @@ def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
     z, cov = np.array([2.0, 0.0]), correlated(correlation)
     values = values_of(X0=gtsam.Pose3(), L0=np.array([3.0, 0.3, 0.0]))
     robust, quadratic = (
-        graph_of(factors.landmark_sighting(X(0), L(0), gtsam.Pose3(), z, cov, kernel).values()).error(values)
+        graph_of(
+            factors.landmark_sighting(
+                X(0), L(0), gtsam.Pose3(), z, cov, kernel
+            ).values()
+        ).error(values)
         for kernel in (huber, plain)
     )
     assert robust < 0.2 * quadratic
@@ -239,21 +384,34 @@ def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
 
 def efficiency(k: float, d: int) -> float:
     """Of Huber's mean of d-dimensional Gaussian noise of length r: ``(E psi')^2 / E psi^2``, by Stein's lemma."""
-    mean = lambda f: sum(quad(lambda r: f(r) * chi(d).pdf(r), *ends)[0] for ends in ((0, k), (k, 20)))  # noqa: E731
-    slope, square = mean(lambda r: min(r, k) * r) / d, mean(lambda r: min(r, k) ** 2) / d
+
+    def mean(f):
+        return sum(
+            quad(lambda r: f(r) * chi(d).pdf(r), *ends)[0] for ends in ((0, k), (k, 20))
+        )
+
+    slope, square = (
+        mean(lambda r: min(r, k) * r) / d,
+        mean(lambda r: min(r, k) ** 2) / d,
+    )
     return slope**2 / square
 
 
 @pytest.mark.parametrize("d", [1, 3])
 def test_the_kernel_of_headings_and_fixes_is_95_percent_efficient_in_its_dimensions(d):
     """A width of the other one is not; far off the loss is ``k (r - k / 2)``."""
-    k, (other,) = HUBER_WIDTHS[d], [width for dimension, width in HUBER_WIDTHS.items() if dimension != d]
+    k, (other,) = (
+        HUBER_WIDTHS[d],
+        [width for dimension, width in HUBER_WIDTHS.items() if dimension != d],
+    )
     assert efficiency(k, d) == pytest.approx(0.95, abs=1e-4)
     assert abs(efficiency(other, d) - 0.95) > 0.01
     if d == 1:
         factor = factors.heading(X(0), B(0), 1.0, 0.1)
     else:
-        factor = factors.position(X(0), np.array([6.0, 0.0, 8.0]), np.zeros(3), np.eye(3))
+        factor = factors.position(
+            X(0), np.array([6.0, 0.0, 8.0]), np.zeros(3), np.eye(3)
+        )
     values = values_of(X0=gtsam.Pose3(), B0=np.zeros(11))
     assert factor.error(values) == pytest.approx(k * (10.0 - k / 2))
 
@@ -261,7 +419,10 @@ def test_the_kernel_of_headings_and_fixes_is_95_percent_efficient_in_its_dimensi
 @poses
 def test_depth_is_the_height_of_the_port_and_nothing_else(pose):
     port, sigma = np.array([0.3, -0.2, 0.1]), 0.02
-    height = float(Rotation.from_matrix(pose.rotation().matrix()).apply(port)[2] + pose.translation()[2])
+    height = float(
+        Rotation.from_matrix(pose.rotation().matrix()).apply(port)[2]
+        + pose.translation()[2]
+    )
     factor = factors.depth(X(0), height - 0.05, port, sigma)
     values = values_of(X0=pose)
     assert factor.whitenedError(values)[2] == pytest.approx(0.05 / sigma)
@@ -280,19 +441,31 @@ def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch)
     assert np.allclose(truth.unwhitenedError(values_of(X0=pose)), 0, atol=1e-12)
     yawed = gtsam.Pose3(gtsam.Rot3.Rz(1.3).compose(pose.rotation()), pose.translation())
     assert np.allclose(truth.unwhitenedError(values_of(X0=yawed)), 0, atol=1e-12)
-    tilted = values_of(X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3))))
-    angle = np.arccos(np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1))
-    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(2 * np.sin(angle / 2) / sigma, abs=1e-5)
+    tilted = values_of(
+        X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3)))
+    )
+    angle = np.arccos(
+        np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1)
+    )
+    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(
+        2 * np.sin(angle / 2) / sigma, abs=1e-5
+    )
 
 
 @poses
 def test_a_gravity_direction_that_does_not_fit_still_says_nothing_of_the_yaw(pose):
     """GTSAM's factor with both directions in the world says the residual's square."""
     sigma, up_in_body = 0.01, pose.rotation().matrix().T @ [0, 0, 1.0]
-    tilted = values_of(X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.03, 0.04, 0), np.zeros(3))))
-    vertical = np.concatenate([tilted.atPose3(X(0)).rotation().matrix().T @ [0, 0, 1.0], np.zeros(3)])
+    tilted = values_of(
+        X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.03, 0.04, 0), np.zeros(3)))
+    )
+    vertical = np.concatenate(
+        [tilted.atPose3(X(0)).rotation().matrix().T @ [0, 0, 1.0], np.zeros(3)]
+    )
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-    in_world = gtsam.AttitudeFactorPose3(X(0), gtsam.Unit3(np.array([0, 0, 1.0])), noise, gtsam.Unit3(up_in_body))
+    in_world = gtsam.AttitudeFactorPose3(
+        X(0), gtsam.Unit3(np.array([0, 0, 1.0])), noise, gtsam.Unit3(up_in_body)
+    )
     of_yaw = [
         vertical @ information([factor], tilted, [X(0)]) @ vertical
         for factor in (factors.gravity_direction(X(0), up_in_body, sigma), in_world)
@@ -317,12 +490,18 @@ BLIND_POSES = (gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 20.0, 0.0
 
 
 @pytest.mark.parametrize("is_held", [False, True])
-def test_only_its_first_direction_holds_a_landmark_behind_every_sonar_that_saw_it(is_held):
-    values = values_of(X0=BLIND_POSES[0], X1=BLIND_POSES[1], L0=np.array([-10.0, 9.0, 0.5]))
+def test_only_its_first_direction_holds_a_landmark_behind_every_sonar_that_saw_it(
+    is_held,
+):
+    values = values_of(
+        X0=BLIND_POSES[0], X1=BLIND_POSES[1], L0=np.array([-10.0, 9.0, 0.5])
+    )
     graph: list[gtsam.NonlinearFactor] = []
     for k, pose in enumerate(BLIND_POSES):
         z = np.array([np.linalg.norm(pose.transformTo(values.atPoint3(L(0)))), 0.1])
-        graph += factors.landmark_sighting(X(k), L(0), gtsam.Pose3(), z, np.diag([4e-4, 8e-5]), plain, 0.07).values()
+        graph += factors.landmark_sighting(
+            X(k), L(0), gtsam.Pose3(), z, np.diag([4e-4, 8e-5]), plain, 0.07
+        ).values()
     if is_held:
         graph.append(factors.first_direction(X(0), L(0), np.array([12.0, 1.0, 0.0])))
     held = np.linalg.eigvalsh(information(graph, values, [X(0), X(1), L(0)])[12:, 12:])
@@ -333,21 +512,33 @@ def test_the_floor_holds_the_height_of_a_landmark_alone():
     factor = factors.floor_prior(L(0), -1.7, 0.01)
     values = values_of(L0=np.array([40.0, -30.0, -1.68]))
     assert factor.error(values) == pytest.approx(0.5 * 2**2, rel=1e-5)
-    assert np.diag(information([factor], values, [L(0)])) == pytest.approx([0, 0, 1e4], abs=1e-8)
+    assert np.diag(information([factor], values, [L(0)])) == pytest.approx(
+        [0, 0, 1e4], abs=1e-8
+    )
 
 
 def test_start_sigmas_of_position_are_along_the_worlds_axes():
     """Many starts, drawn with the position in the world and the rotation about the body's axes."""
     sigmas, turns = np.array([0.5, 0.02, 0.1]), np.array([0.01, 0.02, 0.03])
     start = Start(
-        position_m=(1, 2, 3), rpy_rad=(0.3, -0.2, 1.2), position_sigma_m=tuple(sigmas), rpy_sigma_rad=tuple(turns)
+        position_m=(1, 2, 3),
+        rpy_rad=(0.3, -0.2, 1.2),
+        position_sigma_m=tuple(sigmas),
+        rpy_sigma_rad=tuple(turns),
     )
     factor, pose = factors.start_prior(X(0), Calibration(start=start)), start.pose()
     rng, n = np.random.default_rng(0), 2000
     squares = []
     for drawn in rng.standard_normal((n, 6)):
         turned = pose.rotation().compose(gtsam.Rot3.Expmap(turns * drawn[3:]))
-        squares.append(2 * factor.error(values_of(X0=gtsam.Pose3(turned, pose.translation() + sigmas * drawn[:3]))))
+        squares.append(
+            2
+            * factor.error(
+                values_of(
+                    X0=gtsam.Pose3(turned, pose.translation() + sigmas * drawn[:3])
+                )
+            )
+        )
     check_consistent(squares, 6)
     cov = np.linalg.inv(information([factor], values_of(X0=pose), [X(0)]))
     assert np.linalg.norm(np.diag(cov[:3, :3]) - turns**2) < 1e-9
@@ -356,19 +547,35 @@ def test_start_sigmas_of_position_are_along_the_worlds_axes():
 def test_correlated_sightings_together_are_what_each_is():
     """Under no kernel and two others, wherever the landmarks lie about the sonars."""
     rng, values, made = np.random.default_rng(6), gtsam.Values(), []
-    kernels = [plain, RobustKernel(shape="huber").robust(), RobustKernel(shape="cauchy").robust()]
+    kernels = [
+        plain,
+        RobustKernel(shape="huber").robust(),
+        RobustKernel(shape="cauchy").robust(),
+    ]
     for k in range(5):
         values.insert(X(k), gtsam.Pose3.Expmap(rng.standard_normal(6)))
         values.insert(L(k), 3.0 * rng.standard_normal(3))
     for k in range(60):
-        body_T_sonar, half = gtsam.Pose3.Expmap(rng.standard_normal(6)), 0.1 * rng.standard_normal((2, 2))
+        body_T_sonar, half = (
+            gtsam.Pose3.Expmap(rng.standard_normal(6)),
+            0.1 * rng.standard_normal((2, 2)),
+        )
         z, cov = rng.uniform((1.0, -3.0), (5.0, 3.0)), half @ half.T + 1e-3 * np.eye(2)
         keys = X(int(rng.integers(5))), L(int(rng.integers(5)))
-        made.append(factors.CorrelatedSighting(*keys, body_T_sonar, z, kernels[k % 3](factors.gaussian(cov))))
+        made.append(
+            factors.CorrelatedSighting(
+                *keys, body_T_sonar, z, kernels[k % 3](factors.gaussian(cov))
+            )
+        )
     stack = SightingStack(made)
-    assert stack.error(values) == pytest.approx(sum(factor.error(values) for factor in made), rel=1e-12)
+    assert stack.error(values) == pytest.approx(
+        sum(factor.error(values) for factor in made), rel=1e-12
+    )
     for found, factor in zip(stack.linear_factors(values), made, strict=True):
-        mine, theirs = found.augmentedInformation(), factor.linearize(values).augmentedInformation()
+        mine, theirs = (
+            found.augmentedInformation(),
+            factor.linearize(values).augmentedInformation(),
+        )
         assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9 * np.abs(theirs).max())
 
 
@@ -383,13 +590,22 @@ def test_odometry_factors_together_are_what_each_is():
         motion = some_motion(k, 0.05)
         values.insert(X(k), gtsam.Pose3.Expmap(rng.standard_normal(6)))
         if k % 2:
-            X_j = values.atPose3(X(k - 1)).compose(motion.corrected(values.atVector(B(k % 3))))
-            values.update(X(k), X_j.compose(gtsam.Pose3.Expmap(spread * rng.standard_normal(6))))
+            X_j = values.atPose3(X(k - 1)).compose(
+                motion.corrected(values.atVector(B(k % 3)))
+            )
+            values.update(
+                X(k), X_j.compose(gtsam.Pose3.Expmap(spread * rng.standard_normal(6)))
+            )
         if k:
             up = values.atPose3(X(k)).rotation().matrix()[2] if k % 3 else np.zeros(3)
             made.append(OdometryWithBias(X(k - 1), X(k), B(k % 3), motion, up))
     stack = OdometryStack(made)
-    assert stack.error(values) == pytest.approx(sum(factor.error(values) for factor in made), rel=1e-12)
+    assert stack.error(values) == pytest.approx(
+        sum(factor.error(values) for factor in made), rel=1e-12
+    )
     for found, factor in zip(stack.linear_factors(values), made, strict=True):
-        mine, theirs = found.augmentedInformation(), factor.linearize(values).augmentedInformation()
+        mine, theirs = (
+            found.augmentedInformation(),
+            factor.linearize(values).augmentedInformation(),
+        )
         assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9 * np.abs(theirs).max())

@@ -55,22 +55,33 @@ def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
     world_T_body = dive.smoother.values.atPose3(X(0))
 
     def expected(change: Floats) -> Floats:
-        pose = world_T_body.compose(gtsam.Pose3.Expmap(change[:6])).compose(SONAR.mounting.pose())
+        pose = world_T_body.compose(gtsam.Pose3.Expmap(change[:6])).compose(
+            SONAR.mounting.pose()
+        )
         return polar(pose, landmark + change[6:])
 
-    H = np.column_stack([(expected(1e-6 * a) - expected(-1e-6 * a)) / 2e-6 for a in np.eye(9)])
+    H = np.column_stack(
+        [(expected(1e-6 * a) - expected(-1e-6 * a)) / 2e-6 for a in np.eye(9)]
+    )
     z = expected(np.zeros(9)) + np.array([0.03, -0.02])
     dive.see(0.0, (5, *z))
     log = dive.sightings.journal.log()
     assert log.outcomes[-1] is Outcome.USED
     assert log.innovations[-1] == pytest.approx([0.03, -0.02], abs=1e-9)
-    assert np.allclose(log.innovation_covs[-1], H @ P @ H.T + np.diag([0.02**2, 0.01**2]), rtol=1e-5, atol=1e-10)
+    assert np.allclose(
+        log.innovation_covs[-1],
+        H @ P @ H.T + np.diag([0.02**2, 0.01**2]),
+        rtol=1e-5,
+        atol=1e-10,
+    )
 
 
 def test_noise_of_the_motion_since_the_keyframe_is_added():
     """Dead ahead, 2 s after the keyframe, with a log of 0.2 m/s at 10 Hz: range has 0.2^2 x 0.1 s x 2 s more of it."""
     log = DvlCalibration(velocity_sigma_m_s=(0.2, 1e-6, 1e-6))
-    dive = dive_with(dvl=log, sonar=SonarCalibration(range_sigma_m=0.02, azimuth_sigma_rad=0.01))
+    dive = dive_with(
+        dvl=log, sonar=SonarCalibration(range_sigma_m=0.02, azimuth_sigma_rad=0.01)
+    )
     dive.keyframes.params = KeyframeParams(max_interval_s=100.0, motion_noise_share=1e9)
     dive.see(0.0, (5, 4.0, 0.0))
     dive.see(0.0, (5, 4.0, 0.0))
@@ -94,7 +105,9 @@ def test_the_gate_is_the_chi_square_quantile(beyond):
     dive.see(0.0, (5, 3.0 + edge_m * (1.001 if beyond else 0.999), 0.0))
     assert dive.outcomes[-1] is (Outcome.GATED if beyond else Outcome.USED)
     assert dive.smoother.graph.size() == before + (0 if beyond else 2)
-    assert dive.sightings.journal.log().innovations[1] == pytest.approx([6.0, 0.0], abs=1e-6)
+    assert dive.sightings.journal.log().innovations[1] == pytest.approx(
+        [6.0, 0.0], abs=1e-6
+    )
 
 
 def test_a_frame_before_the_start_is_unlocated():
@@ -104,7 +117,9 @@ def test_a_frame_before_the_start_is_unlocated():
     assert dive.smoother.graph.size() == 0
 
 
-@pytest.mark.parametrize("share", [0.0, 1e9], ids=["keyframe in between", "no keyframe in between"])
+@pytest.mark.parametrize(
+    "share", [0.0, 1e9], ids=["keyframe in between", "no keyframe in between"]
+)
 def test_a_frame_older_than_what_was_processed_is_late(share):
     """Whether a keyframe was set since then or not: motion to it is no longer kept."""
     dive = Dive()
@@ -160,11 +175,17 @@ def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
     for after_s in (0.0, 0.35):
         off_it = dive_with(dvl=DvlCalibration(velocity_sigma_m_s=(0.2, 0.2, 0.2)))
         off_it.see(after_s, (5, 3.0, 0.0))
-        ranges = [f for f in factors_of(off_it.smoother.graph) if isinstance(f, gtsam.RangeFactorWithTransform3D)]
+        ranges = [
+            f
+            for f in factors_of(off_it.smoother.graph)
+            if isinstance(f, gtsam.RangeFactorWithTransform3D)
+        ]
         sigmas += [factor.noiseModel().sigma() for factor in ranges]
     motion = off_it.keyframes.motion_since_newest(T0_NS + round(0.35 * NS))
     assert sigmas[0] == pytest.approx(SONAR.range_sigma_m)
-    assert sigmas[1] == pytest.approx(np.sqrt(SONAR.range_sigma_m**2 + motion.covariance[3, 3]), rel=1e-2)
+    assert sigmas[1] == pytest.approx(
+        np.sqrt(SONAR.range_sigma_m**2 + motion.covariance[3, 3]), rel=1e-2
+    )
     assert sigmas[1] > 1.5 * sigmas[0]
 
 
@@ -172,7 +193,9 @@ def test_a_first_sighting_places_a_landmark_on_the_centre_beam():
     dive = Dive()
     dive.see(0.0, (5, 3.0, 0.0))
     assert dive.outcomes == [Outcome.NEW]
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.3, 0.1, -0.1]) + 3.0 * BEAM)
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(
+        np.array([0.3, 0.1, -0.1]) + 3.0 * BEAM
+    )
 
 
 def test_a_known_floor_gives_the_elevation():
@@ -182,10 +205,14 @@ def test_a_known_floor_gives_the_elevation():
     assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
     assert dive.smoother.graph.size() == 2 + 4
     settle(dive)
-    assert np.sqrt(dive.smoother.marginals.marginalCovariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
+    assert np.sqrt(
+        dive.smoother.marginals.marginalCovariance(L(5))[2, 2]
+    ) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
 
 
-DOUBTFUL_HEIGHT = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
+DOUBTFUL_HEIGHT = Start(
+    position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03)
+)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +220,9 @@ DOUBTFUL_HEIGHT = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01,
     [(0.6, CALIBRATION.start), (0.9, DOUBTFUL_HEIGHT)],
     ids=["near", "far, of a doubtful height"],
 )
-def test_a_floor_out_of_the_aperture_is_accepted_all_the_same(below_rad: float, start: Start):
+def test_a_floor_out_of_the_aperture_is_accepted_all_the_same(
+    below_rad: float, start: Start
+):
     """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
     floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(below_rad), sigma_m=0.01)
     dive = dive_with(floor=floor, start=start)
@@ -201,12 +230,17 @@ def test_a_floor_out_of_the_aperture_is_accepted_all_the_same(below_rad: float, 
     settle(dive, 5)
     assert dive.outcomes == [Outcome.NEW]
     assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(floor.z_m, abs=1e-2)
-    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3) == (start is CALIBRATION.start)
+    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3) == (
+        start is CALIBRATION.start
+    )
 
 
 def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
     """0.5 rad below the centre beam is seven sigmas of the aperture, which has a factor then, and the floor none."""
-    dive, without = dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)), Dive()
+    dive, without = (
+        dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)),
+        Dive(),
+    )
     for each in (dive, without):
         each.see(0.0, (5, 3.0, 0.0))
         settle(each)
@@ -223,7 +257,9 @@ def test_elevation_is_one_factor_a_landmark():
     up = np.array([np.cos(0.2) * np.sin(0.4), np.sin(0.2) * np.sin(0.4), np.cos(0.4)])
     cov = dive.smoother.marginals.marginalCovariance(L(5))
     elevation_sigma = SONAR.elevation_aperture_rad / np.sqrt(12)
-    assert np.sqrt(up @ cov @ up) == pytest.approx(3.0 * np.tan(elevation_sigma), rel=0.01)
+    assert np.sqrt(up @ cov @ up) == pytest.approx(
+        3.0 * np.tan(elevation_sigma), rel=0.01
+    )
     assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 8
 
 
@@ -270,7 +306,10 @@ STEPS = ["retract", "associate", "rivals", "judge", "held", "reconsider", "forge
 DECIDING = [TrackedIdentities, NamelessLandmarks, MixtureIdentities]
 
 
-def watched(monkeypatch: pytest.MonkeyPatch, watch: Callable[[IdentityPolicy, str, Callable[[], Any]], Any]) -> None:
+def watched(
+    monkeypatch: pytest.MonkeyPatch,
+    watch: Callable[[IdentityPolicy, str, Callable[[], Any]], Any],
+) -> None:
     """From now on each step of a policy runs in ``watch(policy, name, step)``."""
 
     def wrapped(name: str, step: Callable[..., Any]) -> Callable[..., Any]:
@@ -282,13 +321,22 @@ def watched(monkeypatch: pytest.MonkeyPatch, watch: Callable[[IdentityPolicy, st
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_a_policy_only_decides_and_graph_landmarks_and_journal_change_between_its_steps(policy: str, monkeypatch):
-    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3))
+def test_a_policy_only_decides_and_graph_landmarks_and_journal_change_between_its_steps(
+    policy: str, monkeypatch
+):
+    sequence = simulate_basin(
+        BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3)
+    )
     decided: Counter[str] = Counter()
 
     def seen(landmarks: LandmarkGraph) -> tuple:
         log = landmarks.journal.log()
-        return landmarks.sizes(), landmarks.smoother.graph.size(), log.outcomes, log.landmark_ids.tolist()
+        return (
+            landmarks.sizes(),
+            landmarks.smoother.graph.size(),
+            log.outcomes,
+            log.landmark_ids.tolist(),
+        )
 
     def watch(deciding: IdentityPolicy, name: str, step: Callable[[], Any]) -> Any:
         before = seen(deciding.landmarks)
@@ -310,7 +358,9 @@ def test_a_renamed_track_is_retracted_then_associated_and_then_judged(monkeypatc
     def watch(_: IdentityPolicy, name: str, step: Callable[[], Any]) -> Any:
         found = step()
         if isinstance(found, Decision) and not found.is_empty:
-            steps.append((name, [(each.outcome, each.landmark_id) for each in found.assignments]))
+            steps.append(
+                (name, [(each.outcome, each.landmark_id) for each in found.assignments])
+            )
         return found
 
     see(world, 0.0, SURE[5])

@@ -47,8 +47,17 @@ def same(one: Estimate, other: Estimate) -> bool:
 
 def until(sequence: Sequence, end_ns: int) -> Sequence:
     """The log, had it been cut off there."""
-    blocks = {name: getattr(sequence, name) for name in ("imu", "dvl", "depth", "detections")}
-    return replace(sequence, **{name: rows.between(0, end_ns) for name, rows in blocks.items() if rows is not None})
+    blocks = {
+        name: getattr(sequence, name) for name in ("imu", "dvl", "depth", "detections")
+    }
+    return replace(
+        sequence,
+        **{
+            name: rows.between(0, end_ns)
+            for name, rows in blocks.items()
+            if rows is not None
+        },
+    )
 
 
 def assert_is_batch(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
@@ -57,7 +66,12 @@ def assert_is_batch(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> 
     assert graph.error(batch) <= graph.error(values) * (1 + 1e-9)
     assert graph.error(values) == pytest.approx(graph.error(batch), rel=0.01)
     for key in poses_in(values):
-        assert np.linalg.norm(values.atPose3(key).translation() - batch.atPose3(key).translation()) < 0.01
+        assert (
+            np.linalg.norm(
+                values.atPose3(key).translation() - batch.atPose3(key).translation()
+            )
+            < 0.01
+        )
 
 
 def poses_in(values: gtsam.Values) -> list[int]:
@@ -71,8 +85,12 @@ PRECISE = {"smoother__lag_s": 1e6, "smoother__waiting_gain": 0.0}
 @pytest.mark.parametrize("bias", [0.0, 1.0])
 def test_incremental_equals_batch_in_the_basin(kernel, bias):
     """iSAM2's own estimate, when it keeps all poses and relinearises what moved by a tenth of a milliradian."""
-    sequence = simulate_basin(BasinOptions(duration_s=BASIN_S, laps=1, seed=3, gyro_bias_scale=bias))
-    estimator, _ = ran(sequence, **PRECISE, kernel__shape=kernel, smoother__relinearize_threshold=1e-4)
+    sequence = simulate_basin(
+        BasinOptions(duration_s=BASIN_S, laps=1, seed=3, gyro_bias_scale=bias)
+    )
+    estimator, _ = ran(
+        sequence, **PRECISE, kernel__shape=kernel, smoother__relinearize_threshold=1e-4
+    )
     assert len(poses_in(estimator.values)) > 20
     assert_is_batch(estimator.graph, estimator.values)
 
@@ -95,8 +113,13 @@ def test_the_final_answer_is_the_batch_solution(basin):
     found, smoothed = estimator.landmarks(), estimator.trajectory()
     for landmark_id, position in zip(found.ids.tolist(), found.positions, strict=True):
         assert position == pytest.approx(batch.atPoint3(L(landmark_id)), abs=1e-3)
-    batch_positions = np.array([batch.atPose3(key).translation() for key in poses_in(batch)[1:]])
-    nearest = np.min(np.linalg.norm(smoothed.positions[None] - batch_positions[:, None], axis=2), axis=1)
+    batch_positions = np.array(
+        [batch.atPose3(key).translation() for key in poses_in(batch)[1:]]
+    )
+    nearest = np.min(
+        np.linalg.norm(smoothed.positions[None] - batch_positions[:, None], axis=2),
+        axis=1,
+    )
     assert np.median(nearest) < 1e-3
     assert estimator.values.equals(before, 0.0)
 
@@ -114,7 +137,9 @@ def test_refused_detections_leave_everything_as_it_is():
     sequence = small_world()
     rows = sequence.detections
     doubtful = replace(rows, id_probability=0.1 * rows.id_probability)
-    (refusing, refused), (blind, plain) = (ran(replace(sequence, detections=rows)) for rows in (doubtful, None))
+    (refusing, refused), (blind, plain) = (
+        ran(replace(sequence, detections=rows)) for rows in (doubtful, None)
+    )
     assert refusing.detections().outcomes == [Outcome.NO_IDENTITY] * len(rows)
     assert refusing.graph.size() == blind.graph.size()
     assert all(same(a, b) for a, b in zip(refused, plain, strict=True))
@@ -124,7 +149,10 @@ def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
     truth = sequence.truth.at(np.array([e.stamp_ns for e in estimates]))
     off = np.array([e.world_T_body.translation() for e in estimates]) - truth.positions
     rotations = [e.world_T_body.rotation().matrix() for e in estimates]
-    covs = [R @ e.covariance[3:, 3:] @ R.T for R, e in zip(rotations, estimates, strict=True)]
+    covs = [
+        R @ e.covariance[3:, 3:] @ R.T
+        for R, e in zip(rotations, estimates, strict=True)
+    ]
     return normalised_squares(off, np.array(covs))
 
 
@@ -144,14 +172,19 @@ def test_twenty_basins_are_consistent():
     """Two-sided 99.9 % band of the mean over independent runs at the end of each, three degrees of freedom."""
     last = []
     for seed in range(20):
-        sequence = simulate_basin(BasinOptions(duration_s=300.0, laps=1, seed=seed, gyro_bias_scale=0.0))
+        sequence = simulate_basin(
+            BasinOptions(duration_s=300.0, laps=1, seed=seed, gyro_bias_scale=0.0)
+        )
         last.append(position_nees(sequence, ran(sequence, 1.0)[1])[-1])
     check_consistent(last, 3, confidence=0.999)
 
 
 def test_time_does_not_go_back(basin):
     """The same instant again is the same estimate and one row of the trajectory; an earlier one gets none."""
-    estimator, instants = Isam2(basin.calibration, Odometry(basin.calibration)), basin.instants(1.0)[:20]
+    estimator, instants = (
+        Isam2(basin.calibration, Odometry(basin.calibration)),
+        basin.instants(1.0)[:20],
+    )
     first = [estimator.process(m) for m in basin.replay(instants)][-1]
     again = estimator.process(Measurements(int(instants[-1])))
     assert again.world_T_body.equals(first.world_T_body, 1e-12)
@@ -159,11 +192,15 @@ def test_time_does_not_go_back(basin):
     assert estimator.trajectory().stamps_ns.tolist() == instants.tolist()
 
 
-@pytest.mark.parametrize(("section", "name"), [("imu", "gyro_noise_density"), ("start", "position_sigma_m")])
+@pytest.mark.parametrize(
+    ("section", "name"), [("imu", "gyro_noise_density"), ("start", "position_sigma_m")]
+)
 def test_noise_of_zero_is_refused_by_name(basin, section, name):
     part = getattr(basin.calibration, section)
     zero = 0.0 if section == "imu" else (0.0, 0.0, 0.0)
-    calibration = basin.calibration.model_copy(update={section: part.model_copy(update={name: zero})})
+    calibration = basin.calibration.model_copy(
+        update={section: part.model_copy(update={name: zero})}
+    )
     with pytest.raises(CalibrationError, match=f"{section}.{name}"):
         Isam2(calibration, Odometry(calibration))
 
@@ -172,13 +209,29 @@ LAG_S = 3.0
 """Much less than the worlds last: what is wrong leaves the window before it is known to be."""
 IN_THE_GRAPH = {Outcome.NEW, Outcome.USED, Outcome.USED_LATER, Outcome.REASSIGNED}
 QUICK = ["max-mixture whole ignore", "robust bounded associate", "robust whole ignore"]
-ALL = [" ".join(of) for of in product(("gate", "robust"), ("whole", "bounded"), ("ignore", "associate"))]
-SLOW = [pytest.param(chosen, marks=pytest.mark.slow) for chosen in ALL if chosen not in QUICK]
+ALL = [
+    " ".join(of)
+    for of in product(("gate", "robust"), ("whole", "bounded"), ("ignore", "associate"))
+]
+SLOW = [
+    pytest.param(chosen, marks=pytest.mark.slow)
+    for chosen in ALL
+    if chosen not in QUICK
+]
 
 
 def settings(policy: str, history: str, unknown_landmarks: str) -> Any:
-    unknown = {"identity__unknown__policy": "associate"} if unknown_landmarks == "associate" else {}
-    return isam2_params(identity__policy=policy, history__policy=history, smoother__lag_s=LAG_S, **unknown)
+    unknown = (
+        {"identity__unknown__policy": "associate"}
+        if unknown_landmarks == "associate"
+        else {}
+    )
+    return isam2_params(
+        identity__policy=policy,
+        history__policy=history,
+        smoother__lag_s=LAG_S,
+        **unknown,
+    )
 
 
 @pytest.mark.parametrize("chosen", [*QUICK, *SLOW])
@@ -188,36 +241,62 @@ def test_asking_changes_nothing(chosen: str) -> None:
 
 def test_landmarks_list_and_covariances_are_of_one_choice() -> None:
     world = misnamed_world()
-    estimator = Isam2(world.calibration, Odometry(world.calibration), settings("max-mixture", "whole", "ignore"))
+    estimator = Isam2(
+        world.calibration,
+        Odometry(world.calibration),
+        settings("max-mixture", "whole", "ignore"),
+    )
     differing = []
     for step in world.replay(world.instants(1.0)):
         estimator.process(step)
         found, log = estimator.landmarks(), estimator.detections()
-        used = [i for i, said in zip(log.landmark_ids.tolist(), log.outcomes, strict=True) if said in IN_THE_GRAPH]
+        used = [
+            i
+            for i, said in zip(log.landmark_ids.tolist(), log.outcomes, strict=True)
+            if said in IN_THE_GRAPH
+        ]
         assert set(used) == set(found.ids.tolist())
         for landmark_id, cov in zip(found.ids.tolist(), found.covariances, strict=True):
-            np.testing.assert_array_equal(estimator.marginal(landmark=landmark_id, over="history"), cov)
-        window = [estimator.values.atPoint3(L(i)) for i in found.ids.tolist() if estimator.values.exists(L(i))]
+            np.testing.assert_array_equal(
+                estimator.marginal(landmark=landmark_id, over="history"), cov
+            )
+        window = [
+            estimator.values.atPoint3(L(i))
+            for i in found.ids.tolist()
+            if estimator.values.exists(L(i))
+        ]
         if len(window) == len(found) > 0:
             differing.append(not np.allclose(window, found.positions, atol=0.1))
     assert any(differing), "else it is not seen which is asked"
 
 
-def test_the_newest_landmarks_are_those_of_the_window_and_within_their_doubt_of_the_solution(basin) -> None:
+def test_the_newest_landmarks_are_those_of_the_window_and_within_their_doubt_of_the_solution(
+    basin,
+) -> None:
     """For a live run, whose map must not wait for the solution of the whole graph; asking leaves no trace."""
     estimator, _ = ran(basin, 7.0)
     newest, solved = estimator.newest_landmarks(), estimator.landmarks()
     np.testing.assert_array_equal(newest.ids, solved.ids)
     assert len(newest) == 4
-    for landmark_id, position, cov in zip(newest.ids.tolist(), newest.positions, newest.covariances, strict=True):
-        np.testing.assert_array_equal(position, estimator.values.atPoint3(L(landmark_id)))
-        np.testing.assert_allclose(cov, estimator.marginal(landmark=landmark_id, over="window"), rtol=1e-9)
+    for landmark_id, position, cov in zip(
+        newest.ids.tolist(), newest.positions, newest.covariances, strict=True
+    ):
+        np.testing.assert_array_equal(
+            position, estimator.values.atPoint3(L(landmark_id))
+        )
+        np.testing.assert_allclose(
+            cov, estimator.marginal(landmark=landmark_id, over="window"), rtol=1e-9
+        )
     off = newest.positions - solved.positions
     nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(newest.covariances), off)
     assert nees.max() < 1.0
-    ratio = np.trace(newest.covariances, axis1=1, axis2=2) / np.trace(solved.covariances, axis1=1, axis2=2)
+    ratio = np.trace(newest.covariances, axis1=1, axis2=2) / np.trace(
+        solved.covariances, axis1=1, axis2=2
+    )
     assert ((ratio > 0.8) & (ratio < 1.25)).all()
-    assert estimator.newest_landmarks().positions.tobytes() == newest.positions.tobytes()
+    assert (
+        estimator.newest_landmarks().positions.tobytes() == newest.positions.tobytes()
+    )
 
 
 def test_estimators_without_a_quick_map_give_the_whole_one(basin) -> None:
@@ -225,7 +304,10 @@ def test_estimators_without_a_quick_map_give_the_whole_one(basin) -> None:
     estimator = kind(basin.calibration, Odometry(basin.calibration))
     for step in basin.replay(basin.instants(1.0)):
         estimator.process(step)
-    assert newest_landmarks_of(estimator).positions.tobytes() == estimator.landmarks().positions.tobytes()
+    assert (
+        newest_landmarks_of(estimator).positions.tobytes()
+        == estimator.landmarks().positions.tobytes()
+    )
 
 
 LANDMARK, BEFORE = 2, 1
@@ -245,7 +327,9 @@ def named_wrongly() -> LandmarkDetections:
     """One sighting of the landmark before, called by the name of one that has not been seen yet."""
     detections, row = basin_of_first_sightings().detections, sightings_of(BEFORE)[5]
     ids = detections.candidate_ids.copy()
-    ids[row] = np.select([ids[row] == BEFORE, ids[row] == LANDMARK], [LANDMARK, BEFORE], ids[row])
+    ids[row] = np.select(
+        [ids[row] == BEFORE, ids[row] == LANDMARK], [LANDMARK, BEFORE], ids[row]
+    )
     return replace(detections, candidate_ids=ids)
 
 
@@ -256,13 +340,20 @@ def ranged_wrongly(by_m: float) -> LandmarkDetections:
     return replace(detections, range_m=detections.range_m + by_m * is_first)
 
 
-def error_and_sigma_m(detections: LandmarkDetections, **settings: str) -> tuple[float, float]:
+def error_and_sigma_m(
+    detections: LandmarkDetections, **settings: str
+) -> tuple[float, float]:
     """Of the landmark at the end: how far it is from where it lies, horizontally, and what is said of that."""
     sequence = replace(basin_of_first_sightings(), detections=detections)
     found, true = ran(sequence, 1.0, **settings)[0].landmarks(), sequence.true_landmarks
-    at, truly = int(np.argmax(found.ids == LANDMARK)), int(np.argmax(true.ids == LANDMARK))
+    at, truly = (
+        int(np.argmax(found.ids == LANDMARK)),
+        int(np.argmax(true.ids == LANDMARK)),
+    )
     offset = (found.positions[at] - true.positions[truly])[:2]
-    return float(np.linalg.norm(offset)), float(np.sqrt(np.trace(found.covariances[at][:2, :2])))
+    return float(np.linalg.norm(offset)), float(
+        np.sqrt(np.trace(found.covariances[at][:2, :2]))
+    )
 
 
 def test_a_whole_history_takes_a_wrong_first_identity_back_and_a_bounded_one_keeps_it_and_is_sure():
@@ -274,14 +365,18 @@ def test_a_whole_history_takes_a_wrong_first_identity_back_and_a_bounded_one_kee
 
 
 @pytest.mark.parametrize("by_m", [1.0, 3.0, 30.0])
-def test_twenty_two_right_sightings_outvote_a_first_range_however_wrong_it_is(by_m: float):
+def test_twenty_two_right_sightings_outvote_a_first_range_however_wrong_it_is(
+    by_m: float,
+):
     """From three metres on what they say has no pull, and the landmark begins anew (`misplaced`)."""
     assert len(sightings_of(LANDMARK)) == 23
     assert error_and_sigma_m(ranged_wrongly(by_m))[0] < 0.05
 
 
 def test_answers_that_differ_in_one_bit_are_unlike() -> None:
-    one, other = (laws.run(partial(Isam2, params=isam2_params()), small_world()) for _ in range(2))
+    one, other = (
+        laws.run(partial(Isam2, params=isam2_params()), small_world()) for _ in range(2)
+    )
     assert unlike(one, other) == []
     other.trajectory.positions[3, 1] += 1e-15
     other.landmarks.covariances[0, 0, 0] *= 1 + 1e-15
@@ -296,15 +391,30 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"identity.gate_probability": 0.9},
         'identity.gate_probability: there is no such field with policy = "robust"; identity.policy = "gate" has it',
     ),
-    "mixture without its policy": ({"identity.view_range_m": 5.0}, 'policy = "max-mixture" has it'),
+    "mixture without its policy": (
+        {"identity.view_range_m": 5.0},
+        'policy = "max-mixture" has it',
+    ),
     "unknown landmarks in a mixture": (
         {"identity.policy": "max-mixture", "identity.unknown.policy": "associate"},
         'no such field with policy = "max-mixture"; identity.policy = "robust" or "gate" has it',
     ),
-    "association without its policy": ({"identity.unknown.sightings": 3}, 'identity.unknown.policy = "associate" has'),
-    "belief in a mixture": ({"identity.policy": "max-mixture", "identity.minimum_probability": 0.9}, '"gate" has it'),
-    "memory of a whole history": ({"history.remembered_s": 30.0}, 'history.policy = "bounded" has it'),
-    "width of no kernel": ({"kernel.shape": "none", "kernel.width": 2.0}, 'kernel.shape = "huber" or "cauchy" has it'),
+    "association without its policy": (
+        {"identity.unknown.sightings": 3},
+        'identity.unknown.policy = "associate" has',
+    ),
+    "belief in a mixture": (
+        {"identity.policy": "max-mixture", "identity.minimum_probability": 0.9},
+        '"gate" has it',
+    ),
+    "memory of a whole history": (
+        {"history.remembered_s": 30.0},
+        'history.policy = "bounded" has it',
+    ),
+    "width of no kernel": (
+        {"kernel.shape": "none", "kernel.width": 2.0},
+        'kernel.shape = "huber" or "cauchy" has it',
+    ),
     "mixture in a bounded history": (
         {"identity.policy": "max-mixture", "history.policy": "bounded"},
         'history.policy = "bounded" cannot be with identity.policy = "max-mixture", which chooses anew in the whole',
@@ -313,9 +423,18 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"identity.policy": "max-mixture", "history.policy": "bounded"},
         'policy = "max-mixture", which',
     ),
-    "no such policy": ({"identity.policy": "gcn"}, "identity.policy: there is no 'gcn'; there are: robust, gate, max-"),
-    "a policy for its section": ({"identity": "gate"}, 'identity: expected a section with policy = "gate"'),
-    "no such section": ({"smother.lag_s": 3}, "smother: there is no such field; did you mean smoother?"),
+    "no such policy": (
+        {"identity.policy": "gcn"},
+        "identity.policy: there is no 'gcn'; there are: robust, gate, max-",
+    ),
+    "a policy for its section": (
+        {"identity": "gate"},
+        'identity: expected a section with policy = "gate"',
+    ),
+    "no such section": (
+        {"smother.lag_s": 3},
+        "smother: there is no such field; did you mean smoother?",
+    ),
     "no such setting": (
         {"smoother": {"lag": 3}},
         "smoother.lag: there is no such field; did you mean lag_s? smoother has",
@@ -332,14 +451,18 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("given", "fault"), REFUSED.values(), ids=REFUSED)
-def test_what_a_policy_does_not_read_is_refused_by_name(given: dict[str, Any], fault: str) -> None:
+def test_what_a_policy_does_not_read_is_refused_by_name(
+    given: dict[str, Any], fault: str
+) -> None:
     with pytest.raises(EstimatorError) as refused:
         make_params(Isam2, given, "isam2")
     assert fault in str(refused.value)
 
 
 def test_a_section_keeps_its_default_policy_where_none_is_given() -> None:
-    params = Isam2Params(**nested({"identity.longest_wait_s": 3.0, "kernel.width": 2.0}))
+    params = Isam2Params(
+        **nested({"identity.longest_wait_s": 3.0, "kernel.width": 2.0})
+    )
     assert params.identity.policy == "robust"
     assert params.identity.longest_wait_s == 3.0
     assert params.model_dump()["kernel"] == {"shape": "cauchy", "width": 2.0}
@@ -351,5 +474,9 @@ def test_the_listing_has_every_setting_once_with_its_policy() -> None:
     assert len(listed) == len(settings_of(Isam2Params)) == 24
     assert listed["smoother.lag_s"].default == 15.0
     assert listed["identity.policy"].default == "robust"
-    assert listed["identity.gate_probability"].meaning.endswith('Only with policy = "gate".')
-    assert listed["identity.minimum_probability"].meaning.endswith('Only with policy = "robust" or "gate".')
+    assert listed["identity.gate_probability"].meaning.endswith(
+        'Only with policy = "gate".'
+    )
+    assert listed["identity.minimum_probability"].meaning.endswith(
+        'Only with policy = "robust" or "gate".'
+    )

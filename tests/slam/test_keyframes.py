@@ -35,7 +35,9 @@ from .made import smoother_with
 G = 9.80665
 NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0, accel_bias_sigma=0.0)
 EXACT_DVL = DvlCalibration(velocity_sigma_m_s=(1e-7, 1e-7, 1e-7))
-POLICY = KeyframeParams(max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0)
+POLICY = KeyframeParams(
+    max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0
+)
 
 
 def seconds(keyframes: Keyframes) -> list[float]:
@@ -54,8 +56,12 @@ def steady_dvl(until_s: float, velocity=(0.5, 0.0, 0.0)) -> Dvl:
     return dvl(stamps(5, until_s), velocity)
 
 
-def keyframes_of(calibration: Calibration, policy: KeyframeParams = POLICY) -> Keyframes:
-    return Keyframes(calibration, Odometry(calibration), policy, smoother_with(1e9, 0.01, 1e9))
+def keyframes_of(
+    calibration: Calibration, policy: KeyframeParams = POLICY
+) -> Keyframes:
+    return Keyframes(
+        calibration, Odometry(calibration), policy, smoother_with(1e9, 0.01, 1e9)
+    )
 
 
 def driven(
@@ -68,13 +74,21 @@ def driven(
     felt: Imu | None = None,
 ) -> Keyframes:
     keyframes = keyframes_of(calibration)
-    keyframes.add(felt or level_imu(until_s, rate), steady_dvl(until_s, velocity), depth)
+    keyframes.add(
+        felt or level_imu(until_s, rate), steady_dvl(until_s, velocity), depth
+    )
     keyframes.advance(int(at(until_s)[0]))
     return keyframes
 
 
-def factors_on(keyframes: Keyframes, kind: type, key: int) -> list[gtsam.NonlinearFactor]:
-    return [f for f in factors_of(keyframes.smoother.graph) if isinstance(f, kind) and list(f.keys()) == [key]]
+def factors_on(
+    keyframes: Keyframes, kind: type, key: int
+) -> list[gtsam.NonlinearFactor]:
+    return [
+        f
+        for f in factors_of(keyframes.smoother.graph)
+        if isinstance(f, kind) and list(f.keys()) == [key]
+    ]
 
 
 def factor_of(keyframes: Keyframes, kind: type) -> gtsam.NonlinearFactor:
@@ -102,7 +116,9 @@ def see(keyframes: Keyframes, after_s: float) -> PreintegratedMotion:
     return keyframes.set_for_frame(stamp, keyframes.motion_since_newest(stamp))
 
 
-def noisy_keyframes(share: float, axis: int = 0, turn_rad_s: float = 0.0, **calibration) -> Keyframes:
+def noisy_keyframes(
+    share: float, axis: int = 0, turn_rad_s: float = 0.0, **calibration
+) -> Keyframes:
     """0.3 m/s along an axis at 5 Hz: the displacement's variance grows by 0.018 m^2 a second."""
     dvl = DvlCalibration(velocity_sigma_m_s=tuple(0.01 + 0.29 * np.eye(3)[axis]))
     exact_gyro = ImuCalibration(gyro_noise_density=1e-12, gyro_bias_sigma=0.0)
@@ -116,20 +132,33 @@ def noisy_keyframes(share: float, axis: int = 0, turn_rad_s: float = 0.0, **cali
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("blurred_s", "expected"), [(0.55, [0.0]), (0.57, [0.0, 0.4])])
-def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share_along_any_axis(blurred_s, expected, axis):
+def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share_along_any_axis(
+    blurred_s, expected, axis
+):
     """A tenth of (0.3178 m)^2 is 0.0101 m^2, reached after 0.561 s; it sits at the newest reached node."""
-    sonar = SonarCalibration(range_sigma_m=np.sqrt(0.018 * 0.561 / 0.1), azimuth_sigma_rad=1e3)
+    sonar = SonarCalibration(
+        range_sigma_m=np.sqrt(0.018 * 0.561 / 0.1), azimuth_sigma_rad=1e3
+    )
     keyframes = noisy_keyframes(0.1, axis, sonar=sonar)
     motion = see(keyframes, blurred_s)
     assert seconds(keyframes) == pytest.approx(expected)
-    assert motion.i_T_j.translation() == pytest.approx([0.5 * (blurred_s - expected[-1]), 0, 0])
-    assert motion.covariance[3 + axis, 3 + axis] == pytest.approx(0.018 * (blurred_s - expected[-1]))
+    assert motion.i_T_j.translation() == pytest.approx(
+        [0.5 * (blurred_s - expected[-1]), 0, 0]
+    )
+    assert motion.covariance[3 + axis, 3 + axis] == pytest.approx(
+        0.018 * (blurred_s - expected[-1])
+    )
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(
     ("density", "bias_sigma", "azimuth_sigma_rad", "expected"),
-    [(0.1, 0.0, 0.20, [0.0, 0.4]), (0.1, 0.0, 0.22, [0.0]), (1e-12, 0.1, 0.1, [0.0, 0.4]), (1e-12, 0.1, 0.15, [0.0])],
+    [
+        (0.1, 0.0, 0.20, [0.0, 0.4]),
+        (0.1, 0.0, 0.22, [0.0]),
+        (1e-12, 0.1, 0.1, [0.0, 0.4]),
+        (1e-12, 0.1, 0.15, [0.0]),
+    ],
     ids=["noise", "noise under the share", "bias", "bias under the share"],
 )
 def test_the_turn_by_noise_or_unknown_bias_is_compared_with_azimuth(
@@ -162,13 +191,24 @@ def test_every_keyframe_has_its_odometry_and_gravity_and_is_held_on_a_plane():
     keyframes = driven(Calibration(imu=NO_BIAS), 6.0)
     graph = keyframes.smoother.graph
     assert graph.size() == 2 + 3 * 2
-    assert [len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) for k in range(4)] == [0, 1, 1, 1]
-    assert [list(graph.at(k).keys()) for k in (2, 4, 6)] == [[X(0), X(1)], [X(1), X(2)], [X(2), X(3)]]
+    assert [
+        len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) for k in range(4)
+    ] == [0, 1, 1, 1]
+    assert [list(graph.at(k).keys()) for k in (2, 4, 6)] == [
+        [X(0), X(1)],
+        [X(1), X(2)],
+        [X(2), X(3)],
+    ]
     without = Calibration(imu=NO_BIAS, use_gravity=False)
     assert driven(without, 6.0).smoother.graph.size() == 2 + 3
     keyframes = driven(without.model_copy(update={"planar": PlanarMotion()}), 6.0)
     for kind in (gtsam.MagPoseFactorPose3, gtsam.GPSFactorArm):
-        assert [len(factors_on(keyframes, kind, X(k))) for k in range(4)] == [1, 1, 1, 1]
+        assert [len(factors_on(keyframes, kind, X(k))) for k in range(4)] == [
+            1,
+            1,
+            1,
+            1,
+        ]
 
 
 def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
@@ -188,16 +228,24 @@ def test_the_direction_of_gravity_is_as_doubtful_as_the_velocities_at_both_ends(
         rows = replace(rows, velocity_cov=sigmas[:, None, None] ** 2 * np.eye(3))
         keyframes.add(level_imu(2.0), rows, None)
         keyframes.advance(int(at(2.0)[0]))
-        variances.append(factor_of(keyframes, gtsam.MagPoseFactorPose3).noiseModel().sigma() ** 2)
-    assert np.diff(variances) == pytest.approx(np.diff((ends**2).sum(axis=1)) / (2.0 * G) ** 2, rel=1e-3, abs=1e-9)
+        variances.append(
+            factor_of(keyframes, gtsam.MagPoseFactorPose3).noiseModel().sigma() ** 2
+        )
+    assert np.diff(variances) == pytest.approx(
+        np.diff((ends**2).sum(axis=1)) / (2.0 * G) ** 2, rel=1e-3, abs=1e-9
+    )
 
 
 def test_velocity_is_taken_to_the_imu_before_gravity_is():
     """A vehicle that begins to turn accelerates an IMU off its centre: without the lever arm up would seem to lean."""
     arm, alpha = 2.0, 0.05
-    calibration = Calibration(imu=NO_BIAS.model_copy(update={"mounting": Mounting(translation_m=(arm, 0, 0))}))
+    calibration = Calibration(
+        imu=NO_BIAS.model_copy(update={"mounting": Mounting(translation_m=(arm, 0, 0))})
+    )
     t = np.arange(41) / 20
-    force = np.column_stack([-((alpha * t) ** 2) * arm, np.full(41, alpha * arm), np.full(41, G)])
+    force = np.column_stack(
+        [-((alpha * t) ** 2) * arm, np.full(41, alpha * arm), np.full(41, G)]
+    )
     felt = Imu(at(*t), np.outer(alpha * t, [0, 0, 1.0]), force)
     keyframes = driven(calibration, 2.0, velocity=(0, 0, 0), felt=felt)
     assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 2e-5
@@ -207,19 +255,30 @@ def test_velocity_is_taken_to_the_imu_before_gravity_is():
 def test_depths_since_the_last_keyframe_become_one_factor_at_their_weighted_mean():
     """The vehicle sinks at 0.1 m/s; samples on the way are carried to the keyframe by its own (exact) motion."""
     port, variance = (0.3, 0.0, 0.2), np.array([1e-4, 4e-4, np.nan])
-    calibration = Calibration(imu=NO_BIAS, dvl=EXACT_DVL, depth=DepthCalibration(sigma_m=0.03, port_m=port))
+    calibration = Calibration(
+        imu=NO_BIAS, dvl=EXACT_DVL, depth=DepthCalibration(sigma_m=0.03, port_m=port)
+    )
     when = np.array([0.5, 1.1, 1.9])
     depth = Depth(at(*when), -0.1 * when + port[2] + 0.01, variance)
     keyframes = driven(calibration, 2.0, depth, velocity=(0.0, 0.0, -0.1))
     sigma = (1 / 1e-4 + 1 / 4e-4 + 1 / 9e-4) ** -0.5
     height = keyframes.smoother.values.atPose3(X(1)).translation()[2]
-    assert height - error_of(keyframes, gtsam.GPSFactorArm)[2] == pytest.approx(-0.2 + 0.01, abs=1e-4)
-    assert factor_of(keyframes, gtsam.GPSFactorArm).noiseModel().sigmas()[2] == pytest.approx(sigma)
+    assert height - error_of(keyframes, gtsam.GPSFactorArm)[2] == pytest.approx(
+        -0.2 + 0.01, abs=1e-4
+    )
+    assert factor_of(keyframes, gtsam.GPSFactorArm).noiseModel().sigmas()[
+        2
+    ] == pytest.approx(sigma)
 
 
 def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
     """Mean port and sigma as from the exact path of a constant twist; the log's axes differ in noise."""
-    rate, velocity, port, bias = np.array([0.3, 0.1, -0.2]), np.array([0.5, 0.2, -0.1]), (0.4, -0.3, 0.2), 0.02
+    rate, velocity, port, bias = (
+        np.array([0.3, 0.1, -0.2]),
+        np.array([0.5, 0.2, -0.1]),
+        (0.4, -0.3, 0.2),
+        0.02,
+    )
     sigmas = np.array([0.002, 0.06, 0.004])
     calibration = Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-9, gyro_bias_sigma=1e-9),
@@ -244,11 +303,16 @@ def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
     q = []
     for k, dt in enumerate(np.diff([*when, 2.0])):
         ups = [
-            start.compose(gtsam.Pose3.Expmap(twist * (when[k] + u * dt))).rotation().matrix()[2] for u in (0.25, 0.75)
+            start.compose(gtsam.Pose3.Expmap(twist * (when[k] + u * dt)))
+            .rotation()
+            .matrix()[2]
+            for u in (0.25, 0.75)
         ]
         q.append(np.mean([up**2 @ sigmas**2 for up in ups]) * 0.2 * dt)
     weights, variance = average_at_end(np.full(len(when), 0.05**2), np.array(q))
-    mean_port = weights @ [path[-1].transformTo(pose.transformFrom(np.array(port))) for pose in path[:-1]]
+    mean_port = weights @ [
+        path[-1].transformTo(pose.transformFrom(np.array(port))) for pose in path[:-1]
+    ]
     values = gtsam.Values()
     for pose in (
         gtsam.Pose3(),
@@ -265,8 +329,12 @@ def test_a_depth_carried_far_by_a_noisy_log_is_worth_less():
     """Vertical noise of 0.2 m/s at 5 Hz on a vehicle that points straight up: its x axis; for 1.5 s."""
     dvl = DvlCalibration(velocity_sigma_m_s=(0.2, 1e-7, 1e-7))
     for pitch, carried in ((0.0, 0.0), (-np.pi / 2, 0.2**2 * 0.2 * 1.5)):
-        calibration = Calibration(imu=NO_BIAS, dvl=dvl, start=Start(rpy_rad=(0, pitch, 0)), use_gravity=False)
-        keyframes = driven(calibration, 2.0, Depth(at(0.5), np.zeros(1), np.full(1, 1e-4)))
+        calibration = Calibration(
+            imu=NO_BIAS, dvl=dvl, start=Start(rpy_rad=(0, pitch, 0)), use_gravity=False
+        )
+        keyframes = driven(
+            calibration, 2.0, Depth(at(0.5), np.zeros(1), np.full(1, 1e-4))
+        )
         sigma = factor_of(keyframes, gtsam.GPSFactorArm).noiseModel().sigmas()[2]
         assert sigma**2 == pytest.approx(1e-4 + carried, rel=1e-3)
 
@@ -279,7 +347,14 @@ def test_the_bias_walks_between_stretches():
     walks = [f for f in every if isinstance(f, gtsam.BetweenFactorVector)]
     assert [list(f.keys()) for f in walks] == [[B(0), B(1)], [B(1), B(2)]]
     assert walks[0].noiseModel().sigmas() == pytest.approx(
-        [*[1e-4 * np.sqrt(10)] * 3, *[0.0] * 3, *[2e-4 * np.sqrt(10)] * 3, 1e-3 * 0.05, 0.0], abs=1e-11
+        [
+            *[1e-4 * np.sqrt(10)] * 3,
+            *[0.0] * 3,
+            *[2e-4 * np.sqrt(10)] * 3,
+            1e-3 * 0.05,
+            0.0,
+        ],
+        abs=1e-11,
     )
     odometry = [list(f.keys()) for f in every if f.size() == 3]
     assert odometry == [[X(k), X(k + 1), B(k // 5)] for k in range(12)]
@@ -290,11 +365,18 @@ def test_the_bias_walks_between_stretches():
 def test_a_vehicle_that_turns_with_the_earth_stays_where_it_heads():
     """Its gyros feel 15 degrees an hour about the Earth's axis, in a body that heads south and leans."""
     start = Start(rpy_rad=(0.2, -0.1, -1.6))
-    calibration = Calibration(imu=NO_BIAS, start=start, earth_rate_latitude_rad=0.63, use_gravity=False)
+    calibration = Calibration(
+        imu=NO_BIAS, start=start, earth_rate_latitude_rad=0.63, use_gravity=False
+    )
     felt = start.pose().rotation().matrix().T @ earth_rate_in_world(calibration)
     unaware = calibration.model_copy(update={"earth_rate_latitude_rad": None})
-    at_rest = [driven(given, 60.0, rate=felt, velocity=(0, 0, 0)) for given in (calibration, unaware)]
-    kept, drifted = (start.pose().between(each.smoother.values.atPose3(X(30))) for each in at_rest)
+    at_rest = [
+        driven(given, 60.0, rate=felt, velocity=(0, 0, 0))
+        for given in (calibration, unaware)
+    ]
+    kept, drifted = (
+        start.pose().between(each.smoother.values.atPose3(X(30))) for each in at_rest
+    )
     assert kept.equals(gtsam.Pose3(), 1e-7)
     turned_rad = np.linalg.norm(gtsam.Rot3.Logmap(drifted.rotation()))
     assert turned_rad == pytest.approx(60 * 7.292115e-5, rel=1e-3)
@@ -312,13 +394,21 @@ def test_depths_that_come_late_are_passed_over():
         keyframes.advance(int(at(2.0)[0]))
         return factor_of(keyframes, gtsam.GPSFactorArm)
 
-    in_order, again, more = depth_factor(0.3, 0.9), depth_factor(0.3, 0.9, 0.9, 0.6), depth_factor(0.3, 0.6, 0.9)
+    in_order, again, more = (
+        depth_factor(0.3, 0.9),
+        depth_factor(0.3, 0.9, 0.9, 0.6),
+        depth_factor(0.3, 0.6, 0.9),
+    )
     assert in_order.equals(again, 1e-12)
     assert not in_order.equals(more, 1e-3)
 
 
-@pytest.mark.parametrize(("until_s", "late_s"), [(0.8, 1.0), (1.2, 0.7)], ids=["in order", "before others"])
-def test_rows_that_come_between_two_questions_about_one_instant_count(until_s: float, late_s: float):
+@pytest.mark.parametrize(
+    ("until_s", "late_s"), [(0.8, 1.0), (1.2, 0.7)], ids=["in order", "before others"]
+)
+def test_rows_that_come_between_two_questions_about_one_instant_count(
+    until_s: float, late_s: float
+):
     """A live feed delivers a Doppler row late, after the motion to that instant was already asked for."""
     calibration = Calibration(imu=NO_BIAS, dvl=EXACT_DVL)
     asked_twice, at_once = keyframes_of(calibration), keyframes_of(calibration)
@@ -329,7 +419,9 @@ def test_rows_that_come_between_two_questions_about_one_instant_count(until_s: f
     before = [asked_twice.motion_since_newest(instant) for instant in instants]
     for keyframes in (asked_twice, at_once):
         keyframes.add(None, dvl(at(late_s), (0.6, 0.0, 0.0)), None)
-    after, expected = (each.motion_since_newest(instants[1]).i_T_j for each in (asked_twice, at_once))
+    after, expected = (
+        each.motion_since_newest(instants[1]).i_T_j for each in (asked_twice, at_once)
+    )
     assert after.equals(expected, 1e-12)
     assert not after.equals(before[1].i_T_j, 1e-3)
 
@@ -340,11 +432,15 @@ GAPS_S = ((2.0, 6.0), (7.0, 10.0))
 def keyframes_over_gaps(max_interval_s: float = 1e3) -> Keyframes:
     """Straight on at 0.5 m/s for twelve seconds, without bottom lock twice."""
     dvl = DvlCalibration(velocity_sigma_m_s=(0.01, 0.01, 0.01), gap_s=0.3)
-    never = KeyframeParams(max_interval_s=max_interval_s, motion_noise_share=1e9, bias_interval_s=10.0)
+    never = KeyframeParams(
+        max_interval_s=max_interval_s, motion_noise_share=1e9, bias_interval_s=10.0
+    )
     keyframes = keyframes_of(Calibration(imu=NO_BIAS, dvl=dvl), never)
     velocity = steady_dvl(12.0)
     s = (velocity.stamps_ns - T0_NS) / NS
-    is_lost = np.any([(s > lost_s) & (s < found_s) for lost_s, found_s in GAPS_S], axis=0)
+    is_lost = np.any(
+        [(s > lost_s) & (s < found_s) for lost_s, found_s in GAPS_S], axis=0
+    )
     keyframes.add(level_imu(12.0), velocity.rows(~is_lost), None)
     return keyframes
 
@@ -365,7 +461,9 @@ def shares(keyframes: Keyframes, at_s: list[float]) -> list[float]:
 
 def test_frames_over_one_gap_together_tell_ever_nearer_what_one_exact_frame_would_and_never_more():
     """A telescoping sum by hand: ``1 / (k (k + 1)) = 1 / k - 1 / (k + 1)``, so that n of them tell ``n / (n + 1)``."""
-    told = np.cumsum(shares(keyframes_over_gaps(), (2.5 + 0.1 * np.arange(30)).tolist()))
+    told = np.cumsum(
+        shares(keyframes_over_gaps(), (2.5 + 0.1 * np.arange(30)).tolist())
+    )
     n = np.arange(1, 31)
     assert told == pytest.approx(n / (n + 1))
 
@@ -373,7 +471,10 @@ def test_frames_over_one_gap_together_tell_ever_nearer_what_one_exact_frame_woul
 @pytest.mark.parametrize(
     ("at_s", "told"),
     [
-        ([1.0, 2.2, 3.0, 4.0, 6.3, 6.7, 8.0, 9.0, 9.5, 11.0], [1, 1, 1 / 2, 1 / 6, 1, 1, 1 / 2, 1 / 6, 1 / 12, 1]),
+        (
+            [1.0, 2.2, 3.0, 4.0, 6.3, 6.7, 8.0, 9.0, 9.5, 11.0],
+            [1, 1, 1 / 2, 1 / 6, 1, 1, 1 / 2, 1 / 6, 1 / 12, 1],
+        ),
         ([4.0, 6.4], [1 / 2, 1]),
     ],
     ids=["each gap anew", "a gap that has ended before a frame"],
@@ -389,25 +490,40 @@ def test_frames_between_gaps_tell_all(at_s: list[float], told: list[float]):
 
 
 @pytest.mark.parametrize("off", [1.3, 10.0])
-def test_a_heading_far_from_the_others_has_its_variance_larger_by_what_exceeds_the_kernel_s_width(off):
+def test_a_heading_far_from_the_others_has_its_variance_larger_by_what_exceeds_the_kernel_s_width(
+    off,
+):
     """Four that agree and one beside them, with exact gyros: the mean's information is a sum by hand, k = 1.345."""
     exact = NO_BIAS.model_copy(update={"gyro_noise_density": 1e-9})
     keyframes, sigma = keyframes_of(Calibration(imu=exact, dvl=EXACT_DVL)), 0.02
     yaw_rad = np.array([0.0, 0.0, off * sigma, 0.0, 0.0])
     keyframes.add(
-        level_imu(3.0), steady_dvl(3.0), None, Heading(at(0.3, 0.6, 0.9, 1.2, 1.5), yaw_rad, np.full(5, sigma))
+        level_imu(3.0),
+        steady_dvl(3.0),
+        None,
+        Heading(at(0.3, 0.6, 0.9, 1.2, 1.5), yaw_rad, np.full(5, sigma)),
     )
     keyframes.advance(int(at(2.5)[0]))
-    (factor,) = [f for f in factors_of(keyframes.smoother.graph) if list(f.keys()) == [X(1), B(0)] and f.dim() == 1]
+    (factor,) = [
+        f
+        for f in factors_of(keyframes.smoother.graph)
+        if list(f.keys()) == [X(1), B(0)] and f.dim() == 1
+    ]
     doubt = max(1.0, off / 1.345)
-    assert factor.noiseModel().noise().covariance().item() == pytest.approx(sigma**2 / (4 + 1 / doubt), rel=1e-6)
+    assert factor.noiseModel().noise().covariance().item() == pytest.approx(
+        sigma**2 / (4 + 1 / doubt), rel=1e-6
+    )
 
 
 def test_fixes_have_the_covariance_of_the_motion_from_their_keyframe_and_share_its_error_over_a_gap():
     """With bottom lock, then the first and second in a gap: a sum by hand, of the lever arm too."""
     keyframes, antenna = keyframes_over_gaps(), np.array([0.3, -0.2, 0.5])
-    positions = keyframes.calibration.positions.model_copy(update={"antenna_m": tuple(antenna)})
-    keyframes.calibration = keyframes.calibration.model_copy(update={"positions": positions})
+    positions = keyframes.calibration.positions.model_copy(
+        update={"antenna_m": tuple(antenna)}
+    )
+    keyframes.calibration = keyframes.calibration.model_copy(
+        update={"positions": positions}
+    )
     expected = []
     for when, times in ((1.0, 1.0), (3.0, 2.0), (4.0, 6.0)):
         (stamp_ns,) = at(when).tolist()
@@ -418,43 +534,69 @@ def test_fixes_have_the_covariance_of_the_motion_from_their_keyframe_and_share_i
         keyframes.add_fix(stamp_ns, np.zeros(3), 1e-4 * np.eye(3))
         keyframes.update_if_due()
     assert len(keyframes.stamps_ns) == 1
-    found = [factor.noiseModel().noise().covariance() for factor in factors_on(keyframes, gtsam.GPSFactorArm, X(0))]
-    assert found == [pytest.approx(covariance, rel=1e-6, abs=1e-8) for covariance in expected]
+    found = [
+        factor.noiseModel().noise().covariance()
+        for factor in factors_on(keyframes, gtsam.GPSFactorArm, X(0))
+    ]
+    assert found == [
+        pytest.approx(covariance, rel=1e-6, abs=1e-8) for covariance in expected
+    ]
     assert np.abs(expected[0] - 1e-4 * np.eye(3)).max() > 1e-5
 
 
 @pytest.mark.parametrize(("depth_s", "count"), [(1.5, 0), (5.6, 0), (6.0, 1)])
-def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_near_the_end(depth_s, count):
+def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_near_the_end(
+    depth_s, count
+):
     keyframes = keyframes_over_gaps(5.0)
     keyframes.add(None, None, Depth(at(depth_s), np.zeros(1), np.full(1, 1e-4)))
     keyframes.advance(int(at(5.9)[0]))
     motion = keyframes.motion_since_newest(int(at(6.2)[0]))
     keyframes.advance(int(at(6.3)[0]))
     assert seconds(keyframes) == [0.0, 6.2]
-    (between,) = (f for f in factors_of(keyframes.smoother.graph) if isinstance(f, gtsam.BetweenFactorPose3))
-    np.testing.assert_allclose(between.noiseModel().covariance(), motion.covariance, rtol=1e-6, atol=1e-15)
+    (between,) = (
+        f
+        for f in factors_of(keyframes.smoother.graph)
+        if isinstance(f, gtsam.BetweenFactorPose3)
+    )
+    np.testing.assert_allclose(
+        between.noiseModel().covariance(), motion.covariance, rtol=1e-6, atol=1e-15
+    )
     assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(1))) == count
 
 
 @pytest.mark.parametrize("lost_s", [[2.05], [2.15], [2.12, 2.17]])
 def test_depths_too_long_before_the_end_of_a_gap_leave_the_factor_of_the_others(lost_s):
     """From 2.0 s to 2.4 s; none is carried on for longer than without a Doppler row, 0.21 s."""
-    calibration = Calibration(imu=NO_BIAS, dvl=DvlCalibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.21))
+    calibration = Calibration(
+        imu=NO_BIAS, dvl=DvlCalibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.21)
+    )
     found = []
     for when in ([2.5, 2.7], [*lost_s, 2.5, 2.7]):
-        keyframes = keyframes_of(calibration, POLICY.model_copy(update={"max_interval_s": 2.8}))
+        keyframes = keyframes_of(
+            calibration, POLICY.model_copy(update={"max_interval_s": 2.8})
+        )
         log = steady_dvl(3.0)
         depth = Depth(at(*when), 0.1 * np.array(when), np.full(len(when), 1e-4))
         keyframes.add(level_imu(3.0), log.rows(log.stamps_ns != at(2.2)[0]), depth)
         keyframes.advance(int(at(3.0)[0]))
         assert seconds(keyframes) == [0.0, 2.8]
-        found.append((error_of(keyframes, gtsam.GPSFactorArm), factor_of(keyframes, gtsam.GPSFactorArm)))
+        found.append(
+            (
+                error_of(keyframes, gtsam.GPSFactorArm),
+                factor_of(keyframes, gtsam.GPSFactorArm),
+            )
+        )
     (error, factor), (expected, alone) = found[1], found[0]
     assert error == pytest.approx(expected, abs=1e-12)
     assert factor.noiseModel().sigmas() == pytest.approx(alone.noiseModel().sigmas())
 
 
-@given(st.lists(st.tuples(st.floats(1e-9, 1e-2), st.floats(1e-5, 1e-2)), min_size=1, max_size=12))
+@given(
+    st.lists(
+        st.tuples(st.floats(1e-9, 1e-2), st.floats(1e-5, 1e-2)), min_size=1, max_size=12
+    )
+)
 def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths):
     """Two samples share the error of the way that both are carried, that of the later one."""
     wander, variance = np.array(depths).T
@@ -464,7 +606,9 @@ def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths):
     expected = np.linalg.solve(C, ones) / (ones @ np.linalg.solve(C, ones))
     weights, mean_variance = average_at_end(variance, wander)
     assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
-    assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
+    assert mean_variance == pytest.approx(
+        1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6
+    )
 
 
 def test_motions_from_a_keyframe_are_for_the_bias_that_is_estimated_there():
@@ -476,5 +620,7 @@ def test_motions_from_a_keyframe_are_for_the_bias_that_is_estimated_there():
         if estimator.process(step) is not None:
             keyframes = estimator._keyframes
             biases.append(keyframes.bias(len(keyframes.stamps_ns) - 1).tolist())
-            assert keyframes.motion_since_newest(step.end_ns).bias.tolist() == biases[-1]
+            assert (
+                keyframes.motion_since_newest(step.end_ns).bias.tolist() == biases[-1]
+            )
     assert len(set(map(tuple, biases))) > 3

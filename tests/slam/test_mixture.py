@@ -33,12 +33,23 @@ KERNELS = [GaussianKernel(), RobustKernel(shape="huber", width=1.3), RobustKerne
 NAMES = [kernel.shape for kernel in KERNELS]
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.4, 0.2), np.array([0.3, 0.1, -0.1]))
 R = np.array([[4e-4, 1.2e-4], [1.2e-4, 1e-4]])
-PLACES = {7: np.array([3.0, 0.5, -1.0]), 4: np.array([3.2, 1.4, -1.1]), 9: np.array([2.6, -0.6, -0.9])}
+PLACES = {
+    7: np.array([3.0, 0.5, -1.0]),
+    4: np.array([3.2, 1.4, -1.1]),
+    9: np.array([2.6, -0.6, -0.9]),
+}
 
 
 def world() -> gtsam.Values:
-    poses = [gtsam.Pose3(gtsam.Rot3.Ypr(3 + 0.1 * k, 0.05, -0.03), np.array([6, 1, -0.2 * k])) for k in range(6)]
-    named = {f"X{k}": pose for k, pose in enumerate(poses)} | {f"L{i}": place for i, place in PLACES.items()}
+    poses = [
+        gtsam.Pose3(
+            gtsam.Rot3.Ypr(3 + 0.1 * k, 0.05, -0.03), np.array([6, 1, -0.2 * k])
+        )
+        for k in range(6)
+    ]
+    named = {f"X{k}": pose for k, pose in enumerate(poses)} | {
+        f"L{i}": place for i, place in PLACES.items()
+    }
     return values_of(**named)
 
 
@@ -51,13 +62,25 @@ def wrapped(e: Floats) -> Floats:
     return np.array([e[0], (e[1] + np.pi) % (2 * np.pi) - np.pi])
 
 
-def watch(values: gtsam.Values, point: Floats, frames: list[int], off: Floats, said: dict[int, float]) -> TrackedObject:
+def watch(
+    values: gtsam.Values,
+    point: Floats,
+    frames: list[int],
+    off: Floats,
+    said: dict[int, float],
+) -> TrackedObject:
     """Something seen in some frames, off by this, shape (n, 2), in standard deviations."""
     noise = np.linalg.cholesky(R)
     return TrackedObject(
         IdentityPosterior(said),
         [
-            Sighting(k, k, Sightline(X(k), MOUNTED, shown(values, k, point) + noise @ e), R, None)
+            Sighting(
+                k,
+                k,
+                Sightline(X(k), MOUNTED, shown(values, k, point) + noise @ e),
+                R,
+                None,
+            )
             for k, e in zip(frames, off, strict=True)
         ],
     )
@@ -66,7 +89,9 @@ def watch(values: gtsam.Values, point: Floats, frames: list[int], off: Floats, s
 def log_density(values: gtsam.Values, seen: TrackedObject, point: Floats) -> float:
     """Of all sightings of a watch, were they of something at a point."""
     at = [(s.line.z, shown(values, s.stamp_ns, point)) for s in seen.sightings]
-    return sum(float(multivariate_normal.logpdf(wrapped(z - h), np.zeros(2), R)) for z, h in at)
+    return sum(
+        float(multivariate_normal.logpdf(wrapped(z - h), np.zeros(2), R)) for z, h in at
+    )
 
 
 def log_weights(said: dict[int, float], i: int, count: int = 20) -> tuple[float, float]:
@@ -85,7 +110,9 @@ def some_watches(values: gtsam.Values) -> list[TrackedObject]:
     rng = np.random.default_rng(4)
     return [
         watch(values, PLACES[7], [0, 1, 2], rng.standard_normal((3, 2)), {7: 0.9}),
-        watch(values, PLACES[4], [3], 3.0 * rng.standard_normal((1, 2)), {7: 0.6, 4: 0.3}),
+        watch(
+            values, PLACES[4], [3], 3.0 * rng.standard_normal((1, 2)), {7: 0.6, 4: 0.3}
+        ),
         watch(values, PLACES[9], [1, 4], rng.standard_normal((2, 2)), {}),
     ]
 
@@ -93,7 +120,9 @@ def some_watches(values: gtsam.Values) -> list[TrackedObject]:
 @pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
 def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
     e = np.sinh(np.linspace(-18.0, 18.0, 400_001))  # as far as Cauchy's tails matter
-    assert trapezoid(np.exp(kernel.log_normaliser - kernel.loss(e)), e) == pytest.approx(1.0, abs=1e-6)
+    assert trapezoid(
+        np.exp(kernel.log_normaliser - kernel.loss(e)), e
+    ) == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:], ids=NAMES[1:])
@@ -101,18 +130,34 @@ def test_a_kernels_loss_is_that_of_gtsam(kernel: Kernel) -> None:
     estimator = kernel.estimator()
     assert estimator is not None
     for e in [-30.0, -2.0, -1.31, -1.29, -0.4, 0.0, 0.7, 1.5, 8.0]:
-        assert float(kernel.loss(np.array(e))) == pytest.approx(estimator.loss(e), rel=1e-12)
+        assert float(kernel.loss(np.array(e))) == pytest.approx(
+            estimator.loss(e), rel=1e-12
+        )
 
 
 def losses(kernel: Kernel, noise: Floats) -> Floats:
     """That of the graph's factors and that of the mixture, shape (n, 2), of points at elevation 0 all about one."""
-    estimator, values, found = kernel.estimator(), values_of(X0=gtsam.Pose3(), L7=np.zeros(3)), []
+    estimator, values, found = (
+        kernel.estimator(),
+        values_of(X0=gtsam.Pose3(), L7=np.zeros(3)),
+        [],
+    )
     z = np.array([3.0, 0.2])
-    robust = (lambda model: gtsam.noiseModel.Robust.Create(estimator, model)) if estimator else plain
-    made = factors.landmark_sighting(X(0), L(7), gtsam.Pose3(), z, noise, robust).values()
-    errors = Errors([Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), noise, None)], values)
+    robust = (
+        (lambda model: gtsam.noiseModel.Robust.Create(estimator, model))
+        if estimator
+        else plain
+    )
+    made = factors.landmark_sighting(
+        X(0), L(7), gtsam.Pose3(), z, noise, robust
+    ).values()
+    errors = Errors(
+        [Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), noise, None)], values
+    )
     for size, angle in product([0.3, 1.0, 3.0, 12.0], np.linspace(0.0, 2 * np.pi, 13)):
-        r, a = z + np.linalg.cholesky(noise) @ (size * np.array([np.cos(angle), np.sin(angle)]))
+        r, a = z + np.linalg.cholesky(noise) @ (
+            size * np.array([np.cos(angle), np.sin(angle)])
+        )
         point = np.array([r * np.cos(a), r * np.sin(a), 0.0])
         values.update(L(7), point)
         theirs = sum(factor.error(values) for factor in made)
@@ -128,7 +173,9 @@ def test_the_mixtures_loss_is_that_of_the_graphs_factors(kernel: Kernel) -> None
 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:], ids=NAMES[1:])
-def test_a_kernel_on_correlated_noise_is_once_to_twice_as_strict_in_the_mixture(kernel: Kernel) -> None:
+def test_a_kernel_on_correlated_noise_is_once_to_twice_as_strict_in_the_mixture(
+    kernel: Kernel,
+) -> None:
     """The factor's is of the norm, the mixture's of both components: a loss that is concave in e² adds up to more."""
     theirs, ours = losses(kernel, R).T
     assert (ours >= theirs * (1 - 1e-9)).all()
@@ -145,7 +192,9 @@ def test_a_new_detections_components_are_predictive_densities() -> None:
     said = {4: 0.6, 5: 0.3}
     found = MIXTURE.at_first(IdentityPosterior(said), [7, 4, 9], z, expected, S)
     for k, i in enumerate((7, 4, 9)):
-        density = multivariate_normal.logpdf(wrapped(z - expected[k]), np.zeros(2), S[k])
+        density = multivariate_normal.logpdf(
+            wrapped(z - expected[k]), np.zeros(2), S[k]
+        )
         assert found[i] == pytest.approx(density + log_weights(said, i)[0])
     assert found[5] == pytest.approx(LOG_U + log_weights(said, 5)[0])
     assert found[None] == pytest.approx(LOG_U + log_weights(said, 5)[1])
@@ -154,30 +203,47 @@ def test_a_new_detections_components_are_predictive_densities() -> None:
 
 def test_gains_are_densities_over_that_of_no_landmark() -> None:
     values = world()
-    watches, points = some_watches(values), np.array([PLACES[7], PLACES[4] + [0.0, 0.05, 0.0]])
+    watches, points = (
+        some_watches(values),
+        np.array([PLACES[7], PLACES[4] + [0.0, 0.05, 0.0]]),
+    )
     found = MIXTURE.gains(7, watches, points, values)
     for n, seen in enumerate(watches):
         named, none = log_weights(seen.posterior.probability, 7)
         for k, point in enumerate(points):
-            expected = named + log_density(values, seen, point) - none - of_nothing(seen)
+            expected = (
+                named + log_density(values, seen, point) - none - of_nothing(seen)
+            )
             assert found[n, k] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("is_alone", [True, False])
-def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_alone: bool) -> None:
+def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(
+    is_alone: bool,
+) -> None:
     """Else its perfect fit would be praised; others fit it, or do not, as any landmark."""
     values = world()
     watches = some_watches(values)
     own, other, third = watches
-    found = MIXTURE.scores(watches, values, [7, 4, None], {7: 3 if is_alone else 4, 4: 6})
+    found = MIXTURE.scores(
+        watches, values, [7, 4, None], {7: 3 if is_alone else 4, 4: 6}
+    )
     in_place = log_density(values, own, PLACES[7])
     weight, none = log_weights({7: 0.9}, 7)
-    assert found[0][7] == pytest.approx(weight + (of_nothing(own) if is_alone else in_place))
-    assert found[0][4] == pytest.approx(log_weights({7: 0.9}, 4)[0] + log_density(values, own, PLACES[4]))
+    assert found[0][7] == pytest.approx(
+        weight + (of_nothing(own) if is_alone else in_place)
+    )
+    assert found[0][4] == pytest.approx(
+        log_weights({7: 0.9}, 4)[0] + log_density(values, own, PLACES[4])
+    )
     assert found[0][None] == pytest.approx(none + of_nothing(own))
     others_weight = log_weights(other.posterior.probability, 7)[0]
-    assert found[1][7] == pytest.approx(others_weight + log_density(values, other, PLACES[7]))
-    assert found[2][4] == pytest.approx(log_weights({}, 4)[0] + log_density(values, third, PLACES[4]))
+    assert found[1][7] == pytest.approx(
+        others_weight + log_density(values, other, PLACES[7])
+    )
+    assert found[2][4] == pytest.approx(
+        log_weights({}, 4)[0] + log_density(values, third, PLACES[4])
+    )
     assert [list(row) for row in found] == [[4, 7, None]] * 3
 
 
@@ -189,16 +255,26 @@ def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     for frames in ([0, 1], [0, 1], [2], [3], [4, 5]):
         place = [*PLACES.values(), np.array([3.5, 0.9, -1.0])][int(rng.integers(4))]
         said = {int(rng.choice(list(PLACES))): float(rng.choice([0.4, 0.9]))}
-        watches.append(watch(values, place, frames, rng.standard_normal((len(frames), 2)), said))
+        watches.append(
+            watch(values, place, frames, rng.standard_normal((len(frames), 2)), said)
+        )
     found = MIXTURE.best(watches, values, [None] * 5, dict.fromkeys(PLACES, 9))
     table: list[dict[int | None, float]] = []
     for seen in watches:
         weights = {i: log_weights(seen.posterior.probability, i) for i in PLACES}
-        placed = {i: named + log_density(values, seen, PLACES[i]) for i, (named, _) in weights.items()}
+        placed = {
+            i: named + log_density(values, seen, PLACES[i])
+            for i, (named, _) in weights.items()
+        }
         table.append(placed | {None: weights[7][1] + of_nothing(seen)})
     total = {}
     for choices in product([*PLACES, None], repeat=5):
-        frames = [(i, k) for seen, i in zip(watches, choices, strict=True) if i is not None for k in seen.stamps_ns]
+        frames = [
+            (i, k)
+            for seen, i in zip(watches, choices, strict=True)
+            if i is not None
+            for k in seen.stamps_ns
+        ]
         if len(set(frames)) == len(frames):  # no landmark is twice in a frame
             total[choices] = sum(row[i] for row, i in zip(table, choices, strict=True))
     best, second = sorted(total, key=total.__getitem__, reverse=True)[:2]
@@ -212,18 +288,27 @@ HERE, THERE = PLACES[7], PLACES[7] + np.array([0.0, 0.4, 0.0])
 
 def vote(watches: list[TrackedObject], point: Floats) -> float:
     values, (weight, none) = world(), log_weights(SAID, 7)
-    gains = (weight + log_density(values, w, point) - none - of_nothing(w) for w in watches)
+    gains = (
+        weight + log_density(values, w, point) - none - of_nothing(w) for w in watches
+    )
     return sum(max(gain, 0.0) for gain in gains)
 
 
-@pytest.mark.parametrize(("here", "there"), [(6, 2), (6, 5), (4, 4), (2, 6), (1, 3), (0, 2)])
+@pytest.mark.parametrize(
+    ("here", "there"), [(6, 2), (6, 5), (4, 4), (2, 6), (1, 3), (0, 2)]
+)
 @pytest.mark.parametrize("strays", [0, 1, 3])
-def test_the_place_with_most_votes_wins_whatever_lies_far_off(here: int, there: int, strays: int) -> None:
+def test_the_place_with_most_votes_wins_whatever_lies_far_off(
+    here: int, there: int, strays: int
+) -> None:
     """What fits nowhere has no voice, however far off it is; summed errors would be drawn to it."""
     values = world()
     far = [HERE + np.array([0.0, 1.2 + 0.5 * k, 0.0]) for k in range(strays)]
     rng, points = np.random.default_rng(3), [HERE] * here + [THERE] * there + far
-    watches = [watch(values, point, [0], 0.3 * rng.standard_normal((1, 2)), SAID) for point in points]
+    watches = [
+        watch(values, point, [0], 0.3 * rng.standard_normal((1, 2)), SAID)
+        for point in points
+    ]
     elsewhere = [seen.sightings[0].line.point(values) for seen in watches[here:]]
     best = max(elsewhere, key=lambda p: vote(watches, p))
     is_moved = bool(vote(watches, best) >= vote(watches, HERE) + mixture.LEAST_MARGIN)

@@ -34,12 +34,22 @@ from .made import POSES, polar, random_covariance, some_motion
 angles = st.floats(-3.0, 3.0)
 coordinates = st.floats(-20.0, 20.0)
 poses = st.builds(
-    lambda *v: gtsam.Pose3.Expmap(np.array(v)), angles, angles, angles, coordinates, coordinates, coordinates
+    lambda *v: gtsam.Pose3.Expmap(np.array(v)),
+    angles,
+    angles,
+    angles,
+    coordinates,
+    coordinates,
+    coordinates,
 )
 tiny = st.floats(-1e-7, 1e-7)
-near_identity = st.builds(lambda *v: gtsam.Pose3.Expmap(np.array(v)), tiny, tiny, tiny, tiny, tiny, tiny)
+near_identity = st.builds(
+    lambda *v: gtsam.Pose3.Expmap(np.array(v)), tiny, tiny, tiny, tiny, tiny, tiny
+)
 any_pose = poses | near_identity
-views = st.tuples(st.floats(0.5, 15.0), st.floats(-math.pi, math.pi), st.floats(-1.2, 1.2))
+views = st.tuples(
+    st.floats(0.5, 15.0), st.floats(-math.pi, math.pi), st.floats(-1.2, 1.2)
+)
 
 
 @given(any_pose, any_pose, views)
@@ -58,14 +68,20 @@ def test_a_located_point_is_seen_there_and_derivatives_of_both_are_those_of_diff
     assert z[0] == pytest.approx(view[0], rel=1e-9)
     assert math.remainder(z[1] - view[1], 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
     assert_allclose(z, range_azimuth(world_T_sonar, p), atol=1e-12)
-    check_derivative(lambda xi: range_azimuth(sonar(xi), p), H_pose, np.zeros(6), angles=[1])
-    check_derivative(lambda q: range_azimuth(world_T_sonar, q), H_landmark, p, angles=[1])
+    check_derivative(
+        lambda xi: range_azimuth(sonar(xi), p), H_pose, np.zeros(6), angles=[1]
+    )
+    check_derivative(
+        lambda q: range_azimuth(world_T_sonar, q), H_landmark, p, angles=[1]
+    )
     check_derivative(lambda xi: locate(sonar(xi), *view), G_pose, np.zeros(6))
     check_derivative(lambda at: locate(world_T_sonar, *at), G_view, view)
 
 
 def test_the_check_finds_a_missing_inverse_square_and_a_missing_adjoint():
-    body_T_sonar = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.5, 0.0), np.array([0.4, 0.1, -0.2]))
+    body_T_sonar = gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(0.0, 0.5, 0.0), np.array([0.4, 0.1, -0.2])
+    )
     world_T_body = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 1.0, 2.0, 3.0]))
     q = sonar_point(3.0, 0.4, 0.1)
     _, D_q = project(q)
@@ -73,12 +89,16 @@ def test_the_check_finds_a_missing_inverse_square_and_a_missing_adjoint():
     _, H_pose, _ = range_azimuth_jacobians(world_T_body, body_T_sonar, p)
 
     def moved(xi):
-        return range_azimuth(world_T_body.compose(gtsam.Pose3.Expmap(xi)).compose(body_T_sonar), p)
+        return range_azimuth(
+            world_T_body.compose(gtsam.Pose3.Expmap(xi)).compose(body_T_sonar), p
+        )
 
     check_derivative(lambda q: project(q)[0], D_q, q)
     check_derivative(moved, H_pose, np.zeros(6))
     with pytest.raises(AssertionError, match="row 1"):
-        check_derivative(lambda q: project(q)[0], D_q * [[1.0], [q[0] ** 2 + q[1] ** 2]], q)
+        check_derivative(
+            lambda q: project(q)[0], D_q * [[1.0], [q[0] ** 2 + q[1] ** 2]], q
+        )
     with pytest.raises(AssertionError, match="by differences"):
         check_derivative(moved, H_pose @ body_T_sonar.AdjointMap(), np.zeros(6))
 
@@ -94,23 +114,33 @@ def test_a_wrapped_angle_is_the_same_direction(angle):
     st.floats(-0.3, 0.3), st.floats(0.2, 0.9), st.floats(-3, 3), st.floats(-0.2, 0.2), st.floats(-0.12, 0.12),
     st.floats(1.0, 3.0),
 )  # fmt: skip
-def test_elevation_on_the_floor_is_that_of_a_point_on_it(roll, pitch, yaw, azimuth, elevation, range_m):
-    world_T_sonar = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([1.0, -2.0, 3.0]))
+def test_elevation_on_the_floor_is_that_of_a_point_on_it(
+    roll, pitch, yaw, azimuth, elevation, range_m
+):
+    world_T_sonar = gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([1.0, -2.0, 3.0])
+    )
     floor_z = locate(world_T_sonar, range_m, azimuth, elevation)[2]
     found = elevation_on_floor(world_T_sonar, range_m, azimuth, floor_z, 0.244)
     assert found is not None
     assert abs(found) <= abs(elevation) + 1e-7
-    assert locate(world_T_sonar, range_m, azimuth, found)[2] == pytest.approx(floor_z, abs=1e-9)
+    assert locate(world_T_sonar, range_m, azimuth, found)[2] == pytest.approx(
+        floor_z, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("floor_z", [-0.2, -5.0, 4.0])
 def test_a_floor_outside_the_aperture_gives_no_elevation(floor_z):
     world_T_sonar = gtsam.Pose3(gtsam.Rot3.Pitch(math.radians(30)), np.zeros(3))
-    assert elevation_on_floor(world_T_sonar, 2.0, 0.0, -1.0, 0.244) == pytest.approx(0.0, abs=1e-12)
+    assert elevation_on_floor(world_T_sonar, 2.0, 0.0, -1.0, 0.244) == pytest.approx(
+        0.0, abs=1e-12
+    )
     assert elevation_on_floor(world_T_sonar, 2.0, 0.0, floor_z, 0.244) is None
 
 
-BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.4, -0.3), np.array([0.4, 0.1, -0.2]))
+BODY_T_SONAR = gtsam.Pose3(
+    gtsam.Rot3.RzRyRx(0.1, 0.4, -0.3), np.array([0.4, 0.1, -0.2])
+)
 keyframes = pytest.mark.parametrize("keyframe", POSES.values(), ids=POSES)
 with_bias = pytest.mark.parametrize("bias", [True, False], ids=["bias", "no bias"])
 
@@ -124,16 +154,22 @@ def observed(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
     return polar(world_T_body.compose(BODY_T_SONAR), point)
 
 
-def ahead(keyframe: gtsam.Pose3, motion: PreintegratedMotion, azimuth_rad: float = 0.3) -> Floats:
+def ahead(
+    keyframe: gtsam.Pose3, motion: PreintegratedMotion, azimuth_rad: float = 0.3
+) -> Floats:
     q = 3.0 * np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.1])
     return keyframe.compose(motion.i_T_j).compose(BODY_T_SONAR).transformFrom(q)
 
 
 def made(keyframe, motion, joint, bias: bool = True) -> PredictedView:
-    return PredictedView(Tie(X(2), B(0) if bias else None, motion), keyframe, BODY_T_SONAR, joint)
+    return PredictedView(
+        Tie(X(2), B(0) if bias else None, motion), keyframe, BODY_T_SONAR, joint
+    )
 
 
-def expected_of(view: PredictedView, landmarks: dict[int, Floats], *ids: int) -> tuple[Floats, Floats]:
+def expected_of(
+    view: PredictedView, landmarks: dict[int, Floats], *ids: int
+) -> tuple[Floats, Floats]:
     return view.expect([L(i) for i in ids], np.array([landmarks[i] for i in ids]))
 
 
@@ -146,17 +182,28 @@ def some_view(keyframe: gtsam.Pose3, bias: bool, seed: int = 0, sigma: float = 0
     return made(keyframe, motion, joint, bias), motion, landmarks, joint
 
 
-def moved(keyframe: gtsam.Pose3, motion: PreintegratedMotion, xi: Floats, db: Floats, noise: Floats) -> gtsam.Pose3:
+def moved(
+    keyframe: gtsam.Pose3,
+    motion: PreintegratedMotion,
+    xi: Floats,
+    db: Floats,
+    noise: Floats,
+) -> gtsam.Pose3:
     """X Exp(xi) M Exp(D db + noise)."""
     wrong = gtsam.Pose3.Expmap(motion.D_bias @ db + noise)
     return keyframe.compose(gtsam.Pose3.Expmap(xi)).compose(motion.i_T_j).compose(wrong)
 
 
-def numerical_of_view(keyframe: gtsam.Pose3, motion: PreintegratedMotion, point: Floats) -> Floats:
+def numerical_of_view(
+    keyframe: gtsam.Pose3, motion: PreintegratedMotion, point: Floats
+) -> Floats:
     """Derivative of what is observed by (pose, landmark, bias, motion), by differences, shape (2, 26)."""
 
     def at(change: Floats) -> Floats:
-        return observed(moved(keyframe, motion, change[:6], change[9:20], change[20:]), point + change[6:9])
+        return observed(
+            moved(keyframe, motion, change[:6], change[9:20], change[20:]),
+            point + change[6:9],
+        )
 
     return central_differences(at, np.zeros(26), angles=[1])
 
@@ -170,7 +217,9 @@ def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed
     Expected jointly each landmark is as alone.
     """
     view, motion, landmarks, joint = some_view(keyframe, bias, seed)
-    together, cov = view.expect_jointly([L(5), L(6)], np.array([landmarks[5], landmarks[6]]), [])
+    together, cov = view.expect_jointly(
+        [L(5), L(6)], np.array([landmarks[5], landmarks[6]]), []
+    )
     for k, (landmark_id, point) in enumerate(landmarks.items()):
         keys = [X(2), L(landmark_id), *([B(0)] if bias else [])]
         P = block_of(joint, keys)
@@ -192,11 +241,15 @@ def test_the_variance_of_a_height_is_that_of_keyframe_and_motion(keyframe):
     q = np.array([1.5, -0.4, -0.8])
 
     def z(change: Floats) -> float:
-        return moved(keyframe, motion, change[:6], np.zeros(11), change[6:]).transformFrom(q)[2]
+        return moved(
+            keyframe, motion, change[:6], np.zeros(11), change[6:]
+        ).transformFrom(q)[2]
 
     J = central_differences(z, np.zeros(12))
     expected = J[:6] @ joint.at(X(2), X(2)) @ J[:6] + J[6:] @ motion.covariance @ J[6:]
-    assert view.height_variances(body.transformFrom(q)[None])[0] == pytest.approx(expected, rel=1e-6)
+    assert view.height_variances(body.transformFrom(q)[None])[0] == pytest.approx(
+        expected, rel=1e-6
+    )
 
 
 @keyframes
@@ -207,13 +260,28 @@ def test_blurred_noise_is_the_noise_and_the_variances_of_the_motion(keyframe):
     short = some_motion(9)
     expected = R + np.diag(np.diag(H @ short.covariance @ H.T))
     kept = R.copy()
-    assert np.allclose(view.blurred(R[None], short, landmarks[5][None])[0], expected, rtol=1e-6, atol=1e-12)
+    assert np.allclose(
+        view.blurred(R[None], short, landmarks[5][None])[0],
+        expected,
+        rtol=1e-6,
+        atol=1e-12,
+    )
     assert np.array_equal(R, kept)
     assert np.all(np.diag(expected) > 1.01 * np.diag(R))
 
 
-@pytest.mark.parametrize(("azimuth_sigma", "larger"), [(0.03, 25.0), (0.08, 64.0)], ids=["by range", "by azimuth"])
-@given(st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi), st.floats(-1, 1), st.floats(-0.9, 0.9), st.floats(-0.9, 0.9))
+@pytest.mark.parametrize(
+    ("azimuth_sigma", "larger"),
+    [(0.03, 25.0), (0.08, 64.0)],
+    ids=["by range", "by azimuth"],
+)
+@given(
+    st.floats(-np.pi, np.pi),
+    st.floats(-np.pi, np.pi),
+    st.floats(-1, 1),
+    st.floats(-0.9, 0.9),
+    st.floats(-0.9, 0.9),
+)
 @settings(max_examples=25)
 def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
     azimuth_sigma, larger, measured, expected, range_off, by_prior, by_noise
@@ -224,12 +292,16 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
 
     prior, noise = cov(0.1, azimuth_sigma, by_prior), cov(0.02, 0.01, by_noise)
     z, predicted = np.array([[3.0 + range_off, measured]]), np.array([[3.0, expected]])
-    (innovation,), (S,), (distance,), (gain,) = weigh(z, predicted, prior[None], noise[None])
+    (innovation,), (S,), (distance,), (gain,) = weigh(
+        z, predicted, prior[None], noise[None]
+    )
     assert innovation[0] == pytest.approx(range_off)
     assert abs(innovation[1]) <= np.pi + 1e-12
     assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)
     assert np.array_equal(S, prior + noise)
-    assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9, abs=1e-12)
+    assert distance == pytest.approx(
+        innovation @ np.linalg.solve(S, innovation), rel=1e-9, abs=1e-12
+    )
     assert gain == pytest.approx(larger)
 
 
@@ -237,18 +309,29 @@ DRAWS = 20_000
 SMALL = 1e-3
 
 
-@pytest.mark.parametrize("seen_from", [X(1), X(2)], ids=["an earlier keyframe", "the same keyframe"])
+@pytest.mark.parametrize(
+    "seen_from", [X(1), X(2)], ids=["an earlier keyframe", "the same keyframe"]
+)
 def test_the_joint_covariance_is_that_of_many_draws(seen_from: int):
     """Keyframes, bias, landmark, motion and the located point's own noise, drawn with their correlations."""
     keyframe, motion = POSES["random"], some_motion(3, SMALL)
-    earlier = keyframe.compose(gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([-0.4, 0.2, 0.0])))
+    earlier = keyframe.compose(
+        gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([-0.4, 0.2, 0.0]))
+    )
     landmark, located = ahead(keyframe, motion), ahead(keyframe, motion, -0.4)
-    joint = joint_of(random_covariance(26, SMALL, 5), {X(1): 6, X(2): 6, B(0): 11, L(5): 3})
+    joint = joint_of(
+        random_covariance(26, SMALL, 5), {X(1): 6, X(2): 6, B(0): 11, L(5): 3}
+    )
     anchor = {X(1): earlier, X(2): keyframe}[seen_from]
     body_p, own = anchor.transformTo(located), random_covariance(3, SMALL, 7)
-    by_pose = central_differences(lambda xi: anchor.compose(gtsam.Pose3.Expmap(xi)).transformFrom(body_p), np.zeros(6))
+    by_pose = central_differences(
+        lambda xi: anchor.compose(gtsam.Pose3.Expmap(xi)).transformFrom(body_p),
+        np.zeros(6),
+    )
     source = Source(seen_from, located, by_pose, own)
-    predicted, cov = made(keyframe, motion, joint).expect_jointly([L(5)], landmark[None], [source])
+    predicted, cov = made(keyframe, motion, joint).expect_jointly(
+        [L(5)], landmark[None], [source]
+    )
     rng = np.random.default_rng(1)
     drawn = rng.multivariate_normal(np.zeros(26), joint.matrix, DRAWS)
     noise = rng.multivariate_normal(np.zeros(6), motion.covariance, DRAWS)
@@ -258,19 +341,31 @@ def test_the_joint_covariance_is_that_of_many_draws(seen_from: int):
         body = moved(keyframe, motion, x[6:12], x[12:23], e)
         of_anchor = x[:6] if seen_from == X(1) else x[6:12]
         point = anchor.compose(gtsam.Pose3.Expmap(of_anchor)).transformFrom(body_p) + d
-        shown.append(np.concatenate([observed(body, landmark + x[23:]), observed(body, point)]))
+        shown.append(
+            np.concatenate([observed(body, landmark + x[23:]), observed(body, point)])
+        )
     sigma = np.sqrt(np.diag(cov))
-    assert predicted.ravel() == pytest.approx(np.mean(shown, axis=0), abs=5 * sigma.max() / np.sqrt(DRAWS))
-    assert np.cov(np.transpose(shown)) / np.outer(sigma, sigma) == pytest.approx(cov / np.outer(sigma, sigma), abs=0.04)
+    assert predicted.ravel() == pytest.approx(
+        np.mean(shown, axis=0), abs=5 * sigma.max() / np.sqrt(DRAWS)
+    )
+    assert np.cov(np.transpose(shown)) / np.outer(sigma, sigma) == pytest.approx(
+        cov / np.outer(sigma, sigma), abs=0.04
+    )
     assert np.abs(cov[:2, 2:] / np.outer(sigma[:2], sigma[2:])).max() > 0.2
 
 
-@pytest.mark.parametrize("left_out", ["pose with landmark", "pose with bias", "bias with landmark", "motion"])
+@pytest.mark.parametrize(
+    "left_out", ["pose with landmark", "pose with bias", "bias with landmark", "motion"]
+)
 def test_no_part_of_the_covariance_is_idle(left_out):
     """Negative control: each cross-covariance, and the motion's noise, changes what is expected."""
     view, motion, landmarks, joint = some_view(POSES["random"], True)
     S = expected_of(view, landmarks, 5)[1][0]
-    pairs = {"pose with landmark": (X(2), L(5)), "pose with bias": (X(2), B(0)), "bias with landmark": (B(0), L(5))}
+    pairs = {
+        "pose with landmark": (X(2), L(5)),
+        "pose with bias": (X(2), B(0)),
+        "bias with landmark": (B(0), L(5)),
+    }
     if left_out == "motion":
         motion = replace(motion, covariance=np.zeros((6, 6)))
     else:

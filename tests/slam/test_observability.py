@@ -22,7 +22,16 @@ from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
 from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open
 from sonar_graph.states import Estimate, Outcome, Refusal
 
-from .made import estimates_of, graph_of, isam2_params, isotropic, plain, point_prior, smoother_with, values_of
+from .made import (
+    estimates_of,
+    graph_of,
+    isam2_params,
+    isotropic,
+    plain,
+    point_prior,
+    smoother_with,
+    values_of,
+)
 
 HERE = values_of(X0=gtsam.Pose3(), L1=np.array([2.0, 0.0, 0.0]))
 
@@ -43,13 +52,18 @@ def along(direction: list[float], sigma: float) -> gtsam.NonlinearFactor:
 def test_nearly_the_same_is_not_the_same(tilt: float) -> None:
     """Two directions apart by a small angle hold both, however badly; the same direction twice holds one."""
     made = [along([0.0, 0.0, 1.0], 0.1), along([1.0, 1.0, 0.0], 0.1)]
-    assert left_open(graph_of([*made, along([1.0, 1.0 + tilt, 0.0], 0.1)]), HERE, [L(1)]) == []
+    assert (
+        left_open(graph_of([*made, along([1.0, 1.0 + tilt, 0.0], 0.1)]), HERE, [L(1)])
+        == []
+    )
     (open_,) = left_open(graph_of([*made, along([1.0, 1.0, 0.0], 0.1)]), HERE, [L(1)])
     np.testing.assert_allclose(open_.directions @ [1.0, 1.0, 0.0], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("sigma", [1e-6, 1.0, 1e6])
-def test_what_is_open_does_not_depend_on_how_surely_the_rest_is_held(sigma: float) -> None:
+def test_what_is_open_does_not_depend_on_how_surely_the_rest_is_held(
+    sigma: float,
+) -> None:
     made = [along([0.0, 0.0, 1.0], sigma), along([1.0, 0.0, 0.0], 1.0)]
     (open_,) = left_open(graph_of(made), HERE, [L(1)])
     np.testing.assert_allclose(np.abs(open_.directions), [[0.0, 1.0, 0.0]], atol=1e-9)
@@ -62,7 +76,10 @@ def test_a_range_leaves_open_what_is_across_it() -> None:
     (across,) = left_open(graph_of([distance]), HERE, [L(1)])
     assert np.linalg.matrix_rank(across.directions) == 2
     np.testing.assert_allclose(across.directions[:, 0], 0.0, atol=1e-9)
-    weak = [along([0.0, 1.0, 0.0], 0.9 / LEAST_SAID), along([0.0, 0.0, 1.0], 1.1 / LEAST_SAID)]
+    weak = [
+        along([0.0, 1.0, 0.0], 0.9 / LEAST_SAID),
+        along([0.0, 0.0, 1.0], 1.1 / LEAST_SAID),
+    ]
     assert left_open(graph_of([distance, *weak]), HERE, [L(1)]) == []
     (left,) = left_open(graph_of([distance, *weak]), HERE, [L(1)], LEAST_SAID)
     assert left.axes() == "z"
@@ -83,7 +100,9 @@ def without(row: int, sensor: str = "detections") -> Sequence:
 
 
 def run(sequence: Sequence, history: str = "whole") -> tuple[Isam2, list[Estimate]]:
-    params = isam2_params(history__policy=history, smoother__lag_s=8.0, smoother__waiting_gain=0.0)
+    params = isam2_params(
+        history__policy=history, smoother__lag_s=8.0, smoother__waiting_gain=0.0
+    )
     estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), params)
     return estimator, estimates_of(estimator, sequence, 1.0)
 
@@ -92,23 +111,43 @@ def numbers(outcome: tuple[Isam2, list[Estimate]]) -> np.ndarray:
     """Causal, smoothed and landmarks' estimates with their covariances."""
     estimator, estimates = outcome
     smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
-    columns = [np.array([e.world_T_body.matrix() for e in estimates]), np.array([e.covariance for e in estimates])]
-    columns += [smoothed.positions, smoothed.covariances, landmarks.positions, landmarks.covariances]
+    columns = [
+        np.array([e.world_T_body.matrix() for e in estimates]),
+        np.array([e.covariance for e in estimates]),
+    ]
+    columns += [
+        smoothed.positions,
+        smoothed.covariances,
+        landmarks.positions,
+        landmarks.covariances,
+    ]
     return np.concatenate([column.ravel() for column in columns])
 
 
 FAULTS = [
-    *(("detections", "range_azimuth_cov", np.diag(cov)) for cov in ([0.0, 0.0], [1e-4, -1e-4], [np.inf, 1e-4])),
+    *(
+        ("detections", "range_azimuth_cov", np.diag(cov))
+        for cov in ([0.0, 0.0], [1e-4, -1e-4], [np.inf, 1e-4])
+    ),
     ("detections", "range_azimuth_cov", np.full((2, 2), 1e-4)),
     *(("detections", "range_m", range_m) for range_m in (0.0, -3.0)),
-    *(("dvl", "velocity_cov", cov) for cov in (np.zeros((3, 3)), np.diag([1e-4, 1e-4, -1e-4]))),
+    *(
+        ("dvl", "velocity_cov", cov)
+        for cov in (np.zeros((3, 3)), np.diag([1e-4, 1e-4, -1e-4]))
+    ),
     *(("depth", "variance_m2", variance) for variance in (0.0, -1e-4, np.inf)),
 ]
 
 
 @MODES
-@pytest.mark.parametrize(("sensor", "column", "value"), FAULTS, ids=lambda value: str(value).replace("\n", ""))
-def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(sensor, column, value, history):
+@pytest.mark.parametrize(
+    ("sensor", "column", "value"),
+    FAULTS,
+    ids=lambda value: str(value).replace("\n", ""),
+)
+def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(
+    sensor, column, value, history
+):
     block = getattr(mission(), sensor)
     values = getattr(block, column).copy()
     values[ROW] = value
@@ -118,15 +157,23 @@ def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(sensor, col
     stamp_ns = block.stamps_ns[ROW]
     if sensor == "detections":
         log = faulty[0].detections()
-        assert [log.stamps_ns[k] for k, outcome in enumerate(log.outcomes) if outcome is Outcome.UNSOUND] == [stamp_ns]
+        assert [
+            log.stamps_ns[k]
+            for k, outcome in enumerate(log.outcomes)
+            if outcome is Outcome.UNSOUND
+        ] == [stamp_ns]
         assert len(log) == len(mission().detections)
     else:
-        refused = [row for row in faulty[0].refused_rows() if row.reason is Refusal.UNSOUND]
+        refused = [
+            row for row in faulty[0].refused_rows() if row.reason is Refusal.UNSOUND
+        ]
         assert [(row.sensor, row.stamp_ns) for row in refused] == [(sensor, stamp_ns)]
 
 
 def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
-    fine, late = (Isam2(mission().calibration, Odometry(mission().calibration)) for _ in range(2))
+    fine, late = (
+        Isam2(mission().calibration, Odometry(mission().calibration)) for _ in range(2)
+    )
     for step in mission().replay(mission().instants(0.5)):
         half_ns = (step.depth.stamps_ns[0] + step.depth.stamps_ns[-1]) // 2
         parts = step.depth.between(0, half_ns), step.depth.between(half_ns, step.end_ns)
@@ -134,29 +181,47 @@ def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
         estimates = fine.process(now), late.process(now)
         for estimator, estimate in zip((fine, late), estimates, strict=True):
             assert estimate is not None
-            estimator.process(replace(step, imu=None, dvl=None, detections=None, depth=None))
+            estimator.process(
+                replace(step, imu=None, dvl=None, detections=None, depth=None)
+            )
         late.process(Measurements(step.end_ns, depth=parts[0]))
     assert np.array_equal(fine.trajectory().positions, late.trajectory().positions)
     assert not fine.refused_rows()
-    assert {(row.sensor, row.reason) for row in late.refused_rows()} == {("depth", Refusal.LATE)}
+    assert {(row.sensor, row.reason) for row in late.refused_rows()} == {
+        ("depth", Refusal.LATE)
+    }
 
 
 def test_a_key_that_is_taken_is_named_and_nothing_is_added():
     smoother, other = begun(), begun()
-    with pytest.raises(EstimatorError, match="keyframe 1 is in the graph already; give each its own key"):
+    with pytest.raises(
+        EstimatorError,
+        match="keyframe 1 is in the graph already; give each its own key",
+    ):
         smoother.add_pose(X(1), gtsam.Pose3(), 2.0)
-    with pytest.raises(EstimatorError, match="landmark 3 is in the graph already; give each its own key"):
+    with pytest.raises(
+        EstimatorError,
+        match="landmark 3 is in the graph already; give each its own key",
+    ):
         smoother.add_landmark(L(3), np.zeros(3))
     assert smoother.values.equals(other.values, 0)
     for each in (smoother, other):
         step(each, 2)
-    assert np.allclose(smoother.values.atPoint3(L(3)), other.values.atPoint3(L(3)), rtol=0, atol=1e-12)
+    assert np.allclose(
+        smoother.values.atPoint3(L(3)), other.values.atPoint3(L(3)), rtol=0, atol=1e-12
+    )
 
 
-@pytest.mark.parametrize("cov", [np.zeros((2, 2)), np.diag([1.0, -1.0]), np.ones((2, 2)), np.diag([1.0, np.nan])])
+@pytest.mark.parametrize(
+    "cov",
+    [np.zeros((2, 2)), np.diag([1.0, -1.0]), np.ones((2, 2)), np.diag([1.0, np.nan])],
+)
 def test_noise_that_is_no_covariance_is_refused_where_gtsam_takes_it(cov):
     assert gtsam.noiseModel.Gaussian.Covariance(cov, False) is not None
-    with pytest.raises(MeasurementError, match="expected a positive definite covariance, not one with an eigenvalue"):
+    with pytest.raises(
+        MeasurementError,
+        match="expected a positive definite covariance, not one with an eigenvalue",
+    ):
         factors.gaussian(cov)
 
 
@@ -197,21 +262,40 @@ def same(one: Smoother, other: Smoother, tolerance: float = 1e-9) -> None:
     assert one.values.equals(other.values, tolerance)
     assert one.graph.size() == other.graph.size()
     for key in (X(5), L(3)):
-        found, expected = (smoother.marginals.marginalCovariance(key) for smoother in (one, other))
-        assert np.allclose(found, expected, rtol=rtol, atol=rtol * np.abs(expected).max())
-    (values, marginals), (others, other_marginals) = one.solve_history(), other.solve_history()
+        found, expected = (
+            smoother.marginals.marginalCovariance(key) for smoother in (one, other)
+        )
+        assert np.allclose(
+            found, expected, rtol=rtol, atol=rtol * np.abs(expected).max()
+        )
+    (values, marginals), (others, other_marginals) = (
+        one.solve_history(),
+        other.solve_history(),
+    )
     assert values.equals(others, tolerance)
-    found, expected = (of.marginalCovariance(L(3)) for of in (marginals, other_marginals))
+    found, expected = (
+        of.marginalCovariance(L(3)) for of in (marginals, other_marginals)
+    )
     assert np.allclose(found, expected, rtol=rtol, atol=0)
 
 
 POINT = np.array([5.0, 0.2, 0.3])
 OF_7, FROM_1 = {L(7): POINT}, r"from keyframe 1 at 1\.000 s: 1"
 MISSING = "an elevation, a floor prior or a view from elsewhere is missing"
-SIGHTING = factors.landmark_sighting(X(1), L(7), gtsam.Pose3(), np.array([4.0, 0.05]), np.diag([1e-4, 1e-4]), plain)
+SIGHTING = factors.landmark_sighting(
+    X(1), L(7), gtsam.Pose3(), np.array([4.0, 0.05]), np.diag([1e-4, 1e-4]), plain
+)
 FAULTY = {
-    "lone range": (OF_7, {"range": range_factor(1, 7, 3.0)}, rf"landmark 7, {FROM_1} range; open: .*; {MISSING}"),
-    "no elevation": (OF_7, SIGHTING, rf"landmark 7, {FROM_1} azimuth, 1 range; open: mostly z \(.*\); {MISSING}"),
+    "lone range": (
+        OF_7,
+        {"range": range_factor(1, 7, 3.0)},
+        rf"landmark 7, {FROM_1} range; open: .*; {MISSING}",
+    ),
+    "no elevation": (
+        OF_7,
+        SIGHTING,
+        rf"landmark 7, {FROM_1} azimuth, 1 range; open: mostly z \(.*\); {MISSING}",
+    ),
     "no number": (
         {},
         {"range": range_factor(1, 3, np.nan)},
@@ -224,14 +308,21 @@ FAULTY = {
     ),
 }
 WAYS = list(product(FAULTY, ("update", "update by QR", "flush", "exchange")))
-for by in ("update by QR", "flush"):  # QR solves what sigmas of a thousand radians leave; flushed it is linearised anew
+for by in (
+    "update by QR",
+    "flush",
+):  # QR solves what sigmas of a thousand radians leave; flushed it is linearised anew
     WAYS.remove(("no elevation", by))
 
 
 @pytest.mark.parametrize("is_bounded", [False, True], ids=["whole", "bounded"])
 @pytest.mark.parametrize(("fault", "way"), WAYS)
-def test_what_has_no_solution_is_withheld_by_name_whichever_way_it_comes(fault, is_bounded, way):
-    smoother, other = (begun(is_bounded=is_bounded, by_qr=way == "update by QR") for _ in range(2))
+def test_what_has_no_solution_is_withheld_by_name_whichever_way_it_comes(
+    fault, is_bounded, way
+):
+    smoother, other = (
+        begun(is_bounded=is_bounded, by_qr=way == "update by QR") for _ in range(2)
+    )
     landmarks, new, said = FAULTY[fault]
     step(other, 2)
     if not way.startswith("update"):
@@ -272,26 +363,42 @@ def test_a_keyframe_without_odometry_is_named_with_what_is_missing():
     smoother = begun()
     smoother.add_pose(X(2), gtsam.Pose3(), 2.0)
     smoother.add({"range": range_factor(2, 3, 3.0)})
-    with pytest.raises(EstimatorError, match=r"keyframe 2 at 2\.000 s: 1 range; open: .*; odometry from another"):
+    with pytest.raises(
+        EstimatorError,
+        match=r"keyframe 2 at 2\.000 s: 1 range; open: .*; odometry from another",
+    ):
         smoother.update(2.0)
 
 
 @MODES
-def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_with_the_next(monkeypatch, history):
+def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_with_the_next(
+    monkeypatch, history
+):
     """Once, a landmark's first sighting goes without what is said of its direction and height.
 
     Cholesky fails with it and the window is begun anew: causal estimates agree to a few hundredths of their sigmas. The
     batch solutions start at different windows then, and each stops at a step that gains little: 0.05 mm.
     """
-    ids, stamps = mission().detections.most_probable()[0], mission().detections.stamps_ns
-    row = max(int(np.argmax(ids == landmark)) for landmark in set(ids.tolist()) if np.sum(ids == landmark) > 5)
+    ids, stamps = (
+        mission().detections.most_probable()[0],
+        mission().detections.stamps_ns,
+    )
+    row = max(
+        int(np.argmax(ids == landmark))
+        for landmark in set(ids.tolist())
+        if np.sum(ids == landmark) > 5
+    )
     make, faulty = SightingFactors.make, []
 
     def without_once(self, sighting, key, *, is_first):
         made = make(self, sighting, key, is_first=is_first)
         if sighting.stamp_ns == stamps[row] and key == L(ids[row]):
             faulty.append(key)
-            return {label: made[label] for label in made if label not in ("first direction", "floor prior")}
+            return {
+                label: made[label]
+                for label in made
+                if label not in ("first direction", "floor prior")
+            }
         return made
 
     expected, others = run(without(row), history)
@@ -304,29 +411,58 @@ def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_
     assert found.withheld()[0].startswith(f"landmark {ids[row]}, from keyframe")
     for mine, other in zip(estimates, others, strict=True):
         sigma_m = np.sqrt(np.trace(other.covariance[3:, 3:]))
-        assert np.linalg.norm(mine.world_T_body.translation() - other.world_T_body.translation()) < 0.05 * sigma_m
+        assert (
+            np.linalg.norm(
+                mine.world_T_body.translation() - other.world_T_body.translation()
+            )
+            < 0.05 * sigma_m
+        )
     if history == "whole":
         assert found.graph.size() == expected.graph.size()
-        assert np.allclose(found.trajectory().positions, expected.trajectory().positions, rtol=0, atol=5e-5)
+        assert np.allclose(
+            found.trajectory().positions,
+            expected.trajectory().positions,
+            rtol=0,
+            atol=5e-5,
+        )
 
 
 @MODES
-def test_all_factors_of_a_sighting_go_with_the_one_that_is_no_number(monkeypatch, history):
+def test_all_factors_of_a_sighting_go_with_the_one_that_is_no_number(
+    monkeypatch, history
+):
     """A range that is no number gets into a factor: the azimuth beside it is not used either."""
-    ids, stamps = mission().detections.most_probable()[0], mission().detections.stamps_ns
-    row = next(k for k in range(ROW, len(ids)) if ids[k] in ids[:k] and np.sum(stamps == stamps[k]) > 2 and ids[k] >= 0)
+    ids, stamps = (
+        mission().detections.most_probable()[0],
+        mission().detections.stamps_ns,
+    )
+    row = next(
+        k
+        for k in range(ROW, len(ids))
+        if ids[k] in ids[:k] and np.sum(stamps == stamps[k]) > 2 and ids[k] >= 0
+    )
     expected, make = run(without(row), history), SightingFactors.make
 
     def spoilt(self, sighting, key, *, is_first):
         made = make(self, sighting, key, is_first=is_first)
         if sighting.stamp_ns == stamps[row] and key == L(ids[row]):
-            return {**made, "range": gtsam.RangeFactor3D(sighting.line.pose_key, key, np.nan, isotropic(1, 0.1))}
+            return {
+                **made,
+                "range": gtsam.RangeFactor3D(
+                    sighting.line.pose_key, key, np.nan, isotropic(1, 0.1)
+                ),
+            }
         return made
 
     monkeypatch.setattr(SightingFactors, "make", spoilt)
     found = run(mission(), history)
     outcomes = found[0].detections().outcomes
-    assert [k for k, outcome in enumerate(outcomes) if outcome is Outcome.WITHHELD] == [row]
-    assert re.match(rf"landmark {ids[row]}, from .*: 1 range gives an error that is no number", found[0].withheld()[0])
+    assert [k for k, outcome in enumerate(outcomes) if outcome is Outcome.WITHHELD] == [
+        row
+    ]
+    assert re.match(
+        rf"landmark {ids[row]}, from .*: 1 range gives an error that is no number",
+        found[0].withheld()[0],
+    )
     assert found[0].graph.size() == expected[0].graph.size()
     assert np.allclose(numbers(found), numbers(expected), rtol=0, atol=1e-8)

@@ -12,7 +12,11 @@ from scipy.optimize import least_squares
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment, LandmarkGraph
+from sonar_graph.slam.landmarks.landmark_graph import (
+    AmendableJournal,
+    Assignment,
+    LandmarkGraph,
+)
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
 from sonar_graph.slam.landmarks.unknown import place
 from sonar_graph.slam.smoother import Changed, Sightline
@@ -32,14 +36,18 @@ def begun() -> LandmarkGraph:
     """Keyframes whose poses are known, and no landmark yet."""
     smoother = smoother_with(1e9, 0.1, 1e9)
     for k in range(POSES):
-        pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.1 * k, 0.2, 0.0), np.array([0.2 * k, 0.1 * k, 0.0]))
+        pose = gtsam.Pose3(
+            gtsam.Rot3.Ypr(0.1 * k, 0.2, 0.0), np.array([0.2 * k, 0.1 * k, 0.0])
+        )
         smoother.add_pose(X(k), pose, float(k))
         smoother.add({"prior": pose_prior(X(k), pose, 0.01)})
     smoother.update(float(POSES))
     return LandmarkGraph(smoother, MAKER, AmendableJournal())
 
 
-def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkGraph) -> Sighting:
+def sighting_of(
+    landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkGraph
+) -> Sighting:
     z = polar(landmarks.smoother.values.atPose3(X(k)), PLACES[landmark_id])
     row = landmarks.journal.record(k, landmark_id, Outcome.WAITING)
     sighting = Sighting(k, row, Sightline(X(k), gtsam.Pose3(), z), NOISE, floor)
@@ -47,25 +55,37 @@ def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: L
     return sighting
 
 
-def change(landmarks: LandmarkGraph, changes: list[tuple[Sighting, int | None]]) -> None:
+def change(
+    landmarks: LandmarkGraph, changes: list[tuple[Sighting, int | None]]
+) -> None:
     """Give sightings to landmarks, or to none."""
     later = {Outcome.WAITING: Outcome.USED_LATER}
     landmarks.apply(
         [
-            Assignment(s, later.get(landmarks.state(s).outcome, Outcome.MOVED) if i else Outcome.TAKEN_BACK, i)
+            Assignment(
+                s,
+                later.get(landmarks.state(s).outcome, Outcome.MOVED)
+                if i
+                else Outcome.TAKEN_BACK,
+                i,
+            )
             for s, i in changes
         ],
         float(POSES),
     )
 
 
-def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkGraph) -> list[float]:
+def errors(
+    graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkGraph
+) -> list[float]:
     rng, found = np.random.default_rng(0), []
     for _ in range(4):
         values = gtsam.Values()
         for k in range(POSES):
             pose = landmarks.smoother.values.atPose3(X(k))
-            values.insert(X(k), pose.compose(gtsam.Pose3.Expmap(0.1 * rng.standard_normal(6))))
+            values.insert(
+                X(k), pose.compose(gtsam.Pose3.Expmap(0.1 * rng.standard_normal(6)))
+            )
         for i in PLACES:
             point = PLACES[i] + 0.3 * rng.standard_normal(3)
             if i in ids:
@@ -76,21 +96,49 @@ def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: Landmar
 
 @pytest.mark.parametrize("floor", [None, FLOOR], ids=["no floor", "floor"])
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.lists(st.sampled_from([7, 9, None]), min_size=POSES, max_size=POSES), min_size=1, max_size=3))
-def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPrior | None, stages: list) -> None:
+@given(
+    st.lists(
+        st.lists(st.sampled_from([7, 9, None]), min_size=POSES, max_size=POSES),
+        min_size=1,
+        max_size=3,
+    )
+)
+def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(
+    floor: FloorPrior | None, stages: list
+) -> None:
     """Each stage gives each sighting to a landmark or none; the first to come is often not the earliest."""
     landmarks = begun()
-    seen, of = [sighting_of(7, k, floor, landmarks) for k in range(POSES)], dict[Sighting, int]()
+    seen, of = (
+        [sighting_of(7, k, floor, landmarks) for k in range(POSES)],
+        dict[Sighting, int](),
+    )
     for stage in stages:
-        change(landmarks, [(s, i) for s, i in zip(seen, stage, strict=True) if landmarks.state(s).landmark_id != i])
+        change(
+            landmarks,
+            [
+                (s, i)
+                for s, i in zip(seen, stage, strict=True)
+                if landmarks.state(s).landmark_id != i
+            ],
+        )
         of = {s: i for s, i in zip(seen, stage, strict=True) if i is not None}
-        expected, ids = graph_of(landmarks.smoother.graph.at(k) for k in range(POSES)), sorted(set(of.values()))
+        expected, ids = (
+            graph_of(landmarks.smoother.graph.at(k) for k in range(POSES)),
+            sorted(set(of.values())),
+        )
         for i in ids:
-            mine = sorted((s for s, landmark in of.items() if landmark == i), key=lambda s: s.stamp_ns)
+            mine = sorted(
+                (s for s, landmark in of.items() if landmark == i),
+                key=lambda s: s.stamp_ns,
+            )
             for s in mine:
-                expected.push_back(graph_of(MAKER.make(s, L(i), is_first=s is mine[0]).values()))
+                expected.push_back(
+                    graph_of(MAKER.make(s, L(i), is_first=s is mine[0]).values())
+                )
         assert landmarks.smoother.graph.nrFactors() == expected.nrFactors()
-        assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(errors(expected, ids, landmarks))
+        assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(
+            errors(expected, ids, landmarks)
+        )
         assert landmarks.ids == landmarks.smoother.landmark_ids == ids
 
 
@@ -120,23 +168,34 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
         ([Outcome.USED_LATER, Outcome.TAKEN_BACK], Outcome.USED),
     ],
 )
-def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(before: list[Outcome], after: Outcome) -> None:
+def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(
+    before: list[Outcome], after: Outcome
+) -> None:
     """From waiting by way of other states."""
     landmarks = begun()
     sighting = sighting_of(7, 0, None, landmarks)
     for outcome in before:
         landmarks.apply([Assignment(sighting, outcome, 7)], float(POSES))
-    state, outcomes = landmarks.state(sighting).outcome, landmarks.journal.log().outcomes
+    state, outcomes = (
+        landmarks.state(sighting).outcome,
+        landmarks.journal.log().outcomes,
+    )
     with pytest.raises(AssertionError, match="cannot become"):
         landmarks.apply([Assignment(sighting, after, 7)], float(POSES))
-    assert (landmarks.state(sighting).outcome, landmarks.ids, landmarks.journal.log().outcomes) == (state, [], outcomes)
+    assert (
+        landmarks.state(sighting).outcome,
+        landmarks.ids,
+        landmarks.journal.log().outcomes,
+    ) == (state, [], outcomes)
 
 
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
 POINT = np.array([3.0, 0.5, -1.7])
 
 
-@pytest.mark.parametrize("floor", [None, FloorPrior(z_m=-1.7, sigma_m=0.02)], ids=["no floor", "floor"])
+@pytest.mark.parametrize(
+    "floor", [None, FloorPrior(z_m=-1.7, sigma_m=0.02)], ids=["no floor", "floor"]
+)
 def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
     """With the elevation at the first sighting, or the floor, as a prior; to a tenth of a sigma.
 
@@ -148,11 +207,19 @@ def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
         poses.append(gtsam.Pose3(gtsam.Rot3.Yaw(a), POINT - off).compose(MOUNTED))
     noise = 0.5 * np.random.default_rng(0).standard_normal((6, 2)) * sigmas
     measured = [polar(pose, POINT) + e for pose, e in zip(poses, noise, strict=True)]
-    sightings = [Sighting(k, k, Sightline(X(k), MOUNTED, z), NOISE, floor) for k, z in enumerate(measured)]
-    values = values_of(**{f"X{k}": pose.compose(MOUNTED.inverse()) for k, pose in enumerate(poses)})
+    sightings = [
+        Sighting(k, k, Sightline(X(k), MOUNTED, z), NOISE, floor)
+        for k, z in enumerate(measured)
+    ]
+    values = values_of(
+        **{f"X{k}": pose.compose(MOUNTED.inverse()) for k, pose in enumerate(poses)}
+    )
 
     def residuals(p: Floats) -> Floats:
-        rows = [(polar(pose, p) - z) / sigmas for pose, z in zip(poses, measured, strict=True)]
+        rows = [
+            (polar(pose, p) - z) / sigmas
+            for pose, z in zip(poses, measured, strict=True)
+        ]
         elevation = math.asin(poses[0].transformTo(p)[2] / polar(poses[0], p)[0])
         middle = MAKER.elevation_on(floor, poses[0], measured[0])
         rows.append(np.array([(elevation - middle) / (APERTURE_RAD / math.sqrt(12))]))

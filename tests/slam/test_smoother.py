@@ -12,7 +12,16 @@ from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
 from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
 
-from .fed import FOREVER_S, NEVER_M, SONAR, Fed, assert_is_least_squares, in_the_basin, on_the_rail, ranged
+from .fed import (
+    FOREVER_S,
+    NEVER_M,
+    SONAR,
+    Fed,
+    assert_is_least_squares,
+    in_the_basin,
+    on_the_rail,
+    ranged,
+)
 from .graphs import block_of, off_sigmas
 from .made import (
     counted,
@@ -33,7 +42,9 @@ END_S = (NODES - 1) * STEP_S
 _, NUMBERS = rail(NODES)
 
 
-@pytest.mark.parametrize("lag_s", [FOREVER_S, 2.6, 0.6], ids=["all", "five poses", "one pose"])
+@pytest.mark.parametrize(
+    "lag_s", [FOREVER_S, 2.6, 0.6], ids=["all", "five poses", "one pose"]
+)
 def test_on_the_rail_window_and_history_are_least_squares(lag_s):
     """Marginalising is exact where nothing is linearised: means and covariances to 1e-8."""
     fed = on_the_rail(NODES, lag_s)
@@ -41,13 +52,20 @@ def test_on_the_rail_window_and_history_are_least_squares(lag_s):
     mean, variance = NUMBERS.solution(NODES)
     values, marginals = fed.smoother.solve_history()
     for k in range(NODES):
-        assert values.atPose3(X(k)).translation()[0] == pytest.approx(mean[f"x{k}"], abs=1e-8)
-        assert marginals.marginalCovariance(X(k))[3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-8)
+        assert values.atPose3(X(k)).translation()[0] == pytest.approx(
+            mean[f"x{k}"], abs=1e-8
+        )
+        assert marginals.marginalCovariance(X(k))[3, 3] == pytest.approx(
+            variance[f"x{k}"], abs=1e-8
+        )
 
 
 def test_factors_wait_until_they_are_worth_an_update_and_the_history_is_solved_anew():
     fed = in_the_basin(5, 6.0)
-    before, smoothed = (of.atPoint3(L(3)) for of in (fed.smoother.values, fed.smoother.solve_history()[0]))
+    before, smoothed = (
+        of.atPoint3(L(3))
+        for of in (fed.smoother.values, fed.smoother.solve_history()[0])
+    )
     fed.add({"prior": point_prior(L(3), np.zeros(3), 0.01)})
     assert not fed.smoother.is_due
     fed.smoother.add({}, gain=0.1)
@@ -56,7 +74,9 @@ def test_factors_wait_until_they_are_worth_an_update_and_the_history_is_solved_a
     fed.smoother.update(4.0)
     assert not fed.smoother.is_due
     assert np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - before) > 0.5
-    assert np.linalg.norm(fed.smoother.solve_history()[0].atPoint3(L(3)) - smoothed) > 0.5
+    assert (
+        np.linalg.norm(fed.smoother.solve_history()[0].atPoint3(L(3)) - smoothed) > 0.5
+    )
 
 
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 3.0])
@@ -69,8 +89,16 @@ def test_biases_in_a_row_are_least_squares(lag_s):
         smoother.add({"prior": pose_prior(X(k), gtsam.Pose3(), 1.0)})
         smoother.add_bias(B(k), np.zeros(11))
         walks, sigmas = np.full(11, walk), np.full(11, sigma)
-        smoother.add({"walk": factors.bias_walk(B(k - 1), B(k), walks) if k else factors.bias_prior(B(0), sigmas)})
-        told = gtsam.PriorFactorVector(B(k), np.full(11, np.sin(k)), isotropic(11, reading))
+        smoother.add(
+            {
+                "walk": factors.bias_walk(B(k - 1), B(k), walks)
+                if k
+                else factors.bias_prior(B(0), sigmas)
+            }
+        )
+        told = gtsam.PriorFactorVector(
+            B(k), np.full(11, np.sin(k)), isotropic(11, reading)
+        )
         smoother.add({"prior": told})
         smoother.update(float(k))
         if k:
@@ -79,8 +107,12 @@ def test_biases_in_a_row_are_least_squares(lag_s):
         A.append(np.eye(8)[k] / reading)
         b.append(np.sin(k) / reading)
     cov = np.linalg.inv(np.transpose(A) @ A)
-    assert smoother.values.atVector(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 11, abs=1e-9)
-    assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx([cov[7, 7]] * 11, abs=1e-9)
+    assert smoother.values.atVector(B(7)) == pytest.approx(
+        [(cov @ np.transpose(A) @ b)[7]] * 11, abs=1e-9
+    )
+    assert np.diag(smoother.marginals.marginalCovariance(B(7))) == pytest.approx(
+        [cov[7, 7]] * 11, abs=1e-9
+    )
 
 
 def test_one_covariance_a_step_answers_for_all_landmarks_in_reach(monkeypatch):
@@ -90,8 +122,15 @@ def test_one_covariance_a_step_answers_for_all_landmarks_in_reach(monkeypatch):
     asked = counted(monkeypatch, gtsam.ISAM2, "jointMarginalCovariance")
     fed.joint(X(5))
     fed.joint(X(5), L(3))
-    assert [set(keys) for _, keys in asked] == [{X(5)}, {X(5), L(3)}]  # no range was measured yet
-    z = polar(fed.smoother.values.atPose3(X(5)).compose(SONAR), fed.smoother.values.atPoint3(L(5)))
+    # no range was measured yet
+    assert [set(keys) for _, keys in asked] == [
+        {X(5)},
+        {X(5), L(3)},
+    ]
+    z = polar(
+        fed.smoother.values.atPose3(X(5)).compose(SONAR),
+        fed.smoother.values.atPoint3(L(5)),
+    )
     new = factors.landmark_sighting(X(5), L(5), SONAR, z, np.diag([4e-4, 8e-5]), plain)
     fed.groups[fed.smoother.add(new, (L(5), Sightline(X(5), SONAR, z)))] = new
     fed.smoother.update(5.0)
@@ -113,7 +152,9 @@ def test_covariances_are_those_of_where_the_window_has_settled():
     fed.joint(*keys)
     fed.smoother.settle(11.0)
     expected = fed.dense(fed.smoother.values, *keys)
-    assert np.allclose(fed.joint(*keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+    assert np.allclose(
+        fed.joint(*keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 1.1], ids=["in the window", "not in it"])
@@ -125,7 +166,9 @@ def test_a_joint_covariance_of_any_poses_is_that_of_all_factors(lag_s):
     assert off_sigmas(found, fed.dense(values, *keys)) < 1e-2
 
 
-def assert_all_is_least_squares(fed: Fed, numbers: Rail, landmarks: tuple[int, ...] = (4, 7)) -> None:
+def assert_all_is_least_squares(
+    fed: Fed, numbers: Rail, landmarks: tuple[int, ...] = (4, 7)
+) -> None:
     """The window, and the beginning of the history."""
     assert_is_least_squares(fed, numbers, NODES, landmarks)
     x1 = fed.smoother.solve_history()[0].atPose3(X(1)).translation()[0]
@@ -134,11 +177,16 @@ def assert_all_is_least_squares(fed: Fed, numbers: Rail, landmarks: tuple[int, .
 
 def with_ranges(gone: list[tuple[int, int]], *new: tuple[int, int, float]) -> Rail:
     """The rail without ranges, by node and landmark, and with others."""
-    return Rail(NUMBERS.displacements_m, [*(r for r in NUMBERS.ranges if r[:2] not in gone), *new])
+    return Rail(
+        NUMBERS.displacements_m,
+        [*(r for r in NUMBERS.ranges if r[:2] not in gone), *new],
+    )
 
 
 @pytest.mark.parametrize(
-    ("lag_s", "oldest"), [(FOREVER_S, 7), (2.6, 17), (2.6, 7)], ids=["all", "recent", "marginalised"]
+    ("lag_s", "oldest"),
+    [(FOREVER_S, 7), (2.6, 17), (2.6, 7)],
+    ids=["all", "recent", "marginalised"],
 )
 def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest):
     """Least squares without those ranges; the history is not solved for it."""
@@ -169,14 +217,20 @@ class Refusing:
 
 
 @pytest.mark.parametrize("gives_up", [False, True])
-def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at_once(monkeypatch, gives_up):
+def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at_once(
+    monkeypatch, gives_up
+):
     """Six sightings that put a landmark a metre off; a thousandth of that is left, also when Cholesky gives up."""
     fed = in_the_basin(15, FOREVER_S)
     wrong: list[int] = []
     for k in range(9, 15):
         values = fed.smoother.values
-        z = polar(values.atPose3(X(k)).compose(SONAR), values.atPoint3(L(3))) + np.array([2.0, 0.5])
-        new = factors.landmark_sighting(X(k), L(3), SONAR, z, np.diag([1e-4, 1e-4]), plain)
+        z = polar(
+            values.atPose3(X(k)).compose(SONAR), values.atPoint3(L(3))
+        ) + np.array([2.0, 0.5])
+        new = factors.landmark_sighting(
+            X(k), L(3), SONAR, z, np.diag([1e-4, 1e-4]), plain
+        )
         wrong.append(fed.smoother.add(new))
     for _ in range(5):
         fed.smoother.update(14.0)
@@ -186,7 +240,9 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
     if gives_up:
         fed.smoother._window.isam = Refusing(fed.smoother._window.isam)
     fed.smoother.exchange(14.0, wrong)
-    off_m.append(np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3))))
+    off_m.append(
+        np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3)))
+    )
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
     assert solved or not gives_up
@@ -199,13 +255,21 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
     assert_all_is_least_squares(fed, with_ranges(gone), (4,))
     assert not fed.smoother.values.exists(L(7))
     (distance,) = (r for k, i, r in NUMBERS.ranges if (k, i) == (NODES - 1, 7))
-    point = fed.smoother.values.atPose3(X(NODES - 1)).translation() + distance * np.eye(3)[0]
-    fed.smoother.exchange(END_S, (), [FactorGroup(ranged(NODES - 1, 7, distance, 3e-4))], {L(7): point})
+    point = (
+        fed.smoother.values.atPose3(X(NODES - 1)).translation()
+        + distance * np.eye(3)[0]
+    )
+    fed.smoother.exchange(
+        END_S, (), [FactorGroup(ranged(NODES - 1, 7, distance, 3e-4))], {L(7): point}
+    )
     assert_all_is_least_squares(fed, with_ranges(gone[:-1]))
 
 
 def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypatch):
-    fed, solved = on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}), counted(monkeypatch, batch_solution, "descended")
+    fed, solved = (
+        on_the_rail(NODES, 0.6, held={X(3): FOREVER_S}),
+        counted(monkeypatch, batch_solution, "descended"),
+    )
     handles = fed.smoother.exchange(END_S, (), [FactorGroup(ranged(3, 4, 24.0))]).added
     assert not solved
     assert_all_is_least_squares(fed, with_ranges([], (3, 4, 24.0)))
@@ -217,7 +281,9 @@ def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypa
 def test_a_keyframe_and_all_later_ones_are_held_until_the_time_given():
     for until_s, gone, kept in ((END_S, 2, range(3, NODES)), (8.0, 17, [18])):
         fed = on_the_rail(NODES, 1.1, held={X(3): until_s}, is_bounded=True)
-        assert all(fed.smoother.marginals.marginalCovariance(X(k))[3, 3] > 0 for k in kept)
+        assert all(
+            fed.smoother.marginals.marginalCovariance(X(k))[3, 3] > 0 for k in kept
+        )
         with pytest.raises(IndexError):
             fed.smoother.marginals.marginalCovariance(X(gone))
 
@@ -250,7 +316,13 @@ def test_a_held_keyframe_stays_however_its_time_is_rounded(start_s: float) -> No
     smoother.hold({X(0): np.inf})
     for k in range(1, 400):
         smoother.add_pose(X(k), gtsam.Pose3(), start_s + 0.1 * k)
-        smoother.add({"odometry": gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, 0.1))})
+        smoother.add(
+            {
+                "odometry": gtsam.BetweenFactorPose3(
+                    X(k - 1), X(k), gtsam.Pose3(), isotropic(6, 0.1)
+                )
+            }
+        )
         smoother.update(start_s + 0.1 * k)
         assert smoother.in_window([X(0)]) == [X(0)]
     smoother.hold({})
@@ -266,7 +338,9 @@ def test_a_window_that_begins_anew_says_what_the_batch_does(lag_s):
     keys = [X(14), L(3), L(5), L(8), B(0)]
     batch = solve(graph_of(fed.given), fed.smoother.values)
     for key in keys[1:]:
-        assert np.allclose(fed.smoother.values.atVector(key), batch.atVector(key), atol=1e-4)
+        assert np.allclose(
+            fed.smoother.values.atVector(key), batch.atVector(key), atol=1e-4
+        )
     assert fed.smoother.values.atPose3(keys[0]).equals(batch.atPose3(keys[0]), 1e-4)
     expected = fed.dense(batch, *keys)
     assert off_sigmas(fed.joint(*keys), expected) < 1e-3
@@ -281,10 +355,16 @@ def test_on_the_rail_restarts_of_a_bounded_window_change_nothing(monkeypatch):
 
 @pytest.mark.parametrize("is_bounded", [False, True], ids=["whole", "bounded"])
 @pytest.mark.parametrize("last", [20, 40, 60])
-def test_a_window_that_restarts_for_long_counts_each_factor_once(monkeypatch, last, is_bounded):
+def test_a_window_that_restarts_for_long_counts_each_factor_once(
+    monkeypatch, last, is_bounded
+):
     """Divergence is pretended at each update of a stretch: where all is linear, restarts change nothing."""
     monkeypatch.setattr(Smoother, "_largest_step", lambda _: np.inf)
-    monkeypatch.setattr(Smoother, "_has_diverged", lambda self: 20 <= gtsam.Symbol(self._newest_pose).index() <= last)
+    monkeypatch.setattr(
+        Smoother,
+        "_has_diverged",
+        lambda self: 20 <= gtsam.Symbol(self._newest_pose).index() <= last,
+    )
     solved = counted(monkeypatch, batch_solution, "descended")
     fed, (_, numbers) = on_the_rail(61, 3.1, is_bounded=is_bounded), rail(61)
     assert len(solved) >= last - 20
@@ -295,8 +375,13 @@ def test_a_window_that_restarts_for_long_counts_each_factor_once(monkeypatch, la
 def test_drift_beyond_what_cholesky_takes_is_survived():
     """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother agrees with algebra."""
     smoother, sigmas = smoother_with(FOREVER_S, 1e-3, NEVER_M), np.array([20.0, 0.002])
-    wide, narrow = (gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [s] * 3)) for s in sigmas)
-    steps = [gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(), narrow) for k in range(2)]
+    wide, narrow = (
+        gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [s] * 3)) for s in sigmas
+    )
+    steps = [
+        gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(), narrow)
+        for k in range(2)
+    ]
     given = [gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), wide), *steps]
     for k, factor in enumerate(given):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
@@ -305,12 +390,18 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
     with pytest.raises(RuntimeError, match="Indeterminate"):
         gtsam.ISAM2().update(graph_of(given), smoother.values)
     variance = sigmas[0] ** 2 + 2 * sigmas[1] ** 2
-    assert smoother.marginals.marginalCovariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
-    assert smoother.solve_history()[1].marginalCovariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
+    assert smoother.marginals.marginalCovariance(X(2))[5, 5] == pytest.approx(
+        variance, rel=1e-6
+    )
+    assert smoother.solve_history()[1].marginalCovariance(X(2))[5, 5] == pytest.approx(
+        variance, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(("shift_m", "is_due"), [(0.09, False), (0.11, True)])
-def test_a_bounded_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(monkeypatch, shift_m, is_due):
+def test_a_bounded_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(
+    monkeypatch, shift_m, is_due
+):
     solved = counted(monkeypatch, batch_solution, "descended")
     smoother = smoother_with(1e9, 1.0, 0.1, is_bounded=True)
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
@@ -327,19 +418,39 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end():
     fed = Fed(30.0, stale_shift_m=1e-9)
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     fed.add({"start prior": factors.start_prior(X(0), calibration_)})
-    cov, step = np.diag([1e-10] * 3 + [1e-6] * 3), gtsam.Pose3(gtsam.Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0]))
+    cov, step = (
+        np.diag([1e-10] * 3 + [1e-6] * 3),
+        gtsam.Pose3(gtsam.Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0])),
+    )
     motion = motion_of(step, cov)
     truth, landmark = gtsam.Pose3(), np.array([3.0, 1.0, -1.0])
     fed.smoother.add_landmark(L(1), landmark + np.array([0.3, -0.2, 0.1]))
     for k in range(1, 100):
         truth = truth.compose(step)
-        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(step), float(k))
+        fed.smoother.add_pose(
+            X(k), fed.smoother.values.atPose3(X(k - 1)).compose(step), float(k)
+        )
         z = polar(truth.compose(SONAR), landmark)
         fed.add({"odometry": factors.odometry(X(k - 1), X(k), motion)})
-        fed.add(factors.landmark_sighting(X(k), L(1), SONAR, z, np.diag([4e-4, 8e-5]), plain, 0.3 if k == 1 else None))
+        fed.add(
+            factors.landmark_sighting(
+                X(k),
+                L(1),
+                SONAR,
+                z,
+                np.diag([4e-4, 8e-5]),
+                plain,
+                0.3 if k == 1 else None,
+            )
+        )
         fed.smoother.update(float(k))
     assert fed.smoother._is_by_qr
-    assert np.linalg.norm(fed.smoother.values.atPose3(X(99)).translation() - truth.translation()) < 0.05
+    assert (
+        np.linalg.norm(
+            fed.smoother.values.atPose3(X(99)).translation() - truth.translation()
+        )
+        < 0.05
+    )
 
 
 def test_a_factor_in_python_is_handed_no_copy_of_all_values():
@@ -354,7 +465,9 @@ def test_a_factor_in_python_is_handed_no_copy_of_all_values():
         return gtsam.Pose3.Logmap(values.atPose3(X(0))) - 0.1
 
     group = FactorGroup({"prior": gtsam.CustomFactor(isotropic(6, 1.0), [X(0)], error)})
-    window.update({0: group}, values_of(X0=gtsam.Pose3()), removed=(), relinearises=True)
+    window.update(
+        {0: group}, values_of(X0=gtsam.Pose3()), removed=(), relinearises=True
+    )
     window.update({}, gtsam.Values(), removed=(), relinearises=True)
     assert len(handed) > 1
     assert all(handed)

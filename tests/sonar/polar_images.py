@@ -18,8 +18,15 @@ FLOOR_DB = 35.0
 
 def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> Floats:
     """Down by the pitch, then rolled; written out."""
-    cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
-    return np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    cp, sp, cr, sr = (
+        np.cos(pitch_rad),
+        np.sin(pitch_rad),
+        np.cos(roll_rad),
+        np.sin(roll_rad),
+    )
+    return np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array(
+        [[1, 0, 0], [0, cr, -sr], [0, sr, cr]]
+    )
 
 
 ROTATION = level_R_sonar()
@@ -32,13 +39,24 @@ def polar(xy_m: tuple[float, float]) -> tuple[float, float]:
     return float(r), float(a)
 
 
-def candidates_at(range_m: list[float], azimuth_rad: list[float], rejected: tuple[int, ...] = ()) -> Candidates:
+def candidates_at(
+    range_m: list[float], azimuth_rad: list[float], rejected: tuple[int, ...] = ()
+) -> Candidates:
     """Candidates with these positions and an elevation known to 0.07 rad."""
     zero, verdicts = np.zeros(len(range_m)), np.zeros(len(range_m), dtype=np.int64)
     verdicts[list(rejected)] = CandidateVerdict.TOO_SMALL
-    positions = np.zeros((len(zero), 3)), np.array(range_m, dtype=float), np.array(azimuth_rad, dtype=float)
-    boxes, labels = np.zeros((len(zero), 4), dtype=np.int64), np.zeros((2, 2), dtype=np.int32)
-    return Candidates(*positions, *[zero] * 4, verdicts, zero + 0.07, boxes, WINDOW, labels)
+    positions = (
+        np.zeros((len(zero), 3)),
+        np.array(range_m, dtype=float),
+        np.array(azimuth_rad, dtype=float),
+    )
+    boxes, labels = (
+        np.zeros((len(zero), 4), dtype=np.int64),
+        np.zeros((2, 2), dtype=np.int32),
+    )
+    return Candidates(
+        *positions, *[zero] * 4, verdicts, zero + 0.07, boxes, WINDOW, labels
+    )
 
 
 @cache
@@ -48,14 +66,24 @@ def _floor_points(numbers: tuple[float, ...]) -> Floats:
     xy = np.full((96, 512, 2), np.nan)
     for beam, azimuth in enumerate(AZIMUTHS_RAD):
         rays = np.column_stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+            [
+                np.cos(elevation) * np.cos(azimuth),
+                np.cos(elevation) * np.sin(azimuth),
+                np.sin(elevation),
+            ]
         )
         level = rays @ rotation.T
-        distance = np.where(level[:, 2] < -1e-6, -HEIGHT_M / np.minimum(level[:, 2], -1e-6), np.inf)
+        distance = np.where(
+            level[:, 2] < -1e-6, -HEIGHT_M / np.minimum(level[:, 2], -1e-6), np.inf
+        )
         order = np.argsort(distance)
         for axis in range(2):
             xy[beam, :, axis] = np.interp(
-                RANGES_M, distance[order], (distance[:, None] * level[:, :2])[order, axis], np.nan, np.nan
+                RANGES_M,
+                distance[order],
+                (distance[:, None] * level[:, :2])[order, axis],
+                np.nan,
+                np.nan,
             )
     return xy
 
@@ -79,7 +107,10 @@ def image_db(
     if design is not None:
         u, v = xy[..., 0] - xy_m[0], xy[..., 1] - xy_m[1]
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
-        on_floor = design.level_db(np.nan_to_num(cos * u + sin * v, nan=9.0), np.nan_to_num(cos * v - sin * u, nan=9.0))
+        on_floor = design.level_db(
+            np.nan_to_num(cos * u + sin * v, nan=9.0),
+            np.nan_to_num(cos * v - sin * u, nan=9.0),
+        )
         level = level + np.where(lit, np.nan_to_num(on_floor), 0.0)
     if rng is not None:
         level = level + 10 * np.log10(rng.exponential(size=level.shape))

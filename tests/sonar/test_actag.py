@@ -13,7 +13,12 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.simulation.sonar_image.frames import FrameSimulator
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON, ImageOptions
 from sonar_graph.simulation.sonar_image.scene import place_landmark
-from sonar_graph.sonar.actag import AcTagRecogniser, AcTagSettings, evenly_sampled, tag_design
+from sonar_graph.sonar.actag import (
+    AcTagRecogniser,
+    AcTagSettings,
+    evenly_sampled,
+    tag_design,
+)
 from sonar_graph.sonar.recogniser import REPORTED
 from sonar_graph.sonar.tracker import SonarStep
 
@@ -63,12 +68,16 @@ def at_once(settings: AcTagSettings | None = None) -> AcTagRecogniser:
 def test_a_bright_spot_stays_where_it_is_though_beams_are_not_equally_spaced():
     spot_m, spot_rad = 1.9, np.radians(7.0)
     beams, bins = np.meshgrid(AZIMUTHS_RAD, RANGES_M, indexing="ij")
-    image = np.exp(-(((beams - spot_rad) / 0.01) ** 2) - ((bins - spot_m) / 0.02) ** 2).astype(np.float32)
+    image = np.exp(
+        -(((beams - spot_rad) / 0.01) ** 2) - ((bins - spot_m) / 0.02) ** 2
+    ).astype(np.float32)
     picture, rows_m, columns_rad = evenly_sampled(image, RANGES_M, AZIMUTHS_RAD, 0.005)
     row, column = np.unravel_index(np.argmax(picture), picture.shape)
     assert rows_m[row] == pytest.approx(spot_m, abs=0.004)
     assert columns_rad[column] == pytest.approx(spot_rad, abs=0.002)
-    as_if_even = np.linspace(AZIMUTHS_RAD[0], AZIMUTHS_RAD[-1], 96)[np.argmax(image.max(axis=1))]
+    as_if_even = np.linspace(AZIMUTHS_RAD[0], AZIMUTHS_RAD[-1], 96)[
+        np.argmax(image.max(axis=1))
+    ]
     assert abs(as_if_even - spot_rad) > np.radians(0.8)
 
 
@@ -83,29 +92,54 @@ def test_the_farthest_range_and_the_leftmost_beam_come_first_and_pixels_are_squa
     assert -np.diff(rows_m)[0] == pytest.approx(0.005, rel=0.02)
     assert -np.diff(columns_rad)[0] * RANGES_M.mean() == pytest.approx(0.005, rel=0.02)
     speckle = np.random.default_rng(0).normal(0, 5.6, (96, 512)).astype(np.float32)
-    fine, coarse = (evenly_sampled(speckle, RANGES_M, AZIMUTHS_RAD, pixel_m)[0].std() for pixel_m in (0.0024, 0.0098))
+    fine, coarse = (
+        evenly_sampled(speckle, RANGES_M, AZIMUTHS_RAD, pixel_m)[0].std()
+        for pixel_m in (0.0024, 0.0098)
+    )
     assert coarse < 0.6 * fine
 
 
 def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
     corners = np.array([[1.9, 0.10], [2.0, 0.11], [2.02, 0.02], [1.92, 0.01]])
     decoder.found = [[3, corners * 0, corners]]
-    recogniser = at_once(AcTagSettings(probability=0.97, range_sigma_m=0.02, least_frames=1))
+    recogniser = at_once(
+        AcTagSettings(probability=0.97, range_sigma_m=0.02, least_frames=1)
+    )
     found = recogniser.process(frame_of(noise()))
-    assert (found.range_m, found.azimuth_rad) == (pytest.approx([1.96]), pytest.approx([0.06]))
-    assert (found.candidate_ids.tolist(), found.id_probability.tolist()) == ([[3]], [[0.97]])
+    assert (found.range_m, found.azimuth_rad) == (
+        pytest.approx([1.96]),
+        pytest.approx([0.06]),
+    )
+    assert (found.candidate_ids.tolist(), found.id_probability.tolist()) == (
+        [[3]],
+        [[0.97]],
+    )
     assert found.range_azimuth_cov[0] == pytest.approx(np.diag([0.02**2, 0.001**2]))
     assert found.stamps_ns.tolist() == [5]
     assert [fate.outcome for fate in recogniser.fates] == [REPORTED]
-    given = [decoder.settings[name] for name in ("min_range", "max_range", "horizontal_aperture")]
-    assert given == pytest.approx([RANGES_M[0], RANGES_M[-1], 2 * np.abs(AZIMUTHS_RAD).max()])
-    assert decoder.image.shape == pytest.approx([1.25 / 0.00544, 0.497 * 1.885 / 0.00544], rel=0.01)
+    given = [
+        decoder.settings[name]
+        for name in ("min_range", "max_range", "horizontal_aperture")
+    ]
+    assert given == pytest.approx(
+        [RANGES_M[0], RANGES_M[-1], 2 * np.abs(AZIMUTHS_RAD).max()]
+    )
+    assert decoder.image.shape == pytest.approx(
+        [1.25 / 0.00544, 0.497 * 1.885 / 0.00544], rel=0.01
+    )
 
 
 def test_a_tag_is_reported_once_a_frame(decoder):
     corners, recogniser = np.full((4, 2), [2.0, 0.0]), at_once()
-    decoder.found = [[3, corners, corners], [3, corners, corners + 0.1], [4, corners, corners]]
-    assert recogniser.process(frame_of(noise())).candidate_ids.ravel().tolist() == [3, 4]
+    decoder.found = [
+        [3, corners, corners],
+        [3, corners, corners + 0.1],
+        [4, corners, corners],
+    ]
+    assert recogniser.process(frame_of(noise())).candidate_ids.ravel().tolist() == [
+        3,
+        4,
+    ]
     assert [fate.outcome for fate in recogniser.fates].count(REPORTED) == 2
     assert any("already" in fate.outcome for fate in recogniser.fates)
 
@@ -118,20 +152,30 @@ def test_a_tag_is_reported_once_a_frame(decoder):
         ([2.0, 2.0, 2.0], [0.0, 1.0, 1.0], [False, False, False]),
     ],
 )
-def test_a_tag_is_reported_when_it_was_decoded_twice_in_one_place(decoder, ranges_m, ahead_m, expected):
+def test_a_tag_is_reported_when_it_was_decoded_twice_in_one_place(
+    decoder, ranges_m, ahead_m, expected
+):
     """Decoded at these ranges after these motions ahead."""
     recogniser, is_reported = AcTagRecogniser(Calibration()), []
     for n, (range_m, moved_m) in enumerate(zip(ranges_m, ahead_m, strict=True)):
         decoder.found = [[3, np.zeros((4, 2)), np.tile([range_m, 0.0], (4, 1))]]
-        step = SonarStep(gtsam.Pose3(gtsam.Rot3(), np.array([moved_m, 0.0, 0.0])), np.zeros((6, 6)))
+        step = SonarStep(
+            gtsam.Pose3(gtsam.Rot3(), np.array([moved_m, 0.0, 0.0])), np.zeros((6, 6))
+        )
         is_reported.append(recogniser.process(frame_of(noise(n), n), step) is not None)
     assert is_reported == expected
 
 
-def test_frames_that_must_not_be_used_are_not_shown_to_actag_and_one_without_tags_gives_nothing(decoder):
+def test_frames_that_must_not_be_used_are_not_shown_to_actag_and_one_without_tags_gives_nothing(
+    decoder,
+):
     recogniser = AcTagRecogniser(Calibration())
-    block = SonarFrames(np.array([5, 6]), np.stack([noise(1), noise(2)]), RANGES_M, AZIMUTHS_RAD)
-    with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
+    block = SonarFrames(
+        np.array([5, 6]), np.stack([noise(1), noise(2)]), RANGES_M, AZIMUTHS_RAD
+    )
+    with pytest.raises(
+        MeasurementError, match=r"a block of 2 frames; give blocks of one"
+    ):
         recogniser.process(block)
     assert recogniser.process(frame_of(np.zeros((96, 512), np.uint8))) is None
     assert "zero" in recogniser.fates[0].outcome
@@ -150,7 +194,10 @@ def test_an_unknown_family_and_a_missing_package_are_named(decoder, monkeypatch)
 
 @pytest.mark.parametrize("tag", range(7))
 def test_actag_itself_reads_tags_in_simulated_frames(tag):
-    pytest.importorskip("actag", reason="AcTag has wheels for Linux with Python 3.10 and 3.11 only: extra actag")
+    pytest.importorskip(
+        "actag",
+        reason="AcTag has wheels for Linux with Python 3.10 and 3.11 only: extra actag",
+    )
     right = 0
     for frame, range_m, azimuth_rad in (simulated(tag, number) for number in range(3)):
         found = at_once().process(frame)
@@ -166,9 +213,15 @@ def simulated(tag: int, number: int) -> tuple[SonarFrames, float, float]:
     """A tag on the floor of a basin, seen from a height of 0.95 m, and its range and azimuth."""
     rng = np.random.default_rng([tag, number])
     floor_m, centre_m = -1.7, np.array([11.7, 7.0 + rng.uniform(-0.1, 0.1), -1.687])
-    design = place_landmark(tag_design(FAMILY, tag, 0.1306), centre_m, rng.uniform(-np.pi, np.pi), floor_m)
+    design = place_landmark(
+        tag_design(FAMILY, tag, 0.1306), centre_m, rng.uniform(-np.pi, np.pi), floor_m
+    )
     simulator = FrameSimulator(ImageOptions(), [design], floor_m, seed=tag)
     sonar_m = np.array([10.0 + 0.1 * (number - 1), 7.0, floor_m + 0.95])
     world_R_sonar = Rotation.from_euler("ZYX", [0, np.radians(30), 0])
     x, y, z = world_R_sonar.inv().apply(centre_m - sonar_m)
-    return frame_of(simulator.frame(sonar_m, world_R_sonar, number, 0.0)), np.hypot(np.hypot(x, y), z), np.arctan2(y, x)
+    return (
+        frame_of(simulator.frame(sonar_m, world_R_sonar, number, 0.0)),
+        np.hypot(np.hypot(x, y), z),
+        np.arctan2(y, x),
+    )

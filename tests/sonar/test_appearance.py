@@ -16,7 +16,15 @@ from sonar_graph.sonar.appearance import (
     DesignFit,
 )
 from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.evidence import BEHIND, EVIDENCE, FAR, NEAR, STEP, STRETCHES, Figures
+from sonar_graph.sonar.evidence import (
+    BEHIND,
+    EVIDENCE,
+    FAR,
+    NEAR,
+    STEP,
+    STRETCHES,
+    Figures,
+)
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.templates import (
     Patch,
@@ -49,13 +57,26 @@ MODEL = confusion_for(DEFAULT_DESIGNS)
 @pytest.fixture(scope="module")
 def appearance() -> Appearance:
     """For images that are as sharp as these, of landmarks as flat: neither beams nor pulse blur them."""
-    return Appearance([replace(design, relief_m=0.0) for design in DEFAULT_DESIGNS], BLUR_M)
+    return Appearance(
+        [replace(design, relief_m=0.0) for design in DEFAULT_DESIGNS], BLUR_M
+    )
 
 
 def _fit(
-    appearance: Appearance, image: Floats, near_m: tuple[float, float], view: FloorView = VIEW
+    appearance: Appearance,
+    image: Floats,
+    near_m: tuple[float, float],
+    view: FloorView = VIEW,
 ) -> DesignFit | None:
-    return appearance.fit(GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m))
+    return appearance.fit(
+        GRID.patch(
+            image,
+            view,
+            np.array(near_m),
+            appearance.patch_side,
+            appearance.params.cell_m,
+        )
+    )
 
 
 def half_plane() -> LandmarkDesign:
@@ -72,11 +93,15 @@ def edge_in_the_middle(design: LandmarkDesign) -> LandmarkDesign:
 
 def places_m(templates: Templates) -> Floats:
     """(x, y) of the cells, shape (2, cells)."""
-    return templates.cell_m * (np.stack(np.divmod(templates.cells, templates.side)) - templates.side // 2)
+    return templates.cell_m * (
+        np.stack(np.divmod(templates.cells, templates.side)) - templates.side // 2
+    )
 
 
 @pytest.mark.parametrize("heading_rad", [0.0, np.pi / 2])
-def test_the_power_of_an_edge_is_blurred_by_the_pulse_away_from_the_sonar_and_by_beams_across(heading_rad):
+def test_the_power_of_an_edge_is_blurred_by_the_pulse_away_from_the_sonar_and_by_beams_across(
+    heading_rad,
+):
     templates = Templates.of([half_plane()], 0.01, 0.0, (0.02, 0.04))
     picture = templates.pictures[np.isclose(templates.heading_rad, heading_rad)][0]
     x, y = places_m(templates)
@@ -91,9 +116,16 @@ def test_foam_that_stands_up_shows_its_near_side_over_the_first_centimetres_of_i
     flush = half_plane()
     raised = edge_in_the_middle(replace(flush, height_m=0.02, relief_m=0.02))
     for heading_rad in (0.0, np.pi, np.pi / 2):
-        before, after = (picture_of(one, heading_rad, 151, 0.004, (1e-3, 1e-3))[0] for one in (flush, raised))
-        brighter_mm = 4 * (after - before).sum(axis=0) / (10 * np.log10(1 + np.sqrt(3) ** 3))
-        np.testing.assert_allclose(brighter_mm[10:65], 0.0 if heading_rad else 13.5, atol=1.5)
+        before, after = (
+            picture_of(one, heading_rad, 151, 0.004, (1e-3, 1e-3))[0]
+            for one in (flush, raised)
+        )
+        brighter_mm = (
+            4 * (after - before).sum(axis=0) / (10 * np.log10(1 + np.sqrt(3) ** 3))
+        )
+        np.testing.assert_allclose(
+            brighter_mm[10:65], 0.0 if heading_rad else 13.5, atol=1.5
+        )
 
 
 def test_a_beam_is_as_wide_as_beams_are_apart_and_a_pulse_as_long_as_a_bin():
@@ -102,7 +134,8 @@ def test_a_beam_is_as_wide_as_beams_are_apart_and_a_pulse_as_long_as_a_bin():
     half_power = 2 * np.sqrt(2 * np.log(2))
     assert across_m * half_power == pytest.approx(2.0 * spacing_rad, rel=1e-3)
     bin_m = RANGES_M[1] - RANGES_M[0]
-    assert away_m * half_power == pytest.approx(bin_m * 2.0 / 1.6, rel=1e-3)  # ranges differ by less than places
+    # ranges differ by less than places
+    assert away_m * half_power == pytest.approx(bin_m * 2.0 / 1.6, rel=1e-3)
 
 
 def test_a_heading_turns_from_x_to_y():
@@ -117,14 +150,17 @@ def test_a_heading_turns_from_x_to_y():
 
 
 @pytest.mark.parametrize("margin_m", [0.0, 0.05])
-def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_for_its_shadow(margin_m: float):
+def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_for_its_shadow(
+    margin_m: float,
+):
     templates = Templates.of(DEFAULT_DESIGNS, 0.01, margin_m, (0.01, 0.01))
     material_m = max(map(material_radius_m, DEFAULT_DESIGNS))
     radius_m = material_m + margin_m
     x, y = places_m(templates)
     away_m = np.hypot(x, y)
     assert radius_m - 0.01 < away_m.max() <= radius_m
-    area_m2 = np.pi * (material_m**2 + 2 / 3 * (radius_m**2 - material_m**2))  # a third of the ring is behind
+    # a third of the ring is behind
+    area_m2 = np.pi * (material_m**2 + 2 / 3 * (radius_m**2 - material_m**2))
     assert len(away_m) == pytest.approx(area_m2 / 0.01**2, rel=0.03)
     assert away_m[x > 0.51 * away_m].max() <= material_m
     assert margin_m == 0 or away_m[x < 0.49 * away_m].max() > material_m + 0.03
@@ -133,32 +169,54 @@ def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_f
 def test_material_ends_where_the_mask_ends_and_headings_that_look_alike_are_one_template_of_each_design():
     mask = np.full((100, 100), np.nan)
     mask[45:55, 45:55], mask[50, 80] = 12.0, 3.0
-    assert material_radius_m(LandmarkDesign(1, "dot", 1.0, mask)) == pytest.approx(np.hypot(0.305, 0.005), abs=1e-9)
+    assert material_radius_m(LandmarkDesign(1, "dot", 1.0, mask)) == pytest.approx(
+        np.hypot(0.305, 0.005), abs=1e-9
+    )
     disc, square = DEFAULT_DESIGNS[:2]
     twin = LandmarkDesign(9, "twin", disc.size_m, disc.mask)
-    assert np.bincount(Templates.of([disc, twin, square], 0.015, 0.03, (0.01, 0.01)).design).tolist() == [1, 1, 12]
+    assert np.bincount(
+        Templates.of([disc, twin, square], 0.015, 0.03, (0.01, 0.01)).design
+    ).tolist() == [1, 1, 12]
 
 
 def test_a_patch_shows_what_a_search_along_rays_finds_whatever_the_order_of_beams():
-    rotation, centre = level_R_sonar(np.radians(29), np.radians(3)), np.array([1.75, 0.02])
+    rotation, centre = (
+        level_R_sonar(np.radians(29), np.radians(3)),
+        np.array([1.75, 0.02]),
+    )
     xy, lit = floor_points(rotation)
     view, cells_m = FloorView(rotation, HEIGHT_M), 0.015 * (np.arange(21) - 10)
-    for axis, expected in enumerate(np.meshgrid(centre[0] + cells_m, centre[1] + cells_m, indexing="ij")):
+    for axis, expected in enumerate(
+        np.meshgrid(centre[0] + cells_m, centre[1] + cells_m, indexing="ij")
+    ):
         image = np.where(lit, 100 * xy[..., axis], 0).astype(np.float32)
         turned = PolarGrid.of(RANGES_M, AZIMUTHS_RAD[::-1])
-        for patch in (GRID.patch(image, view, centre, 21, 0.015), turned.patch(image[::-1], view, centre, 21, 0.015)):
+        for patch in (
+            GRID.patch(image, view, centre, 21, 0.015),
+            turned.patch(image[::-1], view, centre, 21, 0.015),
+        ):
             assert (patch.seen == 1).all()
             np.testing.assert_allclose(patch.level_db / 100, expected, atol=2e-3)
 
 
 def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
     """A fine grid over the far end, and one over the near end."""
-    cell_m, bin_m, image = 0.004, RANGES_M[1] - RANGES_M[0], np.ones((96, 512), np.float32)
+    cell_m, bin_m, image = (
+        0.004,
+        RANGES_M[1] - RANGES_M[0],
+        np.ones((96, 512), np.float32),
+    )
     for end_m in (RANGES_M[0], RANGES_M[-1]):
-        centre, cells_m = np.array([np.sqrt(end_m**2 - HEIGHT_M**2), 0.0]), cell_m * (np.arange(41) - 20)
+        centre, cells_m = (
+            np.array([np.sqrt(end_m**2 - HEIGHT_M**2), 0.0]),
+            cell_m * (np.arange(41) - 20),
+        )
         patch = GRID.patch(image, VIEW, centre, 41, cell_m)
         r = np.sqrt((centre[0] + cells_m[:, None]) ** 2 + cells_m**2 + HEIGHT_M**2)
-        covered = np.abs(RANGES_M[0] + bin_m * np.arange(-60, 572) - r[..., None]) < cell_m / 2
+        covered = (
+            np.abs(RANGES_M[0] + bin_m * np.arange(-60, 572) - r[..., None])
+            < cell_m / 2
+        )
         outside = covered[..., [*range(60), *range(572, 632)]].any(axis=2)
         np.testing.assert_array_equal(patch.seen, ~outside)
         np.testing.assert_allclose(patch.level_db, patch.seen, atol=1e-6)
@@ -168,19 +226,32 @@ def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
 @example(10.0, 512)
 @example(15.0, 128)
 @example(0.015 * 512, 512)
-def test_a_patch_has_a_value_wherever_the_image_has_data_whatever_the_window(window_m: float, bins: int):
+def test_a_patch_has_a_value_wherever_the_image_has_data_whatever_the_window(
+    window_m: float, bins: int
+):
     """A constant image gives a constant patch, and an image of its ranges the range of each cell."""
     cell_m, bin_m = 0.015, window_m / bins
     ranges_m = 0.7 + bin_m * (np.arange(bins) + 0.5)
-    grid, (x, y) = PolarGrid.of(ranges_m, AZIMUTHS_RAD), 1.75 + cell_m * (np.mgrid[:41, :41] - 20.0)
+    grid, (x, y) = (
+        PolarGrid.of(ranges_m, AZIMUTHS_RAD),
+        1.75 + cell_m * (np.mgrid[:41, :41] - 20.0),
+    )
     r = np.sqrt(x**2 + (y - 1.75) ** 2 + HEIGHT_M**2)
     flat, sloped = (
-        grid.patch(np.tile(level, (96, 1)).astype(np.float32), VIEW, np.array([1.75, 0.0]), 41, cell_m)
+        grid.patch(
+            np.tile(level, (96, 1)).astype(np.float32),
+            VIEW,
+            np.array([1.75, 0.0]),
+            41,
+            cell_m,
+        )
         for level in (np.full(bins, 37.0), 100 * ranges_m)
     )
     np.testing.assert_array_equal(flat.seen, 1)
     np.testing.assert_allclose(flat.level_db, 37.0, rtol=1e-6)
-    np.testing.assert_allclose(sloped.level_db / 100, r, atol=1e-5 if bin_m > cell_m else bin_m / 2 + 1e-5)
+    np.testing.assert_allclose(
+        sloped.level_db / 100, r, atol=1e-5 if bin_m > cell_m else bin_m / 2 + 1e-5
+    )
 
 
 @pytest.mark.parametrize("bin_m", [0.0024, 0.0149, 0.0151, 0.03])
@@ -188,10 +259,15 @@ def test_what_lies_beyond_the_first_or_last_bin_is_not_seen(bin_m: float):
     """Patches across the ends of a window: a cell reaches half of itself beyond a bin's middle, a finer one not."""
     cell_m, end_m = 0.015, np.hypot(1.75, HEIGHT_M)
     x, y = cell_m * (np.mgrid[:41, :41] - 20.0)
-    r, reach_m = np.sqrt((1.75 + x) ** 2 + y**2 + HEIGHT_M**2), 0.0 if bin_m > cell_m else cell_m / 2
+    r, reach_m = (
+        np.sqrt((1.75 + x) ** 2 + y**2 + HEIGHT_M**2),
+        0.0 if bin_m > cell_m else cell_m / 2,
+    )
     for ranges_m in (end_m + bin_m * np.arange(-50, 1), end_m + bin_m * np.arange(51)):
         image = np.ones((96, 51), np.float32)
-        patch = PolarGrid.of(ranges_m, AZIMUTHS_RAD).patch(image, VIEW, np.array([1.75, 0.0]), 41, cell_m)
+        patch = PolarGrid.of(ranges_m, AZIMUTHS_RAD).patch(
+            image, VIEW, np.array([1.75, 0.0]), 41, cell_m
+        )
         inside = (r > ranges_m[0] + reach_m) & (r < ranges_m[-1] - reach_m)
         outside = (r < ranges_m[0] - reach_m) | (r > ranges_m[-1] + reach_m)
         assert inside.any()
@@ -203,9 +279,17 @@ def test_what_lies_beyond_the_first_or_last_bin_is_not_seen(bin_m: float):
 
 @pytest.mark.parametrize("index", range(len(DEFAULT_DESIGNS)))
 @pytest.mark.parametrize("heading_rad", [0.3, 2.0, -2.6])
-def test_every_design_is_known_at_every_heading_in_speckle(appearance, index, heading_rad):
+def test_every_design_is_known_at_every_heading_in_speckle(
+    appearance, index, heading_rad
+):
     rotation = level_R_sonar(np.radians(31), np.radians(-2))
-    image = image_db(DEFAULT_DESIGNS[index], (1.7, 0.05), heading_rad, rotation, np.random.default_rng(index))
+    image = image_db(
+        DEFAULT_DESIGNS[index],
+        (1.7, 0.05),
+        heading_rad,
+        rotation,
+        np.random.default_rng(index),
+    )
     fit = _fit(appearance, image, (1.72, 0.03), FloorView(rotation, HEIGHT_M))
     found = odds(fit)
     assert found[index] > 5
@@ -214,9 +298,15 @@ def test_every_design_is_known_at_every_heading_in_speckle(appearance, index, he
 
 
 @pytest.mark.parametrize("rim", [47, 44, 35, 30])
-def test_places_and_headings_are_those_of_the_best_correlation_over_the_cells_in_view(appearance, rim: int):
+def test_places_and_headings_are_those_of_the_best_correlation_over_the_cells_in_view(
+    appearance, rim: int
+):
     """A landmark in noise, of which the image holds the first columns; all shifts and headings by `np.corrcoef`."""
-    templates, side, rng = appearance.templates, appearance.patch_side, np.random.default_rng(rim)
+    templates, side, rng = (
+        appearance.templates,
+        appearance.patch_side,
+        np.random.default_rng(rim),
+    )
     x, y = np.divmod(templates.cells, templates.side)
     steps, row = range(2 * appearance._steps + 1), len(templates.design) // 2
     level = rng.normal(40, 4, (side, side)).astype(np.float32)
@@ -229,7 +319,16 @@ def test_places_and_headings_are_those_of_the_best_correlation_over_the_cells_in
         if held.mean() >= appearance.params.least_searched:
             window = level[x + appearance._rim + i, y + appearance._rim + j][held]
             for n, picture in enumerate(templates.pictures):
-                best = max(best, (float(np.corrcoef(window, picture[held])[0, 1]), n, i, j, float(held.mean())))
+                best = max(
+                    best,
+                    (
+                        float(np.corrcoef(window, picture[held])[0, 1]),
+                        n,
+                        i,
+                        j,
+                        float(held.mean()),
+                    ),
+                )
     _, template, i, j, visible = best
     if visible < appearance.params.least_visible:
         assert fit is None
@@ -237,7 +336,9 @@ def test_places_and_headings_are_those_of_the_best_correlation_over_the_cells_in
     design = templates.design[template]
     assert template == row
     assert fit.heading_rad[design] == templates.heading_rad[template]
-    np.testing.assert_allclose(fit.centre_m[design], 0.015 * (np.array([i, j]) - appearance._steps), atol=0.002)
+    np.testing.assert_allclose(
+        fit.centre_m[design], 0.015 * (np.array([i, j]) - appearance._steps), atol=0.002
+    )
     assert fit.visible == pytest.approx(visible, abs=0.12)
 
 
@@ -245,14 +346,20 @@ def odds(fit: DesignFit, model: Confusion = MODEL) -> np.ndarray:
     return model.log_odds(fit.evidence)
 
 
-def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch) -> tuple[list[float], int]:
+def plain_evidence(
+    figures: Figures, template: int, x: int, y: int, patch: Patch
+) -> tuple[list[float], int]:
     """The equations of the module in NumPy: least squares on the cells in view, over and over; and the edge."""
     rows, side = slice(*figures.first[template : template + 2]), len(patch.seen)
     i, j = np.divmod(figures.cells[rows], side) + np.array([[x], [y]])
     seen, held = patch.seen[i, j] > 0, patch.held[i, j] > 0.5
     level = patch.level_db[i, j] - patch.level_db[i, j][seen].mean()
     smooth = patch.smooth_db[i, j] - patch.level_db[i, j][seen].mean()
-    values, zones, design = figures.values[rows] * float(STEP), figures.zones[rows], figures.smooth[rows]
+    values, zones, design = (
+        figures.values[rows] * float(STEP),
+        figures.zones[rows],
+        figures.smooth[rows],
+    )
 
     def fitted(*columns: int) -> tuple[float, Floats]:
         A, z = values[seen][:, columns], level[seen].astype(float)
@@ -267,26 +374,45 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
     if fitted(one, figure, shades)[1][2] < 0:
         shaded = fitted(one, figure, shades)[0]
     both = min(best, shaded)
-    if delta < 0 and shaded < plain and max(fitted(one, figure, dark, shades)[1][2:]) < 0:
+    if (
+        delta < 0
+        and shaded < plain
+        and max(fitted(one, figure, dark, shades)[1][2:]) < 0
+    ):
         both = fitted(one, figure, dark, shades)[0]
     others = [shaded]
     for q in range(1, shades - figure):
         with_shade, c = fitted(one, figure + q, shades + q)
         others.append(with_shade if c[2] < 0 else fitted(one, figure + q)[0])
-    away = 0.015 * (np.stack([i - x, j - y]) - (side - 7) // 2)  # from the middle; three places on each side
+    # from the middle; three places on each side
+    away = 0.015 * (np.stack([i - x, j - y]) - (side - 7) // 2)
     B = values[:, figure]
     kept = np.where(B > 0.12, B, 0.0)
-    radius = np.sqrt(2 * (away**2).sum(axis=0) @ np.maximum(B, 0) / np.maximum(B, 0).sum())
+    radius = np.sqrt(
+        2 * (away**2).sum(axis=0) @ np.maximum(B, 0) / np.maximum(B, 0).sum()
+    )
     without_figure = fitted(one, dark)[0] if delta < 0 else fitted(one)[0]
-    covered, edge, edges = without_figure, -1, product(2 * np.pi * np.arange(12) / 12, (0.15, 0.4, 0.65))
+    covered, edge, edges = (
+        without_figure,
+        -1,
+        product(2 * np.pi * np.arange(12) / 12, (0.15, 0.4, 0.65)),
+    )
     for number, (towards, offset) in enumerate(edges):
-        part = kept * (away[0] * np.cos(towards) + away[1] * np.sin(towards) <= offset * radius)
-        A = np.stack([np.ones_like(part), *([values[:, dark]] if delta < 0 else []), part])[:, seen].T
+        part = kept * (
+            away[0] * np.cos(towards) + away[1] * np.sin(towards) <= offset * radius
+        )
+        A = np.stack(
+            [np.ones_like(part), *([values[:, dark]] if delta < 0 else []), part]
+        )[:, seen].T
         c = np.linalg.lstsq(A, level[seen].astype(float), rcond=None)[0]
         if c[-1] > 0 and (left := float(((level[seen] - A @ c) ** 2).sum())) < covered:
             covered, edge = left, number
     whole = best if beta > 0 else without_figure
-    edge = edge if figures.independent * seen.sum() / 2 * np.log(whole / covered) > np.log(36) else -1
+    edge = (
+        edge
+        if figures.independent * seen.sum() / 2 * np.log(whole / covered) > np.log(36)
+        else -1
+    )
     covered = min(covered, whole)
     off = smooth - floor - beta * design[:, 1] - delta * design[:, 0]
     near, far, back = ((zones & zone > 0) & held for zone in (NEAR, FAR, BEHIND))
@@ -297,10 +423,28 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
         np.log(min(others) / both),
         np.log(min(fitted(one, figure + q)[0] for q in range(shades - figure)) / plain),
         np.log(max(beta, 0.5) / np.sqrt(mean_square)),
-        np.log((np.mean(np.maximum(off[near], 0) ** 2) if near.sum() > 8 else mean_square / 3) + 0.3),
-        np.log((np.mean(np.minimum(off[far], 0) ** 2) if far.sum() > 8 else mean_square / 3) + 0.3),
+        np.log(
+            (
+                np.mean(np.maximum(off[near], 0) ** 2)
+                if near.sum() > 8
+                else mean_square / 3
+            )
+            + 0.3
+        ),
+        np.log(
+            (
+                np.mean(np.minimum(off[far], 0) ** 2)
+                if far.sum() > 8
+                else mean_square / 3
+            )
+            + 0.3
+        ),
         np.mean(level[back] - floor) if back.sum() > 5 else 0.0,
-        np.sqrt(max(min(np.log(shaded / both), np.log(fitted(one, dark)[0] / best)), 0.0)) if delta < 0 else 0.0,
+        np.sqrt(
+            max(min(np.log(shaded / both), np.log(fitted(one, dark)[0] / best)), 0.0)
+        )
+        if delta < 0
+        else 0.0,
         float(not figures.has_dark[template]),
         np.log(covered / (level[seen] @ level[seen])),
         max(np.log(best / covered), 0.0),
@@ -308,7 +452,9 @@ def plain_evidence(figures: Figures, template: int, x: int, y: int, patch: Patch
     return columns, edge
 
 
-@pytest.mark.parametrize(("rim", "blur_m"), [(99, BLUR_M), (30, BLUR_M), (26, BLUR_M), (99, (0.008, 0.02))])
+@pytest.mark.parametrize(
+    ("rim", "blur_m"), [(99, BLUR_M), (30, BLUR_M), (26, BLUR_M), (99, (0.008, 0.02))]
+)
 def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur_m):
     """Every design in rough noise: weak, whole, dark where it should be bright, or its plate alone; with holes.
 
@@ -316,20 +462,33 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
     """
     appearance = Appearance(DEFAULT_DESIGNS, blur_m)
     share = np.prod([min(0.015 / (2.3548 * one), 1.0) for one in blur_m])
-    templates, figures, rng = appearance.templates, appearance.figures, np.random.default_rng(rim)
+    templates, figures, rng = (
+        appearance.templates,
+        appearance.figures,
+        np.random.default_rng(rim),
+    )
     side, has, is_edge = appearance.patch_side, set(), set()
-    i, j = np.divmod(templates.cells, templates.side) + np.array([[3 + appearance._rim], [2 + appearance._rim]])
-    seen = (np.arange(side) < rim) & (rng.random((side, side)) > (0.0 if rim > side else 0.05))
+    i, j = np.divmod(templates.cells, templates.side) + np.array(
+        [[3 + appearance._rim], [2 + appearance._rim]]
+    )
+    seen = (np.arange(side) < rim) & (
+        rng.random((side, side)) > (0.0 if rim > side else 0.05)
+    )
     seen = seen.astype(np.float32)
     for template, picture in enumerate(templates.pictures):
         level = rng.normal(40, 4, (side, side)).astype(np.float32)
-        level[i, j] += (0.3 * picture, picture, -picture, 3 * np.minimum(picture, 0))[template % 4]
+        level[i, j] += (0.3 * picture, picture, -picture, 3 * np.minimum(picture, 0))[
+            template % 4
+        ]
         level[side // 2 + (5, 12)[template % 2] :] -= (0, 8)[template // 2 % 2]
         patch = Patch.of(level * seen, seen, np.zeros(2))
         another, at = (template + 1) % len(templates.design), np.array([[3, 2], [3, 3]])
-        (found, rival), edges = figures.evidence(patch, np.array([template, another]), at)
+        (found, rival), edges = figures.evidence(
+            patch, np.array([template, another]), at
+        )
         (own, edge), (of_another, edge_of_another) = (
-            plain_evidence(figures, one, *place, patch) for one, place in zip((template, another), at, strict=True)
+            plain_evidence(figures, one, *place, patch)
+            for one, place in zip((template, another), at, strict=True)
         )
         assert edges.tolist() == [edge, edge_of_another]
         is_edge |= {*(edges >= 0)}
@@ -339,14 +498,20 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
         expected[7] *= np.sqrt(share)
         np.testing.assert_allclose(found, expected, atol=5e-5)
         assert rival[9] == pytest.approx(share * (min(shares) - shares[1]), abs=5e-5)
-        has |= {name for name, *values in zip(EVIDENCE, found, rival, strict=True) if any(values)}
+        has |= {
+            name
+            for name, *values in zip(EVIDENCE, found, rival, strict=True)
+            if any(values)
+        }
     assert has == {*EVIDENCE} - ({"bare"} if figures.has_dark.all() else set())
     assert is_edge == {True, False}
 
 
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
 def test_no_shadow_lies_on_the_face_of_foam_however_bright_its_near_side_is(design):
-    figures = Appearance([replace(design, height_m=0.06, relief_m=0.06)], BLUR_M).figures
+    figures = Appearance(
+        [replace(design, height_m=0.06, relief_m=0.06)], BLUR_M
+    ).figures
     values = figures.values * STEP
     figure, shadow = values[:, 2], values[:, 2 + len(STRETCHES)]
     assert shadow[figure > 0.95].max() <= 0.06
@@ -354,29 +519,49 @@ def test_no_shadow_lies_on_the_face_of_foam_however_bright_its_near_side_is(desi
 
 
 @pytest.mark.parametrize("width", [11, 23])
-def test_zones_of_which_only_a_few_cells_are_in_view_say_nothing(appearance, width: int):
+def test_zones_of_which_only_a_few_cells_are_in_view_say_nothing(
+    appearance, width: int
+):
     """Only the middle is in view: at its rim lie the first cells next to the figure, behind it, or farther out."""
-    templates, figures, rng = appearance.templates, appearance.figures, np.random.default_rng(width)
+    templates, figures, rng = (
+        appearance.templates,
+        appearance.figures,
+        np.random.default_rng(width),
+    )
     side = appearance.patch_side
     inside = np.abs(np.arange(side) - side // 2) <= width // 2
     seen = (inside[:, None] & inside).astype(np.float32)
     for template in range(len(templates.design)):
-        patch = Patch.of(rng.normal(40, 4, (side, side)).astype(np.float32) * seen, seen, np.zeros(2))
-        ((found,), _) = figures.evidence(patch, np.array([template]), np.array([[3, 2]]))
-        np.testing.assert_allclose(found[4:7], plain_evidence(figures, template, 3, 2, patch)[0][4:7], atol=2e-3)
+        patch = Patch.of(
+            rng.normal(40, 4, (side, side)).astype(np.float32) * seen, seen, np.zeros(2)
+        )
+        ((found,), _) = figures.evidence(
+            patch, np.array([template]), np.array([[3, 2]])
+        )
+        np.testing.assert_allclose(
+            found[4:7],
+            plain_evidence(figures, template, 3, 2, patch)[0][4:7],
+            atol=2e-3,
+        )
 
 
 def test_gain_and_floor_level_change_nothing(appearance):
     """Decibels are as the sonar's gain lifts them; the heading of a triangle is found up to its symmetry."""
-    image = image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0))
-    plain, other = (_fit(appearance, picture, (1.7, 0.0)) for picture in (image, image + 20))
+    image = image_db(
+        DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0)
+    )
+    plain, other = (
+        _fit(appearance, picture, (1.7, 0.0)) for picture in (image, image + 20)
+    )
     np.testing.assert_allclose(other.evidence, plain.evidence, atol=2e-3)
     off = (plain.heading_rad[2] - 0.4) % (2 * np.pi / 3)
     assert min(off, 2 * np.pi / 3 - off) < np.radians(5)
 
 
 def test_a_patch_of_one_level_says_nothing(appearance):
-    image = image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0))
+    image = image_db(
+        DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0)
+    )
     assert _fit(appearance, np.full_like(image, 30.0), (1.7, 0.0)) is None
     assert _fit(appearance, image, (1.7, 0.0)) is not None
 
@@ -385,7 +570,9 @@ def test_a_patch_of_one_level_says_nothing(appearance):
 def test_weaker_contrast_does_not_change_the_ranking(appearance, design):
     """Down to foam that is as bright as the floor, on its plate."""
     for by_db in (0.0, 3.0, 6.0, 9.0, 12.0):
-        image = image_db(weaker(design, by_db), (1.7, 0.0), 0.3, ROTATION, np.random.default_rng(1))
+        image = image_db(
+            weaker(design, by_db), (1.7, 0.0), 0.3, ROTATION, np.random.default_rng(1)
+        )
         found = odds(_fit(appearance, image, (1.7, 0.0)))
         assert found.argmax() == design.id - 1
         assert found.max() > 0
@@ -393,7 +580,9 @@ def test_weaker_contrast_does_not_change_the_ranking(appearance, design):
 
 def weaker(design: LandmarkDesign, by_db: float) -> LandmarkDesign:
     """Its foam that much less bright."""
-    return replace(design, mask=np.where(design.mask > 0, design.mask - by_db, design.mask))
+    return replace(
+        design, mask=np.where(design.mask > 0, design.mask - by_db, design.mask)
+    )
 
 
 def on_floor(design: LandmarkDesign) -> LandmarkDesign:
@@ -404,24 +593,40 @@ def on_floor(design: LandmarkDesign) -> LandmarkDesign:
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
 def test_a_plate_that_is_not_seen_is_no_evidence_against_a_design(appearance, design):
     seen, unseen = (
-        _fit(appearance, image_db(one, (1.7, 0.0), 0.3, ROTATION, np.random.default_rng(2)), (1.7, 0.0))
+        _fit(
+            appearance,
+            image_db(one, (1.7, 0.0), 0.3, ROTATION, np.random.default_rng(2)),
+            (1.7, 0.0),
+        )
         for one in (design, on_floor(design))
     )
     plate = EVIDENCE.index("plate")
-    assert unseen.evidence[design.id - 1, plate] < 0.5 * seen.evidence[design.id - 1, plate]
+    assert (
+        unseen.evidence[design.id - 1, plate]
+        < 0.5 * seen.evidence[design.id - 1, plate]
+    )
     assert odds(unseen).argmax() == design.id - 1
     assert odds(unseen).max() > 0
 
 
 def drawn(figure: Floats, below_db: float | None = None) -> LandmarkDesign:
     """A figure of 12 dB, and where it is not a level or the floor."""
-    return LandmarkDesign(9, "figure", 0.6, np.where(figure, 12.0, np.nan if below_db is None else below_db))
+    return LandmarkDesign(
+        9,
+        "figure",
+        0.6,
+        np.where(figure, 12.0, np.nan if below_db is None else below_db),
+    )
 
 
 def strangers() -> dict[str, LandmarkDesign | None]:
-    x, y = np.meshgrid(0.002 * (np.arange(300) - 149.5), 0.002 * (149.5 - np.arange(300)))
+    x, y = np.meshgrid(
+        0.002 * (np.arange(300) - 149.5), 0.002 * (149.5 - np.arange(300))
+    )
     bar, small = (np.abs(y) < 0.04) & (np.abs(x) < 0.25), np.hypot(x, y) < 0.09
-    ragged = np.hypot(x, y) < 0.13 + 0.05 * np.cos(3 * np.arctan2(y, x)) + 0.03 * np.cos(5 * np.arctan2(y, x) + 1)
+    ragged = np.hypot(x, y) < 0.13 + 0.05 * np.cos(
+        3 * np.arctan2(y, x)
+    ) + 0.03 * np.cos(5 * np.arctan2(y, x) + 1)
     return {
         "floor": None, "bar": drawn(bar), "a lid of another size": drawn(small), "ragged": drawn(ragged),
     }  # fmt: skip
@@ -429,7 +634,9 @@ def strangers() -> dict[str, LandmarkDesign | None]:
 
 @pytest.mark.parametrize("name", strangers())
 def test_a_stranger_is_none(appearance, name):
-    image = image_db(strangers()[name], (1.7, 0.0), 0.2, ROTATION, np.random.default_rng(3))
+    image = image_db(
+        strangers()[name], (1.7, 0.0), 0.2, ROTATION, np.random.default_rng(3)
+    )
     assert odds(_fit(appearance, image, (1.7, 0.0))).max() < -2
 
 
@@ -443,7 +650,9 @@ def test_a_long_shadow_speaks_against_a_design(appearance):
     first, last = (polar((1.7 + d, 0.0))[0] for d in (0.15, 0.24))
     dark = (r > first) & (r < last) & (np.abs(r * np.sin(a)) < 0.13) & (x > 0)
     shaded[dark] -= 15
-    plain, behind = (odds(_fit(appearance, one, (1.7, 0.0)))[1] for one in (image, shaded))
+    plain, behind = (
+        odds(_fit(appearance, one, (1.7, 0.0)))[1] for one in (image, shaded)
+    )
     assert behind < plain - 1
 
 
@@ -452,7 +661,9 @@ def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design)
     for y_m in np.linspace(0.34, 0.46, 7):
         fit = _fit(appearance, image_db(design, (1.7, y_m), 0.6), (1.7, y_m - 0.02))
         if fit is not None:
-            np.testing.assert_allclose(fit.centre_m[design.id - 1], (1.7, y_m), atol=0.004)
+            np.testing.assert_allclose(
+                fit.centre_m[design.id - 1], (1.7, y_m), atol=0.004
+            )
 
 
 def test_azimuths_are_those_of_the_arctangent_all_round():
@@ -461,7 +672,9 @@ def test_azimuths_are_those_of_the_arctangent_all_round():
     np.testing.assert_allclose(found, angles_rad, atol=1e-7)
 
 
-@pytest.mark.parametrize(("first_m", "last_m", "most"), [(1.2, 2.5, 12), (0.0, 10.0, 50)])
+@pytest.mark.parametrize(
+    ("first_m", "last_m", "most"), [(1.2, 2.5, 12), (0.0, 10.0, 50)]
+)
 def test_templates_in_view_are_those_that_candidates_there_need(first_m, last_m, most):
     """Of candidates at any range and depression one in a hundred may need others, at a corner of the steps."""
     noise, depressions_rad = np.random.default_rng(0), (0.2, 0.8)
@@ -471,7 +684,9 @@ def test_templates_in_view_are_those_that_candidates_there_need(first_m, last_m,
     needed = [
         grid.blur_steps(range_m * np.cos(depression_rad), range_m)
         for range_m, depression_rad in zip(
-            noise.uniform(max(first_m, 0.4), last_m, 1000), noise.uniform(*depressions_rad, 1000), strict=True
+            noise.uniform(max(first_m, 0.4), last_m, 1000),
+            noise.uniform(*depressions_rad, 1000),
+            strict=True,
         )
     ]
     assert np.mean([steps in prepared for steps in needed]) >= 0.99

@@ -5,7 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.sonar.bayes import Beliefs, IdentityParams, bounded_evidence, jeffrey, news_of_motion, predict
+from sonar_graph.sonar.bayes import (
+    Beliefs,
+    IdentityParams,
+    bounded_evidence,
+    jeffrey,
+    news_of_motion,
+    predict,
+)
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.tracker import Association
@@ -22,13 +29,21 @@ def confusion_of(accuracy: float) -> np.ndarray:
     return np.where(np.eye(4) > 0, accuracy, (1 - accuracy) / 3)
 
 
-@given(seeds, st.integers(1, 5), st.integers(0, 4), st.integers(2, 6), st.integers(2, 6))
-def test_beliefs_stay_distributions(seed: int, tracks: int, before: int, classes: int, features: int):
+@given(
+    seeds, st.integers(1, 5), st.integers(0, 4), st.integers(2, 6), st.integers(2, 6)
+)
+def test_beliefs_stay_distributions(
+    seed: int, tracks: int, before: int, classes: int, features: int
+):
     rng = np.random.default_rng(seed)
     beliefs = _rows(rng, before, classes) if before else np.empty((0, classes))
-    predicted = predict(beliefs, _rows(rng, tracks, before + 1), _rows(rng, classes), 0.01)
+    predicted = predict(
+        beliefs, _rows(rng, tracks, before + 1), _rows(rng, classes), 0.01
+    )
     np.testing.assert_allclose(predicted.sum(axis=1), 1)
-    after = jeffrey(predicted, _rows(rng, tracks, features), _rows(rng, classes, features))
+    after = jeffrey(
+        predicted, _rows(rng, tracks, features), _rows(rng, classes, features)
+    )
     assert (after >= 0).all()
     np.testing.assert_allclose(after.sum(axis=1), 1)
 
@@ -36,23 +51,42 @@ def test_beliefs_stay_distributions(seed: int, tracks: int, before: int, classes
 @given(seeds)
 def test_rules_are_their_equations_with_an_index_for_everything(seed: int):
     rng = np.random.default_rng(seed)
-    start, scores, C, birth = _rows(rng, 3, 5), _rows(rng, 3, 4), _rows(rng, 5, 4), _rows(rng, 5)
-    sums, counted, looks, doubt = rng.normal(0, 30, (3, 5)), rng.uniform(0, 9, 3), rng.uniform(1, 5), rng.uniform()
+    start, scores, C, birth = (
+        _rows(rng, 3, 5),
+        _rows(rng, 3, 4),
+        _rows(rng, 5, 4),
+        _rows(rng, 5),
+    )
+    sums, counted, looks, doubt = (
+        rng.normal(0, 30, (3, 5)),
+        rng.uniform(0, 9, 3),
+        rng.uniform(1, 5),
+        rng.uniform(),
+    )
     printed, ours = np.zeros_like(start), np.zeros_like(start)
     for m, k in np.ndindex(start.shape):
         for j in range(4):
-            printed[m, k] += C[k, j] * start[m, k] / sum(C[i, j] * start[m, i] for i in range(5)) * scores[m, j]
+            printed[m, k] += (
+                C[k, j]
+                * start[m, k]
+                / sum(C[i, j] * start[m, i] for i in range(5))
+                * scores[m, j]
+            )
         ours[m, k] = birth[k] * np.exp(sums[m, k] / (counted[m] + looks))
     np.testing.assert_allclose(jeffrey(start, scores, C), printed)
     found = bounded_evidence(birth, sums, counted, looks, doubt)
-    np.testing.assert_allclose(found, (1 - doubt) * ours / ours.sum(axis=1, keepdims=True) + doubt * birth)
+    np.testing.assert_allclose(
+        found, (1 - doubt) * ours / ours.sum(axis=1, keepdims=True) + doubt * birth
+    )
 
 
 def test_jeffrey_is_bayes_for_one_hot_scores():
     rng = np.random.default_rng(0)
     predicted, confusion = _rows(rng, 1, 4), _rows(rng, 4, 3)
     bayes = predicted * confusion[:, 1]
-    np.testing.assert_allclose(jeffrey(predicted, np.array([[0.0, 1.0, 0.0]]), confusion), bayes / bayes.sum())
+    np.testing.assert_allclose(
+        jeffrey(predicted, np.array([[0.0, 1.0, 0.0]]), confusion), bayes / bayes.sum()
+    )
 
 
 def test_jeffrey_saturates_where_the_matrix_explains_the_scores():
@@ -76,7 +110,9 @@ def test_jeffrey_forgets_in_frames_without_information_and_depends_on_the_order_
 
 def test_a_missing_measurement_changes_nothing_and_an_impossible_feature_divides_nothing_by_zero():
     predicted = _rows(np.random.default_rng(2), 2, 4)
-    np.testing.assert_array_equal(jeffrey(predicted, np.zeros((2, 4)), confusion_of(0.9)), predicted)
+    np.testing.assert_array_equal(
+        jeffrey(predicted, np.zeros((2, 4)), confusion_of(0.9)), predicted
+    )
     predicted, scores = np.array([[0.5, 0.5, 0.0]]), np.array([[0.0, 0.0, 1.0]])
     np.testing.assert_allclose(jeffrey(predicted, scores, np.eye(3)), predicted)
 
@@ -84,16 +120,26 @@ def test_a_missing_measurement_changes_nothing_and_an_impossible_feature_divides
 @given(seeds)
 def test_evidence_is_bounded_and_the_order_of_frames_does_not_matter(seed: int):
     """However many frames say the same, the odds are at most those of a track that always looked so."""
-    log_odds, birth = np.append(np.random.default_rng(seed).normal(0, 5, 2), 0.0), np.array([0.25, 0.25, 0.5])
+    log_odds, birth = (
+        np.append(np.random.default_rng(seed).normal(0, 5, 2), 0.0),
+        np.array([0.25, 0.25, 0.5]),
+    )
     n, looks = np.array([1.0, 10.0, 1e9]), 3.0
-    found = np.log(bounded_evidence(birth, n[:, None] * log_odds, n, looks, 0.0) / birth)
+    found = np.log(
+        bounded_evidence(birth, n[:, None] * log_odds, n, looks, 0.0) / birth
+    )
     odds = found - found[:, -1:]
-    np.testing.assert_allclose(odds[:, :2], (n / (n + looks))[:, None] * log_odds[:2], atol=1e-6)
+    np.testing.assert_allclose(
+        odds[:, :2], (n / (n + looks))[:, None] * log_odds[:2], atol=1e-6
+    )
     assert (abs(odds[:, :2]) <= abs(log_odds[:2]) + 1e-6).all()
     sure = bounded_evidence(birth, np.array([[1e6, 0.0, 0.0]]), np.ones(1), looks, 0.01)
     np.testing.assert_allclose(sure, [[0.9925, 0.0025, 0.005]])
     places, other = [(0, 0, 0), (0, 0.2, 0), (0, 0.4, 0)], np.array([[-1.0, 2.0, 0.0]])
-    forth, back = (_after(places, odds=o)[-1] for o in ([LOOKS_LIKE_1, other, other], [other, other, LOOKS_LIKE_1]))
+    forth, back = (
+        _after(places, odds=o)[-1]
+        for o in ([LOOKS_LIKE_1, other, other], [other, other, LOOKS_LIKE_1])
+    )
     assert forth == pytest.approx(back)
 
 
@@ -101,12 +147,18 @@ def test_evidence_is_bounded_and_the_order_of_frames_does_not_matter(seed: int):
     ("association", "forgetting", "expected"),
     [
         ([[0.0, 0.0, 1.0]], 1e-3, [0.1, 0.2, 0.7]),  # new
-        ([[1.0, 0.0, 0.0]], 0.1, [0.91, 0.02, 0.07]),  # a share returns to the belief of a new track
+        (
+            [[1.0, 0.0, 0.0]],
+            0.1,
+            [0.91, 0.02, 0.07],
+        ),  # a share returns to the belief of a new track
         ([[0.5, 0.5, 0.0]], 0.0, [0.5, 0.5, 0.0]),  # of either track before
     ],
 )
 def test_prediction_follows_the_association(association, forgetting, expected):
-    predicted = predict(np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting)
+    predicted = predict(
+        np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting
+    )
     np.testing.assert_allclose(predicted, [expected])
 
 
@@ -116,7 +168,9 @@ def test_news_follow_from_the_autocorrelation_of_a_triangle():
     triangle = np.maximum(0.07 - np.abs(places), 0.0)
     autocorrelation = np.convolve(triangle, triangle, mode="same")
     moved = np.array([-1.0, 0.0, 0.01, 0.03, 0.0357, 0.05, 0.07, 0.09, 0.12, 0.14, 1.0])
-    expected = 1 - np.interp(moved, places, autocorrelation / autocorrelation.max()) ** 2
+    expected = (
+        1 - np.interp(moved, places, autocorrelation / autocorrelation.max()) ** 2
+    )
     np.testing.assert_allclose(news_of_motion(moved, 0.14), expected, atol=1e-3)
     assert expected[4] == pytest.approx(0.5, abs=0.01)
 
@@ -131,11 +185,24 @@ SIDEWAYS = np.array([[0.0, 1.0, 0.0]])
 
 
 def _association(before: list[int], after: list[int]) -> Association:
-    matrix = np.array([[float(track == old) for old in before] + [float(track not in before)] for track in after])
+    matrix = np.array(
+        [
+            [float(track == old) for old in before] + [float(track not in before)]
+            for track in after
+        ]
+    )
     n = len(after)
-    tracks = np.array(after), np.tile([2.0, 0, 0], (n, 1)), np.zeros((n, 3, 3)), np.ones(n), np.full(n, 5)
+    tracks = (
+        np.array(after),
+        np.tile([2.0, 0, 0], (n, 1)),
+        np.zeros((n, 3, 3)),
+        np.ones(n),
+        np.full(n, 5),
+    )
     rows, none = matrix.reshape(n, len(before) + 1), np.array([], int)
-    return Association(*tracks, 0, np.array(before, int), rows, np.zeros(n, int), none, ())
+    return Association(
+        *tracks, 0, np.array(before, int), rows, np.zeros(n, int), none, ()
+    )
 
 
 def _after(
@@ -147,9 +214,20 @@ def _after(
     """Belief in landmark 1 after each frame of one track, looked at from these places; None: not looked at."""
     params = IdentityParams.model_validate({"rule": rule} | settings)
     beliefs, before, found = Beliefs(CONFUSION, params), [], []
-    for place, log_odds in zip(places, odds or [LOOKS_LIKE_1] * len(places), strict=True):
-        looked, place = np.array([place is not None]), np.array(place or (0.0, 0.0, 0.0))
-        found.append(float(beliefs.step(_association(before, [7]), log_odds, looked, place, SIDEWAYS)[0, 0]))
+    for place, log_odds in zip(
+        places, odds or [LOOKS_LIKE_1] * len(places), strict=True
+    ):
+        looked, place = (
+            np.array([place is not None]),
+            np.array(place or (0.0, 0.0, 0.0)),
+        )
+        found.append(
+            float(
+                beliefs.step(
+                    _association(before, [7]), log_odds, looked, place, SIDEWAYS
+                )[0, 0]
+            )
+        )
         before = [7]
     return found
 
@@ -170,14 +248,18 @@ def test_looks_from_new_places_add_up_and_old_places_are_no_news():
     away_and_back = _after([(0, 0, 0), (0, 0.1, 0), (0, 0, 0), (0, 0.1, 0)])
     assert away_and_back[3] <= away_and_back[1] > away_and_back[0]
     back = [(0, 0, 0), (0, 0.14, 0), (0, 0, 0)]
-    assert (np.diff(_after(back, most_looks=1)) > 0).all()  # places beyond the limit are forgotten
+    assert (
+        np.diff(_after(back, most_looks=1)) > 0
+    ).all()  # places beyond the limit are forgotten
     remembered = _after(back)
     assert remembered[2] <= remembered[1]
 
 
 def test_motion_ahead_counts_less_than_motion_to_the_side_and_hardly_any_waits_until_it_adds_up():
     """4 mm each: a hundredth of a frame; after 16 mm a seventh."""
-    ahead, aside = (_after([(0, 0, 0), place]) for place in ((0.03, 0, 0), (0, 0.03, 0)))
+    ahead, aside = (
+        _after([(0, 0, 0), place]) for place in ((0.03, 0, 0), (0, 0.03, 0))
+    )
     assert ahead[0] < ahead[1] < aside[1]
     found = _after([(0, 0.004 * k, 0) for k in range(6)])
     assert found[2] <= found[1] <= found[0] < max(found[3:])
@@ -188,15 +270,27 @@ def test_beliefs_follow_their_tracks(is_reversed: bool):
     """Rows change places after the frame, or before it."""
     beliefs, scores = Beliefs(CONFUSION), np.array([[6.0, -3.0, 0.0], [-3.0, 6.0, 0.0]])
     place, sideways = np.zeros(3), np.tile(SIDEWAYS, (2, 1))
-    first = beliefs.step(_association([], [3, 4]), scores, np.array([True, True]), place, sideways)
-    change = _association([4, 3], [3, 4]) if is_reversed else _association([3, 4], [4, 3])
-    after = beliefs.step(change, np.nan * scores, np.array([False, False]), place, sideways)
+    first = beliefs.step(
+        _association([], [3, 4]), scores, np.array([True, True]), place, sideways
+    )
+    change = (
+        _association([4, 3], [3, 4]) if is_reversed else _association([3, 4], [4, 3])
+    )
+    after = beliefs.step(
+        change, np.nan * scores, np.array([False, False]), place, sideways
+    )
     np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)
 
 
 def test_a_new_track_has_the_prior_until_it_is_looked_at_and_a_frame_that_is_not_counted_changes_nothing():
     beliefs = Beliefs(CONFUSION, IdentityParams(unknown_prior=0.6))
-    found = beliefs.step(_association([], [7]), np.full((1, 3), np.nan), np.array([False]), np.zeros(3), SIDEWAYS)
+    found = beliefs.step(
+        _association([], [7]),
+        np.full((1, 3), np.nan),
+        np.array([False]),
+        np.zeros(3),
+        SIDEWAYS,
+    )
     np.testing.assert_allclose(found, [[0.2, 0.2, 0.6]])
     kept = _after([(0, 0, 0), None, None])
     assert kept[1:] == pytest.approx([kept[0]] * 2)
@@ -207,5 +301,11 @@ def test_a_new_track_has_the_prior_until_it_is_looked_at_and_a_frame_that_is_not
 def test_places_of_a_track_end_with_it():
     beliefs = Beliefs(CONFUSION)
     for before, after in (([], [7]), ([7], [8])):
-        beliefs.step(_association(before, after), LOOKS_LIKE_1, np.array([True]), np.zeros(3), SIDEWAYS)
+        beliefs.step(
+            _association(before, after),
+            LOOKS_LIKE_1,
+            np.array([True]),
+            np.zeros(3),
+            SIDEWAYS,
+        )
     assert beliefs._looked.tolist() == [8]

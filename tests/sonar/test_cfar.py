@@ -12,11 +12,20 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
+from sonar_graph.simulation.sonar_image import (
+    FrameSimulator,
+    ImageOptions,
+    place_landmark,
+)
 from sonar_graph.sonar import cfar
 from sonar_graph.sonar.appearance import AppearanceParams
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.regions import MEDIAN_TO_SIGMA, CandidateVerdict, background_of, measure_regions
+from sonar_graph.sonar.regions import (
+    MEDIAN_TO_SIGMA,
+    CandidateVerdict,
+    background_of,
+    measure_regions,
+)
 
 from . import polar_images
 from .polar_images import HEIGHT_M, RANGES_M, image_db, polar
@@ -28,7 +37,9 @@ PLATE_DB = 12.0
 
 def speckle_db(seed: int, level_db: float | Floats = 30.0) -> Floats:
     """One-look speckle: 10 log10 of an exponential variable, shape (96, 512)."""
-    return level_db + 10 * np.log10(np.random.default_rng(seed).exponential(size=(96, 512)))
+    return level_db + 10 * np.log10(
+        np.random.default_rng(seed).exponential(size=(96, 512))
+    )
 
 
 def floor_xy(view=VIEW, azimuths_rad=AZIMUTHS_RAD):
@@ -44,12 +55,19 @@ def frame_with_plate(x=1.65, y=0.05, side=0.3, plate_db=PLATE_DB):
 
 
 def select(image, view=VIEW, **settings):
-    return cfar.select_candidates(image, RANGES_M, AZIMUTHS_RAD, view, cfar.DetectionParams(**settings))
+    return cfar.select_candidates(
+        image, RANGES_M, AZIMUTHS_RAD, view, cfar.DetectionParams(**settings)
+    )
 
 
 def shares_over(frames, **settings):
     """Pixels over the threshold in each frame, shape (frames, beams, bins)."""
-    return np.array([select(f.astype(np.float32), closing_m=0, **settings).labels > 0 for f in frames])
+    return np.array(
+        [
+            select(f.astype(np.float32), closing_m=0, **settings).labels > 0
+            for f in frames
+        ]
+    )
 
 
 @pytest.mark.parametrize(("closing_m", "count"), [(0.12, 1), (0.0, 2)])
@@ -57,29 +75,48 @@ def test_gaps_up_to_a_width_are_bridged(closing_m, count):
     """Two halves of a plate, 8 cm apart."""
     x, y = floor_xy()
     halves = (np.abs(x - 1.65) < 0.15) & (np.abs(np.abs(y) - 0.1) < 0.06)
-    assert len(select((speckle_db(1) + 15 * halves).astype(np.float32), closing_m=closing_m).accepted) == count
+    assert (
+        len(
+            select(
+                (speckle_db(1) + 15 * halves).astype(np.float32), closing_m=closing_m
+            ).accepted
+        )
+        == count
+    )
 
 
 def test_offsets_are_those_of_speckle_of_one_look_and_of_many_and_interpolated_for_images():
     """-ln(0.01) = 4.605 times the mean is 6.63 dB, and the mean of decibels lies 2.51 dB below that of the power."""
-    assert cfar.false_alarm_offset_db(5.570, 0.01) == pytest.approx(6.632 + 2.507, abs=0.01)
+    assert cfar.false_alarm_offset_db(5.570, 0.01) == pytest.approx(
+        6.632 + 2.507, abs=0.01
+    )
     for looks in (1, 4, 20):
         levels = 10 * np.log10(stats.gamma(looks).rvs(1_000_000, random_state=4))
         offset = cfar.false_alarm_offset_db(float(np.std(levels)), 1e-2)
-        assert np.mean(levels > np.mean(levels) + offset) == pytest.approx(1e-2, rel=0.06)
+        assert np.mean(levels > np.mean(levels) + offset) == pytest.approx(
+            1e-2, rel=0.06
+        )
     spreads = np.array([0.3, 1.23, 5.57, 8.0], dtype=np.float32)
     exact = [cfar.false_alarm_offset_db(float(spread), 1e-3) for spread in spreads]
     assert cfar.false_alarm_offsets_db(spreads, 1e-3) == pytest.approx(exact, abs=0.02)
     cell_m = 1.885 * np.radians(0.3), 1.25 / 512
-    assert [cfar.odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [(3, 13), (1, 1)]  # beams and bins
+    # beams and bins
+    assert [cfar.odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [
+        (3, 13),
+        (1, 1),
+    ]
 
 
 ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
 
 
-@pytest.mark.parametrize("level", [20.0, 50.0, 30.0 - 12.0 * (RANGES_M - 1.26) / 1.25, 30.0 + 3.0 * ACROSS])
+@pytest.mark.parametrize(
+    "level", [20.0, 50.0, 30.0 - 12.0 * (RANGES_M - 1.26) / 1.25, 30.0 + 3.0 * ACROSS]
+)
 def test_false_alarms_keep_their_rate_whatever_the_level_and_at_the_rim(level):
-    masks = shares_over([speckle_db(seed, level) for seed in range(30)], false_alarm=1e-2)
+    masks = shares_over(
+        [speckle_db(seed, level) for seed in range(30)], false_alarm=1e-2
+    )
     assert 0.7e-2 < masks.mean() < 1.7e-2
     if np.ndim(level) == 0:
         for rim in (masks[:, 0], masks[:, -1], masks[..., 0], masks[..., -1]):
@@ -93,7 +130,9 @@ def test_an_object_is_one_candidate_whatever_the_window(window_m):
     r, a = np.meshgrid(ranges_m, AZIMUTHS_RAD)
     disc = np.hypot(r * np.cos(a) - 1.9, r * np.sin(a)) < 0.14
     for seed in range(5):
-        found = cfar.select_candidates(speckle_db(seed, 30.0 + 12.0 * disc), ranges_m, AZIMUTHS_RAD)
+        found = cfar.select_candidates(
+            speckle_db(seed, 30.0 + 12.0 * disc), ranges_m, AZIMUTHS_RAD
+        )
         near = found.accepted[np.abs(found.range_m[found.accepted] - 1.9) < 0.1]
         assert len(near) == 1
         assert found.area_m2[near[0]] == pytest.approx(np.pi * 0.14**2, rel=0.5)
@@ -102,16 +141,25 @@ def test_an_object_is_one_candidate_whatever_the_window(window_m):
 def test_a_background_that_hardly_varies_makes_no_candidates():
     """Constant, or varying by its quantisation only."""
     steps = 30.0 + 0.05 * np.round(np.random.default_rng(2).uniform(0, 0.6, (96, 512)))
-    assert not shares_over([np.full((96, 512), 0.0), np.full((96, 512), 80.0), steps]).any()
+    assert not shares_over(
+        [np.full((96, 512), 0.0), np.full((96, 512), 80.0), steps]
+    ).any()
 
 
 def test_texture_raises_the_threshold_by_itself():
     """Gamma texture of shape 1 in patches as large as the smoothing: a fixed threshold would stand out everywhere."""
     rng = np.random.default_rng(5)
-    textures = [np.kron(rng.gamma(1.0, size=(32, 32)), np.ones((3, 16))) for _ in range(8)]
-    images = [speckle_db(seed) + 10 * np.log10(texture) for seed, texture in enumerate(textures)]
+    textures = [
+        np.kron(rng.gamma(1.0, size=(32, 32)), np.ones((3, 16))) for _ in range(8)
+    ]
+    images = [
+        speckle_db(seed) + 10 * np.log10(texture)
+        for seed, texture in enumerate(textures)
+    ]
     smooth = np.mean(np.reshape(images, (8, 32, 3, 32, 16)), axis=(2, 4))
-    fixed = np.median(smooth, axis=(1, 2), keepdims=True) + cfar.false_alarm_offset_db(5.57 / np.sqrt(48), 1e-2)
+    fixed = np.median(smooth, axis=(1, 2), keepdims=True) + cfar.false_alarm_offset_db(
+        5.57 / np.sqrt(48), 1e-2
+    )
     assert shares_over(images, false_alarm=1e-2).mean() < 2e-2
     assert np.mean(smooth > fixed) > 0.2
 
@@ -128,19 +176,33 @@ def test_a_plate_is_one_candidate_where_geometry_says(x, y):
     assert found.extent_m[row] == pytest.approx(0.3, abs=0.03)
     assert found.level_db[row] == pytest.approx(PLATE_DB, abs=2.5)
     assert np.sin(found.elevation_rad[row]) == pytest.approx(q[2] / r, abs=1e-9)
-    assert found.area_m2[row] / blind.area_m2[flat] == pytest.approx(r / np.sqrt(r**2 - HEIGHT_M**2), rel=0.03)
+    assert found.area_m2[row] / blind.area_m2[flat] == pytest.approx(
+        r / np.sqrt(r**2 - HEIGHT_M**2), rel=0.03
+    )
     assert (blind.elevation_rad == 0).all()
     assert blind.elevation_sigma_rad[flat] == pytest.approx(0.244 / np.sqrt(12))
 
 
-@pytest.mark.parametrize(("roll", "pitch", "half_rad"), [(0.0, 0.0, 0.25), (0.3, 0.5, 0.9)])
-def test_the_area_of_all_of_an_image_is_that_of_its_outline_on_the_floor(roll, pitch, half_rad):
+@pytest.mark.parametrize(
+    ("roll", "pitch", "half_rad"), [(0.0, 0.0, 0.25), (0.3, 0.5, 0.9)]
+)
+def test_the_area_of_all_of_an_image_is_that_of_its_outline_on_the_floor(
+    roll, pitch, half_rad
+):
     """By the shoelace formula."""
-    view, azimuths = FloorView.from_angles(HEIGHT_M, roll, pitch), np.linspace(half_rad, -half_rad, 192)
-    labels, contrast = np.ones((192, 512), dtype=np.int32), np.zeros((192, 512), dtype=np.float32)
+    view, azimuths = (
+        FloorView.from_angles(HEIGHT_M, roll, pitch),
+        np.linspace(half_rad, -half_rad, 192),
+    )
+    labels, contrast = (
+        np.ones((192, 512), dtype=np.int32),
+        np.zeros((192, 512), dtype=np.float32),
+    )
     area = measure_regions(contrast, labels, 1, RANGES_M, azimuths, view).area_m2[0]
     xy = floor_xy(view, azimuths)
-    x, y = np.concatenate([xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1)
+    x, y = np.concatenate(
+        [xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1
+    )
     shoelace = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
     assert area == pytest.approx(shoelace * 192 / 191 * 512 / 511, rel=2e-3)
 
@@ -149,9 +211,18 @@ def test_the_area_of_all_of_an_image_is_that_of_its_outline_on_the_floor(roll, p
 def test_the_extent_of_a_bar_does_not_depend_on_how_it_lies(turned_rad):
     """Labelled by hand, 0.4 m by 0.05 m, in the slant plane at 2 m."""
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
-    x, y, cos, sin = r * np.cos(a) - 1.9, r * np.sin(a), np.cos(turned_rad), np.sin(turned_rad)
-    labels = ((np.abs(x * cos + y * sin) < 0.2) & (np.abs(y * cos - x * sin) < 0.025)).astype(np.int32)
-    found = measure_regions(np.zeros((96, 512), np.float32), labels, 1, RANGES_M, AZIMUTHS_RAD, None)
+    x, y, cos, sin = (
+        r * np.cos(a) - 1.9,
+        r * np.sin(a),
+        np.cos(turned_rad),
+        np.sin(turned_rad),
+    )
+    labels = (
+        (np.abs(x * cos + y * sin) < 0.2) & (np.abs(y * cos - x * sin) < 0.025)
+    ).astype(np.int32)
+    found = measure_regions(
+        np.zeros((96, 512), np.float32), labels, 1, RANGES_M, AZIMUTHS_RAD, None
+    )
     assert found.extent_m[0] == pytest.approx(0.4, abs=0.015)
     assert found.area_m2[0] == pytest.approx(0.02, rel=0.05)
 
@@ -170,7 +241,9 @@ def test_each_gate_is_the_reason_that_it_gives(settings, verdict):
     assert len(gated.accepted) == 0
 
 
-@pytest.mark.parametrize(("x", "y"), [(1.65, 0.4), (1.65, -0.4), (2.25, 0.0), (0.85, 0.0)])
+@pytest.mark.parametrize(
+    ("x", "y"), [(1.65, 0.4), (1.65, -0.4), (2.25, 0.0), (0.85, 0.0)]
+)
 def test_a_plate_cut_by_the_edge_is_rejected_unless_wanted(x, y):
     cut = select(frame_with_plate(x, y))
     assert CandidateVerdict.AT_EDGE in cut.verdicts[cut.area_m2 > 0.01]
@@ -179,7 +252,10 @@ def test_a_plate_cut_by_the_edge_is_rejected_unless_wanted(x, y):
 
 
 def test_beyond_the_limit_the_strongest_are_kept():
-    image = np.maximum(frame_with_plate(y=0.25, side=0.22), frame_with_plate(y=-0.2, side=0.15, plate_db=40.0))
+    image = np.maximum(
+        frame_with_plate(y=0.25, side=0.22),
+        frame_with_plate(y=-0.2, side=0.15, plate_db=40.0),
+    )
     both, one = select(image), select(image, max_candidates=1)
     right, left = both.accepted[np.argsort(both.azimuth_rad[both.accepted])]
     assert both.area_m2[left] > both.area_m2[right]  # the weaker one is larger
@@ -190,11 +266,19 @@ def test_beyond_the_limit_the_strongest_are_kept():
 @pytest.mark.parametrize("pitch", np.arange(0.0, 1.2, 0.02))
 def test_of_a_region_those_pixels_count_whose_rays_meet_the_floor(pitch):
     """One bin is exactly as far as the floor is deep."""
-    view, ranges, contrast = FloorView.from_angles(2.0, 0.0, pitch), np.linspace(1.0, 3.0, 201), np.zeros((95, 201))
+    view, ranges, contrast = (
+        FloorView.from_angles(2.0, 0.0, pitch),
+        np.linspace(1.0, 3.0, 201),
+        np.zeros((95, 201)),
+    )
     azimuths, labels = np.linspace(0.25, -0.25, 95), np.ones((95, 201), dtype=np.int32)
-    whole = measure_regions(contrast.astype(np.float32), labels, 1, ranges, azimuths, view)
+    whole = measure_regions(
+        contrast.astype(np.float32), labels, 1, ranges, azimuths, view
+    )
     labels[:, ranges <= 2.0] = 0
-    beyond = measure_regions(contrast.astype(np.float32), labels, 1, ranges, azimuths, view)
+    beyond = measure_regions(
+        contrast.astype(np.float32), labels, 1, ranges, azimuths, view
+    )
     for found in ("points_m", "area_m2", "extent_m"):
         assert getattr(whole, found) == pytest.approx(getattr(beyond, found), rel=1e-9)
 
@@ -202,7 +286,9 @@ def test_of_a_region_those_pixels_count_whose_rays_meet_the_floor(pitch):
 def test_what_lies_nearer_than_the_floor_is_off_it():
     image = speckle_db(6)
     image[40:56, 20:60] += 15
-    found = select(image.astype(np.float32), view=FloorView.from_angles(1.6, 0.0, np.radians(45)))
+    found = select(
+        image.astype(np.float32), view=FloorView.from_angles(1.6, 0.0, np.radians(45))
+    )
     near = np.flatnonzero(found.boxes[:, 3] * found.boxes[:, 2] > 200)
     assert found.verdicts[near].tolist() == [CandidateVerdict.OFF_FLOOR]
 
@@ -228,18 +314,28 @@ def medians(values: Floats) -> Floats:
 
 @pytest.mark.parametrize("nodes", [20, 21])
 @pytest.mark.parametrize("shaded", [0.0, 0.4])
-def test_the_background_is_a_median_and_the_spread_the_median_of_what_is_left(nodes: int, shaded: float):
+def test_the_background_is_a_median_and_the_spread_the_median_of_what_is_left(
+    nodes: int, shaded: float
+):
     """A shadow 40 dB deep over less than half of the beams is below what bytes reach, -16 dB."""
-    level = np.random.default_rng(nodes).normal(40, 2, (nodes, 30)) + 0.3 * np.arange(30)
+    level = np.random.default_rng(nodes).normal(40, 2, (nodes, 30)) + 0.3 * np.arange(
+        30
+    )
     level[: int(shaded * nodes)] -= 40
     level = level.astype(np.float32)
     pixels = np.kron(level, np.ones((BEAMS, BINS), np.float32))
-    level_db, spread_db = background_of(pixels, (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS))
-    trend = sliding_window_view(np.pad(np.median(level, axis=0), 2, mode="reflect"), 5).mean(axis=1)
+    level_db, spread_db = background_of(
+        pixels, (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS)
+    )
+    trend = sliding_window_view(
+        np.pad(np.median(level, axis=0), 2, mode="reflect"), 5
+    ).mean(axis=1)
     residual = level - trend
     local = medians(np.clip(residual, -16, 127 / 8))
     assert level_db == pytest.approx(local + trend, abs=1.01 * HALF_STEP_DB)
-    spread = MEDIAN_TO_SIGMA * medians(np.minimum(np.abs(residual - (level_db - trend)), 255 / 40))
+    spread = MEDIAN_TO_SIGMA * medians(
+        np.minimum(np.abs(residual - (level_db - trend)), 255 / 40)
+    )
     tolerance = MEDIAN_TO_SIGMA * 1.01 * HALF_DEVIATION_STEP_DB
     assert spread_db == pytest.approx(np.maximum(spread, 0.2), abs=tolerance)
 
@@ -249,7 +345,11 @@ SEARCH_M = AppearanceParams().search_m
 PIXELS = 200
 
 
-def design_of(*boxes_m: tuple[float, float, float, float], level_db: float = 12.0, size_m: float = 0.5):
+def design_of(
+    *boxes_m: tuple[float, float, float, float],
+    level_db: float = 12.0,
+    size_m: float = 0.5,
+):
     """Bright boxes of x and y from the middle, half width and half height."""
     middles = ((np.arange(PIXELS) + 0.5) / PIXELS - 0.5) * size_m
     y, x = np.meshgrid(-middles, middles, indexing="ij")
@@ -262,33 +362,53 @@ def design_of(*boxes_m: tuple[float, float, float, float], level_db: float = 12.
 def accepted_near_its_figure(design: LandmarkDesign) -> int:
     """Candidates of the selection itself, in an image without speckle but for a little, close enough to be compared."""
     image = image_db(design, (1.7, 0.0), 0.0)
-    image = image + np.random.default_rng(0).normal(0, 0.5, image.shape).astype(np.float32)
-    found = cfar.select_candidates(image, RANGES_M, polar_images.AZIMUTHS_RAD, polar_images.VIEW, PARAMS)
+    image = image + np.random.default_rng(0).normal(0, 0.5, image.shape).astype(
+        np.float32
+    )
+    found = cfar.select_candidates(
+        image, RANGES_M, polar_images.AZIMUTHS_RAD, polar_images.VIEW, PARAMS
+    )
     r, a = found.range_m[found.accepted], found.azimuth_rad[found.accepted]
     x, y = design.figure_m
-    away = np.hypot(r * np.sin(a) - y, np.sqrt(r**2 - HEIGHT_M**2) * np.cos(a) - 1.7 - x)
+    away = np.hypot(
+        r * np.sin(a) - y, np.sqrt(r**2 - HEIGHT_M**2) * np.cos(a) - 1.7 - x
+    )
     return int((away <= SEARCH_M).sum())
 
 
-SPECK, CORNER, MIDDLE = (0.0, 0.0, 0.02, 0.02), (0.17, 0.17, 0.06, 0.06), (0.0, 0.0, 0.1, 0.1)
+SPECK, CORNER, MIDDLE = (
+    (0.0, 0.0, 0.02, 0.02),
+    (0.17, 0.17, 0.06, 0.06),
+    (0.0, 0.0, 0.1, 0.1),
+)
 ONE = design_of(MIDDLE)
 TWO_APART = design_of((-0.17, 0.0, 0.07, 0.07), (0.17, 0.0, 0.07, 0.07))
 AT_A_CORNER = design_of((0.15, 0.15, 0.08, 0.08))
 TINY = design_of(SPECK)
 APART = design_of((-0.2, 0.0, 0.1, 0.1), (0.2, 0.0, 0.06, 0.06), size_m=0.7)
 BAR, BESIDE = design_of((0.0, 0.0, 0.22, 0.04)), design_of((0.06, 0.0, 0.1, 0.1))
-DARK_APART = replace(ONE, mask=np.where(np.isnan(ONE.mask) & (np.indices(ONE.mask.shape)[0] < 20), -8.0, ONE.mask))
+DARK_APART = replace(
+    ONE,
+    mask=np.where(
+        np.isnan(ONE.mask) & (np.indices(ONE.mask.shape)[0] < 20), -8.0, ONE.mask
+    ),
+)
 
 
 def set_to(**settings: float) -> cfar.DetectionParams:
     return PARAMS.model_copy(update=settings)
 
 
-def is_refused(design: LandmarkDesign, search_m: float = SEARCH_M, **settings: float) -> bool:
+def is_refused(
+    design: LandmarkDesign, search_m: float = SEARCH_M, **settings: float
+) -> bool:
     try:
         cfar.check_candidates([design], set_to(**settings), search_m)
     except CalibrationError as error:
-        return f"{design.name} (id {design.id}) would never be found: its bright parts are" in str(error)
+        return (
+            f"{design.name} (id {design.id}) would never be found: its bright parts are"
+            in str(error)
+        )
     return False
 
 
@@ -303,13 +423,18 @@ def is_refused(design: LandmarkDesign, search_m: float = SEARCH_M, **settings: f
         (design_of((0.0, 0.0, 0.24, 0.24)), 0),  # too large
     ],
 )
-def test_a_design_is_let_through_where_the_selection_finds_its_figure(design: LandmarkDesign, count: int):
+def test_a_design_is_let_through_where_the_selection_finds_its_figure(
+    design: LandmarkDesign, count: int
+):
     assert accepted_near_its_figure(design) == count
     assert is_refused(design) == (count == 0)
 
 
 def test_one_part_must_have_the_size_and_the_place():
-    joined, dark = design_of((-0.06, 0.0, 0.05, 0.08), (0.06, 0.0, 0.05, 0.08)), design_of(MIDDLE, level_db=-12.0)
+    joined, dark = (
+        design_of((-0.06, 0.0, 0.05, 0.08), (0.06, 0.0, 0.05, 0.08)),
+        design_of(MIDDLE, level_db=-12.0),
+    )
     refused = [
         dark, (BAR, {"max_extent_m": 0.4}),
         (APART, {"max_area_m2": 0.03}),  # the largest has the place, another one the size
@@ -319,37 +444,60 @@ def test_one_part_must_have_the_size_and_the_place():
         *DEFAULT_DESIGNS, joined, DARK_APART, design_of((0.0, 0.0, 0.06, 0.06), CORNER), AT_A_CORNER, TWO_APART, APART,
         design_of(SPECK, CORNER), (BAR, {"max_extent_m": 0.55}), BESIDE,
     ]  # fmt: skip
-    for case, expected in [*((case, True) for case in refused), *((case, False) for case in taken)]:
+    for case, expected in [
+        *((case, True) for case in refused),
+        *((case, False) for case in taken),
+    ]:
         design, settings = case if isinstance(case, tuple) else (case, {})
         assert is_refused(design, **settings) == expected, (design.name, settings)
 
 
 def test_a_refusal_names_areas_distances_limits_and_settings():
-    with pytest.raises(CalibrationError, match=r" m² with its centre 40 cm .* within 4.5 cm of .*closing_m"):
+    with pytest.raises(
+        CalibrationError,
+        match=r" m² with its centre 40 cm .* within 4.5 cm of .*closing_m",
+    ):
         cfar.check_candidates([APART], set_to(max_area_m2=0.03), 0.045)
-    with pytest.raises(CalibrationError, match="its bright parts are all smoothed away; one must have"):
+    with pytest.raises(
+        CalibrationError, match="its bright parts are all smoothed away; one must have"
+    ):
         cfar.check_candidates([TINY], set_to(smoothing_m=0.1), SEARCH_M)
 
 
 def test_parts_have_the_area_length_and_place_of_their_drawing_largest_first():
-    areas_m2, extents_m, offsets_m = cfar.bright_parts(design_of((0.1, 0.05, 0.1, 0.05)), PARAMS)
+    areas_m2, extents_m, offsets_m = cfar.bright_parts(
+        design_of((0.1, 0.05, 0.1, 0.05)), PARAMS
+    )
     assert areas_m2 == pytest.approx([0.02], rel=0.25)
     assert extents_m == pytest.approx([0.2], rel=0.1)
     assert offsets_m == pytest.approx([0.0], abs=0.004)
-    areas_m2, _, offsets_m = cfar.bright_parts(design_of((-0.15, 0.0, 0.03, 0.03), (0.1, 0.0, 0.1, 0.1)), PARAMS)
+    areas_m2, _, offsets_m = cfar.bright_parts(
+        design_of((-0.15, 0.0, 0.03, 0.03), (0.1, 0.0, 0.1, 0.1)), PARAMS
+    )
     assert areas_m2[0] > 4 * areas_m2[1]
     assert offsets_m == pytest.approx([0.0, 0.25], abs=0.005)
-    assert len(cfar.bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1  # closing does not average
-    touching = design_of((-0.0525, -0.0525, 0.05, 0.05), (0.05, 0.045, 0.05, 0.05))  # at a corner: one part
-    areas_m2, _, _ = cfar.bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
+    # closing does not average
+    assert len(cfar.bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1
+    # at a corner: one part
+    touching = design_of((-0.0525, -0.0525, 0.05, 0.05), (0.05, 0.045, 0.05, 0.05))
+    areas_m2, _, _ = cfar.bright_parts(
+        touching, set_to(smoothing_m=0.005, closing_m=0.0)
+    )
     assert areas_m2 == pytest.approx([0.02], rel=0.1)
 
 
 def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
     """Against scipy, in cells of 2 mm; 3 dB of 12 are reached beyond the edge."""
-    areas_m2, extents_m, _ = cfar.bright_parts(design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1))
+    areas_m2, extents_m, _ = cfar.bright_parts(
+        design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1)
+    )
     x_m, y_m = np.meshgrid(*2 * [0.002 * np.arange(-200, 201)])
-    is_part = uniform_filter(np.where((np.abs(x_m) <= 0.2) & (np.abs(y_m) <= 0.1), 12.0, 0.0), 50) >= 3.0
+    is_part = (
+        uniform_filter(
+            np.where((np.abs(x_m) <= 0.2) & (np.abs(y_m) <= 0.1), 12.0, 0.0), 50
+        )
+        >= 3.0
+    )
     assert areas_m2 == pytest.approx([is_part.sum() * 0.002**2], rel=0.05)
     assert extents_m == pytest.approx([np.sqrt(12 * x_m[is_part].var())], rel=0.02)
     assert extents_m[0] > 0.41
@@ -358,33 +506,50 @@ def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
 @pytest.mark.parametrize("settings", [{}, {"smoothing_m": 0.1}, {"closing_m": 0.1}])
 def test_the_edge_of_the_square_is_none_of_a_part(settings):
     """The same box, in a square that it fills and in a larger one."""
-    filled, larger = (cfar.bright_parts(design_of(MIDDLE, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
+    filled, larger = (
+        cfar.bright_parts(design_of(MIDDLE, size_m=size_m), set_to(**settings))
+        for size_m in (0.2, 0.5)
+    )
     for one, other in zip(filled, larger, strict=True):
         assert one == pytest.approx(other, rel=0.06, abs=0.003)
 
 
 def share_near_weak_landmarks(settings: cfar.DetectionParams) -> float:
     """Share of frames of the simulator with a candidate within 6 cm of a landmark 6 dB weaker than designed."""
-    sonar_m, tilt = np.array([0.0, 0.0, 1.5]), Rotation.from_euler("Y", 22, degrees=True)
+    sonar_m, tilt = (
+        np.array([0.0, 0.0, 1.5]),
+        Rotation.from_euler("Y", 22, degrees=True),
+    )
     found = []
     for design in DEFAULT_DESIGNS:
-        weak = replace(design, mask=np.where(design.mask > 0, design.mask - 6.0, design.mask))
+        weak = replace(
+            design, mask=np.where(design.mask > 0, design.mask - 6.0, design.mask)
+        )
         centre_m = np.array([3.6, 0.0, design.height_m])
         x, y, z = tilt.inv().apply(centre_m - sonar_m)
         r, a = float(np.sqrt(x**2 + y**2 + z**2)), float(np.arctan2(y, x))
         for seed, heading in enumerate(np.linspace(0, 2.0, 8)):
             landmark = place_landmark(weak, centre_m, heading, 0.0)
-            simulator = FrameSimulator(ImageOptions(window_m=5.0), [landmark], 0.0, seed)
+            simulator = FrameSimulator(
+                ImageOptions(window_m=5.0), [landmark], 0.0, seed
+            )
             view = FloorView(tilt.as_matrix(), sonar_m[2] - design.height_m)
             level_db = simulator.level_db(sonar_m, tilt, 0, 3.6)
             candidates = cfar.select_candidates(
                 level_db, simulator.ranges_m(), simulator.azimuths_rad(), view, settings
             )
-            off_m = np.hypot(candidates.range_m - r, r * (candidates.azimuth_rad - a))[candidates.accepted]
+            off_m = np.hypot(candidates.range_m - r, r * (candidates.azimuth_rad - a))[
+                candidates.accepted
+            ]
             found.append(off_m.min(initial=np.inf) < 0.06)
     return float(np.mean(found))
 
 
 def test_weak_landmarks_are_candidates_and_break_up_at_a_strict_threshold_with_narrow_gaps():
     assert share_near_weak_landmarks(cfar.DetectionParams()) > 0.75
-    assert share_near_weak_landmarks(cfar.DetectionParams(false_alarm=1e-3, closing_m=0.03)) < 0.5
+    assert (
+        share_near_weak_landmarks(
+            cfar.DetectionParams(false_alarm=1e-3, closing_m=0.03)
+        )
+        < 0.5
+    )

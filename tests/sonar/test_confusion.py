@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from sonar_graph.devices import landmark_designs
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
+from sonar_graph.devices.landmark_designs import (
+    DEFAULT_DESIGNS,
+    LandmarkDesign,
+    load_designs,
+)
 from sonar_graph.errors import CalibrationError
 from sonar_graph.sonar.confusion import (
     Confusion,
@@ -26,7 +30,9 @@ DESIGNS = [RING, replace(RING, id=10)]
 ROWS = ((0.8, 0.1, 0.1), (0.2, 0.7, 0.1), (0.5, 0.1, 0.4))
 
 
-def model(rows: tuple[tuple[float, ...], ...] = ROWS, designs: Sequence[LandmarkDesign] = ()) -> Confusion:
+def model(
+    rows: tuple[tuple[float, ...], ...] = ROWS, designs: Sequence[LandmarkDesign] = ()
+) -> Confusion:
     return Confusion(
         ids=tuple(range(9, 8 + len(rows))), matrix=rows, designs=tuple(map(mark_of, designs)),
         weights=tuple(range(len(EVIDENCE))), looks=2.0, range_sigma_m=0.01, across_sigma_m=0.004,
@@ -44,14 +50,21 @@ def test_log_odds_are_weighted_evidence_and_scores_the_posterior_of_one_look():
 
 def test_rows_are_the_means_of_their_dirichlet_posteriors():
     """Half a count of each feature before n trials: uniform without trials, and never certain."""
-    rows = posterior_mean_rows(np.array([[1.0, 0.0, 0.0], [0.9, 0.1, 0.0], [0.2, 0.3, 0.5]]), np.array([0, 10, 10**9]))
-    np.testing.assert_allclose(rows[:2], [[1 / 3] * 3, np.array([9.5, 1.5, 0.5]) / 11.5])
+    rows = posterior_mean_rows(
+        np.array([[1.0, 0.0, 0.0], [0.9, 0.1, 0.0], [0.2, 0.3, 0.5]]),
+        np.array([0, 10, 10**9]),
+    )
+    np.testing.assert_allclose(
+        rows[:2], [[1 / 3] * 3, np.array([9.5, 1.5, 0.5]) / 11.5]
+    )
     np.testing.assert_allclose(rows[2], [0.2, 0.3, 0.5], atol=1e-8)
 
 
 def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks():
     shipped = confusion_for(DEFAULT_DESIGNS)
-    landmarks = sum(int(shipped.provenance[f"tracks of landmark {k}"]) for k in shipped.ids)
+    landmarks = sum(
+        int(shipped.provenance[f"tracks of landmark {k}"]) for k in shipped.ids
+    )
     none = int(shipped.provenance["tracks of no landmark"])
     for row, trials in zip(shipped.array(), [landmarks] * 4 + [none], strict=True):
         assert row.min() >= 0.5 / (trials + 2.5)
@@ -65,21 +78,33 @@ def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks()
         ({"matrix": [[1.5, -0.5, 0.0], *ROWS[1:]]}, "each row must be probabilities"),
         ({"matrix": [[0.8, 0.2], *ROWS[1:]]}, "matrix: expected 3 rows of 3 for 2 ids"),
         ({"matrix": [[0.9, 0.1, 0.0], *ROWS[1:]]}, "an entry is 0"),
-        ({"designs": [{"name": "ring", "digest": ""}]}, "expected one for each of 2 ids, not 1"),
+        (
+            {"designs": [{"name": "ring", "digest": ""}]},
+            "expected one for each of 2 ids, not 1",
+        ),
         ({"looks": -1.0}, "looks"),
         ({"looks": float("inf")}, "looks"),
         ({"range_sigma_m": float("inf")}, "range_sigma_m"),
         ({"weights": [float("nan")] * 9}, "weights"),
         ({"ids": [1, 1]}, "ids: expected each once, not 1, 1"),
         ({"weights": [1.0, 2.0]}, "weights: expected 11, for prior, outline"),
-        ({"sharpness": 17.0, "threshold": 0.8}, "an earlier version .* measure it again"),
+        (
+            {"sharpness": 17.0, "threshold": 0.8},
+            "an earlier version .* measure it again",
+        ),
         ({"error_correlation": 0.8}, "an earlier version .* measure it again"),
         (None, "not JSON"),
     ],
 )
-def test_a_file_comes_back_and_a_wrong_one_is_named_with_the_reason(tmp_path: Path, change, complaint: str | None):
+def test_a_file_comes_back_and_a_wrong_one_is_named_with_the_reason(
+    tmp_path: Path, change, complaint: str | None
+):
     path, written = tmp_path / "model.json", model(designs=DESIGNS)
-    path.write_text("{" if change is None else json.dumps(json.loads(written.model_dump_json()) | change))
+    path.write_text(
+        "{"
+        if change is None
+        else json.dumps(json.loads(written.model_dump_json()) | change)
+    )
     if complaint is None:
         assert read_confusion(path) == written
         return
@@ -88,20 +113,34 @@ def test_a_file_comes_back_and_a_wrong_one_is_named_with_the_reason(tmp_path: Pa
     assert "model.json" in str(refusal.value)
 
 
-@pytest.mark.parametrize("change", [{"name": "plate"}, {"size_m": 0.31}, {"height_m": 0.02}, {"mask": np.eye(4)}])
+@pytest.mark.parametrize(
+    "change",
+    [{"name": "plate"}, {"size_m": 0.31}, {"height_m": 0.02}, {"mask": np.eye(4)}],
+)
 def test_designs_that_only_have_the_same_numbers_are_refused(change: dict):
     measured = model(designs=DESIGNS)
     measured.check_designs(DESIGNS)
-    with pytest.raises(CalibrationError, match=r"mine: measured for another landmark 9 \(ring\) than .*calibrate"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"mine: measured for another landmark 9 \(ring\) than .*calibrate",
+    ):
         measured.check_designs([replace(RING, **change), DESIGNS[1]], "mine")
-    with pytest.raises(CalibrationError, match=r"measured for landmarks 9, 10, the designs are 10, 9; give"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"measured for landmarks 9, 10, the designs are 10, 9; give",
+    ):
         measured.check_designs(DESIGNS[::-1])
     with pytest.raises(CalibrationError, match="designs: is missing"):
         model().check_designs(DESIGNS)
 
 
 def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
-    for shipped in (DEFAULT_DESIGNS, load_designs(Path(landmark_designs.__file__).with_name("default_landmarks.toml"))):
+    for shipped in (
+        DEFAULT_DESIGNS,
+        load_designs(
+            Path(landmark_designs.__file__).with_name("default_landmarks.toml")
+        ),
+    ):
         assert "simulated basins" in confusion_for(shipped).provenance["origin"]
     other = confusion_for([RING])
     assert other.ids == (9,)

@@ -14,7 +14,9 @@ def _noise(seed: int, beams: int = BEAMS, bins: int = BINS) -> np.ndarray:
     return np.random.default_rng(seed).integers(1, 200, (beams, bins)).astype(np.uint8)
 
 
-def _frame(stamp_ns: int = 1, image: np.ndarray | None = None, *, end_m: float = 2.0, **places) -> SonarFrames:
+def _frame(
+    stamp_ns: int = 1, image: np.ndarray | None = None, *, end_m: float = 2.0, **places
+) -> SonarFrames:
     image = _noise(stamp_ns) if image is None else image
     ranges_m = places.get("ranges_m", np.linspace(1, end_m, image.shape[1]))
     azimuths_rad = places.get("azimuths_rad", np.linspace(-0.2, 0.2, len(image)))
@@ -32,24 +34,48 @@ BAD = {
     "same samples": (_frame(2, _noise(1)), "duplicated: same samples"),
     "earlier": (_frame(0), "out of order"),
     "more beams": (_frame(2, _noise(2, BEAMS + 1)), "wrong size or window: 11 x 40"),
-    "fewer bins": (_frame(2, _noise(2, bins=BINS - 1)), "wrong size or window: 10 x 39"),
-    "another range": (_frame(2, end_m=3.0), "wrong size or window: 10 x 40, 1.00 m to 3.00 m"),
-    "half a bin longer": (_frame(2, end_m=2.0 + 0.6 / (BINS - 1)), "wrong size or window: 10 x 40"),
+    "fewer bins": (
+        _frame(2, _noise(2, bins=BINS - 1)),
+        "wrong size or window: 10 x 39",
+    ),
+    "another range": (
+        _frame(2, end_m=3.0),
+        "wrong size or window: 10 x 40, 1.00 m to 3.00 m",
+    ),
+    "half a bin longer": (
+        _frame(2, end_m=2.0 + 0.6 / (BINS - 1)),
+        "wrong size or window: 10 x 40",
+    ),
 }
 BAD_IN_ITSELF = {
     "one beam": (_frame(2, _noise(2, 1)), "wrong size: 1 x 40"),
     "few bins": (_frame(2, _noise(2, bins=5)), "wrong size: 10 x 5"),
     "zero": (_frame(2, np.zeros((BEAMS, BINS), np.uint8)), "all samples are zero"),
-    "constant": (_frame(2, np.full((BEAMS, BINS), 17, np.uint8)), "all samples are the same"),
+    "constant": (
+        _frame(2, np.full((BEAMS, BINS), 17, np.uint8)),
+        "all samples are the same",
+    ),
     "white": (_frame(2, np.full((BEAMS, BINS), 255, np.uint8)), "saturated"),
     "mostly white": (_frame(2, _changed(np.s_[:6], 255)), "saturated"),
     "nan": (_frame(2, _changed((3, 3), np.nan)), "not finite"),
     "huge": (_frame(2, _noise(2) * 1e300), "not finite"),
     "over the scale": (_frame(2, _noise(2) * np.uint16(100)), "samples over 255"),
-    "nan ranges": (_frame(2, ranges_m=np.full(BINS, np.nan)), "ranges or azimuths that are not finite"),
-    "backwards": (_frame(2, ranges_m=np.linspace(2, 1, BINS)), "do not increase evenly"),
-    "uneven": (_frame(2, ranges_m=np.geomspace(0.01, 2, BINS)), "do not increase evenly"),
-    "to and fro": (_frame(2, azimuths_rad=np.sin(np.arange(BEAMS))), "do not go one way"),
+    "nan ranges": (
+        _frame(2, ranges_m=np.full(BINS, np.nan)),
+        "ranges or azimuths that are not finite",
+    ),
+    "backwards": (
+        _frame(2, ranges_m=np.linspace(2, 1, BINS)),
+        "do not increase evenly",
+    ),
+    "uneven": (
+        _frame(2, ranges_m=np.geomspace(0.01, 2, BINS)),
+        "do not increase evenly",
+    ),
+    "to and fro": (
+        _frame(2, azimuths_rad=np.sin(np.arange(BEAMS))),
+        "do not go one way",
+    ),
 }
 
 
@@ -70,13 +96,18 @@ def test_good_frames_have_no_fault_on_the_scale_of_the_calibration():
     assert FrameCheck().fault(_frame(1, some_saturated)) is None
     for scale in (SonarImage(scale="linear"), SonarImage(full_scale=65535)):
         assert FrameCheck(scale).fault(_frame(1, wide)) is None
-    assert "sonar.image.full_scale" in (FrameCheck(SonarImage(full_scale=4095)).fault(_frame(1, wide)) or "")
+    assert "sonar.image.full_scale" in (
+        FrameCheck(SonarImage(full_scale=4095)).fault(_frame(1, wide)) or ""
+    )
 
 
 def test_a_window_is_used_from_its_second_frame_on_and_the_change_is_told_once():
     check = FrameCheck()
     assert check.fault(_frame(1)) is None
-    faults, changes = zip(*((check.fault(_frame(n, end_m=3.0)), check.change) for n in (2, 3, 4)), strict=True)
+    faults, changes = zip(
+        *((check.fault(_frame(n, end_m=3.0)), check.change) for n in (2, 3, 4)),
+        strict=True,
+    )
     assert [fault is None for fault in faults] == [False, True, True]
     assert [change is None for change in changes] == [True, False, True]
     assert "10 x 40, 1.00 m to 3.00 m" in changes[1]
@@ -85,11 +116,16 @@ def test_a_window_is_used_from_its_second_frame_on_and_the_change_is_told_once()
 def test_windows_that_alternate_lose_one_frame_and_one_that_a_driver_computes_anew_for_every_ping_is_the_same():
     """And of ever new ones a limited number is remembered."""
     check = FrameCheck()
-    faults = [check.fault(_frame(stamp, end_m=2.0 + stamp % 2)) for stamp in range(1, 9)]
+    faults = [
+        check.fault(_frame(stamp, end_m=2.0 + stamp % 2)) for stamp in range(1, 9)
+    ]
     assert [number for number, fault in enumerate(faults) if fault] == [1]
     check = FrameCheck()
     for stamp in range(1, 20):
-        assert check.fault(_frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp)) is None
+        assert (
+            check.fault(_frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp))
+            is None
+        )
         assert check.change is None
     check = FrameCheck()
     for k in range(200):

@@ -8,7 +8,14 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
-from sonar_graph.sonar.geometry import Fan, FloorView, point_covariances, points, ranges_azimuths_elevations, with_lens
+from sonar_graph.sonar.geometry import (
+    Fan,
+    FloorView,
+    point_covariances,
+    points,
+    ranges_azimuths_elevations,
+    with_lens,
+)
 
 angles = st.floats(-0.3, 0.3)
 
@@ -29,7 +36,9 @@ def test_range_azimuth_and_elevation_are_undone_by_their_point(r, a, e):
 
 
 @given(st.floats(0.5, 1.2), angles, st.floats(0.2, 0.9), st.floats(1.3, 2.5), angles)
-def test_floor_points_lie_on_the_floor_at_their_range_and_azimuth(height, roll, pitch, r, a):
+def test_floor_points_lie_on_the_floor_at_their_range_and_azimuth(
+    height, roll, pitch, r, a
+):
     view = view_of(height, roll, pitch)
     q = view.floor_points(np.array([r]), np.array([a]))
     world = gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix() @ q[0]
@@ -45,18 +54,29 @@ def test_a_centre_beam_tilted_down_meets_the_floor_where_the_triangle_says():
     view = view_of(1.0, 0.0, np.radians(30))
     ahead, below, none = view.floor_points(np.array([2.0, 1.5, 0.9]), np.zeros(3))
     assert ahead == pytest.approx([2.0, 0.0, 0.0], abs=1e-12)
-    assert ranges_azimuths_elevations(below)[2] == pytest.approx(np.radians(30) - np.arcsin(1 / 1.5))
+    assert ranges_azimuths_elevations(below)[2] == pytest.approx(
+        np.radians(30) - np.arcsin(1 / 1.5)
+    )
     assert np.isnan(none).all()
     assert view.floor_point(2.0, 0.0) == pytest.approx([np.sqrt(3), 0.0])
     assert view.floor_point(0.9, 0.0) is None
 
 
 @given(st.floats(0.5, 1.2), angles, st.floats(0.2, 0.9), st.floats(1.3, 2.5), angles)
-def test_a_sonar_hung_upside_down_sees_the_same_floor_mirrored(height, roll, pitch, r, a):
+def test_a_sonar_hung_upside_down_sees_the_same_floor_mirrored(
+    height, roll, pitch, r, a
+):
     """Half a turn about the centre beam swaps left and right, up and down; the point on the floor stays."""
-    upright, inverted = view_of(height, roll, pitch), view_of(height, roll + np.pi, pitch)
+    upright, inverted = (
+        view_of(height, roll, pitch),
+        view_of(height, roll + np.pi, pitch),
+    )
     q = upright.floor_points(np.array([r]), np.array([a]))[0]
-    np.testing.assert_allclose(inverted.floor_points(np.array([r]), np.array([-a]))[0], q * [1, -1, -1], atol=1e-9)
+    np.testing.assert_allclose(
+        inverted.floor_points(np.array([r]), np.array([-a]))[0],
+        q * [1, -1, -1],
+        atol=1e-9,
+    )
 
 
 @given(st.floats(-3, 3), angles, st.floats(0.2, 0.9))
@@ -69,16 +89,26 @@ def test_heading_drops_out_of_a_view_from_a_pose(yaw, roll, pitch):
 
 @pytest.mark.parametrize(
     ("height", "pitch", "words"),
-    [(0.0, 0.5, "height_m"), (-1.0, 0.5, "height_m"), (np.nan, 0.5, "height_m"), (1.0, np.pi / 2, "vertical")],
+    [
+        (0.0, 0.5, "height_m"),
+        (-1.0, 0.5, "height_m"),
+        (np.nan, 0.5, "height_m"),
+        (1.0, np.pi / 2, "vertical"),
+    ],
 )
-def test_a_sonar_must_be_above_the_floor_and_not_look_straight_down(height, pitch, words):
+def test_a_sonar_must_be_above_the_floor_and_not_look_straight_down(
+    height, pitch, words
+):
     with pytest.raises(CalibrationError, match=words):
         view_of(height, 0.0, pitch)
 
 
 def test_covariance_of_a_point_is_that_of_many_samples():
     rng, R = np.random.default_rng(1), np.array([[4e-4, 2e-5], [2e-5, 1e-4]])
-    ra, e = rng.multivariate_normal([2.0, 0.2], R, 200_000), rng.uniform(-0.06, 0.06, 200_000)
+    ra, e = (
+        rng.multivariate_normal([2.0, 0.2], R, 200_000),
+        rng.uniform(-0.06, 0.06, 200_000),
+    )
     sampled = np.cov(points(ra[:, 0], ra[:, 1], e).T)
     found = point_covariances(point(2.0, 0.2), R, np.array([0.12 / np.sqrt(12)]))[0]
     assert np.allclose(found, sampled, atol=0.02 * np.abs(sampled).max())
@@ -87,7 +117,10 @@ def test_covariance_of_a_point_is_that_of_many_samples():
 def test_elevation_spread_on_a_floor_is_that_of_many_samples():
     """Height and tilt drawn; the elevation of the floor at one pixel, from ``tilt - asin(h / r)``."""
     rng = np.random.default_rng(2)
-    height, tilt = rng.normal(0.95, 0.02, 200_000), rng.normal(np.radians(30), 0.01, 200_000)
+    height, tilt = (
+        rng.normal(0.95, 0.02, 200_000),
+        rng.normal(np.radians(30), 0.01, 200_000),
+    )
     sampled = np.std(tilt - np.arcsin(height / 2.0))
     view = view_of(0.95, 0.0, np.radians(30))
     found = view.elevation_sigmas(view.floor_points(np.array([2.0]), np.array([0.0])))
@@ -96,7 +129,9 @@ def test_elevation_spread_on_a_floor_is_that_of_many_samples():
 
 def frames_of(azimuths_rad: np.ndarray, bins: int = 8) -> SonarFrames:
     image = np.arange(len(azimuths_rad))[:, None] * np.ones(bins)
-    return SonarFrames(np.array([0]), image[None], np.linspace(1.0, 2.0, bins), azimuths_rad)
+    return SonarFrames(
+        np.array([0]), image[None], np.linspace(1.0, 2.0, bins), azimuths_rad
+    )
 
 
 def test_a_log_with_equally_spaced_beams_is_put_right_by_the_lens():
@@ -111,8 +146,13 @@ def test_a_log_with_equally_spaced_beams_is_put_right_by_the_lens():
 def test_a_lens_keeps_the_order_of_the_beams():
     told = frames_of(DIDSON.linear_azimuths_rad()[::-1])
     assert with_lens(told, "as-logged") is told
-    assert np.allclose(with_lens(told, "didson").azimuths_rad, DIDSON.azimuths_rad()[::-1], atol=1e-5)
-    assert len(with_lens(frames_of(np.linspace(-0.25, 0.25, 48)), "didson").azimuths_rad) == 48
+    assert np.allclose(
+        with_lens(told, "didson").azimuths_rad, DIDSON.azimuths_rad()[::-1], atol=1e-5
+    )
+    assert (
+        len(with_lens(frames_of(np.linspace(-0.25, 0.25, 48)), "didson").azimuths_rad)
+        == 48
+    )
     aris = with_lens(frames_of(np.linspace(-0.25, 0.25, 128)), "aris").azimuths_rad
     assert (np.diff(aris) > 0).all()
     assert np.degrees(aris[-1]) == pytest.approx(14.7, abs=0.1)
@@ -146,5 +186,9 @@ def test_a_point_is_drawn_on_the_pixel_that_shows_it(range_m, azimuth_rad):
     row, column = min(row, len(fan.beam) - 1), min(column, fan.beam.shape[1] - 1)
     assert fan.beam[row, column] >= 0
     # Half a pixel each way, half a bin, and a pixel more where the last column or row stands for what lies beyond it.
-    assert ranges[fan.bin[row, column]] == pytest.approx(range_m, abs=2.0 / fan.pixels_per_m)
-    assert azimuths[fan.beam[row, column]] == pytest.approx(azimuth_rad, abs=2 / fan.pixels_per_m / range_m + 0.004)
+    assert ranges[fan.bin[row, column]] == pytest.approx(
+        range_m, abs=2.0 / fan.pixels_per_m
+    )
+    assert azimuths[fan.beam[row, column]] == pytest.approx(
+        azimuth_rad, abs=2 / fan.pixels_per_m / range_m + 0.004
+    )

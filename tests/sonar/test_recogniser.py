@@ -20,12 +20,19 @@ from sonar_graph.sonar import recogniser as module
 from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.confusion import confusion_for
-from sonar_graph.sonar.recogniser import REPORTED, Recogniser, RecogniserParams, each_once
+from sonar_graph.sonar.recogniser import (
+    REPORTED,
+    Recogniser,
+    RecogniserParams,
+    each_once,
+)
 from sonar_graph.sonar.tracker import SonarStep
 
 from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, image_db, polar
 
-DECIBELS = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=80.0, full_scale=80.0)))
+DECIBELS = Calibration(
+    sonar=SonarCalibration(image=SonarImage(decibel_span=80.0, full_scale=80.0))
+)
 FRAME_NS = 200_000_000
 DISC, SQUARE, TRIANGLE, CROSS = range(4)
 COVARIANCE = np.diag([1e-8] * 6)
@@ -34,18 +41,29 @@ EVERY = RecogniserParams(independent=False)
 
 
 @cache
-def picture(design: int | None, x_m: float, y_m: float, heading_rad: float, seed: int) -> Floats:
+def picture(
+    design: int | None, x_m: float, y_m: float, heading_rad: float, seed: int
+) -> Floats:
     known = None if design is None else DEFAULT_DESIGNS[design]
-    return image_db(known, (x_m, y_m), heading_rad, ROTATION, np.random.default_rng(seed))
+    return image_db(
+        known, (x_m, y_m), heading_rad, ROTATION, np.random.default_rng(seed)
+    )
 
 
 def frame(number: int, image: Floats) -> SonarFrames:
-    return SonarFrames(np.array([number * FRAME_NS]), image[None], RANGES_M, AZIMUTHS_RAD)
+    return SonarFrames(
+        np.array([number * FRAME_NS]), image[None], RANGES_M, AZIMUTHS_RAD
+    )
 
 
-def moved(ahead_m: float = 0.0, left_m: float = 0.0, turned: gtsam.Rot3 | None = None) -> SonarStep:
+def moved(
+    ahead_m: float = 0.0, left_m: float = 0.0, turned: gtsam.Rot3 | None = None
+) -> SonarStep:
     """Level: in the axes of a sonar that is tilted about its y axis, left is along y."""
-    return SonarStep(gtsam.Pose3(turned or gtsam.Rot3(), np.array([ahead_m, left_m, 0.0])), COVARIANCE)
+    return SonarStep(
+        gtsam.Pose3(turned or gtsam.Rot3(), np.array([ahead_m, left_m, 0.0])),
+        COVARIANCE,
+    )
 
 
 def aside(metres: float, number: int = 1) -> SonarStep | None:
@@ -53,15 +71,23 @@ def aside(metres: float, number: int = 1) -> SonarStep | None:
     return moved(left_m=metres) if number else None
 
 
-def pass_by(recogniser: Recogniser, design: int | None, frames: int = 9, step_m: float = 0.05) -> list:
+def pass_by(
+    recogniser: Recogniser, design: int | None, frames: int = 9, step_m: float = 0.05
+) -> list:
     """Detections of frames in which the sonar moves to the left past something straight ahead."""
     places = [(k, round((frames // 2 - k) * step_m, 6)) for k in range(frames)]
-    return [recogniser.process(frame(k, picture(design, 1.7, y, 0.4, k)), aside(step_m, k), VIEW) for k, y in places]
+    return [
+        recogniser.process(
+            frame(k, picture(design, 1.7, y, 0.4, k)), aside(step_m, k), VIEW
+        )
+        for k, y in places
+    ]
 
 
 @pytest.mark.parametrize("design", [DISC, SQUARE, TRIANGLE, CROSS])
 def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int):
-    flush = [replace(one, relief_m=0.0) for one in DEFAULT_DESIGNS]  # as these pictures show them
+    # as these pictures show them
+    flush = [replace(one, relief_m=0.0) for one in DEFAULT_DESIGNS]
     last = pass_by(Recogniser(DECIBELS, flush, EVERY), design)[-1]
     assert last.candidate_ids.tolist() == [[1, 2, 3, 4]]
     ids, probability = last.most_probable()
@@ -70,17 +96,24 @@ def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int)
     assert last.id_probability.sum() <= 1 + 1e-12
     r, a = polar((1.7, -0.2))
     errors = np.array([last.range_m[0] - r, last.azimuth_rad[0] - a])
-    assert errors @ np.linalg.solve(last.range_azimuth_cov[0], errors) < 13.8  # 0.999 of chi2 with two degrees
+    # 0.999 of chi2 with two degrees
+    assert errors @ np.linalg.solve(last.range_azimuth_cov[0], errors) < 13.8
     assert np.abs(errors) == pytest.approx([0, 0], abs=0.015)
     assert last.stamps_ns.tolist() == [8 * FRAME_NS]
 
 
-def standing(recogniser: Recogniser, frames: range, design: int | None = SQUARE, y_m: float = 0.0) -> list:
+def standing(
+    recogniser: Recogniser, frames: range, design: int | None = SQUARE, y_m: float = 0.0
+) -> list:
     """Detections of frames from one place, and the outcomes of their tracks."""
     results = []
     for k in frames:
-        found = recogniser.process(frame(k, picture(design, 1.7, y_m, 0.4, k)), aside(0.0, k), VIEW)
-        results.append((found, [fate.outcome for fate in recogniser.fates if fate.track >= 0]))
+        found = recogniser.process(
+            frame(k, picture(design, 1.7, y_m, 0.4, k)), aside(0.0, k), VIEW
+        )
+        results.append(
+            (found, [fate.outcome for fate in recogniser.fates if fate.track >= 0])
+        )
     return results
 
 
@@ -88,17 +121,32 @@ def standing(recogniser: Recogniser, frames: range, design: int | None = SQUARE,
     ("settings", "y_m", "reasons"),
     [
         ({"least_frames": 4}, 0.0, ["seen in fewer than 4 frames"] * 3),
-        ({"least_frames": 1, "least_existence": 0.5}, 0.0, ["exists with less than 0.5"]),
-        ({"least_frames": 1, "least_existence": 0.0}, 0.45, ["too little of it is in view"] * 5),
+        (
+            {"least_frames": 1, "least_existence": 0.5},
+            0.0,
+            ["exists with less than 0.5"],
+        ),
+        (
+            {"least_frames": 1, "least_existence": 0.0},
+            0.45,
+            ["too little of it is in view"] * 5,
+        ),
     ],
 )
-def test_a_track_is_reported_from_the_frame_that_is_enough_and_the_reason_is_said(settings, y_m, reasons):
-    params = RecogniserParams(detection=DetectionParams(keep_at_edge=y_m > 0), independent=False, **settings)
+def test_a_track_is_reported_from_the_frame_that_is_enough_and_the_reason_is_said(
+    settings, y_m, reasons
+):
+    params = RecogniserParams(
+        detection=DetectionParams(keep_at_edge=y_m > 0), independent=False, **settings
+    )
     results = standing(Recogniser(DECIBELS, params=params), range(5), y_m=y_m)
     for (found, outcomes), reason in zip(results, reasons, strict=False):
         assert found is None
         assert set(outcomes) == {f"not reported: {reason}"}
-    assert all(found is not None and REPORTED in outcomes for found, outcomes in results[len(reasons) :])
+    assert all(
+        found is not None and REPORTED in outcomes
+        for found, outcomes in results[len(reasons) :]
+    )
 
 
 def test_a_track_ends_with_a_row_and_the_next_has_another_number():
@@ -107,43 +155,87 @@ def test_a_track_ends_with_a_row_and_the_next_has_another_number():
     assert recogniser.track_ids.tolist() == [0]
     blank = standing(recogniser, range(4, 30), None)
     assert all(found is None for found, _ in blank)
-    assert "track ended: exists with less than 0.01" in [outcome for _, outcomes in blank for outcome in outcomes]
-    tracks = [found.track.tolist() for found, _ in standing(recogniser, range(30, 36)) if found is not None]
+    assert "track ended: exists with less than 0.01" in [
+        outcome for _, outcomes in blank for outcome in outcomes
+    ]
+    tracks = [
+        found.track.tolist()
+        for found, _ in standing(recogniser, range(30, 36))
+        if found is not None
+    ]
     assert len(set(map(tuple, tracks))) == 1
-    assert tracks[0] == [fate.track for fate in recogniser.fates if fate.outcome == REPORTED]
+    assert tracks[0] == [
+        fate.track for fate in recogniser.fates if fate.outcome == REPORTED
+    ]
     assert tracks[0][0] > 0
 
 
 def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
     """Patches are compared in that plane where no floor is known."""
-    scale = Calibration(sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8)))
-    recognisers = tuple(Recogniser(of, params=EVERY) for of in (DECIBELS, scale, DECIBELS))
+    scale = Calibration(
+        sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8))
+    )
+    recognisers = tuple(
+        Recogniser(of, params=EVERY) for of in (DECIBELS, scale, DECIBELS)
+    )
     for k in range(4):
         image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
-        given = (image, VIEW), ((1e3 * 10 ** (image / 20)).astype(np.float32), VIEW), (image, None)
-        found = [r.process(frame(k, im), aside(0.0, k), v) for r, (im, v) in zip(recognisers, given, strict=True)]
+        given = (
+            (image, VIEW),
+            ((1e3 * 10 ** (image / 20)).astype(np.float32), VIEW),
+            (image, None),
+        )
+        found = [
+            r.process(frame(k, im), aside(0.0, k), v)
+            for r, (im, v) in zip(recognisers, given, strict=True)
+        ]
     plain, linear, flat = ((one.range_m, one.azimuth_rad) for one in found)
     np.testing.assert_allclose(linear, plain, atol=1e-4)
-    np.testing.assert_allclose(found[1].id_probability, found[0].id_probability, atol=0.01)
+    np.testing.assert_allclose(
+        found[1].id_probability, found[0].id_probability, atol=0.01
+    )
     np.testing.assert_allclose(flat, plain, atol=0.04)
 
 
 def test_other_designs_and_blocks_of_more_frames_are_refused():
     model = RecogniserParams(confusion=confusion_for(DEFAULT_DESIGNS[:2]))
-    with pytest.raises(CalibrationError, match=r" 1, 2, the designs are 1, 2, 3, 4; .*calibrate"):
+    with pytest.raises(
+        CalibrationError, match=r" 1, 2, the designs are 1, 2, 3, 4; .*calibrate"
+    ):
         Recogniser(DECIBELS, params=model)
     assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], model).ids.tolist() == [1, 2]
-    recogniser, both = Recogniser(DECIBELS, params=EVERY), np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)])
-    with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
-        recogniser.process(SonarFrames(np.array([0, FRAME_NS]), both, RANGES_M, AZIMUTHS_RAD), None, VIEW)
+    recogniser, both = (
+        Recogniser(DECIBELS, params=EVERY),
+        np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)]),
+    )
+    with pytest.raises(
+        MeasurementError, match=r"a block of 2 frames; give blocks of one"
+    ):
+        recogniser.process(
+            SonarFrames(np.array([0, FRAME_NS]), both, RANGES_M, AZIMUTHS_RAD),
+            None,
+            VIEW,
+        )
     assert recogniser.stamp_ns is None
 
 
-def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.MonkeyPatch):
-    seen, select, recogniser = [], module.select_candidates, Recogniser(DECIBELS, params=EVERY)
-    monkeypatch.setattr(module, "select_candidates", lambda *a, **k: seen.append(select(*a, **k)) or seen[-1])
+def test_nothing_that_stands_out_disappears_without_a_row(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    seen, select, recogniser = (
+        [],
+        module.select_candidates,
+        Recogniser(DECIBELS, params=EVERY),
+    )
+    monkeypatch.setattr(
+        module,
+        "select_candidates",
+        lambda *a, **k: seen.append(select(*a, **k)) or seen[-1],
+    )
     for k in range(4):
-        recogniser.process(frame(k, picture(CROSS, 1.7, 0.0, 0.4, k)), aside(0.0, k), VIEW)
+        recogniser.process(
+            frame(k, picture(CROSS, 1.7, 0.0, 0.4, k)), aside(0.0, k), VIEW
+        )
         fates = [f for f in recogniser.fates if np.isfinite(f.range_m)]
         assert len(fates) == len(seen[-1]) > 1
         assert sum(f.track >= 0 for f in fates) == len(seen[-1].accepted)
@@ -156,33 +248,52 @@ def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_onc
     good, bad = Recogniser(DECIBELS, params=EVERY), Recogniser(DECIBELS, params=EVERY)
     for recogniser in (good, bad):
         pass_by(recogniser, SQUARE, 5)
-    assert bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW) is None
+    assert (
+        bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW)
+        is None
+    )
     assert [fate[:2] for fate in bad.fates] == [(5 * FRAME_NS, -1)]
     assert np.isnan(bad.fates[0][2:4]).all()
     assert bad.fates[0].outcome == "frame not used: all samples are zero"
     assert bad.sightings == []
     last = frame(6, picture(SQUARE, 1.7, -0.15, 0.4, 6))
-    expected, found = good.process(last, aside(0.05), VIEW), bad.process(last, aside(-0.3), VIEW)
+    expected, found = (
+        good.process(last, aside(0.05), VIEW),
+        bad.process(last, aside(-0.3), VIEW),
+    )
     np.testing.assert_allclose(found.range_m, expected.range_m)
     np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
-    assert [f.track for f in bad.fates if f.track >= 0] == [f.track for f in good.fates if f.track >= 0]
+    assert [f.track for f in bad.fates if f.track >= 0] == [
+        f.track for f in good.fates if f.track >= 0
+    ]
 
 
 def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
     """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
-    recogniser, image = Recogniser(DECIBELS, params=EVERY), picture(SQUARE, 1.7, -0.2, 0.4, 8)
+    recogniser, image = (
+        Recogniser(DECIBELS, params=EVERY),
+        picture(SQUARE, 1.7, -0.2, 0.4, 8),
+    )
     before = pass_by(recogniser, SQUARE)[-1]
     for k in range(500):
-        found = recogniser.process(frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW)
+        found = recogniser.process(
+            frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW
+        )
     assert before.id_probability[0, SQUARE] > 0.9
     np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
 
 
 def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_counts_them():
     ours, papers = (
-        [float(found.id_probability[0, SQUARE]) for found in pass_by(recogniser, SQUARE, 8, 0.0) if found is not None]
+        [
+            float(found.id_probability[0, SQUARE])
+            for found in pass_by(recogniser, SQUARE, 8, 0.0)
+            if found is not None
+        ]
         for rule in ("virtual-evidence", "jeffrey")
-        for params in [RecogniserParams(identity=IdentityParams(rule=rule), independent=False)]
+        for params in [
+            RecogniserParams(identity=IdentityParams(rule=rule), independent=False)
+        ]
         for recogniser in [Recogniser(DECIBELS, params=params)]
     )
     np.testing.assert_allclose(ours, ours[0], rtol=1e-9)
@@ -191,7 +302,10 @@ def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_c
 
 def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> float:
     """Belief in the square after frames along these steps, with the same picture of it in each."""
-    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.0, independent=False))
+    recogniser = Recogniser(
+        DECIBELS,
+        params=RecogniserParams(least_frames=1, least_existence=0.0, independent=False),
+    )
     for k, (step, xy) in enumerate(zip([None, *steps], xy_m, strict=True)):
         found = recogniser.process(frame(k, picture(SQUARE, *xy, 0.4, 5)), step, VIEW)
     return float(found.id_probability[0, SQUARE])
@@ -200,9 +314,13 @@ def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> fl
 def test_turning_on_the_spot_is_no_news_and_moving_across_is():
     """The vertical is tilted in the sonar's axes."""
     turned = moved(turned=gtsam.Rot3.AxisAngle(ROTATION.T @ [0.0, 0.0, 1.0], 0.03))
-    spots = [(1.7 * np.cos(0.03 * k), round(-1.7 * np.sin(0.03 * k), 6)) for k in range(4)]
+    spots = [
+        (1.7 * np.cos(0.03 * k), round(-1.7 * np.sin(0.03 * k), 6)) for k in range(4)
+    ]
     turning, once = _belief_after([turned] * 3, spots), _belief_after([], spots[:1])
-    across = _belief_after([aside(0.05)] * 3, [(1.7, round(-0.05 * k, 6)) for k in range(4)])
+    across = _belief_after(
+        [aside(0.05)] * 3, [(1.7, round(-0.05 * k, 6)) for k in range(4)]
+    )
     assert once - 0.1 < turning <= once
     assert across > once
 
@@ -211,10 +329,15 @@ def test_what_is_across_turns_with_the_sonar(monkeypatch: pytest.MonkeyPatch):
     """After a quarter turn, motion along the old centre beam is motion to the side."""
     recogniser, looks = Recogniser(DECIBELS, params=EVERY), []
     step = recogniser._beliefs.step
-    monkeypatch.setattr(recogniser._beliefs, "step", lambda *args: looks.append(args[3:]) or step(*args))
-    for k, motion in enumerate([None, moved(turned=gtsam.Rot3.Rz(np.pi / 2)), moved(ahead_m=0.1)]):
+    monkeypatch.setattr(
+        recogniser._beliefs, "step", lambda *args: looks.append(args[3:]) or step(*args)
+    )
+    for k, motion in enumerate(
+        [None, moved(turned=gtsam.Rot3.Rz(np.pi / 2)), moved(ahead_m=0.1)]
+    ):
         recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), motion, VIEW)
-    np.testing.assert_allclose(looks[-1][0], [0.0, 0.1, 0.0], atol=1e-12)  # in the axes of the first frame
+    # in the axes of the first frame
+    np.testing.assert_allclose(looks[-1][0], [0.0, 0.1, 0.0], atol=1e-12)
     np.testing.assert_allclose(looks[0][1], [[0.0, 1.0, 0.0]], atol=0.02)
     np.testing.assert_allclose(looks[1][1], [[-1.0, 0.0, 0.0]], atol=0.02)
 
@@ -224,8 +347,13 @@ def test_two_discs_at_once_are_not_both_the_disc():
     recogniser = Recogniser(DECIBELS, params=EVERY)
     for k in range(9):
         y_m = round(0.2 - 0.05 * k, 6)
-        left, right = picture(DISC, 1.7, y_m + 0.2, 0.4, k), picture(DISC, 1.75, y_m - 0.2, 0.4, k)
-        found = recogniser.process(frame(k, np.maximum(left, right)), aside(0.05, k), VIEW)
+        left, right = (
+            picture(DISC, 1.7, y_m + 0.2, 0.4, k),
+            picture(DISC, 1.75, y_m - 0.2, 0.4, k),
+        )
+        found = recogniser.process(
+            frame(k, np.maximum(left, right)), aside(0.05, k), VIEW
+        )
         if found is not None and len(found) == 2:
             pair = found.id_probability
             assert pair.argmax(axis=1)[pair.max(axis=1) > 0.5].tolist() in ([], [DISC])
@@ -233,25 +361,36 @@ def test_two_discs_at_once_are_not_both_the_disc():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 4))
-def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, tracks: int, known: int):
+def test_no_landmark_is_the_most_probable_identity_of_two_tracks(
+    seed: int, tracks: int, known: int
+):
     surer = np.array([[0.7, 0.1, 0.2], [0.9, 0.05, 0.05]])
     np.testing.assert_allclose(each_once(surer), [[0.0, 0.1, 0.9], [0.9, 0.05, 0.05]])
     beliefs = np.random.default_rng(seed).dirichlet(np.full(known + 1, 0.4), tracks)
     found = each_once(beliefs)
     np.testing.assert_allclose(found.sum(axis=1), 1)
-    before, after = ([k for k in b.argmax(axis=1).tolist() if k < known] for b in (beliefs, found))
+    before, after = (
+        [k for k in b.argmax(axis=1).tolist() if k < known] for b in (beliefs, found)
+    )
     assert len(set(after)) == len(after)
     if len(set(before)) == len(before):
         np.testing.assert_array_equal(found, beliefs)
 
 
 def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its_identity_changes():
-    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 0.8})  # one frame in four
+    # one frame in four
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 0.8})
     named = {}
     for independent in (True, False):
-        recogniser = Recogniser(DECIBELS, params=RecogniserParams(confusion=model, independent=independent))
+        recogniser = Recogniser(
+            DECIBELS, params=RecogniserParams(confusion=model, independent=independent)
+        )
         found = pass_by(recogniser, SQUARE, frames=15, step_m=0.02)
-        named[independent] = {k: int(one.most_probable()[0][0]) for k, one in enumerate(found) if one is not None}
+        named[independent] = {
+            k: int(one.most_probable()[0][0])
+            for k, one in enumerate(found)
+            if one is not None
+        }
     assert len(named[False]) == 13, "from the third frame on"
     reports = sorted(named[True])
     assert reports[0] == min(named[False])
@@ -259,24 +398,36 @@ def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its
     for before, now in pairwise(reports):
         assert now - before == 4 or named[True][before] != named[True][now]
     assert len(reports) <= 2 + len(believed) // 4 + int(np.sum(np.diff(believed) != 0))
-    assert recogniser_said(model)[module.NOT_INDEPENDENT] == len(named[False]) - len(reports)
+    assert recogniser_said(model)[module.NOT_INDEPENDENT] == len(named[False]) - len(
+        reports
+    )
 
 
 def test_a_new_identity_is_reported_at_once(monkeypatch: pytest.MonkeyPatch):
     model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 3.8})
-    recogniser, frames = Recogniser(DECIBELS, params=RecogniserParams(confusion=model)), iter(range(15))
+    recogniser, frames = (
+        Recogniser(DECIBELS, params=RecogniserParams(confusion=model)),
+        iter(range(15)),
+    )
     believed = np.eye(5)[[SQUARE] * 8 + [DISC] * 7]
     monkeypatch.setattr(
-        recogniser._beliefs, "step", lambda association, *_: believed[[next(frames)] * len(association)]
+        recogniser._beliefs,
+        "step",
+        lambda association, *_: believed[[next(frames)] * len(association)],
     )
     found = pass_by(recogniser, SQUARE, frames=15, step_m=0.02)
     assert [k for k, one in enumerate(found) if one is not None] == [2, 8]
 
 
 def recogniser_said(model) -> Counter:
-    recogniser, said = Recogniser(DECIBELS, params=RecogniserParams(confusion=model)), Counter()
+    recogniser, said = (
+        Recogniser(DECIBELS, params=RecogniserParams(confusion=model)),
+        Counter(),
+    )
     for k in range(15):
         y = round((15 // 2 - k) * 0.02, 6)
-        recogniser.process(frame(k, picture(SQUARE, 1.7, y, 0.4, k)), aside(0.02, k), VIEW)
+        recogniser.process(
+            frame(k, picture(SQUARE, 1.7, y, 0.4, k)), aside(0.02, k), VIEW
+        )
         said.update(fate.outcome for fate in recogniser.fates if fate.track >= 0)
     return said

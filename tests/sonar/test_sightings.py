@@ -18,11 +18,24 @@ from sonar_graph.sonar.appearance import (
 from sonar_graph.sonar.confusion import Confusion, confusion_for
 from sonar_graph.sonar.geometry import FloorView
 
-from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, ROTATION, VIEW, candidates_at, image_db, polar
+from .polar_images import (
+    AZIMUTHS_RAD,
+    HEIGHT_M,
+    RANGES_M,
+    ROTATION,
+    VIEW,
+    candidates_at,
+    image_db,
+    polar,
+)
 
 APERTURE_RAD = 0.244
 USUAL = {"range_bound_m": 1e-3, "across_bound_m": 1.2e-3, "bound_power": 1.5}
-SETTINGS = {"height_bias_m": 0.0, "range_sigma_m": 0.01, "across_sigma_m": 0.008} | USUAL
+SETTINGS = {
+    "height_bias_m": 0.0,
+    "range_sigma_m": 0.01,
+    "across_sigma_m": 0.008,
+} | USUAL
 MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(update=SETTINGS)
 TRIANGLE = 2
 FLUSH = [replace(design, relief_m=0.0) for design in DEFAULT_DESIGNS]
@@ -34,7 +47,9 @@ def odds(fit: DesignFit, model: Confusion = MODEL) -> Floats:
     return model.log_odds(fit.evidence)
 
 
-def frame(image: Floats, ranges_m: Floats = RANGES_M, azimuths_rad: Floats = AZIMUTHS_RAD) -> SonarFrames:
+def frame(
+    image: Floats, ranges_m: Floats = RANGES_M, azimuths_rad: Floats = AZIMUTHS_RAD
+) -> SonarFrames:
     return SonarFrames(np.array([1]), image[None], ranges_m, azimuths_rad)
 
 
@@ -53,16 +68,25 @@ def look_at(
 
 @pytest.fixture(scope="module")
 def triangle() -> np.ndarray:
-    return image_db(DEFAULT_DESIGNS[TRIANGLE], (1.7, 0.05), 0.5, ROTATION, np.random.default_rng(0))
+    return image_db(
+        DEFAULT_DESIGNS[TRIANGLE], (1.7, 0.05), 0.5, ROTATION, np.random.default_rng(0)
+    )
 
 
 def test_range_and_azimuth_are_those_of_the_centre_and_as_certain_as_the_fit(triangle):
     found = look_at(triangle, (1.725, 0.03))
     r, a = polar((1.7, 0.05))
     assert odds(found.fit).argmax() == TRIANGLE
-    assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
-    sigmas_m = np.hypot(np.array([0.01, 0.008]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5, found.moved_m)
-    np.testing.assert_allclose(found.covariance, np.diag((sigmas_m / [1, found.range_m]) ** 2))
+    assert (found.range_m, found.azimuth_rad) == (
+        pytest.approx(r, abs=0.006),
+        pytest.approx(a, abs=0.004),
+    )
+    sigmas_m = np.hypot(
+        np.array([0.01, 0.008]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5, found.moved_m
+    )
+    np.testing.assert_allclose(
+        found.covariance, np.diag((sigmas_m / [1, found.range_m]) ** 2)
+    )
 
 
 def test_a_fit_tells_no_less_than_the_centroid_of_its_candidate(triangle):
@@ -72,10 +96,14 @@ def test_a_fit_tells_no_less_than_the_centroid_of_its_candidate(triangle):
     np.testing.assert_allclose(found.covariance, np.diag(np.square(sigmas)))
 
 
-def test_a_face_that_is_higher_than_the_landmarks_place_seems_nearer_by_what_is_added(triangle):
+def test_a_face_that_is_higher_than_the_landmarks_place_seems_nearer_by_what_is_added(
+    triangle,
+):
     high = MODEL.model_copy(update={"height_bias_m": 0.02})
     plain, found = (look_at(triangle, (1.7, 0.05), model) for model in (MODEL, high))
-    assert found.range_m - plain.range_m == pytest.approx(0.02 * HEIGHT_M / plain.range_m, rel=1e-6)
+    assert found.range_m - plain.range_m == pytest.approx(
+        0.02 * HEIGHT_M / plain.range_m, rel=1e-6
+    )
     assert look_at(triangle, (1.7, 0.05), high, view=None).range_per_height == 0.0
 
 
@@ -83,23 +111,37 @@ def test_a_face_that_is_higher_than_the_landmarks_place_seems_nearer_by_what_is_
     ("near_m", "view", "aperture_rad"),
     [
         ((1.7, 0.75), VIEW, APERTURE_RAD),  # hardly in the image
-        ((0.9, 0.0), FloorView(ROTATION, 2.0), APERTURE_RAD),  # no ray meets the floor there
-        ((1.95, 0.05), VIEW, 0.05),  # a fan of a fifth of the opening shows a strip of it
+        (
+            (0.9, 0.0),
+            FloorView(ROTATION, 2.0),
+            APERTURE_RAD,
+        ),  # no ray meets the floor there
+        (
+            (1.95, 0.05),
+            VIEW,
+            0.05,
+        ),  # a fan of a fifth of the opening shows a strip of it
     ],
 )
-def test_what_is_not_in_view_is_compared_with_nothing(triangle, near_m, view, aperture_rad):
+def test_what_is_not_in_view_is_compared_with_nothing(
+    triangle, near_m, view, aperture_rad
+):
     found = look_at(triangle, near_m, view=view, aperture_rad=aperture_rad)
     assert found.fit is None
     r, a = polar(near_m)
     assert (found.range_m, found.azimuth_rad) == (r, a)
-    np.testing.assert_allclose(found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2]))
+    np.testing.assert_allclose(
+        found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2])
+    )
 
 
 def test_rows_say_which_candidate_and_odds_are_those_of_the_model(triangle):
     r, a = polar((1.7, 0.05))
     look = CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD)
     candidates = candidates_at([2.05, r], [-0.1, a])
-    none, seen, beside = look.at(triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0]))
+    none, seen, beside = look.at(
+        triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0])
+    )
     assert none is None
     assert beside.azimuth_rad == pytest.approx(-0.1, abs=0.05)
     found = look.log_odds([none, seen, beside])
@@ -111,11 +153,20 @@ def test_rows_say_which_candidate_and_odds_are_those_of_the_model(triangle):
 def test_candidates_of_one_frame_are_seen_as_each_alone(triangle):
     """Of three the middle one is not in view, and its row of the others is not the frame's."""
     places = [polar(xy) for xy in ((1.7, 0.07), (1.7, 0.75), (1.69, 0.04))]
-    look = CandidateFit(FLUSH, AppearanceParams(), MODEL.model_copy(update={"height_bias_m": 0.02}), APERTURE_RAD)
+    look = CandidateFit(
+        FLUSH,
+        AppearanceParams(),
+        MODEL.model_copy(update={"height_bias_m": 0.02}),
+        APERTURE_RAD,
+    )
 
     def seen(*of: tuple[float, float]) -> list[ObjectSighting]:
         return look.at(
-            triangle, frame(triangle), VIEW, candidates_at(*map(list, zip(*of, strict=True))), np.arange(len(of))
+            triangle,
+            frame(triangle),
+            VIEW,
+            candidates_at(*map(list, zip(*of, strict=True))),
+            np.arange(len(of)),
         )
 
     for one, (other,) in zip(seen(*places), map(seen, places), strict=True):
@@ -128,9 +179,14 @@ def test_candidates_of_one_frame_are_seen_as_each_alone(triangle):
 
 def test_other_beams_and_bins_are_looked_up_anew(triangle):
     """A log may change its window on the way: beams the other way round, fewer bins, farther bins."""
-    look, (r, a) = CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD), polar((1.7, 0.05))
+    look, (r, a) = (
+        CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD),
+        polar((1.7, 0.05)),
+    )
     first, turned, fewer, farther = (
-        look.at(image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.evidence
+        look.at(
+            image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0])
+        )[0].fit.evidence
         for image, *window in (
             (triangle, RANGES_M, AZIMUTHS_RAD),
             (np.ascontiguousarray(triangle[::-1]), RANGES_M, AZIMUTHS_RAD[::-1].copy()),
@@ -145,13 +201,29 @@ def test_other_beams_and_bins_are_looked_up_anew(triangle):
 def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image():
     """A design drawn in that plane is found; on the floor's grid it would be foreshortened."""
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
-    level = np.nan_to_num(DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)) + 35.0
-    image = (level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))).astype(np.float32)
+    level = (
+        np.nan_to_num(
+            DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)
+        )
+        + 35.0
+    )
+    image = (
+        level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))
+    ).astype(np.float32)
     r, a = np.hypot(1.9, 0.1), np.arctan2(0.1, 1.9)
-    candidate, look = candidates_at([r], [a]), CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD)
-    flat, tilted = (look.at(image, frame(image), view, candidate, np.array([0]))[0] for view in (None, VIEW))
+    candidate, look = (
+        candidates_at([r], [a]),
+        CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD),
+    )
+    flat, tilted = (
+        look.at(image, frame(image), view, candidate, np.array([0]))[0]
+        for view in (None, VIEW)
+    )
     assert odds(flat.fit).argmax() == 1
-    assert (flat.range_m, flat.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.003))
+    assert (flat.range_m, flat.azimuth_rad) == (
+        pytest.approx(r, abs=0.006),
+        pytest.approx(a, abs=0.003),
+    )
     assert tilted.fit is None or odds(tilted.fit)[1] < odds(flat.fit)[1] - 1
 
 

@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.sonar.tracker import Expected, SonarStep, Tracker, TrackingParams, TrackStates, corrected
+from sonar_graph.sonar.tracker import (
+    Expected,
+    SonarStep,
+    Tracker,
+    TrackingParams,
+    TrackStates,
+    corrected,
+)
 
 from .polar_images import WINDOW, candidates_at
 
@@ -28,7 +35,11 @@ def moved_by(x=0.0, y=0.0, yaw=0.0):
 def run(tracker, frames, step=STILL):
     """Associations of frames, each a list of (range, azimuth)."""
     return [
-        tracker.step(candidates_at([r for r, _ in seen], [a for _, a in seen]), step, (k + 1) * FRAME_NS)
+        tracker.step(
+            candidates_at([r for r, _ in seen], [a for _, a in seen]),
+            step,
+            (k + 1) * FRAME_NS,
+        )
         for k, seen in enumerate(frames)
     ]
 
@@ -38,23 +49,42 @@ def polar(point) -> tuple[float, float]:
 
 
 def track_at(q, P) -> TrackStates:
-    return TrackStates(np.array([0]), np.array([q]), np.array([P]), np.array([0.5]), np.array([1]))
+    return TrackStates(
+        np.array([0]), np.array([q]), np.array([P]), np.array([0.5]), np.array([1])
+    )
 
 
-@given(st.lists(st.integers(0, 6), min_size=1, max_size=5), st.integers(0, 2**32 - 1), st.booleans())
-def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(counts, seed, is_crowded):
+@given(
+    st.lists(st.integers(0, 6), min_size=1, max_size=5),
+    st.integers(0, 2**32 - 1),
+    st.booleans(),
+)
+def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(
+    counts, seed, is_crowded
+):
     """Places are drawn and not chosen: between two candidates equally far from a track there is no better one."""
-    rng, (r, a) = np.random.default_rng(seed), (((1.8, 2.0), 0.06) if is_crowded else ((1.3, 2.5), 0.24))
-    frames = [list(zip(rng.uniform(*r, n), rng.uniform(-a, a, n), strict=True)) for n in counts]
+    rng, (r, a) = (
+        np.random.default_rng(seed),
+        (((1.8, 2.0), 0.06) if is_crowded else ((1.3, 2.5), 0.24)),
+    )
+    frames = [
+        list(zip(rng.uniform(*r, n), rng.uniform(-a, a, n), strict=True))
+        for n in counts
+    ]
     shuffled = [[seen[i] for i in rng.permutation(len(seen))] for seen in frames]
-    pairs, numbers = list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True)), []
+    pairs, numbers = (
+        list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True)),
+        [],
+    )
     for found, _ in pairs:
         assert found.matrix.shape == (len(found.ids), len(found.previous_ids) + 1)
         assert (found.matrix >= 0).all()
         assert np.allclose(found.matrix.sum(axis=1), 1.0)
         assert ((found.existence >= 0) & (found.existence <= 1)).all()
         goes_on = np.isin(found.ids, found.previous_ids)
-        assert (found.matrix[goes_on, -1] == 0).all()  # only a track that starts can be new
+        assert (
+            found.matrix[goes_on, -1] == 0
+        ).all()  # only a track that starts can be new
         assert (found.matrix[~goes_on, -1] > 0).all()
         numbers += found.ids[~goes_on].tolist()
         assert len(set(numbers)) == len(numbers)  # numbers are not used twice
@@ -80,13 +110,18 @@ def test_association_and_existence_are_ratios_of_densities_by_hand():
     var_r, var_a = 2 * params.range_sigma_m**2, 2 * params.azimuth_sigma_rad**2
     own = 0.1 / 0.6 * 0.9 / (2 * np.pi * np.sqrt(var_r * var_a))
     other, none = own * np.exp(-0.5 * 0.03**2 / var_a), 0.6 / AREA
-    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]]) / (own + other + none)
+    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]]) / (
+        own + other + none
+    )
     assert found.matrix == pytest.approx(expected, rel=1e-6)
     found = run(Tracker(params), [[(2.0, 0.0)], [(2.02, 0.0)]])[-1]
     density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
     birth, likelihood = 0.1 / 0.6, 0.1 + 0.9 * density * AREA / 0.5
-    assert found.existence[0] == pytest.approx(birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6)
-    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)  # between two equally certain places
+    assert found.existence[0] == pytest.approx(
+        birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6
+    )
+    # between two equally certain places
+    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -94,26 +129,41 @@ def test_association_and_existence_are_ratios_of_densities_by_hand():
     [(1.9, 1, 1e12, 0.1, 0.1), (1.26, 3, 1e12, 0.1, 0.55), (1.9, 1, 10.0, 10.0, 0.1)],
     ids=["inside", "on the edge: missed with half the probability", "after a lifetime"],
 )
-def test_a_missed_track_loses_existence_as_bayes_says(range_m, frames, lifetime_s, elapsed_s, missed):
+def test_a_missed_track_loses_existence_as_bayes_says(
+    range_m, frames, lifetime_s, elapsed_s, missed
+):
     tracker = Tracker(TrackingParams(lifetime_s=lifetime_s, least_existence=0.0))
     before = run(tracker, [[(range_m, 0.0)]] * frames)[-1].existence[0]
-    found = tracker.step(candidates_at([], []), STILL, frames * FRAME_NS + round(elapsed_s * 1e9))
+    found = tracker.step(
+        candidates_at([], []), STILL, frames * FRAME_NS + round(elapsed_s * 1e9)
+    )
     faded = before * np.exp(-elapsed_s / lifetime_s)
-    assert found.existence[0] == pytest.approx(faded * missed / (1 - faded + faded * missed), rel=1e-4)
+    assert found.existence[0] == pytest.approx(
+        faded * missed / (1 - faded + faded * missed), rel=1e-4
+    )
     assert (found.matrix.tolist(), found.candidate.tolist()) == ([[1.0, 0.0]], [-1])
     assert found.frames_seen.tolist() == [frames]
 
 
 def test_a_track_starts_from_an_accepted_candidate_as_uncertain_as_it_and_its_elevation():
-    found = Tracker().step(candidates_at([2.0, 1.5, 2.0], [0.0, 0.1, 0.0], rejected=(0,)), None, FRAME_NS)
+    found = Tracker().step(
+        candidates_at([2.0, 1.5, 2.0], [0.0, 0.1, 0.0], rejected=(0,)), None, FRAME_NS
+    )
     assert found.candidate.tolist() == [1, 2]
-    assert found.position_m[0] == pytest.approx(1.5 * np.array([np.cos(0.1), np.sin(0.1), 0.0]))
-    assert np.allclose(found.position_cov[1], np.diag([0.03**2, (2 * 0.015) ** 2, (2 * 0.07) ** 2]))
+    assert found.position_m[0] == pytest.approx(
+        1.5 * np.array([np.cos(0.1), np.sin(0.1), 0.0])
+    )
+    assert np.allclose(
+        found.position_cov[1], np.diag([0.03**2, (2 * 0.015) ** 2, (2 * 0.07) ** 2])
+    )
 
 
 def test_what_persists_becomes_certain_and_what_flickers_ends_with_its_reason():
     rng = np.random.default_rng(7)
-    frames = [[(2.0, 0.1), (rng.uniform(1.3, 2.5), rng.uniform(-0.24, 0.0))] for _ in range(20)]
+    frames = [
+        [(2.0, 0.1), (rng.uniform(1.3, 2.5), rng.uniform(-0.24, 0.0))]
+        for _ in range(20)
+    ]
     found = run(Tracker(), frames)
     last = found[-1]
     persistent = int(np.flatnonzero(last.ids == found[0].ids[0])[0])
@@ -132,17 +182,27 @@ def test_motion_is_what_makes_a_track_persist(is_compensated):
     tracker, ids = Tracker(), []
     for k in range(6):
         r, a = polar(point)
-        found = tracker.step(candidates_at([r], [a]), step if is_compensated else STILL, (k + 1) * FRAME_NS)
+        found = tracker.step(
+            candidates_at([r], [a]),
+            step if is_compensated else STILL,
+            (k + 1) * FRAME_NS,
+        )
         ids.append(int(found.ids[found.candidate >= 0][0]))
         point = step.previous_T_sonar.transformTo(point)
     assert (len(set(ids)) == 1) is is_compensated
     if is_compensated:
-        assert found.position_m[0] == pytest.approx(step.previous_T_sonar.transformFrom(point), abs=1e-3)
+        assert found.position_m[0] == pytest.approx(
+            step.previous_T_sonar.transformFrom(point), abs=1e-3
+        )
 
 
 @pytest.mark.parametrize("skipped", [1, 3])
 def test_skipped_frames_move_the_tracks_too(skipped: int):
-    step, point, tracker = moved_by(0.1, 0.0, 0.04), np.array([2.2, 0.1, 0.0]), Tracker()
+    step, point, tracker = (
+        moved_by(0.1, 0.0, 0.04),
+        np.array([2.2, 0.1, 0.0]),
+        Tracker(),
+    )
     run(tracker, [[polar(point)]])
     for _ in range(skipped):
         tracker.skip(step)
@@ -156,32 +216,59 @@ def test_skipped_frames_move_the_tracks_too(skipped: int):
 
 
 def test_steps_join_as_samples_of_them_do():
-    one, two = (SonarStep(moved_by(*by).previous_T_sonar, CORRELATED) for by in ((0.3, 0.1, 0.4), (-0.1, 0.2, -0.9)))
+    one, two = (
+        SonarStep(moved_by(*by).previous_T_sonar, CORRELATED)
+        for by in ((0.3, 0.1, 0.4), (-0.1, 0.2, -0.9))
+    )
     first, second, joined = one.previous_T_sonar, two.previous_T_sonar, one.then(two)
-    noise = np.random.default_rng(8).multivariate_normal(np.zeros(12), np.kron(np.eye(2), CORRELATED), 8_000)
+    noise = np.random.default_rng(8).multivariate_normal(
+        np.zeros(12), np.kron(np.eye(2), CORRELATED), 8_000
+    )
     sampled = [first.retract(n[:6]).compose(second.retract(n[6:])) for n in noise]
-    tangents = np.array([joined.previous_T_sonar.localCoordinates(pose) for pose in sampled])
-    assert np.allclose(np.cov(tangents.T), joined.covariance, atol=0.05 * joined.covariance.max())
+    tangents = np.array(
+        [joined.previous_T_sonar.localCoordinates(pose) for pose in sampled]
+    )
+    assert np.allclose(
+        np.cov(tangents.T), joined.covariance, atol=0.05 * joined.covariance.max()
+    )
 
 
 def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
-    rng, step = np.random.default_rng(9), SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
+    rng, step = (
+        np.random.default_rng(9),
+        SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED),
+    )
     q, P = np.array([2.0, 0.3, -0.2]), np.diag([1e-3, 2e-3, 4e-3])
     found, rested = (track_at(q, P).moved(motion, 0.02) for motion in (step, STILL))
-    points, noise = rng.multivariate_normal(q, P, 8_000), rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
-    sampled = [step.previous_T_sonar.retract(n).transformTo(p) for n, p in zip(noise, points, strict=True)]
+    points, noise = (
+        rng.multivariate_normal(q, P, 8_000),
+        rng.multivariate_normal(np.zeros(6), step.covariance, 8_000),
+    )
+    sampled = [
+        step.previous_T_sonar.retract(n).transformTo(p)
+        for n, p in zip(noise, points, strict=True)
+    ]
     assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=1e-2)
     expected = np.cov(np.array(sampled).T) + 0.02**2 * np.eye(3)
-    assert np.allclose(found.position_cov[0], expected, atol=0.06 * found.position_cov.max())
+    assert np.allclose(
+        found.position_cov[0], expected, atol=0.06 * found.position_cov.max()
+    )
     assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
 
 
 def test_a_density_is_normal_and_ends_at_the_gate():
     """18 cm are 4.2 deviations of the innovation of a tracker; 14 cm are 3.3."""
-    expected = Expected.of(track_at([1.9, 0.2, -0.3], CORRELATED[:3, :3]), np.diag([9e-4, 2e-4]))
-    z = expected.z + np.array([2.99, 3.01])[:, None] * np.linalg.cholesky(expected.S[0])[:, 0]
+    expected = Expected.of(
+        track_at([1.9, 0.2, -0.3], CORRELATED[:3, :3]), np.diag([9e-4, 2e-4])
+    )
+    z = (
+        expected.z
+        + np.array([2.99, 3.01])[:, None] * np.linalg.cholesky(expected.S[0])[:, 0]
+    )
     inside, outside = expected.densities(z, 9.0)[:, 0]
-    assert inside == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(z[0]), rel=1e-9)
+    assert inside == pytest.approx(
+        multivariate_normal(expected.z[0], expected.S[0]).pdf(z[0]), rel=1e-9
+    )
     assert outside == 0
     for off_m, is_inside in ((0.18, False), (0.14, True)):
         tracker = Tracker()
@@ -195,15 +282,24 @@ def test_innovations_wrap_behind_the_sonar():
     expected = Expected.of(tracks, R)
     turned, plain = np.array([[2.0, -np.pi + 5e-4]]), np.array([[2.0, np.pi + 5e-4]])
     density = expected.densities(turned, 9.0)[0, 0]
-    assert density == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9)
-    one, other = (corrected(tracks, expected, z, np.array([0]), R).position_m for z in (turned, plain))
+    assert density == pytest.approx(
+        multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9
+    )
+    one, other = (
+        corrected(tracks, expected, z, np.array([0]), R).position_m
+        for z in (turned, plain)
+    )
     assert one == pytest.approx(other, abs=1e-12)
     assert one[0, 1] < 0  # on the other side of the axis
 
 
 def test_a_correction_is_that_of_the_information_form():
     """P^-1 grows by H^T R^-1 H; H by differences of range and azimuth."""
-    q, P, R = np.array([1.9, 0.2, -0.3]), np.diag([1e-2, 3e-2, 2e-2]), np.diag([9e-4, 2e-4])
+    q, P, R = (
+        np.array([1.9, 0.2, -0.3]),
+        np.diag([1e-2, 3e-2, 2e-2]),
+        np.diag([9e-4, 2e-4]),
+    )
     tracks = track_at(q, P)
     expected = Expected.of(tracks, R)
 
@@ -219,7 +315,9 @@ def test_a_correction_is_that_of_the_information_form():
     assert after.position_m[0] == pytest.approx(q + gain @ [0.02, -0.01], abs=1e-7)
 
 
-@pytest.mark.parametrize(("inside_m", "ahead"), [(0.15, 1.0), (-0.15, -1.0)], ids=["too near", "too far"])
+@pytest.mark.parametrize(
+    ("inside_m", "ahead"), [(0.15, 1.0), (-0.15, -1.0)], ids=["too near", "too far"]
+)
 def test_what_leaves_the_image_ends_and_is_not_held_against_it(inside_m, ahead):
     tracker = Tracker(TrackingParams(lifetime_s=1e12))
     start_m = WINDOW[0, 0 if inside_m > 0 else 1] + inside_m

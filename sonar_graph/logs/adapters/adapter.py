@@ -32,7 +32,9 @@ def axes_matrix(rotation: Rotation) -> Floats:
         return np.eye(3)
     if rotation == "frd":
         return np.diag([1.0, -1.0, -1.0])
-    return np.asarray(SpatialRotation.from_euler("xyz", rotation, degrees=True).as_matrix())
+    return np.asarray(
+        SpatialRotation.from_euler("xyz", rotation, degrees=True).as_matrix()
+    )
 
 
 def turn(rotation: Rotation, vectors: Floats) -> Floats:
@@ -63,7 +65,15 @@ RATES = {"rad/s": 1.0, "deg/s": np.pi / 180, "mrad/s": 1e-3}
 FORCES = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s2": 1e-2, "mm/s2": 1e-3}
 SPEEDS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1 / 3.6, "kn": 1852 / 3600}
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048}
-PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1e3, "dbar": 1e4, "bar": 1e5, "psi": 6894.757293168}
+PRESSURES = {
+    "Pa": 1.0,
+    "hPa": 100.0,
+    "mbar": 100.0,
+    "kPa": 1e3,
+    "dbar": 1e4,
+    "bar": 1e5,
+    "psi": 6894.757293168,
+}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 """Units by name, for a scale instead of its number."""
@@ -77,7 +87,9 @@ def _from_units(units: Mapping[str, float]) -> BeforeValidator:
         if isinstance(value, str) and value not in units:
             close = get_close_matches(value, units, 1)
             meant = f"did you mean {close[0]}? " if close else ""
-            raise ValueError(f"{meant}expected a factor or one of the units {', '.join(units)}")
+            raise ValueError(
+                f"{meant}expected a factor or one of the units {', '.join(units)}"
+            )
         return units[value] if isinstance(value, str) else value
 
     return BeforeValidator(factor)
@@ -157,7 +169,9 @@ def field_paths(*values: str | Iterable[str] | None) -> Iterator[str]:
         yield from (value,) if isinstance(value, str) else value or ()
 
 
-def leaf_fields(definition: Struct, prefix: str = "", size: str = "") -> Iterator[tuple[str, str]]:
+def leaf_fields(
+    definition: Struct, prefix: str = "", size: str = ""
+) -> Iterator[tuple[str, str]]:
     """Paths of all fields that hold values, through nested messages, with ``[n]`` or ``[]`` for arrays."""
     for entry in definition.fields:
         own = size + (f"[{entry.length or ''}]" if entry.is_array else "")
@@ -190,10 +204,17 @@ class CovarianceFields(Section):
         matrices = self._matrices(table)
         negative = matrices[:, 0, 0] < 0
         zero = ~matrices.any(axis=(1, 2))
-        invalid = (negative & (self.negative == "invalid")) | (zero & (self.zero == "invalid"))
+        invalid = (negative & (self.negative == "invalid")) | (
+            zero & (self.zero == "invalid")
+        )
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
-        unknown = negative | zero | ~np.isfinite(matrices).all(axis=(1, 2)) | _is_indefinite(matrices)
+        unknown = (
+            negative
+            | zero
+            | ~np.isfinite(matrices).all(axis=(1, 2))
+            | _is_indefinite(matrices)
+        )
         return np.where(unknown[:, None, None], np.nan, matrices), invalid
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
@@ -201,7 +222,9 @@ class CovarianceFields(Section):
         if self.meaning == "standard deviation":
             return
         matrices = self._matrices(table)
-        indefinite: NDArray[np.bool_] = _is_indefinite(matrices) & (matrices[:, 0, 0] >= 0)
+        indefinite: NDArray[np.bool_] = _is_indefinite(matrices) & (
+            matrices[:, 0, 0] >= 0
+        )
         count = np.count_nonzero(indefinite)
         if count:
             yield (
@@ -213,7 +236,9 @@ class CovarianceFields(Section):
         """Variances from one field, shape (n,); NaN: unknown (zero, negative, not finite)."""
         value = table.column(self.fields[0]).astype(float)
         known = np.isfinite(value) & (value > 0)
-        return np.where(known, value**2 if self.meaning == "standard deviation" else value, np.nan)
+        return np.where(
+            known, value**2 if self.meaning == "standard deviation" else value, np.nan
+        )
 
     def _matrices(self, table: FieldTable) -> Floats:
         columns = [table.column(path).astype(float) for path in self.fields]
@@ -221,12 +246,19 @@ class CovarianceFields(Section):
             stacked = np.stack(columns, axis=-1)
             if stacked.ndim == 2:
                 return _diagonal(stacked)
-            return stacked if stacked.shape[1:] == (3, 3) else np.full((len(stacked), 3, 3), np.nan)
+            return (
+                stacked
+                if stacked.shape[1:] == (3, 3)
+                else np.full((len(stacked), 3, 3), np.nan)
+            )
         (column,) = columns
         if column.ndim == 1:
             return _diagonal(np.repeat(column[:, None], 3, axis=1))
         if column.shape[1] not in (9, 36):
-            table.refuse(self.fields[0], f"has {column.shape[1]} numbers; a covariance has 1, 9 or 36")
+            table.refuse(
+                self.fields[0],
+                f"has {column.shape[1]} numbers; a covariance has 1, 9 or 36",
+            )
         side = 3 if column.shape[1] == 9 else 6
         return column.reshape(-1, side, side)[:, :3, :3]
 
@@ -234,7 +266,9 @@ class CovarianceFields(Section):
 def _is_indefinite(matrices: Floats) -> NDArray[np.bool_]:
     """Matrices with a negative eigenvalue beyond rounding, shape (n,); none where a number is not finite."""
     finite = np.isfinite(matrices).all(axis=(1, 2))
-    symmetric = np.where(np.asarray(finite)[:, None, None], matrices + np.swapaxes(matrices, 1, 2), 0.0)
+    symmetric = np.where(
+        np.asarray(finite)[:, None, None], matrices + np.swapaxes(matrices, 1, 2), 0.0
+    )
     variances: Floats = np.linalg.eigvalsh(symmetric)
     return np.asarray(variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1))
 

@@ -24,10 +24,23 @@ from sonar_graph.logs.adapters.adapter import (
     axes_matrix,
     field_paths,
 )
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.message_table import (
+    NOT_FINITE,
+    Dropped,
+    FieldTable,
+    fit_rows,
+    not_finite,
+)
 from sonar_graph.logs.geodesy import Origin, east_north_up
 from sonar_graph.logs.mcap import Keep, Topic
-from sonar_graph.measurements import FARTHEST_FIX_M, FULL_TURN_RAD, UNMEASURED_M2, Floats, Heading, PositionFixes
+from sonar_graph.measurements import (
+    FARTHEST_FIX_M,
+    FULL_TURN_RAD,
+    UNMEASURED_M2,
+    Floats,
+    Heading,
+    PositionFixes,
+)
 
 ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 STEEPEST_RAD = np.radians(80.0)
@@ -68,9 +81,17 @@ class HeadingAdapter(Adapter):
 
     def refusal(self, topic: Topic) -> str | None:
         """Reason why no message has a heading, which completes "/imu ..."."""
-        if topic.keep is not Keep.ALL or not topic.messages() or self.is_measured(self.table(topic)).any():
+        if (
+            topic.keep is not Keep.ALL
+            or not topic.messages()
+            or self.is_measured(self.table(topic)).any()
+        ):
             return None
-        field = self.variance.fields[0] if self.variance and self.needs_variance else self.status
+        field = (
+            self.variance.fields[0]
+            if self.variance and self.needs_variance
+            else self.status
+        )
         return (
             f"says of no orientation that it is measured ({field}); to use it all the same: needs_variance = false and "
             "status = false under [heading] in a log configuration"
@@ -78,41 +99,64 @@ class HeadingAdapter(Adapter):
 
     def is_measured(self, table: FieldTable) -> NDArray[np.bool_]:
         """Mask of messages that say that yaw is measured, shape (n,)."""
-        measured = np.ones(len(table), bool) if self.status is None else table.column(self.status) != -1
+        measured = (
+            np.ones(len(table), bool)
+            if self.status is None
+            else table.column(self.status) != -1
+        )
         if self.variance is not None and self.needs_variance:
             measured &= np.isfinite(self.variance.read_variance(table))
         return measured
 
-    def read(self, table: FieldTable, body_R_sensor: Floats) -> tuple[Heading | None, Dropped]:
+    def read(
+        self, table: FieldTable, body_R_sensor: Floats
+    ) -> tuple[Heading | None, Dropped]:
         """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
         faults = {"whose orientation is no measurement": ~self.is_measured(table)}
         if self.orientation is not None:
             quaternions = table.beside(self.orientation).astype(float)
             lengths = np.linalg.norm(quaternions, axis=1)
             is_rotation = np.isfinite(lengths) & (lengths > 0.5)
-            sensor = SpatialRotation.from_quat(np.where(is_rotation[:, None], quaternions, [0.0, 0.0, 0.0, 1.0]))
+            sensor = SpatialRotation.from_quat(
+                np.where(is_rotation[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
+            )
             enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
-            R = enu_R_world @ sensor.as_matrix() @ (body_R_sensor @ axes_matrix(self.rotation)).T
+            R = (
+                enu_R_world
+                @ sensor.as_matrix()
+                @ (body_R_sensor @ axes_matrix(self.rotation)).T
+            )
             yaw_rad = np.arctan2(R[:, 1, 0], R[:, 0, 0])
             faults |= {
                 "without an orientation": ~is_rotation,
-                "with the nose too steep for a heading": np.abs(R[:, 2, 0]) > np.sin(STEEPEST_RAD),
+                "with the nose too steep for a heading": np.abs(R[:, 2, 0])
+                > np.sin(STEEPEST_RAD),
             }
         else:
             yaw_rad = table.column(str(self.yaw)) * self.scale
             yaw_rad = np.pi / 2 - yaw_rad if self.world == "ned" else yaw_rad
             faults[NOT_FINITE] = not_finite(yaw_rad)
-        variance = self.variance.read_variance(table) if self.variance else np.full(len(table), np.nan)
+        variance = (
+            self.variance.read_variance(table)
+            if self.variance
+            else np.full(len(table), np.nan)
+        )
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         if not rows.size:
             return None, dropped
-        yaw_rad = yaw_rad[rows] + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad[rows]
+        yaw_rad = (
+            yaw_rad[rows] + self.yaw_offset_rad
+            if self.yaw_offset_rad
+            else yaw_rad[rows]
+        )
         return Heading(table.stamps_ns[rows], yaw_rad, np.sqrt(variance[rows])), dropped
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
         if self.variance is not None:
-            is_beyond = self.is_measured(table) & (self.variance.read_variance(table) > FULL_TURN_RAD**2)
+            is_beyond = self.is_measured(table) & (
+                self.variance.read_variance(table) > FULL_TURN_RAD**2
+            )
             if is_beyond.any():
                 yield (
                     f"{np.count_nonzero(is_beyond)} of {len(table)} rows have a sigma beyond a full turn "
@@ -153,17 +197,29 @@ class GeodeticFields(Section):
 
         Drivers without a fix send latitude and longitude 0; a height that is not measured is NaN.
         """
-        place = np.column_stack([table.column(self.latitude), table.column(self.longitude)]).astype(float)
+        place = np.column_stack(
+            [table.column(self.latitude), table.column(self.longitude)]
+        ).astype(float)
         if self.unit == "ddmm.mmmm":
             degrees = np.trunc(place / 100)
             place = degrees + (place - 100 * degrees) / 60
         elif self.unit == "rad":
             place = np.degrees(place)
-        height = table.column(self.height).astype(float) if self.height else np.full(len(table), np.nan)
-        is_fix = np.isfinite(place).all(axis=1) & place.any(axis=1) & (np.abs(place) <= [90.0, 360.0]).all(axis=1)
+        height = (
+            table.column(self.height).astype(float)
+            if self.height
+            else np.full(len(table), np.nan)
+        )
+        is_fix = (
+            np.isfinite(place).all(axis=1)
+            & place.any(axis=1)
+            & (np.abs(place) <= [90.0, 360.0]).all(axis=1)
+        )
         if self.status is not None:
             is_fix &= table.column(self.status) >= 0
-        return np.column_stack([place, np.where(np.isfinite(height), height, np.nan)]), is_fix
+        return np.column_stack(
+            [place, np.where(np.isfinite(height), height, np.nan)]
+        ), is_fix
 
     def beyond(self, table: FieldTable) -> str:
         """Remark about latitudes that are none, for rows without a fix; empty where there are few."""
@@ -178,11 +234,23 @@ class GeodeticFields(Section):
         rows = np.flatnonzero(is_fix)
         if not rows.size:
             return None
-        latitude, longitude, height = places[rows[np.argmin(table.stamps_ns[rows])]].tolist()
+        latitude, longitude, height = places[
+            rows[np.argmin(table.stamps_ns[rows])]
+        ].tolist()
         heights = places[is_fix & np.isfinite(places[:, 2]), 2]
-        return latitude, longitude, height if np.isfinite(height) else float(heights[0]) if heights.size else 0.0
+        return (
+            latitude,
+            longitude,
+            height
+            if np.isfinite(height)
+            else float(heights[0])
+            if heights.size
+            else 0.0,
+        )
 
-    def positions(self, table: FieldTable, origin: Origin | None) -> tuple[Floats, np.ndarray, NDArray[np.bool_]]:
+    def positions(
+        self, table: FieldTable, origin: Origin | None
+    ) -> tuple[Floats, np.ndarray, NDArray[np.bool_]]:
         """Metres east, north, up of an origin in degrees and metres, shape (n, 3), and masks of fixes and of heights.
 
         A height that is not measured is 0.
@@ -191,10 +259,22 @@ class GeodeticFields(Section):
         latitude_deg, longitude_deg, height_m = origin or (0.0, 0.0, 0.0)
         has_height = np.isfinite(places[:, 2])
         heights_m = np.where(has_height, places[:, 2], height_m)
-        degrees = np.where(is_fix[:, None], places[:, :2], [latitude_deg, longitude_deg])
-        origin_rad = float(np.radians(latitude_deg)), float(np.radians(longitude_deg)), height_m
-        metres = east_north_up(np.radians(degrees[:, 0]), np.radians(degrees[:, 1]), heights_m, origin_rad)
-        return np.where(has_height[:, None], metres, metres * [1.0, 1.0, 0.0]), is_fix, has_height
+        degrees = np.where(
+            is_fix[:, None], places[:, :2], [latitude_deg, longitude_deg]
+        )
+        origin_rad = (
+            float(np.radians(latitude_deg)),
+            float(np.radians(longitude_deg)),
+            height_m,
+        )
+        metres = east_north_up(
+            np.radians(degrees[:, 0]), np.radians(degrees[:, 1]), heights_m, origin_rad
+        )
+        return (
+            np.where(has_height[:, None], metres, metres * [1.0, 1.0, 0.0]),
+            is_fix,
+            has_height,
+        )
 
 
 class PositionAdapter(Adapter):
@@ -218,7 +298,9 @@ class PositionAdapter(Adapter):
     @model_validator(mode="after")
     def _has_one_source(self) -> PositionAdapter:
         if (self.geodetic is None) == (self.position is None):
-            raise ValueError("give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}")
+            raise ValueError(
+                "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
+            )
         return self
 
     def fields(self) -> Iterator[str]:
@@ -228,7 +310,10 @@ class PositionAdapter(Adapter):
         return field_paths(geodetic, self.position, covariance, self.covariance_type)
 
     def read(
-        self, table: FieldTable, origin: Origin | None, sigma_m: tuple[float, float, float]
+        self,
+        table: FieldTable,
+        origin: Origin | None,
+        sigma_m: tuple[float, float, float],
     ) -> tuple[PositionFixes | None, Dropped]:
         """Fixes with covariances, NaN: unknown.
 
@@ -241,22 +326,38 @@ class PositionAdapter(Adapter):
             positions, is_fix, has_height = self.geodetic.positions(table, origin)
             faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
         else:
-            positions = table.beside(self.position or ()).astype(float) * self.scale - self.origin_m
+            positions = (
+                table.beside(self.position or ()).astype(float) * self.scale
+                - self.origin_m
+            )
             faults[NOT_FINITE] = not_finite(positions)
         covariances = np.full((len(table), 3, 3), np.nan)
         if self.covariance is not None:
-            covariances, faults["with a covariance that says invalid"] = self.covariance.read(table)
+            covariances, faults["with a covariance that says invalid"] = (
+                self.covariance.read(table)
+            )
         if self.covariance_type is not None:
-            covariances = np.where((table.column(self.covariance_type) == 0)[:, None, None], np.nan, covariances)
+            covariances = np.where(
+                (table.column(self.covariance_type) == 0)[:, None, None],
+                np.nan,
+                covariances,
+            )
         if self.position is not None:
             covariances = covariances * self.scale**2
         if self.position is not None and self.world == "ned":
-            positions, covariances = positions @ ENU_R_NED.T, ENU_R_NED @ covariances @ ENU_R_NED.T
+            positions, covariances = (
+                positions @ ENU_R_NED.T,
+                ENU_R_NED @ covariances @ ENU_R_NED.T,
+            )
         flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
         flat[:, 2, :], flat[:, :, 2], flat[:, 2, 2] = 0.0, 0.0, UNMEASURED_M2
         covariances = np.where(has_height[:, None, None], covariances, flat)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        fixes = PositionFixes(table.stamps_ns[rows], positions[rows], covariances[rows]) if rows.size else None
+        fixes = (
+            PositionFixes(table.stamps_ns[rows], positions[rows], covariances[rows])
+            if rows.size
+            else None
+        )
         return fixes, dropped
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
@@ -264,7 +365,9 @@ class PositionAdapter(Adapter):
         if self.covariance is not None:
             yield from self.covariance.warnings(table)
         if self.position is not None:
-            positions = table.beside(self.position).astype(float) * self.scale - self.origin_m
+            positions = (
+                table.beside(self.position).astype(float) * self.scale - self.origin_m
+            )
             is_far = (np.abs(positions) > FARTHEST_FIX_M).any(axis=1)
             if is_far.any():
                 yield (

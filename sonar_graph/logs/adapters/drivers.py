@@ -8,11 +8,23 @@ it into `SHIPPED` (docs/design/0004-logs.md).
 from dataclasses import dataclass
 
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields
-from sonar_graph.logs.adapters.aiding_messages import GeodeticFields, HeadingAdapter, PositionAdapter
+from sonar_graph.logs.adapters.aiding_messages import (
+    GeodeticFields,
+    HeadingAdapter,
+    PositionAdapter,
+)
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
-from sonar_graph.logs.adapters.landmark_messages import DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter
+from sonar_graph.logs.adapters.landmark_messages import (
+    DetectionArrayAdapter,
+    DetectionListsAdapter,
+    LandmarkMapAdapter,
+)
 from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
-from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter
+from sonar_graph.logs.adapters.vehicle_messages import (
+    DepthAdapter,
+    ImuAdapter,
+    TruthAdapter,
+)
 
 TRUTH_WORDS = ("truth",)
 _DVL_WORDS = ("dvl", "doppler")
@@ -42,7 +54,10 @@ def _xyz(prefix: str) -> tuple[str, str, str]:
 def _poses(type_name: str, prefix: str, covariance: str | None) -> TruthAdapter:
     orientation = (*_xyz(f"{prefix}.orientation"), f"{prefix}.orientation.w")
     return TruthAdapter(
-        type=type_name, position=_xyz(f"{prefix}.position"), orientation=orientation, covariance=covariance
+        type=type_name,
+        position=_xyz(f"{prefix}.position"),
+        orientation=orientation,
+        covariance=covariance,
     )
 
 
@@ -50,7 +65,9 @@ def _water_linked(*covariance: str, meaning: str = "variance") -> DvlAdapter:
     return DvlAdapter(
         type="dvl_msgs/msg/DVL",
         velocity=_xyz("velocity"),
-        covariance=CovarianceFields.model_validate({"fields": covariance, "meaning": meaning}),
+        covariance=CovarianceFields.model_validate(
+            {"fields": covariance, "meaning": meaning}
+        ),
         valid_where={"velocity_valid": True},
     )
 
@@ -75,9 +92,15 @@ HEADING = HeadingAdapter(
     variance=CovarianceFields(fields=("sigma_rad",), meaning="standard deviation"),
 )
 HEADING_QUATERNION = HeadingAdapter(
-    type="geometry_msgs/msg/QuaternionStamped", orientation=(*_xyz("quaternion"), "quaternion.w")
+    type="geometry_msgs/msg/QuaternionStamped",
+    orientation=(*_xyz("quaternion"), "quaternion.w"),
 )
-SATELLITE_FIELDS = GeodeticFields(latitude="latitude", longitude="longitude", height="altitude", status="status.status")
+SATELLITE_FIELDS = GeodeticFields(
+    latitude="latitude",
+    longitude="longitude",
+    height="altitude",
+    status="status.status",
+)
 SATELLITE_FIX = PositionAdapter(
     type="sensor_msgs/msg/NavSatFix",
     geodetic=SATELLITE_FIELDS,
@@ -90,7 +113,9 @@ FIX_POSE = PositionAdapter(
     covariance=CovarianceFields(fields=("pose.covariance",)),
     frame_id_field=None,
 )
-FIX_POINT = PositionAdapter(type="geometry_msgs/msg/PointStamped", position=_xyz("point"), frame_id_field=None)
+FIX_POINT = PositionAdapter(
+    type="geometry_msgs/msg/PointStamped", position=_xyz("point"), frame_id_field=None
+)
 MARINE_DVL = DvlAdapter(
     type="marine_acoustic_msgs/msg/Dvl",
     velocity=_xyz("velocity"),
@@ -106,20 +131,33 @@ UUV_SIMULATOR_DVLS = [
     DvlAdapter(
         type=f"{package}/msg/DVL",
         velocity=_xyz("velocity"),
-        covariance=CovarianceFields(fields=("velocity_covariance",), negative="invalid", zero="unknown"),
+        covariance=CovarianceFields(
+            fields=("velocity_covariance",), negative="invalid", zero="unknown"
+        ),
     )
-    for package in ("uuv_sensor_ros_plugins_msgs", "stonefish_ros2", "cola2_msgs", "smarc_msgs")
+    for package in (
+        "uuv_sensor_ros_plugins_msgs",
+        "stonefish_ros2",
+        "cola2_msgs",
+        "smarc_msgs",
+    )
 ]
 TWIST = DvlAdapter(
     type="geometry_msgs/msg/TwistWithCovarianceStamped",
     velocity=_xyz("twist.twist.linear"),
     covariance=CovarianceFields(fields=("twist.covariance",)),
 )
-ODOMETRY_TWIST = TWIST.model_copy(update={"type": "nav_msgs/msg/Odometry", "frame_id_field": "child_frame_id"})
-PRESSURE = DepthAdapter(
-    type="sensor_msgs/msg/FluidPressure", pressure="fluid_pressure", variance=CovarianceFields(fields=("variance",))
+ODOMETRY_TWIST = TWIST.model_copy(
+    update={"type": "nav_msgs/msg/Odometry", "frame_id_field": "child_frame_id"}
 )
-HEIGHT_OF_POSE = DepthAdapter(type="geometry_msgs/msg/PoseStamped", height="pose.position.z", frame_id_field=None)
+PRESSURE = DepthAdapter(
+    type="sensor_msgs/msg/FluidPressure",
+    pressure="fluid_pressure",
+    variance=CovarianceFields(fields=("variance",)),
+)
+HEIGHT_OF_POSE = DepthAdapter(
+    type="geometry_msgs/msg/PoseStamped", height="pose.position.z", frame_id_field=None
+)
 HEIGHT_OF_POSE_WITH_COVARIANCE = DepthAdapter(
     type="geometry_msgs/msg/PoseWithCovarianceStamped",
     height="pose.pose.position.z",
@@ -128,9 +166,15 @@ HEIGHT_OF_POSE_WITH_COVARIANCE = DepthAdapter(
 )
 ODOMETRY_TRUTH = _poses("nav_msgs/msg/Odometry", "pose.pose", "pose.covariance")
 POSE_TRUTH = _poses("geometry_msgs/msg/PoseStamped", "pose", None)
-POSE_WITH_COVARIANCE_TRUTH = _poses("geometry_msgs/msg/PoseWithCovarianceStamped", "pose.pose", "pose.covariance")
-POINT_TRUTH = TruthAdapter(type="geometry_msgs/msg/PointStamped", position=_xyz("point"))
-SATELLITE_TRUTH = TruthAdapter(type="sensor_msgs/msg/NavSatFix", geodetic=SATELLITE_FIELDS)
+POSE_WITH_COVARIANCE_TRUTH = _poses(
+    "geometry_msgs/msg/PoseWithCovarianceStamped", "pose.pose", "pose.covariance"
+)
+POINT_TRUTH = TruthAdapter(
+    type="geometry_msgs/msg/PointStamped", position=_xyz("point")
+)
+SATELLITE_TRUTH = TruthAdapter(
+    type="sensor_msgs/msg/NavSatFix", geodetic=SATELLITE_FIELDS
+)
 PROJECTED_SONAR_IMAGE = SonarAdapter(
     type="marine_acoustic_msgs/msg/ProjectedSonarImage",
     data="image.data",
@@ -177,7 +221,11 @@ SHIPPED: dict[str, tuple[Shipped, ...]] = {
     ),
     "detections": (
         Shipped(DetectionListsAdapter(type="sonar_graph_msgs/msg/LandmarkDetections")),
-        Shipped(DetectionArrayAdapter(type="vision_msgs/msg/Detection3DArray"), _LANDMARK_WORDS, is_general=True),
+        Shipped(
+            DetectionArrayAdapter(type="vision_msgs/msg/Detection3DArray"),
+            _LANDMARK_WORDS,
+            is_general=True,
+        ),
     ),
     "truth": (
         Shipped(ODOMETRY_TRUTH, TRUTH_WORDS),
@@ -186,7 +234,11 @@ SHIPPED: dict[str, tuple[Shipped, ...]] = {
         Shipped(POINT_TRUTH, TRUTH_WORDS, is_general=True),
         Shipped(SATELLITE_TRUTH, TRUTH_WORDS, is_general=True),
     ),
-    "true_landmarks": (Shipped(LandmarkMapAdapter(type="sonar_graph_msgs/msg/LandmarkMap"), TRUTH_WORDS),),
+    "true_landmarks": (
+        Shipped(
+            LandmarkMapAdapter(type="sonar_graph_msgs/msg/LandmarkMap"), TRUTH_WORDS
+        ),
+    ),
     "sonar": (Shipped(PROJECTED_SONAR_IMAGE), Shipped(OCULUS_PING)),
 }
 """Adapters by role; of several for one type the first is taken whose fields the messages have."""

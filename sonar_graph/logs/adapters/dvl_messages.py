@@ -18,8 +18,21 @@ from pydantic import Field, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.devices import velocity_of_beams
-from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, SpeedScale, field_paths, turn, turn_covariances
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.adapter import (
+    Adapter,
+    CovarianceFields,
+    SpeedScale,
+    field_paths,
+    turn,
+    turn_covariances,
+)
+from sonar_graph.logs.adapters.message_table import (
+    NOT_FINITE,
+    Dropped,
+    FieldTable,
+    fit_rows,
+    not_finite,
+)
 from sonar_graph.measurements import Dvl, Floats
 
 LARGEST_TILT_DEG = 45.0
@@ -50,9 +63,13 @@ class BeamGeometry(Section):
         """Unit vectors, shape (beams, 3), z down."""
         tilt, azimuth = np.radians(self.tilt_deg), np.radians(self.azimuth_deg)
         across, down = np.sin(tilt), np.full(azimuth.shape, np.cos(tilt))
-        return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), down])
+        return np.column_stack(
+            [across * np.cos(azimuth), across * np.sin(azimuth), down]
+        )
 
-    def velocities(self, table: FieldTable, scale: float) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    def velocities(
+        self, table: FieldTable, scale: float
+    ) -> tuple[Floats, Floats, NDArray[np.int64]]:
         """Velocities from the valid beams of each row, along the driver's axes; ``scale`` turns the field into m/s.
 
         Shape (n, 3), NaN with too few beams; their covariances, shape (n, 3, 3), NaN without `sigma_m_s`; and the
@@ -60,17 +77,29 @@ class BeamGeometry(Section):
         """
         along = table.column(str(self.velocity)).astype(float)
         if along.shape[1:] != (len(self.azimuth_deg),):
-            table.refuse(str(self.velocity), f"has {along.shape[1:]} beams; azimuth_deg has {len(self.azimuth_deg)}")
+            table.refuse(
+                str(self.velocity),
+                f"has {along.shape[1:]} beams; azimuth_deg has {len(self.azimuth_deg)}",
+            )
         valid = np.isfinite(along)
         if self.valid is not None:
             said = table.column(self.valid)
             if said.shape != along.shape:
-                table.refuse(self.valid, f"has {said.shape[1:]} elements; there are {along.shape[1]} beams")
+                table.refuse(
+                    self.valid,
+                    f"has {said.shape[1:]} elements; there are {along.shape[1]} beams",
+                )
             valid &= said.astype(bool)
-        velocity, covariance = velocity_of_beams(self.directions(), along * scale, valid, self.sigma_m_s or 1.0)
+        velocity, covariance = velocity_of_beams(
+            self.directions(), along * scale, valid, self.sigma_m_s or 1.0
+        )
         count = valid.sum(axis=1)
         velocity[count < self.fewest] = np.nan
-        return velocity, covariance if self.sigma_m_s else np.full_like(covariance, np.nan), count
+        return (
+            velocity,
+            covariance if self.sigma_m_s else np.full_like(covariance, np.nan),
+            count,
+        )
 
     @property
     def fewest(self) -> int:
@@ -87,7 +116,10 @@ def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str 
     if not np.isfinite(vectors).all() or not vectors.any():
         return None
     across, down = np.hypot(vectors[:, 0], vectors[:, 1]), np.abs(vectors[:, 2])
-    if np.allclose(across, down, atol=1e-3) and across.max() < np.sin(np.radians(LARGEST_TILT_DEG)) - 1e-2:
+    if (
+        np.allclose(across, down, atol=1e-3)
+        and across.max() < np.sin(np.radians(LARGEST_TILT_DEG)) - 1e-2
+    ):
         tilt_deg = float(np.degrees(np.arcsin(down)).mean())
         return (
             f"have z = {down.mean():.3f}, the sine of the tilt of {tilt_deg:.1f}°, where its cosine "
@@ -95,7 +127,9 @@ def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str 
         )
     lengths = np.linalg.norm(vectors, axis=1)
     if np.any(np.abs(lengths - 1) > 1e-2):
-        return f"are no unit vectors (length {lengths.min():.3f} to {lengths.max():.3f})"
+        return (
+            f"are no unit vectors (length {lengths.min():.3f} to {lengths.max():.3f})"
+        )
     tilt_deg = float(np.degrees(np.arccos(np.clip(down, 0, 1))).max())
     if tilt_deg > LARGEST_TILT_DEG:
         return (
@@ -110,7 +144,8 @@ def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str 
         return None
     if len(vectors) != len(geometry.azimuth_deg):
         return f"are {len(vectors)}, the configured beams {len(geometry.azimuth_deg)}"
-    configured = geometry.directions() * np.sign(vectors[:, 2:]) ** np.array([0, 0, 1])  # z may point up or down
+    # z may point up or down
+    configured = geometry.directions() * np.sign(vectors[:, 2:]) ** np.array([0, 0, 1])
     off_deg = np.degrees(np.arccos(np.clip((configured * vectors).sum(axis=1), -1, 1)))
     beam = int(off_deg.argmax())
     if off_deg[beam] <= TOLERANCE_DEG:
@@ -151,16 +186,32 @@ class DvlAdapter(Adapter):
 
     @model_validator(mode="after")
     def _has_a_velocity(self) -> DvlAdapter:
-        if self.velocity is None and (self.beams is None or self.beams.velocity is None):
-            raise ValueError("give velocity = [x, y, z] fields, or beams with a velocity field")
+        if self.velocity is None and (
+            self.beams is None or self.beams.velocity is None
+        ):
+            raise ValueError(
+                "give velocity = [x, y, z] fields, or beams with a velocity field"
+            )
         return self
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        checked = (self.beam_ranges, self.beam_ranges_valid, self.sound_speed, self.beam_unit_vectors)
+        checked = (
+            self.beam_ranges,
+            self.beam_ranges_valid,
+            self.sound_speed,
+            self.beam_unit_vectors,
+        )
         beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
         covariance = self.covariance.fields if self.covariance else None
-        return field_paths(self.velocity, covariance, self.valid_where, self.good_beams, *checked, *beams)
+        return field_paths(
+            self.velocity,
+            covariance,
+            self.valid_where,
+            self.good_beams,
+            *checked,
+            *beams,
+        )
 
     def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
@@ -168,7 +219,11 @@ class DvlAdapter(Adapter):
         if self.beams is not None and self.beams.velocity is not None:
             velocity, covariance, count = self.beams.velocities(table, self.scale)
             fewest = self.beams.fewest
-            faults["without a valid beam" if fewest == 1 else f"with fewer than {fewest} valid beams"] = count < fewest
+            faults[
+                "without a valid beam"
+                if fewest == 1
+                else f"with fewer than {fewest} valid beams"
+            ] = count < fewest
         else:
             assert self.velocity is not None  # by the validator
             velocity = table.beside(self.velocity)
@@ -178,33 +233,51 @@ class DvlAdapter(Adapter):
             covariance, faults[SAID_INVALID] = self.covariance.read(table)
             covariance = covariance if self.scale == 1 else covariance * self.scale**2
         for path, value in self.valid_where.items():
-            faults[f"with {path} not {str(value).lower()}"] = table.column(path) != value
+            faults[f"with {path} not {str(value).lower()}"] = (
+                table.column(path) != value
+            )
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
-            faults["without a good beam"] = (beams == 0) & (self.are_beams_counted or beams.any())
+            faults["without a good beam"] = (beams == 0) & (
+                self.are_beams_counted or beams.any()
+            )
         faults[NOT_FINITE] = not_finite(velocity)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        velocity, covariance = turn(self.rotation, velocity[rows]), turn_covariances(self.rotation, covariance[rows])
-        return (Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None), dropped
+        velocity, covariance = (
+            turn(self.rotation, velocity[rows]),
+            turn_covariances(self.rotation, covariance[rows]),
+        )
+        return (
+            Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None
+        ), dropped
 
     @property
     def _is_noise_of_beams(self) -> bool:
         """Tell whether the covariance follows from the beams, not from a field of the message."""
-        return self.beams is not None and self.beams.velocity is not None and self.beams.sigma_m_s is not None
+        return (
+            self.beams is not None
+            and self.beams.velocity is not None
+            and self.beams.sigma_m_s is not None
+        )
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about covariances, beam directions, ranges and the speed of sound that a driver gets wrong."""
         if self.covariance is not None and not self._is_noise_of_beams:
             yield from self.covariance.warnings(table)
         if self.beam_unit_vectors is not None:
-            vectors = np.stack([table.column(path)[0] for path in self.beam_unit_vectors], axis=-1)
+            vectors = np.stack(
+                [table.column(path)[0] for path in self.beam_unit_vectors], axis=-1
+            )
             if fault := beam_direction_fault(vectors, self.beams):
                 field = self.beam_unit_vectors[0].rpartition(".")[0]
                 yield f"{table.source}: {field}: beam directions {fault}; they are not used"
         if self.sound_speed is not None and not table.column(self.sound_speed).any():
             yield f"{self.sound_speed} is 0 in every message: the driver does not fill it"
         if self.beam_ranges is not None and self.beam_ranges_valid is not None:
-            ranges, said = table.column(self.beam_ranges), table.column(self.beam_ranges_valid).astype(bool)
+            ranges, said = (
+                table.column(self.beam_ranges),
+                table.column(self.beam_ranges_valid).astype(bool),
+            )
             wrong = said & ~(np.isfinite(ranges) & (ranges > 0)).all(axis=1)
             if wrong.any():
                 yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"

@@ -13,8 +13,19 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sonar_graph.logs.adapters.adapter import Adapter, field_paths, turn, turn_covariances
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, fit_rows, header_stamps_ns, not_finite
+from sonar_graph.logs.adapters.adapter import (
+    Adapter,
+    field_paths,
+    turn,
+    turn_covariances,
+)
+from sonar_graph.logs.adapters.message_table import (
+    NOT_FINITE,
+    Dropped,
+    fit_rows,
+    header_stamps_ns,
+    not_finite,
+)
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import (
@@ -55,12 +66,19 @@ class _Joined:
         most = max(1, *(part.ids.shape[1] for part in parts))
         self.message = np.concatenate([part.message for part in parts])
         self.stamps_ns = np.concatenate([part.stamps_ns for part in parts])
-        self.values = [np.concatenate(columns) for columns in zip(*(part.values for part in parts), strict=True)]
+        self.values = [
+            np.concatenate(columns)
+            for columns in zip(*(part.values for part in parts), strict=True)
+        ]
         self.ids = np.concatenate([_padded(part.ids, most, -1) for part in parts])
-        self.probabilities = np.concatenate([_padded(part.probabilities, most, 0) for part in parts])
+        self.probabilities = np.concatenate(
+            [_padded(part.probabilities, most, 0) for part in parts]
+        )
         if (large := (self.ids >= FIRST_TOO_LARGE_ID).any(axis=1)).any():
             where = f"message {self.message[int(np.argmax(large))]} has an identity of 2^56 or more"
-            raise topic.error(f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false")
+            raise topic.error(
+                f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false"
+            )
 
     def fit(self, faults: Mapping[str, np.ndarray]) -> tuple[Ints, Dropped]:
         """Rows without a fault, in the order of their stamps, and the number of the others by fault."""
@@ -70,16 +88,27 @@ class _Joined:
         return order[rows], dropped
 
     def detections(
-        self, rows: Ints, ranges_m: Floats, azimuths_rad: Floats, covariances: Floats, tracks: Ints
+        self,
+        rows: Ints,
+        ranges_m: Floats,
+        azimuths_rad: Floats,
+        covariances: Floats,
+        tracks: Ints,
     ) -> LandmarkDetections | None:
         """The chosen rows as measurements; None where there are none."""
         measured = (ranges_m[rows], azimuths_rad[rows], covariances[rows])
         identities = (self.ids[rows], self.probabilities[rows], tracks[rows])
-        return LandmarkDetections(self.stamps_ns[rows], *measured, *identities) if rows.size else None
+        return (
+            LandmarkDetections(self.stamps_ns[rows], *measured, *identities)
+            if rows.size
+            else None
+        )
 
 
 def _padded(columns: np.ndarray, count: int, filling: int) -> np.ndarray:
-    return np.pad(columns, ((0, 0), (0, count - columns.shape[1])), constant_values=filling)
+    return np.pad(
+        columns, ((0, 0), (0, count - columns.shape[1])), constant_values=filling
+    )
 
 
 class DetectionListsAdapter(Adapter):
@@ -93,7 +122,9 @@ class DetectionListsAdapter(Adapter):
         log_times_ns = topic.log_times_ns  # of sound messages, which are known now
         if not groups:
             return None, {}
-        rows = _Joined(topic, [self._rows(topic, group, log_times_ns) for group in groups])
+        rows = _Joined(
+            topic, [self._rows(topic, group, log_times_ns) for group in groups]
+        )
         ranges, azimuths, covariances, tracks = rows.values
         faults = {
             NOT_FINITE: not_finite(ranges, azimuths, rows.probabilities),
@@ -105,16 +136,28 @@ class DetectionListsAdapter(Adapter):
     def _rows(self, topic: Topic, group: Messages, log_times_ns: Ints) -> _Rows:
         frames, count = group["range_m"].shape
         ids, probabilities = group["candidate_ids"], group["id_probability"]
-        tracks = group["track"] if "track" in group.layout.columns else np.empty((frames, 0))  # not in old logs
+        # not in old logs
+        tracks = (
+            group["track"] if "track" in group.layout.columns else np.empty((frames, 0))
+        )
         where = f"message {group.rows[0]} has {count} ranges"
-        azimuths, covariances = group["azimuth_rad"].shape[1], group["covariance"].shape[1]
-        if (azimuths, covariances, ids.shape[1] % count) != (count, 4 * count, 0) or probabilities.shape != ids.shape:
+        azimuths, covariances = (
+            group["azimuth_rad"].shape[1],
+            group["covariance"].shape[1],
+        )
+        if (azimuths, covariances, ids.shape[1] % count) != (
+            count,
+            4 * count,
+            0,
+        ) or probabilities.shape != ids.shape:
             raise topic.error(
                 f"{where}, {azimuths} azimuths, {covariances} covariance elements, {ids.shape[1]} identities, "
                 f"{probabilities.shape[1]} probabilities; expected n, n, 4n, kn and kn"
             )
         if tracks.shape[1] not in (0, count):
-            raise topic.error(f"{where} and {tracks.shape[1]} tracks; expected as many, or none")
+            raise topic.error(
+                f"{where} and {tracks.shape[1]} tracks; expected as many, or none"
+            )
         total, candidates = frames * count, ids.shape[1] // count
         return _Rows(
             np.repeat(group.rows, count),
@@ -123,7 +166,9 @@ class DetectionListsAdapter(Adapter):
                 group["range_m"].reshape(total),
                 group["azimuth_rad"].reshape(total),
                 group["covariance"].reshape(total, 2, 2),
-                tracks.astype(np.int64).reshape(total) if tracks.size else np.full(total, NO_TRACK, np.int64),
+                tracks.astype(np.int64).reshape(total)
+                if tracks.size
+                else np.full(total, NO_TRACK, np.int64),
             ),
             ids.reshape(total, candidates),
             probabilities.reshape(total, candidates),
@@ -150,11 +195,19 @@ class DetectionArrayAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        return field_paths(f"{_CENTRE}.x", _SCORE, _CLASS, f"{_RESULT}.pose.position.x", f"{_RESULT}.covariance")
+        return field_paths(
+            f"{_CENTRE}.x",
+            _SCORE,
+            _CLASS,
+            f"{_RESULT}.pose.position.x",
+            f"{_RESULT}.covariance",
+        )
 
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection that has a result; the scores are the posterior, in the order of the results."""
-        groups = [group for group in topic.messages() if group.lengths("detections.results")]
+        groups = [
+            group for group in topic.messages() if group.lengths("detections.results")
+        ]
         if not groups:
             return None, {}
         rows = _Joined(topic, [self._rows(topic, group) for group in groups])
@@ -182,18 +235,30 @@ class DetectionArrayAdapter(Adapter):
         """Every detection, with the results of each at its own places; NaN: unknown."""
         counts = np.array(group.lengths("detections.results"), np.int64)
         n, m, k = len(group), len(counts), max(1, int(counts.max()))
-        detection, result = np.repeat(np.arange(m), counts), np.concatenate([np.arange(c) for c in counts]).astype(int)
+        detection, result = (
+            np.repeat(np.arange(m), counts),
+            np.concatenate([np.arange(c) for c in counts]).astype(int),
+        )
         scores, ids = np.zeros((n, m, k)), np.full((n, m, k), -1, np.int64)
         scores[:, detection, result] = group[_SCORE]
         names = group.strings(_CLASS)
-        ids[:, detection, result] = [[self._identity(topic, name) for name in message] for message in names]
-        positions, covariances = np.full((n, m, 3), np.nan), np.full((n, m, 3, 3), np.nan)
+        ids[:, detection, result] = [
+            [self._identity(topic, name) for name in message] for message in names
+        ]
+        positions, covariances = (
+            np.full((n, m, 3), np.nan),
+            np.full((n, m, 3, 3), np.nan),
+        )
         if self.position == "bbox":
-            positions[:] = np.stack([group[f"{_CENTRE}.{axis}"] for axis in "xyz"], axis=-1)
+            positions[:] = np.stack(
+                [group[f"{_CENTRE}.{axis}"] for axis in "xyz"], axis=-1
+            )
         else:
             some = np.flatnonzero(counts)
             first = (np.cumsum(counts) - counts)[some]
-            found = np.stack([group[f"{_RESULT}.pose.position.{axis}"] for axis in "xyz"], axis=-1)
+            found = np.stack(
+                [group[f"{_RESULT}.pose.position.{axis}"] for axis in "xyz"], axis=-1
+            )
             positions[:, some] = found[:, first]
             pose = group[f"{_RESULT}.covariance"].reshape(n, -1, 6, 6)[:, first, :3, :3]
             known = pose.any(axis=(2, 3)) & (pose[..., 0, 0] >= 0)
@@ -209,7 +274,8 @@ class DetectionArrayAdapter(Adapter):
     def _identity(self, topic: Topic, name: str) -> int:
         try:
             identity = self.ids[name] if name in self.ids else int(name)
-            return max(-1, min(identity, FIRST_TOO_LARGE_ID))  # beyond int64 is refused as too large as well
+            # beyond int64 is refused as too large as well
+            return max(-1, min(identity, FIRST_TOO_LARGE_ID))
         except ValueError:
             raise topic.error(
                 f"class {name!r} is no integer identity; say in a log configuration which it is: [detections] ids = "
@@ -217,7 +283,9 @@ class DetectionArrayAdapter(Adapter):
             ) from None
 
 
-def range_and_azimuth(positions: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
+def range_and_azimuth(
+    positions: Floats, covariances: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Range, azimuth and their covariance, shapes (n,), (n,) and (n, 2, 2), from positions and theirs."""
     x, y, _ = positions.T
     ranges, across_squared = np.linalg.norm(positions, axis=1), x**2 + y**2
@@ -241,7 +309,9 @@ class LandmarkMapAdapter(Adapter):
         if not groups:
             return None, {}
         last = max(groups, key=lambda group: int(group.rows[-1]))
-        ids, position, covariance = (last[name][-1] for name in ("ids", "position", "covariance"))
+        ids, position, covariance = (
+            last[name][-1] for name in ("ids", "position", "covariance")
+        )
         count, different = len(ids), len(np.unique(ids))
         if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
             raise topic.error(
@@ -249,19 +319,29 @@ class LandmarkMapAdapter(Adapter):
                 f"elements; expected n different, 3n and 9n"
             )
         order = np.argsort(ids)
-        positions, covariances = position.reshape(-1, 3)[order], covariance.reshape(-1, 3, 3)[order]
+        positions, covariances = (
+            position.reshape(-1, 3)[order],
+            covariance.reshape(-1, 3, 3)[order],
+        )
         return LandmarkMap(ids[order].astype(np.int64), positions, covariances), {}
 
 
-def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: int) -> Iterator[str]:
+def detection_warnings(
+    detections: LandmarkDetections, first_ns: int, last_ns: int
+) -> Iterator[str]:
     """Rows that estimators do not use: impossible ranges and covariances, repeated tracks, and rows without odometry.
 
     The odometry lasts from ``first_ns`` to ``last_ns``.
     """
-    is_range, is_azimuth = possible_ranges(detections.range_m), np.abs(detections.azimuth_rad) <= FULL_TURN_RAD
+    is_range, is_azimuth = (
+        possible_ranges(detections.range_m),
+        np.abs(detections.azimuth_rad) <= FULL_TURN_RAD,
+    )
     faults = {
         "a range that is not above 0 and at most 100 km": ~is_range,
-        "a covariance that is not positive definite": is_range & is_azimuth & ~detections.are_sound(),
+        "a covariance that is not positive definite": is_range
+        & is_azimuth
+        & ~detections.are_sound(),
         "a stamp before the first odometry": detections.stamps_ns < first_ns,
         "a stamp after the last odometry": detections.stamps_ns > last_ns,
     }

@@ -8,10 +8,21 @@ from typing import Literal
 import numpy as np
 from pydantic import model_validator
 
-from sonar_graph.logs.adapters.adapter import Adapter, AngleScale, LengthScale, field_paths
+from sonar_graph.logs.adapters.adapter import (
+    Adapter,
+    AngleScale,
+    LengthScale,
+    field_paths,
+)
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED
 from sonar_graph.logs.adapters.landmark_messages import NO_POSTERIOR
-from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.message_table import (
+    NOT_FINITE,
+    Dropped,
+    FieldTable,
+    fit_rows,
+    not_finite,
+)
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
     ID_ADVICE,
@@ -51,42 +62,72 @@ class DetectionRowsAdapter(Adapter):
         if not self.ids:
             raise ValueError("give ids = [...], at least one field")
         if self.probabilities and len(self.probabilities) != len(self.ids):
-            raise ValueError(f"give as many probabilities as ids: {len(self.ids)}, not {len(self.probabilities)}")
+            raise ValueError(
+                f"give as many probabilities as ids: {len(self.ids)}, not {len(self.probabilities)}"
+            )
         if (self.range_sigma is None) != (self.azimuth_sigma is None):
             raise ValueError("give range_sigma and azimuth_sigma, or neither")
         if self.rotation not in ("flu", "frd"):
-            raise ValueError('give rotation = "flu" (azimuth to the left) or "frd" (to the right)')
+            raise ValueError(
+                'give rotation = "flu" (azimuth to the left) or "frd" (to the right)'
+            )
         return self
 
     def fields(self) -> Iterator[str]:
         """Paths that a row must have."""
         more = (self.range_sigma, self.azimuth_sigma, self.track)
-        return field_paths(self.range, self.azimuth, self.ids, self.probabilities, *more)
+        return field_paths(
+            self.range, self.azimuth, self.ids, self.probabilities, *more
+        )
 
     def read(self, table: FieldTable) -> tuple[LandmarkDetections | None, Dropped]:
         """Detections in the order of their stamps."""
         range_m = table.column(self.range) * self.range_scale
-        azimuth_rad = table.column(self.azimuth) * self.azimuth_scale * (-1.0 if self.rotation == "frd" else 1.0)
+        azimuth_rad = (
+            table.column(self.azimuth)
+            * self.azimuth_scale
+            * (-1.0 if self.rotation == "frd" else 1.0)
+        )
         ids = np.column_stack([_whole(table, path, -1) for path in self.ids])
         if (ids >= FIRST_TOO_LARGE_ID).any():
-            table.refuse(", ".join(self.ids), f"has an identity of 2^56 or more; {ID_ADVICE}")
+            table.refuse(
+                ", ".join(self.ids), f"has an identity of 2^56 or more; {ID_ADVICE}"
+            )
         probability = np.zeros(ids.shape)
         probability[:, 0] = 1.0
         if self.probabilities:
             given = table.beside(self.probabilities)
-            probability = np.where(np.isnan(given).all(axis=1)[:, None], probability, np.nan_to_num(given))
+            probability = np.where(
+                np.isnan(given).all(axis=1)[:, None], probability, np.nan_to_num(given)
+            )
         probability = np.where(ids < 0, 0.0, probability)
         covariance = np.full((len(table), 2, 2), np.nan)
         if self.range_sigma is not None and self.azimuth_sigma is not None:
-            sigmas = table.beside((self.range_sigma, self.azimuth_sigma)) * [self.range_scale, self.azimuth_scale]
+            sigmas = table.beside((self.range_sigma, self.azimuth_sigma)) * [
+                self.range_scale,
+                self.azimuth_scale,
+            ]
             known = np.asarray((sigmas > 0).all(axis=1))
-            covariance = np.where(known[:, None, None], (sigmas**2)[:, :, None] * np.eye(2), np.nan)
-        track = np.full(len(table), NO_TRACK, np.int64) if self.track is None else _whole(table, self.track, NO_TRACK)
-        faults = {NOT_FINITE: not_finite(range_m, azimuth_rad), NO_POSTERIOR: no_posterior(probability)}
+            covariance = np.where(
+                known[:, None, None], (sigmas**2)[:, :, None] * np.eye(2), np.nan
+            )
+        track = (
+            np.full(len(table), NO_TRACK, np.int64)
+            if self.track is None
+            else _whole(table, self.track, NO_TRACK)
+        )
+        faults = {
+            NOT_FINITE: not_finite(range_m, azimuth_rad),
+            NO_POSTERIOR: no_posterior(probability),
+        }
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=False)
         measured = (range_m[rows], azimuth_rad[rows], covariance[rows])
         identities = (ids[rows], probability[rows], track[rows])
-        return (LandmarkDetections(table.stamps_ns[rows], *measured, *identities) if rows.size else None), dropped
+        return (
+            LandmarkDetections(table.stamps_ns[rows], *measured, *identities)
+            if rows.size
+            else None
+        ), dropped
 
 
 class LandmarkRowsAdapter(Adapter):
@@ -107,17 +148,29 @@ class LandmarkRowsAdapter(Adapter):
 
     def read(self, table: FieldTable) -> tuple[LandmarkMap | None, Dropped]:
         """Map of the rows, of which each has another identity."""
-        ids, positions = _whole(table, self.id, -1), table.beside(self.position) * self.scale
+        ids, positions = (
+            _whole(table, self.id, -1),
+            table.beside(self.position) * self.scale,
+        )
         positions = positions @ ENU_R_NED.T if self.world == "ned" else positions
         fit = (ids >= 0) & ~not_finite(positions)
-        dropped: Dropped = {"without identity or position": int(np.count_nonzero(~fit))} if not fit.all() else {}
+        dropped: Dropped = (
+            {"without identity or position": int(np.count_nonzero(~fit))}
+            if not fit.all()
+            else {}
+        )
         names, counts = np.unique(ids[fit], return_counts=True)
         if (counts > 1).any():
-            table.refuse(self.id, f"has {names[counts > 1][0]} more than once; a landmark has one place")
+            table.refuse(
+                self.id,
+                f"has {names[counts > 1][0]} more than once; a landmark has one place",
+            )
         if not fit.any():
             return None, dropped
         order = np.flatnonzero(fit)[np.argsort(ids[fit], kind="stable")]
-        return LandmarkMap(ids[order], positions[order], np.full((len(order), 3, 3), np.nan)), dropped
+        return LandmarkMap(
+            ids[order], positions[order], np.full((len(order), 3, 3), np.nan)
+        ), dropped
 
 
 def _whole(table: FieldTable, path: str, filling: int) -> Ints:
@@ -125,5 +178,7 @@ def _whole(table: FieldTable, path: str, filling: int) -> Ints:
     values: Floats = np.where(np.isnan(table.column(path)), filling, table.column(path))
     if (values != np.floor(values)).any():
         wrong = values[values != np.floor(values)][0]
-        table.refuse(path, f"has {wrong:g}, and identities and tracks are integers; {ID_ADVICE}")
+        table.refuse(
+            path, f"has {wrong:g}, and identities and tracks are integers; {ID_ADVICE}"
+        )
     return values.astype(np.int64)

@@ -26,10 +26,17 @@ from sonar_graph.logs.adapters.adapter import UNITS, Adapter, leaf_fields
 from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
-from sonar_graph.logs.adapters.landmark_messages import DetectionArrayAdapter, LandmarkMapAdapter
+from sonar_graph.logs.adapters.landmark_messages import (
+    DetectionArrayAdapter,
+    LandmarkMapAdapter,
+)
 from sonar_graph.logs.adapters.message_table import LOG_TIME, field_of
 from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
-from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter
+from sonar_graph.logs.adapters.vehicle_messages import (
+    DepthAdapter,
+    ImuAdapter,
+    TruthAdapter,
+)
 from sonar_graph.logs.cdr import Struct, short_name
 from sonar_graph.settings import faults_in, meanings_of, toml_key, toml_value
 
@@ -71,19 +78,27 @@ class LogConfig:
                 )
         for role, table in values.items():
             if role not in ADAPTERS:
-                raise LogError(f"{source}: there is no role [{role}]; tables are for {', '.join(ADAPTERS)}")
+                raise LogError(
+                    f"{source}: there is no role [{role}]; tables are for {', '.join(ADAPTERS)}"
+                )
             if not isinstance(table, Mapping):
-                raise LogError(f"{source}: {role}: expected a table, [{role}], not {table!r}")
+                raise LogError(
+                    f"{source}: {role}: expected a table, [{role}], not {table!r}"
+                )
         config = cls(values, source)
         for role, table in values.items():
             if "type" in table and not isinstance(table["type"], str):
                 example = SHIPPED[role][0].adapter.type
-                raise LogError(f"{source}: [{role}] type: expected a text such as {example!r}")
+                raise LogError(
+                    f"{source}: [{role}] type: expected a text such as {example!r}"
+                )
             if "type" in table:
                 config.adapters(role, table["type"])
                 continue
             faults = []  # without a type, the table must fit one of the shipped types
-            for type_name in dict.fromkeys(shipped.adapter.type for shipped in SHIPPED[role]):
+            for type_name in dict.fromkeys(
+                shipped.adapter.type for shipped in SHIPPED[role]
+            ):
                 try:
                     config.adapters(role, type_name)
                 except LogError as error:
@@ -105,7 +120,11 @@ class LogConfig:
 
     def types(self) -> frozenset[str]:
         """Message types that tables name, without the ``msg``."""
-        return frozenset(short_name(table["type"]) for table in self.tables.values() if "type" in table)
+        return frozenset(
+            short_name(table["type"])
+            for table in self.tables.values()
+            if "type" in table
+        )
 
     def adapters(self, role: str, type_name: str) -> list[Adapter]:
         """Adapters for one type: the shipped ones, changed as the table says, or the table's own."""
@@ -127,9 +146,17 @@ class LogConfig:
             try:
                 found.append(type(base).model_validate(values))
             except ValidationError as error:
-                is_incomplete = any(fault["type"] == "missing" for fault in error.errors())
-                why = f"; no adapter is shipped for {type_name}, so its fields must be named" if is_incomplete else ""
-                raise LogError(f"{self.source}: [{role}] {faults_in(error, type(base))}{why}") from error
+                is_incomplete = any(
+                    fault["type"] == "missing" for fault in error.errors()
+                )
+                why = (
+                    f"; no adapter is shipped for {type_name}, so its fields must be named"
+                    if is_incomplete
+                    else ""
+                )
+                raise LogError(
+                    f"{self.source}: [{role}] {faults_in(error, type(base))}{why}"
+                ) from error
         return found
 
     def require_fields(self, role: str, type_name: str, definition: Struct) -> None:
@@ -141,30 +168,43 @@ class LogConfig:
             faults = []
             for key, path in _field_names(self.table(role)):
                 if key == "stamp":
-                    is_absent = path != LOG_TIME and not {field_of(path)[0], f"{path}.sec"} & known.keys()
+                    is_absent = (
+                        path != LOG_TIME
+                        and not {field_of(path)[0], f"{path}.sec"} & known.keys()
+                    )
                 else:
-                    is_absent = path in missing or (key == "frame_id_field" and path not in known)
+                    is_absent = path in missing or (
+                        key == "frame_id_field" and path not in known
+                    )
                 if is_absent:
                     similar = get_close_matches(path, known, 1)
                     suggestion = f"did you mean {similar[0]}? " if similar else ""
                     names = ", ".join(name + size for name, size in known.items())
-                    faults.append(f"{key}: {definition.name} has no field {path}; {suggestion}it has: {names}")
+                    faults.append(
+                        f"{key}: {definition.name} has no field {path}; {suggestion}it has: {names}"
+                    )
             if not faults:
                 return
         if faults:
             raise LogError(f"{self.source}: [{role}] {'; '.join(faults)}")
 
 
-def _field_names(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def _field_names(
+    table: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, str]]:
     """Keys of a table with the texts in them that may be names of fields."""
     for key, value in table.items():
         if isinstance(value, str):
             yield prefix + key, value
         elif isinstance(value, Mapping):
-            yield from ((f"{prefix}{key}", path) for path in value if key == "valid_where")
+            yield from (
+                (f"{prefix}{key}", path) for path in value if key == "valid_where"
+            )
             yield from _field_names(value, f"{prefix}{key}.")
         elif isinstance(value, list):
-            yield from ((f"{prefix}{key}", item) for item in value if isinstance(item, str))
+            yield from (
+                (f"{prefix}{key}", item) for item in value if isinstance(item, str)
+            )
 
 
 def shipped_for(role: str, type_name: str) -> list[Adapter]:
@@ -175,7 +215,14 @@ def shipped_for(role: str, type_name: str) -> list[Adapter]:
 
 def shipped_like(role: str, type_name: str, definition: Struct) -> Adapter | None:
     """Shipped adapter for a type whose fields are all in the definition; None where there is none."""
-    return next((base for base in shipped_for(role, type_name) if not base.missing_in(definition)), None)
+    return next(
+        (
+            base
+            for base in shipped_for(role, type_name)
+            if not base.missing_in(definition)
+        ),
+        None,
+    )
 
 
 def read_log_config(path: Path) -> LogConfig:
@@ -200,7 +247,11 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
 
     A setting that is None is written only where the shipped adapter for the type has one.
     """
-    lines = [f"[{role}]", _line("topic", topic, None), _line("type", adapter.type, None)]
+    lines = [
+        f"[{role}]",
+        _line("topic", topic, None),
+        _line("type", adapter.type, None),
+    ]
     meanings = meanings_of(type(adapter))
     for name in type(adapter).model_fields:
         value = getattr(adapter, name)
@@ -216,9 +267,20 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
 def changes_text(adapter: Adapter, shipped: Adapter | None) -> str:
     """Differences from the shipped adapter, or all settings where none is shipped; empty: nothing differs."""
     base = shipped or type(adapter).model_construct(type="")
-    said = {name: getattr(adapter, name) for name in type(adapter).model_fields if name not in ("topic", "use")}
-    changed = {name: value for name, value in said.items() if value != getattr(base, name, None)}
-    return ", ".join(f"{name} = {'false' if value is None else toml_value(value)}" for name, value in changed.items())
+    said = {
+        name: getattr(adapter, name)
+        for name in type(adapter).model_fields
+        if name not in ("topic", "use")
+    }
+    changed = {
+        name: value
+        for name, value in said.items()
+        if value != getattr(base, name, None)
+    }
+    return ", ".join(
+        f"{name} = {'false' if value is None else toml_value(value)}"
+        for name, value in changed.items()
+    )
 
 
 def plain_lines(table: Mapping[str, Any]) -> list[str]:

@@ -20,9 +20,13 @@ LOG_TIME = "log"
 """Value of `Adapter.stamp` that stands for the time of recording."""
 
 
-def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.stamp.") -> Ints:
+def header_stamps_ns(
+    group: Messages, log_times_ns: Ints, prefix: str = "header.stamp."
+) -> Ints:
     """Stamps of messages from their headers, shape (n,); the topic's times of recording where these are zero."""
-    stamps_ns = group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
+    stamps_ns = (
+        group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
+    )
     return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
 
 
@@ -50,7 +54,10 @@ class FieldTable(ABC):
         found = [self.column(path) for path in paths]
         for path, column in zip(paths, found, strict=True):
             if column.ndim > 1:
-                self.refuse(path, f"is an array of {column.shape[1]}; name one element, such as {path}[0]")
+                self.refuse(
+                    path,
+                    f"is an array of {column.shape[1]}; name one element, such as {path}[0]",
+                )
         return np.column_stack(found)
 
 
@@ -61,12 +68,18 @@ class MessageTable(FieldTable):
     """
 
     def __init__(
-        self, topic: Topic, stamp: str = "header.stamp", stamp_unit_s: float = 1.0, stamp_offset_s: float = 0.0
+        self,
+        topic: Topic,
+        stamp: str = "header.stamp",
+        stamp_unit_s: float = 1.0,
+        stamp_offset_s: float = 0.0,
     ) -> None:
         self.topic, self.source = topic, f"topic {topic.name}"
         self.groups = topic.messages()
         if not self.groups:
-            faults = ", ".join(f"{count} {fault}" for fault, count in topic.unsound.items())
+            faults = ", ".join(
+                f"{count} {fault}" for fault, count in topic.unsound.items()
+            )
             raise topic.error(f"no message is what its definition says: {faults}")
         log_times_ns = topic.log_times_ns
         if stamp == LOG_TIME:
@@ -77,7 +90,9 @@ class MessageTable(FieldTable):
             self._require(f"{stamp}.sec")
             self.stamps_ns = np.empty(len(topic), np.int64)
             for group in self.groups:
-                self.stamps_ns[group.rows] = header_stamps_ns(group, log_times_ns, f"{stamp}.")
+                self.stamps_ns[group.rows] = header_stamps_ns(
+                    group, log_times_ns, f"{stamp}."
+                )
         if stamp_offset_s:
             self.stamps_ns = self.stamps_ns + round(stamp_offset_s * NS_PER_S)
 
@@ -92,13 +107,17 @@ class MessageTable(FieldTable):
         parts = [group[name] for group in self.groups]
         if len({part.shape[1:] for part in parts}) > 1:
             self.refuse(name, "has more elements in some messages than in others")
-        values = np.empty((len(self.topic), *parts[0].shape[1:]), parts[0].dtype.newbyteorder("="))
+        values = np.empty(
+            (len(self.topic), *parts[0].shape[1:]), parts[0].dtype.newbyteorder("=")
+        )
         for group, part in zip(self.groups, parts, strict=True):
             values[group.rows] = part
         if index is None:
             return values
         if values.ndim == 1 or index >= values.shape[1]:
-            self.refuse(path, f"has {values.shape[1] if values.ndim > 1 else 'no'} elements")
+            self.refuse(
+                path, f"has {values.shape[1] if values.ndim > 1 else 'no'} elements"
+            )
         return values[:, index]
 
     def refuse(self, path: str, fault: str) -> NoReturn:
@@ -123,15 +142,21 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
     if unit_ns < 1 or abs(unit_ns - round(unit_ns)) > 1e-9 * unit_ns:
         return np.rint(finite * unit_ns).astype(np.int64)
     whole = np.floor(finite)
-    return whole.astype(np.int64) * round(unit_ns) + np.rint((finite - whole) * unit_ns).astype(np.int64)
+    return whole.astype(np.int64) * round(unit_ns) + np.rint(
+        (finite - whole) * unit_ns
+    ).astype(np.int64)
 
 
 def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
     """Mask of rows in which some column has a value that is not finite or larger than `LARGEST`, shape (n,)."""
-    return ~np.all([(np.abs(c) < LARGEST).reshape(len(c), -1).all(axis=1) for c in columns], axis=0)
+    return ~np.all(
+        [(np.abs(c) < LARGEST).reshape(len(c), -1).all(axis=1) for c in columns], axis=0
+    )
 
 
-def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, Dropped]:
+def fit_rows(
+    stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool
+) -> tuple[Ints, Dropped]:
     """Rows fit for use in the order of their stamps, shape (n,), and the number of the others by fault.
 
     Faults are masks, shape (n,), by name; a row counts for its first fault only. With ``unique``, all but the first of

@@ -80,59 +80,108 @@ class SonarAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        single = (self.data, self.ranges, self.range_resolution, self.bearings, self.sample_type, self.sample_bytes)
-        return field_paths(*single, self.big_endian, self.row_gains, self.row_bytes, self.directions)
+        single = (
+            self.data,
+            self.ranges,
+            self.range_resolution,
+            self.bearings,
+            self.sample_type,
+            self.sample_bytes,
+        )
+        return field_paths(
+            *single, self.big_endian, self.row_gains, self.row_bytes, self.directions
+        )
 
-    def read(self, topic: Topic, refused: Refused | None = None) -> Iterator[SonarFrames]:
+    def read(
+        self, topic: Topic, refused: Refused | None = None
+    ) -> Iterator[SonarFrames]:
         """Blocks of frames that share beams, bins and kind of sample, in the order of the log.
 
         A block ends where the next frame differs in these, or has an earlier stamp. A message that is no image is given
         to ``refused`` with its stamp and the reason, or else is an error.
         """
         recorded_ns = topic.log_times_ns
-        is_any_sound = bool(topic.messages())  # from here on the topic knows its sound messages
+        # from here on the topic knows its sound messages
+        is_any_sound = bool(topic.messages())
         if refused is not None:
             instants, counts = np.unique(recorded_ns, return_counts=True)
             sound_ns = np.sort(topic.log_times_ns)
-            sound = np.searchsorted(sound_ns, instants, "right") - np.searchsorted(sound_ns, instants)
+            sound = np.searchsorted(sound_ns, instants, "right") - np.searchsorted(
+                sound_ns, instants
+            )
             for stamp_ns in np.repeat(instants, counts - sound).tolist():
                 refused(stamp_ns, f"message {' or '.join(topic.unsound)}")
         if not is_any_sound:
             return
         table = self.table(topic)
-        blocks = [block for group in table.groups for block in self._images(table, group, refused)]
+        blocks = [
+            block
+            for group in table.groups
+            for block in self._images(table, group, refused)
+        ]
         if not blocks:
             return
         rows = np.concatenate([images.rows for images in blocks])
-        block = np.repeat(np.arange(len(blocks)), [len(images.rows) for images in blocks])
+        block = np.repeat(
+            np.arange(len(blocks)), [len(images.rows) for images in blocks]
+        )
         within = np.concatenate([np.arange(len(images.rows)) for images in blocks])
         order = np.argsort(rows)
         rows, block, within = rows[order], block[order], within[order]
-        begins = np.flatnonzero((np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0)) + 1
+        begins = (
+            np.flatnonzero((np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0))
+            + 1
+        )
         for run in np.split(np.arange(len(rows)), begins):
             images = blocks[block[run[0]]]
             is_whole = len(run) == len(images.rows)  # then without a copy
             samples = images.samples if is_whole else images.samples[within[run]]
-            yield SonarFrames(table.stamps_ns[rows[run]], samples, images.ranges_m, images.azimuths_rad)
+            yield SonarFrames(
+                table.stamps_ns[rows[run]],
+                samples,
+                images.ranges_m,
+                images.azimuths_rad,
+            )
 
-    def _images(self, table: MessageTable, group: Messages, refused: Refused | None) -> Iterator[_Images]:
+    def _images(
+        self, table: MessageTable, group: Messages, refused: Refused | None
+    ) -> Iterator[_Images]:
         """Images of messages of one layout, apart where beams, bins or samples differ."""
         count = len(group)
-        flags = (self.sample_type, self.sample_bytes, self.big_endian, self.row_gains, self.row_bytes)
-        kinds = np.column_stack([np.full(count, -1) if f is None else group[f].astype(np.int64) for f in flags])
-        bins_m = np.asarray(group[str(self.ranges or self.range_resolution)], float).reshape(count, -1)
+        flags = (
+            self.sample_type,
+            self.sample_bytes,
+            self.big_endian,
+            self.row_gains,
+            self.row_bytes,
+        )
+        kinds = np.column_stack(
+            [
+                np.full(count, -1) if f is None else group[f].astype(np.int64)
+                for f in flags
+            ]
+        )
+        bins_m = np.asarray(
+            group[str(self.ranges or self.range_resolution)], float
+        ).reshape(count, -1)
         if self.directions is not None:
             _, y, z = (group[path].astype(float) for path in self.directions)
             azimuths_rad = np.arctan2(-y, z)
         else:
             sign = 1 if self.bearing_positive == "left" else -1
-            azimuths_rad = sign * np.radians(group[str(self.bearings)].astype(float) * self.bearing_unit_deg)
+            azimuths_rad = sign * np.radians(
+                group[str(self.bearings)].astype(float) * self.bearing_unit_deg
+            )
         same = np.column_stack([kinds, bins_m, azimuths_rad])
-        _, first, block = np.unique(same, axis=0, return_index=True, return_inverse=True)
+        _, first, block = np.unique(
+            same, axis=0, return_index=True, return_inverse=True
+        )
         for number, at in enumerate(first.tolist()):
             rows = np.flatnonzero(block.reshape(-1) == number)
             try:
-                samples = self._samples(group[self.data][rows], azimuths_rad.shape[1], kinds[at])
+                samples = self._samples(
+                    group[self.data][rows], azimuths_rad.shape[1], kinds[at]
+                )
                 if self.ranges is None:
                     ranges_m = (np.arange(samples.shape[2]) + 0.5) * bins_m[at, 0]
                 else:
@@ -148,7 +197,9 @@ class SonarAdapter(Adapter):
                 continue
             yield _Images(group.rows[rows], samples, ranges_m, azimuths_rad[at])
 
-    def _samples(self, data: NDArray[np.generic], beams: int, kind: NDArray[np.int64]) -> NDArray[np.generic]:
+    def _samples(
+        self, data: NDArray[np.generic], beams: int, kind: NDArray[np.int64]
+    ) -> NDArray[np.generic]:
         """Intensities, shape (n, beams, bins), from the bytes of n images."""
         sample_type, sample_bytes, big_endian, row_gains, row_bytes = kind.tolist()
         if self.sample_type is not None:
@@ -159,7 +210,10 @@ class SonarAdapter(Adapter):
         else:
             name = f"u{sample_bytes if self.sample_bytes is not None else 1}"
             if name not in ("u1", "u2", "u4"):
-                raise _NoImageError(str(self.sample_bytes), f"is {sample_bytes}; samples have 1, 2 or 4 bytes")
+                raise _NoImageError(
+                    str(self.sample_bytes),
+                    f"is {sample_bytes}; samples have 1, 2 or 4 bytes",
+                )
         dtype = np.dtype((">" if big_endian > 0 else "<") + name)
         data = np.ascontiguousarray(data).view(np.uint8)
         size, head = data.shape[1], _GAIN_BYTES if row_gains > 0 else 0
@@ -170,11 +224,25 @@ class SonarAdapter(Adapter):
         else:
             row_count = beams
             row_bytes = used = row_bytes if row_bytes > 0 else size // max(beams, 1)
-        if beams == 0 or row_count == 0 or row_count * row_bytes != size or used > row_bytes:
-            raise _NoImageError(self.data, f"has {size} bytes; that is no image of {beams} beams of {dtype} samples")
+        if (
+            beams == 0
+            or row_count == 0
+            or row_count * row_bytes != size
+            or used > row_bytes
+        ):
+            raise _NoImageError(
+                self.data,
+                f"has {size} bytes; that is no image of {beams} beams of {dtype} samples",
+            )
         image = data.reshape(len(data), row_count, row_bytes)
         values = np.ascontiguousarray(image[:, :, head:used]).view(dtype)
         if row_gains > 0:
-            gains = np.ascontiguousarray(image[:, :, :_GAIN_BYTES]).view("<u4").astype(np.float32)
+            gains = (
+                np.ascontiguousarray(image[:, :, :_GAIN_BYTES])
+                .view("<u4")
+                .astype(np.float32)
+            )
             values = (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32)
-        return values.transpose(0, 2, 1) if self.image_order == "range-major" else values
+        return (
+            values.transpose(0, 2, 1) if self.image_order == "range-major" else values
+        )

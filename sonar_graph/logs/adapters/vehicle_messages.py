@@ -30,7 +30,14 @@ from sonar_graph.logs.adapters.adapter import (
     turn,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
-from sonar_graph.logs.adapters.message_table import LARGEST, NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.message_table import (
+    LARGEST,
+    NOT_FINITE,
+    Dropped,
+    FieldTable,
+    fit_rows,
+    not_finite,
+)
 from sonar_graph.logs.geodesy import Origin
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
@@ -68,19 +75,31 @@ class ImuAdapter(Adapter):
     def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
-        force = _scaled(table.beside(self.linear_acceleration), self.linear_acceleration_scale)
-        unmeasured = _is_marked(table, self.linear_acceleration_status) | self._is_force_unfilled(table)
+        force = _scaled(
+            table.beside(self.linear_acceleration), self.linear_acceleration_scale
+        )
+        unmeasured = _is_marked(
+            table, self.linear_acceleration_status
+        ) | self._is_force_unfilled(table)
         if self.unfilled == "each":
             unmeasured |= ~force.any(axis=1)
-        force = np.where(unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force)
-        faults = {"without angular rate": _is_marked(table, self.angular_velocity_status), NOT_FINITE: not_finite(rate)}
+        force = np.where(
+            unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force
+        )
+        faults = {
+            "without angular rate": _is_marked(table, self.angular_velocity_status),
+            NOT_FINITE: not_finite(rate),
+        }
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         rate, force = turn(self.rotation, rate[rows]), turn(self.rotation, force[rows])
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about a specific force that the driver does not fill, or fills with what is no number."""
-        names, bad = ", ".join(self.linear_acceleration), not_finite(table.beside(self.linear_acceleration))
+        names, bad = (
+            ", ".join(self.linear_acceleration),
+            not_finite(table.beside(self.linear_acceleration)),
+        )
         if self._is_force_unfilled(table):
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
         elif bad.any() and not bad.all():
@@ -90,7 +109,9 @@ class ImuAdapter(Adapter):
         """Tell whether the force is zero in all messages, which not even free fall gives."""
         if self.are_zeros_measured:
             return False
-        measured = table.beside(self.linear_acceleration)[~_is_marked(table, self.linear_acceleration_status)]
+        measured = table.beside(self.linear_acceleration)[
+            ~_is_marked(table, self.linear_acceleration_status)
+        ]
         return bool(len(measured)) and not measured.any()
 
 
@@ -126,21 +147,37 @@ class DepthAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        return field_paths(self.pressure, self.height, self.variance.fields if self.variance else None)
+        return field_paths(
+            self.pressure, self.height, self.variance.fields if self.variance else None
+        )
 
-    def read(self, table: FieldTable, gravity_m_s2: float) -> tuple[Depth | None, Dropped]:
+    def read(
+        self, table: FieldTable, gravity_m_s2: float
+    ) -> tuple[Depth | None, Dropped]:
         """Heights with variances; NaN: unknown."""
-        variance_m2 = self.variance.read_variance(table) if self.variance else np.full(len(table), np.nan)
+        variance_m2 = (
+            self.variance.read_variance(table)
+            if self.variance
+            else np.full(len(table), np.nan)
+        )
         if self.scale != 1:
             variance_m2 = variance_m2 * self.scale**2
         if self.pressure is not None:
             pascals_per_metre = self.water_density_kg_m3 * gravity_m_s2
-            z_m = (self.atmosphere_pa - table.column(self.pressure) * self.scale) / pascals_per_metre
+            z_m = (
+                self.atmosphere_pa - table.column(self.pressure) * self.scale
+            ) / pascals_per_metre
             variance_m2 = variance_m2 / pascals_per_metre**2
         else:
             z_m = table.column(str(self.height)) * self.scale
-        rows, dropped = fit_rows(table.stamps_ns, {NOT_FINITE: not_finite(z_m)}, unique=True)
-        return (Depth(table.stamps_ns[rows], z_m[rows], variance_m2[rows]) if rows.size else None), dropped
+        rows, dropped = fit_rows(
+            table.stamps_ns, {NOT_FINITE: not_finite(z_m)}, unique=True
+        )
+        return (
+            Depth(table.stamps_ns[rows], z_m[rows], variance_m2[rows])
+            if rows.size
+            else None
+        ), dropped
 
     def assumption(self, gravity_m_s2: float) -> str | None:
         """Formula from pressure to height for the notes; None where the message gives a height."""
@@ -191,17 +228,25 @@ class TruthAdapter(Adapter):
     @model_validator(mode="after")
     def _has_one_source(self) -> TruthAdapter:
         if (self.geodetic is None) == (self.position is None):
-            raise ValueError("give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}")
+            raise ValueError(
+                "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
+            )
         if self.orientation is not None and self.rpy is not None:
-            raise ValueError("give either orientation = [x, y, z, w] or rpy = [roll, pitch, yaw]")
+            raise ValueError(
+                "give either orientation = [x, y, z, w] or rpy = [roll, pitch, yaw]"
+            )
         return self
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
         geodetic = self.geodetic.paths() if self.geodetic else None
-        return field_paths(self.position, geodetic, self.orientation, self.rpy, self.covariance)
+        return field_paths(
+            self.position, geodetic, self.orientation, self.rpy, self.covariance
+        )
 
-    def read(self, table: FieldTable, origin: Origin | None = None) -> tuple[Trajectory | None, Dropped]:
+    def read(
+        self, table: FieldTable, origin: Origin | None = None
+    ) -> tuple[Trajectory | None, Dropped]:
         """Poses with covariances, NaN: unknown; ``origin`` in degrees and metres, of positions on the Earth."""
         faults: dict[str, np.ndarray] = {}
         if self.geodetic is not None:
@@ -212,8 +257,14 @@ class TruthAdapter(Adapter):
             faults[NOT_FINITE] = not_finite(positions)
         if self.orientation is None and self.rpy is None:
             rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-            positions = positions[rows] @ ENU_R_NED.T if self.world == "ned" and self.position else positions[rows]
-            return Trajectory.of_positions(table.stamps_ns[rows], positions) if rows.size else None, dropped
+            positions = (
+                positions[rows] @ ENU_R_NED.T
+                if self.world == "ned" and self.position
+                else positions[rows]
+            )
+            return Trajectory.of_positions(
+                table.stamps_ns[rows], positions
+            ) if rows.size else None, dropped
         quaternions = self._quaternions(table)
         lengths = np.linalg.norm(quaternions, axis=1)
         faults[NOT_FINITE] = not_finite(positions, quaternions)
@@ -221,14 +272,19 @@ class TruthAdapter(Adapter):
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         if not rows.size:
             return None, dropped
-        scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)  # unit quaternions keep every bit
+        # unit quaternions keep every bit
+        scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
         positions, quaternions = positions[rows], (quaternions / scale[:, None])[rows]
         enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
         if self.world != "enu" or self.rotation != "flu":
             matrices = SpatialRotation.from_quat(quaternions).as_matrix()
-            turned = SpatialRotation.from_matrix(enu_R_world @ matrices @ axes_matrix(self.rotation).T)
+            turned = SpatialRotation.from_matrix(
+                enu_R_world @ matrices @ axes_matrix(self.rotation).T
+            )
             positions, quaternions = positions @ enu_R_world.T, turned.as_quat()
-        truth = Trajectory.without_covariances(table.stamps_ns[rows], positions, quaternions)
+        truth = Trajectory.without_covariances(
+            table.stamps_ns[rows], positions, quaternions
+        )
         if self.covariance is None:
             return truth, dropped
         covariances = table.column(self.covariance)
@@ -236,12 +292,16 @@ class TruthAdapter(Adapter):
             table.refuse(self.covariance, "is no array of 36 numbers")
         covariances = covariances.reshape(-1, 6, 6)[rows]
         if self.covariance_meaning == "standard deviation":
-            covariances = np.where(covariances < 0, covariances, covariances**2) * np.eye(6)
+            covariances = np.where(
+                covariances < 0, covariances, covariances**2
+            ) * np.eye(6)
         if self.world != "enu":
             W = np.kron(np.eye(2), enu_R_world)
             covariances = W @ covariances @ W.T
         covariances = ros_to_body(covariances, truth.matrices)
-        return Trajectory(truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances), dropped
+        return Trajectory(
+            truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances
+        ), dropped
 
     def _quaternions(self, table: FieldTable) -> np.ndarray:
         """Orientations x, y, z, w, shape (n, 4); zeros where an angle is not finite."""
@@ -249,16 +309,29 @@ class TruthAdapter(Adapter):
             return table.beside(self.orientation or ())
         angles = table.beside(self.rpy) * self.rpy_scale
         is_finite = np.asarray(np.isfinite(angles).all(axis=1))
-        found = SpatialRotation.from_euler("xyz", np.where(is_finite[:, None], angles, 0.0)).as_quat()
+        found = SpatialRotation.from_euler(
+            "xyz", np.where(is_finite[:, None], angles, 0.0)
+        ).as_quat()
         return np.where(is_finite[:, None], found, 0.0)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about an orientation that never changes while the vehicle moves."""
-        if (self.orientation is None and self.rpy is None) or self.position is None or len(table) < 2:
+        if (
+            (self.orientation is None and self.rpy is None)
+            or self.position is None
+            or len(table) < 2
+        ):
             return
-        quaternions, positions = self._quaternions(table), _scaled(table.beside(self.position), self.scale)
+        quaternions, positions = (
+            self._quaternions(table),
+            _scaled(table.beside(self.position), self.scale),
+        )
         moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
-        if np.isfinite(moved_m) and moved_m > LEAST_MOVE_M and not (quaternions != quaternions[0]).any():
+        if (
+            np.isfinite(moved_m)
+            and moved_m > LEAST_MOVE_M
+            and not (quaternions != quaternions[0]).any()
+        ):
             yield (
                 f"its orientation is the same in all {len(table)} messages, although it moves by {moved_m:.3g} m: if "
                 "that is none, `orientation = false` under [truth] in the log configuration; no heading is then scored"
@@ -277,8 +350,12 @@ def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
 def ros_to_body(covariances: Floats, rotations: Floats) -> Floats:
     """Inverse of `body_to_ros`; all zeros, or a negative variance, mean unknown and become NaN."""
     swap = _swap(rotations).transpose(0, 2, 1)
-    known = np.any(covariances != 0, axis=(1, 2)) & (np.diagonal(covariances, axis1=1, axis2=2) >= 0).all(axis=1)
-    return np.where(known[:, None, None], swap @ covariances @ swap.transpose(0, 2, 1), np.nan)
+    known = np.any(covariances != 0, axis=(1, 2)) & (
+        np.diagonal(covariances, axis1=1, axis2=2) >= 0
+    ).all(axis=1)
+    return np.where(
+        known[:, None, None], swap @ covariances @ swap.transpose(0, 2, 1), np.nan
+    )
 
 
 def _swap(rotations: Floats) -> Floats:

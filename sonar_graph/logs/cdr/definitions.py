@@ -179,7 +179,11 @@ def definition(type_name: str) -> str:
     """Interface text of a type such as ``sensor_msgs/msg/Imu``, with all types that it uses, as in an MCAP schema."""
     wanted = [short_name(type_name)]
     for name in wanted:
-        wanted += [used for used in dict.fromkeys(_FIELD_TYPE.findall(DEFINITIONS[name])) if used not in wanted]
+        wanted += [
+            used
+            for used in dict.fromkeys(_FIELD_TYPE.findall(DEFINITIONS[name]))
+            if used not in wanted
+        ]
     first, *others = wanted
     sections = (f"{_SEPARATOR}\nMSG: {name}\n{DEFINITIONS[name]}" for name in others)
     return "\n".join([DEFINITIONS[first], *sections]) + "\n"
@@ -248,8 +252,13 @@ def _parsed(type_name: str, text: str) -> Struct | str:
     """Tree of a message type, or the fault of its text; both are remembered, since every role asks."""
     if len(text) > _LONGEST_TEXT:
         return f"the definition of {type_name} has {len(text)} characters, and at most {_LONGEST_TEXT} are read"
-    own, *rest = _SECTION.split("\n".join(stripped for line in text.splitlines() if (stripped := line.rstrip())) + "\n")
-    texts = {short_name(name): body for name, body in zip(rest[::2], rest[1::2], strict=True)}
+    own, *rest = _SECTION.split(
+        "\n".join(stripped for line in text.splitlines() if (stripped := line.rstrip()))
+        + "\n"
+    )
+    texts = {
+        short_name(name): body for name, body in zip(rest[::2], rest[1::2], strict=True)
+    }
     root = short_name(type_name)
     texts[root] = own
     try:
@@ -269,29 +278,52 @@ class _Parser:
     def struct(self, name: str, users: tuple[str, ...]) -> Struct:
         """Type of some name; ``users`` are the types around it, from the outermost on."""
         if name in users:
-            raise LogError(f"the definition of {users[0]} uses {name} within itself, which no ROS 2 message can")
+            raise LogError(
+                f"the definition of {users[0]} uses {name} within itself, which no ROS 2 message can"
+            )
         if len(users) > _DEEPEST:
-            raise LogError(f"the definition of {users[0]} nests types more than {_DEEPEST} deep; no real one does")
+            raise LogError(
+                f"the definition of {users[0]} nests types more than {_DEEPEST} deep; no real one does"
+            )
         if name in self._done:
             return self._done[name]
         fields: dict[str, Field] = {}
-        for line in (line.split("#", 1)[0].strip() for line in self._texts[name].splitlines()):
+        for line in (
+            line.split("#", 1)[0].strip() for line in self._texts[name].splitlines()
+        ):
             match = _FIELD.match(line)
             if line and (match is None or match["length"] == "0"):
-                raise LogError(f"the definition of {name} has the line {line[:_SHOWN]!r}, which is no ros2msg field")
-            if match is None or match["rest"].startswith("="):  # an empty line, a constant
+                raise LogError(
+                    f"the definition of {name} has the line {line[:_SHOWN]!r}, which is no ros2msg field"
+                )
+            if match is None or match["rest"].startswith(
+                "="
+            ):  # an empty line, a constant
                 continue
             kind = self._kind(match["type"], name, users)
-            length = 1 if match["array"] is None else int(match["length"]) if match["length"].isdigit() else None
+            length = (
+                1
+                if match["array"] is None
+                else int(match["length"])
+                if match["length"].isdigit()
+                else None
+            )
             if match["name"] in fields:
-                raise LogError(f"the definition of {name} has two fields called {match['name']}")
-            fields[match["name"]] = Field(match["name"], kind, length, is_array=match["array"] is not None)
+                raise LogError(
+                    f"the definition of {name} has two fields called {match['name']}"
+                )
+            fields[match["name"]] = Field(
+                match["name"], kind, length, is_array=match["array"] is not None
+            )
         struct = self._done[name] = Struct(name, tuple(fields.values()))
         self._sizes[name] = sum(
-            self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1 for entry in struct.fields
+            self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1
+            for entry in struct.fields
         )
         if self._sizes[name] > _MOST_FIELDS:
-            raise LogError(f"the definition of {name} has more than {_MOST_FIELDS} fields; no real one has")
+            raise LogError(
+                f"the definition of {name} has more than {_MOST_FIELDS} fields; no real one has"
+            )
         return struct
 
     def _kind(self, type_name: str, owner: str, users: tuple[str, ...]) -> str | Struct:
@@ -300,9 +332,18 @@ class _Parser:
             return type_name
         package = owner.split("/", 1)[0]
         wanted = short_name(type_name)
-        wanted = {"Header": "std_msgs/Header"}.get(wanted, wanted if "/" in wanted else f"{package}/{wanted}")
-        if wanted not in self._texts and wanted.startswith("builtin_interfaces/") and wanted in DEFINITIONS:
-            self._texts[wanted] = DEFINITIONS[wanted]  # some recorders leave these two out
+        wanted = {"Header": "std_msgs/Header"}.get(
+            wanted, wanted if "/" in wanted else f"{package}/{wanted}"
+        )
+        if (
+            wanted not in self._texts
+            and wanted.startswith("builtin_interfaces/")
+            and wanted in DEFINITIONS
+        ):
+            # some recorders leave these two out
+            self._texts[wanted] = DEFINITIONS[wanted]
         if wanted not in self._texts:
-            raise LogError(f"the definition of {owner} uses {type_name}, whose own definition is not in the log")
+            raise LogError(
+                f"the definition of {owner} uses {type_name}, whose own definition is not in the log"
+            )
         return self.struct(wanted, (*users, owner))

@@ -42,7 +42,12 @@ def padding(at: int, size: int) -> int:
 class PayloadWalk:
     """Places of the parts of a payload, noted while the steps of a plan are taken."""
 
-    def __init__(self, steps: int, length_of: Callable[[DecodingStep, int], int], most_elements: int | None) -> None:
+    def __init__(
+        self,
+        steps: int,
+        length_of: Callable[[DecodingStep, int], int],
+        most_elements: int | None,
+    ) -> None:
         self.found: list[list[int]] = [[] for _ in range(steps)]
         """By step: the start of each block; for other steps start and count in turn."""
         self.words: list[tuple[int, int]] = []
@@ -136,7 +141,9 @@ class Text(DecodingStep):
 class Repeated(DecodingStep):
     """Array or sequence of strings or of another type."""
 
-    def __init__(self, index: int, path: str, count: int | None, steps: list[DecodingStep]) -> None:
+    def __init__(
+        self, index: int, path: str, count: int | None, steps: list[DecodingStep]
+    ) -> None:
         super().__init__(index, path)
         self._count = count
         self._steps = steps
@@ -146,7 +153,8 @@ class Repeated(DecodingStep):
         at, count = walk.length(self, at) if self._count is None else (at, self._count)
         walk.found[self.index] += (at, count)
         if walk.most_elements is not None and count > walk.most_elements:
-            return at + count  # every element has a byte at least, so this is beyond the end
+            # every element has a byte at least, so this is beyond the end
+            return at + count
         for _ in range(count):
             for step in self._steps:
                 at = step.take(at, walk)
@@ -179,10 +187,18 @@ class Plan:
         """Arrays and sequences by path, without arrays of numbers."""
         self._parts = 0
         self._steps = self._compile(definition, "", is_single=True)
-        self.texts = [path for path, leaf in self.leaves.items() if isinstance(leaf.step, Text)]
-        self.booleans = [path for path, leaf in self.leaves.items() if leaf.dtypes["<"] == np.bool_]
+        self.texts = [
+            path for path, leaf in self.leaves.items() if isinstance(leaf.step, Text)
+        ]
+        self.booleans = [
+            path for path, leaf in self.leaves.items() if leaf.dtypes["<"] == np.bool_
+        ]
 
-    def walk(self, length_of: Callable[[DecodingStep, int], int], most_elements: int | None = None) -> PayloadWalk:
+    def walk(
+        self,
+        length_of: Callable[[DecodingStep, int], int],
+        most_elements: int | None = None,
+    ) -> PayloadWalk:
         """Take all steps; ``length_of`` gives the length word of a step at a byte offset.
 
         An array of more than ``most_elements`` would reach beyond the end of the payload.
@@ -192,7 +208,9 @@ class Plan:
             walk.end = step.take(walk.end, walk)
         return walk
 
-    def _compile(self, definition: Struct, prefix: str, *, is_single: bool) -> list[DecodingStep]:
+    def _compile(
+        self, definition: Struct, prefix: str, *, is_single: bool
+    ) -> list[DecodingStep]:
         steps: list[DecodingStep] = []
         values: list[Value] = []
         self._add(definition, prefix, is_single, steps, values)
@@ -200,7 +218,12 @@ class Plan:
         return steps
 
     def _add(
-        self, definition: Struct, prefix: str, is_single: bool, steps: list[DecodingStep], values: list[Value]
+        self,
+        definition: Struct,
+        prefix: str,
+        is_single: bool,
+        steps: list[DecodingStep],
+        values: list[Value],
     ) -> None:
         if not definition.fields:
             values.append(Value(prefix, "u1", 1, is_single))
@@ -208,7 +231,11 @@ class Plan:
             path, single = prefix + entry.name, is_single and not entry.is_array
             if isinstance(entry.kind, Struct) and not entry.is_array:
                 self._add(entry.kind, path + ".", single, steps, values)
-            elif isinstance(entry.kind, str) and entry.kind != STRING and entry.length is not None:
+            elif (
+                isinstance(entry.kind, str)
+                and entry.kind != STRING
+                and entry.length is not None
+            ):
                 values.append(Value(path, PRIMITIVES[entry.kind], entry.length, single))
             else:
                 self._close(steps, values)
@@ -228,7 +255,9 @@ class Plan:
             self.sequences[path] = numbers = Numbers(self._next(), path, kind)
             self.leaves[path] = Leaf(numbers, _dtypes(kind), is_single)
             return numbers
-        self.sequences[path] = repeated = Repeated(self._next(), path, entry.length, inner)
+        self.sequences[path] = repeated = Repeated(
+            self._next(), path, entry.length, inner
+        )
         return repeated
 
     def _close(self, steps: list[DecodingStep], values: list[Value]) -> None:
@@ -237,8 +266,12 @@ class Plan:
             block = FieldBlock(self._next(), values)
             steps.append(block)
             for value in values:
-                if value.path and not value.path.endswith("."):  # else it is the byte of a type without fields
-                    self.leaves[value.path] = Leaf(block, _dtypes(value.kind), value.is_single)
+                if value.path and not value.path.endswith(
+                    "."
+                ):  # else it is the byte of a type without fields
+                    self.leaves[value.path] = Leaf(
+                        block, _dtypes(value.kind), value.is_single
+                    )
             values.clear()
 
     def _next(self) -> int:
@@ -296,33 +329,56 @@ class Layout:
         if isinstance(step, FieldBlock):
             offsets = step.offsets[path]
             starts = [start + offsets[start % len(offsets)] for start in found]
-            return PayloadColumn(dtypes[self.byte_order], is_single, starts, [step.counts[path]] * len(found))
-        return PayloadColumn(dtypes[self.byte_order], is_single, found[::2], found[1::2])
+            return PayloadColumn(
+                dtypes[self.byte_order],
+                is_single,
+                starts,
+                [step.counts[path]] * len(found),
+            )
+        return PayloadColumn(
+            dtypes[self.byte_order], is_single, found[::2], found[1::2]
+        )
 
     def lengths(self, path: str) -> list[int]:
         """Number of elements of an array or sequence, one each time it occurs."""
         sequence = self.plan.sequences.get(path)
-        return self.column(path).counts if sequence is None else self._found[sequence.index][1::2]
+        return (
+            self.column(path).counts
+            if sequence is None
+            else self._found[sequence.index][1::2]
+        )
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
         places, expected = self._distinction
-        some = payloads[:, places] if len(rows) == len(payloads) else payloads[np.ix_(rows, places)]
+        some = (
+            payloads[:, places]
+            if len(rows) == len(payloads)
+            else payloads[np.ix_(rows, places)]
+        )
         return np.asarray((some == expected).all(axis=1))
 
     @cached_property
     def _distinction(self) -> tuple[Ints, Bytes]:
         """Places and values of the bytes of the encapsulation and of all length words."""
         words = np.array(self.words, np.int64).reshape(-1, 2)
-        places = np.concatenate([[0, 1], (words[:, :1] + np.arange(LENGTH_BYTES)).reshape(-1)])
+        places = np.concatenate(
+            [[0, 1], (words[:, :1] + np.arange(LENGTH_BYTES)).reshape(-1)]
+        )
         lengths = words[:, 1].astype(f"{self.byte_order}u{LENGTH_BYTES}").view(np.uint8)
-        return places, np.concatenate([np.frombuffer(ENCAPSULATIONS[self.byte_order], np.uint8), lengths])
+        return places, np.concatenate(
+            [np.frombuffer(ENCAPSULATIONS[self.byte_order], np.uint8), lengths]
+        )
 
 
 MOST_PADDING = 3
 _UNPACK_LENGTH = {order: Packing(order + "I").unpack_from for order in ENCAPSULATIONS}
 _BYTE_ORDERS = {start: order for order, start in ENCAPSULATIONS.items()}
-_OTHER_ENCAPSULATIONS = {2: "PL_CDR", 3: "PL_CDR", **dict.fromkeys(range(6, 12), "XCDR2")}
+_OTHER_ENCAPSULATIONS = {
+    2: "PL_CDR",
+    3: "PL_CDR",
+    **dict.fromkeys(range(6, 12), "XCDR2"),
+}
 
 
 class UnsoundMessageError(Exception):
@@ -336,7 +392,9 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
     order = _BYTE_ORDERS.get(bytes(payload[:2]))
     if order is None:
         kind = _OTHER_ENCAPSULATIONS.get(payload[1]) if payload[0] == 0 else None
-        raise UnsoundMessageError(f"encoded as {kind or payload[:HEADER_BYTES].hex()} instead of plain CDR")
+        raise UnsoundMessageError(
+            f"encoded as {kind or payload[:HEADER_BYTES].hex()} instead of plain CDR"
+        )
     unpack, size = _UNPACK_LENGTH[order], len(payload)
 
     def read_length(step: DecodingStep, at: int) -> int:
@@ -355,7 +413,9 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
     return Layout(plan, order, walk)
 
 
-def unsound_contents(layout: Layout, payloads: Bytes) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def unsound_contents(
+    layout: Layout, payloads: Bytes
+) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Faults of booleans and strings of payloads that share a layout, and the rows that have them, shape (n,)."""
     for path in layout.plan.booleans:
         column = layout.column(path)
@@ -368,11 +428,23 @@ def unsound_contents(layout: Layout, payloads: Bytes) -> Iterator[tuple[str, NDA
         column = layout.column(path)
         for start, length in zip(column.starts, column.counts, strict=True):
             end = start + length
-            characters = payloads[:, start:end].tobytes() if many else bytes(first[start:end])
-            if length and (any(characters[length - 1 :: length]) or not characters.isascii()):
-                has_it = np.array([not _is_text(characters[i : i + length]) for i in range(0, len(characters), length)])
+            characters = (
+                payloads[:, start:end].tobytes() if many else bytes(first[start:end])
+            )
+            if length and (
+                any(characters[length - 1 :: length]) or not characters.isascii()
+            ):
+                has_it = np.array(
+                    [
+                        not _is_text(characters[i : i + length])
+                        for i in range(0, len(characters), length)
+                    ]
+                )
                 if has_it.any():
-                    yield f"with a string {path} that is not UTF-8 closed by a NUL", has_it
+                    yield (
+                        f"with a string {path} that is not UTF-8 closed by a NUL",
+                        has_it,
+                    )
 
 
 def _is_text(characters: bytes) -> bool:

@@ -56,7 +56,9 @@ class Messages:
         column = self.layout.column(path)
         values = _view(self.payloads, column)
         if values is None:
-            values = np.ascontiguousarray(self.payloads[:, _places(column)]).view(column.dtype)
+            values = np.ascontiguousarray(self.payloads[:, _places(column)]).view(
+                column.dtype
+            )
         return values[:, 0] if column.is_single else values
 
     def lengths(self, path: str) -> list[int]:
@@ -66,17 +68,29 @@ class Messages:
     def strings(self, path: str) -> list[list[str]]:
         """Values of a string field: for each message one of each occurrence."""
         column = self.layout.column(path)
-        runs = [(start, start + count - 1) for start, count in zip(column.starts, column.counts, strict=True)]
+        runs = [
+            (start, start + count - 1)
+            for start, count in zip(column.starts, column.counts, strict=True)
+        ]
         contents = (payload.tobytes() for payload in self.payloads)
         return [
-            [str(content[start:end], "utf-8") if end > start else "" for start, end in runs] for content in contents
+            [
+                str(content[start:end], "utf-8") if end > start else ""
+                for start, end in runs
+            ]
+            for content in contents
         ]
 
     def first_string(self, path: str) -> str:
         """A string field's value in the first message; empty where there is none."""
         if path not in self.layout.columns:
             return ""
-        return next(iter(Messages(self.rows[:1], self.payloads[:1], self.layout).strings(path)[0]), "")
+        return next(
+            iter(
+                Messages(self.rows[:1], self.payloads[:1], self.layout).strings(path)[0]
+            ),
+            "",
+        )
 
 
 class Decoded(NamedTuple):
@@ -112,7 +126,11 @@ class Decoder:
             for layout, members in self._by_layout(rows, stack):
                 first, last = int(members[0]), int(members[-1])
                 # a view where they lie side by side
-                found = stack[first : last + 1] if last - first + 1 == len(members) else stack[members]
+                found = (
+                    stack[first : last + 1]
+                    if last - first + 1 == len(members)
+                    else stack[members]
+                )
                 is_sound = np.ones(len(members), bool)
                 for fault, has_it in unsound_contents(layout, found):
                     if (has_it & is_sound).any():
@@ -121,8 +139,13 @@ class Decoder:
                 if is_sound.all():
                     groups.append(Messages(rows[members], found, layout))
                 elif is_sound.any():
-                    groups.append(Messages(rows[members[is_sound]], found[is_sound], layout))
-        return Decoded(groups, {fault: np.concatenate(parts) for fault, parts in self._unsound.items()})
+                    groups.append(
+                        Messages(rows[members[is_sound]], found[is_sound], layout)
+                    )
+        return Decoded(
+            groups,
+            {fault: np.concatenate(parts) for fault, parts in self._unsound.items()},
+        )
 
     def _by_layout(self, rows: Ints, stack: Bytes) -> Iterator[tuple[Layout, Ints]]:
         """Layouts of payloads of one length, each with the places of its payloads in the stack."""
@@ -146,13 +169,17 @@ class Decoder:
             left = left[~same]
             known[_LAYOUTS_REMEMBERED - 1 :] = [found]
 
-    def _one_by_one(self, rows: Ints, stack: Bytes, left: Ints) -> Iterator[tuple[Layout, Ints]]:
+    def _one_by_one(
+        self, rows: Ints, stack: Bytes, left: Ints
+    ) -> Iterator[tuple[Layout, Ints]]:
         """Walk every payload, where hardly two have the same layout."""
         found: dict[tuple[object, ...], tuple[Layout, list[int]]] = {}
         for member in left.tolist():
             layout = self._layout(rows[member], stack[member])
             if layout is not None:
-                found.setdefault((layout.byte_order, *layout.words), (layout, []))[1].append(member)
+                found.setdefault((layout.byte_order, *layout.words), (layout, []))[
+                    1
+                ].append(member)
         for layout, members in found.values():
             yield layout, np.array(members)
 
@@ -164,7 +191,12 @@ class Decoder:
             return None
 
 
-def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Lengths | None = None) -> Bytes:
+def encode(
+    definition: Struct,
+    n: int,
+    values: Mapping[str, Value],
+    lengths: Lengths | None = None,
+) -> Bytes:
     """Payloads of n messages with the same layout, shape (n, size); fields that are not given are zero or empty.
 
     Parameters
@@ -187,9 +219,13 @@ def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Len
         raise ValueError(f"{definition.name} has no field {', '.join(sorted(unknown))}")
     layout = Layout(plan, "<", plan.walk(_given_lengths(values, lengths or {})))
     payloads = np.zeros((n, layout.size), np.uint8)
-    payloads[:, : len(ENCAPSULATIONS["<"])] = np.frombuffer(ENCAPSULATIONS["<"], np.uint8)
+    payloads[:, : len(ENCAPSULATIONS["<"])] = np.frombuffer(
+        ENCAPSULATIONS["<"], np.uint8
+    )
     for at, length in layout.words:
-        payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(length.to_bytes(LENGTH_BYTES, "little"), np.uint8)
+        payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(
+            length.to_bytes(LENGTH_BYTES, "little"), np.uint8
+        )
     for path, value in values.items():
         column = layout.column(path)
         if isinstance(value, str | list):
@@ -202,7 +238,11 @@ def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Len
             numbers = given.astype(column.dtype)
         if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
             raise ValueError(f"{path}: a number does not fit into {column.dtype}")
-        numbers = numbers.reshape(-1, 1) if numbers.ndim == 1 and column.is_single else numbers
+        numbers = (
+            numbers.reshape(-1, 1)
+            if numbers.ndim == 1 and column.is_single
+            else numbers
+        )
         numbers = np.broadcast_to(numbers, (n, sum(column.counts)))
         view = _view(payloads, column)
         if view is None:
@@ -212,10 +252,18 @@ def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Len
     return payloads
 
 
-def _given_lengths(values: Mapping[str, Value], lengths: Lengths) -> Callable[[DecodingStep, int], int]:
+def _given_lengths(
+    values: Mapping[str, Value], lengths: Lengths
+) -> Callable[[DecodingStep, int], int]:
     """Length of each string and sequence in turn, from the values and lengths to be written."""
-    texts = {path: iter(value) for path, value in values.items() if isinstance(value, list)}
-    each = {path: iter(length) for path, length in lengths.items() if not isinstance(length, int)}
+    texts = {
+        path: iter(value) for path, value in values.items() if isinstance(value, list)
+    }
+    each = {
+        path: iter(length)
+        for path, length in lengths.items()
+        if not isinstance(length, int)
+    }
 
     def length_of(step: DecodingStep, _: int) -> int:
         value = values.get(step.path)
@@ -227,7 +275,13 @@ def _given_lengths(values: Mapping[str, Value], lengths: Lengths) -> Callable[[D
         given = lengths.get(step.path)
         if isinstance(given, int):
             return given
-        return value.shape[1] if isinstance(value, np.ndarray) else len(value) if isinstance(value, list) else 0
+        return (
+            value.shape[1]
+            if isinstance(value, np.ndarray)
+            else len(value)
+            if isinstance(value, list)
+            else 0
+        )
 
     return length_of
 
@@ -237,13 +291,19 @@ def _view(payloads: Bytes, column: PayloadColumn) -> NDArray[Any] | None:
     starts, size = column.starts, column.dtype.itemsize
     if not starts:
         return np.empty((len(payloads), 0), column.dtype)
-    values = payloads[:, starts[0] : starts[0] + column.counts[0] * size].view(column.dtype)
+    values = payloads[:, starts[0] : starts[0] + column.counts[0] * size].view(
+        column.dtype
+    )
     if len(starts) == 1:
         return values
     spacing = starts[1] - starts[0]
-    if any(count != 1 for count in column.counts) or starts != list(range(starts[0], starts[-1] + 1, spacing)):
+    if any(count != 1 for count in column.counts) or starts != list(
+        range(starts[0], starts[-1] + 1, spacing)
+    ):
         return None
-    return as_strided(values, (len(payloads), len(starts)), (values.strides[0], spacing))
+    return as_strided(
+        values, (len(payloads), len(starts)), (values.strides[0], spacing)
+    )
 
 
 def _places(column: PayloadColumn) -> Ints:

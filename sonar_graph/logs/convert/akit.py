@@ -11,7 +11,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
 from sonar_graph.logs.geodesy import east_north_up
@@ -41,7 +47,18 @@ OFFSETS_S = np.arange(-1.0, 1.005, 0.01)
 FILES = "TrajectoryN/{IMU,DVL,GT}_trajectoryN.csv"
 IMU_COLUMNS = ("Time", "ACC X", "ACC Y", "ACC Z", "GYRO X", "GYRO Y", "GYRO Z")
 DVL_COLUMNS = ("Time", "DVL X", "DVL Y", "DVL Z")
-REFERENCE_COLUMNS = ("Time", "Longitude", "Latitude", "Altitude", "V North", "V East", "V Down", "Roll", "Pitch", "Yaw")
+REFERENCE_COLUMNS = (
+    "Time",
+    "Longitude",
+    "Latitude",
+    "Altitude",
+    "V North",
+    "V East",
+    "V Down",
+    "Roll",
+    "Pitch",
+    "Yaw",
+)
 
 
 def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
@@ -49,7 +66,9 @@ def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
 
     ``enu_R_ned Rz(yaw) Ry(pitch) Rx(roll) frd_R_flu``.
     """
-    ned_R_frd = Rotation.from_euler("ZYX", np.column_stack([yaw_rad, pitch_rad, roll_rad])).as_matrix()
+    ned_R_frd = Rotation.from_euler(
+        "ZYX", np.column_stack([yaw_rad, pitch_rad, roll_rad])
+    ).as_matrix()
     return Rotation.from_matrix(ENU_R_NED @ ned_R_frd @ np.diag(FLU_OF_FRD))
 
 
@@ -61,24 +80,43 @@ def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
     """
     if len(reference) < LEAST_POSES:
         return 0.0
-    seconds, knots = ((ns - imu.stamps_ns[0]) * 1e-9 for ns in (imu.stamps_ns, reference.stamps_ns))
-    steps = 0.5 * (imu.angular_velocity[1:] + imu.angular_velocity[:-1]) * np.diff(seconds)[:, None]
+    seconds, knots = (
+        (ns - imu.stamps_ns[0]) * 1e-9 for ns in (imu.stamps_ns, reference.stamps_ns)
+    )
+    steps = (
+        0.5
+        * (imu.angular_velocity[1:] + imu.angular_velocity[:-1])
+        * np.diff(seconds)[:, None]
+    )
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    knots = knots[(knots + OFFSETS_S[0] >= seconds[0]) & (knots + OFFSETS_S[-1] <= seconds[-1])]
-    rotations = reference.at(imu.stamps_ns[0] + np.rint(knots * NS_PER_S).astype(np.int64)).rotations()
+    knots = knots[
+        (knots + OFFSETS_S[0] >= seconds[0]) & (knots + OFFSETS_S[-1] <= seconds[-1])
+    ]
+    rotations = reference.at(
+        imu.stamps_ns[0] + np.rint(knots * NS_PER_S).astype(np.int64)
+    ).rotations()
     of_reference = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
 
     def misfit(offset_s: float) -> float:
-        by_gyros = [np.diff(np.interp(knots + offset_s, seconds, turned[:, axis])) for axis in range(3)]
+        by_gyros = [
+            np.diff(np.interp(knots + offset_s, seconds, turned[:, axis]))
+            for axis in range(3)
+        ]
         return float(np.var(np.column_stack(by_gyros) - of_reference, axis=0).sum())
 
     misfits = np.array([misfit(offset_s) for offset_s in OFFSETS_S])
     best = int(np.argmin(misfits))
     if not 0 < best < len(OFFSETS_S) - 1:
         return 0.0
-    before, least, after = misfits[best - 1 : best + 2].tolist()  # the vertex of the parabola through them
+    before, least, after = misfits[
+        best - 1 : best + 2
+    ].tolist()  # the vertex of the parabola through them
     return float(
-        OFFSETS_S[best] + 0.5 * (before - after) / (before - 2 * least + after) * (OFFSETS_S[1] - OFFSETS_S[0])
+        OFFSETS_S[best]
+        + 0.5
+        * (before - after)
+        / (before - 2 * least + after)
+        * (OFFSETS_S[1] - OFFSETS_S[0])
     )
 
 
@@ -105,27 +143,50 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     """
     folder = numbered_run(dataset_dir, "TrajectoryN", trajectory, "trajectory", FILES)
     imu_rows, dvl_rows, reference_rows = (
-        read_table(folder / f"{kind}_trajectory{trajectory}.csv", columns, delimiter=",", header_lines=1).values
-        for kind, columns in (("IMU", IMU_COLUMNS), ("DVL", DVL_COLUMNS), ("GT", REFERENCE_COLUMNS))
+        read_table(
+            folder / f"{kind}_trajectory{trajectory}.csv",
+            columns,
+            delimiter=",",
+            header_lines=1,
+        ).values
+        for kind, columns in (
+            ("IMU", IMU_COLUMNS),
+            ("DVL", DVL_COLUMNS),
+            ("GT", REFERENCE_COLUMNS),
+        )
     )
     imu_ns, dvl_ns, reference_ns = (
         np.arange(len(rows), dtype=np.int64) * period_ns
-        for rows, period_ns in ((imu_rows, IMU_PERIOD_NS), (dvl_rows, DVL_PERIOD_NS), (reference_rows, DVL_PERIOD_NS))
+        for rows, period_ns in (
+            (imu_rows, IMU_PERIOD_NS),
+            (dvl_rows, DVL_PERIOD_NS),
+            (reference_rows, DVL_PERIOD_NS),
+        )
     )
     to_flu = FLU_OF_FRD * IMU_FRD_SIGNS
     imu = Imu(imu_ns, imu_rows[:, 4:7] * to_flu, imu_rows[:, 1:4] * to_flu)
-    dvl = Dvl(DVL_DELAY_NS + dvl_ns, dvl_rows[:, 1:] * FLU_OF_FRD, np.full((len(dvl_ns), 3, 3), np.nan))
+    dvl = Dvl(
+        DVL_DELAY_NS + dvl_ns,
+        dvl_rows[:, 1:] * FLU_OF_FRD,
+        np.full((len(dvl_ns), 3, 3), np.nan),
+    )
     longitude, latitude, altitude = reference_rows[:, 1:4].T
     quaternions = enu_R_flu(*reference_rows[:, 7:10].T).as_quat()
-    positions = east_north_up(latitude, longitude, altitude, (float(latitude[0]), float(longitude[0]), 0.0))
+    positions = east_north_up(
+        latitude, longitude, altitude, (float(latitude[0]), float(longitude[0]), 0.0)
+    )
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)
     offset_s = reference_offset_s(imu, truth)
     shifted_ns = reference_ns + round(offset_s * NS_PER_S)
     is_kept = shifted_ns >= 0
-    truth = Trajectory.without_covariances(shifted_ns[is_kept], positions[is_kept], quaternions[is_kept])
+    truth = Trajectory.without_covariances(
+        shifted_ns[is_kept], positions[is_kept], quaternions[is_kept]
+    )
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:
-        raise DatasetError(f"{folder}: the reference has fewer than two rows; expected one a second")
+        raise DatasetError(
+            f"{folder}: the reference has fewer than two rows; expected one a second"
+        )
     start = truth.at(np.array([start_ns]))
     x, y, z = start.positions[0].tolist()
     yaw, pitch, roll = start.rotations().as_euler("ZYX")[0].tolist()
@@ -136,8 +197,15 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
             gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
             mounting=Mounting(translation_m=BODY_P_IMU_M),
         ),
-        dvl=DvlCalibration(velocity_sigma_m_s=VELOCITY_SIGMA_M_S, mounting=Mounting(translation_m=BODY_P_DVL_M)),
-        start=Start(position_m=(x, y, z), rpy_rad=(roll, pitch, yaw), rpy_sigma_rad=START_RPY_SIGMA_RAD),
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=VELOCITY_SIGMA_M_S,
+            mounting=Mounting(translation_m=BODY_P_DVL_M),
+        ),
+        start=Start(
+            position_m=(x, y, z),
+            rpy_rad=(roll, pitch, yaw),
+            rpy_sigma_rad=START_RPY_SIGMA_RAD,
+        ),
         use_gravity=False,  # at 2 m/s a turn feels like a tilt of degrees, while the gyros drift by hundredths
         odometry_interpolation="linear",
         earth_rate_latitude_rad=float(latitude[0]),

@@ -43,7 +43,9 @@ from sonar_graph.logs.vehicle_setup import with_measured_start
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import faults_in
 
-CSV_ADAPTERS: dict[str, type[Adapter]] = {role: adapter for role, adapter in ADAPTERS.items() if role != "sonar"} | {
+CSV_ADAPTERS: dict[str, type[Adapter]] = {
+    role: adapter for role, adapter in ADAPTERS.items() if role != "sonar"
+} | {
     "detections": DetectionRowsAdapter,
     "true_landmarks": LandmarkRowsAdapter,
 }
@@ -81,21 +83,41 @@ def read_csv_config(path: Path) -> dict[str, CsvRole]:
 
 def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRole]:
     """Roles from values as TOML gives them; errors as in `read_csv_config`, with the name of a ``source``."""
-    shared = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
+    shared = {
+        key: value for key, value in values.items() if not isinstance(value, Mapping)
+    }
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     for key in shared:
-        if key not in {*CsvForm.model_fields, "stamp", "stamp_unit_s", "stamp_offset_s"} - {"file", "columns"}:
-            place = "it belongs into the table of a role" if key not in CSV_ADAPTERS else f"expected a table, [{key}]"
-            raise LogError(f"{source}: {key}: stands before the first table and so for all of them; {place}")
+        if key not in {
+            *CsvForm.model_fields,
+            "stamp",
+            "stamp_unit_s",
+            "stamp_offset_s",
+        } - {"file", "columns"}:
+            place = (
+                "it belongs into the table of a role"
+                if key not in CSV_ADAPTERS
+                else f"expected a table, [{key}]"
+            )
+            raise LogError(
+                f"{source}: {key}: stands before the first table and so for all of them; {place}"
+            )
     for role in tables:
         if role not in CSV_ADAPTERS:
             close = get_close_matches(role, CSV_ADAPTERS, 1)
             hint = f"did you mean [{close[0]}]? " if close else ""
-            raise LogError(f"{source}: there is no role [{role}]; {hint}tables are for {', '.join(CSV_ADAPTERS)}")
-    found = {role: _role(role, shared | dict(table), source) for role, table in tables.items()}
+            raise LogError(
+                f"{source}: there is no role [{role}]; {hint}tables are for {', '.join(CSV_ADAPTERS)}"
+            )
+    found = {
+        role: _role(role, shared | dict(table), source)
+        for role, table in tables.items()
+    }
     for role in ("imu", "dvl"):
         if role not in found:
-            raise LogError(f"{source}: has no table [{role}]; every estimator needs IMU and Doppler log")
+            raise LogError(
+                f"{source}: has no table [{role}]; every estimator needs IMU and Doppler log"
+            )
     return found
 
 
@@ -105,11 +127,17 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
     said = {
         key: _as_names(kind, key, value)
         for key, value in table.items()  # false takes away, as in a log configuration, where there is nothing
-        if not (value is False and key in kind.model_fields and not isinstance(getattr(base, key, None), bool))
+        if not (
+            value is False
+            and key in kind.model_fields
+            and not isinstance(getattr(base, key, None), bool)
+        )
     }
     form = {key: said.pop(key) for key in list(said) if key in CsvForm.model_fields}
     for key in said.keys() & NOT_OF_TABLES:
-        raise LogError(f"{source}: [{role}] {key}: is for messages; a table has columns: take it out")
+        raise LogError(
+            f"{source}: [{role}] {key}: is for messages; a table has columns: take it out"
+        )
     try:
         as_form = CsvForm.model_validate(form)
     except ValidationError as error:
@@ -119,7 +147,12 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
     except ValidationError as error:
         raise LogError(f"{source}: [{role}] {faults_in(error, kind)}") from error
     keys = {path: key for key, path in _paths(said) if path in set(adapter.fields())}
-    return CsvRole(role, as_form, adapter, {path: keys.get(path, path) for path in adapter.fields()})
+    return CsvRole(
+        role,
+        as_form,
+        adapter,
+        {path: keys.get(path, path) for path in adapter.fields()},
+    )
 
 
 def _as_names(kind: type[Adapter], key: str, value: Any) -> Any:
@@ -142,7 +175,9 @@ def _paths(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
 
 
 def read_csv(
-    tables: str | Path | Iterable[str | Path], config: str | Path | Mapping[str, Any], name: str = ""
+    tables: str | Path | Iterable[str | Path],
+    config: str | Path | Mapping[str, Any],
+    name: str = "",
 ) -> Sequence:
     r"""Read text tables as a `Sequence`.
 
@@ -186,7 +221,10 @@ def read_csv(
     if isinstance(config, Mapping):
         source, roles = "config", parse_csv_config(config, "config")
     else:
-        source, roles = str(config), read_csv_config(as_path(config, "read_csv(tables, config)"))
+        source, roles = (
+            str(config),
+            read_csv_config(as_path(config, "read_csv(tables, config)")),
+        )
     found = {role: _table(one, files, source) for role, one in roles.items()}
     adapters = {role: one.adapter for role, one in roles.items()}
     calibration, notes = Calibration(), dict[str, str]()
@@ -199,24 +237,45 @@ def read_csv(
             assumed := adapter.assumption(calibration.gravity_m_s2)
         ):
             notes["log.depth"] = assumed
-        blocks[role], dropped[role] = rows_of(adapter, table, calibration, np.eye(3), origin)
+        blocks[role], dropped[role] = rows_of(
+            adapter, table, calibration, np.eye(3), origin
+        )
         if blocks[role] is None:
-            faults = ", ".join(f"{count} {fault}" for fault, count in dropped[role].items())
-            raise LogError(f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {faults}")
+            faults = ", ".join(
+                f"{count} {fault}" for fault, count in dropped[role].items()
+            )
+            raise LogError(
+                f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {faults}"
+            )
     require_use(source, blocks["imu"], blocks["dvl"])
-    doubts = [f"{role}: {text}" for role, table in found.items() for text in adapters[role].warnings(table)]
+    doubts = [
+        f"{role}: {text}"
+        for role, table in found.items()
+        for text in adapters[role].warnings(table)
+    ]
     doubts += [
         f"{role}: {text}"
         for role, table in found.items()
         if role != "true_landmarks"
         for text in stamp_faults(table.stamps_ns, table.stamps_ns)
     ]
-    left_out = [f"{role}: {count} {fault}" for role, faults in dropped.items() for fault, count in faults.items()]
-    notes |= {f"csv.{role}": f"{one.file.path.name}: {'; '.join(_said(roles[role]))}" for role, one in found.items()}
+    left_out = [
+        f"{role}: {count} {fault}"
+        for role, faults in dropped.items()
+        for fault, count in faults.items()
+    ]
+    notes |= {
+        f"csv.{role}": f"{one.file.path.name}: {'; '.join(_said(roles[role]))}"
+        for role, one in found.items()
+    }
     notes |= {"csv.left_out": "; ".join(left_out)} if left_out else {}
     notes |= {"csv.warnings": "; ".join(doubts)} if doubts else {}
     calibration, notes["log.start"] = with_measured_start(calibration, blocks)
-    name = name or spelt(found["imu"].file.path.stem if isinstance(config, Mapping) else Path(config).stem)
+    name = name or spelt(
+        found["imu"].file.path.stem
+        if isinstance(config, Mapping)
+        else Path(config).stem
+    )
     return Sequence(name=name, calibration=calibration, notes=notes, **blocks)
 
 
@@ -224,17 +283,28 @@ def _said(one: CsvRole) -> list[str]:
     """What the configuration says of a role, for the notes."""
     base = type(one.adapter).model_construct(type="csv", stamp=STAMP)
     said = {key: getattr(one.adapter, key) for key in type(one.adapter).model_fields}
-    return plain_lines({key: value for key, value in said.items() if value != getattr(base, key, None)})
+    return plain_lines(
+        {key: value for key, value in said.items() if value != getattr(base, key, None)}
+    )
 
 
 def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
     """Rows of the file that plays a role."""
     wanted = one.form.file
     if wanted is None and len(files) != 1:
-        raise LogError(f"{source}: [{one.role}] file: is missing; expected one of {', '.join(files) or 'no files'}")
+        raise LogError(
+            f"{source}: [{one.role}] file: is missing; expected one of {', '.join(files) or 'no files'}"
+        )
     if wanted is not None and wanted not in files:
         same = next((name for name in files if name.lower() == wanted.lower()), None)
-        beside = next((path for given in files.values() if (path := given.parent / wanted).is_file()), wanted)
+        beside = next(
+            (
+                path
+                for given in files.values()
+                if (path := given.parent / wanted).is_file()
+            ),
+            wanted,
+        )
         hint = f"did you mean {same!r}?" if same else f"add {beside} to the command;"
         raise LogError(
             f"{source}: [{one.role}] file: {wanted} is not among the tables; {hint} given: {', '.join(files)}"
@@ -256,12 +326,22 @@ def table_files(given: Iterable[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in given:
         if not path.exists():
-            raise LogError(f"{path}: there is no such file; give the tables, or the folder that holds them")
-        inside = sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
+            raise LogError(
+                f"{path}: there is no such file; give the tables, or the folder that holds them"
+            )
+        inside = (
+            sorted(one for one in path.iterdir() if one.is_file())
+            if path.is_dir()
+            else [path]
+        )
         if not inside:
-            raise LogError(f"{path}: holds no files; give the folder that holds the tables")
+            raise LogError(
+                f"{path}: holds no files; give the folder that holds the tables"
+            )
         for one in inside:
             if one.name in found and not found[one.name].samefile(one):
-                raise LogError(f"{one} and {found[one.name]} share a name; rename one, a table says `file` by name")
+                raise LogError(
+                    f"{one} and {found[one.name]} share a name; rename one, a table says `file` by name"
+                )
             found[one.name] = one
     return found

@@ -78,39 +78,65 @@ class CsvFile:
     def _lines(self) -> Iterator[tuple[int, str]]:
         """Number and text of each line with content, without its end."""
         if self.path.is_dir():
-            raise LogError(f"{self.path}: is a folder; expected a text file with a table")
+            raise LogError(
+                f"{self.path}: is a folder; expected a text file with a table"
+            )
         try:
-            with regular(self.path).open(encoding=self.form.encoding, errors="replace", newline=None) as stream:
+            with regular(self.path).open(
+                encoding=self.form.encoding, errors="replace", newline=None
+            ) as stream:
                 for number, line in enumerate(stream, 1):
                     if "\0" in line:
-                        raise LogError(f"{self.path}, line {number}: is no text; expected a table of numbers")
+                        raise LogError(
+                            f"{self.path}, line {number}: is no text; expected a table of numbers"
+                        )
                     if line.strip():
                         yield number, line.rstrip("\r\n").lstrip("\ufeff")
         except (OSError, LookupError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise LogError(f"{self.path}: cannot be read: {reason}; expected a text file with a table") from error
+            raise LogError(
+                f"{self.path}: cannot be read: {reason}; expected a text file with a table"
+            ) from error
 
     def _find_layout(self) -> CsvLayout:
         heads: list[str] = []
         comments: list[str] = []
         for number, line in self._lines():
             if line.lstrip().startswith(self.form.comment):
-                comments.append(line.lstrip().lstrip("".join(self.form.comment)).strip())
+                comments.append(
+                    line.lstrip().lstrip("".join(self.form.comment)).strip()
+                )
                 continue
-            delimiter = _DELIMITERS.get(self.form.delimiter or "", self.form.delimiter) or _delimiter_of(
-                line, self.form.decimal
-            )
+            delimiter = _DELIMITERS.get(
+                self.form.delimiter or "", self.form.delimiter
+            ) or _delimiter_of(line, self.form.decimal)
             cells = split(line, delimiter)
             if any(is_value(cell, self.form.decimal) for cell in cells):
                 return self._named(delimiter, number, cells, heads, comments)
             heads.append(line)
-        if heads and any(is_value(cell, ",") for cell in split(heads[-1], _delimiter_of(heads[-1], ","))):
-            raise LogError(f'{self.path}: has no line with numbers like 1.5; numbers like 1,5 need decimal = ","')
+        if heads and any(
+            is_value(cell, ",")
+            for cell in split(heads[-1], _delimiter_of(heads[-1], ","))
+        ):
+            raise LogError(
+                f'{self.path}: has no line with numbers like 1.5; numbers like 1,5 need decimal = ","'
+            )
         if heads:
-            raise LogError(f"{self.path}: has no line with numbers after the header {heads[0]!r:.80}: it is empty")
-        raise LogError(f"{self.path}: has no line with numbers; expected a table, one row a line")
+            raise LogError(
+                f"{self.path}: has no line with numbers after the header {heads[0]!r:.80}: it is empty"
+            )
+        raise LogError(
+            f"{self.path}: has no line with numbers; expected a table, one row a line"
+        )
 
-    def _named(self, delimiter: str, number: int, cells: list[str], heads: list[str], comments: list[str]) -> CsvLayout:
+    def _named(
+        self,
+        delimiter: str,
+        number: int,
+        cells: list[str],
+        heads: list[str],
+        comments: list[str],
+    ) -> CsvLayout:
         """Layout with the names that fit the number of cells."""
         numbers, count = tuple(str(k + 1) for k in range(len(cells))), len(cells)
         if self.form.columns is not None:
@@ -121,17 +147,28 @@ class CsvFile:
             return CsvLayout(delimiter, self.form.columns, number, tuple(cells))
         if heads:
             found = [split(head, delimiter) for head in heads]
-            names = [" ".join(filter(None, parts)) for parts in zip(*found, strict=False)]
+            names = [
+                " ".join(filter(None, parts)) for parts in zip(*found, strict=False)
+            ]
             if len(names) != count:
                 raise LogError(
                     f"{self.path}, line {number}: has {count} cells, and the header names {len(names)} columns; "
                     f"put the header right, or leave it out and name the columns by number"
                 )
             return CsvLayout(delimiter, _told_apart(names), number, tuple(cells))
-        for comment in reversed([comment for comment in comments if len(split(comment, _delimiter_of(comment))) > 1]):
+        for comment in reversed(
+            [
+                comment
+                for comment in comments
+                if len(split(comment, _delimiter_of(comment))) > 1
+            ]
+        ):
             names = split(comment, _delimiter_of(comment))
-            without = [name for name in names if not name.startswith("[")]  # "[idSensor]": may be absent
-            if fitting := next((some for some in (names, without) if len(some) == count), None):
+            # "[idSensor]": may be absent
+            without = [name for name in names if not name.startswith("[")]
+            if fitting := next(
+                (some for some in (names, without) if len(some) == count), None
+            ):
                 return CsvLayout(delimiter, _told_apart(fitting), number, tuple(cells))
             said = f"its comment names {len(names)} columns, the lines have {count}: {comment}"
             return CsvLayout(delimiter, numbers, number, tuple(cells), said)
@@ -148,13 +185,21 @@ class CsvFile:
         if name.isdecimal() and 1 <= int(name) <= len(names):
             return int(name) - 1
         if name.isdecimal():
-            raise LogError(f"{self.path}: has no column {name} ({key}); it has {len(names)}, numbered from 1")
+            raise LogError(
+                f"{self.path}: has no column {name} ({key}); it has {len(names)}, numbered from 1"
+            )
         close = get_close_matches(name, names, 1)
         hint = f"did you mean {close[0]!r}? " if close else ""
-        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        more = (
+            f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        )
         raise LogError(
             f"{self.path}: has no column {name!r} ({key}); {hint}it has {', '.join(names[:_MOST_NAMED])}{more}"
-            + ("" if self.layout.is_named else ": without a header they are numbered from 1")
+            + (
+                ""
+                if self.layout.is_named
+                else ": without a header they are numbered from 1"
+            )
         )
 
     def columns(self, indices: list[int]) -> tuple[Ints, list[list[str]]]:
@@ -166,7 +211,9 @@ class CsvFile:
         lines: list[int] = []
         found: list[list[str]] = [[] for _ in indices]
         for number, line in self._lines():
-            if number < layout.first_line or line.lstrip().startswith(self.form.comment):
+            if number < layout.first_line or line.lstrip().startswith(
+                self.form.comment
+            ):
                 continue
             cells = split(line, layout.delimiter)
             if len(cells) != count:
@@ -193,14 +240,18 @@ class CsvTable(FieldTable):
     ) -> None:
         """``paths``: key of the configuration by column; ``stamp``: None where rows have no time."""
         self.file, self._role, self.source = file, role, file.path.name
-        wanted = {path: file.index(path, f"[{role}] {key}") for path, key in paths.items()}
+        wanted = {
+            path: file.index(path, f"[{role}] {key}") for path, key in paths.items()
+        }
         at = [file.index(stamp, f"[{role}] stamp")] if stamp is not None else []
         self._lines, cells = file.columns([*wanted.values(), *at])
         self._cells = dict(zip(wanted, cells, strict=False))
         self._values: dict[str, Floats] = {}
         self.stamps_ns = np.zeros(len(self._lines), np.int64)
         if stamp is not None:
-            self.stamps_ns = self._stamps(stamp, cells[-1], unit_s) + round(offset_s * NS_PER_S)
+            self.stamps_ns = self._stamps(stamp, cells[-1], unit_s) + round(
+                offset_s * NS_PER_S
+            )
 
     def column(self, path: str) -> Floats:
         """A column of numbers, shape (n,); NaN for empty cells. A LogError names the line of any other."""
@@ -208,12 +259,19 @@ class CsvTable(FieldTable):
             cells = self._cells[path]
             if self.file.form.decimal != ".":
                 cells = [cell.replace(self.file.form.decimal, ".") for cell in cells]
-            plain = ["nan" if cell.lower() in _EMPTY else _TRUTHS.get(cell.lower(), cell) for cell in cells]
+            plain = [
+                "nan" if cell.lower() in _EMPTY else _TRUTHS.get(cell.lower(), cell)
+                for cell in cells
+            ]
             try:
                 self._values[path] = np.array(plain, dtype=np.float64)
             except ValueError:
                 row = next(k for k, cell in enumerate(plain) if not _is_number(cell))
-                decimal = '; decimal = "," where numbers are written so' if "," in plain[row] else ""
+                decimal = (
+                    '; decimal = "," where numbers are written so'
+                    if "," in plain[row]
+                    else ""
+                )
                 raise LogError(
                     f"{self.file.path}, line {self._lines[row]}: column {path}: {self._cells[path][row]!r} is no "
                     f"number; expected one, or nothing where it was not measured{decimal}"
@@ -227,14 +285,20 @@ class CsvTable(FieldTable):
     def _stamps(self, name: str, cells: list[str], unit_s: float) -> Ints:
         """Nanoseconds of decimal numbers, rounded once, or of dates with times; a LogError names the first other."""
         unit_ns = Decimal(repr(unit_s)) * NS_PER_S
-        is_date = bool(cells) and not _is_number(cells[0].replace(self.file.form.decimal, "."))
+        is_date = bool(cells) and not _is_number(
+            cells[0].replace(self.file.form.decimal, ".")
+        )
         stamps = np.empty(len(cells), np.int64)
         for row, cell in enumerate(cells):
             try:
                 if is_date:
                     stamps[row] = date_ns(cell)
                 else:
-                    number = cell if self.file.form.decimal == "." else cell.replace(self.file.form.decimal, ".")
+                    number = (
+                        cell
+                        if self.file.form.decimal == "."
+                        else cell.replace(self.file.form.decimal, ".")
+                    )
                     stamps[row] = int((Decimal(number) * unit_ns).to_integral_value())
             except (InvalidOperation, ValueError, OverflowError):
                 raise LogError(
@@ -252,7 +316,9 @@ def split(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
     cells = (
-        next(csv.reader([line], delimiter=delimiter, skipinitialspace=True)) if '"' in line else line.split(delimiter)
+        next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+        if '"' in line
+        else line.split(delimiter)
     )
     cells = [cell.strip() for cell in cells]
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
@@ -260,7 +326,14 @@ def split(line: str, delimiter: str) -> list[str]:
 
 def _delimiter_of(line: str, decimal: str = ".") -> str:
     """The first of tab, semicolon and comma that a line has, else white space."""
-    return next((delimiter for delimiter in "\t;," if delimiter in line and delimiter != decimal), " ")
+    return next(
+        (
+            delimiter
+            for delimiter in "\t;,"
+            if delimiter in line and delimiter != decimal
+        ),
+        " ",
+    )
 
 
 def is_value(cell: str, decimal: str = ".") -> bool:
@@ -289,9 +362,13 @@ def date_ns(text: str) -> int:
         raise ValueError(f"{text!r} is no date with a time")
     whole, fraction, zone = parts.groups()
     when = datetime.fromisoformat(whole + (zone or ""))
-    since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(
+        1970, 1, 1, tzinfo=UTC
+    )
     seconds = since.days * 86_400 + since.seconds
-    return seconds * NS_PER_S + int((Decimal(fraction or 0) * NS_PER_S).to_integral_value())
+    return seconds * NS_PER_S + int(
+        (Decimal(fraction or 0) * NS_PER_S).to_integral_value()
+    )
 
 
 def plain_name(name: str) -> str:
@@ -301,4 +378,7 @@ def plain_name(name: str) -> str:
 
 def _told_apart(names: list[str]) -> tuple[str, ...]:
     """Names of which each occurs once: a repeated or empty one is replaced by its number."""
-    return tuple(name if name and names.count(name) == 1 else str(k + 1) for k, name in enumerate(names))
+    return tuple(
+        name if name and names.count(name) == 1 else str(k + 1)
+        for k, name in enumerate(names)
+    )

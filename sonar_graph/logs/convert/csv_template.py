@@ -10,25 +10,95 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.adapters import ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES
+from sonar_graph.logs.adapters import (
+    ANGLES,
+    FORCES,
+    LENGTHS,
+    PRESSURES,
+    RATES,
+    SPEEDS,
+    TIMES,
+)
 from sonar_graph.logs.convert.csv_log import table_files
 from sonar_graph.logs.convert.csv_table import CsvFile, date_ns, is_value, plain_name
 from sonar_graph.settings import toml_value
 
 _SPELLINGS = {
-    **{"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radians": "rad"},
-    **{"deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs": "deg/s", "deg_s": "deg/s", "rad/s": "rad/s"},
-    **{"rad_s": "rad/s", "rads": "rad/s", "mrad/s": "mrad/s", "m/s2": "m/s2", "m/s^2": "m/s2", "m/s²": "m/s2"},
-    **{"m_s2": "m/s2", "g": "g", "mg": "mg", "m/s": "m/s", "mps": "m/s", "m_s": "m/s", "cm/s": "cm/s"},
-    **{"cm_s": "cm/s", "mm/s": "mm/s", "mm_s": "mm/s", "mmps": "mm/s", "km/h": "km/h", "kn": "kn", "knots": "kn"},
-    **{"m": "m", "cm": "cm", "mm": "mm", "ft": "ft", "pa": "Pa", "hpa": "hPa", "mbar": "mbar", "kpa": "kPa"},
-    **{"dbar": "dbar", "bar": "bar", "psi": "psi", "s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us"},
+    **{
+        "deg": "deg",
+        "degree": "deg",
+        "degrees": "deg",
+        "°": "deg",
+        "rad": "rad",
+        "radians": "rad",
+    },
+    **{
+        "deg/s": "deg/s",
+        "°/s": "deg/s",
+        "dps": "deg/s",
+        "degs": "deg/s",
+        "deg_s": "deg/s",
+        "rad/s": "rad/s",
+    },
+    **{
+        "rad_s": "rad/s",
+        "rads": "rad/s",
+        "mrad/s": "mrad/s",
+        "m/s2": "m/s2",
+        "m/s^2": "m/s2",
+        "m/s²": "m/s2",
+    },
+    **{
+        "m_s2": "m/s2",
+        "g": "g",
+        "mg": "mg",
+        "m/s": "m/s",
+        "mps": "m/s",
+        "m_s": "m/s",
+        "cm/s": "cm/s",
+    },
+    **{
+        "cm_s": "cm/s",
+        "mm/s": "mm/s",
+        "mm_s": "mm/s",
+        "mmps": "mm/s",
+        "km/h": "km/h",
+        "kn": "kn",
+        "knots": "kn",
+    },
+    **{
+        "m": "m",
+        "cm": "cm",
+        "mm": "mm",
+        "ft": "ft",
+        "pa": "Pa",
+        "hpa": "hPa",
+        "mbar": "mbar",
+        "kpa": "kPa",
+    },
+    **{
+        "dbar": "dbar",
+        "bar": "bar",
+        "psi": "psi",
+        "s": "s",
+        "sec": "s",
+        "ms": "ms",
+        "us": "us",
+        "µs": "us",
+    },
     **{"usec": "us", "ns": "ns", "nsec": "ns", "min": "min"},
 }
 """Units as headers write them, in small letters, by their names in a log configuration."""
-_RATE, _FORCE = r"gyr|omega|angular_?vel|(?:ang|turn|angular)_?rate|^rate|^w$", r"acc|force|^a$|^f$"
+_RATE, _FORCE = (
+    r"gyr|omega|angular_?vel|(?:ang|turn|angular)_?rate|^rate|^w$",
+    r"acc|force|^a$|^f$",
+)
 _VELOCITY, _PLACE = r"vel|speed|^v$|dvl|bottom", r"pos|^$|^p$|^t$|translation|location"
-_TRUTH, _MAP, _FIX = r"truth|ground|^gt|_gt|reference|mocap", r"landmark|beacon|marker|target|map", r"gps|gnss|usbl|fix"
+_TRUTH, _MAP, _FIX = (
+    r"truth|ground|^gt|_gt|reference|mocap",
+    r"landmark|beacon|marker|target|map",
+    r"gps|gnss|usbl|fix",
+)
 _TIME = r"^(t|time|stamp|timestamp|unix|epoch|secs?|seconds|utc|datetime|date)$|time_?stamp|^time"
 _OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
 _LAST_S = 1e10
@@ -107,13 +177,27 @@ def csv_template(tables: list[Path]) -> str:
 
 
 _EMPTY = {
-    "imu": ['angular_velocity = ["...", "...", "..."]', 'linear_acceleration = ["...", "...", "..."]'],
+    "imu": [
+        'angular_velocity = ["...", "...", "..."]',
+        'linear_acceleration = ["...", "...", "..."]',
+    ],
     "dvl": ['velocity = ["...", "...", "..."]'],
-    "depth": ['height = "..."', "scale = -1  # of a depth, downwards; or pressure = ..."],
-    "heading": ['yaw = "..."', 'scale = "deg"', 'world = "ned"  # a bearing, clockwise from north'],
-    "positions": ['geodetic = {latitude = "...", longitude = "..."}  # or position = [x, y, z]'],
+    "depth": [
+        'height = "..."',
+        "scale = -1  # of a depth, downwards; or pressure = ...",
+    ],
+    "heading": [
+        'yaw = "..."',
+        'scale = "deg"',
+        'world = "ned"  # a bearing, clockwise from north',
+    ],
+    "positions": [
+        'geodetic = {latitude = "...", longitude = "..."}  # or position = [x, y, z]'
+    ],
     "detections": ['range = "..."', 'azimuth = "..."', 'ids = ["..."]'],
-    "truth": ['position = ["...", "...", "..."]  # or geodetic = {latitude = ..., longitude = ...}'],
+    "truth": [
+        'position = ["...", "...", "..."]  # or geodetic = {latitude = ..., longitude = ...}'
+    ],
     "true_landmarks": ['id = "..."', 'position = ["...", "...", "..."]'],
 }
 """Keys to fill in, of roles that nothing was found for."""
@@ -121,51 +205,89 @@ _EMPTY = {
 
 def _listing(name: str, file: CsvFile) -> str:
     layout = file.layout
-    lines = [f"# {name}: {len(layout.names)} columns" + f"; {layout.remark}" * bool(layout.remark)]
-    for number, (column, first) in enumerate(zip(layout.names, layout.first, strict=True), 1):
-        lines.append(f"#   {number:2d}  {column + ' = ' if layout.is_named else ''}{first}")
+    lines = [
+        f"# {name}: {len(layout.names)} columns"
+        + f"; {layout.remark}" * bool(layout.remark)
+    ]
+    for number, (column, first) in enumerate(
+        zip(layout.names, layout.first, strict=True), 1
+    ):
+        lines.append(
+            f"#   {number:2d}  {column + ' = ' if layout.is_named else ''}{first}"
+        )
     return "\n".join(lines)
 
 
 def _guess(name: str, file: CsvFile) -> Iterator[_Guess]:
     """Roles that a file may play."""
-    columns, is_truth = [_column(column) for column in file.layout.names], bool(re.search(_TRUTH, name.lower()))
-    stamp, where, forces = _stamp(columns, file), _where(columns, file), _triple(columns, _FORCE)
+    columns, is_truth = (
+        [_column(column) for column in file.layout.names],
+        bool(re.search(_TRUTH, name.lower())),
+    )
+    stamp, where, forces = (
+        _stamp(columns, file),
+        _where(columns, file),
+        _triple(columns, _FORCE),
+    )
     motion = _motion(columns, forces, is_truth=is_truth)
     if motion:
         yield _Guess(motion[0], name, [*stamp, *motion[1]])
-    spread, bearing = _one(columns, r"range|distance|^r$"), _one(columns, r"azimuth|bearing")
+    spread, bearing = (
+        _one(columns, r"range|distance|^r$"),
+        _one(columns, r"azimuth|bearing"),
+    )
     label = _one(columns, r"^id$|_id$|label|class|landmark|beacon")
     if spread and bearing:
-        yield _Guess("detections", name, [*stamp, *_detections(columns, spread, bearing, label)])
+        yield _Guess(
+            "detections", name, [*stamp, *_detections(columns, spread, bearing, label)]
+        )
         return
     turn = _named(columns, "q_?x", "q_?y", "q_?z", "q_?w")
     angles = _named(columns, "roll|phi", "pitch|theta", "yaw|psi|heading")
     if where and label and _place(columns):
-        yield _Guess("true_landmarks", name, [f"id = {toml_value(label.given)}", *where])
-    elif where and (is_truth or ((turn or angles) and not re.search(_FIX, name.lower()) and not forces)):
+        yield _Guess(
+            "true_landmarks", name, [f"id = {toml_value(label.given)}", *where]
+        )
+    elif where and (
+        is_truth
+        or ((turn or angles) and not re.search(_FIX, name.lower()) and not forces)
+    ):
         yield _Guess("truth", name, [*stamp, *where, *_orientation(turn, angles)])
         return
     elif where:
         place = _place(columns)
-        is_metric = where[0].startswith("geodetic") or (place is not None and place[0].unit in LENGTHS)
+        is_metric = where[0].startswith("geodetic") or (
+            place is not None and place[0].unit in LENGTHS
+        )
         doubt = "" if is_metric or not motion or motion[0] != "imu" else _OF_IMU
         yield _Guess("positions", name, [*stamp, *where], doubt)
     if depth := _one(columns, r"depth") or _one(columns, r"press"):
         yield _Guess("depth", name, [*stamp, *_depth(depth)])
     if yaw := _one(columns, r"^(yaw|heading|compass|hdg|psi)"):
-        lines = [f"yaw = {toml_value(yaw.given)}", *_scale("scale", yaw, ANGLES), 'world = "ned"']
+        lines = [
+            f"yaw = {toml_value(yaw.given)}",
+            *_scale("scale", yaw, ANGLES),
+            'world = "ned"',
+        ]
         yield _Guess("heading", name, [*stamp, *lines])
 
 
-def _motion(columns: list[_Column], forces: list[_Column] | None, *, is_truth: bool) -> tuple[str, list[str]] | None:
+def _motion(
+    columns: list[_Column], forces: list[_Column] | None, *, is_truth: bool
+) -> tuple[str, list[str]] | None:
     """Role and lines of an IMU, else of a Doppler log: velocities beside a truth are true ones."""
     rates = _triple(columns, _RATE) or _named(columns, "p", "q", "r")
     velocity = _triple(columns, _VELOCITY) or _named(columns, "u", "v", "w")
     if forces and (chosen := rates or velocity):
         doubt = "" if rates else "  # by their place; are these rates?"
-        lines = [_list("angular_velocity", chosen) + doubt, *_scale("angular_velocity_scale", chosen[0], RATES)]
-        lines += [_list("linear_acceleration", forces), *_scale("linear_acceleration_scale", forces[0], FORCES)]
+        lines = [
+            _list("angular_velocity", chosen) + doubt,
+            *_scale("angular_velocity_scale", chosen[0], RATES),
+        ]
+        lines += [
+            _list("linear_acceleration", forces),
+            *_scale("linear_acceleration_scale", forces[0], FORCES),
+        ]
         return "imu", [*lines, '# rotation = "frd"  # where gravity is felt along -z']
     if velocity and not is_truth:
         lines = [_list("velocity", velocity), *_scale("scale", velocity[0], SPEEDS)]
@@ -175,9 +297,14 @@ def _motion(columns: list[_Column], forces: list[_Column] | None, *, is_truth: b
     return None
 
 
-def _detections(columns: list[_Column], spread: _Column, bearing: _Column, label: _Column | None) -> list[str]:
+def _detections(
+    columns: list[_Column], spread: _Column, bearing: _Column, label: _Column | None
+) -> list[str]:
     """Lines of ranges and azimuths, with what is said of their identities."""
-    sure, track = _one(columns, r"prob|posterior|score|confidence"), _one(columns, r"track")
+    sure, track = (
+        _one(columns, r"prob|posterior|score|confidence"),
+        _one(columns, r"track"),
+    )
     return [
         f"range = {toml_value(spread.given)}",
         *_scale("range_scale", spread, LENGTHS),
@@ -203,28 +330,44 @@ def _where(columns: list[_Column], file: CsvFile) -> list[str]:
         height = _one(columns, r"^(alt|height)")
         more = f", height = {toml_value(height.given)}" if height else ""
         first = file.layout.first[columns.index(latitude)]
-        more += ', unit = "ddmm.mmmm"' if is_value(first) and abs(float(first)) > 90 else ""
+        more += (
+            ', unit = "ddmm.mmmm"' if is_value(first) and abs(float(first)) > 90 else ""
+        )
         return [
             f"geodetic = {{latitude = {toml_value(latitude.given)}, longitude = {toml_value(longitude.given)}{more}}}"
         ]
     if place := _place(columns):
         return [_list("position", place), *_scale("scale", place[0], LENGTHS)]
     down = _named(columns, "north|n", "east|e", "down|d")
-    return [_list("position", down), *_scale("scale", down[0], LENGTHS), 'world = "ned"'] if down else []
+    return (
+        [_list("position", down), *_scale("scale", down[0], LENGTHS), 'world = "ned"']
+        if down
+        else []
+    )
 
 
 def _depth(column: _Column) -> list[str]:
     """Lines of a depth or a pressure."""
     if column.unit in PRESSURES or "press" in column.name:
-        return [f"pressure = {toml_value(column.given)}", *_scale("scale", column, PRESSURES)]
+        return [
+            f"pressure = {toml_value(column.given)}",
+            *_scale("scale", column, PRESSURES),
+        ]
     factor = LENGTHS.get(column.unit or "m", 1.0)
-    return [f"height = {toml_value(column.given)}", f"scale = {-factor:g}  # downwards, to metres up"]
+    return [
+        f"height = {toml_value(column.given)}",
+        f"scale = {-factor:g}  # downwards, to metres up",
+    ]
 
 
 def _orientation(turn: list[_Column] | None, angles: list[_Column] | None) -> list[str]:
     if turn:
         return [_list("orientation", turn)]
-    return [_list("rpy", angles), *_scale("rpy_scale", angles[0], ANGLES)] if angles else []
+    return (
+        [_list("rpy", angles), *_scale("rpy_scale", angles[0], ANGLES)]
+        if angles
+        else []
+    )
 
 
 def _stamp(columns: list[_Column], file: CsvFile) -> list[str]:
@@ -244,8 +387,14 @@ def _stamp(columns: list[_Column], file: CsvFile) -> list[str]:
         return lines
     unit = column.unit if column.unit in TIMES else None
     if unit is None:
-        unit = next((name for name in ("s", "ms", "us", "ns") if value * TIMES[name] < _LAST_S), None)
-    return [*lines, *([f"stamp_unit_s = {toml_value(unit)}"] if unit and unit != "s" else [])]
+        unit = next(
+            (name for name in ("s", "ms", "us", "ns") if value * TIMES[name] < _LAST_S),
+            None,
+        )
+    return [
+        *lines,
+        *([f"stamp_unit_s = {toml_value(unit)}"] if unit and unit != "s" else []),
+    ]
 
 
 def _column(given: str) -> _Column:
@@ -265,17 +414,29 @@ def _triple(columns: list[_Column], pattern: str) -> list[_Column] | None:
     """Columns x, y, z of one quantity whose name without the axis fits a pattern."""
     stems: dict[str, dict[str, _Column]] = {}
     for column in columns:
-        if match := re.fullmatch(r"(.*?)_?([xyz])(?:_?axis)?|([xyz])_(.*)", column.name):
+        if match := re.fullmatch(
+            r"(.*?)_?([xyz])(?:_?axis)?|([xyz])_(.*)", column.name
+        ):
             stem, axis = (match[1], match[2]) if match[2] else (match[4], match[3])
             stems.setdefault(stem, {})[axis] = column
-    found = [axes for stem, axes in stems.items() if len(axes) == 3 and re.search(pattern, stem)]
-    found.sort(key=lambda axes: "bottom" not in axes["x"].name)  # velocity over the bottom before that through water
+    found = [
+        axes
+        for stem, axes in stems.items()
+        if len(axes) == 3 and re.search(pattern, stem)
+    ]
+    # velocity over the bottom before that through water
+    found.sort(key=lambda axes: "bottom" not in axes["x"].name)
     return [found[0][axis] for axis in "xyz"] if found else None
 
 
 def _named(columns: list[_Column], *patterns: str) -> list[_Column] | None:
     """Columns whose whole names fit patterns, one each."""
-    found = [next((c for c in columns if re.fullmatch(f"(?:.*_)?(?:{pattern})", c.name)), None) for pattern in patterns]
+    found = [
+        next(
+            (c for c in columns if re.fullmatch(f"(?:.*_)?(?:{pattern})", c.name)), None
+        )
+        for pattern in patterns
+    ]
     chosen = [column for column in found if column is not None]
     return chosen if len(chosen) == len(patterns) else None
 
@@ -291,5 +452,11 @@ def _list(key: str, columns: list[_Column]) -> str:
 def _scale(key: str, column: _Column, units: dict[str, float]) -> list[str]:
     """Line with the unit, where the header states another than that of this package."""
     if column.unit not in units or units[column.unit] == 1.0:
-        return [] if column.unit in units else [f"# {key} = {toml_value(list(units)[1])}  # the header states no unit"]
+        return (
+            []
+            if column.unit in units
+            else [
+                f"# {key} = {toml_value(list(units)[1])}  # the header states no unit"
+            ]
+        )
     return [f"{key} = {toml_value(column.unit)}"]

@@ -38,7 +38,11 @@ MAGIC = b"DDF"
 
 
 def convert_didson(
-    path: Path, output: Path, progress: Progress | None = None, *, sound_speed_m_s: float | None = None
+    path: Path,
+    output: Path,
+    progress: Progress | None = None,
+    *,
+    sound_speed_m_s: float | None = None,
 ) -> SonarConversion:
     """Write an MCAP log with all whole frames of a ``.ddf`` file.
 
@@ -59,10 +63,14 @@ def convert_didson(
         When the log cannot be written.
     """
     with ByteSource(Path(path)) as source:
-        return convert_sonar_file(source, DidsonFormat(source, sound_speed_m_s), Path(output), progress)
+        return convert_sonar_file(
+            source, DidsonFormat(source, sound_speed_m_s), Path(output), progress
+        )
 
 
-def convert_aris(path: Path, output: Path, progress: Progress | None = None) -> SonarConversion:
+def convert_aris(
+    path: Path, output: Path, progress: Progress | None = None
+) -> SonarConversion:
     """Write an MCAP log with all whole frames of an ``.aris`` file.
 
     Raises
@@ -80,19 +88,28 @@ class LensSonarFormat(SonarFormat):
     """Frames with a number in the first four bytes of their header, and a signature at byte 12."""
 
     signature_at = 12
-    readings_at: ClassVar = {"depth": 128, "altitude": 132, "pitch": 136, "roll": 144, "heading": 152}
+    readings_at: ClassVar = {
+        "depth": 128,
+        "altitude": 132,
+        "pitch": 136,
+        "roll": 144,
+        "heading": 152,
+    }
     """Offsets in the header of the readings of other sensors."""
 
     def head(self, content: bytes, at: int) -> FrameHead:
         """Header of a frame."""
         if len(content) < self.head_bytes:
-            raise DamagedFrameError(f"a frame cut off, {len(content)} bytes of its header are there")
+            raise DamagedFrameError(
+                f"a frame cut off, {len(content)} bytes of its header are there"
+            )
         if content[self.signature_at : self.signature_at + 4] != self.signature:
             raise DamagedFrameError("no frame begins here")
         (number,) = struct.unpack_from("<I", content, 0)
         clock_ns, samples, settings = self.fields(content, number)
         readings = {
-            name: float(struct.unpack_from("<f", content, where)[0]) for name, where in self.readings_at.items()
+            name: float(struct.unpack_from("<f", content, where)[0])
+            for name, where in self.readings_at.items()
         }
         size = self.head_bytes + self.beams(settings) * samples
         return FrameHead(at, size, number, clock_ns, settings, readings)
@@ -113,7 +130,11 @@ class LensSonarFormat(SonarFormat):
 
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
         """Image of a frame, shape (beams, bins)."""
-        return np.frombuffer(frame, np.uint8, offset=self.head_bytes).reshape(-1, self.beams(settings)).T
+        return (
+            np.frombuffer(frame, np.uint8, offset=self.head_bytes)
+            .reshape(-1, self.beams(settings))
+            .T
+        )
 
 
 HEADER_BYTES = {3: (512, 256), 4: (1024, 1024)}
@@ -145,33 +166,68 @@ _TIME_AT, _WINDOW_AT, _FLAGS_AT = 20, 52, 192
 class DidsonFormat(LensSonarFormat):
     """Headers, samples and geometry of a ``.ddf`` file."""
 
-    readings_at = LensSonarFormat.readings_at | {"pan": 160, "tilt": 164, "sonar roll": 168}
+    readings_at = LensSonarFormat.readings_at | {
+        "pan": 160,
+        "tilt": 164,
+        "sonar roll": 168,
+    }
 
-    def __init__(self, source: ByteSource, sound_speed_m_s: float | None = None) -> None:
+    def __init__(
+        self, source: ByteSource, sound_speed_m_s: float | None = None
+    ) -> None:
         start = source.read(0, len(MAGIC) + 1)
         if start[: len(MAGIC)] != MAGIC:
-            raise DatasetError(f"{source.path}: begins with {start!r}; a DIDSON recording begins with {MAGIC!r}")
+            raise DatasetError(
+                f"{source.path}: begins with {start!r}; a DIDSON recording begins with {MAGIC!r}"
+            )
         self._version = start[-1] if len(start) > len(MAGIC) else 0
         if self._version not in HEADER_BYTES:
-            advice = "use `convert aris`" if self._version == 5 else "versions 3 and 4 are read"
-            raise DatasetError(f"{source.path}: is of DDF version {self._version}; {advice}")
+            advice = (
+                "use `convert aris`"
+                if self._version == 5
+                else "versions 3 and 4 are read"
+            )
+            raise DatasetError(
+                f"{source.path}: is of DDF version {self._version}; {advice}"
+            )
         self.first_at, self.head_bytes = HEADER_BYTES[self._version]
         header = source.read(0, self.first_at)
         if len(header) < self.first_at:
-            raise DatasetError(f"{source.path}: ends within its header of {self.first_at} bytes")
-        self.frames_promised, _, resolution, self._beams, _, self._samples = struct.unpack_from("<4ifi", header, 4)
+            raise DatasetError(
+                f"{source.path}: ends within its header of {self.first_at} bytes"
+            )
+        self.frames_promised, _, resolution, self._beams, _, self._samples = (
+            struct.unpack_from("<4ifi", header, 4)
+        )
         self._reverse, self._serial = struct.unpack_from("<2i", header, 40)
-        if self._beams not in BEAMS or resolution not in (0, 1) or not 0 < self._samples <= MOST_SAMPLES:
-            said = f"{self._beams} beams, {self._samples} samples, resolution {resolution}"
-            expected = f"48 or 96 beams, at most {MOST_SAMPLES} samples, resolution 0 or 1"
-            raise DatasetError(f"{source.path}: its header is damaged: it says {said}; expected {expected}")
+        if (
+            self._beams not in BEAMS
+            or resolution not in (0, 1)
+            or not 0 < self._samples <= MOST_SAMPLES
+        ):
+            said = (
+                f"{self._beams} beams, {self._samples} samples, resolution {resolution}"
+            )
+            expected = (
+                f"48 or 96 beams, at most {MOST_SAMPLES} samples, resolution 0 or 1"
+            )
+            raise DatasetError(
+                f"{source.path}: its header is damaged: it says {said}; expected {expected}"
+            )
         self._is_high = resolution == 1
         self._sound_speed_m_s = sound_speed_m_s or NOMINAL_SOUND_SPEED_M_S
         # frames usually repeat the file's version in their headers, and otherwise all have the same bytes there
         usual = MAGIC + bytes([self._version])
-        first_frames = source.read(len(usual), self.first_at + 2 * (self.head_bytes + self._beams * self._samples))
+        first_frames = source.read(
+            len(usual),
+            self.first_at + 2 * (self.head_bytes + self._beams * self._samples),
+        )
         is_usual = usual in first_frames
-        self.signature = usual if is_usual else source.read(self.first_at + self.signature_at, len(usual))
+        self.signature = (
+            usual
+            if is_usual
+            else source.read(self.first_at + self.signature_at, len(usual))
+        )
         self.image = SonarImage(scale="decibel", decibel_span=DIDSON_DECIBEL_SPAN)
         self.notes = {
             "source": f"DIDSON recording {source.path.name}, DDF version {self._version}",
@@ -192,16 +248,28 @@ class DidsonFormat(LensSonarFormat):
             flags = flags & (CLASSIC | LONG_RANGE) if self._version == 3 else 0
         shift = 0 if self._is_high else LOW_FREQUENCY_SHIFT
         if not 0 <= start <= 31 or not 0 <= length < len(LENGTHS_M[flags]) - shift:
-            raise DamagedFrameError(f"frame {number} with window codes {start} and {length}")
-        year, month, day, hour, minute, second, hundredths = struct.unpack_from("<7i", content, _TIME_AT)
+            raise DamagedFrameError(
+                f"frame {number} with window codes {start} and {length}"
+            )
+        year, month, day, hour, minute, second, hundredths = struct.unpack_from(
+            "<7i", content, _TIME_AT
+        )
         if not 1990 <= year <= LAST_YEAR or not 0 <= hundredths < 100:
-            raise DamagedFrameError(f"frame {number} of the year {year}, with {hundredths} hundredths of a second")
+            raise DamagedFrameError(
+                f"frame {number} of the year {year}, with {hundredths} hundredths of a second"
+            )
         try:
             moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
         except (ValueError, OverflowError) as error:
-            raise DamagedFrameError(f"frame {number} with a time that does not exist: {error}") from error
+            raise DamagedFrameError(
+                f"frame {number} with a time that does not exist: {error}"
+            ) from error
         clock_ns = round(moment.timestamp()) * 10**9 + hundredths * 10**7
-        return clock_ns, self._samples, (start, length, flags, self._beams, self._samples)
+        return (
+            clock_ns,
+            self._samples,
+            (start, length, flags, self._beams, self._samples),
+        )
 
     def beams(self, settings: Settings) -> int:
         """Number of beams, the same in all frames."""
@@ -212,14 +280,34 @@ class DidsonFormat(LensSonarFormat):
         start, length, flags, beams, samples = map(int, settings)
         scale = self._sound_speed_m_s / NOMINAL_SOUND_SPEED_M_S
         begin_m = start * START_STEP_M[flags] * (1 if self._is_high else 2) * scale
-        length_m = LENGTHS_M[flags][length + (0 if self._is_high else LOW_FREQUENCY_SHIFT)] * scale
-        ranges_m = begin_m + (np.arange(samples, dtype=float) + 0.5) * (length_m / samples)
+        length_m = (
+            LENGTHS_M[flags][length + (0 if self._is_high else LOW_FREQUENCY_SHIFT)]
+            * scale
+        )
+        ranges_m = begin_m + (np.arange(samples, dtype=float) + 0.5) * (
+            length_m / samples
+        )
         azimuths_rad = didson_azimuths(beams)[:: -1 if self._reverse else 1]
         frequency_hz = HIGH_FREQUENCY_HZ if self._is_high else LOW_FREQUENCY_HZ
-        return FrameGeometry(ranges_m, azimuths_rad, frequency_hz, self._sound_speed_m_s)
+        return FrameGeometry(
+            ranges_m, azimuths_rad, frequency_hz, self._sound_speed_m_s
+        )
 
 
-BEAMS_OF_PING_MODE = {1: 48, 2: 48, 3: 96, 4: 96, 5: 96, 6: 64, 7: 64, 8: 64, 9: 128, 10: 128, 11: 128, 12: 128}
+BEAMS_OF_PING_MODE = {
+    1: 48,
+    2: 48,
+    3: 96,
+    4: 96,
+    5: 96,
+    6: 64,
+    7: 64,
+    8: 64,
+    9: 128,
+    10: 128,
+    11: 128,
+    12: 128,
+}
 HALF_ANGLE_DEG, TELEPHOTO_HALF_ANGLE_DEG = 14.0, 7.0
 """Field of view for combinations of beams and lens without a table."""
 FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), 1: (1.8e6, 3.0e6), 2: (0.7e6, 1.2e6)}
@@ -237,12 +325,18 @@ class ArisFormat(LensSonarFormat):
 
     first_at = head_bytes = 1024
     signature = b"DDF\x05"
-    readings_at = LensSonarFormat.readings_at | {"compass heading": 160, "compass pitch": 164, "compass roll": 168}
+    readings_at = LensSonarFormat.readings_at | {
+        "compass heading": 160,
+        "compass pitch": 164,
+        "compass roll": 168,
+    }
     readings_at |= {"water temperature": 224, "pan": 244, "tilt": 248}
 
     def __init__(self, source: ByteSource) -> None:
         start = source.read(0, len(self.signature))
-        in_first_frame = source.read(self.first_at + self.signature_at, len(self.signature))
+        in_first_frame = source.read(
+            self.first_at + self.signature_at, len(self.signature)
+        )
         if self.signature not in (start, in_first_frame):
             expected = f"an ARIS recording begins with {self.signature!r}"
             raise DatasetError(f"{source.path}: begins with {start!r}; {expected}")
@@ -261,7 +355,9 @@ class ArisFormat(LensSonarFormat):
         These are ping mode, high frequency, sample period (µs), sound speed, samples, start delay (µs), lens, system.
         """
         (clock_us,) = struct.unpack_from("<Q", content, 20)
-        mode, high, _, _, period_us, _, _, sound_speed, samples = struct.unpack_from("<7IfI", content, 436)
+        mode, high, _, _, period_us, _, _, sound_speed, samples = struct.unpack_from(
+            "<7IfI", content, 436
+        )
         delay_us, lens, system = struct.unpack_from("<3I", content, 476)
         (in_order,) = struct.unpack_from("<I", content, 516)
         faults = {
@@ -272,14 +368,27 @@ class ArisFormat(LensSonarFormat):
             f"{samples} samples a beam": not 0 < samples <= 1 << 16,
             f"a sample period of {period_us} us": not 0 < period_us <= 1000,
             f"a start delay of {delay_us} us": delay_us > 1 << 20,
-            f"a sound speed of {sound_speed:g} m/s": not SOUND_SPEEDS_M_S[0] <= sound_speed <= SOUND_SPEEDS_M_S[1],
+            f"a sound speed of {sound_speed:g} m/s": not SOUND_SPEEDS_M_S[0]
+            <= sound_speed
+            <= SOUND_SPEEDS_M_S[1],
             "samples that are not in order": in_order == 0,
         }
         if any(faults.values()):
-            raise DamagedFrameError(f"a header with {', '.join(text for text, wrong in faults.items() if wrong)}")
+            raise DamagedFrameError(
+                f"a header with {', '.join(text for text, wrong in faults.items() if wrong)}"
+            )
         if clock_us > LAST_US:
             raise DamagedFrameError(f"frame {number} with a time of {clock_us} us")
-        settings = mode, high, period_us, float(sound_speed), samples, delay_us, lens, system
+        settings = (
+            mode,
+            high,
+            period_us,
+            float(sound_speed),
+            samples,
+            delay_us,
+            lens,
+            system,
+        )
         return clock_us * 1000, samples, settings
 
     def beams(self, settings: Settings) -> int:
@@ -288,11 +397,17 @@ class ArisFormat(LensSonarFormat):
 
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins by start delay, sample period and speed of sound."""
-        _, high, period_us, sound_speed, samples, delay_us, lens, system = map(float, settings)
+        _, high, period_us, sound_speed, samples, delay_us, lens, system = map(
+            float, settings
+        )
         beams, telephoto = self.beams(settings), bool(lens)
         azimuths = aris_azimuths(beams, telephoto=telephoto)
         if azimuths is None:
-            azimuths = even_azimuths(beams, TELEPHOTO_HALF_ANGLE_DEG if telephoto else HALF_ANGLE_DEG)
+            azimuths = even_azimuths(
+                beams, TELEPHOTO_HALF_ANGLE_DEG if telephoto else HALF_ANGLE_DEG
+            )
         middles_us = delay_us + (np.arange(int(samples), dtype=float) + 0.5) * period_us
         frequency_hz = FREQUENCIES_HZ[int(system)][int(high)]
-        return FrameGeometry(middles_us * _US * sound_speed / 2, azimuths, frequency_hz, sound_speed)
+        return FrameGeometry(
+            middles_us * _US * sound_speed / 2, azimuths, frequency_hz, sound_speed
+        )

@@ -21,7 +21,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarCalibration, Start
-from sonar_graph.logs.convert.planar import VERTICAL_VELOCITY_SIGMA_M_S, planar_calibration, planar_dvl, planar_imu
+from sonar_graph.logs.convert.planar import (
+    VERTICAL_VELOCITY_SIGMA_M_S,
+    planar_calibration,
+    planar_dvl,
+    planar_imu,
+)
 from sonar_graph.logs.convert.text_tables import NumberTable, numbered_run, read_table
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
@@ -63,19 +68,32 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     DatasetError
         When the folder or the robot does not exist, or a file is missing or malformed.
     """
-    prefix = str(numbered_run(dataset_dir, "RobotN_Odometry.dat", robot, "robot", FILES)).removesuffix("_Odometry.dat")
-    imu, dvl = _odometry(read_table(Path(f"{prefix}_Odometry.dat"), ("time", "forward velocity", "angular velocity")))
+    prefix = str(
+        numbered_run(dataset_dir, "RobotN_Odometry.dat", robot, "robot", FILES)
+    ).removesuffix("_Odometry.dat")
+    imu, dvl = _odometry(
+        read_table(
+            Path(f"{prefix}_Odometry.dat"),
+            ("time", "forward velocity", "angular velocity"),
+        )
+    )
     detections, left_out = _detections(
-        read_table(Path(f"{prefix}_Measurement.dat"), ("time", "bar code", "range", "bearing")),
+        read_table(
+            Path(f"{prefix}_Measurement.dat"), ("time", "bar code", "range", "bearing")
+        ),
         read_table(dataset_dir / "Barcodes.dat", ("subject", "bar code")),
     )
     truth, start = None, None
     if Path(f"{prefix}_Groundtruth.dat").exists():
-        table = read_table(Path(f"{prefix}_Groundtruth.dat"), ("time", "x", "y", "orientation"))
+        table = read_table(
+            Path(f"{prefix}_Groundtruth.dat"), ("time", "x", "y", "orientation")
+        )
         stamps_ns, rows = np.unique(table.stamps_ns(), return_index=True)
         x_m, y_m, heading_rad = table.values[rows, 1:].T
         quaternions = Rotation.from_euler("z", heading_rad[:, None]).as_quat()
-        truth = Trajectory.without_covariances(stamps_ns, np.column_stack([x_m, y_m, np.zeros(len(rows))]), quaternions)
+        truth = Trajectory.without_covariances(
+            stamps_ns, np.column_stack([x_m, y_m, np.zeros(len(rows))]), quaternions
+        )
         start_ns = int(imu.stamps_ns[0])
         if truth.stamps_ns[0] <= start_ns <= truth.stamps_ns[-1]:
             pose = truth.at(np.array([start_ns]))
@@ -89,25 +107,35 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     covariances[:, 0, 0], covariances[:, 1, 1] = values[:, 3] ** 2, values[:, 4] ** 2
     positions = np.column_stack([values[:, 1:3], np.zeros(len(values))])
     noises = (FORWARD_NOISE_M_SQRT_S, SIDEWAYS_NOISE_M_SQRT_S)
-    forward_sigma_m_s, sideways_sigma_m_s = (float(noise / np.sqrt(TYPICAL_INTERVAL_S)) for noise in noises)
+    forward_sigma_m_s, sideways_sigma_m_s = (
+        float(noise / np.sqrt(TYPICAL_INTERVAL_S)) for noise in noises
+    )
     return Sequence(
         name=f"{dataset_dir.resolve().name}_robot{robot}",
         calibration=planar_calibration(
             GYRO,
             (forward_sigma_m_s, sideways_sigma_m_s, VERTICAL_VELOCITY_SIGMA_M_S),
-            SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
+            SonarCalibration(
+                range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD
+            ),
             start,
         ),
         imu=imu,
         dvl=dvl,
         detections=detections,
         truth=truth,
-        true_landmarks=LandmarkMap(values[:, 0].astype(np.int64), positions, covariances),
+        true_landmarks=LandmarkMap(
+            values[:, 0].astype(np.int64), positions, covariances
+        ),
         notes={
             "data set": "UTIAS MRCLAM; Leung, Halpern, Barfoot, Liu, IJRR 30(8), 2011",
             "licence": "none stated; the authors ask to be cited",
-            "truth": "motion capture" if truth is not None else "of the landmarks only; this set has no robot truth",
-            "start": "true pose at the first odometry stamp" if start else "origin: no truth at the first stamp",
+            "truth": "motion capture"
+            if truth is not None
+            else "of the landmarks only; this set has no robot truth",
+            "start": "true pose at the first odometry stamp"
+            if start
+            else "origin: no truth at the first stamp",
             "odometry": "commanded velocities, each held until the next; "
             "the row at a stamp holds the command before it",
             "detections": left_out,
@@ -128,12 +156,17 @@ def _odometry(table: NumberTable) -> tuple[Imu, Dvl]:
     return planar_imu(stamps_ns, in_force[:, 1]), dvl
 
 
-def _detections(table: NumberTable, barcodes: NumberTable) -> tuple[LandmarkDetections | None, str]:
+def _detections(
+    table: NumberTable, barcodes: NumberTable
+) -> tuple[LandmarkDetections | None, str]:
     """Detections of landmarks in the order of time, and a note about those left out."""
     subjects = {int(barcode): int(subject) for subject, barcode in barcodes.values}
     stamps_ns = table.stamps_ns()
     order = np.argsort(stamps_ns, kind="stable")
-    seen = np.array([subjects.get(int(barcode), -1) for barcode in table.values[:, 1]], dtype=np.int64)
+    seen = np.array(
+        [subjects.get(int(barcode), -1) for barcode in table.values[:, 1]],
+        dtype=np.int64,
+    )
     of_robot = np.isin(seen, list(ROBOT_SUBJECTS))
     note = f"left out: {of_robot.sum()} of other robots, {(seen < 0).sum()} with unknown bar codes"
     rows = order[(~of_robot & (seen >= 0))[order]]

@@ -43,7 +43,11 @@ CLOCK_PERIOD_NS = 1 << 32
 second; in microseconds it would have one a minute."""
 FIRE = struct.Struct("<5B4d")
 """Mode, rate, network speed, gamma, flags; range, gain, speed of sound, salinity."""
-RESULTS = {0: struct.Struct("<2I4dIBd2H3I"), 1: struct.Struct("<2I4dIBd2H3I"), 2: struct.Struct("<2I8dBd2H4I3I")}
+RESULTS = {
+    0: struct.Struct("<2I4dIBd2H3I"),
+    1: struct.Struct("<2I4dIBd2H3I"),
+    2: struct.Struct("<2I8dBd2H4I3I"),
+}
 RESULT_AT = {0: 53, 1: 53, 2: 89}
 """Offset and fields of the result by version: number, status, frequency, temperature, pressure, (heading, pitch, roll),
 speed of sound, time, bytes a sample - 1, bin, ranges, beams, (spare), offset and size of the image, size of all."""
@@ -53,7 +57,9 @@ HAS_GAINS = 0b100
 GAIN_BYTES = 4
 
 
-def convert_oculus(path: Path, output: Path, progress: Progress | None = None) -> SonarConversion:
+def convert_oculus(
+    path: Path, output: Path, progress: Progress | None = None
+) -> SonarConversion:
     """Write an MCAP log with all whole pings of a recording.
 
     Raises
@@ -75,16 +81,27 @@ class OculusFormat(SonarFormat):
     signature, signature_at = SIGNATURE, 0
 
     def __init__(self, source: ByteSource) -> None:
-        first = next((head for head in plausible_headers(source, self, 0) if head.has_image), None)
+        first = next(
+            (head for head in plausible_headers(source, self, 0) if head.has_image),
+            None,
+        )
         if first is None:
-            raise DatasetError(f"{source.path}: holds no Oculus ping; give the sonar's network messages as recorded")
+            raise DatasetError(
+                f"{source.path}: holds no Oculus ping; give the sonar's network messages as recorded"
+            )
         wraps = first.settings[0] != 2
         self.clock_period_ns = CLOCK_PERIOD_NS if wraps else None
         sample_bytes = int(first.settings[4])
         code = int(first.settings[2])
         gamma = 1.0 if code in NO_GAMMA else code / 255
-        self.image = SonarImage(scale="linear", full_scale=2 ** (8 * sample_bytes) - 1, gamma=gamma)
-        clock = ", a 32-bit number taken as nanoseconds and continued where it wraps around" if wraps else ""
+        self.image = SonarImage(
+            scale="linear", full_scale=2 ** (8 * sample_bytes) - 1, gamma=gamma
+        )
+        clock = (
+            ", a 32-bit number taken as nanoseconds and continued where it wraps around"
+            if wraps
+            else ""
+        )
         self.notes = {
             "source": f"Oculus recording {source.path.name}",
             "sonar.time": f"since the sonar was switched on, not since 1970{clock}",
@@ -95,7 +112,9 @@ class OculusFormat(SonarFormat):
     def head(self, content: bytes, at: int) -> FrameHead:
         """Header of a message."""
         if len(content) < HEADER.size:
-            raise DamagedFrameError(f"a message cut off, {len(content)} bytes of its header are there")
+            raise DamagedFrameError(
+                f"a message cut off, {len(content)} bytes of its header are there"
+            )
         signature, _, _, kind, version, payload, _ = HEADER.unpack_from(content)
         if struct.pack("<H", signature) != SIGNATURE:
             raise DamagedFrameError("no message begins here")
@@ -106,26 +125,41 @@ class OculusFormat(SonarFormat):
         total = HEADER.size + payload
         start, layout = RESULT_AT[version], RESULTS[version]
         if len(content) < start + layout.size:
-            raise DamagedFrameError(f"a ping cut off, {len(content)} of {total} bytes are there")
+            raise DamagedFrameError(
+                f"a ping cut off, {len(content)} of {total} bytes are there"
+            )
         mode, _, _, gamma, flags, *_ = FIRE.unpack_from(content, HEADER.size)
-        number, _, frequency_hz, temperature, pressure, *others = layout.unpack_from(content, start)
+        number, _, frequency_hz, temperature, pressure, *others = layout.unpack_from(
+            content, start
+        )
         attitude = others[:3] if version == 2 else ()
-        sound_speed, clock, size_code, bin_m, ranges, beams = others[len(attitude) :][:6]
+        sound_speed, clock, size_code, bin_m, ranges, beams = others[len(attitude) :][
+            :6
+        ]
         offset, image_bytes, message_bytes = others[-3:]
         size = size_code + 1
         bearings_at = start + layout.size
         bearings = content[bearings_at : bearings_at + 2 * beams]
         row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
         if len(content) < min(total, bearings_at + 2 * beams):
-            raise DamagedFrameError(f"ping {number} cut off, {len(content)} of {total} bytes are there")
-        hundredths = np.frombuffer(bearings[: len(bearings) // 2 * 2], "<i2").astype(np.int64)
-        increase = bool(np.all(np.diff(hundredths) > 0) and np.abs(hundredths).max(initial=0) <= MOST_BEARING)
+            raise DamagedFrameError(
+                f"ping {number} cut off, {len(content)} of {total} bytes are there"
+            )
+        hundredths = np.frombuffer(bearings[: len(bearings) // 2 * 2], "<i2").astype(
+            np.int64
+        )
+        increase = bool(
+            np.all(np.diff(hundredths) > 0)
+            and np.abs(hundredths).max(initial=0) <= MOST_BEARING
+        )
         faults = {
             f"{size} bytes a sample": size not in (1, 2, 4),
             f"{beams} beams": not 0 < beams <= MOST_BEAMS,
             f"{ranges} ranges": ranges == 0,
-            f"an image of {image_bytes} bytes": image_bytes != ranges * (beams * size + row_gain),
-            f"a message of {message_bytes} bytes": message_bytes != total or offset + image_bytes > total,
+            f"an image of {image_bytes} bytes": image_bytes
+            != ranges * (beams * size + row_gain),
+            f"a message of {message_bytes} bytes": message_bytes != total
+            or offset + image_bytes > total,
             f"an image from byte {offset}": offset < bearings_at + 2 * beams,
             "bearings that do not increase": len(bearings) < 2 * beams or not increase,
             f"bins of {bin_m:g} m": not 1e-5 <= bin_m <= 1.0,
@@ -133,7 +167,9 @@ class OculusFormat(SonarFormat):
             f"a time of {clock:g}": not 0 <= clock < 1 << 32,
         }
         if any(faults.values()):
-            raise DamagedFrameError(f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}")
+            raise DamagedFrameError(
+                f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}"
+            )
         layout_of_image = version, mode, gamma, flags, size, offset, ranges, beams
         settings = (*layout_of_image, bin_m, sound_speed, frequency_hz, bearings)
         clock_ns = round(clock * 1e9) if version == 2 else clock
@@ -151,7 +187,9 @@ class OculusFormat(SonarFormat):
         *_, ranges, _, bin_m, sound_speed, frequency_hz, bearings = settings
         middles_m = (np.arange(int(ranges), dtype=float) + 0.5) * float(bin_m)
         right_rad: Floats = np.radians(np.frombuffer(bytes(bearings), "<i2") / 100)  # type: ignore[arg-type]
-        return FrameGeometry(middles_m, -right_rad, float(frequency_hz), float(sound_speed))
+        return FrameGeometry(
+            middles_m, -right_rad, float(frequency_hz), float(sound_speed)
+        )
 
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
         """Image, shape (beams, bins); rows with a gain are divided by its root, as in `read_sonar_frames`."""
@@ -159,7 +197,9 @@ class OculusFormat(SonarFormat):
         kind = np.dtype(f"<u{size}")
         row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
         row_bytes = row_gain + beams * size
-        rows = np.frombuffer(frame, np.uint8, ranges * row_bytes, offset).reshape(ranges, row_bytes)
+        rows = np.frombuffer(frame, np.uint8, ranges * row_bytes, offset).reshape(
+            ranges, row_bytes
+        )
         values = np.ascontiguousarray(rows[:, row_gain:]).view(kind)
         if not row_gain:
             return values.T

@@ -22,7 +22,14 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.measurements import (
+    NS_PER_S,
+    Dvl,
+    Floats,
+    Imu,
+    Ints,
+    LandmarkDetections,
+)
 from sonar_graph.sequence import Sequence
 
 FLOOR_SIGMA_M = 1e-3
@@ -47,10 +54,16 @@ def twists_of_steps(steps: Floats, covs: Floats) -> tuple[Floats, Floats, Floats
     angle_rad = steps[:, 2]
     half = 0.5 * angle_rad
     small = np.abs(angle_rad) < SMALL_ANGLE_RAD
-    h = np.where(small, 1.0 - angle_rad**2 / 12.0, half / np.tan(np.where(small, 1.0, half)))
+    h = np.where(
+        small, 1.0 - angle_rad**2 / 12.0, half / np.tan(np.where(small, 1.0, half))
+    )
     V_inverse = np.stack([np.stack([h, half], -1), np.stack([-half, h], -1)], -2)
     velocity = np.einsum("nij,nj->ni", V_inverse, steps[:, :2])
-    return velocity, V_inverse @ covs[:, :2, :2] @ np.swapaxes(V_inverse, -1, -2), angle_rad
+    return (
+        velocity,
+        V_inverse @ covs[:, :2, :2] @ np.swapaxes(V_inverse, -1, -2),
+        angle_rad,
+    )
 
 
 def planar_imu(stamps_ns: Ints, rate_rad_s: Floats) -> Imu:
@@ -78,7 +91,11 @@ def planar_calibration(
     """Calibration of a planar robot from its gyro's noise density, bias sigma and bias walk density, and its DVL's."""
     density, bias_sigma, walk_density = gyro
     return Calibration(
-        imu=ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias_sigma, gyro_bias_walk_density=walk_density),
+        imu=ImuCalibration(
+            gyro_noise_density=density,
+            gyro_bias_sigma=bias_sigma,
+            gyro_bias_walk_density=walk_density,
+        ),
         dvl=DvlCalibration(velocity_sigma_m_s=velocity_sigma_m_s),
         sonar=sonar or SonarCalibration(),
         start=start or Start(),
@@ -96,7 +113,9 @@ def range_azimuth(points: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]
     """
     x, y = points.T
     r = np.hypot(x, y)
-    J = np.stack([np.stack([x / r, y / r], -1), np.stack([-y / r**2, x / r**2], -1)], -2)
+    J = np.stack(
+        [np.stack([x / r, y / r], -1), np.stack([-y / r**2, x / r**2], -1)], -2
+    )
     return r, np.arctan2(y, x), J @ covs @ np.swapaxes(J, -1, -2)
 
 
@@ -121,8 +140,14 @@ def stepped_sequence(
     """
     velocity, velocity_cov, rate_rad_s = twists_of_steps(steps, step_covs)
     stamps_ns = np.arange(len(steps) + 1, dtype=np.int64) * NS_PER_S
-    dvl = planar_dvl(stamps_ns, np.vstack([np.zeros(2), velocity]), np.concatenate([velocity_cov[:1], velocity_cov]))
-    x, y, z = np.sqrt(np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)).tolist()
+    dvl = planar_dvl(
+        stamps_ns,
+        np.vstack([np.zeros(2), velocity]),
+        np.concatenate([velocity_cov[:1], velocity_cov]),
+    )
+    x, y, z = np.sqrt(
+        np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
+    ).tolist()
     detections = None
     if ids:
         candidate_ids = np.full((len(ids), max(map(len, ids))), -1, dtype=np.int64)
@@ -132,10 +157,14 @@ def stepped_sequence(
         is_known = candidate_ids >= 0
         id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
         polar = range_azimuth(points, point_covs)
-        detections = LandmarkDetections(stamps_ns[poses], *polar, candidate_ids, id_probability)
+        detections = LandmarkDetections(
+            stamps_ns[poses], *polar, candidate_ids, id_probability
+        )
     return Sequence(
         name=name,
-        calibration=planar_calibration((float(np.sqrt(np.mean(step_covs[:, 2, 2]))), 0.0, 0.0), (x, y, z)),
+        calibration=planar_calibration(
+            (float(np.sqrt(np.mean(step_covs[:, 2, 2]))), 0.0, 0.0), (x, y, z)
+        ),
         imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
         dvl=dvl,
         detections=detections,

@@ -46,7 +46,8 @@ SOURCE_METADATA = "rosbag"
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _CHUNK_BYTES = _PIECE_BYTES = 1 << 20
 _METADATA = "metadata.yaml"
-_ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"  # that of rosbags
+# that of rosbags
+_ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
 _STEPS = 1000
 _INSTALL = "pip install 'sonar-graph[rosbag]'"
 Recode = Callable[[bytes], memoryview]
@@ -65,14 +66,20 @@ class BagConversion:
     @property
     def content(self) -> str:
         """Duration and counts."""
-        return f"{self.duration_s:.1f} s, {self.messages} messages on {self.topics} topics"
+        return (
+            f"{self.duration_s:.1f} s, {self.messages} messages on {self.topics} topics"
+        )
 
     def shortcomings(self, most: int | None = None) -> list[str]:  # noqa: ARG002
         """Lines about all topics that are left out."""
-        return [f"left out: {topic}: {reason}" for topic, reason in self.left_out.items()]
+        return [
+            f"left out: {topic}: {reason}" for topic, reason in self.left_out.items()
+        ]
 
 
-def convert_rosbag(source: Path, output: Path, progress: Progress | None = None) -> BagConversion:
+def convert_rosbag(
+    source: Path, output: Path, progress: Progress | None = None
+) -> BagConversion:
     """Write an MCAP log of a whole bag; an existing file is replaced only when the new one is complete.
 
     Parameters
@@ -102,10 +109,17 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
         from rosbags.rosbag2 import storage_mcap
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise LogError(f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}") from error
-    rosbag1.decompressors.update(bz2=limited_bz2, lz4=limited_lz4)  # its own have no limit
-    storage_mcap.DECOMPRESSORS.update(lz4=lambda one, _: limited_lz4(one), zstd=lambda one, _: limited_zstd(one))
-    vars(rosbag2).update(zstd=SimpleNamespace(open=limited_zstd_file, decompress=limited_zstd))
+        raise LogError(
+            f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}"
+        ) from error
+    # its own have no limit
+    rosbag1.decompressors.update(bz2=limited_bz2, lz4=limited_lz4)
+    storage_mcap.DECOMPRESSORS.update(
+        lz4=lambda one, _: limited_lz4(one), zstd=lambda one, _: limited_zstd(one)
+    )
+    vars(rosbag2).update(
+        zstd=SimpleNamespace(open=limited_zstd_file, decompress=limited_zstd)
+    )
     is_file_in_bag = source.suffix == ".db3" and (source.parent / _METADATA).exists()
     path = source.parent if is_file_in_bag else source
     try:
@@ -119,7 +133,9 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
         if fault is not None:
             raise LogError(f"{source} is {fault}")
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        with AnyReader(
+            [path], default_typestore=get_typestore(Stores.ROS2_JAZZY)
+        ) as bag:
             yield bag
     except SonarGraphError:
         raise
@@ -129,8 +145,13 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
         advice = {
             ".bag": "of one that was not closed `rosbag reindex` makes a whole one",
             ".db3": "give the folder with the .db3 file and its metadata.yaml (`ros2 bag reindex` makes one)",
-        }.get(source.suffix, "give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml")
-        raise LogError(f"{source} cannot be read as a bag: {error}; {advice}") from error
+        }.get(
+            source.suffix,
+            "give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml",
+        )
+        raise LogError(
+            f"{source} cannot be read as a bag: {error}; {advice}"
+        ) from error
 
 
 def limited_bz2(packed: bytes) -> bytes:
@@ -199,7 +220,9 @@ class _BagCopy:
         self._writer = writer
         self._store = get_typestore(Stores.ROS2_JAZZY)
         known, own = self._store.fielddefs, bag.typestore.fielddefs
-        self._store.register({name: fields for name, fields in own.items() if name not in known})
+        self._store.register(
+            {name: fields for name, fields in own.items() if name not in known}
+        )
         self._schemas: dict[str, int] = {}
         self._recoders: dict[str, Recode] = {}
 
@@ -209,13 +232,24 @@ class _BagCopy:
         bag, writer = self._bag, self._writer
         writer.start(profile="ros2", library=LIBRARY)
         writer.add_metadata("rosbag2", ROSBAG2_METADATA)
-        stated = {c.topic: f"{c.msgtype.replace('/msg/', '/')} {c.digest}" for c in bag.connections}
+        stated = {
+            c.topic: f"{c.msgtype.replace('/msg/', '/')} {c.digest}"
+            for c in bag.connections
+        }
         writer.add_metadata(SOURCE_METADATA, stated)
-        connections = [c for c in bag.connections if c.msgtype in bag.typestore.fielddefs]
-        missing = {c.topic: f"{c.msgtype} is not defined in the bag" for c in bag.connections if c not in connections}
+        connections = [
+            c for c in bag.connections if c.msgtype in bag.typestore.fielddefs
+        ]
+        missing = {
+            c.topic: f"{c.msgtype} is not defined in the bag"
+            for c in bag.connections
+            if c not in connections
+        }
         channels = {(c.id, id(c.owner)): self._channel(c) for c in connections}
         conversion = BagConversion(
-            len({c.topic for c in connections}), duration_s=bag.duration * 1e-9, left_out=missing
+            len({c.topic for c in connections}),
+            duration_s=bag.duration * 1e-9,
+            left_out=missing,
         )
         broken: dict[str, int] = {}
         total = sum(c.msgcount for c in connections)
@@ -227,11 +261,15 @@ class _BagCopy:
             except SerdeError:
                 broken[connection.topic] = broken.get(connection.topic, 0) + 1
                 continue
-            writer.add_message(channels[connection.id, id(connection.owner)], time_ns, payload, time_ns)
+            writer.add_message(
+                channels[connection.id, id(connection.owner)], time_ns, payload, time_ns
+            )
             conversion.messages += 1
             if progress and number % _STEPS == 0:
                 progress(number, total)
-        conversion.left_out |= {topic: f"{n} messages are not of their type" for topic, n in broken.items()}
+        conversion.left_out |= {
+            topic: f"{n} messages are not of their type" for topic, n in broken.items()
+        }
         writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
         return conversion
 
@@ -243,16 +281,25 @@ class _BagCopy:
         from rosbags.interfaces import ConnectionExtRosbag2
 
         type_name = _RENAMED.get(connection.msgtype, connection.msgtype)
-        self._recoders[connection.msgtype] = self._recoder(connection.msgtype, type_name)
+        self._recoders[connection.msgtype] = self._recoder(
+            connection.msgtype, type_name
+        )
         if type_name not in self._schemas:
             text, _ = self._store.generate_msgdef(type_name, ros_version=2)
-            self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
+            self._schemas[type_name] = self._writer.register_schema(
+                type_name, "ros2msg", text.encode()
+            )
         if isinstance(connection.ext, ConnectionExtRosbag2):
-            is_latched = any(profile.durability.value == 1 for profile in connection.ext.offered_qos_profiles)
+            is_latched = any(
+                profile.durability.value == 1
+                for profile in connection.ext.offered_qos_profiles
+            )
         else:
             is_latched = bool(connection.ext.latching)
         offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if is_latched else {}
-        return self._writer.register_channel(connection.topic, "cdr", self._schemas[type_name], offers)
+        return self._writer.register_channel(
+            connection.topic, "cdr", self._schemas[type_name], offers
+        )
 
     def _recoder(self, own: str, type_name: str) -> Recode:
         """Conversion of a payload in the bag to CDR of the type as the log defines it."""
@@ -260,6 +307,19 @@ class _BagCopy:
 
         store: Typestore = self._bag.typestore
         if is_same_wireformat(store, self._store, own, type_name):
-            return memoryview if self._bag.is2 else partial(self._store.ros1_to_cdr, typename=type_name)
+            return (
+                memoryview
+                if self._bag.is2
+                else partial(self._store.ros1_to_cdr, typename=type_name)
+            )
         is2 = self._bag.is2
-        return partial(migrate_bytes, store, self._store, own, type_name, {}, src_is2=is2, dst_is2=True)
+        return partial(
+            migrate_bytes,
+            store,
+            self._store,
+            own,
+            type_name,
+            {},
+            src_is2=is2,
+            dst_is2=True,
+        )

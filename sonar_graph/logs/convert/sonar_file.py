@@ -150,7 +150,12 @@ class ByteSource:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self._stream.close()
 
     def read(self, at: int, count: int) -> bytes:
@@ -159,7 +164,9 @@ class ByteSource:
             self._stream.seek(at)
             return self._stream.read(count)
         except OSError as error:
-            raise DatasetError(f"{self.path}: cannot be read at byte {at}: {error.strerror}") from error
+            raise DatasetError(
+                f"{self.path}: cannot be read at byte {at}: {error.strerror}"
+            ) from error
 
     def places(self, pattern: bytes, start: int) -> Iterator[int]:
         """Offsets of a pattern, from ``start`` on."""
@@ -171,7 +178,9 @@ class ByteSource:
                 found = block.find(pattern, found + 1)
 
 
-def plausible_headers(source: ByteSource, kind: SonarFormat, start: int) -> Iterator[FrameHead]:
+def plausible_headers(
+    source: ByteSource, kind: SonarFormat, start: int
+) -> Iterator[FrameHead]:
     """Plausible headers from an offset on, wherever the signature is found."""
     for at in source.places(kind.signature, start + kind.signature_at):
         begin = at - kind.signature_at
@@ -182,7 +191,9 @@ def plausible_headers(source: ByteSource, kind: SonarFormat, start: int) -> Iter
         yield head
 
 
-def frames_and_losses(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
+def frames_and_losses(
+    source: ByteSource, kind: SonarFormat
+) -> Iterator[FrameHead | Lost]:
     """Headers of all trustworthy frames in the order of the file, and the losses between them."""
     accepted: deque[FrameHead] = deque(maxlen=_NEIGHBOURS)
     waiting: deque[FrameHead] = deque()
@@ -208,16 +219,29 @@ def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead |
     while at < source.size:
         try:
             head = kind.head(source.read(at, kind.head_bytes), at)
-            if head.end > source.size and next(plausible_headers(source, kind, at + 1), None):
+            if head.end > source.size and next(
+                plausible_headers(source, kind, at + 1), None
+            ):
                 reason = f"frame {head.number} claims to be longer than the file, in which others follow"
                 raise DamagedFrameError(reason)
         except DamagedFrameError as error:
             # bytes may be missing from the frame before, or from the file's header
             start = pending.at + 1 if pending else 0 if at == kind.first_at else at + 1
-            found = next((other for other in plausible_headers(source, kind, start) if other.at != at), None)
+            found = next(
+                (
+                    other
+                    for other in plausible_headers(source, kind, start)
+                    if other.at != at
+                ),
+                None,
+            )
             end = found.at if found else source.size
             if pending and _is_shifted(source, kind, pending, found):
-                yield Lost(pending.at, end, f"frame {pending.number} and what follows: bytes are missing or too many")
+                yield Lost(
+                    pending.at,
+                    end,
+                    f"frame {pending.number} and what follows: bytes are missing or too many",
+                )
             else:
                 if pending and pending.has_image:
                     yield pending
@@ -235,35 +259,55 @@ def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead |
         yield pending
 
 
-def _is_shifted(source: ByteSource, kind: SonarFormat, pending: FrameHead, found: FrameHead | None) -> bool:
+def _is_shifted(
+    source: ByteSource, kind: SonarFormat, pending: FrameHead, found: FrameHead | None
+) -> bool:
     """True where the frame before a bad header may lack bytes, or have too many."""
     if found is not None:
         return (found.at - pending.end) % pending.size != 0
     rest = source.size - pending.end
-    if rest < kind.head_bytes and kind.may_follow(source.read(pending.end, rest), pending):
+    if rest < kind.head_bytes and kind.may_follow(
+        source.read(pending.end, rest), pending
+    ):
         return False
     return rest % pending.size != 0
 
 
 def _fault(
-    accepted: Sequence[FrameHead], judged: FrameHead, waiting: Sequence[FrameHead], period_ns: int | None
+    accepted: Sequence[FrameHead],
+    judged: FrameHead,
+    waiting: Sequence[FrameHead],
+    period_ns: int | None,
 ) -> str | None:
     """Reason not to trust a frame's header, from the frames before and after it; None: trusted."""
-    if accepted and (accepted[-1].number, accepted[-1].clock_ns) == (judged.number, judged.clock_ns):
+    if accepted and (accepted[-1].number, accepted[-1].clock_ns) == (
+        judged.number,
+        judged.clock_ns,
+    ):
         return f"a repetition of the frame at byte {accepted[-1].at}"
     others = [*accepted, *waiting]
     is_like_another = any(_agree(judged, other) for other in others)
-    if not is_like_another and any(_agree(one, other) for one, other in combinations(others, 2)):
+    if not is_like_another and any(
+        _agree(one, other) for one, other in combinations(others, 2)
+    ):
         return "its settings are those of no frame beside it"
     if accepted and waiting:
-        before, after = _elapsed(accepted[-1], judged, period_ns), _elapsed(judged, waiting[0], period_ns)
+        before, after = (
+            _elapsed(accepted[-1], judged, period_ns),
+            _elapsed(judged, waiting[0], period_ns),
+        )
         total = _elapsed(accepted[-1], waiting[0], period_ns)
         # where time runs back over both steps, the clock was set, and nothing can be told
         fits = total < 0 or (before >= 0 and after >= 0 and before + after == total)
-    elif len(others) > 1:  # the first or last frame: its interval against the one beside it, unless that runs back
+    elif (
+        len(others) > 1
+    ):  # the first or last frame: its interval against the one beside it, unless that runs back
         row = (judged, *waiting) if waiting else (*accepted, judged)
         first, middle, last = row[:3] if waiting else row[-3:]
-        before, after = _elapsed(first, middle, period_ns), _elapsed(middle, last, period_ns)
+        before, after = (
+            _elapsed(first, middle, period_ns),
+            _elapsed(middle, last, period_ns),
+        )
         gap_ns, usual_ns = (before, after) if waiting else (after, before)
         fits = usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
     else:
@@ -274,7 +318,9 @@ def _fault(
 def _agree(one: FrameHead, other: FrameHead) -> bool:
     """True where two frames have the same settings."""
     return all(
-        abs(a - b) <= _DRIFT * abs(b) if isinstance(a, float) and isinstance(b, float) else a == b
+        abs(a - b) <= _DRIFT * abs(b)
+        if isinstance(a, float) and isinstance(b, float)
+        else a == b
         for a, b in zip(one.settings, other.settings, strict=True)
     )
 
@@ -314,9 +360,13 @@ class SonarConversion:
         """Lines about lost and missing frames; at most ``most`` of the losses."""
         lines = [f"lost: {loss}" for loss in self.lost[:most]]
         if len(self.lost) > len(lines):
-            lines.append(f"lost: and {len(self.lost) - len(lines)} stretches more; all are in the log's notes")
+            lines.append(
+                f"lost: and {len(self.lost) - len(lines)} stretches more; all are in the log's notes"
+            )
         if self.missing:
-            lines.append(f"missing: the numbers of {self.missing} frames between the first and the last")
+            lines.append(
+                f"missing: the numbers of {self.missing} frames between the first and the last"
+            )
         if self.promised > self.frames:
             lines.append(
                 f"missing: {self.promised - self.frames} of {self.promised} frames that the file's header names"
@@ -325,36 +375,74 @@ class SonarConversion:
 
 
 def convert_sonar_file(
-    source: ByteSource, kind: SonarFormat, output: Path, progress: Progress | None = None
+    source: ByteSource,
+    kind: SonarFormat,
+    output: Path,
+    progress: Progress | None = None,
 ) -> SonarConversion:
     """Write all whole frames to an MCAP log; memory holds a few of them at a time."""
     conversion = SonarConversion(promised=kind.frames_promised)
     calibration = Calibration(sonar=SonarCalibration(image=kind.image))
-    record = {"name": spelt(source.path.stem), "calibration": recorded_calibration(calibration)}
-    with recording(output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}) as out:
-        for block in _blocks(frames_and_losses(source, kind), kind.clock_period_ns, conversion):
+    record = {
+        "name": spelt(source.path.stem),
+        "calibration": recorded_calibration(calibration),
+    }
+    with recording(
+        output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}
+    ) as out:
+        for block in _blocks(
+            frames_and_losses(source, kind), kind.clock_period_ns, conversion
+        ):
             heads, stamps_ns = zip(*block, strict=True)
             geometry = kind.geometry(heads[0].settings)
-            images = np.stack([kind.samples(source.read(head.at, head.size), head.settings) for head in heads])
-            frames = SonarFrames(np.array(stamps_ns), images, geometry.ranges_m, geometry.azimuths_rad)
-            frequency_hz, sound_speed_m_s = geometry.frequency_hz, geometry.sound_speed_m_s
-            out.write([sonar_image_messages(TOPIC, frames, frequency_hz=frequency_hz, sound_speed_m_s=sound_speed_m_s)])
+            images = np.stack(
+                [
+                    kind.samples(source.read(head.at, head.size), head.settings)
+                    for head in heads
+                ]
+            )
+            frames = SonarFrames(
+                np.array(stamps_ns), images, geometry.ranges_m, geometry.azimuths_rad
+            )
+            frequency_hz, sound_speed_m_s = (
+                geometry.frequency_hz,
+                geometry.sound_speed_m_s,
+            )
+            out.write(
+                [
+                    sonar_image_messages(
+                        TOPIC,
+                        frames,
+                        frequency_hz=frequency_hz,
+                        sound_speed_m_s=sound_speed_m_s,
+                    )
+                ]
+            )
             if progress:
                 progress(heads[-1].end, source.size)
         if not conversion.frames:
             first = f": {conversion.lost[0]}" if conversion.lost else ""
-            raise DatasetError(f"{source.path}: holds no whole frame{first}; is it a recording of this sonar?")
+            raise DatasetError(
+                f"{source.path}: holds no whole frame{first}; is it a recording of this sonar?"
+            )
         spans = conversion.readings.items()
-        notes = dict(kind.notes) | {f"sonar.{n}": f"{low:g} to {high:g}" for n, (low, high) in spans if low or high}
+        notes = dict(kind.notes) | {
+            f"sonar.{n}": f"{low:g} to {high:g}"
+            for n, (low, high) in spans
+            if low or high
+        }
         shortcomings = conversion.shortcomings()
         if shortcomings:
             notes["sonar.shortcomings"] = "; ".join(shortcomings)
-        out.add_metadata(METADATA, record | {"notes": json.dumps(notes)})  # the later of two records counts
+        # the later of two records counts
+        out.add_metadata(METADATA, record | {"notes": json.dumps(notes)})
     return conversion
 
 
 def _blocks(
-    found: Iterable[FrameHead | Lost], period_ns: int | None, conversion: SonarConversion
+    found: Iterable[FrameHead | Lost],
+    period_ns: int | None,
+    conversion: SonarConversion,
 ) -> Iterator[list[tuple[FrameHead, int]]]:
     """Frames and their stamps in blocks of the same settings, with time running on, and of a size that fits memory.
 
@@ -382,7 +470,12 @@ def _blocks(
         if block:
             last, last_ns = block[-1]
             full = (len(block) + 1) * head.size > _IMAGE_BYTES
-            if full or last.settings != head.settings or last.size != head.size or stamp_ns < last_ns:
+            if (
+                full
+                or last.settings != head.settings
+                or last.size != head.size
+                or stamp_ns < last_ns
+            ):
                 yield block
                 block = []
         block.append((head, stamp_ns))

@@ -39,7 +39,19 @@ DLR_POINT = ("pX", "pY", "quality", "cXX", "cXY", "cYY")
 DLR_LINES = "lines 'STEP image dX dY dPhi + 6 covariances' and 'LANDMARK_C pX pY quality + 3 covariances + IDs'"
 BODY_OF_FILE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """(x, y, θ) in body axes from (x, y, φ) in DLR's file."""
-PARK_STEP = ("i", "j", "dx", "dy", "dtheta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt")
+PARK_STEP = (
+    "i",
+    "j",
+    "dx",
+    "dy",
+    "dtheta",
+    "c_xx",
+    "c_xy",
+    "c_xt",
+    "c_yy",
+    "c_yt",
+    "c_tt",
+)
 PARK_STEP_COV_PLACES = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 PARK_POINT = ("i", "landmark", "x", "y", "c_xx", "c_xy", "c_yy")
 PARK_LINES = "lines 'ODOMETRY i j dx dy dtheta + 6 covariances' and 'LANDMARK i landmark x y + 3 covariances'"
@@ -65,7 +77,9 @@ def read_dlr(path: Path) -> Sequence:
         When the file is missing or malformed, or a landmark comes before the first step.
     """
     if path.is_dir() and not (path / DLR_FILE).exists():
-        raise DatasetError(f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself")
+        raise DatasetError(
+            f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself"
+        )
     path = path / DLR_FILE if path.is_dir() else path
     steps: list[list[float]] = []
     points: list[list[float]] = []
@@ -76,16 +90,24 @@ def read_dlr(path: Path) -> Sequence:
             steps.append(numbers(path, number, rest[1:], DLR_STEP))
             continue
         if kind not in ("LANDMARK", "LANDMARK_C"):
-            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {DLR_LINES}")
+            raise DatasetError(
+                f"{path}, line {number}: begins with {kind!r}; expected {DLR_LINES}"
+            )
         if not steps:
-            raise DatasetError(f"{path}, line {number}: a landmark before the first STEP; expected {DLR_LINES}")
+            raise DatasetError(
+                f"{path}, line {number}: a landmark before the first STEP; expected {DLR_LINES}"
+            )
         points.append(numbers(path, number, rest[: len(DLR_POINT)], DLR_POINT))
         try:
             ids.append([int(text) for text in rest[len(DLR_POINT) :]])
         except ValueError as error:
-            raise DatasetError(f"{path}, line {number}: {error}; expected whole numbers as landmark IDs") from error
+            raise DatasetError(
+                f"{path}, line {number}: {error}; expected whole numbers as landmark IDs"
+            ) from error
         if not ids[-1]:
-            raise DatasetError(f"{path}, line {number}: no landmark ID after the covariances; expected {DLR_LINES}")
+            raise DatasetError(
+                f"{path}, line {number}: no landmark ID after the covariances; expected {DLR_LINES}"
+            )
         poses.append(len(steps))
     if not steps:
         raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
@@ -142,8 +164,12 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     newest = 0
     for number, (kind, *rest) in read_lines(path, PARK_LINES):
         if kind not in ("ODOMETRY", "LANDMARK"):
-            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {PARK_LINES}")
-        values = numbers(path, number, rest, PARK_STEP if kind == "ODOMETRY" else PARK_POINT)
+            raise DatasetError(
+                f"{path}, line {number}: begins with {kind!r}; expected {PARK_LINES}"
+            )
+        values = numbers(
+            path, number, rest, PARK_STEP if kind == "ODOMETRY" else PARK_POINT
+        )
         if values[0] != newest:
             raise DatasetError(
                 f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"

@@ -30,13 +30,37 @@ from sonar_graph.measurements import Dvl, Floats, Heading, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
-MTI_COLUMNS = ("time", *("roll", "pitch", "yaw"), *("rate x", "rate y", "rate z"), *("force x", "force y", "force z"))
+MTI_COLUMNS = (
+    "time",
+    *("roll", "pitch", "yaw"),
+    *("rate x", "rate y", "rate z"),
+    *("force x", "force y", "force z"),
+)
 CLOCK = ("year", "month", "day", "hour", "minute", "second")
 DVL_COLUMNS = (
     *("time", *CLOCK, "water x", "water y", "water z", "water status"),
     *("bottom x", "bottom y", "bottom z", "bottom status"),
-    *("range 1", "range 2", "range 3", "amplitude 1", "amplitude 2", "amplitude 3", "good pings", "heading", "pitch"),
-    *("roll", "temperature", "pressure", "power", "sound speed 1", "sound speed 2", "distance x", "distance y"),
+    *(
+        "range 1",
+        "range 2",
+        "range 3",
+        "amplitude 1",
+        "amplitude 2",
+        "amplitude 3",
+        "good pings",
+        "heading",
+        "pitch",
+    ),
+    *(
+        "roll",
+        "temperature",
+        "pressure",
+        "power",
+        "sound speed 1",
+        "sound speed 2",
+        "distance x",
+        "distance y",
+    ),
 )
 FIX_COLUMNS = (
     *("time", "latitude", "longitude", "status", "height", "geoid height"),
@@ -76,22 +100,40 @@ def read_stpere(dataset_dir: Path) -> Sequence:
     if missing := [name for name in FILES if not (dataset_dir / name).exists()]:
         raise DatasetError(f"{dataset_dir}: holds no {', '.join(missing)}; {advice}")
     inertial, doppler, fixes = (
-        read_table(dataset_dir / name, columns, comment="%", encoding="latin-1") for name, columns in FILES.items()
+        read_table(dataset_dir / name, columns, comment="%", encoding="latin-1")
+        for name, columns in FILES.items()
     )
     imu, bias = _inertial_rows(inertial)
     has_lock = doppler.values[:, DVL_COLUMNS.index("bottom status")] == 1
-    velocity = 0.01 * doppler.values[has_lock, DVL_COLUMNS.index("bottom x") : DVL_COLUMNS.index("bottom status")]
-    dvl = Dvl(doppler.stamps_ns()[has_lock], velocity, np.full((len(velocity), 3, 3), np.nan))
+    velocity = (
+        0.01
+        * doppler.values[
+            has_lock, DVL_COLUMNS.index("bottom x") : DVL_COLUMNS.index("bottom status")
+        ]
+    )
+    dvl = Dvl(
+        doppler.stamps_ns()[has_lock], velocity, np.full((len(velocity), 3, 3), np.nan)
+    )
     angles = np.radians(inertial.values[:, 1:4])
     yaw_rad = enu_R_flu(*angles.T).as_euler("ZYX")[:, 0] - BODY_YAW_IMU_RAD
     heading = Heading(imu.stamps_ns, yaw_rad, np.full(len(imu), np.nan))
-    latitude, longitude = (np.radians(_degrees(fixes.values[:, column])) for column in (1, 2))
+    latitude, longitude = (
+        np.radians(_degrees(fixes.values[:, column])) for column in (1, 2)
+    )
     height = fixes.values[:, FIX_COLUMNS.index("height")]
     origin = float(latitude[0]), float(longitude[0]), float(height[0])
-    truth = Trajectory.of_positions(fixes.stamps_ns(), east_north_up(latitude, longitude, height, origin))
+    truth = Trajectory.of_positions(
+        fixes.stamps_ns(), east_north_up(latitude, longitude, height, origin)
+    )
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
-    x, y, _ = truth.at(np.array([max(start_ns, int(truth.stamps_ns[0]))])).positions[0].tolist()
-    start_yaw = float(np.interp(start_ns, heading.stamps_ns, np.unwrap(heading.yaw_rad)))
+    x, y, _ = (
+        truth.at(np.array([max(start_ns, int(truth.stamps_ns[0]))]))
+        .positions[0]
+        .tolist()
+    )
+    start_yaw = float(
+        np.interp(start_ns, heading.stamps_ns, np.unwrap(heading.yaw_rad))
+    )
     return Sequence(
         name="stpere",
         calibration=Calibration(
@@ -103,14 +145,19 @@ def read_stpere(dataset_dir: Path) -> Sequence:
                 mounting=Mounting(rpy_rad=(0.0, 0.0, BODY_YAW_IMU_RAD)),
             ),
             dvl=DvlCalibration(
-                velocity_sigma_m_s=(0.08, 0.08, 0.08), mounting=Mounting(rpy_rad=(0.0, 0.0, BODY_YAW_DVL_RAD))
+                velocity_sigma_m_s=(0.08, 0.08, 0.08),
+                mounting=Mounting(rpy_rad=(0.0, 0.0, BODY_YAW_DVL_RAD)),
             ),
             heading=COMPASS,
             start=Start(
                 position_m=(x, y, 0.0),
                 rpy_rad=(0.0, 0.0, float(np.angle(np.exp(1j * start_yaw)))),
                 # one row of the compass, with the error that all of its rows share
-                rpy_sigma_rad=(0.1, 0.1, float(np.hypot(COMPASS.sigma_rad, COMPASS.bias_sigma_rad))),
+                rpy_sigma_rad=(
+                    0.1,
+                    0.1,
+                    float(np.hypot(COMPASS.sigma_rad, COMPASS.bias_sigma_rad)),
+                ),
             ),
         ),
         imu=imu,
@@ -136,7 +183,9 @@ def _inertial_rows(table: NumberTable) -> tuple[Imu, str]:
         f"{GYRO_Z_BIAS_RAD_S} rad/s about z, and the mean of the horizontal forces, {mean_force[0]:.3f} and "
         f"{mean_force[1]:.3f} m/s2"
     )
-    return Imu(table.stamps_ns(), rate - [0.0, 0.0, GYRO_Z_BIAS_RAD_S], force - mean_force), bias
+    return Imu(
+        table.stamps_ns(), rate - [0.0, 0.0, GYRO_Z_BIAS_RAD_S], force - mean_force
+    ), bias
 
 
 def _degrees(ddmm: Floats) -> Floats:

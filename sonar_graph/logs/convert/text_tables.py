@@ -48,7 +48,9 @@ def read_table(
     first: list[str] = []
     rows: list[list[float]] = []
     expected = f"rows of {', '.join(columns)}"
-    for number, fields in read_lines(path, expected, delimiter, header_lines, comment, encoding):
+    for number, fields in read_lines(
+        path, expected, delimiter, header_lines, comment, encoding
+    ):
         rows.append(numbers(path, number, fields, columns))
         first.append(fields[0])
     return NumberTable(path, first, np.array(rows))
@@ -82,7 +84,9 @@ def read_lines(
         raise DatasetError(f"{path}: holds no data; expected {expected}")
 
 
-def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]) -> list[float]:
+def numbers(
+    path: Path, number: int, fields: list[str], columns: tuple[str, ...]
+) -> list[float]:
     """Fields of one line as finite numbers; an error names the line and the columns expected."""
     expected = f"expected {len(columns)} numbers: {', '.join(columns)}"
     if len(fields) != len(columns):
@@ -96,7 +100,9 @@ def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]
     return values
 
 
-def numbered_run(folder: Path, entry: str, number: int, kind: str, expected: str) -> Path:
+def numbered_run(
+    folder: Path, entry: str, number: int, kind: str, expected: str
+) -> Path:
     """Path of a run in a data set's folder, where the runs are numbered.
 
     ``folder``: folder of the data set; ``entry``: name of a run's file or folder, with ``N`` for the number;
@@ -104,11 +110,21 @@ def numbered_run(folder: Path, entry: str, number: int, kind: str, expected: str
     where one does not exist.
     """
     if not folder.is_dir():
-        raise DatasetError(f"{folder}: is not a folder; give the folder that holds {expected}")
+        raise DatasetError(
+            f"{folder}: is not a folder; give the folder that holds {expected}"
+        )
     pattern = re.escape(entry).replace("N", r"(\d+)")
-    found = sorted(int(match[1]) for path in folder.iterdir() if (match := re.fullmatch(pattern, path.name)))
+    found = sorted(
+        int(match[1])
+        for path in folder.iterdir()
+        if (match := re.fullmatch(pattern, path.name))
+    )
     if not found:
-        raise DatasetError(f"{folder}: holds no {entry}; give the folder that holds {expected}")
+        raise DatasetError(
+            f"{folder}: holds no {entry}; give the folder that holds {expected}"
+        )
     if number not in found:
-        raise DatasetError(f"{folder}: has no {kind} {number}; it has {', '.join(map(str, found))}")
+        raise DatasetError(
+            f"{folder}: has no {kind} {number}; it has {', '.join(map(str, found))}"
+        )
     return folder / entry.replace("N", str(number))

@@ -23,13 +23,18 @@ def log_parts(path: Path) -> list[Path]:
         return [path]
     if (path / METADATA_FILE).is_file():
         return _named_parts(path)
-    files = [file for file in path.iterdir() if file.suffix == ".mcap" and file.is_file()]
+    files = [
+        file for file in path.iterdir() if file.suffix == ".mcap" and file.is_file()
+    ]
     if not files:
         raise LogError(
             f"{path}: is a folder without {METADATA_FILE} and .mcap files; give a log, or the folder of a bag that "
             "`ros2 bag record` wrote"
         )
-    spans = sorted(((*_span_ns(file), file) for file in files), key=lambda span: (span[0], span[2].name))
+    spans = sorted(
+        ((*_span_ns(file), file) for file in files),
+        key=lambda span: (span[0], span[2].name),
+    )
     for (_, end_ns, before), (begin_ns, _, after) in pairwise(spans):
         if end_ns is not None and begin_ns < end_ns:
             raise LogError(
@@ -53,9 +58,13 @@ def _named_parts(folder: Path) -> list[Path]:
     listed = re.search(r"relative_file_paths:[ \t]*\n((?:[ \t]*-[^\n]*\n?)+)", text)
     flow = re.search(r"relative_file_paths:[ \t]*\[(.*?)\]", text, re.DOTALL)
     rows = listed[1].split("\n") if listed else flow[1].split(",") if flow else []
-    names = [name for row in rows if (name := row.strip().removeprefix("-").strip(" '\""))]
+    names = [
+        name for row in rows if (name := row.strip().removeprefix("-").strip(" '\""))
+    ]
     if not names:
-        raise LogError(f"{folder / METADATA_FILE}: names no files under relative_file_paths; `ros2 bag reindex` does")
+        raise LogError(
+            f"{folder / METADATA_FILE}: names no files under relative_file_paths; `ros2 bag reindex` does"
+        )
     if packed := next((name for name in names if not name.endswith(".mcap")), None):
         raise LogError(
             f"{folder}: {packed} is no .mcap file; unpack the files first (`zstd -d`), then `ros2 bag reindex`"
@@ -67,5 +76,9 @@ def _span_ns(file: Path) -> tuple[int, int | None]:
     """Times of the first message and, where the file's summary says it, of the last."""
     with LogFile(file) as log:
         summary, _ = read_summary(log)
-        end_ns = None if summary is None or summary.statistics is None else int(summary.statistics.message_end_time)
+        end_ns = (
+            None
+            if summary is None or summary.statistics is None
+            else int(summary.statistics.message_end_time)
+        )
         return first_time_ns(log, summary), end_ns

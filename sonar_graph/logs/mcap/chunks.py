@@ -18,13 +18,26 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.mcap.records import HEAD, LARGEST_BYTES, LOOSE, SMALLER_CHUNKS, ChunkRecord
+from sonar_graph.logs.mcap.records import (
+    HEAD,
+    LARGEST_BYTES,
+    LOOSE,
+    SMALLER_CHUNKS,
+    ChunkRecord,
+)
 from sonar_graph.measurements import Ints
 
 _PIECE = 1 << 10
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 _MESSAGE = np.dtype(
-    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log", "<u8"),
+        ("publish", "<u8"),
+    ]
 )
 _MESSAGE_FIELDS = _MESSAGE.itemsize - HEAD.size
 Index = Mapping[int, NDArray[np.uint64]]
@@ -74,9 +87,16 @@ class Content:
         rest = self.data[self.end : self.end + 1]
         if not len(rest) or rest[0] in LOOSE or not self.channels:
             return self
-        last = max(self.channels, key=lambda channel: int(self.channels[channel].offsets[-1]))
+        last = max(
+            self.channels, key=lambda channel: int(self.channels[channel].offsets[-1])
+        )
         channels = {**self.channels, last: self.channels[last].of(slice(0, -1))}
-        return Content(self.data, {c: f for c, f in channels.items() if len(f.sizes)}, self.described, self.end)
+        return Content(
+            self.data,
+            {c: f for c, f in channels.items() if len(f.sizes)},
+            self.described,
+            self.end,
+        )
 
 
 _DECOMPRESSOR = zstandard.ZstdDecompressor()
@@ -86,15 +106,25 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
     """Records of a chunk; a ChunkError where they cannot be decompressed, or the CRC does not fit."""
     data = packed
     try:
-        if chunk.compression == "zstd" or (chunk.compression not in ("", "lz4") and packed.startswith(_ZSTD)):
+        if chunk.compression == "zstd" or (
+            chunk.compression not in ("", "lz4") and packed.startswith(_ZSTD)
+        ):
             size = zstandard.get_frame_parameters(packed).content_size
-            unknown = size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR)
-            data = _DECOMPRESSOR.decompress(
-                packed, max_output_size=_limited(chunk.uncompressed_size if unknown else size)
+            unknown = size in (
+                zstandard.CONTENTSIZE_UNKNOWN,
+                zstandard.CONTENTSIZE_ERROR,
             )
-        elif chunk.compression == "lz4" or (chunk.compression and packed.startswith(_LZ4)):
+            data = _DECOMPRESSOR.decompress(
+                packed,
+                max_output_size=_limited(chunk.uncompressed_size if unknown else size),
+            )
+        elif chunk.compression == "lz4" or (
+            chunk.compression and packed.startswith(_LZ4)
+        ):
             size = _limited(chunk.uncompressed_size)
-            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(
+                packed, max_length=size + 1
+            )
         elif chunk.compression:
             raise ChunkError(f"its compression {chunk.compression!r} is not known")
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as error:
@@ -102,7 +132,9 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
     if chunk.crc and zlib.crc32(data) != chunk.crc:
         raise ChunkError("its CRC does not fit its content")
     if not chunk.crc and len(data) != chunk.uncompressed_size:
-        raise ChunkError(f"it has {len(data)} bytes instead of {chunk.uncompressed_size}")
+        raise ChunkError(
+            f"it has {len(data)} bytes instead of {chunk.uncompressed_size}"
+        )
     return data
 
 
@@ -120,7 +152,9 @@ def unpack_beginning(chunk: ChunkRecord, packed: bytes) -> bytes:
     if not chunk.compression:
         return packed
     reader: Any = (
-        lz4.frame.LZ4FrameDecompressor() if chunk.compression == "lz4" else zstandard.ZstdDecompressor().decompressobj()
+        lz4.frame.LZ4FrameDecompressor()
+        if chunk.compression == "lz4"
+        else zstandard.ZstdDecompressor().decompressobj()
     )
     found = bytearray()
     try:
@@ -142,12 +176,18 @@ def find_by_index(data: bytes | memoryview, index: Index) -> Content | None:
     counts = [len(rows) for rows in index.values()]
     rows = np.concatenate([*index.values(), np.empty((0, 2), np.uint64)])
     starts, times_ns = rows[:, 1].astype(np.int64), rows[:, 0]
-    if len(starts) and (starts.min() < 0 or starts.max() > len(data) - _MESSAGE.itemsize):
+    if len(starts) and (
+        starts.min() < 0 or starts.max() > len(data) - _MESSAGE.itemsize
+    ):
         return None
     heads = _heads(data)[starts]
     lengths = heads["length"].astype(np.int64)
     channels = np.repeat(np.array(list(index), np.uint16), counts)
-    agree = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channels) & (heads["log"] == times_ns)
+    agree = (
+        (heads["opcode"] == Opcode.MESSAGE)
+        & (heads["channel"] == channels)
+        & (heads["log"] == times_ns)
+    )
     if not (agree & (lengths >= _MESSAGE_FIELDS) & (lengths <= len(data))).all():
         return None
     order = np.argsort(starts, kind="stable")
@@ -165,9 +205,13 @@ def find_by_index(data: bytes | memoryview, index: Index) -> Content | None:
             last = at + stop
         if last != following[gap]:
             return None
-    every = Found(starts + _MESSAGE.itemsize, lengths - _MESSAGE_FIELDS, times_ns.astype(np.int64))
+    every = Found(
+        starts + _MESSAGE.itemsize, lengths - _MESSAGE_FIELDS, times_ns.astype(np.int64)
+    )
     found: dict[int, Found] = {}
-    for channel, count, end in zip(index, counts, np.cumsum(counts).tolist(), strict=True):
+    for channel, count, end in zip(
+        index, counts, np.cumsum(counts).tolist(), strict=True
+    ):
         part = every.of(slice(end - count, end))
         is_sorted = (part.offsets[1:] > part.offsets[:-1]).all()
         found[channel] = part if is_sorted else part.of(np.argsort(part.offsets))
@@ -176,7 +220,9 @@ def find_by_index(data: bytes | memoryview, index: Index) -> Content | None:
 
 def _heads(data: bytes | memoryview) -> NDArray[Any]:
     """View of the bytes as the head of a message at every offset."""
-    return np.ndarray((max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,))
+    return np.ndarray(
+        (max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,)
+    )
 
 
 def find_by_walk(data: bytes | memoryview) -> Content:
@@ -192,9 +238,15 @@ def find_by_walk(data: bytes | memoryview) -> Content:
         end = stop
     starts = np.array(messages, np.int64)
     heads = _heads(data)[starts]
-    sizes, times_ns = heads["length"].astype(np.int64) - _MESSAGE_FIELDS, heads["log"].astype(np.int64)
+    sizes, times_ns = (
+        heads["length"].astype(np.int64) - _MESSAGE_FIELDS,
+        heads["log"].astype(np.int64),
+    )
     every = Found(starts + _MESSAGE.itemsize, sizes, times_ns)
-    found = {channel: every.of(heads["channel"] == channel) for channel in np.unique(heads["channel"]).tolist()}
+    found = {
+        channel: every.of(heads["channel"] == channel)
+        for channel in np.unique(heads["channel"]).tolist()
+    }
     return Content(data, found, described, end)
 
 

@@ -19,7 +19,15 @@ from mcap.records import Channel, ChunkIndex, Schema, Statistics
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.chunks import find_by_walk
-from sonar_graph.logs.mcap.records import HEAD, LARGEST_BYTES, MAGIC, ByteRange, ChunkRecord, LogFile, RecordWalk
+from sonar_graph.logs.mcap.records import (
+    HEAD,
+    LARGEST_BYTES,
+    MAGIC,
+    ByteRange,
+    ChunkRecord,
+    LogFile,
+    RecordWalk,
+)
 
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
@@ -55,8 +63,12 @@ def parse(kind: Callable[[ReadDataStream], T], content: bytes) -> T:
         record.write(builder)
         again = builder.end()[HEAD.size :]  # type: ignore[no-untyped-call]  # of the mcap package
     except Exception as error:  # the package's reader raises whatever its parts raise
-        raise LogError(f"it cannot be read ({error or type(error).__name__})") from error
-    if again != content:  # the package's reader accepts content that is too short or too long
+        raise LogError(
+            f"it cannot be read ({error or type(error).__name__})"
+        ) from error
+    if (
+        again != content
+    ):  # the package's reader accepts content that is too short or too long
         raise LogError(f"its {len(content)} bytes do not make sense")
     return record
 
@@ -67,17 +79,26 @@ def read_summary(file: LogFile) -> tuple[FileSummary | None, str | None]:
     Where the CRC does not fit, bytes may be missing or doubled in the data before: the summary is then searched for by
     the record that ends the data, and used without its offsets of chunks.
     """
-    tail = file.read(max(file.size - _FOOTER.size - len(MAGIC), 0), _FOOTER.size + len(MAGIC))
+    tail = file.read(
+        max(file.size - _FOOTER.size - len(MAGIC), 0), _FOOTER.size + len(MAGIC)
+    )
     if len(tail) < _FOOTER.size + len(MAGIC) or not tail.endswith(MAGIC):
         return None, "it does not end as an MCAP file does"
     opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
     footer_at = file.size - len(tail)
     start = start or footer_at
     least = len(MAGIC) + _DATA_END.size
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - HEAD.size or not least <= start <= footer_at:
+    if (
+        opcode != Opcode.FOOTER
+        or length != _FOOTER.size - HEAD.size
+        or not least <= start <= footer_at
+    ):
         return None, "its footer is damaged"
     if footer_at - start > LARGEST_BYTES:
-        return None, f"its summary is said to have {footer_at - start} bytes, and at most {LARGEST_BYTES} are read"
+        return (
+            None,
+            f"its summary is said to have {footer_at - start} bytes, and at most {LARGEST_BYTES} are read",
+        )
     if not crc or _crc(file, start, footer_at) == crc:
         return _read(file, start, footer_at, has_crc=crc != 0)
     first = max(footer_at - _LARGEST_MOVED, 0)
@@ -92,7 +113,10 @@ def read_summary(file: LogFile) -> tuple[FileSummary | None, str | None]:
             summary, _ = _read(file, moved, footer_at, has_crc=True)
             if summary:
                 summary.chunks.clear()
-            return summary, "bytes are missing or doubled in it, so that its index does not fit"
+            return (
+                summary,
+                "bytes are missing or doubled in it, so that its index does not fit",
+            )
     return None, "its summary is damaged: the CRC does not fit"
 
 
@@ -100,7 +124,9 @@ def _crc(file: LogFile, start: int, footer_at: int) -> int:
     return zlib.crc32(file.read(start, footer_at + _FOOTER.size - 4 - start))
 
 
-def _read(file: LogFile, start: int, footer_at: int, *, has_crc: bool) -> tuple[FileSummary | None, str | None]:
+def _read(
+    file: LogFile, start: int, footer_at: int, *, has_crc: bool
+) -> tuple[FileSummary | None, str | None]:
     data_end_at = start - _DATA_END.size
     opcode, length, data_crc = _DATA_END.unpack(file.read(data_end_at, _DATA_END.size))
     is_sound = (opcode, length) == (Opcode.DATA_END, 4)
@@ -154,11 +180,20 @@ class Instant:
                 when = datetime.fromisoformat(text)
             except ValueError:
                 expected = "seconds from its beginning such as 90.5, or a date and time such as 2026-05-01T12:30:00Z"
-                raise LogError(f"{text!r} is no time in a log: give {expected}") from None
-            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-            return cls(absolute_ns=(since.days * 86_400 + since.seconds) * _NS_PER_S + since.microseconds * 1000)
+                raise LogError(
+                    f"{text!r} is no time in a log: give {expected}"
+                ) from None
+            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(
+                1970, 1, 1, tzinfo=UTC
+            )
+            return cls(
+                absolute_ns=(since.days * 86_400 + since.seconds) * _NS_PER_S
+                + since.microseconds * 1000
+            )
         if not 0 <= seconds < _LAST_NS / _NS_PER_S:
-            raise LogError(f"{text!r} is no time in a log: give seconds from its beginning, 0 or more")
+            raise LogError(
+                f"{text!r} is no time in a log: give seconds from its beginning, 0 or more"
+            )
         return cls(seconds=seconds)
 
     def resolve(self, beginning_ns: int) -> int:
@@ -181,14 +216,24 @@ class TimeWindow:
     @classmethod
     def parse(cls, start: str | None, end: str | None) -> TimeWindow:
         """Window between two times in text, as `Instant.parse` takes them; None: no limit."""
-        first, last = (None if text is None else Instant.parse(text) for text in (start, end))
+        first, last = (
+            None if text is None else Instant.parse(text) for text in (start, end)
+        )
         return cls(first, last)
 
     def describe(self, beginning_ns: int) -> str:
         """Text with the limits in seconds after the log's beginning."""
         start_ns, end_ns = self.resolve(beginning_ns)
-        start = "the beginning" if self.start is None else f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        end = "the end" if self.end is None else f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        start = (
+            "the beginning"
+            if self.start is None
+            else f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        )
+        end = (
+            "the end"
+            if self.end is None
+            else f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        )
         return f"{start} to {end} of the recording"
 
     def resolve(self, beginning_ns: int) -> tuple[int, int]:
@@ -196,7 +241,9 @@ class TimeWindow:
         start_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
         end_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
         if start_ns >= end_ns:
-            raise LogError("the wanted part of the log ends before it starts: --start must be less than --end")
+            raise LogError(
+                "the wanted part of the log ends before it starts: --start must be less than --end"
+            )
         return start_ns, end_ns
 
 

@@ -26,7 +26,12 @@ from sonar_graph.logs.mcap.chunks import (
     unpack,
     unpack_beginning,
 )
-from sonar_graph.logs.mcap.file_summary import TimeWindow, first_time_ns, parse, read_summary
+from sonar_graph.logs.mcap.file_summary import (
+    TimeWindow,
+    first_time_ns,
+    parse,
+    read_summary,
+)
 from sonar_graph.logs.mcap.records import (
     PRIVATE,
     ByteRange,
@@ -90,13 +95,18 @@ class Passage:
         self._limits_ns: tuple[int, int] | None = None
         if window is not None and (window.start or window.end):
             beginning_ns = first_time_ns(file, self._summary)
-            self._limits_ns, self.part = window.resolve(beginning_ns), window.describe(beginning_ns)
+            self._limits_ns, self.part = (
+                window.resolve(beginning_ns),
+                window.describe(beginning_ns),
+            )
         self._described = Descriptions(file.path, keep)
         self.topics = self._described.by_name
         """All described topics by name."""
         self.as_written = self._described.as_written
         """Channel and schema of each topic."""
-        self._walk = RecordWalk(file, self._summary.data_end_at if self._summary else None)
+        self._walk = RecordWalk(
+            file, self._summary.data_end_at if self._summary else None
+        )
         self._last_ns: int | None = None
         self._open_losses: list[Loss] = []
         self._without_crc = 0
@@ -121,13 +131,21 @@ class Passage:
         chunk: ChunkRecord | None = None
         index: dict[int, np.ndarray] = {}
         for item in self._walk:
-            if chunk is not None and isinstance(item, Record) and item.opcode == Opcode.MESSAGE_INDEX:
+            if (
+                chunk is not None
+                and isinstance(item, Record)
+                and item.opcode == Opcode.MESSAGE_INDEX
+            ):
                 content = self._file.content(item)
-                rows = np.frombuffer(content, "<u8", offset=6, count=(len(content) - 6) // 16 * 2).reshape(-1, 2)
+                rows = np.frombuffer(
+                    content, "<u8", offset=6, count=(len(content) - 6) // 16 * 2
+                ).reshape(-1, 2)
                 index[int.from_bytes(content[:2], "little")] = rows
                 continue
             before_hole = isinstance(item, Hole)
-            is_told = chunk is not None and (yield from self._take_chunk(chunk, index, before_hole=before_hole))
+            is_told = chunk is not None and (
+                yield from self._take_chunk(chunk, index, before_hole=before_hole)
+            )
             chunk, index = None, {}
             if isinstance(item, ChunkRecord):
                 self._report(item.end)
@@ -142,7 +160,9 @@ class Passage:
                 self._report(item.end)
                 self._is_loose = True
                 loose = find_by_walk(self._file.read(item.at, item.end - item.at))
-                yield from self._take_content(loose, item.at, item.end, is_covered=False)
+                yield from self._take_content(
+                    loose, item.at, item.end, is_covered=False
+                )
             elif isinstance(item, Hole) and not is_told:
                 yield from self._take_hole(item)
             elif isinstance(item, Record):
@@ -153,14 +173,21 @@ class Passage:
 
     def _is_wanted(self, chunk: ChunkRecord, index: ChunkIndex) -> bool:
         """True where a chunk may hold a wanted topic in the wanted time."""
-        topics = [self._described.by_channel.get(channel) for channel in index.message_index_offsets]
+        topics = [
+            self._described.by_channel.get(channel)
+            for channel in index.message_index_offsets
+        ]
         first_ns, after_ns = self._limits_ns or (chunk.start_ns, chunk.end_ns + 1)
         is_inside = chunk.start_ns < after_ns and chunk.end_ns >= first_ns
         return any(
-            topic is None or (topic.keep is not Keep.NONE and (is_inside or topic.is_latched)) for topic in topics
+            topic is None
+            or (topic.keep is not Keep.NONE and (is_inside or topic.is_latched))
+            for topic in topics
         )
 
-    def _take_chunk(self, chunk: ChunkRecord, index: Index, *, before_hole: bool) -> Generator[ChunkPart, None, bool]:
+    def _take_chunk(
+        self, chunk: ChunkRecord, index: Index, *, before_hole: bool
+    ) -> Generator[ChunkPart, None, bool]:
         """Messages of a chunk; returns True where the chunk is lost, together with a hole after it."""
         try:
             data = unpack(chunk, self._file.read(chunk.data_at, chunk.data_size))
@@ -169,28 +196,49 @@ class Passage:
             # before a hole the chunk may have a wrong length: the next record is searched from its beginning
             end = self._walk.search(chunk.at).end if before_hole else chunk.end
             if end == self._file.size and not self._walk.reached_end:
-                self.damage.ending = Loss(chunk.at, end, f"the file is cut off, or overwritten from there: {reason}")
+                self.damage.ending = Loss(
+                    chunk.at,
+                    end,
+                    f"the file is cut off, or overwritten from there: {reason}",
+                )
             else:
-                counted = {self._name(channel): len(rows) for channel, rows in index.items()}
+                counted = {
+                    self._name(channel): len(rows) for channel, rows in index.items()
+                }
                 self._lose(chunk.at, end, reason, chunk, counted or None)
             return True
         content = find_by_index(data, index) if index else None
         if content is None:
             content = find_by_walk(data)
             if index:
-                self._remark(f"the message index of chunk {self.chunks} (byte {chunk.at}) does not fit; read without")
+                self._remark(
+                    f"the message index of chunk {self.chunks} (byte {chunk.at}) does not fit; read without"
+                )
             if content.end < len(data):
-                self._lose(chunk.at, chunk.end, f"chunk {self.chunks} ends in {len(data) - content.end} bytes unread")
+                self._lose(
+                    chunk.at,
+                    chunk.end,
+                    f"chunk {self.chunks} ends in {len(data) - content.end} bytes unread",
+                )
         said = self._indexed(chunk)
         if said is not None and content.channels:
             first_ns, last_ns = content.times_ns()
             is_inside = chunk.start_ns <= first_ns and last_ns <= chunk.end_ns
-            if not (is_inside and content.channels.keys() <= said.message_index_offsets.keys()):
-                self._remark(f"the summary's index does not fit chunk {self.chunks} (byte {chunk.at}); read without")
+            if not (
+                is_inside
+                and content.channels.keys() <= said.message_index_offsets.keys()
+            ):
+                self._remark(
+                    f"the summary's index does not fit chunk {self.chunks} (byte {chunk.at}); read without"
+                )
                 if self._may_skip:
-                    raise IndexMismatchError(f"{self._file.path}: its index does not fit its chunks")
+                    raise IndexMismatchError(
+                        f"{self._file.path}: its index does not fit its chunks"
+                    )
         self._without_crc += not chunk.crc
-        yield from self._take_content(content, chunk.at, chunk.end, is_covered=chunk.crc != 0)
+        yield from self._take_content(
+            content, chunk.at, chunk.end, is_covered=chunk.crc != 0
+        )
         return False
 
     def _indexed(self, chunk: ChunkRecord) -> ChunkIndex | None:
@@ -198,8 +246,18 @@ class Passage:
         index = self._summary.chunks.get(chunk.at) if self._summary else None
         if index is None or not index.message_index_offsets:
             return None
-        said = (index.message_start_time, index.message_end_time, index.compressed_size, index.uncompressed_size)
-        return index if said == (chunk.start_ns, chunk.end_ns, chunk.data_size, chunk.uncompressed_size) else None
+        said = (
+            index.message_start_time,
+            index.message_end_time,
+            index.compressed_size,
+            index.uncompressed_size,
+        )
+        return (
+            index
+            if said
+            == (chunk.start_ns, chunk.end_ns, chunk.data_size, chunk.uncompressed_size)
+            else None
+        )
 
     def _take_hole(self, hole: Hole) -> Iterator[ChunkPart]:
         """Messages at the beginning of a chunk that is cut off; any other hole is a loss."""
@@ -212,7 +270,9 @@ class Passage:
             self.damage.ending = Loss(hole.at, hole.end, reason, self._last_ns)
             return
         self.chunks += 1
-        content = find_by_walk(unpack_beginning(chunk, self._file.read(chunk.data_at, chunk.data_size))).trusted()
+        content = find_by_walk(
+            unpack_beginning(chunk, self._file.read(chunk.data_at, chunk.data_size))
+        ).trusted()
         if len(content):
             reason += f"; of the messages, {len(content)} are from the beginning of a chunk, which no CRC covers"
         self.damage.ending = Loss(hole.at, hole.end, reason, self._last_ns)
@@ -226,7 +286,9 @@ class Passage:
                 content, is_sealed = open_seal(found.metadata)
             except LogError as error:
                 end = self._walk.search(record.at).end  # the length may be damaged
-                self._lose(record.at, end, f"a metadata record is lost: {error}", messages={})
+                self._lose(
+                    record.at, end, f"a metadata record is lost: {error}", messages={}
+                )
                 return
             self.metadata[found.name] = content
             self.others.append(record)
@@ -235,15 +297,24 @@ class Passage:
         elif record.opcode == Opcode.ATTACHMENT:
             self.others.append(record)
         elif record.opcode >= PRIVATE:
-            self._remark(f"bytes {record.at} to {record.end}: a record of private kind {record.opcode:#x}, not read")
+            self._remark(
+                f"bytes {record.at} to {record.end}: a record of private kind {record.opcode:#x}, not read"
+            )
 
-    def _take_content(self, content: Content, at: int, end: int, *, is_covered: bool) -> Iterator[ChunkPart]:
+    def _take_content(
+        self, content: Content, at: int, end: int, *, is_covered: bool
+    ) -> Iterator[ChunkPart]:
         """Wanted messages of some bytes; their schemas and channels are added to the descriptions."""
         for opcode, described in content.described:
             try:
                 self._described.add(opcode, described, is_covered=is_covered)
             except LogError as error:
-                self._lose(at, end, f"the description of a channel is lost: {error}", messages={})
+                self._lose(
+                    at,
+                    end,
+                    f"the description of a channel is lost: {error}",
+                    messages={},
+                )
         if content.channels:
             first_ns, last_ns = content.times_ns()
             for loss in self._open_losses:  # lost messages were recorded before these
@@ -254,11 +325,15 @@ class Passage:
             topic = self._described.by_channel.get(channel)
             if topic is None:
                 reason = f"messages of channel {channel}, whose description is lost"
-                self._lose(at, end, reason, messages={self._name(channel): len(found.sizes)})
+                self._lose(
+                    at, end, reason, messages={self._name(channel): len(found.sizes)}
+                )
                 continue
             if self._limits_ns and not topic.is_latched:
                 first_ns, after_ns = self._limits_ns
-                found = found.of((found.log_times_ns >= first_ns) & (found.log_times_ns < after_ns))
+                found = found.of(
+                    (found.log_times_ns >= first_ns) & (found.log_times_ns < after_ns)
+                )
             if len(found.sizes):
                 yield ChunkPart(topic, content.data, found)
 
@@ -267,7 +342,12 @@ class Passage:
         return f"channel {channel}" if topic is None else topic.name
 
     def _lose(
-        self, at: int, end: int, reason: str, chunk: ChunkRecord | None = None, messages: dict[str, int] | None = None
+        self,
+        at: int,
+        end: int,
+        reason: str,
+        chunk: ChunkRecord | None = None,
+        messages: dict[str, int] | None = None,
     ) -> None:
         loss = Loss(at, end, reason, self._last_ns, None, messages)
         self.damage.losses.append(loss)
@@ -296,18 +376,26 @@ class Passage:
                 self._remark(f"{self._ending_fault}; the data before its end is whole")
         if damage.ending is not None:
             damage.ending.start_ns = self._last_ns
-        unprotected = [f"{self._without_crc} chunks carry no CRC"] if self._without_crc else []
+        unprotected = (
+            [f"{self._without_crc} chunks carry no CRC"] if self._without_crc else []
+        )
         unprotected += ["messages lie outside chunks"] if self._is_loose else []
         unprotected += [f"metadata record {name!r}" for name in self._unsealed]
-        if unprotected and not self.skipped and not damage.losses and summary is not None and summary.data_crc:
+        if (
+            unprotected
+            and not self.skipped
+            and not damage.losses
+            and summary is not None
+            and summary.data_crc
+        ):
             crc = 0
             for at in range(0, summary.data_end_at, _BLOCK):
-                crc = zlib.crc32(self._file.read(at, min(_BLOCK, summary.data_end_at - at)), crc)
+                crc = zlib.crc32(
+                    self._file.read(at, min(_BLOCK, summary.data_end_at - at)), crc
+                )
             if crc == summary.data_crc:  # the CRC over all data protects them
                 return
-            reason = (
-                f"the CRC over all data does not fit, and {', '.join(unprotected)}: somewhere in these a bit is wrong"
-            )
+            reason = f"the CRC over all data does not fit, and {', '.join(unprotected)}: somewhere in these a bit is wrong"
             damage.losses.append(Loss(0, summary.data_end_at, reason, messages={}))
         damage.unprotected = unprotected
 
@@ -349,9 +437,7 @@ class Recording:
 
     def notes(self) -> dict[str, str]:
         """Notes about the reading for whoever uses the results, by subject."""
-        skipped = (
-            f"{self.skipped_chunks} of {self.chunks} chunks hold nothing that was asked for; not read, not checked"
-        )
+        skipped = f"{self.skipped_chunks} of {self.chunks} chunks hold nothing that was asked for; not read, not checked"
         texts = {
             "log.ending": self.ending or "",
             "log.damage": "; ".join(self.corrupt),
@@ -365,6 +451,8 @@ class Recording:
     def require_sound(self) -> None:
         """Refuse a file that has holes by a LogError, which names the first hole and what reads the rest."""
         if self.corrupt:
-            more = f" (and {len(self.corrupt) - 1} more)" if len(self.corrupt) > 1 else ""
+            more = (
+                f" (and {len(self.corrupt) - 1} more)" if len(self.corrupt) > 1 else ""
+            )
             advice = "copy it again, or read what is whole with --salvage"
             raise LogError(f"{self.path} is damaged: {self.corrupt[0]}{more}; {advice}")

@@ -32,9 +32,17 @@ def kind_and_advice(path: Path, start: bytes) -> str:
     """The end of "`path` is not an MCAP file but ...", from the first `START_BYTES` bytes of the file."""
     for kind, command, is_so in (
         ("a ROS 1 bag", "rosbag", start.startswith(b"#ROSBAG")),
-        ("a ROS 2 bag of the sqlite3 kind", "rosbag", start.startswith(b"SQLite format 3")),
+        (
+            "a ROS 2 bag of the sqlite3 kind",
+            "rosbag",
+            start.startswith(b"SQLite format 3"),
+        ),
         ("an ARIS' recording", "aris", start.startswith(b"DDF\x05")),
-        ("a DIDSON's recording", "didson", start.startswith(b"DDF") and start[3:4] < b" "),
+        (
+            "a DIDSON's recording",
+            "didson",
+            start.startswith(b"DDF") and start[3:4] < b" ",
+        ),
         ("an Oculus' recording", "oculus", start.startswith(b"SO") and b"\0" in start),
     ):
         if is_so:
@@ -61,8 +69,11 @@ def _unknown_kind(start: bytes, advice: str) -> str:
     if not start.strip(b"\0"):
         kind = "zeros" if start else "empty"
         return f"{kind}: copy it again, or see whether the recorder wrote anything"
-    text = start.decode("utf-8", "replace").rstrip("\ufffd")  # the last character may be cut
-    if text and all(character.isprintable() or character.isspace() for character in text):
+    # the last character may be cut
+    text = start.decode("utf-8", "replace").rstrip("\ufffd")
+    if text and all(
+        character.isprintable() or character.isspace() for character in text
+    ):
         first_line = start.decode("utf-8", "replace").strip().partition("\n")[0]
         return f"a text that begins with {first_line[:40]!r}; {advice}"
     return f"something else; {advice}"
@@ -73,7 +84,9 @@ LARGEST_BYTES = 1 << 28
 """Most bytes of one record, and of a chunk without compression; a stated size could ask for all memory."""
 LARGEST_RATIO = 64
 """Bytes of messages for each byte of a log; samples of an IMU at rest, each with its stamp, compress by some thirty."""
-SMALLER_CHUNKS = "`mcap compress LOG -o OUT.mcap --chunk-size 4194304` writes smaller chunks"
+SMALLER_CHUNKS = (
+    "`mcap compress LOG -o OUT.mcap --chunk-size 4194304` writes smaller chunks"
+)
 LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Kinds of records within chunks; outside where the writer makes no chunks."""
 _TIMES_SIZE_CRC = struct.Struct("<QQQII")
@@ -160,7 +173,9 @@ class LogFile:
         start = self.read(0, START_BYTES)
         if not start.startswith(MAGIC):
             self._stream.close()
-            raise LogError(f"{path} is not an MCAP file but {kind_and_advice(path, start)}")
+            raise LogError(
+                f"{path} is not an MCAP file but {kind_and_advice(path, start)}"
+            )
 
     def __enter__(self) -> Self:
         return self
@@ -201,8 +216,13 @@ class LogFile:
         chunk = None if opcode == Opcode.MESSAGE else _chunk(start, at)
         if chunk is not None and chunk.size != size:
             following = self.read(chunk.end, HEAD.size)
-            next_opcode, next_size = HEAD.unpack(following) if len(following) == HEAD.size else (0, 0)
-            is_followed = 0 < next_opcode <= Opcode.DATA_END and next_size <= self.size - chunk.end - HEAD.size
+            next_opcode, next_size = (
+                HEAD.unpack(following) if len(following) == HEAD.size else (0, 0)
+            )
+            is_followed = (
+                0 < next_opcode <= Opcode.DATA_END
+                and next_size <= self.size - chunk.end - HEAD.size
+            )
             if opcode != Opcode.CHUNK or not (is_followed or chunk.end == self.size):
                 chunk = None
         return chunk or Record(opcode, at, size)
@@ -211,14 +231,20 @@ class LogFile:
         """True where the head of a chunk is at an offset, whatever its lengths."""
         start = self.read(at, _CHUNK_HEAD)
         chunk = _chunk(start, at)
-        return chunk is not None and start[0] == Opcode.CHUNK and chunk.compression in ("", "lz4", "zstd")
+        return (
+            chunk is not None
+            and start[0] == Opcode.CHUNK
+            and chunk.compression in ("", "lz4", "zstd")
+        )
 
 
 def _chunk(start: bytes, at: int) -> ChunkRecord | None:
     """Chunk with these bytes as its head, by the lengths in the head."""
     if len(start) < HEAD.size + _CHUNK_FIXED:
         return None
-    start_ns, end_ns, uncompressed, crc, letters = _TIMES_SIZE_CRC.unpack_from(start, HEAD.size)
+    start_ns, end_ns, uncompressed, crc, letters = _TIMES_SIZE_CRC.unpack_from(
+        start, HEAD.size
+    )
     name_at = HEAD.size + _TIMES_SIZE_CRC.size
     if letters > _LONGEST_COMPRESSION or name_at + letters + 8 > len(start):
         return None
@@ -226,7 +252,18 @@ def _chunk(start: bytes, at: int) -> ChunkRecord | None:
     (data_size,) = struct.unpack_from("<Q", start, name_at + letters)
     data_at = at + name_at + letters + 8
     size = _CHUNK_FIXED + letters + data_size
-    return ChunkRecord(Opcode.CHUNK, at, size, start_ns, end_ns, uncompressed, crc, compression, data_at, data_size)
+    return ChunkRecord(
+        Opcode.CHUNK,
+        at,
+        size,
+        start_ns,
+        end_ns,
+        uncompressed,
+        crc,
+        compression,
+        data_at,
+        data_size,
+    )
 
 
 class RecordWalk:
@@ -244,10 +281,19 @@ class RecordWalk:
     def __iter__(self) -> Iterator[Record | ByteRange | Hole]:
         while self._at < self._stop_at:
             record = self._file.record(self._at)
-            if record is not None and record.opcode == Opcode.DATA_END and record.size == 4 and not self.reached_end:
+            if (
+                record is not None
+                and record.opcode == Opcode.DATA_END
+                and record.size == 4
+                and not self.reached_end
+            ):
                 self.reached_end = True
                 return
-            if record is None or record.end > self._stop_at or not self._is_likely(record):
+            if (
+                record is None
+                or record.end > self._stop_at
+                or not self._is_likely(record)
+            ):
                 yield self.search(self._at)
             elif record.opcode not in LOOSE:
                 self._has_chunks |= isinstance(record, ChunkRecord)
@@ -255,12 +301,18 @@ class RecordWalk:
                 yield record
             else:
                 # only the record after it confirms the length of a record outside chunks
-                following = self._file.record(record.end) if record.end < self._stop_at else None
+                following = (
+                    self._file.record(record.end)
+                    if record.end < self._stop_at
+                    else None
+                )
                 if following is not None and not self._is_likely(following):
                     yield self.search(self._at)
                     continue
                 self._is_loose = True
-                stretch = ByteRange(self._at, max(record.end, self._confirmed_end(self._at)))
+                stretch = ByteRange(
+                    self._at, max(record.end, self._confirmed_end(self._at))
+                )
                 self._at = stretch.end
                 yield stretch
 
@@ -289,7 +341,9 @@ class RecordWalk:
             return isinstance(record, ChunkRecord) or record.at == len(MAGIC)
         if record.opcode == Opcode.MESSAGE_INDEX:
             count = self._file.read(record.content_at + 2, 4)
-            return len(count) == 4 and int.from_bytes(count, "little") == record.size - 6
+            return (
+                len(count) == 4 and int.from_bytes(count, "little") == record.size - 6
+            )
         if record.opcode == Opcode.DATA_END:
             return record.size == 4
         if record.opcode in _SMALLEST:
@@ -302,7 +356,11 @@ class RecordWalk:
         place = last = 0
         while place + HEAD.size <= len(block):
             opcode, size = HEAD.unpack_from(block, place)
-            if opcode not in LOOSE or size < _SMALLEST[opcode] or place + HEAD.size + size > len(block):
+            if (
+                opcode not in LOOSE
+                or size < _SMALLEST[opcode]
+                or place + HEAD.size + size > len(block)
+            ):
                 break
             last, place = place, place + HEAD.size + size
         return at + (place if at + place == self._stop_at else last)
@@ -317,7 +375,9 @@ class RecordWalk:
                 continue
             octets = np.frombuffer(block, np.uint8)
             places = np.flatnonzero(wanted[octets[: len(octets) - HEAD.size + 1]])
-            lengths = np.ndarray((len(octets) - 7,), "<u8", block, strides=(1,))[places + 1]
+            lengths = np.ndarray((len(octets) - 7,), "<u8", block, strides=(1,))[
+                places + 1
+            ]
             for offset in places[lengths <= self._stop_at].tolist():
                 if offset < _BLOCK and self._is_trustworthy(block_at + offset):
                     return block_at + offset
@@ -329,7 +389,11 @@ class RecordWalk:
         if isinstance(record, ChunkRecord):
             return record.size == HEAD.unpack(self._file.read(at, HEAD.size))[1]
         for _ in range(_CHAIN):
-            if record is None or record.end > self._stop_at or not self._is_likely(record):
+            if (
+                record is None
+                or record.end > self._stop_at
+                or not self._is_likely(record)
+            ):
                 return False
             if record.end == self._stop_at:
                 return True

@@ -7,8 +7,18 @@ import numpy as np
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.bag_folder import log_parts
-from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow, first_time_ns, read_summary
-from sonar_graph.logs.mcap.reader import IndexMismatchError, Passage, Progress, Recording
+from sonar_graph.logs.mcap.file_summary import (
+    Instant,
+    TimeWindow,
+    first_time_ns,
+    read_summary,
+)
+from sonar_graph.logs.mcap.reader import (
+    IndexMismatchError,
+    Passage,
+    Progress,
+    Recording,
+)
 from sonar_graph.logs.mcap.records import LARGEST_BYTES, LARGEST_RATIO, LogFile
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 
@@ -16,7 +26,10 @@ _PIECE_BYTES = 1 << 20
 
 
 def scan(
-    path: Path, keep: Callable[[str], Keep], window: TimeWindow | None = None, progress: Progress | None = None
+    path: Path,
+    keep: Callable[[str], Keep],
+    window: TimeWindow | None = None,
+    progress: Progress | None = None,
 ) -> Recording:
     """Read a log in one pass: an MCAP file, or a folder of several (`log_parts`).
 
@@ -46,13 +59,18 @@ def scan(
             window = window if whole.beginning_ns is not None else _fixed(window, file)
             _join(whole, _scan_file(part, keep, window, steps[part]))
         whole.topics = dict(sorted(whole.topics.items()))
-    if whole.part and not any(len(topic) and not topic.is_latched for topic in whole.topics.values()):
+    if whole.part and not any(
+        len(topic) and not topic.is_latched for topic in whole.topics.values()
+    ):
         raise LogError(f"{path}: nothing was recorded from {whole.part}")
     return whole
 
 
 def _scan_file(
-    path: Path, keep: Callable[[str], Keep], window: TimeWindow | None, progress: Progress | None
+    path: Path,
+    keep: Callable[[str], Keep],
+    window: TimeWindow | None,
+    progress: Progress | None,
 ) -> Recording:
     with LogFile(path) as file:
         passage = Passage(file, keep, window, progress=progress)
@@ -67,16 +85,23 @@ def _scan_file(
     topics = {
         name: topic
         for name, topic in sorted(passage.topics.items())
-        if len(topic) or (topic.keep is Keep.NONE and (counts or {}).get(name))  # those of skipped chunks
+        if len(topic)
+        or (
+            topic.keep is Keep.NONE and (counts or {}).get(name)
+        )  # those of skipped chunks
     }
-    is_complete = not passage.skipped and passage.part is None  # every message that can be read was counted
+    # every message that can be read was counted
+    is_complete = not passage.skipped and passage.part is None
     settle(passage.damage, topics, counts if is_complete else None)
     return Recording(
         path,
         topics,
         passage.metadata,
         passage.damage,
-        min((int(topic.log_times_ns.min()) for topic in topics.values() if topic.times), default=None),
+        min(
+            (int(topic.log_times_ns.min()) for topic in topics.values() if topic.times),
+            default=None,
+        ),
         passage.chunks,
         passage.skipped,
         passage.part,
@@ -90,7 +115,11 @@ def _opened(parts: list[Path], damage: Damage) -> Iterator[tuple[Path, LogFile]]
         try:
             file = LogFile(part)
         except LogError as error:
-            reason = "is missing" if not part.exists() else str(error).removeprefix(f"{part} ")
+            reason = (
+                "is missing"
+                if not part.exists()
+                else str(error).removeprefix(f"{part} ")
+            )
             damage.extend(Damage([Loss(0, 0, reason)]), part.name)
             failures.append(str(error))
             continue
@@ -106,18 +135,25 @@ def _fixed(window: TimeWindow | None, first: LogFile) -> TimeWindow | None:
         return window
     beginning_ns = first_time_ns(first, read_summary(first)[0])
     ends = [
-        None if end is None else Instant(absolute_ns=end.resolve(beginning_ns)) for end in (window.start, window.end)
+        None if end is None else Instant(absolute_ns=end.resolve(beginning_ns))
+        for end in (window.start, window.end)
     ]
     return TimeWindow(*ends)
 
 
-def _progress_of(parts: list[Path], progress: Progress | None) -> dict[Path, Progress | None]:
+def _progress_of(
+    parts: list[Path], progress: Progress | None
+) -> dict[Path, Progress | None]:
     """Progress of each file as a part of the progress of all."""
     sizes = [part.stat().st_size if part.exists() else 0 for part in parts]
     before = np.concatenate([[0], np.cumsum(sizes)]).tolist()
 
     def of(first: int) -> Progress | None:
-        return None if progress is None else lambda done, _: progress(first + done, before[-1])
+        return (
+            None
+            if progress is None
+            else lambda done, _: progress(first + done, before[-1])
+        )
 
     return {part: of(first) for part, first in zip(parts, before, strict=False)}
 
@@ -168,13 +204,17 @@ def stream(
     """
     parts, damage, is_first = log_parts(path), Damage(), True
     steps = _progress_of(parts, progress) if parts != [path] else {path: progress}
-    for part, file in _opened(parts, damage) if parts != [path] else [(path, LogFile(path))]:
+    for part, file in (
+        _opened(parts, damage) if parts != [path] else [(path, LogFile(path))]
+    ):
         window, is_first = (_fixed(window, file) if is_first else window), False
         with file:
             passage = Passage(file, keep, window, progress=steps[part])
             held: dict[str, Topic] = {}
             for piece in passage:
-                topic = held.get(piece.topic.name) or held.setdefault(piece.topic.name, piece.topic.empty())
+                topic = held.get(piece.topic.name) or held.setdefault(
+                    piece.topic.name, piece.topic.empty()
+                )
                 topic.gather(piece.data, *piece.found)
                 if topic.held_bytes >= _PIECE_BYTES:
                     yield held.pop(topic.name)

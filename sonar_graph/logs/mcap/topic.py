@@ -56,7 +56,9 @@ class Topic:
     """True where messages hold until they are replaced, as those of ``/tf_static`` do."""
     times: list[Ints] = field(default_factory=list)
     """Log times by chunk."""
-    stacks: dict[int, list[tuple[Ints, Bytes]]] = field(default_factory=lambda: defaultdict(list))
+    stacks: dict[int, list[tuple[Ints, Bytes]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
     """Row numbers and payload bytes by number of bytes."""
     unsound: dict[str, int] = field(default_factory=dict)
     """Number of messages that do not follow their definition, by fault; known after decoding."""
@@ -77,7 +79,9 @@ class Topic:
     @property
     def log_times_ns(self) -> Ints:
         """Time of recording of each message, shape (n,)."""
-        self.times = [np.concatenate(self.times)] if self.times else [np.empty(0, np.int64)]
+        self.times = (
+            [np.concatenate(self.times)] if self.times else [np.empty(0, np.int64)]
+        )
         return self.times[0]
 
     def definition(self) -> Struct:
@@ -85,7 +89,9 @@ class Topic:
         try:
             return parse_definition(self.type_name, self.schema_text)
         except LogError as error:
-            raise LogError(f"{self.file}: topic {self.name} ({self.type_name}): {error}") from error
+            raise LogError(
+                f"{self.file}: topic {self.name} ({self.type_name}): {error}"
+            ) from error
 
     def error(self, fault: str) -> LogError:
         """Error about the messages, naming file and topic."""
@@ -97,8 +103,15 @@ class Topic:
             self._decoders.append(Decoder(self.definition()))
         for parts in self.stacks.values():
             if len(parts) > 1:  # in place: the parts would take the same memory again
-                parts[:] = [(np.concatenate([r for r, _ in parts]), np.concatenate([b for _, b in parts]))]
-        decoded = self._decoders[0].decode(part for parts in self.stacks.values() for part in parts)
+                parts[:] = [
+                    (
+                        np.concatenate([r for r, _ in parts]),
+                        np.concatenate([b for _, b in parts]),
+                    )
+                ]
+        decoded = self._decoders[0].decode(
+            part for parts in self.stacks.values() for part in parts
+        )
         if not decoded.unsound:
             return decoded.groups
         is_sound = np.ones(len(self), bool)
@@ -106,14 +119,22 @@ class Topic:
             is_sound[rows] = False
             self.unsound[fault] = self.unsound.get(fault, 0) + len(rows)
         number = np.cumsum(is_sound) - 1  # rows count sound messages only
-        groups = [Messages(number[group.rows], group.payloads, group.layout) for group in decoded.groups]
-        self.times, self._count = [self.log_times_ns[is_sound]], int(np.count_nonzero(is_sound))
+        groups = [
+            Messages(number[group.rows], group.payloads, group.layout)
+            for group in decoded.groups
+        ]
+        self.times, self._count = (
+            [self.log_times_ns[is_sound]],
+            int(np.count_nonzero(is_sound)),
+        )
         self.stacks.clear()
         for group in groups:
             self.stacks[group.payloads.shape[1]].append((group.rows, group.payloads))
         return groups
 
-    def gather(self, data: bytes | memoryview, offsets: Ints, sizes: Ints, log_times_ns: Ints) -> None:
+    def gather(
+        self, data: bytes | memoryview, offsets: Ints, sizes: Ints, log_times_ns: Ints
+    ) -> None:
         """Add the messages at some offsets of a chunk's bytes."""
         first = self._count
         self._count += len(sizes)
@@ -126,32 +147,54 @@ class Topic:
         for size in [largest] if smallest == largest else np.unique(kept).tolist():
             rows = np.flatnonzero(kept == size)
             if not size:
-                self.stacks[size].append((first + rows, np.empty((len(rows), 0), np.uint8)))
+                self.stacks[size].append(
+                    (first + rows, np.empty((len(rows), 0), np.uint8))
+                )
                 continue
-            windows = np.ndarray((len(data) - size + 1,), f"V{size}", data, strides=(1,))
-            self.stacks[size].append((first + rows, windows[offsets[rows]].view(np.uint8).reshape(-1, size)))
+            windows = np.ndarray(
+                (len(data) - size + 1,), f"V{size}", data, strides=(1,)
+            )
+            self.stacks[size].append(
+                (first + rows, windows[offsets[rows]].view(np.uint8).reshape(-1, size))
+            )
 
     def leave_out(self, log_times_ns: Ints) -> None:
         """Remove the messages that were recorded at some times."""
         is_kept = ~np.isin(self.log_times_ns, log_times_ns)
         number = np.cumsum(is_kept) - 1
         for size, parts in self.stacks.items():
-            self.stacks[size] = [(number[rows[is_kept[rows]]], payloads[is_kept[rows]]) for rows, payloads in parts]
-        self.times, self._count = [self.log_times_ns[is_kept]], int(np.count_nonzero(is_kept))
+            self.stacks[size] = [
+                (number[rows[is_kept[rows]]], payloads[is_kept[rows]])
+                for rows, payloads in parts
+            ]
+        self.times, self._count = (
+            [self.log_times_ns[is_kept]],
+            int(np.count_nonzero(is_kept)),
+        )
 
     def extend(self, later: Topic) -> None:
         """Add the messages of the same topic in the next file of a log; a LogError where it has another type."""
-        if (self.type_name, self.encoding, self.schema_text) != (later.type_name, later.encoding, later.schema_text):
-            raise later.error(f"is a {later.type_name} defined otherwise than in the files before")
+        if (self.type_name, self.encoding, self.schema_text) != (
+            later.type_name,
+            later.encoding,
+            later.schema_text,
+        ):
+            raise later.error(
+                f"is a {later.type_name} defined otherwise than in the files before"
+            )
         for size, parts in later.stacks.items():
-            self.stacks[size] += [(rows + self._count, payloads) for rows, payloads in parts]
+            self.stacks[size] += [
+                (rows + self._count, payloads) for rows, payloads in parts
+            ]
         self.times += later.times
         self._count += later._count
         self.held_bytes += later.held_bytes
 
     def empty(self) -> Topic:
         """The same topic without messages."""
-        return replace(self, times=[], stacks=defaultdict(list), unsound={}, held_bytes=0, _count=0)
+        return replace(
+            self, times=[], stacks=defaultdict(list), unsound={}, held_bytes=0, _count=0
+        )
 
 
 _NS_PER_S = 1_000_000_000
@@ -180,15 +223,30 @@ class Loss:
 
     def describe(self, beginning_ns: int | None) -> str:
         """Text with times in seconds after the log's beginning."""
-        text = f"bytes {self.at} to {self.end}: {self.reason}" if self.end else self.reason
+        text = (
+            f"bytes {self.at} to {self.end}: {self.reason}" if self.end else self.reason
+        )
         text = f"{self.file}: {text}" if self.file else text
-        if self.start_ns is not None and self.end_ns is not None and beginning_ns is not None:
-            start_s, end_s = ((ns - beginning_ns) / _NS_PER_S for ns in (self.start_ns, self.end_ns))
+        if (
+            self.start_ns is not None
+            and self.end_ns is not None
+            and beginning_ns is not None
+        ):
+            start_s, end_s = (
+                (ns - beginning_ns) / _NS_PER_S for ns in (self.start_ns, self.end_ns)
+            )
             text += f"; {start_s:.3f} s to {end_s:.3f} s of the log"
         if self.messages:
             about = "about " if self.is_estimate else ""
-            parts = [f"{about}{count} of {name}" for name, count in sorted(self.messages.items())]
-            more = f" and of {len(parts) - _TOPICS_NAMED} more topics" if len(parts) > _TOPICS_NAMED else ""
+            parts = [
+                f"{about}{count} of {name}"
+                for name, count in sorted(self.messages.items())
+            ]
+            more = (
+                f" and of {len(parts) - _TOPICS_NAMED} more topics"
+                if len(parts) > _TOPICS_NAMED
+                else ""
+            )
             text += f"; lost: {', '.join(parts[:_TOPICS_NAMED])}{more}"
         elif self.messages is not None:
             text += "; no messages lost"
@@ -211,7 +269,10 @@ class Damage:
     def extend(self, later: Damage, file: str) -> None:
         """Add the damage of the next file of a log: the end of any but the last is a loss in the middle."""
         self.losses += [self.ending] if self.ending is not None else []
-        for loss in (*later.losses, *([later.ending] if later.ending is not None else [])):
+        for loss in (
+            *later.losses,
+            *([later.ending] if later.ending is not None else []),
+        ):
             loss.file = file
         self.losses += later.losses
         self.ending = later.ending
@@ -220,7 +281,9 @@ class Damage:
         self.unprotected += [place + part for part in later.unprotected]
 
 
-def settle(damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int] | None) -> None:
+def settle(
+    damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int] | None
+) -> None:
     """Find the number of lost messages where the loss itself does not tell it.
 
     By the statistics: counted messages less those read and those in losses of known number. Otherwise by the rate of
@@ -237,7 +300,14 @@ def settle(damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int
                 missing[name] = count - found - known
     unknown = [loss for loss in damage.losses if loss.messages is None]
     if missing and not unknown:
-        damage.losses.append(Loss(0, 0, "fewer messages than the file's statistics count", messages=missing))
+        damage.losses.append(
+            Loss(
+                0,
+                0,
+                "fewer messages than the file's statistics count",
+                messages=missing,
+            )
+        )
     for loss in unknown:
         loss.is_estimate = missing is None or len(unknown) > 1
         if missing is not None and (not missing or len(unknown) == 1):
@@ -246,11 +316,18 @@ def settle(damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int
             lost = {}
             for name, topic in topics.items():
                 times_ns = topic.log_times_ns
-                before, after = times_ns[times_ns <= loss.start_ns], times_ns[times_ns >= loss.end_ns]
+                before, after = (
+                    times_ns[times_ns <= loss.start_ns],
+                    times_ns[times_ns >= loss.end_ns],
+                )
                 if len(before) < 2 or not len(after):
                     continue
                 step_ns = float(np.median(np.diff(before[-100:])))
-                count = round((after.min() - before.max()) / step_ns) - 1 if step_ns > 0 else 0
+                count = (
+                    round((after.min() - before.max()) / step_ns) - 1
+                    if step_ns > 0
+                    else 0
+                )
                 if count > 0:
                     lost[name] = count
             loss.messages = lost or None
@@ -294,10 +371,18 @@ class Descriptions:
             self._add_channel(parse(Channel.read, content), is_covered=is_covered)
 
     def _add_schema(self, schema: Schema, *, is_covered: bool) -> None:
-        self._holds(self._schemas, schema, f"schema {schema.id}", "name", is_covered=is_covered)
+        self._holds(
+            self._schemas, schema, f"schema {schema.id}", "name", is_covered=is_covered
+        )
 
     def _add_channel(self, channel: Channel, *, is_covered: bool) -> None:
-        if not self._holds(self._channels, channel, f"channel {channel.id}", "topic", is_covered=is_covered):
+        if not self._holds(
+            self._channels,
+            channel,
+            f"channel {channel.id}",
+            "topic",
+            is_covered=is_covered,
+        ):
             return
         schema, _ = self._schemas.get(channel.schema_id, (_NO_SCHEMA, True))
         offered = channel.metadata.get("offered_qos_profiles", "")
@@ -309,19 +394,32 @@ class Descriptions:
             schema_encoding=schema.encoding,
             schema_text=schema.data.decode("utf-8", "replace"),
             keep=self._keep(schema.name),
-            is_latched=channel.topic.endswith("_static") or bool(_TRANSIENT_LOCAL.search(offered)),
+            is_latched=channel.topic.endswith("_static")
+            or bool(_TRANSIENT_LOCAL.search(offered)),
         )
         self.as_written.setdefault(channel.topic, (channel, schema))
         self.by_channel[channel.id] = self.by_name.setdefault(channel.topic, topic)
 
-    def _holds(self, known: dict[int, tuple[Any, bool]], new: Any, what: str, name: str, *, is_covered: bool) -> bool:
+    def _holds(
+        self,
+        known: dict[int, tuple[Any, bool]],
+        new: Any,
+        what: str,
+        name: str,
+        *,
+        is_covered: bool,
+    ) -> bool:
         """Keep a description that is the first of its number, or the first under a CRC; tells whether it is kept."""
         old, was_covered = known.get(new.id, (None, False))
         holds = old is None or (old != new and is_covered and not was_covered)
         if holds:
             known[new.id] = new, is_covered
         if old is not None and old != new:
-            which = "the one under a CRC holds" if is_covered or was_covered else "the first holds"
+            which = (
+                "the one under a CRC holds"
+                if is_covered or was_covered
+                else "the first holds"
+            )
             remark = f"{what} ({getattr(old, name)}) is described in two ways; {which}"
             self.remarks[remark] = None
         return holds

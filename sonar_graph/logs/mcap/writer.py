@@ -80,14 +80,19 @@ def write_recording(
     with recording(path, metadata) as out:
         if any(entry.is_latched for entry in messages):
             out.offer_latched()
-        end_ns = max((int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)), default=0)
+        end_ns = max(
+            (int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)),
+            default=0,
+        )
         for file in attachments:
             out.attach(file, max(end_ns, 0))
         out.write(messages)
 
 
 @contextmanager
-def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[RecordingWriter]:
+def recording(
+    path: Path, metadata: Mapping[str, Mapping[str, str]]
+) -> Iterator[RecordingWriter]:
     """Recording that is written piece by piece, for messages that do not fit into memory; metadata come first.
 
     An existing file is replaced when the context ends without an error; until then, the pieces go to a file beside it.
@@ -132,7 +137,9 @@ class RecordingWriter:
 
     def attach(self, file: Attachment, time_ns: int) -> None:
         """Add a file within the recording."""
-        self._writer.add_attachment(0, time_ns, file.name, file.media_type, file.content)
+        self._writer.add_attachment(
+            0, time_ns, file.name, file.media_type, file.content
+        )
 
     def offer_latched(self) -> None:
         """State once in the form of rosbag2 that there are latched topics."""
@@ -145,21 +152,43 @@ class RecordingWriter:
         for entry in messages:
             if entry.type_name not in self._schemas:
                 text = definition(entry.type_name).encode()
-                self._schemas[entry.type_name] = self._writer.register_schema(entry.type_name, "ros2msg", text)
+                self._schemas[entry.type_name] = self._writer.register_schema(
+                    entry.type_name, "ros2msg", text
+                )
             if entry.topic not in self._channels:
                 if entry.is_latched:
                     self.offer_latched()
-                offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if entry.is_latched else {}
+                offers = (
+                    {"offered_qos_profiles": TRANSIENT_LOCAL}
+                    if entry.is_latched
+                    else {}
+                )
                 schema = self._schemas[entry.type_name]
-                self._channels[entry.topic] = self._writer.register_channel(entry.topic, "cdr", schema, offers)
+                self._channels[entry.topic] = self._writer.register_channel(
+                    entry.topic, "cdr", schema, offers
+                )
         channels = [self._channels[entry.topic] for entry in messages]
-        times_ns = np.concatenate([np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)])
-        source = np.repeat(np.arange(len(messages)), [len(m.log_times_ns) for m in messages])
-        row = np.concatenate([np.arange(len(m.log_times_ns)) for m in messages] or [np.empty(0, np.int64)])
+        times_ns = np.concatenate(
+            [np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)]
+        )
+        source = np.repeat(
+            np.arange(len(messages)), [len(m.log_times_ns) for m in messages]
+        )
+        row = np.concatenate(
+            [np.arange(len(m.log_times_ns)) for m in messages]
+            or [np.empty(0, np.int64)]
+        )
         order = np.argsort(times_ns, kind="stable")
         written = self._stream.tell()
-        for time_ns, of, at in zip(times_ns[order].tolist(), source[order].tolist(), row[order].tolist(), strict=True):
-            self._writer.add_message(channels[of], time_ns, messages[of].payloads[at].tobytes(), time_ns)
+        for time_ns, of, at in zip(
+            times_ns[order].tolist(),
+            source[order].tolist(),
+            row[order].tolist(),
+            strict=True,
+        ):
+            self._writer.add_message(
+                channels[of], time_ns, messages[of].payloads[at].tobytes(), time_ns
+            )
             if self._stream.tell() != written:  # a chunk was full
                 self._stream.flush()
                 written = self._stream.tell()

@@ -45,7 +45,8 @@ class NoiseDensities:
 def allan_deviation(samples: Floats, together: int) -> Floats:
     """Overlapping Allan deviation of each of (n, columns) over means of ``together`` samples, shape (columns,)."""
     before_first = np.zeros((1, samples.shape[1]))
-    sums = np.cumsum(np.concatenate([before_first, samples]), axis=0)  # (n + 1, columns)
+    # (n + 1, columns)
+    sums = np.cumsum(np.concatenate([before_first, samples]), axis=0)
     means = (sums[together:] - sums[:-together]) / together
     steps = means[together:] - means[:-together]
     return np.asarray(np.sqrt(0.5 * np.mean(steps**2, axis=0)))
@@ -67,12 +68,16 @@ def density(samples: Floats, rate_hz: float) -> Estimate1D:
     """
     if not np.ptp(samples, axis=0).any():
         return Estimate1D(
-            np.nan, np.inf, "the same to the last bit while still: commanded, or too coarse for its noise"
+            np.nan,
+            np.inf,
+            "the same to the last bit while still: commanded, or too coarse for its noise",
         )
     together = max(1, round(TAU_S * rate_hz))
     tau_s = together / rate_hz
     value = float(allan_deviation(samples, together).max()) * np.sqrt(tau_s)
-    return Estimate1D(value, value / np.sqrt(2 * degrees_of_freedom(len(samples), together)))
+    return Estimate1D(
+        value, value / np.sqrt(2 * degrees_of_freedom(len(samples), together))
+    )
 
 
 def noise_densities(imu: Imu) -> NoiseDensities:
@@ -87,7 +92,9 @@ def noise_densities(imu: Imu) -> NoiseDensities:
     force = imu.specific_force[rest]
     gyro = density(imu.angular_velocity[rest], rate_hz)
     if not np.isfinite(force).all():
-        return NoiseDensities(still_s, gyro, Estimate1D(np.nan, np.inf, "no accelerometers"))
+        return NoiseDensities(
+            still_s, gyro, Estimate1D(np.nan, np.inf, "no accelerometers")
+        )
     return NoiseDensities(still_s, gyro, density(force, rate_hz))
 
 
@@ -112,7 +119,9 @@ def longest_rest(imu: Imu) -> slice:
     return slice(int(first[begin]), int(first[last] + count[last]))
 
 
-def _steady(values: Floats, first: Ints, count: Ints, least: float) -> NDArray[np.bool_]:
+def _steady(
+    values: Floats, first: Ints, count: Ints, least: float
+) -> NDArray[np.bool_]:
     """True for seconds that vary no more than the quietest, and whose mean is near that of the second before."""
     means = np.add.reduceat(values, first, axis=0) / count[:, None]
     squares = np.add.reduceat(values**2, first, axis=0) / count[:, None]

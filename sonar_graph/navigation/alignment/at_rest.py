@@ -70,7 +70,9 @@ def angles_by_up(up: Floats) -> Floats:
     x, y, z = up.tolist()
     cosine = np.hypot(y, z)  # of pitch
     if cosine < LEAST_COSINE:
-        raise AlignmentError("alignment: the nose points straight up or down, where roll has no meaning")
+        raise AlignmentError(
+            "alignment: the nose points straight up or down, where roll has no meaning"
+        )
     by_roll = np.array([0.0, z, -y]) / cosine**2
     by_pitch = np.array([-cosine, x * y / cosine, x * z / cosine])
     return np.stack([by_roll, by_pitch])
@@ -92,7 +94,11 @@ def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
             "Imu.specific_force: is not finite in every row; alignment needs accelerometers throughout"
         )
     body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
-    return Imu(imu.stamps_ns, imu.angular_velocity @ body_R_imu.T, imu.specific_force @ body_R_imu.T)
+    return Imu(
+        imu.stamps_ns,
+        imu.angular_velocity @ body_R_imu.T,
+        imu.specific_force @ body_R_imu.T,
+    )
 
 
 BLOCK_S = 0.5
@@ -108,7 +114,9 @@ LARGEST_GRAVITY_ERROR = 0.05
 """Share of gravity; beyond it the unit is another one, or gravity was removed."""
 
 
-def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) -> InitialTilt:
+def align_at_rest(
+    imu: Imu, calibration: Calibration, dvl: Dvl | None = None
+) -> InitialTilt:
     """Roll, pitch and gyro bias of a vehicle that does not move.
 
     Parameters
@@ -153,7 +161,9 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     roll, pitch = roll_and_pitch(up)
     bias = rate - upward * up
     cov = covariance_at_rest(up, length_s, calibration)
-    return InitialTilt(int(imu.stamps_ns[-1]), roll, pitch, bias, cov, np.ones(3, dtype=np.bool_))
+    return InitialTilt(
+        int(imu.stamps_ns[-1]), roll, pitch, bias, cov, np.ones(3, dtype=np.bool_)
+    )
 
 
 def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> Floats:
@@ -164,10 +174,15 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
     upward, level = earth_up_and_level(calibration)
     sensors = calibration.imu
     across = np.eye(3) - np.outer(up, up)
-    tilt = (sensors.accel_bias_sigma**2 + sensors.accel_noise_density**2 / rest_s) / calibration.gravity_m_s2**2
+    tilt = (
+        sensors.accel_bias_sigma**2 + sensors.accel_noise_density**2 / rest_s
+    ) / calibration.gravity_m_s2**2
     by_up = np.concatenate([angles_by_up(up), -upward * np.eye(3)])
     covariance = by_up @ (tilt * across) @ by_up.T
-    noise = sensors.gyro_noise_density**2 / rest_s + sensors.gyro_bias_walk_density**2 * rest_s / 3.0
+    noise = (
+        sensors.gyro_noise_density**2 / rest_s
+        + sensors.gyro_bias_walk_density**2 * rest_s / 3.0
+    )
     covariance[2:, 2:] += noise * np.eye(3) + 0.5 * level**2 * across
     return np.asarray(covariance)
 
@@ -176,9 +191,13 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
     """Raise AlignmentError where the rows, in body axes, are no rest: too short, with a hole, moving or turning."""
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     if seconds[-1] < FEWEST_BLOCKS * BLOCK_S:
-        raise AlignmentError(f"alignment: {seconds[-1]:.1f} s of IMU is too short; give {FEWEST_BLOCKS * BLOCK_S:g} s")
+        raise AlignmentError(
+            f"alignment: {seconds[-1]:.1f} s of IMU is too short; give {FEWEST_BLOCKS * BLOCK_S:g} s"
+        )
     if np.diff(seconds).max() > 0.5 * BLOCK_S:
-        raise AlignmentError(f"Imu: {np.diff(seconds).max():.2f} s without a row; give a stretch without holes")
+        raise AlignmentError(
+            f"Imu: {np.diff(seconds).max():.2f} s without a row; give a stretch without holes"
+        )
     block = (seconds / BLOCK_S).astype(np.int64)
     _, first, count = np.unique(block, return_index=True, return_counts=True)
     for name, values, field in (
@@ -186,7 +205,8 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         ("angular_velocity", imu.angular_velocity, "gyro_noise_density"),
     ):
         density = getattr(calibration.imu, field)
-        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]  # the last block is not full
+        # the last block is not full
+        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
         freedom = means.size - means.shape[1]
         squares = np.sum((means - means.mean(axis=0)) ** 2)
         ratio = np.sqrt(squares * BLOCK_S / freedom)
@@ -213,7 +233,9 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
     during = dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
     if during is not None:
         speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
-        sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(len(during))
+        sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(
+            len(during)
+        )
         if speed > LARGEST_SPEED_M_S + 5.0 * sigma:
             raise AlignmentError(
                 f"Dvl.velocity: {speed:.3f} m/s on average; no rest, give another stretch or align in motion"

@@ -30,7 +30,12 @@ from threadpoolctl import threadpool_limits
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.alignment.at_rest import in_body_axes
-from sonar_graph.navigation.alignment.time_offset import RANGE_S, Estimate1D, SampleSeries, search_offset
+from sonar_graph.navigation.alignment.time_offset import (
+    RANGE_S,
+    Estimate1D,
+    SampleSeries,
+    search_offset,
+)
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import is_partial
 from sonar_graph.numerics import running_rotations
@@ -91,16 +96,24 @@ class InertialPath:
 
     def rotations_at(self, seconds: Floats) -> Floats:
         """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
-        after = np.clip(np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1)
-        share = (seconds - self.seconds[after - 1]) / (self.seconds[after] - self.seconds[after - 1])
+        after = np.clip(
+            np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1
+        )
+        share = (seconds - self.seconds[after - 1]) / (
+            self.seconds[after] - self.seconds[after - 1]
+        )
         before = Rotation.from_matrix(self.rotations[after - 1])
         step = (before.inv() * Rotation.from_matrix(self.rotations[after])).as_rotvec()
-        return np.asarray((before * Rotation.from_rotvec(share[:, None] * step)).as_matrix())
+        return np.asarray(
+            (before * Rotation.from_rotvec(share[:, None] * step)).as_matrix()
+        )
 
     def linear_at(self, seconds: Floats, values: Floats) -> Floats:
         """One of the integrals, or any values at the samples, linear in between, shape (k, ...)."""
         columns = values.reshape(len(values), -1)
-        found = np.column_stack([np.interp(seconds, self.seconds, column) for column in columns.T])
+        found = np.column_stack(
+            [np.interp(seconds, self.seconds, column) for column in columns.T]
+        )
         return found.reshape(len(seconds), *values.shape[1:])
 
 
@@ -114,7 +127,9 @@ def holes_before(stamps_ns: Ints) -> Ints:
     return np.cumsum(ends_hole)
 
 
-def strapdown_integrals(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def strapdown_integrals(
+    seconds: Floats, rate: Floats, force: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """C, F, S and P of the module's equations at every sample."""
     mean_rate = 0.5 * (rate[:-1] + rate[1:])
     turns = mean_rate * np.diff(seconds)[:, None]  # (n - 1, 3)
@@ -206,14 +221,20 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     velocity = dvl.velocity[inside] @ body_R_dvl.T  # (k, 3)
     runs = list(stretches_of(seconds, path.parts_at(seconds)))
     if len(runs) < LEAST_STRETCHES:
-        return DvlMatch.unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both and no hole of the IMU")
-    lever = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
+        return DvlMatch.unknown(
+            f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both and no hole of the IMU"
+        )
+    lever = np.subtract(
+        calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m
+    )
     yaw = 0.0
     scale = 1.0
     gyro_bias = np.zeros(3)
     for done in range(1, ROUNDS + 1):
         # integrated again with the gyro bias found so far: the model is linearised about it
-        path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force))
+        path = InertialPath.of(
+            Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force)
+        )
         turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
         line_up = partial(velocity_changes, path, seconds, turned, runs, lever)
         # small matrices: threads of BLAS would only cost
@@ -234,14 +255,21 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
         step = [turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]
         if np.linalg.norm(step) < LARGEST_STEP_LEFT:
             break
-        is_known = not found.reason or sigma[YAW] <= YAW_LIMIT_RAD or sigma[SCALE] <= SCALE_LIMIT
+        is_known = (
+            not found.reason
+            or sigma[YAW] <= YAW_LIMIT_RAD
+            or sigma[SCALE] <= SCALE_LIMIT
+        )
         if done >= HOPELESS_AFTER and not is_known:
             return DvlMatch.unknown(NO_MANOEUVRES)
     else:
         return DvlMatch.unknown(NO_MANOEUVRES)
 
     def along_axes(values: Floats, sigmas: Floats, limit: float) -> Estimates3D:
-        x, y, z = (Estimate1D(float(values[i]), float(sigmas[i])).limited(limit, NO_TURNS) for i in range(3))
+        x, y, z = (
+            Estimate1D(float(values[i]), float(sigmas[i])).limited(limit, NO_TURNS)
+            for i in range(3)
+        )
         return x, y, z
 
     return DvlMatch(
@@ -271,7 +299,12 @@ def stretches_of(seconds: Floats, parts: Ints) -> Iterator[slice]:
 
 
 def velocity_changes(
-    path: InertialPath, stamped_s: Floats, velocity: Floats, runs: list[slice], lever: Floats, offset_s: float
+    path: InertialPath,
+    stamped_s: Floats,
+    velocity: Floats,
+    runs: list[slice],
+    lever: Floats,
+    offset_s: float,
 ) -> list[SampleSeries]:
     """Differences of x over each run, with the stamps moved by an offset, and their derivatives.
 
@@ -296,9 +329,19 @@ def velocity_changes(
         S_since = S[r] - S[r][0]
         P_since = P[r] - P[r][0]
         F_since = F[r] - F[r][0]
-        drifting = P_since - cross_matrices(F_since) @ S[r][0] - cross_matrices(carried) @ S_since
+        drifting = (
+            P_since
+            - cross_matrices(F_since) @ S[r][0]
+            - cross_matrices(carried) @ S_since
+        )
         # by scale, mounting, lever arm, both biases: (n, 3, 13)
-        columns = [-carried[:, :, None], C[r] @ cross_matrices(in_body), turning[r], -S_since, drifting]
+        columns = [
+            -carried[:, :, None],
+            C[r] @ cross_matrices(in_body),
+            turning[r],
+            -S_since,
+            drifting,
+        ]
         # by the stamps as they are: moved stamps are rounded, and 2.5 rows a second would become 2 or 3
         interval_s = float(np.median(np.diff(stamped_s[r])))
         together = max(1, round(MEAN_OVER_S / interval_s))
@@ -306,11 +349,14 @@ def velocity_changes(
         upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])
         level_R_g = np.asarray(upright.as_matrix())
         y = np.diff(means_over(x[r], together), axis=0) @ level_R_g.T
-        A = level_R_g @ np.diff(means_over(np.concatenate(columns, axis=2), together), axis=0)
+        A = level_R_g @ np.diff(
+            means_over(np.concatenate(columns, axis=2), together), axis=0
+        )
         duration = np.diff(t)
         gravity = duration[:, None, None] * np.eye(3)
         middle = t[:-1] + 0.5 * duration
-        B = np.concatenate([gravity, middle[:, None, None] * gravity], axis=2)  # (m, 3, 6)
+        # (m, 3, 6)
+        B = np.concatenate([gravity, middle[:, None, None] * gravity], axis=2)
         changes.append(SampleSeries(y, A, B, duration, walks=(True, True, False)))
     return changes
 

@@ -79,17 +79,30 @@ class DopplerOnPath:
     """Covariance of x by the noise that is fresh in each sample, shape (k, 3, 3)."""
 
     @classmethod
-    def of(cls, path: InertialPath, seconds: Floats, velocity: Floats, R: Floats, known: Calibration) -> DopplerOnPath:
+    def of(
+        cls,
+        path: InertialPath,
+        seconds: Floats,
+        velocity: Floats,
+        R: Floats,
+        known: Calibration,
+    ) -> DopplerOnPath:
         """Take velocities in body axes and their covariances R to the IMU's point and into the path's frame."""
-        lever = np.subtract(known.imu.mounting.translation_m, known.dvl.mounting.translation_m)
+        lever = np.subtract(
+            known.imu.mounting.translation_m, known.dvl.mounting.translation_m
+        )
         C = path.rotations_at(seconds)  # (k, 3, 3)
         at_imu = velocity + np.cross(path.linear_at(seconds, path.rate), lever)
         turned = np.einsum("kij,kj->ki", C, at_imu)
         skewed = C @ cross_matrices(lever[None])
-        rate_variance = known.imu.gyro_noise_density**2 / float(np.median(np.diff(path.seconds)))
+        rate_variance = known.imu.gyro_noise_density**2 / float(
+            np.median(np.diff(path.seconds))
+        )
         R = C @ R @ C.transpose(0, 2, 1)
         R += rate_variance * skewed @ skewed.transpose(0, 2, 1)
-        return cls(seconds, turned, turned - path.linear_at(seconds, path.impulse), skewed, R)
+        return cls(
+            seconds, turned, turned - path.linear_at(seconds, path.impulse), skewed, R
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,14 +159,18 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     doppler = DopplerOnPath.of(path, seconds, velocity, R, calibration)
     slope, level = np.polyfit(doppler.seconds, doppler.x, 1)
     nothing = np.zeros(3)
-    state = AlignmentState(level, -slope / np.linalg.norm(slope), nothing, nothing, nothing)
+    state = AlignmentState(
+        level, -slope / np.linalg.norm(slope), nothing, nothing, nothing
+    )
     once = imu.rows(np.unique(imu.stamps_ns, return_index=True)[1])
     for _ in range(ROUNDS):
         earth = np.einsum("nji,j->ni", path.rotations, upward * state.up + state.north)
         unbiased = once.angular_velocity - state.gyro_bias - earth
         path = InertialPath.of(replace(once, angular_velocity=unbiased))
         doppler = DopplerOnPath.of(path, seconds, velocity, R, calibration)
-        state, covariance, step, misfit = gauss_newton_step(state, path, doppler, calibration)
+        state, covariance, step, misfit = gauss_newton_step(
+            state, path, doppler, calibration
+        )
         if step < LARGEST_STEP_LEFT:
             break
     freedom = 3 * len(seconds) - 5
@@ -168,7 +185,9 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     joint = by_step @ covariance @ by_step.T
     observed = np.sqrt(np.diag(joint)[2:]) < OBSERVED * calibration.imu.gyro_bias_sigma
     roll, pitch = roll_and_pitch(state.up)
-    return InitialTilt(int(imu.stamps_ns[0]), roll, pitch, state.gyro_bias, joint, observed)
+    return InitialTilt(
+        int(imu.stamps_ns[0]), roll, pitch, state.gyro_bias, joint, observed
+    )
 
 
 def until_hole(imu: Imu) -> Imu:
@@ -177,7 +196,9 @@ def until_hole(imu: Imu) -> Imu:
     return imu if row < 0 else imu.rows(slice(0, row))
 
 
-def whole_doppler_rows(imu: Imu, dvl: Dvl, calibration: Calibration) -> tuple[Floats, Floats, Floats]:
+def whole_doppler_rows(
+    imu: Imu, dvl: Dvl, calibration: Calibration
+) -> tuple[Floats, Floats, Floats]:
     """Seconds since the first IMU row, velocity and its covariance in body axes, of whole rows within the IMU's."""
     seconds = (dvl.stamps_ns - imu.stamps_ns[0]) * 1e-9
     until = min(LONGEST_S, float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9)
@@ -196,14 +217,23 @@ def whole_doppler_rows(imu: Imu, dvl: Dvl, calibration: Calibration) -> tuple[Fl
 
 
 def gauss_newton_step(
-    state: AlignmentState, path: InertialPath, doppler: DopplerOnPath, calibration: Calibration
+    state: AlignmentState,
+    path: InertialPath,
+    doppler: DopplerOnPath,
+    calibration: Calibration,
 ) -> tuple[AlignmentState, Floats, float, float]:
     """The next state, the covariance of all parameters, the size of the step, and chi-square before it."""
     upward, level = earth_up_and_level(calibration)
     sensors = calibration.imu
     g = calibration.gravity_m_s2
     basis = _across(state.up)  # (3, 2)
-    prior_sigmas = [FREE, FREE, sensors.gyro_bias_sigma, sensors.accel_bias_sigma, level / np.sqrt(2)]
+    prior_sigmas = [
+        FREE,
+        FREE,
+        sensors.gyro_bias_sigma,
+        sensors.accel_bias_sigma,
+        level / np.sqrt(2),
+    ]
     sigma = np.repeat(prior_sigmas, [3, 2, 3, 3, 2])  # (13,)
     t = doppler.seconds[:, None]  # (k, 1)
     S = path.linear_at(doppler.seconds, path.turned_time)
@@ -211,11 +241,18 @@ def gauss_newton_step(
     Q_steps = cross_matrices(np.diff(path.impulse, axis=0)) * middle[:, None, None]
     Q = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(Q_steps, axis=0)])
     turned = cross_matrices(doppler.turned)
-    by_gyro = path.linear_at(doppler.seconds, path.tilted_impulse) - turned @ S - doppler.lever
+    by_gyro = (
+        path.linear_at(doppler.seconds, path.tilted_impulse)
+        - turned @ S
+        - doppler.lever
+    )
     by_earth = path.linear_at(doppler.seconds, Q) - turned * t[:, None]
     by_up = (-g * t[:, None] * np.eye(3) + upward * by_earth) @ basis
     still = np.broadcast_to(np.eye(3), S.shape)
-    H = np.concatenate([still, by_up, by_gyro, -S, by_earth @ basis], axis=2).reshape(-1, 13)  # (3 k, 13)
+    # (3 k, 13)
+    H = np.concatenate([still, by_up, by_gyro, -S, by_earth @ basis], axis=2).reshape(
+        -1, 13
+    )
     residual = doppler.x - (state.velocity - g * t * state.up - S @ state.accel_bias)
     factor = cho_factor(noise_covariance(path, doppler, calibration), lower=True)
     root = np.tril(factor[0])
@@ -248,7 +285,9 @@ def _across(up: Floats) -> Floats:
     return np.asarray(np.linalg.svd(up[None])[2][1:].T)
 
 
-def noise_covariance(path: InertialPath, doppler: DopplerOnPath, calibration: Calibration) -> Floats:
+def noise_covariance(
+    path: InertialPath, doppler: DopplerOnPath, calibration: Calibration
+) -> Floats:
     """Covariance of all e of the module's equations, shape (3 k, 3 k)."""
     sensors = calibration.imu
     t = doppler.seconds

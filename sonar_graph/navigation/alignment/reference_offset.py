@@ -20,7 +20,12 @@ from threadpoolctl import threadpool_limits
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Imu, Ints
 from sonar_graph.navigation.alignment.dvl_imu import InertialPath
-from sonar_graph.navigation.alignment.time_offset import RANGE_S, Estimate1D, SampleSeries, search_offset
+from sonar_graph.navigation.alignment.time_offset import (
+    RANGE_S,
+    Estimate1D,
+    SampleSeries,
+    search_offset,
+)
 from sonar_graph.states import Trajectory
 
 LEAST_INTERVAL_S = 0.5
@@ -48,7 +53,9 @@ class ReferenceMatch:
     """Heading of its first pose less that by its other poses and the gyros, rad."""
 
 
-def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibration) -> ReferenceMatch:
+def match_reference_to_imu(
+    imu: Imu, reference: Trajectory, calibration: Calibration
+) -> ReferenceMatch:
     """Compare a reference's rotations with those of the gyros.
 
     Parameters
@@ -88,14 +95,21 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
         B = np.concatenate([steady, from_world], axis=2)  # (m, 3, 6)
         nothing = np.empty((len(y), 3, 0))  # no parameters are common to all stretches
         stretches = _stretches_of(path.parts_at(seconds))
-        return [SampleSeries(y[rows], nothing[rows], B[rows], duration[rows]) for rows in stretches]
+        return [
+            SampleSeries(y[rows], nothing[rows], B[rows], duration[rows])
+            for rows in stretches
+        ]
 
     with threadpool_limits(1, user_api="blas"):
         found = search_offset(line_up, NO_PARAMETERS)
     offset = found.offset().limited(OFFSET_LIMIT_S, "too little turning")
     if not offset.is_known:
-        return ReferenceMatch(offset, Estimate1D(np.nan, np.inf, "the time offset is not known"))
-    return ReferenceMatch(offset, start_heading(path, reference, body_R_imu, offset.value))
+        return ReferenceMatch(
+            offset, Estimate1D(np.nan, np.inf, "the time offset is not known")
+        )
+    return ReferenceMatch(
+        offset, start_heading(path, reference, body_R_imu, offset.value)
+    )
 
 
 def _stretches_of(parts: Ints) -> list[Ints]:
@@ -103,7 +117,9 @@ def _stretches_of(parts: Ints) -> list[Ints]:
     changes = np.flatnonzero(np.diff(parts)) + 1
     within = np.split(np.arange(len(parts) - 1), changes)
     # the last difference before a hole goes over it
-    within = [rows[:-1] if k + 1 < len(within) else rows for k, rows in enumerate(within)]
+    within = [
+        rows[:-1] if k + 1 < len(within) else rows for k, rows in enumerate(within)
+    ]
     return [
         stretch
         for rows in within
@@ -112,7 +128,9 @@ def _stretches_of(parts: Ints) -> list[Ints]:
     ]
 
 
-def start_heading(path: InertialPath, reference: Trajectory, body_R_imu: Floats, offset_s: float) -> Estimate1D:
+def start_heading(
+    path: InertialPath, reference: Trajectory, body_R_imu: Floats, offset_s: float
+) -> Estimate1D:
     """Heading of the beginning, less a line through the rest.
 
     The line's slope is from the medians of the first and last third, so that a few jumps do not matter.
@@ -122,9 +140,13 @@ def start_heading(path: InertialPath, reference: Trajectory, body_R_imu: Floats,
     run_s = float(np.ptp(seconds[inside]))
     inside &= path.parts_at(seconds) == path.parts_at(seconds[inside][:1])
     if np.ptp(seconds[inside]) < LEAST_PART_SHARE * run_s:
-        return Estimate1D(np.nan, np.inf, "a hole of the IMU comes too soon after the start")
+        return Estimate1D(
+            np.nan, np.inf, "a hole of the IMU comes too soon after the start"
+        )
     C = Rotation.from_matrix(path.rotations_at(seconds[inside]))
-    world_R_imu = reference.rotations()[np.flatnonzero(inside)] * Rotation.from_matrix(body_R_imu)
+    world_R_imu = reference.rotations()[np.flatnonzero(inside)] * Rotation.from_matrix(
+        body_R_imu
+    )
     turned = world_R_imu * C.inv()  # world_R_g: constant but for drift
     middle = turned[len(turned) // 2]
     heading = (turned * middle.inv()).as_rotvec()[:, 2]

@@ -66,7 +66,11 @@ class LeastSquaresFit:
     """(r_1 in 1/s, r_2 in 1/s³)."""
 
 
-def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats | None = None) -> LeastSquaresFit:
+def fit(
+    stretches: Sequence[SampleSeries],
+    prior_sigmas: Floats,
+    ratios: Floats | None = None,
+) -> LeastSquaresFit:
     """Fit the common parameters.
 
     ``stretches``: at least one, with more differences in all than parameters. ``prior_sigmas``: of the common
@@ -78,7 +82,9 @@ def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats 
         units = np.array([rate, rate**3])
 
         def bounded(logs: Floats) -> Floats:
-            return np.asarray(units * np.exp(np.clip(logs, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)))
+            return np.asarray(
+                units * np.exp(np.clip(logs, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT))
+            )
 
         def criterion(logs: Floats) -> float:
             return NormalEquations.of(stretches, bounded(logs)).criterion(prior_sigmas)
@@ -87,10 +93,15 @@ def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats 
         from scipy.optimize import minimize  # takes most of a second to load
 
         best = minimize(
-            criterion, start[0], method="Nelder-Mead", options={"initial_simplex": start, "xatol": 0.1, "fatol": 0.02}
+            criterion,
+            start[0],
+            method="Nelder-Mead",
+            options={"initial_simplex": start, "xatol": 0.1, "fatol": 0.02},
         )
         ratios = bounded(best.x)
-    parameters, information, rss, variance = NormalEquations.of(stretches, ratios).solve(prior_sigmas)
+    parameters, information, rss, variance = NormalEquations.of(
+        stretches, ratios
+    ).solve(prior_sigmas)
     covariance = np.asarray(variance * np.linalg.inv(information), dtype=np.float64)
     return LeastSquaresFit(parameters, covariance, rss, variance, ratios)
 
@@ -106,7 +117,9 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
         m = len(stretch.y)
         differences = np.diff(np.eye(m + 1), axis=0)
         factors = _factors(stretch, ratios)
-        own_columns = [_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]
+        own_columns = [
+            _whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)
+        ]
         own, _ = _orthonormal(np.concatenate(own_columns))
         power = 3.0 * m - own.shape[1]
         for axis in range(3):
@@ -126,7 +139,10 @@ def _factors(stretch: SampleSeries, ratios: Floats) -> list[Floats]:
     walk = np.outer(T, T) * np.minimum.outer(middle, middle)
     steady = np.diag(2.0 + ratios[0] * T) - np.eye(m, k=1) - np.eye(m, k=-1)
     # axes of a kind have the same K: one factor each
-    by_kind = {walks: np.linalg.cholesky(steady + walks * ratios[1] * walk) for walks in set(stretch.walks)}
+    by_kind = {
+        walks: np.linalg.cholesky(steady + walks * ratios[1] * walk)
+        for walks in set(stretch.walks)
+    }
     return [np.asarray(by_kind[walks], dtype=np.float64) for walks in stretch.walks]
 
 
@@ -152,9 +168,15 @@ class NormalEquations:
         parts = []
         for stretch in stretches:
             m, _, p = stretch.A.shape
-            columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)  # (m, 3, 1 + p + q)
+            # (m, 3, 1 + p + q)
+            columns = np.concatenate(
+                [stretch.y[:, :, None], stretch.A, stretch.B], axis=2
+            )
             factors = _factors(stretch, ratios)
-            white = np.concatenate([_whitened(factors[axis], columns[:, axis]) for axis in range(3)])  # (3 m, ...)
+            # (3 m, ...)
+            white = np.concatenate(
+                [_whitened(factors[axis], columns[:, axis]) for axis in range(3)]
+            )
             own, size = _orthonormal(white[:, 1 + p :])
             kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
             squares = kept.T @ kept  # of [y, A], (1 + p, 1 + p)
@@ -176,8 +198,12 @@ class NormalEquations:
         variance = self.yty / self.freedom
         for _ in range(3):
             information = self.AtA + np.diag(variance / np.square(prior_sigmas))
-            parameters = np.asarray(np.linalg.solve(information, self.Aty), dtype=np.float64)
-            rss = max(self.yty - float(parameters @ self.Aty), 1e-12 * self.yty + 1e-300)
+            parameters = np.asarray(
+                np.linalg.solve(information, self.Aty), dtype=np.float64
+            )
+            rss = max(
+                self.yty - float(parameters @ self.Aty), 1e-12 * self.yty + 1e-300
+            )
             variance = rss / max(self.freedom - count, 1)
         return parameters, information, rss, variance
 
@@ -250,9 +276,13 @@ class OffsetFit:
         sigma_s = float(np.sqrt(self.fit.covariance[0, 0]))
         return Estimate1D(self.offset_s, sigma_s, self.reason)
 
-    def without_shared_noise(self, stretches: Sequence[SampleSeries], column: int) -> OffsetFit:
+    def without_shared_noise(
+        self, stretches: Sequence[SampleSeries], column: int
+    ) -> OffsetFit:
         """Corrected where one column of A holds the same rates' noise as y (`rate_noise_power`)."""
-        shift = self.fit.covariance[:, column] * rate_noise_power(stretches, self.fit.ratios)
+        shift = self.fit.covariance[:, column] * rate_noise_power(
+            stretches, self.fit.ratios
+        )
         corrected = replace(self.fit, parameters=self.fit.parameters - shift)
         return replace(self, fit=corrected, offset_s=self.offset_s - float(shift[0]))
 
@@ -297,12 +327,18 @@ def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
 
 
 def _converge(
-    line_up: LineUp, prior_sigmas: Floats, ratios: Floats, offset_s: float, limits: tuple[float, float]
+    line_up: LineUp,
+    prior_sigmas: Floats,
+    ratios: Floats,
+    offset_s: float,
+    limits: tuple[float, float],
 ) -> OffsetFit:
     """Gauss-Newton steps of the offset within limits; one that still moves by half its sigma is not known."""
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     for _ in range(ROUNDS):
-        found = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas, ratios)
+        found = fit(
+            _with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas, ratios
+        )
         step = float(np.clip(found.parameters[0], -GRID_STEP_S, GRID_STEP_S))
         offset_s = float(np.clip(offset_s + step, *limits))
         if abs(step) < 1e-5:
@@ -313,9 +349,14 @@ def _converge(
     return OffsetFit(found, offset_s, "" if is_settled else unsettled)
 
 
-def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios: Floats) -> list[SampleSeries]:
+def _with_offset(
+    line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios: Floats
+) -> list[SampleSeries]:
     """The data at an offset, with minus the derivative of ``y - A p`` by it as a further column in front."""
-    here, before, after = (line_up(offset_s + step) for step in (0.0, -DERIVATIVE_STEP_S, DERIVATIVE_STEP_S))
+    here, before, after = (
+        line_up(offset_s + step)
+        for step in (0.0, -DERIVATIVE_STEP_S, DERIVATIVE_STEP_S)
+    )
     p = fit(here, prior_sigmas, ratios).parameters
     stretches = []
     for h, b, a in zip(here, before, after, strict=True):

@@ -59,7 +59,9 @@ class DepthGate:
         z_m = float(world_p_port[2])
         is_stated = "position_m" in start.model_fields_set
         length = LATEST_NS if is_stated else FEWEST - 1
-        self._used = DepthChain(EARLIEST_NS, z_m, start.position_sigma_m[2] ** 2, length)
+        self._used = DepthChain(
+            EARLIEST_NS, z_m, start.position_sigma_m[2] ** 2, length
+        )
         self._refused: list[DepthChain] = []
         self.newest_ns: int = EARLIEST_NS
         """Stamp of the last sample that was judged."""
@@ -69,7 +71,9 @@ class DepthGate:
         """None for a sample that is used, else its squared distance from the last one used."""
         longest_ns = max(LONG_NS, LONG_INTERVALS * (self._interval_ns or 0))
         if self.newest_ns > EARLIEST_NS:
-            self._interval_ns = min(self._interval_ns or LATEST_NS, stamp_ns - self.newest_ns)
+            self._interval_ns = min(
+                self._interval_ns or LATEST_NS, stamp_ns - self.newest_ns
+            )
         else:
             self._used = self._used._replace(stamp_ns=stamp_ns - LONG_NS)
         self.newest_ns = stamp_ns
@@ -81,11 +85,15 @@ class DepthGate:
             self._use(sample._replace(length=used.length + 1))
             return None
         # refused as it is; it may continue a chain of refused samples
-        near = [chain for chain in self._refused if chain.distance(sample) <= DEPTH_GATE]
+        near = [
+            chain for chain in self._refused if chain.distance(sample) <= DEPTH_GATE
+        ]
         if near:
             before = max(near, key=lambda chain: chain.length)
             self._refused.remove(before)
-            sample = sample._replace(length=before.length + 1, is_reachable=before.is_reachable)
+            sample = sample._replace(
+                length=before.length + 1, is_reachable=before.is_reachable
+            )
         else:
             sample = sample._replace(is_reachable=used.distance(sample) <= DEPTH_GATE)
         if sample.length > (FEWEST - 1 if sample.is_reachable else used.length):

@@ -28,7 +28,12 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.preintegration import covariance, row_of, rows_until
-from sonar_graph.navigation.samples import LATEST_NS, PARTIAL_M2_S2, VelocityRow, VelocityRows
+from sonar_graph.navigation.samples import (
+    LATEST_NS,
+    PARTIAL_M2_S2,
+    VelocityRow,
+    VelocityRows,
+)
 from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import Refusal, RefusedRow
@@ -57,7 +62,9 @@ class GateResult(NamedTuple):
         return ~(self.is_outlier | self.is_partial)
 
 
-def gate_velocities(rows: VelocityRows, known: VelocityRows, walk: float, gate: float) -> GateResult:
+def gate_velocities(
+    rows: VelocityRows, known: VelocityRows, walk: float, gate: float
+) -> GateResult:
     """Compare each row with the last whole one accepted, beginning with the known row before the first.
 
     ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
@@ -96,7 +103,9 @@ def _write_gated(
         v = row_of(rows.velocity, k)
         Q_v = covariance(rows.cov, k)
         if stamp_ns > last_ns:
-            distance[k] = squared_distance(u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk)
+            distance[k] = squared_distance(
+                u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk
+            )
         is_partial[k] = Q_v.x.x + Q_v.y.y + Q_v.z.z > PARTIAL_M2_S2
         is_outlier[k] = distance[k] > gate
         if is_partial[k] or is_outlier[k]:
@@ -109,7 +118,9 @@ def _write_gated(
 
 
 @inlined
-def squared_distance(u: Vec3, Q_u: Mat3, v: Vec3, Q_v: Mat3, t: float, walk: float) -> float:
+def squared_distance(
+    u: Vec3, Q_u: Mat3, v: Vec3, Q_v: Mat3, t: float, walk: float
+) -> float:
     """``e^T S^-1 e``, ``e = v - u``, of two velocities t seconds apart; S^-1 is the adjugate over the determinant."""
     x, y, z = v - u
     may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u @ u)
@@ -194,14 +205,23 @@ class VelocityConfirmation:
         if not self._must_wait(row):
             return Confirmed(VelocityRows.of([row]), [])
         if row.stamp_ns not in self.waiting_ns:
-            self._waiting = sorted([*self._waiting, row], key=lambda waiting: waiting.stamp_ns)
+            self._waiting = sorted(
+                [*self._waiting, row], key=lambda waiting: waiting.stamp_ns
+            )
         beyond = self._waiting[:-MOST_WAITING]
-        refused = [RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan) for old in beyond]
+        refused = [
+            RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan)
+            for old in beyond
+        ]
         self._waiting = self._waiting[-MOST_WAITING:]
         # a clock that was set meanwhile: rows before the step confirm nothing after it
         newest_ns = self._waiting[-1].stamp_ns
-        apart = [old.stamp_ns for old in self._waiting if newest_ns - old.stamp_ns > PAUSE_NS]
-        refused += [RefusedRow("dvl", old_ns, Refusal.CLOCK, np.nan) for old_ns in apart]
+        apart = [
+            old.stamp_ns for old in self._waiting if newest_ns - old.stamp_ns > PAUSE_NS
+        ]
+        refused += [
+            RefusedRow("dvl", old_ns, Refusal.CLOCK, np.nan) for old_ns in apart
+        ]
         self._waiting = self._waiting[len(apart) :]
         chain = self.first_accepted_chain()
         released = self.release(chain, refused) if chain else []
@@ -217,25 +237,36 @@ class VelocityConfirmation:
             # the gate of a slow log is wide anyway
             long_ns = max(LONG_NS, LONG_INTERVALS * int(intervals.min()))
         since_ns = row.stamp_ns - self._recent_ns[-1]
-        return since_ns > 0 and (is_waiting or (since_ns > long_ns and not row.is_partial))
+        return since_ns > 0 and (
+            is_waiting or (since_ns > long_ns and not row.is_partial)
+        )
 
     def first_accepted_chain(self) -> list[VelocityRow]:
         """The first chain of waiting rows that is long enough and a majority of its stretch; empty without one."""
         whole = [row for row in self._waiting if not row.is_partial]
         chains: list[list[VelocityRow]] = []
         for row in whole:
-            before = [chain for chain in chains if self._distance(chain[-1], row) <= GATE]
-            longest = max(before, key=lambda one: (len(one), one[-1].stamp_ns), default=[])
+            before = [
+                chain for chain in chains if self._distance(chain[-1], row) <= GATE
+            ]
+            longest = max(
+                before, key=lambda one: (len(one), one[-1].stamp_ns), default=[]
+            )
             chain = [*longest, row]
             for begin in range(len(chain) - needed(row.velocity) + 1):
                 part = chain[begin:]
-                in_stretch = sum(part[0].stamp_ns <= one.stamp_ns <= part[-1].stamp_ns for one in whole)
+                in_stretch = sum(
+                    part[0].stamp_ns <= one.stamp_ns <= part[-1].stamp_ns
+                    for one in whole
+                )
                 if 2 * len(part) > in_stretch:
                     return part
             chains.append(chain)
         return []
 
-    def release(self, chain: list[VelocityRow], refused: list[RefusedRow]) -> list[VelocityRow]:
+    def release(
+        self, chain: list[VelocityRow], refused: list[RefusedRow]
+    ) -> list[VelocityRow]:
         """Stop waiting up to the end of an accepted chain; rows outside it are refused, of a gap all but the last."""
         # at the start all rows of the chain become epochs, after a gap its last one ends the gap
         stamps = {row.stamp_ns for row in chain}
@@ -255,20 +286,29 @@ class VelocityConfirmation:
         self._waiting = [row for row in self._waiting if row.stamp_ns > end_ns]
         if is_start:
             return found
-        refused += [RefusedRow("dvl", row.stamp_ns, Refusal.WAITED, np.nan) for row in found[:-1]]
+        refused += [
+            RefusedRow("dvl", row.stamp_ns, Refusal.WAITED, np.nan)
+            for row in found[:-1]
+        ]
         return found[-1:]
 
     def _instead(self, wrong: VelocityRow, first: VelocityRow) -> VelocityRow:
         """The velocity of a later row at the stamp of a wrong one, with the variance of what may have changed."""
         t = (first.stamp_ns - wrong.stamp_ns) * 1e-9
-        turned = min(TURNING_RAD_S * t, 2.0) ** 2 * float(first.velocity @ first.velocity)
+        turned = min(TURNING_RAD_S * t, 2.0) ** 2 * float(
+            first.velocity @ first.velocity
+        )
         may_change = self._walk**2 * t + turned
-        return VelocityRow(wrong.stamp_ns, first.velocity, first.cov + may_change * np.eye(3))
+        return VelocityRow(
+            wrong.stamp_ns, first.velocity, first.cov + may_change * np.eye(3)
+        )
 
     def _distance(self, one: VelocityRow, other: VelocityRow) -> float:
         """Squared distance; the slower of the two decides how much turning can change."""
         # S depends on the speed of the earlier row: the smaller of both gives the narrower gate
-        fast, slow = sorted((one, other), key=lambda row: -float(row.velocity @ row.velocity))
+        fast, slow = sorted(
+            (one, other), key=lambda row: -float(row.velocity @ row.velocity)
+        )
         since_ns = abs(other.stamp_ns - one.stamp_ns)
         known = VelocityRows.of([slow._replace(stamp_ns=0)])
         rows = VelocityRows.of([fast._replace(stamp_ns=since_ns)])

@@ -57,17 +57,25 @@ class InertialRows(NamedTuple):
         """Values of these rows at other stamps: linear between rows, the nearest beyond them."""
         seconds = (stamps_ns - self.stamps_ns[0]) * 1e-9
         known_s = (self.stamps_ns - self.stamps_ns[0]) * 1e-9
-        return np.column_stack([np.interp(seconds, known_s, values[:, axis]) for axis in range(3)])
+        return np.column_stack(
+            [np.interp(seconds, known_s, values[:, axis]) for axis in range(3)]
+        )
 
     def around(self, first_ns: int, last_ns: int) -> InertialRows | None:
         """The rows for an interval, none after it; None where a force was not measured in it."""
         first = max(int(np.searchsorted(self.stamps_ns, first_ns, side="right")) - 1, 0)
         known = int(np.searchsorted(self.stamps_ns, last_ns, side="right"))
         rows = slice(first, known)
-        within = InertialRows(self.stamps_ns[rows], self.rate[rows], self.specific_force[rows])
+        within = InertialRows(
+            self.stamps_ns[rows], self.rate[rows], self.specific_force[rows]
+        )
         # what is a hole depends on intervals before the first of these rows as well
         with_hole = row_after_hole(self.stamps_ns, first, known - 1, UNFELT_NS) >= 0
-        if with_hole or not len(within.stamps_ns) or not np.isfinite(within.specific_force).all():
+        if (
+            with_hole
+            or not len(within.stamps_ns)
+            or not np.isfinite(within.specific_force).all()
+        ):
             return None
         return within
 
@@ -94,7 +102,9 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     if felt is None:
         still = np.tile(np.eye(3), (n, 1, 1))
         nothing = np.zeros((n, 3))
-        return Carry(still, nothing, nothing, calibration.dvl.velocity_walk_density, False)
+        return Carry(
+            still, nothing, nothing, calibration.dvl.velocity_walk_density, False
+        )
     times_ns = np.union1d(stamps_ns, felt.stamps_ns[felt.stamps_ns > stamps_ns[0]])
     middles_ns = times_ns[:-1] + np.diff(times_ns) // 2
     dt = (np.diff(times_ns) * 1e-9)[:, None]
@@ -106,7 +116,9 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     gained = in_middle @ gains[:, :, None]  # (steps, 3, 1)
     velocity[1:] = np.cumsum(gained[:, :, 0], axis=0)
     at = np.searchsorted(times_ns, stamps_ns)
-    lever = np.subtract(calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m)
+    lever = np.subtract(
+        calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m
+    )
     from_lever = np.cross(felt.at(felt.rate, stamps_ns), lever)
     stretch_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     turned_rad = float(np.linalg.norm(turns, axis=1).sum())
@@ -114,11 +126,16 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     return Carry(rotation[at], velocity[at], from_lever, density, True)
 
 
-def walk_density(calibration: Calibration, stretch_s: float, turned_rad: float) -> float:
+def walk_density(
+    calibration: Calibration, stretch_s: float, turned_rad: float
+) -> float:
     """Q of a stretch, m/s/√s, by the module's table."""
     sensors = calibration.imu
     bias2 = sensors.gyro_bias_sigma**2 + EARTH_RATE_RAD_S**2
-    tilting = sensors.gyro_noise_density**2 * stretch_s**2 / 12.0 + bias2 * stretch_s**3 / 16.0
+    tilting = (
+        sensors.gyro_noise_density**2 * stretch_s**2 / 12.0
+        + bias2 * stretch_s**3 / 16.0
+    )
     by_turning = (sensors.accel_bias_sigma * turned_rad) ** 2 * stretch_s / 16.0
     by_gyro = calibration.gravity_m_s2**2 * tilting
     return float(np.sqrt(sensors.accel_noise_density**2 + by_gyro + by_turning))
@@ -154,13 +171,17 @@ class PartialVelocities:
         stamp_ns = int(rows.stamps_ns[-1])
         self._remember(VelocityRow(stamp_ns, rows.velocity[-1], rows.cov[-1]))
 
-    def completed(self, rows: VelocityRows, is_partial: NDArray[np.bool_], imu: InertialRows) -> VelocityRows:
+    def completed(
+        self, rows: VelocityRows, is_partial: NDArray[np.bool_], imu: InertialRows
+    ) -> VelocityRows:
         """The rows that can be used now, all with a whole velocity; they may be older than those given.
 
         Rows come in order and without NaN; ``is_partial`` marks those that leave a direction unmeasured, shape (n,).
         """
         usable: list[VelocityRow] = []
-        for stamp_ns, velocity, cov, partial in zip(*rows, is_partial.tolist(), strict=True):
+        for stamp_ns, velocity, cov, partial in zip(
+            *rows, is_partial.tolist(), strict=True
+        ):
             row = VelocityRow(int(stamp_ns), velocity, cov)
             newest = self._waiting[-1] if self._waiting else self._whole
             if not partial:
@@ -173,8 +194,12 @@ class PartialVelocities:
 
     def close_stretch(self, row: VelocityRow, imu: InertialRows) -> list[VelocityRow]:
         """The rows that waited for a whole one, completed."""
-        within = [waiting for waiting in self._waiting if waiting.stamp_ns < row.stamp_ns]
-        self._waiting = [waiting for waiting in self._waiting if waiting.stamp_ns > row.stamp_ns]
+        within = [
+            waiting for waiting in self._waiting if waiting.stamp_ns < row.stamp_ns
+        ]
+        self._waiting = [
+            waiting for waiting in self._waiting if waiting.stamp_ns > row.stamp_ns
+        ]
         whole = self._whole
         shared = self._shared
         self._remember(row)
@@ -185,7 +210,9 @@ class PartialVelocities:
             self._not_used_ns += [waiting.stamp_ns for waiting in within]
             return []
         self._whole = row
-        completed, self._shared = solve_stretch([whole, *within, row], shared, imu, self._calibration)
+        completed, self._shared = solve_stretch(
+            [whole, *within, row], shared, imu, self._calibration
+        )
         return completed
 
     def _remember(self, row: VelocityRow) -> None:
@@ -227,7 +254,9 @@ def solve_stretch(
     return completed, R.T @ shared_next @ R
 
 
-def least_squares(rows: list[VelocityRow], by: Carry, intervals_s: Floats) -> tuple[Floats, Floats]:
+def least_squares(
+    rows: list[VelocityRow], by: Carry, intervals_s: Floats
+) -> tuple[Floats, Floats]:
     """Equation (1): y, shape (n, 3), and its joint covariance, shape (3n, 3n)."""
     n = len(rows)
     size = 3 * n + (3 if by.is_inertial else 0)

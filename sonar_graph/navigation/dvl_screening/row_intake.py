@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.dvl_screening.depth_gate import DepthGate
-from sonar_graph.navigation.dvl_screening.dvl_gate import GATE, GateResult, VelocityConfirmation, gate_velocities
-from sonar_graph.navigation.dvl_screening.partial_beams import InertialRows, PartialVelocities
+from sonar_graph.navigation.dvl_screening.dvl_gate import (
+    GATE,
+    GateResult,
+    VelocityConfirmation,
+    gate_velocities,
+)
+from sonar_graph.navigation.dvl_screening.partial_beams import (
+    InertialRows,
+    PartialVelocities,
+)
 from sonar_graph.navigation.samples import (
     EARLIEST_NS,
     LATEST_NS,
@@ -66,7 +74,9 @@ class RowIntake:
         self._partial = PartialVelocities(calibration)
         self.imu = StampedRows(np.empty((0, 3)), np.empty((0, 3)))
         """Angular rate and specific force, body axes."""
-        self.dvl = StampedRows(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.int64))
+        self.dvl = StampedRows(
+            np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.int64)
+        )
         """Velocity of the DVL's origin and its covariance, body axes, and the stamp from which they are known."""
         self.settled_ns: int = EARLIEST_NS
         """Stamp up to which motion is used and final."""
@@ -76,8 +86,14 @@ class RowIntake:
     def refused(self) -> list[RefusedRow]:
         """Rows that are not used, and why; includes rows that may still be completed or confirmed."""
         waiting_ns = self._confirmation.waiting_ns if self._confirmation else []
-        incomplete = [RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan) for at_ns in self._partial.not_completed_ns]
-        unconfirmed = [RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan) for at_ns in waiting_ns]
+        incomplete = [
+            RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan)
+            for at_ns in self._partial.not_completed_ns
+        ]
+        unconfirmed = [
+            RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan)
+            for at_ns in waiting_ns
+        ]
         return [*self._refused, *incomplete, *unconfirmed]
 
     def add_imu(self, imu: Imu) -> bool:
@@ -115,19 +131,32 @@ class RowIntake:
         """Samples that pass, each stamp once; None without any."""
         gate = self._depth_gate
         is_used = np.zeros(len(depth), np.bool_)
-        variance_m2 = np.where(np.isnan(depth.variance_m2), self._depth_variance, depth.variance_m2)
-        rows = zip(depth.stamps_ns.tolist(), depth.z_m.tolist(), variance_m2.tolist(), strict=True)
+        variance_m2 = np.where(
+            np.isnan(depth.variance_m2), self._depth_variance, depth.variance_m2
+        )
+        rows = zip(
+            depth.stamps_ns.tolist(),
+            depth.z_m.tolist(),
+            variance_m2.tolist(),
+            strict=True,
+        )
         for k, (stamp_ns, z_m, variance) in enumerate(rows):
             if not 0.0 < variance < np.inf:
-                self._refused.append(RefusedRow("depth", stamp_ns, Refusal.UNSOUND, np.nan))
+                self._refused.append(
+                    RefusedRow("depth", stamp_ns, Refusal.UNSOUND, np.nan)
+                )
             elif stamp_ns <= gate.newest_ns:
                 if stamp_ns < gate.newest_ns:  # a repeated stamp is no late sample
-                    self._refused.append(RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan))
+                    self._refused.append(
+                        RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan)
+                    )
             else:
                 distance = gate.distance(stamp_ns, z_m, variance)
                 is_used[k] = distance is None
                 if distance is not None:
-                    self._refused.append(RefusedRow("depth", stamp_ns, Refusal.OUT_OF_REACH, distance))
+                    self._refused.append(
+                        RefusedRow("depth", stamp_ns, Refusal.OUT_OF_REACH, distance)
+                    )
         if is_used.all():
             return depth
         return depth.rows(is_used) if is_used.any() else None
@@ -142,12 +171,16 @@ class RowIntake:
         result = self._gated(rows)
         if confirmation is None:
             return self._place(rows, result)
-        whole_ns = rows.stamps_ns if result.is_plain else rows.stamps_ns[result.is_accepted]
+        whole_ns = (
+            rows.stamps_ns if result.is_plain else rows.stamps_ns[result.is_accepted]
+        )
         if confirmation.lets_all_pass(rows.stamps_ns, whole_ns):
             confirmation.accept(whole_ns)
             return self._place(rows, result)
         was_placed_before = False
-        for stamp_ns, velocity, cov, is_partial in zip(*rows, result.is_partial, strict=True):
+        for stamp_ns, velocity, cov, is_partial in zip(
+            *rows, result.is_partial, strict=True
+        ):
             row = VelocityRow(int(stamp_ns), velocity, cov, bool(is_partial))
             confirmed, refused = confirmation.confirm(row)
             self._refused += refused
@@ -196,7 +229,10 @@ class RowIntake:
         return is_sound | np.isnan(given[:, 0, 0]), cov
 
     def _refuse(self, sensor: str, stamps_ns: Ints, reason: Refusal) -> None:
-        self._refused += [RefusedRow(sensor, stamp_ns, reason, np.nan) for stamp_ns in stamps_ns.tolist()]
+        self._refused += [
+            RefusedRow(sensor, stamp_ns, reason, np.nan)
+            for stamp_ns in stamps_ns.tolist()
+        ]
 
     def _gated(self, rows: VelocityRows) -> GateResult:
         """Compare rows with those placed already."""
@@ -204,7 +240,9 @@ class RowIntake:
         known = VelocityRows(self.dvl.stamps_ns, velocity, cov)
         return gate_velocities(rows, known, self._walk, self._gate)
 
-    def _place(self, rows: VelocityRows, result: GateResult, confirmed_ns: int = EARLIEST_NS) -> bool:
+    def _place(
+        self, rows: VelocityRows, result: GateResult, confirmed_ns: int = EARLIEST_NS
+    ) -> bool:
         """Complete and place rows that are no outliers; True as for `add_imu`."""
         known_ns = rows.stamps_ns
         if result.is_plain and not self._partial.is_waiting:
@@ -214,11 +252,15 @@ class RowIntake:
             outlier_ns = rows.stamps_ns[outlier].tolist()
             distances = result.distance[outlier].tolist()
             for stamp_ns, distance in zip(outlier_ns, distances, strict=True):
-                self._refused.append(RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance))
+                self._refused.append(
+                    RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
+                )
             inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
             # a completed row is known from the whole row on that completed it
             whole_ns = rows.stamps_ns[result.is_accepted]
-            rows = self._partial.completed(rows.where(~outlier), result.is_partial[~outlier], inertial)
+            rows = self._partial.completed(
+                rows.where(~outlier), result.is_partial[~outlier], inertial
+            )
             known_ns = whole_ns[whole_ns.searchsorted(rows.stamps_ns)]
         if not len(rows.stamps_ns):
             return False
@@ -235,7 +277,9 @@ class RowIntake:
         if rows.stamps_ns[0] <= self.settled_ns:
             late = rows.between(EARLIEST_NS, self.settled_ns)
             if late is not None:
-                self._refuse(sensor, np.setdiff1d(late.stamps_ns, known_ns), Refusal.LATE)
+                self._refuse(
+                    sensor, np.setdiff1d(late.stamps_ns, known_ns), Refusal.LATE
+                )
             later = rows.between(self.settled_ns, LATEST_NS)
             if later is None:
                 return None

@@ -5,11 +5,27 @@ from dataclasses import dataclass, replace
 
 from matplotlib.figure import Figure
 
-from sonar_graph.evaluation import DURATION_S, MAP_TIMES_S, Comparison, repeats_published, unaligned
+from sonar_graph.evaluation import (
+    DURATION_S,
+    MAP_TIMES_S,
+    Comparison,
+    repeats_published,
+    unaligned,
+)
 from sonar_graph.report import sentences
-from sonar_graph.report.figure_style import PAGE_WIDTH_IN, Illustration, inline_svg, sized
+from sonar_graph.report.figure_style import (
+    PAGE_WIDTH_IN,
+    Illustration,
+    inline_svg,
+    sized,
+)
 from sonar_graph.report.figures import detection_figures, error_figures
-from sonar_graph.report.figures.maps import enlargement, growth_figure, map_figure, paths_cut_off
+from sonar_graph.report.figures.maps import (
+    enlargement,
+    growth_figure,
+    map_figure,
+    paths_cut_off,
+)
 
 MAP_WIDTH_IN = 4.8
 """Width of the map on the page: whole on a phone, where wider figures scroll."""
@@ -32,7 +48,9 @@ class Drawing:
 
 DRAWINGS = {
     "map": Drawing("Map", map_figure, columns=1),
-    "growth": Drawing("Map as it grew", growth_figure, instead="No run kept its map on the way."),
+    "growth": Drawing(
+        "Map as it grew", growth_figure, instead="No run kept its map on the way."
+    ),
     "errors": Drawing(
         "Error over time and distance",
         error_figures.error_figure,
@@ -59,7 +77,12 @@ DRAWINGS = {
         ("causal.own_map_m",),
         columns=1,
     ),
-    "yaw": Drawing("Yaw over time", error_figures.yaw_figure, scores=("causal.yaw_rmse_rad",), columns=1),
+    "yaw": Drawing(
+        "Yaw over time",
+        error_figures.yaw_figure,
+        scores=("causal.yaw_rmse_rad",),
+        columns=1,
+    ),
     "nees": Drawing(
         "Consistency over time",
         error_figures.nees_figure,
@@ -104,15 +127,29 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
     for name, drawing in drawings(comparison).items():
         told = []  # the figure's numbers, run by run, for a reader who does not see it
         for run in comparison.runs:
-            scores = [score for key in drawing.scores if (score := comparison.score_of(run.estimator, key))]
+            scores = [
+                score
+                for key in drawing.scores
+                if (score := comparison.score_of(run.estimator, key))
+            ]
             if scores:
-                told.append(f"{run.estimator}: {' and '.join(score.with_unit for score in scores)}")
-        numbers = " ".join(sentences.finding(comparison)) if name == "map" else f"{'; '.join(told)}." if told else ""
+                told.append(
+                    f"{run.estimator}: {' and '.join(score.with_unit for score in scores)}"
+                )
+        numbers = (
+            " ".join(sentences.finding(comparison))
+            if name == "map"
+            else f"{'; '.join(told)}."
+            if told
+            else ""
+        )
         with sized(MAP_WIDTH_IN if drawing.draw is map_figure else PAGE_WIDTH_IN):
             figure = drawing.draw(comparison)
             described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
             svg = "" if figure is None else inline_svg(figure, name, described)
-        found[name] = Illustration(name, drawing.title, drawing.caption, svg, drawing.instead)
+        found[name] = Illustration(
+            name, drawing.title, drawing.caption, svg, drawing.instead
+        )
     return found
 
 
@@ -120,7 +157,11 @@ def drawings(comparison: Comparison) -> dict[str, Drawing]:
     """Kinds of figures by name, with their captions in full."""
     captions = _captions(comparison)
     return {
-        name: replace(drawing, caption=captions.get(name, drawing.caption), instead=_instead(comparison, drawing))
+        name: replace(
+            drawing,
+            caption=captions.get(name, drawing.caption),
+            instead=_instead(comparison, drawing),
+        )
         for name, drawing in DRAWINGS.items()
     }
 
@@ -134,7 +175,10 @@ def _instead(comparison: Comparison, drawing: Drawing) -> str:
 
 def _captions(comparison: Comparison) -> dict[str, str]:
     """Captions that depend on the comparison."""
-    is_repeated, world = repeats_published(comparison.sequence), unaligned(comparison.sequence)
+    is_repeated, world = (
+        repeats_published(comparison.sequence),
+        unaligned(comparison.sequence),
+    )
     counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
     factor = enlargement(comparison)
     as_large = "" if factor == 1 else f", drawn {factor} times as large"
@@ -146,17 +190,15 @@ def _captions(comparison: Comparison) -> dict[str, str]:
     if is_repeated:
         *others, last = (f"{time_s:.1f}" for time_s in MAP_TIMES_S)
         if abs(comparison.sequence.duration_s - DURATION_S) < 1:
-            growth += f" T are the instants nearest to its {', '.join(others)} and {last} s."
-        else:
             growth += (
-                f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
+                f" T are the instants nearest to its {', '.join(others)} and {last} s."
             )
+        else:
+            growth += f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
     has_map = comparison.sequence.true_landmarks is not None or any(
         run.landmarks is not None and len(run.landmarks) for run in comparison.runs
     )
-    landmarks = (
-        f" Ellipses hold 95 % of where each estimator believes a landmark to be{as_large}; numbers are landmark IDs."
-    )
+    landmarks = f" Ellipses hold 95 % of where each estimator believes a landmark to be{as_large}; numbers are landmark IDs."
     gone, far = paths_cut_off(comparison), error_figures.errors_cut_off(comparison)
     return {
         "map": (
@@ -166,7 +208,9 @@ def _captions(comparison: Comparison) -> dict[str, str]:
         "growth": growth,
         "errors": DRAWINGS["errors"].caption.format(
             unaligned=world,
-            and_heading=", and size of the causal heading's error" if error_figures.has_yaw(comparison) else "",
+            and_heading=", and size of the causal heading's error"
+            if error_figures.has_yaw(comparison)
+            else "",
             cut=_leaving(far),
         ),
         "bounds": DRAWINGS["bounds"].caption.format(unaligned=world),

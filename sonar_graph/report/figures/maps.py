@@ -44,22 +44,55 @@ def map_figure(comparison: Comparison) -> Figure | None:
     panel: Axes = axes[0, 0]
     truth, true_landmarks = comparison.sequence.truth, true_landmarks_drawn(comparison)
     if truth is not None and len(truth):
-        look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 3.2, "alpha": 0.6, "solid_capstyle": "round"}
+        look: dict[str, Any] = {
+            "color": style.TRUTH,
+            "linewidth": 3.2,
+            "alpha": 0.6,
+            "solid_capstyle": "round",
+        }
         panel.plot(*horizontal(truth), label="truth", zorder=1, **look)
     if true_landmarks is not None and len(true_landmarks):
         look = {"color": style.INK, "markersize": 9, "markeredgewidth": 1.4}
-        panel.plot(*true_landmarks.positions.T[:2], "+", label="true landmarks", zorder=5, **look)
+        panel.plot(
+            *true_landmarks.positions.T[:2],
+            "+",
+            label="true landmarks",
+            zorder=5,
+            **look,
+        )
     for index, run in enumerate(comparison.runs):
         own = style.colour(index)
         if run.causal is not None and len(run.causal):
             look = {"linestyle": style.line_style(index), "linewidth": 1.3}
-            panel.plot(*horizontal(run.causal), color=own, label=f"{run.estimator}, causal", zorder=3, **look)
+            panel.plot(
+                *horizontal(run.causal),
+                color=own,
+                label=f"{run.estimator}, causal",
+                zorder=3,
+                **look,
+            )
         if run.smoothed is not None and smoothed_differs(run):
             look = {"linestyle": (0, (1, 1)), "linewidth": 1.9, "alpha": 0.75}
-            panel.plot(*horizontal(run.smoothed), color=own, label=f"{run.estimator}, smoothed", zorder=2, **look)
+            panel.plot(
+                *horizontal(run.smoothed),
+                color=own,
+                label=f"{run.estimator}, smoothed",
+                zorder=2,
+                **look,
+            )
         if run.landmarks is not None and len(run.landmarks):
-            look = {"markersize": 3.5, "markerfacecolor": "none", "label": f"{run.estimator}, landmarks"}
-            panel.plot(*run.landmarks.positions.T[:2], "os^Dv<"[index % 6], color=own, zorder=4, **look)
+            look = {
+                "markersize": 3.5,
+                "markerfacecolor": "none",
+                "label": f"{run.estimator}, landmarks",
+            }
+            panel.plot(
+                *run.landmarks.positions.T[:2],
+                "os^Dv<"[index % 6],
+                color=own,
+                zorder=4,
+                **look,
+            )
             for ellipse in ellipses(run.landmarks, own, factor):
                 panel.add_patch(ellipse)
     label_landmarks(panel, comparison, view)
@@ -73,7 +106,11 @@ def map_figure(comparison: Comparison) -> Figure | None:
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
     """The true landmarks in the world of the start pose: where they are surveyed in another, the first map tells."""
     true = comparison.sequence.true_landmarks
-    maps = [run.landmarks for run in comparison.runs if run.landmarks is not None and len(run.landmarks)]
+    maps = [
+        run.landmarks
+        for run in comparison.runs
+        if run.landmarks is not None and len(run.landmarks)
+    ]
     scored = scored_map(maps[0], comparison.sequence) if maps else None
     if true is None or scored is None or scored.alignment is None:
         return true
@@ -102,14 +139,22 @@ def smoothed_differs(run: RunResult) -> bool:
 
 
 def _paths(run: RunResult) -> list[Floats]:
-    return [path.positions[:, :2] for path in (run.causal, run.smoothed) if path is not None and len(path)]
+    return [
+        path.positions[:, :2]
+        for path in (run.causal, run.smoothed)
+        if path is not None and len(path)
+    ]
 
 
 def map_view(comparison: Comparison) -> Floats | None:
     """Lower left and upper right corner of the map, shape (2, 2), metres; None where there is no path."""
     estimates = [path for run in comparison.runs for path in _paths(run)]
     sequence = comparison.sequence
-    references = [sequence.truth.positions[:, :2]] if sequence.truth and len(sequence.truth) else []
+    references = (
+        [sequence.truth.positions[:, :2]]
+        if sequence.truth and len(sequence.truth)
+        else []
+    )
 
     def box(points: Floats) -> Floats:
         return np.array([np.nanmin(points, axis=0), np.nanmax(points, axis=0)])
@@ -119,44 +164,70 @@ def map_view(comparison: Comparison) -> Floats | None:
     true = true_landmarks_drawn(comparison)
     if true is not None and len(true):
         references.append(true.positions[:, :2])
-    maps = [run.landmarks.positions[:, :2] for run in comparison.runs if run.landmarks and len(run.landmarks)]
+    maps = [
+        run.landmarks.positions[:, :2]
+        for run in comparison.runs
+        if run.landmarks and len(run.landmarks)
+    ]
     anchor = box(np.vstack(references or estimates))
     largest = max(float(np.max(anchor[1] - anchor[0])), 1.0)
     limits = anchor + np.array([[-1.0], [1.0]]) * MARGIN * largest
     everything = np.vstack([anchor, *estimates, *maps])
-    shown = box(np.clip(everything[np.isfinite(everything).all(axis=1)], limits[0], limits[1]))
+    shown = box(
+        np.clip(everything[np.isfinite(everything).all(axis=1)], limits[0], limits[1])
+    )
     return shown + np.array([[-1.0], [1.0]]) * 0.04 * largest
 
 
 def with_room(view: Floats) -> Floats:
     """The view, widened by what the largest ellipse may need."""
-    return np.asarray(view + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max()))
+    return np.asarray(
+        view
+        + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max())
+    )
 
 
 def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[Ellipse]:
     """Horizontal ellipses that hold each landmark with `ELLIPSE_PROBABILITY`; none where the covariance is unknown."""
     scale = enlarged * 2 * math.sqrt(chi_square_quantile(ELLIPSE_PROBABILITY, 2))
     ellipses = []
-    for position, cov in zip(landmarks.positions, landmarks.covariances[:, :2, :2], strict=True):
+    for position, cov in zip(
+        landmarks.positions, landmarks.covariances[:, :2, :2], strict=True
+    ):
         if not np.isfinite(cov).all():
             continue
         variances, directions = np.linalg.eigh(cov)
         width, height = scale * np.sqrt(np.maximum(variances[::-1], 0.0))
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
         ellipses.append(
-            Ellipse((position[0], position[1]), width, height, angle=angle, fill=False, edgecolor=edge, zorder=4)
+            Ellipse(
+                (position[0], position[1]),
+                width,
+                height,
+                angle=angle,
+                fill=False,
+                edgecolor=edge,
+                zorder=4,
+            )
         )
     return ellipses
 
 
 def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
     """Write identities beside landmarks that are in view: the true ones, or those of the first run that has any."""
-    candidates = [true_landmarks_drawn(comparison), *(run.landmarks for run in comparison.runs)]
-    landmarks = next((known for known in candidates if known is not None and len(known)), None)
+    candidates = [
+        true_landmarks_drawn(comparison),
+        *(run.landmarks for run in comparison.runs),
+    ]
+    landmarks = next(
+        (known for known in candidates if known is not None and len(known)), None
+    )
     if landmarks is None:
         return
     size = "medium" if len(landmarks) <= 40 else "x-small"
-    for identity, position in zip(landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True):
+    for identity, position in zip(
+        landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True
+    ):
         if np.all((position >= view[0]) & (position <= view[1])):
             panel.annotate(
                 str(identity),
@@ -185,19 +256,48 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     stamps_ns = grown_at(comparison)
     enlarged = enlargement(comparison)
     size = style.width_in(), style.width_in()
-    figure, axes = style.blank_panels(len(runs), len(stamps_ns), size, sharex=True, sharey=True)
+    figure, axes = style.blank_panels(
+        len(runs), len(stamps_ns), size, sharex=True, sharey=True
+    )
     true = true_landmarks_drawn(comparison)
     for row, (index, run) in enumerate(runs):
         for column, stamp_ns in enumerate(stamps_ns.tolist()):
             panel: Axes = axes[row, column]
             own, truth = style.colour(index), comparison.sequence.truth
-            _draw_until(panel, stamp_ns, truth, color=style.TRUTH, linewidth=2.6, alpha=0.6, label="truth")
-            _draw_until(panel, stamp_ns, run.causal, color=own, linewidth=1.0, label="causal estimate")
+            _draw_until(
+                panel,
+                stamp_ns,
+                truth,
+                color=style.TRUTH,
+                linewidth=2.6,
+                alpha=0.6,
+                label="truth",
+            )
+            _draw_until(
+                panel,
+                stamp_ns,
+                run.causal,
+                color=own,
+                linewidth=1.0,
+                label="causal estimate",
+            )
             if true is not None:
-                look: dict[str, Any] = {"color": style.INK, "markersize": 7, "markeredgewidth": 1.2}
+                look: dict[str, Any] = {
+                    "color": style.INK,
+                    "markersize": 7,
+                    "markeredgewidth": 1.2,
+                }
                 panel.plot(*true.positions.T[:2], "+", label="true landmarks", **look)
-            for known in (known.landmarks for known in run.maps if known.stamp_ns == stamp_ns):
-                panel.plot(*known.positions.T[:2], "o", color=own, markersize=2.5, label="estimated landmarks")
+            for known in (
+                known.landmarks for known in run.maps if known.stamp_ns == stamp_ns
+            ):
+                panel.plot(
+                    *known.positions.T[:2],
+                    "o",
+                    color=own,
+                    markersize=2.5,
+                    label="estimated landmarks",
+                )
                 for ellipse in ellipses(known, own, enlarged):
                     panel.add_patch(ellipse)
             label_landmarks(panel, comparison, view)
@@ -213,8 +313,12 @@ def growth_figure(comparison: Comparison) -> Figure | None:
 
 def grown_at(comparison: Comparison) -> Ints:
     """Stamps at which the growing map is drawn, shape (n,)."""
-    kept = [known.stamp_ns for _, run in _runs_with_maps(comparison) for known in run.maps]
-    return np.intersect1d(kept, map_instants(comparison.instants_ns, comparison.sequence.start_ns))
+    kept = [
+        known.stamp_ns for _, run in _runs_with_maps(comparison) for known in run.maps
+    ]
+    return np.intersect1d(
+        kept, map_instants(comparison.instants_ns, comparison.sequence.start_ns)
+    )
 
 
 def enlargement(comparison: Comparison) -> int:
@@ -236,11 +340,19 @@ def enlargement(comparison: Comparison) -> int:
 
 
 def _runs_with_maps(comparison: Comparison) -> list[tuple[int, RunResult]]:
-    return [(i, run) for i, run in enumerate(comparison.runs) if any(len(known.landmarks) for known in run.maps)]
+    return [
+        (i, run)
+        for i, run in enumerate(comparison.runs)
+        if any(len(known.landmarks) for known in run.maps)
+    ]
 
 
-def _draw_until(panel: Axes, stamp_ns: int, path: Trajectory | None, **look: Any) -> None:
+def _draw_until(
+    panel: Axes, stamp_ns: int, path: Trajectory | None, **look: Any
+) -> None:
     """The path until an instant."""
-    until = None if path is None else path.rows(np.flatnonzero(path.stamps_ns <= stamp_ns))
+    until = (
+        None if path is None else path.rows(np.flatnonzero(path.stamps_ns <= stamp_ns))
+    )
     if until is not None and len(until):
         panel.plot(*horizontal(until), **look)

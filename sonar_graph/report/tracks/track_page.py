@@ -19,11 +19,20 @@ NONE = "none of them"
 
 
 def write_track_page(
-    path: Path, name: str, recognition: Recognition, stories: TrackStories, identities: Sequence[str], start_ns: int
+    path: Path,
+    name: str,
+    recognition: Recognition,
+    stories: TrackStories,
+    identities: Sequence[str],
+    start_ns: int,
 ) -> None:
     """Write the page, one file with all pictures in it; ``identities`` are names of the designs in their order."""
-    longest = sorted(stories.tracks.values(), key=lambda story: -story.frames)[:MOST_TRACKS]
-    shown = sorted(longest, key=lambda story: (REPORTED not in story.outcomes, story.first_ns))
+    longest = sorted(stories.tracks.values(), key=lambda story: -story.frames)[
+        :MOST_TRACKS
+    ]
+    shown = sorted(
+        longest, key=lambda story: (REPORTED not in story.outcomes, story.first_ns)
+    )
     content: dict[str, Any] = {
         "kind": "recognition",
         "name": name,
@@ -54,6 +63,10 @@ def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, An
         "from_s": (story.first_ns - start_ns) * 1e-9,
         "to_s": (story.last_ns - start_ns) * 1e-9,
         "frames": _number_of(story.frames, "frame"),
-        "beliefs": [(names[k], float(story.beliefs[k])) for k in order if story.beliefs[k] >= LEAST_SHOWN],
+        "beliefs": [
+            (names[k], float(story.beliefs[k]))
+            for k in order
+            if story.beliefs[k] >= LEAST_SHOWN
+        ],
         "outcomes": story.outcomes.most_common(),
     }

@@ -24,7 +24,12 @@ SCENES: dict[SceneName, dict[str, Any]] = {
     "hard": {
         **{"contrast_db": -4.5, "plate_db": 0.0, "sediment": 0.25, "fouling": 0.25},
         **{"texture_shape": 1.5, "texture_length_m": 0.05, "noise_db": 20.0},
-        **{"ripple_length_m": 0.12, "ripple_height_m": 0.012, "attitude_error_deg": 0.5, "altitude_error_m": 0.02},
+        **{
+            "ripple_length_m": 0.12,
+            "ripple_height_m": 0.012,
+            "attitude_error_deg": 0.5,
+            "altitude_error_m": 0.02,
+        },
         **{"strangers": ("natural", "look-alikes")},
     },
 }
@@ -71,11 +76,17 @@ class SceneConditions(Section):
     @classmethod
     def _with_preset(cls, values: Any) -> Any:
         """What is not given, from the preset."""
-        preset = SCENES.get(values.get("scene", "easy")) if isinstance(values, dict) else None
+        preset = (
+            SCENES.get(values.get("scene", "easy"))
+            if isinstance(values, dict)
+            else None
+        )
         return values if preset is None else preset | values
 
 
-def true_mounting(mounting: Mounting, conditions: SceneConditions, seed: int) -> Mounting:
+def true_mounting(
+    mounting: Mounting, conditions: SceneConditions, seed: int
+) -> Mounting:
     """Mounting with which the sonar sees, beside the one in the log: higher or lower, and turned.
 
     Angles of the mounting err by independent normal errors, and so does its height.
@@ -85,4 +96,6 @@ def true_mounting(mounting: Mounting, conditions: SceneConditions, seed: int) ->
     x, y, z = mounting.translation_m
     higher_m = conditions.altitude_error_m * rng.standard_normal()
     rpy_rad = tuple((np.array(mounting.rpy_rad) + turned_rad).tolist())
-    return mounting.model_copy(update={"translation_m": (x, y, z + higher_m), "rpy_rad": rpy_rad})
+    return mounting.model_copy(
+        update={"translation_m": (x, y, z + higher_m), "rpy_rad": rpy_rad}
+    )

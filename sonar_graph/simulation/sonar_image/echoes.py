@@ -88,7 +88,13 @@ class Horizon(NamedTuple):
 
 
 @compiled
-def block_rays(view: SonarPlacement, surface: Surface, horizon: Horizon, raised_m: float, cell_m: float) -> None:
+def block_rays(
+    view: SonarPlacement,
+    surface: Surface,
+    horizon: Horizon,
+    raised_m: float,
+    cell_m: float,
+) -> None:
     """Fill the horizon: everything behind a raised cell is blocked below the ray over its top."""
     bearings, distances = horizon.tangent.shape
     for row in range(surface.relief_m.shape[0]):
@@ -116,7 +122,13 @@ def block_rays(view: SonarPlacement, surface: Surface, horizon: Horizon, raised_
 
 @compiled
 def add_echo(
-    tables: Tables, echoes: Floats32, column: int, range_m: float, amplitude: float, re: float, im: float
+    tables: Tables,
+    echoes: Floats32,
+    column: int,
+    range_m: float,
+    amplitude: float,
+    re: float,
+    im: float,
 ) -> None:
     """One echo with its phase, spread over the bins that the pulse reaches."""
     waves = range_m * tables.waves_per_m
@@ -135,7 +147,9 @@ def add_echo(
 
 
 @compiled
-def is_blocked(view: SonarPlacement, horizon: Horizon, x: float, y: float, z: float) -> bool:
+def is_blocked(
+    view: SonarPlacement, horizon: Horizon, x: float, y: float, z: float
+) -> bool:
     """True where something nearer hides a point from the sonar."""
     bearings, distances = horizon.tangent.shape
     ahead = view.heading[0] * x + view.heading[1] * y
@@ -149,7 +163,9 @@ def is_blocked(view: SonarPlacement, horizon: Horizon, x: float, y: float, z: fl
 
 
 @compiled
-def slopes(relief_m: Floats32, row: int, column: int, cell_m: float) -> tuple[float, float]:
+def slopes(
+    relief_m: Floats32, row: int, column: int, cell_m: float
+) -> tuple[float, float]:
     """Rise per metre along x and y; 0 at the border of the view."""
     rows, columns = relief_m.shape
     if not (0 < row < rows - 1 and 0 < column < columns - 1):
@@ -160,7 +176,9 @@ def slopes(relief_m: Floats32, row: int, column: int, cell_m: float) -> tuple[fl
 
 
 @compiled
-def table_places(R: Floats, x: float, y: float, z: float, per_range: float, tables: Tables) -> tuple[int, int]:
+def table_places(
+    R: Floats, x: float, y: float, z: float, per_range: float, tables: Tables
+) -> tuple[int, int]:
     """Column of azimuth and step of elevation of a point at distance 1 / per_range, (-1, -1) outside of the tables."""
     forward = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
     left = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
@@ -169,7 +187,11 @@ def table_places(R: Floats, x: float, y: float, z: float, per_range: float, tabl
         return -1, -1
     t = left / forward
     t2 = t * t
-    azimuth = t * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) if t2 < 0.1 else np.arctan(t)
+    azimuth = (
+        t * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9))))
+        if t2 < 0.1
+        else np.arctan(t)
+    )
     column = int(np.floor(azimuth * tables.columns_per_rad + 0.5 * tables.columns))
     lift = int((up * per_range + 0.5) * ELEVATION_STEPS)
     if not 0 <= column < tables.columns or not 0 <= lift < ELEVATION_STEPS:
@@ -202,7 +224,8 @@ def sum_echoes(
         j = (view.spans[row, 0] - 1) % cells
         point_column = (j + view.shift[1]) % cells
         for column in range(view.spans[row, 0], view.spans[row, 1]):
-            j = j + 1 if j + 1 < cells else 0  # a remainder costs as much as all else here
+            # a remainder costs as much as all else here
+            j = j + 1 if j + 1 < cells else 0
             point_column = point_column + 1 if point_column + 1 < cells else 0
             point = points[point_row, point_column]
             x = column * cell_m - view.position_m[0] + cell_m * point[2]
@@ -222,20 +245,36 @@ def sum_echoes(
             if has_shadows and is_blocked(view, horizon, x, y, z):
                 continue
             range_m = np.sqrt(range_m2)
-            beam_column, lift = table_places(view.sonar_R_world, x, y, z, 1 / range_m, tables)
+            beam_column, lift = table_places(
+                view.sonar_R_world, x, y, z, 1 / range_m, tables
+            )
             if beam_column < 0:
                 continue
-            amplitude = gain * toward / (range_m * np.sqrt(area)) * tables.elevation[lift]
-            add_echo(tables, echoes, beam_column, range_m, amplitude, point[0], point[1])
+            amplitude = (
+                gain * toward / (range_m * np.sqrt(area)) * tables.elevation[lift]
+            )
+            add_echo(
+                tables, echoes, beam_column, range_m, amplitude, point[0], point[1]
+            )
             steepness = 1 - 1 / area
             if steepness > STEEP and relief > 0 and floor_reflection > 0:
                 image_m = np.sqrt(x * x + y * y + (height_m + relief) ** 2)
                 ghost = 2 * floor_reflection * steepness * amplitude
-                add_echo(tables, echoes, beam_column, 0.5 * (range_m + image_m), ghost, point[0], point[1])
+                add_echo(
+                    tables,
+                    echoes,
+                    beam_column,
+                    0.5 * (range_m + image_m),
+                    ghost,
+                    point[0],
+                    point[1],
+                )
 
 
 @compiled
-def through_beams(beam_matrix: Floats32, bands: Ints, echoes: Floats32, seen: Floats32) -> None:
+def through_beams(
+    beam_matrix: Floats32, bands: Ints, echoes: Floats32, seen: Floats32
+) -> None:
     """Matrix product ``seen += beam_matrix @ echoes``, on one core and always in the same order.
 
     Shapes (beams, columns), (columns, samples), (beams, samples). Of each beam only the columns of its band count, from

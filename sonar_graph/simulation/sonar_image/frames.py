@@ -21,7 +21,11 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Mounting
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
-from sonar_graph.simulation.detections import FieldOfView, inside, range_azimuth_elevation
+from sonar_graph.simulation.detections import (
+    FieldOfView,
+    inside,
+    range_azimuth_elevation,
+)
 from sonar_graph.simulation.sensors import body_R_sensor, seconds_since_start
 from sonar_graph.simulation.sonar_image import echoes
 from sonar_graph.simulation.sonar_image.echoes import (
@@ -93,19 +97,24 @@ class FrameSimulator:
             options.ripple_length_m,
             options.ripple_height_m,
         )
-        pulse_sigma_m = sonar.range_resolution_m / (2 * np.sqrt(np.log(2)))  # the Gaussian's square is as wide at half
+        # the Gaussian's square is as wide at half
+        pulse_sigma_m = sonar.range_resolution_m / (2 * np.sqrt(np.log(2)))
         self._column_rad = column_rad = sonar.beam_width_rad / COLUMNS_PER_BEAM
         self._tables = tables_of(sonar, column_rad, pulse_sigma_m)
 
         ranges_m = sonar.ranges_m()
         absorbed_db = 2 * options.absorption_db_m * (ranges_m - REFERENCE_M)
         gain_db = GAIN_SLOPE_DB * np.log10(ranges_m / REFERENCE_M) + absorbed_db
-        gain_db = gain_db + drawn_gain_error_db(options.tvg_error_db, len(ranges_m), seed)
+        gain_db = gain_db + drawn_gain_error_db(
+            options.tvg_error_db, len(ranges_m), seed
+        )
         self._gain_db: Floats32 = gain_db.astype(np.float32)
         # mean square of the sum over a floor of unit strength at the reference: cells in a resolution cell
         across_m = REFERENCE_M * (2 / 3) * sonar.wavelength_m / sonar.aperture_m
         along_m = pulse_sigma_m * np.sqrt(np.pi) / np.sqrt(1 - REFERENCE_GRAZING**2)
-        reference_intensity = float(across_m * along_m / CELL_M**2 * REFERENCE_GRAZING**2)
+        reference_intensity = float(
+            across_m * along_m / CELL_M**2 * REFERENCE_GRAZING**2
+        )
         strength = 10 ** (options.floor_db / 20) / np.sqrt(reference_intensity)
         spreading = strength * (REFERENCE_M / ranges_m) ** 2 * 10 ** (-absorbed_db / 20)
         self._spreading: Floats32 = spreading.astype(np.float32)
@@ -121,7 +130,11 @@ class FrameSimulator:
 
     def azimuths_rad(self) -> Floats:
         """Azimuths of the beams as a log states them: true ones, or equally spaced, shape (beams,)."""
-        return self.sonar.azimuths_rad() if self.options.measured_lens else self.sonar.linear_azimuths_rad()
+        return (
+            self.sonar.azimuths_rad()
+            if self.options.measured_lens
+            else self.sonar.linear_azimuths_rad()
+        )
 
     def ranges_m(self) -> Floats:
         """Middles of the bins as a log states them: true ones scaled by the error of the sound speed, shape (bins,)."""
@@ -132,18 +145,28 @@ class FrameSimulator:
         return bool(self._rng(number, 1).random() < self.options.drop_probability)
 
     def frame(
-        self, position_m: Floats, world_R_sonar: Rotation, number: int, surface_z_m: float | None = None
+        self,
+        position_m: Floats,
+        world_R_sonar: Rotation,
+        number: int,
+        surface_z_m: float | None = None,
     ) -> NDArray[np.uint8]:
         """Recorded image, shape (beams, bins).
 
         The sonar's x points along its axis, its y to the left. The frame's number is the seed of its noise.
         ``surface_z_m`` is the height of the water's surface; None: too far away to matter.
         """
-        counts = self.level_db(position_m, world_R_sonar, number, surface_z_m) * (255 / self.sonar.decibel_span)
+        counts = self.level_db(position_m, world_R_sonar, number, surface_z_m) * (
+            255 / self.sonar.decibel_span
+        )
         return np.clip(np.rint(counts), 0, 255).astype(np.uint8)
 
     def level_db(
-        self, position_m: Floats, world_R_sonar: Rotation, number: int, surface_z_m: float | None = None
+        self,
+        position_m: Floats,
+        world_R_sonar: Rotation,
+        number: int,
+        surface_z_m: float | None = None,
     ) -> Floats32:
         """Level of each sample before it is rounded and clipped, shape (beams, bins)."""
         position_m = np.asarray(position_m, float)
@@ -157,10 +180,14 @@ class FrameSimulator:
         signal = seen.reshape(-1, bins, 2) * self._spreading[:, None]
         if self.options.multipath and surface_z_m is not None:
             heights_m = position_m[2] - self._floor_z_m, surface_z_m - position_m[2]
-            signal = with_surface_path(signal, self.sonar, *heights_m, self.options.surface_path_db)
+            signal = with_surface_path(
+                signal, self.sonar, *heights_m, self.options.surface_path_db
+            )
         if self.options.noise_db is not None:
             sigma = np.float32(10 ** (self.options.noise_db / 20) * np.sqrt(0.5))
-            signal = signal + sigma * self._rng(number, 0).standard_normal(signal.shape, np.float32)
+            signal = signal + sigma * self._rng(number, 0).standard_normal(
+                signal.shape, np.float32
+            )
         intensity = signal[..., 0] ** 2 + signal[..., 1] ** 2
         return 10 * np.log10(np.maximum(intensity, np.float32(1e-12))) + self._gain_db
 
@@ -168,17 +195,31 @@ class FrameSimulator:
         """Random generator of a frame for one purpose."""
         return np.random.default_rng([self._seed, 2, number, purpose])
 
-    def scattered(self, position_m: Floats, world_R_sonar: Rotation, number: int) -> Floats32:
+    def scattered(
+        self, position_m: Floats, world_R_sonar: Rotation, number: int
+    ) -> Floats32:
         """Sum of the scatterers by column of azimuth, shape (columns, bins, 2)."""
         tables = self._tables
         total = np.zeros((tables.columns, tables.bins + 2 * TAPS, 2), np.float32)
         height_m = position_m[2] - self._floor_z_m
-        window = self.sonar.range_start_m, self.sonar.range_start_m + self.sonar.range_length_m
+        window = (
+            self.sonar.range_start_m,
+            self.sonar.range_start_m + self.sonar.range_length_m,
+        )
         half_azimuth_rad = 0.5 * tables.columns * self._column_rad
-        sector = lit_sector(world_R_sonar, height_m, window, half_azimuth_rad, HALF_LIFT_RAD)
+        sector = lit_sector(
+            world_R_sonar, height_m, window, half_azimuth_rad, HALF_LIFT_RAD
+        )
         if sector is not None:
-            cells, is_fixed = cells_of(sector, position_m), self.options.speckle == "world"
-            shift = np.zeros(2, np.int64) if is_fixed else self._rng(number, 2).integers(0, CELLS, 2)
+            cells, is_fixed = (
+                cells_of(sector, position_m),
+                self.options.speckle == "world",
+            )
+            shift = (
+                np.zeros(2, np.int64)
+                if is_fixed
+                else self._rng(number, 2).integers(0, CELLS, 2)
+            )
             view = SonarPlacement(
                 position_m,
                 np.ascontiguousarray(world_R_sonar.inv().as_matrix()),
@@ -189,19 +230,38 @@ class FrameSimulator:
                 shift,
             )
             surface, horizon = echoes.no_surface(), echoes.no_horizon()
-            near = within(self.objects, position_m, sector.farthest_m / np.cos(sector.half_bearing_rad / 2))
+            near = within(
+                self.objects,
+                position_m,
+                sector.farthest_m / np.cos(sector.half_bearing_rad / 2),
+            )
             laid = laid_out(near, cells, self._floor.relief_m)
             if laid.relief_m.any() or not np.isnan(laid.amplitude).all():
                 surface = laid
                 if self.options.shadows:
                     steps = int(np.ceil(sector.farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
                     blocked = np.full((BEARINGS, steps), -np.inf, np.float32)
-                    horizon = Horizon(blocked, float(np.tan(sector.half_bearing_rad + 0.02)), DISTANCE_STEP_M)
+                    horizon = Horizon(
+                        blocked,
+                        float(np.tan(sector.half_bearing_rad + 0.02)),
+                        DISTANCE_STEP_M,
+                    )
                     raised_m = RAISED_M - self.options.ripple_height_m
                     echoes.block_rays(view, surface, horizon, raised_m, CELL_M)
-            reflection = self.options.floor_reflection if self.options.multipath else 0.0
+            reflection = (
+                self.options.floor_reflection if self.options.multipath else 0.0
+            )
             floor = self._floor
-            echoes.sum_echoes(view, floor.points, floor.texture, surface, horizon, tables, reflection, total)
+            echoes.sum_echoes(
+                view,
+                floor.points,
+                floor.texture,
+                surface,
+                horizon,
+                tables,
+                reflection,
+                total,
+            )
         return total[:, TAPS:-TAPS]
 
 
@@ -218,18 +278,27 @@ def with_cross_talk(seen: Floats32, sonar: ImagingSonar, level_db: float) -> Flo
 
 
 def with_surface_path(
-    signal: Floats32, sonar: ImagingSonar, height_m: float, depth_m: float, level_db: float
+    signal: Floats32,
+    sonar: ImagingSonar,
+    height_m: float,
+    depth_m: float,
+    level_db: float,
 ) -> Floats32:
     """Add echoes that went one way by the surface and arrive later than the direct ones."""
     ranges_m = sonar.ranges_m()
     run2 = np.maximum(ranges_m**2 - height_m**2, 0.0)
     late_m = 0.5 * (ranges_m + np.sqrt(run2 + (height_m + 2 * depth_m) ** 2))
-    source = np.rint(np.interp(ranges_m, late_m, np.arange(len(ranges_m)), left=-1)).astype(int)
+    source = np.rint(
+        np.interp(ranges_m, late_m, np.arange(len(ranges_m)), left=-1)
+    ).astype(int)
     arrives = source >= 0
     of = source[arrives]
     turn = 2 * np.pi * (2 / sonar.wavelength_m) * (late_m - ranges_m)[of]
     level = 10 ** (level_db / 20) * (ranges_m / late_m)[of] ** 2
-    cos, sin = (level * np.cos(turn)).astype(np.float32), (level * np.sin(turn)).astype(np.float32)
+    cos, sin = (
+        (level * np.cos(turn)).astype(np.float32),
+        (level * np.sin(turn)).astype(np.float32),
+    )
     real, imaginary = signal[:, of, 0], signal[:, of, 1]
     result = signal.copy()
     result[:, arrives, 0] += real * cos - imaginary * sin
@@ -264,30 +333,54 @@ def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
     """Error of the time-varied gain: a tilt over the window and a slow wave of a third of it, shape (bins,)."""
     rng = np.random.default_rng([seed, 1])
     along = np.linspace(-0.5, 0.5, bins)
-    tilt, wave, phase = rng.standard_normal(), rng.standard_normal(), rng.uniform(0, 2 * np.pi)
+    tilt, wave, phase = (
+        rng.standard_normal(),
+        rng.standard_normal(),
+        rng.uniform(0, 2 * np.pi),
+    )
     return sigma_db * (tilt * along + wave / 3 * np.sin(3 * np.pi * along + phase))
 
 
-def laid_out(objects: Sequence[SeabedObject], cells: Cells, ripples_m: Floats32 | None) -> Surface:
+def laid_out(
+    objects: Sequence[SeabedObject], cells: Cells, ripples_m: Floats32 | None
+) -> Surface:
     """Objects and ripples on the cells in view; the later of two objects covers the earlier.
 
     Ripples end within `SCOUR_M` around an object.
     """
-    first_column, end_column = int(cells.spans[:, 0].min()), int(cells.spans[:, 1].max())
+    first_column, end_column = (
+        int(cells.spans[:, 0].min()),
+        int(cells.spans[:, 1].max()),
+    )
     shape = len(cells.spans), end_column - first_column
-    amplitude, relief_m = np.full(shape, np.nan, np.float32), np.zeros(shape, np.float32)
+    amplitude, relief_m = (
+        np.full(shape, np.nan, np.float32),
+        np.zeros(shape, np.float32),
+    )
     if ripples_m is not None:
-        rows, columns = cells.first_row + np.arange(shape[0]), first_column + np.arange(shape[1])
+        rows, columns = (
+            cells.first_row + np.arange(shape[0]),
+            first_column + np.arange(shape[1]),
+        )
         relief_m = ripples_m[np.ix_(rows % CELLS, columns % CELLS)]
         for item in objects:
-            y, x = (rows + 0.5) * CELL_M - item.position_m[1], (columns + 0.5) * CELL_M - item.position_m[0]
+            y, x = (
+                (rows + 0.5) * CELL_M - item.position_m[1],
+                (columns + 0.5) * CELL_M - item.position_m[0],
+            )
             away_m = np.hypot(x, y[:, None]) - item.extent_m
             relief_m *= np.clip(away_m / SCOUR_M, 0, 1).astype(np.float32)
     for item in objects:
-        to_rows, own_rows = _overlap(item.first_row - cells.first_row, len(item.amplitude), shape[0])
-        to_columns, own_columns = _overlap(item.first_column - first_column, item.amplitude.shape[1], shape[1])
+        to_rows, own_rows = _overlap(
+            item.first_row - cells.first_row, len(item.amplitude), shape[0]
+        )
+        to_columns, own_columns = _overlap(
+            item.first_column - first_column, item.amplitude.shape[1], shape[1]
+        )
         patch = item.amplitude[own_rows, own_columns]
-        amplitude[to_rows, to_columns] = np.where(np.isnan(patch), amplitude[to_rows, to_columns], patch)
+        amplitude[to_rows, to_columns] = np.where(
+            np.isnan(patch), amplitude[to_rows, to_columns], patch
+        )
         relief_m[to_rows, to_columns] += item.relief_m[own_rows, own_columns]
     return Surface(first_column, amplitude, relief_m)
 
@@ -301,7 +394,13 @@ def _overlap(first: int, length: int, size: int) -> tuple[slice, slice]:
 
 _RING = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 _SPREAD = np.concatenate(
-    [np.zeros((1, 3)), *(s * np.column_stack([np.cos(_RING), np.sin(_RING), 0 * _RING]) for s in (0.5, 1.0))]
+    [
+        np.zeros((1, 3)),
+        *(
+            s * np.column_stack([np.cos(_RING), np.sin(_RING), 0 * _RING])
+            for s in (0.5, 1.0)
+        ),
+    ]
 )
 """Points of a unit disc on the floor: its centre and two rings."""
 SURFACE_Z_M = 0.0
@@ -342,38 +441,59 @@ class ImagedFrames:
 
 
 def image_along(
-    path: VehiclePath, mounting: Mounting, pings_ns: Ints, simulator: FrameSimulator, frames_per_block: int = 32
+    path: VehiclePath,
+    mounting: Mounting,
+    pings_ns: Ints,
+    simulator: FrameSimulator,
+    frames_per_block: int = 32,
 ) -> Iterator[ImagedFrames]:
     """Record a frame at every ping but those that are dropped, a block at a time.
 
     Frames are stamped later than their pings, shape (n,), by the options' time offset.
     """
-    numbers = np.array([n for n in range(len(pings_ns)) if not simulator.is_dropped(n)], dtype=np.int64)
+    numbers = np.array(
+        [n for n in range(len(pings_ns)) if not simulator.is_dropped(n)], dtype=np.int64
+    )
     for first in range(0, len(numbers), frames_per_block):
         block = numbers[first : first + frames_per_block]
         motion = path.at(seconds_since_start(pings_ns[block]))
-        positions = motion.position + motion.world_R_body.apply(np.array(mounting.translation_m))
+        positions = motion.position + motion.world_R_body.apply(
+            np.array(mounting.translation_m)
+        )
         world_R_sonar = motion.world_R_body * body_R_sensor(mounting)
         images = [
             simulator.frame(position, rotation, number, SURFACE_Z_M)
-            for position, rotation, number in zip(positions, world_R_sonar, block.tolist(), strict=True)
+            for position, rotation, number in zip(
+                positions, world_R_sonar, block.tolist(), strict=True
+            )
         ]
         stamps_ns = pings_ns[block] + round(simulator.options.time_offset_s * NS_PER_S)
-        frames = SonarFrames(stamps_ns, np.stack(images), simulator.ranges_m(), simulator.azimuths_rad())
+        frames = SonarFrames(
+            stamps_ns, np.stack(images), simulator.ranges_m(), simulator.azimuths_rad()
+        )
         yield ImagedFrames(frames, frame_truth(positions, world_R_sonar, simulator))
 
 
-def frame_truth(positions: Floats, world_R_sonar: Rotation, simulator: FrameSimulator) -> FrameTruth:
+def frame_truth(
+    positions: Floats, world_R_sonar: Rotation, simulator: FrameSimulator
+) -> FrameTruth:
     """Position of every object in the sonar's frame, for positions (n, 3) and n rotations of the sonar."""
     sonar, objects = simulator.sonar, simulator.objects
     far_m = sonar.range_start_m + sonar.range_length_m
     half_azimuth_rad = float(np.abs(sonar.azimuths_rad()).max())
-    fan = FieldOfView(sonar.range_start_m, far_m, half_azimuth_rad, sonar.elevation_span_rad / 2)
+    fan = FieldOfView(
+        sonar.range_start_m, far_m, half_azimuth_rad, sonar.elevation_span_rad / 2
+    )
     sonar_R_world = world_R_sonar.inv().as_matrix()
     centres = np.reshape([o.position_m for o in objects], (-1, 3))
-    discs = centres[:, None] + np.reshape([o.extent_m for o in objects], (-1, 1, 1)) * _SPREAD
+    discs = (
+        centres[:, None]
+        + np.reshape([o.extent_m for o in objects], (-1, 1, 1)) * _SPREAD
+    )
     points_m = np.einsum("nij,nmj->nmi", sonar_R_world, centres - positions[:, None])
-    spread_m = np.einsum("nij,nmkj->nmki", sonar_R_world, discs - positions[:, None, None])
+    spread_m = np.einsum(
+        "nij,nmkj->nmki", sonar_R_world, discs - positions[:, None, None]
+    )
     return FrameTruth(
         positions=positions,
         quaternions_xyzw=world_R_sonar.as_quat(),

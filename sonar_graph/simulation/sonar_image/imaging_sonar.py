@@ -55,28 +55,40 @@ class ImagingSonar(Section):
 
     def ranges_m(self) -> Floats:
         """Middle of each range bin, shape (bins,)."""
-        return self.range_start_m + (np.arange(self.bins) + 0.5) * self.range_length_m / self.bins
+        return (
+            self.range_start_m
+            + (np.arange(self.bins) + 0.5) * self.range_length_m / self.bins
+        )
 
     def linear_azimuths_rad(self) -> Floats:
         """Equally spaced beams over the span, rightmost first, shape (beams,)."""
-        return ((np.arange(self.beams) + 0.5) / self.beams - 0.5) * self.azimuth_span_rad
+        return (
+            (np.arange(self.beams) + 0.5) / self.beams - 0.5
+        ) * self.azimuth_span_rad
 
     def azimuths_rad(self) -> Floats:
         """True azimuth of each beam, positive to the left, rightmost first, shape (beams,)."""
         if self.lens_cubic is None:
             return self.linear_azimuths_rad()
         numbers = np.polyval(self.lens_cubic, _FINE_DEG)
-        return np.radians(-np.interp(np.arange(1, self.beams + 1), numbers, _FINE_DEG)[::-1])
+        return np.radians(
+            -np.interp(np.arange(1, self.beams + 1), numbers, _FINE_DEG)[::-1]
+        )
 
     def two_way_pattern(self, offset_rad: Floats, side_lobes: bool) -> Floats:
         """Amplitude over the angle from a beam's centre, 1 there; without side lobes a Gaussian of equal width."""
         if side_lobes:
-            return np.sinc(self.aperture_m * np.sin(offset_rad) / self.wavelength_m) ** 2
+            return (
+                np.sinc(self.aperture_m * np.sin(offset_rad) / self.wavelength_m) ** 2
+            )
         return np.exp2(-((2 * offset_rad / self.beam_width_rad) ** 2))
 
     def elevation_pattern(self, elevation_rad: Floats) -> Floats:
         """Two-way amplitude over elevation, 1 at 0: ``sinc²(0.886 sin e / sin span)``."""
-        return np.sinc(0.886 * np.sin(elevation_rad) / np.sin(self.elevation_span_rad)) ** 2
+        return (
+            np.sinc(0.886 * np.sin(elevation_rad) / np.sin(self.elevation_span_rad))
+            ** 2
+        )
 
 
 DIDSON = ImagingSonar(
@@ -120,7 +132,11 @@ OCULUS_M1200D = ImagingSonar(
 )
 """Oculus M1200d, high frequency; an electronic array, which forms all beams from one ping."""
 SonarName = Literal["didson", "aris3000", "oculus1200"]
-SONARS: dict[SonarName, ImagingSonar] = {"didson": DIDSON, "aris3000": ARIS_3000, "oculus1200": OCULUS_M1200D}
+SONARS: dict[SonarName, ImagingSonar] = {
+    "didson": DIDSON,
+    "aris3000": ARIS_3000,
+    "oculus1200": OCULUS_M1200D,
+}
 
 
 class ImageOptions(SceneConditions):
@@ -175,4 +191,6 @@ class ImageOptions(SceneConditions):
         sonar = SONARS[self.sonar]
         length_m = self.window_m or sonar.range_length_m
         resolution_m = sonar.range_resolution_m * length_m / sonar.range_length_m
-        return sonar.model_copy(update={"range_length_m": length_m, "range_resolution_m": resolution_m})
+        return sonar.model_copy(
+            update={"range_length_m": length_m, "range_resolution_m": resolution_m}
+        )

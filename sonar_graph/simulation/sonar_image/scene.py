@@ -44,8 +44,14 @@ class Scatterers:
 def smooth_field(length_m: float, rng: np.random.Generator) -> Floats:
     """Periodic Gaussian random field of unit variance with the correlation ``exp(-(d / length)²)``, (1250, 1250)."""
     frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
-    smoothing = np.exp(-((np.pi * length_m) ** 2) * np.add.outer(frequency[0] ** 2, frequency[1] ** 2) / 2)
-    field = np.fft.irfft2(smoothing * np.fft.rfft2(rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS))
+    smoothing = np.exp(
+        -((np.pi * length_m) ** 2)
+        * np.add.outer(frequency[0] ** 2, frequency[1] ** 2)
+        / 2
+    )
+    field = np.fft.irfft2(
+        smoothing * np.fft.rfft2(rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS)
+    )
     return field / field.std()
 
 
@@ -57,9 +63,15 @@ def ripples(length_m: float, height_m: float, rng: np.random.Generator) -> Float
     """
     heading = rng.uniform(-np.pi, np.pi)
     period_m = CELLS * CELL_M
-    waves_x, waves_y = np.rint(period_m / length_m * np.array([np.cos(heading), np.sin(heading)]))
+    waves_x, waves_y = np.rint(
+        period_m / length_m * np.array([np.cos(heading), np.sin(heading)])
+    )
     along = 2 * np.pi * np.arange(CELLS) / CELLS
-    phase = waves_y * along[:, None] + waves_x * along + MEANDER_RAD * smooth_field(MEANDER_LENGTHS * length_m, rng)
+    phase = (
+        waves_y * along[:, None]
+        + waves_x * along
+        + MEANDER_RAD * smooth_field(MEANDER_LENGTHS * length_m, rng)
+    )
     return 0.5 * height_m * (np.cos(phase) - 1)
 
 
@@ -78,20 +90,30 @@ def scatterers(
     """
     points_rng, texture_rng, ripple_rng = rng.spawn(3)
     points = np.empty((CELLS, CELLS, 4), np.float32)
-    points[..., :2] = points_rng.standard_normal((CELLS, CELLS, 2), np.float32) * np.float32(np.sqrt(0.5))
+    points[..., :2] = points_rng.standard_normal(
+        (CELLS, CELLS, 2), np.float32
+    ) * np.float32(np.sqrt(0.5))
     points[..., 2:] = points_rng.random((CELLS, CELLS, 2), np.float32)
     strength = np.ones((CELLS, CELLS))
     if texture_shape is not None:
         quantiles = np.linspace(-6, 6, 2001)
-        levels = stats.gamma.ppf(stats.norm.cdf(quantiles), texture_shape, scale=1 / texture_shape)
-        strength = np.interp(smooth_field(texture_length_m, texture_rng), quantiles, levels)
+        levels = stats.gamma.ppf(
+            stats.norm.cdf(quantiles), texture_shape, scale=1 / texture_shape
+        )
+        strength = np.interp(
+            smooth_field(texture_length_m, texture_rng), quantiles, levels
+        )
     if joints:
         middle_m = (np.arange(CELLS) + 0.5) * CELL_M
         on_line = (middle_m + JOINT_WIDTH_M / 2) % JOINT_SPACING_M < JOINT_WIDTH_M
         on_joint = on_line[:, None] | on_line[None, :]
         strength = np.where(on_joint, strength * 10 ** (JOINT_DB / 10), strength)
     is_even = ripple_height_m == 0
-    relief_m = None if is_even else ripples(ripple_length_m, ripple_height_m, ripple_rng).astype(np.float32)
+    relief_m = (
+        None
+        if is_even
+        else ripples(ripple_length_m, ripple_height_m, ripple_rng).astype(np.float32)
+    )
     return Scatterers(points, np.sqrt(strength).astype(np.float32), relief_m)
 
 
@@ -125,7 +147,13 @@ class SeabedObject:
 
 
 def place(
-    id_: int, kind: str, shape: Shape, extent_m: float, position_m: Floats, yaw_rad: float, margin_m: float = 0.0
+    id_: int,
+    kind: str,
+    shape: Shape,
+    extent_m: float,
+    position_m: Floats,
+    yaw_rad: float,
+    margin_m: float = 0.0,
 ) -> SeabedObject:
     """Put a shape on the grid, at a world position and turned by a yaw (positive to the left).
 
@@ -138,16 +166,33 @@ def place(
     y = (first[1] + np.arange(cells) + 0.5) * CELL_M - position_m[1]
     world_x, world_y = np.meshgrid(x, y)
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    level_db, height_m = shape(cos * world_x + sin * world_y, cos * world_y - sin * world_x)
+    level_db, height_m = shape(
+        cos * world_x + sin * world_y, cos * world_y - sin * world_x
+    )
     amplitude = (10 ** (level_db / 20)).astype(np.float32)
     position_m = np.asarray(position_m, float)
     relief = height_m.astype(np.float32)
     row, column = int(first[1]), int(first[0])
-    return SeabedObject(id_, kind, position_m, yaw_rad, extent_m, radius_m, row, column, amplitude, relief)
+    return SeabedObject(
+        id_,
+        kind,
+        position_m,
+        yaw_rad,
+        extent_m,
+        radius_m,
+        row,
+        column,
+        amplitude,
+        relief,
+    )
 
 
 def place_landmark(
-    design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float, foam_height_m: float | None = None
+    design: LandmarkDesign,
+    position_m: Floats,
+    yaw_rad: float,
+    floor_z_m: float,
+    foam_height_m: float | None = None,
 ) -> SeabedObject:
     """Put a landmark on the floor, with its face at its true position (m, world) and a yaw in rad.
 
@@ -159,13 +204,16 @@ def place_landmark(
     pixels = len(design.mask)
     middle_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * design.size_m
     away_m = np.hypot(middle_m[:, None], middle_m[None, :]) + design.size_m / pixels
-    plate_m = float(away_m[~np.isnan(design.mask)].max(initial=0.0))  # radius of all of its material
+    # radius of all of its material
+    plate_m = float(away_m[~np.isnan(design.mask)].max(initial=0.0))
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         level_db = design.level_db(x_m, y_m)
         away = np.clip((np.hypot(x_m, y_m) - plate_m) / SLOPE_M, 0, 1)
         ground_m = bottom_m * 0.5 * (1 + np.cos(np.pi * away))
-        height_m = np.where(level_db > 0, design.height_m, max(design.height_m - relief_m, 0.0))
+        height_m = np.where(
+            level_db > 0, design.height_m, max(design.height_m - relief_m, 0.0)
+        )
         return level_db, ground_m + np.where(np.isnan(level_db), 0.0, height_m)
 
     return place(design.id, design.name, shape, plate_m, position_m, yaw_rad, SLOPE_M)
@@ -199,31 +247,46 @@ def ragged_patch(radius_m: float, level_db: float, rng: np.random.Generator) -> 
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         angle = np.arctan2(y_m, x_m)[..., None] * order
-        outline = radius_m * np.clip(1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.3, 1.7)
+        outline = radius_m * np.clip(
+            1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.3, 1.7
+        )
         inside = np.hypot(x_m, y_m) < outline
         return np.where(inside, level_db, np.nan), np.where(inside, 0.005, 0.0)
 
     return shape
 
 
-def scattered_objects(spots_m: Floats, stones: int, rng: np.random.Generator) -> list[SeabedObject]:
+def scattered_objects(
+    spots_m: Floats, stones: int, rng: np.random.Generator
+) -> list[SeabedObject]:
     """Stones at the first of some spots (n, 3), ragged patches at the others, with identities -1, -2, ..."""
     objects = []
     for number, spot in enumerate(spots_m):
         if number < stones:
             radius_m = rng.uniform(0.08, 0.16)
-            kind, shape = "stone", stone(radius_m, rng.uniform(0.02, 0.06), rng.uniform(4, 10))
+            kind, shape = (
+                "stone",
+                stone(radius_m, rng.uniform(0.02, 0.06), rng.uniform(4, 10)),
+            )
         else:
             mean_radius_m = rng.uniform(0.10, 0.16)
             kind, shape = "patch", ragged_patch(mean_radius_m, rng.uniform(9, 13), rng)
             radius_m = 1.7 * mean_radius_m
-        objects.append(place(-1 - number, kind, shape, radius_m, spot, rng.uniform(-np.pi, np.pi)))
+        objects.append(
+            place(-1 - number, kind, shape, radius_m, spot, rng.uniform(-np.pi, np.pi))
+        )
     return objects
 
 
-def within(objects: Sequence[SeabedObject], centre_m: Floats, reach_m: float) -> list[SeabedObject]:
+def within(
+    objects: Sequence[SeabedObject], centre_m: Floats, reach_m: float
+) -> list[SeabedObject]:
     """Objects that a circle on the floor touches."""
-    return [o for o in objects if np.hypot(*(o.position_m[:2] - centre_m[:2])) < reach_m + o.radius_m]
+    return [
+        o
+        for o in objects
+        if np.hypot(*(o.position_m[:2] - centre_m[:2])) < reach_m + o.radius_m
+    ]
 
 
 class Sector(NamedTuple):
@@ -255,10 +318,18 @@ def lit_sector(
     """Floor within the ranges and the angles either side of the axis; None without any."""
     axis = world_R_sonar.apply([1.0, 0.0, 0.0])
     azimuth, lift = np.meshgrid(
-        np.linspace(-half_azimuth_rad, half_azimuth_rad, 5), np.linspace(-half_lift_rad, half_lift_rad, 5)
+        np.linspace(-half_azimuth_rad, half_azimuth_rad, 5),
+        np.linspace(-half_lift_rad, half_lift_rad, 5),
     )
     rays = world_R_sonar.apply(
-        np.stack([np.cos(lift) * np.cos(azimuth), np.cos(lift) * np.sin(azimuth), np.sin(lift)], -1).reshape(-1, 3)
+        np.stack(
+            [
+                np.cos(lift) * np.cos(azimuth),
+                np.cos(lift) * np.sin(azimuth),
+                np.sin(lift),
+            ],
+            -1,
+        ).reshape(-1, 3)
     )
     run = np.hypot(rays[:, 0], rays[:, 1])
     nearest, farthest = (np.sqrt(max(r**2 - height_m**2, 0.0)) for r in ranges_m)
@@ -269,8 +340,12 @@ def lit_sector(
     if nearest >= farthest or height_m <= 0:
         return None
     heading = axis[:2] / np.hypot(*axis[:2])
-    bearings = np.arctan2(heading[0] * rays[:, 1] - heading[1] * rays[:, 0], rays[:, :2] @ heading)
-    return Sector(heading, float(np.abs(bearings).max()), float(nearest), float(farthest))
+    bearings = np.arctan2(
+        heading[0] * rays[:, 1] - heading[1] * rays[:, 0], rays[:, :2] @ heading
+    )
+    return Sector(
+        heading, float(np.abs(bearings).max()), float(nearest), float(farthest)
+    )
 
 
 def cells_of(sector: Sector, foot_m: Floats) -> Cells:
@@ -289,7 +364,12 @@ def cells_of(sector: Sector, foot_m: Floats) -> Cells:
             continue
         crosses = (middle >= min(y1, y2)) & (middle <= max(y1, y2))
         at = x1 + (middle[crosses] - y1) * (x2 - x1) / (y2 - y1)
-        left[crosses], right[crosses] = np.minimum(left[crosses], at), np.maximum(right[crosses], at)
+        left[crosses], right[crosses] = (
+            np.minimum(left[crosses], at),
+            np.maximum(right[crosses], at),
+        )
     empty = left > right
     left[empty], right[empty] = x[0], x[0]
-    return Cells(first_row, np.column_stack([np.floor(left), np.ceil(right)]).astype(np.int64))
+    return Cells(
+        first_row, np.column_stack([np.floor(left), np.ceil(right)]).astype(np.int64)
+    )

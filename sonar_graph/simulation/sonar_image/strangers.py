@@ -9,12 +9,21 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.sonar_image.scene import SeabedObject, Shape, block, place, stone
+from sonar_graph.simulation.sonar_image.scene import (
+    SeabedObject,
+    Shape,
+    block,
+    place,
+    stone,
+)
 
 Natural = Literal["stone", "weed", "stick"]
 LookAlike = Literal["lid", "tile", "hexagon", "pan-lid", "box", "round-stone"]
 StrangerName = Literal[Natural, LookAlike, "natural", "look-alikes"]
-GROUPS: dict[str, tuple[str, ...]] = {"natural": get_args(Natural), "look-alikes": get_args(LookAlike)}
+GROUPS: dict[str, tuple[str, ...]] = {
+    "natural": get_args(Natural),
+    "look-alikes": get_args(LookAlike),
+}
 
 
 class Drawn(NamedTuple):
@@ -37,47 +46,90 @@ def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> 
     return shape
 
 
-def rimmed_disc(radius_m: float, rim_m: float, rim_height_m: float, dome_m: float, knob_m: float) -> Shape:
+def rimmed_disc(
+    radius_m: float, rim_m: float, rim_height_m: float, dome_m: float, knob_m: float
+) -> Shape:
     """A round lid: 2 dB under the floor where it is smooth, 9 dB over it on rim and knob; it rises to a dome."""
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         away = np.hypot(x_m, y_m)
         is_rough = ((away > radius_m - rim_m) & (away < radius_m)) | (away < knob_m)
-        top = rim_height_m + dome_m * np.clip(1 - (away / radius_m) ** 2, 0, 1) + np.where(away < knob_m, 0.02, 0.0)
+        top = (
+            rim_height_m
+            + dome_m * np.clip(1 - (away / radius_m) ** 2, 0, 1)
+            + np.where(away < knob_m, 0.02, 0.0)
+        )
         level_db = np.where(is_rough, 9.0, -2.0)
-        return np.where(away < radius_m, level_db, np.nan), np.where(away < radius_m, top, 0.0)
+        return np.where(away < radius_m, level_db, np.nan), np.where(
+            away < radius_m, top, 0.0
+        )
 
     return shape
 
 
-def boulder(radius_m: float, height_m: float, level_db: float, rng: np.random.Generator) -> Shape:
+def boulder(
+    radius_m: float, height_m: float, level_db: float, rng: np.random.Generator
+) -> Shape:
     """A stone of random outline and lumpy top: half an ellipsoid whose radius varies with direction."""
     order = np.arange(1, 5)
     waves = rng.normal(0, 0.16 / np.sqrt(order), (2, len(order)))
-    flattened, lumps, lump_m = rng.uniform(0.6, 1.0), rng.uniform(0, 2 * np.pi, 2), 0.5 * radius_m
+    flattened, lumps, lump_m = (
+        rng.uniform(0.6, 1.0),
+        rng.uniform(0, 2 * np.pi, 2),
+        0.5 * radius_m,
+    )
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         angle = np.arctan2(y_m, x_m)[..., None] * order
-        outline = radius_m * np.clip(1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.5, 1.4)
+        outline = radius_m * np.clip(
+            1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.5, 1.4
+        )
         from_top = (np.hypot(x_m, y_m / flattened) / outline) ** 2
-        lumpy = 1 + 0.2 * np.sin(x_m / lump_m * np.pi + lumps[0]) * np.sin(y_m / lump_m * np.pi + lumps[1])
-        return np.where(from_top < 1, level_db, np.nan), height_m * lumpy * np.sqrt(np.clip(1 - from_top, 0, None))
+        lumpy = 1 + 0.2 * np.sin(x_m / lump_m * np.pi + lumps[0]) * np.sin(
+            y_m / lump_m * np.pi + lumps[1]
+        )
+        return np.where(from_top < 1, level_db, np.nan), height_m * lumpy * np.sqrt(
+            np.clip(1 - from_top, 0, None)
+        )
 
     return shape
 
 
-def tuft(radius_m: float, height_m: float, level_db: float, fronds: int, rng: np.random.Generator) -> Shape:
+def tuft(
+    radius_m: float,
+    height_m: float,
+    level_db: float,
+    fronds: int,
+    rng: np.random.Generator,
+) -> Shape:
     """Weed: narrow fronds from one root, which lie over the floor and between which it shows."""
-    angle, length_m = rng.uniform(-np.pi, np.pi, fronds), radius_m * rng.uniform(0.4, 1.0, fronds)
+    angle, length_m = (
+        rng.uniform(-np.pi, np.pi, fronds),
+        radius_m * rng.uniform(0.4, 1.0, fronds),
+    )
     bend, width_m = rng.normal(0, 2.5, fronds), rng.uniform(0.004, 0.010, fronds)
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         level, top = np.full(np.shape(x_m), np.nan), np.zeros(np.shape(x_m))
-        for turn, reach_m, curve, wide_m in zip(angle, length_m, bend, width_m, strict=True):
-            along, aside = np.cos(turn) * x_m + np.sin(turn) * y_m, np.cos(turn) * y_m - np.sin(turn) * x_m
-            covers = (along > 0) & (along < reach_m) & (np.abs(aside - curve * along**2) < wide_m)
+        for turn, reach_m, curve, wide_m in zip(
+            angle, length_m, bend, width_m, strict=True
+        ):
+            along, aside = (
+                np.cos(turn) * x_m + np.sin(turn) * y_m,
+                np.cos(turn) * y_m - np.sin(turn) * x_m,
+            )
+            covers = (
+                (along > 0)
+                & (along < reach_m)
+                & (np.abs(aside - curve * along**2) < wide_m)
+            )
             level[covers] = level_db
-            top = np.maximum(top, np.where(covers, height_m * np.sqrt(np.clip(1 - along / reach_m, 0, 1)), 0.0))
+            top = np.maximum(
+                top,
+                np.where(
+                    covers, height_m * np.sqrt(np.clip(1 - along / reach_m, 0, 1)), 0.0
+                ),
+            )
         return level, top
 
     return shape
@@ -85,18 +137,29 @@ def tuft(radius_m: float, height_m: float, level_db: float, fronds: int, rng: np
 
 def _tuft(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.12, 0.2)
-    shape = tuft(radius_m, rng.uniform(0.03, 0.08), rng.uniform(4, 9), int(rng.integers(10, 24)), rng)
+    shape = tuft(
+        radius_m,
+        rng.uniform(0.03, 0.08),
+        rng.uniform(4, 9),
+        int(rng.integers(10, 24)),
+        rng,
+    )
     return Drawn(shape, 1.2 * radius_m)
 
 
 def _boulder(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.08, 0.17)
-    return Drawn(boulder(radius_m, rng.uniform(0.03, 0.09), rng.uniform(4, 11), rng), 1.4 * radius_m)
+    return Drawn(
+        boulder(radius_m, rng.uniform(0.03, 0.09), rng.uniform(4, 11), rng),
+        1.4 * radius_m,
+    )
 
 
 def _stick(rng: np.random.Generator) -> Drawn:
     length_m, width_m = rng.uniform(0.3, 0.5), rng.uniform(0.015, 0.04)
-    return Drawn(block(length_m, width_m, 0.8 * width_m, rng.uniform(4, 10)), length_m / 2)
+    return Drawn(
+        block(length_m, width_m, 0.8 * width_m, rng.uniform(4, 10)), length_m / 2
+    )
 
 
 def _lid(rng: np.random.Generator) -> Drawn:
@@ -116,7 +179,9 @@ def _hexagon(rng: np.random.Generator) -> Drawn:
 
 def _pan_lid(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.11, 0.15)
-    return Drawn(rimmed_disc(radius_m, 0.012, 0.01, rng.uniform(0.015, 0.03), 0.02), radius_m)
+    return Drawn(
+        rimmed_disc(radius_m, 0.012, 0.01, rng.uniform(0.015, 0.03), 0.02), radius_m
+    )
 
 
 def _box(rng: np.random.Generator) -> Drawn:
@@ -130,7 +195,14 @@ def _round_stone(rng: np.random.Generator) -> Drawn:
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
-    **{"stone": _boulder, "weed": _tuft, "stick": _stick, "lid": _lid, "tile": _tile, "hexagon": _hexagon},
+    **{
+        "stone": _boulder,
+        "weed": _tuft,
+        "stick": _stick,
+        "lid": _lid,
+        "tile": _tile,
+        "hexagon": _hexagon,
+    },
     **{"pan-lid": _pan_lid, "box": _box, "round-stone": _round_stone},
 }
 """How each kind is drawn. lid: a flat rough disc; tile: a square one; box: 5 cm high; pan-lid: a dome with rim and
@@ -138,18 +210,36 @@ knob; round-stone: half an ellipsoid, stone: one of random outline."""
 
 
 def strangers_at(
-    spots_m: Floats, names: Sequence[StrangerName], first_id: int, rng: np.random.Generator
+    spots_m: Floats,
+    names: Sequence[StrangerName],
+    first_id: int,
+    rng: np.random.Generator,
 ) -> list[SeabedObject]:
     """Objects of these names at spots (n, 3), each name as often as the others, with identities downward.
 
     The names take turns in a random order. ``first_id`` is negative.
     """
-    kinds = list(dict.fromkeys(kind for name in names for kind in GROUPS.get(name, (name,))))
+    kinds = list(
+        dict.fromkeys(kind for name in names for kind in GROUPS.get(name, (name,)))
+    )
     if not kinds:
         return []
-    order = np.concatenate([rng.permutation(len(kinds)) for _ in range(-(-len(spots_m) // len(kinds)))])
+    order = np.concatenate(
+        [rng.permutation(len(kinds)) for _ in range(-(-len(spots_m) // len(kinds)))]
+    )
     objects = []
-    for number, (spot, kind) in enumerate(zip(spots_m, (kinds[k] for k in order), strict=False)):
+    for number, (spot, kind) in enumerate(
+        zip(spots_m, (kinds[k] for k in order), strict=False)
+    ):
         drawn = KINDS[kind](rng)
-        objects.append(place(first_id - number, kind, drawn.shape, drawn.extent_m, spot, rng.uniform(-np.pi, np.pi)))
+        objects.append(
+            place(
+                first_id - number,
+                kind,
+                drawn.shape,
+                drawn.extent_m,
+                spot,
+                rng.uniform(-np.pi, np.pi),
+            )
+        )
     return objects

@@ -21,9 +21,12 @@ DRAPE_M = 0.015
 """Sigma with which sediment rounds edges off."""
 
 
-def patches(is_material: NDArray[np.bool_], share: float, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Floats]:
+def patches(
+    is_material: NDArray[np.bool_], share: float, rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], Floats]:
     """Mask of patches that cover a share of the material, and how far within they are: 0 at the edge, 1 at most."""
-    sigma = PATCH_M / (2 * CELL_M)  # the field's autocorrelation is exp(-(d / PATCH_M)^2)
+    # the field's autocorrelation is exp(-(d / PATCH_M)^2)
+    sigma = PATCH_M / (2 * CELL_M)
     field = gaussian_filter(rng.standard_normal(is_material.shape), sigma, mode="wrap")
     ranked = np.sort(field[is_material])
     count = round(share * len(ranked))
@@ -33,10 +36,15 @@ def patches(is_material: NDArray[np.bool_], share: float, rng: np.random.Generat
     return field >= edge, np.clip((field - edge) / max(field.max() - edge, 1e-9), 0, 1)
 
 
-def weathered(landmark: SeabedObject, conditions: SceneConditions, rng: np.random.Generator) -> SeabedObject:
+def weathered(
+    landmark: SeabedObject, conditions: SceneConditions, rng: np.random.Generator
+) -> SeabedObject:
     """The landmark after wear: levels of its bright and dark parts changed, then overgrown, then drowned."""
     fouling_rng, sediment_rng = rng.spawn(2)
-    amplitude, relief_m = landmark.amplitude.astype(float), landmark.relief_m.astype(float)
+    amplitude, relief_m = (
+        landmark.amplitude.astype(float),
+        landmark.relief_m.astype(float),
+    )
     is_material, is_bright = ~np.isnan(amplitude), amplitude > 1
     amplitude[is_bright] *= 10 ** (conditions.contrast_db / 20)
     if conditions.plate_db is not None:
@@ -48,5 +56,13 @@ def weathered(landmark: SeabedObject, conditions: SceneConditions, rng: np.rando
     if conditions.sediment > 0:
         drowned, _ = patches(is_material, conditions.sediment, sediment_rng)
         amplitude[drowned] = np.nan
-        relief_m = np.where(drowned, gaussian_filter(relief_m, DRAPE_M / CELL_M, mode="nearest"), relief_m)
-    return replace(landmark, amplitude=amplitude.astype(np.float32), relief_m=relief_m.astype(np.float32))
+        relief_m = np.where(
+            drowned,
+            gaussian_filter(relief_m, DRAPE_M / CELL_M, mode="nearest"),
+            relief_m,
+        )
+    return replace(
+        landmark,
+        amplitude=amplitude.astype(np.float32),
+        relief_m=relief_m.astype(np.float32),
+    )

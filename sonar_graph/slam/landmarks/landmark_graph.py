@@ -28,22 +28,50 @@ import gtsam
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.sighting import (
+    Frame,
+    SeenFrame,
+    Sighting,
+    SightingFactors,
+)
 from sonar_graph.slam.smoother import Changed, FactorGroup, Known, Marginals, Smoother
-from sonar_graph.states import OUTCOME_NUMBERS, UNKNOWN, DetectionJournal, DetectionLog, Outcome
+from sonar_graph.states import (
+    OUTCOME_NUMBERS,
+    UNKNOWN,
+    DetectionJournal,
+    DetectionLog,
+    Outcome,
+)
 
 IN_GRAPH = frozenset(
-    {Outcome.USED, Outcome.NEW, Outcome.USED_LATER, Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED}
+    {
+        Outcome.USED,
+        Outcome.NEW,
+        Outcome.USED_LATER,
+        Outcome.PLACED_LATER,
+        Outcome.MOVED,
+        Outcome.REASSIGNED,
+    }
 )
 """States of a sighting whose factors are in the graph."""
 FITTING = frozenset({Outcome.USED_LATER, Outcome.REASSIGNED, Outcome.UNFIT})
 GIVEN_UP = frozenset({Outcome.FORGOTTEN, Outcome.NO_IDENTITY})
 LATER: dict[Outcome | None, frozenset[Outcome]] = {
-    None: frozenset({Outcome.USED, Outcome.NEW, Outcome.REASSIGNED, Outcome.GATED, Outcome.REPEATED})
+    None: frozenset(
+        {Outcome.USED, Outcome.NEW, Outcome.REASSIGNED, Outcome.GATED, Outcome.REPEATED}
+    )
     | {Outcome.UNFIT, Outcome.WAITING},
     Outcome.WAITING: GIVEN_UP
-    | {Outcome.USED_LATER, Outcome.PLACED_LATER, Outcome.NEW, Outcome.GATED, Outcome.REPEATED},
-    **dict.fromkeys(IN_GRAPH, FITTING | {Outcome.TAKEN_BACK, Outcome.MOVED, Outcome.WITHHELD}),
+    | {
+        Outcome.USED_LATER,
+        Outcome.PLACED_LATER,
+        Outcome.NEW,
+        Outcome.GATED,
+        Outcome.REPEATED,
+    },
+    **dict.fromkeys(
+        IN_GRAPH, FITTING | {Outcome.TAKEN_BACK, Outcome.MOVED, Outcome.WITHHELD}
+    ),
     Outcome.TAKEN_BACK: frozenset({Outcome.MOVED, Outcome.GATED, Outcome.REPEATED}),
     Outcome.GATED: frozenset({Outcome.WAITING}),
     Outcome.REPEATED: frozenset({Outcome.WAITING}),
@@ -211,7 +239,9 @@ UNJUDGED = State()
 class LandmarkGraph:
     """Sightings with their states and landmarks, and the journal of all detections."""
 
-    def __init__(self, smoother: Smoother, factors: SightingFactors, journal: AmendableJournal) -> None:
+    def __init__(
+        self, smoother: Smoother, factors: SightingFactors, journal: AmendableJournal
+    ) -> None:
         self.smoother = smoother
         self.factors = factors
         self.journal = journal
@@ -247,7 +277,9 @@ class LandmarkGraph:
 
     def sizes(self) -> dict[int, int]:
         """Number of sightings of each landmark; all that have left a bounded window count as one."""
-        return {i: len(sightings) + (i in self._rooted) for i, sightings in self._of.items()}
+        return {
+            i: len(sightings) + (i in self._rooted) for i, sightings in self._of.items()
+        }
 
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Stamps of the frames that show a landmark."""
@@ -270,7 +302,9 @@ class LandmarkGraph:
             state = self.state(each.sighting)
             # a policy that breaks the table would leave factors in the graph that no state names
             if each.outcome not in LATER.get(state.outcome, ()):
-                raise AssertionError(f"a sighting that is {state.outcome!r} cannot become {each.outcome!r}")
+                raise AssertionError(
+                    f"a sighting that is {state.outcome!r} cannot become {each.outcome!r}"
+                )
             self.journal.amend(each)
             if state.landmark_id is not None:
                 retracted.append(each.sighting)
@@ -280,7 +314,9 @@ class LandmarkGraph:
                 else:
                     associated.append((each.sighting, each.landmark_id))
             if each.outcome in LATER:
-                self._states[each.sighting] = State(each.outcome, state.landmark_id, state.handle)
+                self._states[each.sighting] = State(
+                    each.outcome, state.landmark_id, state.handle
+                )
             else:
                 self._states.pop(each.sighting, None)
         # before an exchange, which enters what waits
@@ -306,7 +342,9 @@ class LandmarkGraph:
         """
         if not (changed.withheld or changed.left):
             return  # the usual case; the loops below visit every sighting of the run
-        withheld = [s for s, state in self._states.items() if state.handle in changed.withheld]
+        withheld = [
+            s for s, state in self._states.items() if state.handle in changed.withheld
+        ]
         for sighting in withheld:
             self._remove(sighting)
             self._states[sighting] = State(Outcome.WITHHELD)
@@ -328,13 +366,22 @@ class LandmarkGraph:
         key = L(new.landmark_id)
         is_first = new.landmark_id not in self
         if is_first:
-            start = self.factors.start(new.sighting, self.smoother.estimates) if new.start is None else new.start
+            start = (
+                self.factors.start(new.sighting, self.smoother.estimates)
+                if new.start is None
+                else new.start
+            )
             self.smoother.add_landmark(key, start)
         made = self.factors.make(new.sighting, key, is_first=is_first)
         handle = self.smoother.add(made, (key, new.sighting.line), gain=new.gain)
         self._insert(new.sighting, new.landmark_id, handle)
 
-    def _exchange(self, retracted: list[Sighting], associated: list[tuple[Sighting, int]], time_s: float) -> None:
+    def _exchange(
+        self,
+        retracted: list[Sighting],
+        associated: list[tuple[Sighting, int]],
+        time_s: float,
+    ) -> None:
         """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
 
         A landmark begins with its first sighting and leaves the graph with its last.
@@ -347,7 +394,9 @@ class LandmarkGraph:
             if landmark_id is not None:  # the flush may have withheld it
                 old_of[sighting] = landmark_id
         new_of = dict(associated)
-        first_before = {i: self._first(i) for i in sorted({*old_of.values(), *new_of.values()})}
+        first_before = {
+            i: self._first(i) for i in sorted({*old_of.values(), *new_of.values()})
+        }
         removed = [self.state(sighting).handle for sighting in old_of]
         for sighting in old_of:
             self._remove(sighting)
@@ -373,9 +422,13 @@ class LandmarkGraph:
             if s is not None and first_before[i] is None
         }
         # a landmark without sightings would be undetermined
-        lost = [L(i) for i, s in first.items() if s is None and first_before[i] is not None]
+        lost = [
+            L(i) for i, s in first.items() if s is None and first_before[i] is not None
+        ]
         handles = [handle for handle in removed if handle is not None]
-        changed = self.smoother.exchange(time_s, handles, list(made.values()), begun, lost)
+        changed = self.smoother.exchange(
+            time_s, handles, list(made.values()), begun, lost
+        )
         for sighting, handle in zip(made, changed.added, strict=True):
             self._states[sighting] = self._states[sighting]._replace(handle=handle)
         self.follow(changed)
@@ -384,10 +437,16 @@ class LandmarkGraph:
         """Sighting that has the factors that a landmark has once."""
         if landmark_id in self._rooted:  # its factors are final
             return self._rooted[landmark_id]
-        return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
+        return min(
+            self._of.get(landmark_id, {}),
+            key=lambda s: (s.stamp_ns, s.row),
+            default=None,
+        )
 
     def _insert(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
-        self._states[sighting] = State(self.state(sighting).outcome, landmark_id, handle)
+        self._states[sighting] = State(
+            self.state(sighting).outcome, landmark_id, handle
+        )
         self._of[landmark_id][sighting] = None
 
     def _remove(self, sighting: Sighting) -> None:

@@ -87,7 +87,10 @@ class IdentityPosterior:
     @property
     def favourite(self) -> int | None:
         """Landmark more probable than all else together, or None."""
-        return next((landmark_id for landmark_id, p in self.probability.items() if p > 0.5), None)
+        return next(
+            (landmark_id for landmark_id, p in self.probability.items() if p > 0.5),
+            None,
+        )
 
     def log_weights(self, ids: list[int], errors: RecogniserErrors) -> Floats:
         """Logarithms of w for K landmarks and for none, shape (K + 1,)."""
@@ -123,8 +126,14 @@ class Errors:
     """Whitened errors of n sightings against landmarks, for poses as they are estimated."""
 
     def __init__(self, sightings: Sequence[Sighting], values: Known) -> None:
-        poses = {key: values.atPose3(key) for key in {sighting.line.pose_key for sighting in sightings}}
-        world_T_sonar = [poses[s.line.pose_key].compose(s.line.body_T_sonar).matrix() for s in sightings]
+        poses = {
+            key: values.atPose3(key)
+            for key in {sighting.line.pose_key for sighting in sightings}
+        }
+        world_T_sonar = [
+            poses[s.line.pose_key].compose(s.line.body_T_sonar).matrix()
+            for s in sightings
+        ]
         sonars = np.array(world_T_sonar).reshape(-1, 4, 4)
         noise = np.array([sighting.noise for sighting in sightings]).reshape(-1, 2, 2)
         self._world_R_sonar = sonars[:, :3, :3]
@@ -137,9 +146,11 @@ class Errors:
     def of(self, points: Floats) -> Floats:
         """Against landmarks at points of the world, shape (K, 3): range and azimuth, shape (n, K, 2)."""
         from_sonar = points[None] - self._world_p_sonar[:, None]
-        q = np.einsum("nji,nkj->nki", self._world_R_sonar, from_sonar)  # R^T (p - t), in sonar axes
+        # R^T (p - t), in sonar axes
+        q = np.einsum("nji,nkj->nki", self._world_R_sonar, from_sonar)
         expected, _ = project_points(q.reshape(-1, 3))
-        e = polar_difference(expected.reshape(*q.shape[:2], 2), self._z[:, None])  # (n, K, 2)
+        # (n, K, 2)
+        e = polar_difference(expected.reshape(*q.shape[:2], 2), self._z[:, None])
         return np.einsum("nij,nkj->nki", self._whitener, e)
 
 
@@ -151,7 +162,14 @@ class Mixture:
         self._kernel = kernel
         self._log_peak = 2.0 * kernel.log_normaliser
 
-    def at_first(self, posterior: IdentityPosterior, ids: list[int], z: Floats, expected: Floats, S: Floats) -> Scores:
+    def at_first(
+        self,
+        posterior: IdentityPosterior,
+        ids: list[int],
+        z: Floats,
+        expected: Floats,
+        S: Floats,
+    ) -> Scores:
         """Components of a detection that the state is not yet conditioned on, with its innovation covariances S."""
         e = polar_difference(z, expected)  # (K, 2)
         whitener = np.linalg.inv(np.linalg.cholesky(S))
@@ -164,15 +182,32 @@ class Mixture:
         totals[len(ids) :] += self._errors.log_density
         return dict(zip([*ids, *new, None], totals.tolist(), strict=True))
 
-    def gains(self, landmark_id: int, objects: list[TrackedObject], points: Floats, values: Known) -> Floats:
+    def gains(
+        self,
+        landmark_id: int,
+        objects: list[TrackedObject],
+        points: Floats,
+        values: Known,
+    ) -> Floats:
         """Log density l_i of a landmark at each of k points minus l_none, for n tracked objects, shape (n, k)."""
-        log_weights = np.array([each.posterior.log_weights([landmark_id], self._errors) for each in objects])
+        log_weights = np.array(
+            [
+                each.posterior.log_weights([landmark_id], self._errors)
+                for each in objects
+            ]
+        )
         log_odds = log_weights[:, 0] - log_weights[:, 1]
         unplaced = self._unplaced(objects)
-        return self._fits(objects, points, values) - unplaced[:, None] + log_odds[:, None]
+        return (
+            self._fits(objects, points, values) - unplaced[:, None] + log_odds[:, None]
+        )
 
     def scores(
-        self, objects: list[TrackedObject], values: Known, choices: Choices, sizes: dict[int, int]
+        self,
+        objects: list[TrackedObject],
+        values: Known,
+        choices: Choices,
+        sizes: dict[int, int],
     ) -> list[Scores]:
         """Log density of each component of each tracked object, at the estimate.
 
@@ -201,7 +236,13 @@ class Mixture:
             scores.append(dict(zip([*ids, *new, None], totals.tolist(), strict=True)))
         return scores
 
-    def best(self, objects: list[TrackedObject], values: Known, choices: Choices, sizes: dict[int, int]) -> Choices:
+    def best(
+        self,
+        objects: list[TrackedObject],
+        values: Known,
+        choices: Choices,
+        sizes: dict[int, int],
+    ) -> Choices:
         """Largest component of each tracked object at the estimate; no landmark twice in a frame.
 
         A landmark that is not in the graph begins with one object, the one with most sightings. Others that chose it
@@ -216,7 +257,10 @@ class Mixture:
         for k in sorted(range(len(objects)), key=lambda k: -len(objects[k].sightings)):
             if best[k] is not None and best[k] not in sizes:
                 beginning.setdefault(best[k], k)
-        return [choices[k] if beginning.get(new, k) != k else new for k, new in enumerate(best)]
+        return [
+            choices[k] if beginning.get(new, k) != k else new
+            for k, new in enumerate(best)
+        ]
 
     def _unplaced(self, objects: list[TrackedObject]) -> Floats:
         """Log densities of the sightings of objects whose place is not known, shape (n,).
@@ -234,13 +278,20 @@ class Mixture:
             totals.append(log_u + repeated.sum())
         return np.array(totals)
 
-    def _fits(self, objects: list[TrackedObject], points: Floats, values: Known) -> Floats:
+    def _fits(
+        self, objects: list[TrackedObject], points: Floats, values: Known
+    ) -> Floats:
         """Log densities of tracked objects, for landmarks at points of the world, shape (n, k)."""
-        errors = Errors([sighting for each in objects for sighting in each.sightings], values)
+        errors = Errors(
+            [sighting for each in objects for sighting in each.sightings], values
+        )
         losses = self._kernel.loss(errors.of(points)).sum(axis=2)
-        single = self._log_peak - errors.half_log_det[:, None] - losses  # (sightings, k)
+        # (sightings, k)
+        single = self._log_peak - errors.half_log_det[:, None] - losses
         # sum over the sightings of each object, which follow each other
-        starts = list(accumulate((len(each.sightings) for each in objects[:-1]), initial=0))
+        starts = list(
+            accumulate((len(each.sightings) for each in objects[:-1]), initial=0)
+        )
         return np.asarray(np.add.reduceat(single, starts, axis=0))
 
 
@@ -250,7 +301,9 @@ def each_once(scores: list[Scores], stamps_ns: list[set[int]]) -> Choices:
     taken_ns: dict[int, set[int]] = defaultdict(set)
     """Stamps of the frames that show each landmark."""
     for row in sorted(range(len(scores)), key=lambda row: -max(scores[row].values())):
-        for landmark_id in sorted(scores[row], key=scores[row].__getitem__, reverse=True):
+        for landmark_id in sorted(
+            scores[row], key=scores[row].__getitem__, reverse=True
+        ):
             if landmark_id is None:
                 break
             if taken_ns[landmark_id].isdisjoint(stamps_ns[row]):
@@ -269,18 +322,33 @@ LEAST_MARGIN = 3.0
 
 
 def supporters_elsewhere(
-    landmark_id: int, objects: list[TrackedObject], choices: Choices, values: Known, mixture: Mixture
+    landmark_id: int,
+    objects: list[TrackedObject],
+    choices: Choices,
+    values: Known,
+    mixture: Mixture,
 ) -> list[TrackedObject] | None:
     """Tracked objects that agree on a better place for the landmark that they name; None: no better place."""
     voters = objects[-MOST_VOTERS:]
-    others = [each for each, choice in zip(objects, choices, strict=True) if choice != landmark_id]
-    proposals = [each.sightings[0].line.point(values) for each in others[-MOST_PROPOSALS:]]
+    others = [
+        each
+        for each, choice in zip(objects, choices, strict=True)
+        if choice != landmark_id
+    ]
+    proposals = [
+        each.sightings[0].line.point(values) for each in others[-MOST_PROPOSALS:]
+    ]
     if len(proposals) < 2:
         return None
-    points = np.vstack([values.atPoint3(L(landmark_id)), *proposals])  # the first: where the landmark is now
+    # the first: where the landmark is now
+    points = np.vstack([values.atPoint3(L(landmark_id)), *proposals])
     gains = mixture.gains(landmark_id, voters, points, values)  # (voters, points)
     votes = np.maximum(gains, 0.0).sum(axis=0)
     winner = int(np.argmax(votes))
     if votes[winner] < votes[0] + LEAST_MARGIN:
         return None
-    return [each for each, gain in zip(voters, gains[:, winner].tolist(), strict=True) if gain > 0.0]
+    return [
+        each
+        for each, gain in zip(voters, gains[:, winner].tolist(), strict=True)
+        if gain > 0.0
+    ]

@@ -41,7 +41,11 @@ from sonar_graph.slam.landmarks.mixture import (
     supporters_elsewhere,
 )
 from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, late_view
-from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, second_rows_of_tracks
+from sonar_graph.slam.landmarks.tracked import (
+    GatedIdentity,
+    RobustIdentity,
+    second_rows_of_tracks,
+)
 from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
 from sonar_graph.states import Outcome
 
@@ -79,7 +83,9 @@ class MixtureIdentity(RecogniserErrors):
     """Longest time for which detections of a track wait in the window. A track that is not seen for this time ends."""
 
 
-IdentityParams = Annotated[RobustIdentity | GatedIdentity | MixtureIdentity, *tagged("policy", "robust")]
+IdentityParams = Annotated[
+    RobustIdentity | GatedIdentity | MixtureIdentity, *tagged("policy", "robust")
+]
 Changes = list[tuple[TrackedObject, int | None]]
 """Tracked objects with the landmark that each is to count as; None: no landmark."""
 
@@ -97,7 +103,9 @@ class ChosenHistory(NamedTuple):
 class MixtureIdentities(IdentityPolicy):
     """Keeps the graph in line with the best component of every tracked object."""
 
-    def __init__(self, landmarks: LandmarkGraph, params: MixtureIdentity, kernel: Kernel) -> None:
+    def __init__(
+        self, landmarks: LandmarkGraph, params: MixtureIdentity, kernel: Kernel
+    ) -> None:
         super().__init__(landmarks)
         self.mixture = Mixture(params, kernel)
         self.objects: list[TrackedObject] = []
@@ -123,13 +131,22 @@ class MixtureIdentities(IdentityPolicy):
         """Landmarks of the graph, of a large map those near a detection or named; see `MOST_RIVALS`."""
         ids = self.landmarks.ids
         if len(ids) > MOST_RIVALS:
-            seen = np.array([locate(world_T_sonar, r, a, 0.0)[:2] for r, a in frame.z.tolist()])
+            seen = np.array(
+                [locate(world_T_sonar, r, a, 0.0)[:2] for r, a in frame.z.tolist()]
+            )
             points = np.array([self.smoother.estimates.atPoint3(L(i))[:2] for i in ids])
             # horizontal: the elevation of a detection is not known
             distance_m = np.linalg.norm(points - seen[:, None], axis=2)  # (m, K)
-            nearest = np.argpartition(distance_m, MOST_RIVALS - 1, axis=1)[:, :MOST_RIVALS]
+            nearest = np.argpartition(distance_m, MOST_RIVALS - 1, axis=1)[
+                :, :MOST_RIVALS
+            ]
             kept: set[int | None] = {ids[k] for k in np.unique(nearest).tolist()}
-            kept.update(*(IdentityPosterior.of(frame.detections, row).probability for row in range(len(frame))))
+            kept.update(
+                *(
+                    IdentityPosterior.of(frame.detections, row).probability
+                    for row in range(len(frame))
+                )
+            )
             kept.update(map(self.landmark_of, self._tracks.values()))
             ids = [i for i in ids if i in kept]
         return [L(i) for i in ids]
@@ -144,7 +161,9 @@ class MixtureIdentities(IdentityPolicy):
         tracks = frame.detections.track.tolist()
         posteriors = [IdentityPosterior.of(frame.detections, row) for row in rows]
         ids = [gtsam.Symbol(key).index() for key in seen.keys]
-        points = np.array([self.smoother.estimates.atPoint3(key) for key in seen.keys]).reshape(-1, 3)
+        points = np.array(
+            [self.smoother.estimates.atPoint3(key) for key in seen.keys]
+        ).reshape(-1, 3)
         expected, S_0 = seen.view.expect(seen.keys, points)
         # all components of each detection, before the state is conditioned on it
         scores: list[Scores] = []
@@ -155,7 +174,11 @@ class MixtureIdentities(IdentityPolicy):
                 scores.append({landmark_id: np.inf})
             else:
                 S = S_0 + frame.noise[row]
-                scores.append(self.mixture.at_first(posteriors[row], ids, frame.z[row], expected, S))
+                scores.append(
+                    self.mixture.at_first(
+                        posteriors[row], ids, frame.z[row], expected, S
+                    )
+                )
         chosen = each_once(scores, [{frame.stamp_ns}] * len(frame))
         judged: list[Assignment] = []
         for row, sighting in enumerate(seen.sightings(rows, seen.beam_points(rows))):
@@ -163,14 +186,19 @@ class MixtureIdentities(IdentityPolicy):
             judged += self._extended(each, sighting, chosen[row])
         # the recogniser may use the number of a track that is over for another object
         self._oldest_ns = frame.stamp_ns - self._longest_wait_ns
-        self._tracks = {k: each for k, each in self._tracks.items() if each.sightings[-1].stamp_ns >= self._oldest_ns}
+        self._tracks = {
+            k: each
+            for k, each in self._tracks.items()
+            if each.sightings[-1].stamp_ns >= self._oldest_ns
+        }
         self._round = 0
         return Decision.of(judged)
 
     def held(self) -> dict[int, float]:
         """Keyframes of sightings of tracks that are of no landmark yet."""
         return {
-            sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+            sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns)
+            / NS_PER_S
             for each in self._tracks.values()
             if self.landmark_of(each) is None
             for sighting in each.sightings
@@ -186,7 +214,11 @@ class MixtureIdentities(IdentityPolicy):
     def smoothed(self) -> Solution:
         """Solution of the whole graph with the choices that suit it best."""
         chosen = self.history()
-        return Solution(chosen.values, chosen.marginals, sorted({i for i in chosen.choices if i is not None}))
+        return Solution(
+            chosen.values,
+            chosen.marginals,
+            sorted({i for i in chosen.choices if i is not None}),
+        )
 
     def rechosen(self) -> list[Assignment]:
         """Assignments of the whole history that differ from those of the window."""
@@ -212,21 +244,34 @@ class MixtureIdentities(IdentityPolicy):
         each.posterior = posterior
         return each
 
-    def _extended(self, each: TrackedObject, sighting: Sighting, chosen: int | None) -> list[Assignment]:
+    def _extended(
+        self, each: TrackedObject, sighting: Sighting, chosen: int | None
+    ) -> list[Assignment]:
         """Extend a tracked object by a sighting as chosen; what waited in its track follows."""
-        waiting = [s for s in each.sightings if self.landmarks.state(s).outcome is Outcome.UNFIT]
+        waiting = [
+            s
+            for s in each.sightings
+            if self.landmarks.state(s).outcome is Outcome.UNFIT
+        ]
         each.sightings.append(sighting)
         favourite = each.posterior.favourite
         self._dispute([(each, chosen)])
         if chosen is None:
-            return [Assignment(sighting, Outcome.UNFIT, -1 if favourite is None else favourite)]
+            return [
+                Assignment(
+                    sighting, Outcome.UNFIT, -1 if favourite is None else favourite
+                )
+            ]
         outcome = Outcome.USED if chosen == favourite else Outcome.REASSIGNED
         if chosen not in self.landmarks:
             outcome = Outcome.NEW
         # a landmark is once in a frame
         taken_ns = self.landmarks.stamps_ns(chosen) | {sighting.stamp_ns}
         free = [s for s in waiting if s.stamp_ns not in taken_ns]
-        return [Assignment(sighting, outcome, chosen), *(_late(s, each, chosen) for s in free)]
+        return [
+            Assignment(sighting, outcome, chosen),
+            *(_late(s, each, chosen) for s in free),
+        ]
 
     def _dispute(self, changes: Changes) -> None:
         """Note the landmarks that objects name and are not taken for."""
@@ -238,16 +283,24 @@ class MixtureIdentities(IdentityPolicy):
     def _changes(self, objects: list[TrackedObject]) -> Changes:
         """Best components that differ from the present choices."""
         choices = [self.landmark_of(each) for each in objects]
-        best = self.mixture.best(objects, self.smoother.estimates, choices, self.landmarks.sizes())
+        best = self.mixture.best(
+            objects, self.smoother.estimates, choices, self.landmarks.sizes()
+        )
         return self._differing(objects, best)
 
     def _differing(self, objects: list[TrackedObject], choices: Choices) -> Changes:
-        return [(each, new) for each, new in zip(objects, choices, strict=True) if new != self.landmark_of(each)]
+        return [
+            (each, new)
+            for each, new in zip(objects, choices, strict=True)
+            if new != self.landmark_of(each)
+        ]
 
     def _revise_window(self) -> Decision:
         """Next choices in the window; empty when none changes, and after `MOST_WINDOW_ROUNDS`."""
         self._round += 1
-        if self._round == 1:  # the window is read once a frame; later rounds revise the same objects
+        if (
+            self._round == 1
+        ):  # the window is read once a frame; later rounds revise the same objects
             self._open = self._revisable()
         if self._round > 1 + MOST_WINDOW_ROUNDS:
             self._open = []
@@ -255,7 +308,9 @@ class MixtureIdentities(IdentityPolicy):
         if changes and self._round == 1:
             # a step of a robust kernel may end far from the minimum at which the choices are to be revised
             return Decision(settles=True)
-        preferred = [(each, new) for each, new in changes if self._is_preferred(new, each)]
+        preferred = [
+            (each, new) for each, new in changes if self._is_preferred(new, each)
+        ]
         if not preferred:
             self._open = []
         self._dispute(preferred)
@@ -264,15 +319,26 @@ class MixtureIdentities(IdentityPolicy):
     def _relocate(self) -> Decision:
         """Begin the next disputed landmark again where the objects that name it agree that it is."""
         while self._disputed:
-            landmark_id = min(self._disputed)  # the order must not depend on how the set was filled
+            # the order must not depend on how the set was filled
+            landmark_id = min(self._disputed)
             self._disputed.discard(landmark_id)
             if landmark_id not in self.landmarks:
                 continue
-            naming = [each for each in self.objects if each.posterior.favourite == landmark_id]
+            naming = [
+                each for each in self.objects if each.posterior.favourite == landmark_id
+            ]
             choices = [self.landmark_of(each) for each in naming]
-            supporters = supporters_elsewhere(landmark_id, naming, choices, self.smoother.estimates, self.mixture)
+            supporters = supporters_elsewhere(
+                landmark_id, naming, choices, self.smoother.estimates, self.mixture
+            )
             if supporters is not None:
-                leaving = _assigned([(each, None) for each in self.objects if self.landmark_of(each) == landmark_id])
+                leaving = _assigned(
+                    [
+                        (each, None)
+                        for each in self.objects
+                        if self.landmark_of(each) == landmark_id
+                    ]
+                )
                 coming = _assigned([(each, landmark_id) for each in supporters])
                 # in two rounds: a landmark begins in a new place only after it has lost its last sighting
                 return Decision((tuple(leaving), tuple(coming)))
@@ -291,7 +357,11 @@ class MixtureIdentities(IdentityPolicy):
             and each.posterior.favourite != self.landmark_of(each)
         ]
         recent = self.objects[-MOST_OPEN:]
-        inside = set(self.smoother.in_window(sorted({s.line.pose_key for each in recent for s in each.sightings})))
+        inside = set(
+            self.smoother.in_window(
+                sorted({s.line.pose_key for each in recent for s in each.sightings})
+            )
+        )
         return contradicted + [
             each
             for each in recent
@@ -303,7 +373,9 @@ class MixtureIdentities(IdentityPolicy):
     def _is_alone(self, each: TrackedObject) -> bool:
         """True when no other object has sightings of its landmark."""
         landmark_id = self.landmark_of(each)
-        return landmark_id is not None and self.landmarks.sizes()[landmark_id] == len(each.sightings)
+        return landmark_id is not None and self.landmarks.sizes()[landmark_id] == len(
+            each.sightings
+        )
 
     def _is_preferred(self, new: int | None, each: TrackedObject) -> bool:
         """True when the predictive density of the newest sighting also prefers the new component to the present one.
@@ -319,9 +391,17 @@ class MixtureIdentities(IdentityPolicy):
         values = self.smoother.estimates
         ids = [i for i in (old, new) if i is not None and i in self.landmarks]
         keys = [L(i) for i in ids]
-        view = late_view(sighting, values, self.smoother.joint_covariance_of_any([sighting.line.pose_key, *keys]))
-        expected, S_0 = view.expect(keys, np.array([values.atPoint3(key) for key in keys]))
-        scores = self.mixture.at_first(each.posterior, ids, sighting.line.z, expected, S_0 + sighting.noise)
+        view = late_view(
+            sighting,
+            values,
+            self.smoother.joint_covariance_of_any([sighting.line.pose_key, *keys]),
+        )
+        expected, S_0 = view.expect(
+            keys, np.array([values.atPoint3(key) for key in keys])
+        )
+        scores = self.mixture.at_first(
+            each.posterior, ids, sighting.line.z, expected, S_0 + sighting.noise
+        )
         return scores[new] > scores[old]
 
     def history(self) -> ChosenHistory:
@@ -329,21 +409,35 @@ class MixtureIdentities(IdentityPolicy):
         solved, marginals = self.smoother.solve_history()
         # the solution of an unchanged graph is the same object; sightings of no landmark do not change it
         count = sum(len(each.sightings) for each in self.objects)
-        if self._chosen is None or self._chosen[0] is not solved or self._chosen[1] != count:
+        if (
+            self._chosen is None
+            or self._chosen[0] is not solved
+            or self._chosen[1] != count
+        ):
             self._chosen = (solved, count, self._choose_history(solved, marginals))
         return self._chosen[2]
 
-    def _choose_history(self, solved: gtsam.Values, marginals: Marginals) -> ChosenHistory:
+    def _choose_history(
+        self, solved: gtsam.Values, marginals: Marginals
+    ) -> ChosenHistory:
         # what left a variable undetermined in the run would do so here
         objects = [each for each in self.objects if not self._is_withheld(each)]
-        handles = {self.landmarks.state(sighting).handle for each in objects for sighting in each.sightings}
-        rest = self.smoother.graph_without({handle for handle in handles if handle is not None})
+        handles = {
+            self.landmarks.state(sighting).handle
+            for each in objects
+            for sighting in each.sightings
+        }
+        rest = self.smoother.graph_without(
+            {handle for handle in handles if handle is not None}
+        )
         values = solved
         choices = [self.landmark_of(each) for each in objects]
         for _ in range(MOST_HISTORY_ROUNDS):
             # first the choices at the solution; when they are stable, the places of landmarks
             start = values
-            better = self.mixture.best(objects, values, choices, _sizes(objects, choices))
+            better = self.mixture.best(
+                objects, values, choices, _sizes(objects, choices)
+            )
             if better == choices:
                 start, better = self._relocated(objects, values, choices)
             if better == choices:
@@ -356,7 +450,9 @@ class MixtureIdentities(IdentityPolicy):
 
     def _is_withheld(self, each: TrackedObject) -> bool:
         """True when a sighting of an object of no landmark could not be used."""
-        outcomes = [self.landmarks.state(sighting).outcome for sighting in each.sightings]
+        outcomes = [
+            self.landmarks.state(sighting).outcome for sighting in each.sightings
+        ]
         return self.landmark_of(each) is None and Outcome.WITHHELD in outcomes
 
     def _relocated(
@@ -366,21 +462,34 @@ class MixtureIdentities(IdentityPolicy):
         moved = gtsam.Values(values)
         for landmark_id in sorted(_sizes(objects, choices)):
             named = [each.posterior.favourite == landmark_id for each in objects]
-            naming = [each for each, is_named in zip(objects, named, strict=True) if is_named]
-            present = [choice for choice, is_named in zip(choices, named, strict=True) if is_named]
-            supporters = supporters_elsewhere(landmark_id, naming, present, values, self.mixture)
+            naming = [
+                each for each, is_named in zip(objects, named, strict=True) if is_named
+            ]
+            present = [
+                choice
+                for choice, is_named in zip(choices, named, strict=True)
+                if is_named
+            ]
+            supporters = supporters_elsewhere(
+                landmark_id, naming, present, values, self.mixture
+            )
             if supporters is None:
                 continue
             without = [None if choice == landmark_id else choice for choice in choices]
             choices = [
-                landmark_id if each in supporters else choice for each, choice in zip(objects, without, strict=True)
+                landmark_id if each in supporters else choice
+                for each, choice in zip(objects, without, strict=True)
             ]
             first = min((s for each in supporters for s in each.sightings), key=_age)
             moved.update(L(landmark_id), self.landmarks.factors.start(first, values))
         return moved, choices
 
     def solution(
-        self, rest: gtsam.NonlinearFactorGraph, objects: list[TrackedObject], values: gtsam.Values, choices: Choices
+        self,
+        rest: gtsam.NonlinearFactorGraph,
+        objects: list[TrackedObject],
+        values: gtsam.Values,
+        choices: Choices,
     ) -> gtsam.Values:
         """Solution of the history in which each tracked object is the landmark chosen for it."""
         start = gtsam.Values(values)
@@ -391,11 +500,16 @@ class MixtureIdentities(IdentityPolicy):
             lines[L(choice)] += [sighting.line for sighting in each.sightings]
             # a landmark that the run does not have begins where its first object has it
             if not start.exists(L(choice)):
-                start.insert(L(choice), self.landmarks.factors.start(each.sightings[0], values))
+                start.insert(
+                    L(choice), self.landmarks.factors.start(each.sightings[0], values)
+                )
         return solve_in_sight(self.graph(rest, objects, choices), start, lines)
 
     def graph(
-        self, rest: gtsam.NonlinearFactorGraph, objects: list[TrackedObject], choices: Choices
+        self,
+        rest: gtsam.NonlinearFactorGraph,
+        objects: list[TrackedObject],
+        choices: Choices,
     ) -> gtsam.NonlinearFactorGraph:
         """All factors, those of sightings as chosen."""
         graph = gtsam.NonlinearFactorGraph(rest)
@@ -406,7 +520,9 @@ class MixtureIdentities(IdentityPolicy):
         for landmark_id, sightings in of.items():
             # as in `LandmarkGraph`, the earliest has the factors that a landmark has once
             for k, sighting in enumerate(sorted(sightings, key=_age)):
-                for factor in self.landmarks.factors.make(sighting, L(landmark_id), is_first=k == 0).values():
+                for factor in self.landmarks.factors.make(
+                    sighting, L(landmark_id), is_first=k == 0
+                ).values():
                     graph.add(factor)
         return graph
 
@@ -416,11 +532,17 @@ def _late(sighting: Sighting, each: TrackedObject, new: int | None) -> Assignmen
     favourite = each.posterior.favourite
     if new is None:
         return Assignment(sighting, Outcome.UNFIT, favourite)
-    return Assignment(sighting, Outcome.USED_LATER if new == favourite else Outcome.REASSIGNED, new)
+    return Assignment(
+        sighting, Outcome.USED_LATER if new == favourite else Outcome.REASSIGNED, new
+    )
 
 
 def _assigned(changes: Changes) -> list[Assignment]:
-    return [_late(sighting, each, new) for each, new in changes for sighting in each.sightings]
+    return [
+        _late(sighting, each, new)
+        for each, new in changes
+        for sighting in each.sightings
+    ]
 
 
 def _age(sighting: Sighting) -> tuple[int, int]:

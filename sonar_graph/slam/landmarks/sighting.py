@@ -23,7 +23,12 @@ from sonar_graph.slam.smoother import Factors, JointCovariance, Known, Sightline
 from sonar_graph.states import Outcome
 
 STILL = PreintegratedMotion(
-    gtsam.Pose3(), np.zeros((6, 6)), np.zeros((6, 3)), np.zeros(3), 0.0, mean_specific_force=np.full(3, np.nan)
+    gtsam.Pose3(),
+    np.zeros((6, 6)),
+    np.zeros((6, 3)),
+    np.zeros(3),
+    0.0,
+    mean_specific_force=np.full(3, np.nan),
 )
 """No motion: the motion between keyframe and sonar is already part of a sighting."""
 
@@ -47,7 +52,9 @@ class Sighting:
 class SightingFactors:
     """Makes the factors of sightings, with noise models that a kernel wraps."""
 
-    def __init__(self, sonar: SonarCalibration, robust: Robust, floor: FloorPrior | None = None) -> None:
+    def __init__(
+        self, sonar: SonarCalibration, robust: Robust, floor: FloorPrior | None = None
+    ) -> None:
         self.elevation_sigma_rad = sonar.elevation_aperture_rad / math.sqrt(12.0)
         """Standard deviation of an elevation that is uniform over the aperture."""
         self.body_T_sonar = sonar.mounting.pose()
@@ -60,19 +67,33 @@ class SightingFactors:
     def make(self, sighting: Sighting, key: int, *, is_first: bool) -> Factors:
         """Range and azimuth; for the first sighting of a landmark also its direction, and its elevation or floor."""
         line = sighting.line
-        elevation = self.elevation_sigma_rad if is_first and sighting.floor is None else None
+        elevation = (
+            self.elevation_sigma_rad if is_first and sighting.floor is None else None
+        )
         # once for each landmark, and only where no floor gives the height
         made: Factors = {
             **factors.landmark_sighting(
-                line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation
+                line.pose_key,
+                key,
+                line.body_T_sonar,
+                line.z,
+                sighting.noise,
+                self._robust,
+                elevation,
             )
         }
         if is_first:
             # in the keyframe's body frame
-            body_p_landmark = locate(line.body_T_sonar, line.z[0], line.z[1], sighting.elevation_rad)
-            made["first direction"] = factors.first_direction(line.pose_key, key, body_p_landmark)
+            body_p_landmark = locate(
+                line.body_T_sonar, line.z[0], line.z[1], sighting.elevation_rad
+            )
+            made["first direction"] = factors.first_direction(
+                line.pose_key, key, body_p_landmark
+            )
         if is_first and sighting.floor is not None:
-            made["floor prior"] = factors.floor_prior(key, sighting.floor.z_m, sighting.floor.sigma_m)
+            made["floor prior"] = factors.floor_prior(
+                key, sighting.floor.z_m, sighting.floor.sigma_m
+            )
         return made
 
     def start(self, sighting: Sighting, values: Known) -> Floats:
@@ -82,11 +103,18 @@ class SightingFactors:
         elevation_rad = self.elevation_on(sighting.floor, world_T_sonar, line.z)
         return locate(world_T_sonar, line.z[0], line.z[1], elevation_rad)
 
-    def elevation_on(self, floor: FloorPrior | None, world_T_sonar: gtsam.Pose3, z: Floats) -> float:
+    def elevation_on(
+        self, floor: FloorPrior | None, world_T_sonar: gtsam.Pose3, z: Floats
+    ) -> float:
         """Elevation (rad) of a floor at a range and azimuth; 0 where there is none, or not in the aperture."""
         if floor is None:
             return 0.0
-        return elevation_on_floor(world_T_sonar, float(z[0]), float(z[1]), floor.z_m, self._aperture_rad) or 0.0
+        return (
+            elevation_on_floor(
+                world_T_sonar, float(z[0]), float(z[1]), floor.z_m, self._aperture_rad
+            )
+            or 0.0
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +176,13 @@ class SeenFrame:
         on_beam[:, 0] = ranges_m * np.cos(azimuths_rad)
         on_beam[:, 1] = ranges_m * np.sin(azimuths_rad)
         world_T_sonar = self.view.world_T_sonar
-        return np.asarray(on_beam @ world_T_sonar.rotation().matrix().T + world_T_sonar.translation())
+        return np.asarray(
+            on_beam @ world_T_sonar.rotation().matrix().T + world_T_sonar.translation()
+        )
 
-    def sightings(self, rows: list[int], points: Floats, elevation_rad: float = 0.0) -> list[Sighting]:
+    def sightings(
+        self, rows: list[int], points: Floats, elevation_rad: float = 0.0
+    ) -> list[Sighting]:
         """Sightings of some detections.
 
         Parameters
@@ -185,7 +217,9 @@ class SeenFrame:
             return [None] * len(rows)
         points = self.beam_points(rows)
         # an elevation of e raises the point by e times the range along the sonar's z axis
-        slope_m = self.frame.z[rows, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
+        slope_m = (
+            self.frame.z[rows, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
+        )
         by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
         variance = by_elevation + self.view.height_variances(points) + floor.sigma_m**2
         # an object on a wall or a wreck must not be pulled to the floor
@@ -193,7 +227,14 @@ class SeenFrame:
         return [floor if is_on else None for is_on in is_on_floor.tolist()]
 
 
-def late_view(sighting: Sighting, values: Known, joint: JointCovariance) -> PredictedView:
+def late_view(
+    sighting: Sighting, values: Known, joint: JointCovariance
+) -> PredictedView:
     """Prediction of an earlier frame from the keyframe of a sighting, as it is estimated now."""
     line = sighting.line
-    return PredictedView(Tie(line.pose_key, None, STILL), values.atPose3(line.pose_key), line.body_T_sonar, joint)
+    return PredictedView(
+        Tie(line.pose_key, None, STILL),
+        values.atPose3(line.pose_key),
+        line.body_T_sonar,
+        joint,
+    )

@@ -94,7 +94,11 @@ class GatedIdentity(TrackedIdentity):
     @property
     def gate(self) -> float:
         """Largest squared Mahalanobis distance of range and azimuth; infinite: no gate."""
-        return chi_square_quantile(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
+        return (
+            chi_square_quantile(self.gate_probability, 2)
+            if self.gate_probability < 1
+            else math.inf
+        )
 
 
 @dataclass(eq=False)
@@ -113,8 +117,12 @@ class Track:
     def reopen(self, sightings: list[Sighting]) -> None:
         """Let settled sightings wait again."""
         reopened = set(sightings)
-        self.settled = [sighting for sighting in self.settled if sighting not in reopened]
-        self.waiting = sorted(self.waiting + sightings, key=lambda sighting: sighting.stamp_ns)
+        self.settled = [
+            sighting for sighting in self.settled if sighting not in reopened
+        ]
+        self.waiting = sorted(
+            self.waiting + sightings, key=lambda sighting: sighting.stamp_ns
+        )
 
 
 class TrackedIdentities(IdentityPolicy):
@@ -135,12 +143,20 @@ class TrackedIdentities(IdentityPolicy):
     def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
         """Refuse second rows of tracks, improbable identities, and those that the frame has in a more probable row."""
         oldest_ns = int(frame.stamps_ns[0]) - self._longest_wait_ns
-        known = {number: track.identity for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
+        known = {
+            number: track.identity
+            for number, track in self._tracks.items()
+            if track.newest_ns >= oldest_ns
+        }
         refusals = second_rows_of_tracks(frame, known)
         # the second rows are left out before a landmark is given to the most probable row of the frame
         kept = np.array([why is None for why in refusals])
-        _, outcomes = identify(frame if kept.all() else frame.rows(kept), self._minimum_probability)
-        for row, number in zip(np.flatnonzero(kept).tolist(), outcomes.tolist(), strict=True):
+        _, outcomes = identify(
+            frame if kept.all() else frame.rows(kept), self._minimum_probability
+        )
+        for row, number in zip(
+            np.flatnonzero(kept).tolist(), outcomes.tolist(), strict=True
+        ):
             refusals[row] = None if number == ACCEPTED else OUTCOMES[number]
         return refusals
 
@@ -151,7 +167,9 @@ class TrackedIdentities(IdentityPolicy):
         in its frame.
         """
         self._claims = []
-        tracked = None if frame is None else frame.select(frame.detections.track != NO_TRACK)
+        tracked = (
+            None if frame is None else frame.select(frame.detections.track != NO_TRACK)
+        )
         if tracked is None:
             return UNCHANGED
         given_up = self.forget(tracked.stamp_ns)
@@ -170,7 +188,9 @@ class TrackedIdentities(IdentityPolicy):
             track.identity = identity
         # sightings that lost their frame's landmark to one that is retracted now
         for track in self._tracks.values() if freed else ():
-            displaced = [s for s in track.settled if self._is_displaced_from(s, track, freed)]
+            displaced = [
+                s for s in track.settled if self._is_displaced_from(s, track, freed)
+            ]
             if displaced:
                 reopened += displaced
                 track.reopen(displaced)
@@ -194,7 +214,11 @@ class TrackedIdentities(IdentityPolicy):
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
         """Landmarks of the graph that the detections name."""
-        return [L(frame.ids[row]) for row in self._named(frame) if frame.ids[row] in self.landmarks]
+        return [
+            L(frame.ids[row])
+            for row in self._named(frame)
+            if frame.ids[row] in self.landmarks
+        ]
 
     def judge(self, seen: SeenFrame) -> Decision:
         """Use what has an identity, inside the gate if its landmark is in the graph. The rest waits in its track."""
@@ -208,7 +232,11 @@ class TrackedIdentities(IdentityPolicy):
         for row, sighting in zip(others, waiting, strict=True):
             # repeated: a more probable row of the frame has the landmark
             is_repeated = frame.refusals[row] is Outcome.REPEATED
-            judged.append(Assignment(sighting, Outcome.REPEATED if is_repeated else Outcome.WAITING))
+            judged.append(
+                Assignment(
+                    sighting, Outcome.REPEATED if is_repeated else Outcome.WAITING
+                )
+            )
         track_of = dict(zip(frame.rows, frame.detections.track.tolist(), strict=True))
         for each in judged:
             track = self._tracks.get(track_of[each.sighting.row])
@@ -223,7 +251,8 @@ class TrackedIdentities(IdentityPolicy):
     def held(self) -> dict[int, float]:
         """Keyframes of sightings that wait, of tracks that may still be of a landmark."""
         return {
-            sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+            sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns)
+            / NS_PER_S
             for track in self._tracks.values()
             if track.identity != NO_LANDMARK
             for sighting in track.waiting
@@ -234,19 +263,37 @@ class TrackedIdentities(IdentityPolicy):
         oldest_ns = now_ns - self._longest_wait_ns
         given_up: list[Assignment] = []
         for track in self._tracks.values():
-            old = {s for s in track.waiting if s.stamp_ns < oldest_ns or s.line.pose_key in left}
+            old = {
+                s
+                for s in track.waiting
+                if s.stamp_ns < oldest_ns or s.line.pose_key in left
+            }
             if old:
-                why = Outcome.NO_IDENTITY if track.identity == NO_LANDMARK else Outcome.FORGOTTEN
+                why = (
+                    Outcome.NO_IDENTITY
+                    if track.identity == NO_LANDMARK
+                    else Outcome.FORGOTTEN
+                )
                 # a retracted sighting stays one
                 given_up += [
                     Assignment(s, why)
                     for s in track.waiting
                     if s in old and self.landmarks.state(s).outcome is Outcome.WAITING
                 ]
-                track.waiting = [sighting for sighting in track.waiting if sighting not in old]
+                track.waiting = [
+                    sighting for sighting in track.waiting if sighting not in old
+                ]
             if left:
-                track.settled = [sighting for sighting in track.settled if sighting.line.pose_key not in left]
-        self._tracks = {number: track for number, track in self._tracks.items() if track.newest_ns >= oldest_ns}
+                track.settled = [
+                    sighting
+                    for sighting in track.settled
+                    if sighting.line.pose_key not in left
+                ]
+        self._tracks = {
+            number: track
+            for number, track in self._tracks.items()
+            if track.newest_ns >= oldest_ns
+        }
         return given_up
 
     def _decided(self, frame: Frame) -> list[tuple[Track, int]]:
@@ -265,9 +312,13 @@ class TrackedIdentities(IdentityPolicy):
     def _waiting(self, sighting: Sighting) -> Assignment:
         """Let a sighting wait; one in the graph is retracted."""
         is_in_graph = self.landmarks.state(sighting).landmark_id is not None
-        return Assignment(sighting, Outcome.TAKEN_BACK if is_in_graph else Outcome.WAITING)
+        return Assignment(
+            sighting, Outcome.TAKEN_BACK if is_in_graph else Outcome.WAITING
+        )
 
-    def _is_displaced_from(self, sighting: Sighting, track: Track, freed: set[tuple[int, int]]) -> bool:
+    def _is_displaced_from(
+        self, sighting: Sighting, track: Track, freed: set[tuple[int, int]]
+    ) -> bool:
         """True when its frame showed the landmark of its track elsewhere, and no longer does."""
         is_free = (track.identity, sighting.stamp_ns) in freed
         return is_free and self.landmarks.state(sighting).outcome is Outcome.REPEATED
@@ -283,13 +334,18 @@ class TrackedIdentities(IdentityPolicy):
                 taken_ns.add(sighting.stamp_ns)
                 free.append(sighting)
         outcomes = dict.fromkeys(track.waiting, Outcome.REPEATED)
-        for sighting, is_inside in zip(free, self._pass_gate(free, L(track.identity)), strict=True):
+        for sighting, is_inside in zip(
+            free, self._pass_gate(free, L(track.identity)), strict=True
+        ):
             is_retracted = self.landmarks.state(sighting).outcome is Outcome.TAKEN_BACK
             used = Outcome.MOVED if is_retracted else Outcome.USED_LATER
             outcomes[sighting] = used if is_inside else Outcome.GATED
         track.settled += track.waiting
         track.waiting = []
-        return [Assignment(sighting, outcome, track.identity) for sighting, outcome in outcomes.items()]
+        return [
+            Assignment(sighting, outcome, track.identity)
+            for sighting, outcome in outcomes.items()
+        ]
 
     def _pass_gate(self, sightings: list[Sighting], key: int) -> list[bool]:
         """Flags of earlier sightings that lie inside the gate of a landmark."""
@@ -297,12 +353,16 @@ class TrackedIdentities(IdentityPolicy):
         if not sightings or math.isinf(self._gate) or not values.exists(key):
             return [True] * len(sightings)
         # one joint covariance for all: its cost is that of the keyframes, not of the sightings
-        joint = self.smoother.joint_covariance_of_any([key, *{s.line.pose_key for s in sightings}])
+        joint = self.smoother.joint_covariance_of_any(
+            [key, *{s.line.pose_key for s in sightings}]
+        )
         point = values.atPoint3(key)[None]
         flags = []
         for sighting in sightings:
             view = late_view(sighting, values, joint)
-            compared = view.compare([key], point, sighting.line.z[None], sighting.noise[None])
+            compared = view.compare(
+                [key], point, sighting.line.z[None], sighting.noise[None]
+            )
             flags.append(bool(compared.distance[0] <= self._gate))
         return flags
 
@@ -314,11 +374,16 @@ class TrackedIdentities(IdentityPolicy):
         """Use detections of landmarks of the graph that lie inside the gate."""
         frame = seen.frame
         keys = [L(frame.ids[row]) for row in rows]
-        landmarks = np.array([self.smoother.estimates.atPoint3(key) for key in keys])  # (m, 3)
+        # (m, 3)
+        landmarks = np.array([self.smoother.estimates.atPoint3(key) for key in keys])
         compared = seen.view.compare(keys, landmarks, frame.z[rows], frame.noise[rows])
         # a sighting of a track may change its landmark, so that its noise must not depend on one
         is_tracked = frame.detections.track[rows] != NO_TRACK
-        points = np.where(is_tracked[:, None], seen.beam_points(rows), landmarks) if is_tracked.any() else landmarks
+        points = (
+            np.where(is_tracked[:, None], seen.beam_points(rows), landmarks)
+            if is_tracked.any()
+            else landmarks
+        )
         judged = []
         for k, sighting in enumerate(seen.sightings(rows, points)):
             is_inside = bool(compared.distance[k] <= self._gate)
@@ -338,7 +403,9 @@ class TrackedIdentities(IdentityPolicy):
         """Begin a landmark, on the known floor where it can stand on it, else on the centre beam."""
         frame = seen.frame
         z = frame.z[row]
-        elevation_rad = seen.factors.elevation_on(seen.floors_under([row])[0], seen.view.world_T_sonar, z)
+        elevation_rad = seen.factors.elevation_on(
+            seen.floors_under([row])[0], seen.view.world_T_sonar, z
+        )
         start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
         # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
         if frame.detections.track[row] == NO_TRACK:
@@ -357,7 +424,9 @@ def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
     return np.where(is_named, ids, decisions).tolist()
 
 
-def second_rows_of_tracks(frame: LandmarkDetections, identities: Mapping[int, int]) -> list[Outcome | None]:
+def second_rows_of_tracks(
+    frame: LandmarkDetections, identities: Mapping[int, int]
+) -> list[Outcome | None]:
     """Refusals of the rows of a frame that show an object a second time; None: the row stays.
 
     A track is one object in one place, so each frame keeps one row of it: the row with the highest posterior for the

@@ -31,7 +31,11 @@ from pydantic import Field
 from sonar_graph.calibration import Section, tagged
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.models import locate_jacobians, polar_difference, range_azimuth_jacobians
+from sonar_graph.models import (
+    locate_jacobians,
+    polar_difference,
+    range_azimuth_jacobians,
+)
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
@@ -41,7 +45,12 @@ from sonar_graph.slam.landmarks.landmark_graph import (
     IdentityPolicy,
     LandmarkGraph,
 )
-from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.sighting import (
+    Frame,
+    SeenFrame,
+    Sighting,
+    SightingFactors,
+)
 from sonar_graph.slam.prediction import PredictedView, Source
 from sonar_graph.slam.smoother import JointCovariance, Known
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
@@ -120,20 +129,32 @@ class _Search:
     def __init__(self, innovations: Innovations, probability: float) -> None:
         count = len(innovations.innovation)
         self._innovations = innovations
-        self._gates = [0.0] + [chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)]
+        self._gates = [0.0] + [
+            chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
+        ]
         # a pair that is incompatible alone stays so in every pairing
         self._possible = [
-            [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]] for row in innovations.distances()
+            [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]]
+            for row in innovations.distances()
         ]
-        self._order = sorted(range(count), key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])))
-        self._left = [sum(bool(self._possible[i]) for i in self._order[depth:]) for depth in range(count + 1)]
+        self._order = sorted(
+            range(count),
+            key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])),
+        )
+        self._left = [
+            sum(bool(self._possible[i]) for i in self._order[depth:])
+            for depth in range(count + 1)
+        ]
         """Number of detections at each depth and below that are compatible with a landmark."""
         self.best = Pairing((UNPAIRED,) * count, 0.0)
 
     def branch(self, depth: int, part: Pairing) -> None:
         """Try all pairings that extend a part of one."""
         best = self.best
-        if (part.size, -part.distance) > (best.size, -best.distance) and part.distance <= self._gates[part.size]:
+        if (part.size, -part.distance) > (
+            best.size,
+            -best.distance,
+        ) and part.distance <= self._gates[part.size]:
             self.best = part
         if self._left[depth] == 0:
             return
@@ -144,13 +165,17 @@ class _Search:
         i = self._order[depth]
         for j in self._possible[i]:
             if j not in part.landmarks:
-                more = self._innovations.pairing((*part.landmarks[:i], j, *part.landmarks[i + 1 :]))
+                more = self._innovations.pairing(
+                    (*part.landmarks[:i], j, *part.landmarks[i + 1 :])
+                )
                 if more.distance <= self._gates[reach]:
                     self.branch(depth + 1, more)
         self.branch(depth + 1, part)
 
 
-def drop_unlikely(innovations: Innovations, pairing: Pairing, log_rivals: Floats) -> Pairing:
+def drop_unlikely(
+    innovations: Innovations, pairing: Pairing, log_rivals: Floats
+) -> Pairing:
     """Drop the pairs that are less likely than a landmark which is not in the map.
 
     Where the expectation is wide, a detection inside the gate may as well be of such a rival. Pairs are kept where the
@@ -181,14 +206,18 @@ def drop_unlikely(innovations: Innovations, pairing: Pairing, log_rivals: Floats
         if excess[worst] > 0:
             is_likely = log_density(e, C) > float(log_rivals[paired].sum())
             return innovations.pairing(landmarks) if is_likely else nothing
-        landmarks = tuple(UNPAIRED if i == paired[worst] else j for i, j in enumerate(landmarks))
+        landmarks = tuple(
+            UNPAIRED if i == paired[worst] else j for i, j in enumerate(landmarks)
+        )
     return nothing
 
 
 def log_density(e: Floats, C: Floats) -> float:
     """Logarithm of ``N(e; 0, C)``."""
     log_det = float(np.linalg.slogdet(C)[1])
-    return -0.5 * (float(e @ np.linalg.solve(C, e)) + log_det + len(e) * math.log(2 * math.pi))
+    return -0.5 * (
+        float(e @ np.linalg.solve(C, e)) + log_det + len(e) * math.log(2 * math.pi)
+    )
 
 
 ROUNDING_S = 1e-3
@@ -235,7 +264,9 @@ class AssociatedUnknown(Section):
         return math.log(ODDS * self.density_m2)
 
 
-UnknownParams = Annotated[IgnoredUnknown | AssociatedUnknown, *tagged("policy", "ignore")]
+UnknownParams = Annotated[
+    IgnoredUnknown | AssociatedUnknown, *tagged("policy", "ignore")
+]
 
 
 def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
@@ -261,11 +292,15 @@ class PairedDetection(NamedTuple):
 class NamelessLandmarks(IdentityPolicy):
     """Pairs detections without identities, and begins and merges landmarks."""
 
-    def __init__(self, landmarks: LandmarkGraph, keyframes: Keyframes, params: AssociatedUnknown) -> None:
+    def __init__(
+        self, landmarks: LandmarkGraph, keyframes: Keyframes, params: AssociatedUnknown
+    ) -> None:
         super().__init__(landmarks)
         self._keyframes = keyframes
         self._params = params
-        self._longest_wait_s = max(min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0)
+        self._longest_wait_s = max(
+            min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0
+        )
         self._candidates: list[Candidate] = []
         self._grown: list[Candidate] = []
         """Candidates that the last frame shows."""
@@ -290,12 +325,18 @@ class NamelessLandmarks(IdentityPolicy):
         ids = self.landmarks.ids
         if len(ids) < 2 or ids[-1] < FIRST_ANONYMOUS_ID:
             return UNCHANGED
-        joint = self.smoother.joint_covariance([self._keyframes.newest_key, *self._keys()])
-        duplicates = nearest_duplicates(self.landmarks, self.smoother.estimates, joint, self._params)
+        joint = self.smoother.joint_covariance(
+            [self._keyframes.newest_key, *self._keys()]
+        )
+        duplicates = nearest_duplicates(
+            self.landmarks, self.smoother.estimates, joint, self._params
+        )
         if duplicates is None:
             return UNCHANGED
         stays, goes = duplicates
-        return Decision.of(Assignment(s, Outcome.MOVED, stays) for s in self.landmarks.sightings(goes))
+        return Decision.of(
+            Assignment(s, Outcome.MOVED, stays) for s in self.landmarks.sightings(goes)
+        )
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
         """All landmarks, and the keyframes of all candidates."""
@@ -307,10 +348,22 @@ class NamelessLandmarks(IdentityPolicy):
         rows = list(range(len(seen.frame)))
         paired = self.pair(seen.view, seen.frame.z, seen.frame.noise, seen.taken)
         judged = []
-        for sighting, pair in zip(seen.sightings(rows, seen.beam_points(rows)), paired, strict=True):
+        for sighting, pair in zip(
+            seen.sightings(rows, seen.beam_points(rows)), paired, strict=True
+        ):
             if pair.landmark_id is not None and pair.S is not None:
-                gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0  # S = S_0 + R
-                judged.append(Assignment(sighting, Outcome.USED, pair.landmark_id, pair.innovation, pair.S, gain))
+                # S = S_0 + R
+                gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0
+                judged.append(
+                    Assignment(
+                        sighting,
+                        Outcome.USED,
+                        pair.landmark_id,
+                        pair.innovation,
+                        pair.S,
+                        gain,
+                    )
+                )
                 continue
             candidate = pair.candidate
             if candidate is None:  # neither near a landmark nor near what waits
@@ -330,8 +383,13 @@ class NamelessLandmarks(IdentityPolicy):
                 landmark_id = self._next_id
                 self._next_id += 1
                 *earlier, newest = candidate
-                later = [Assignment(sighting, Outcome.PLACED_LATER, landmark_id) for sighting in earlier]
-                return Decision.of([*later, Assignment(newest, Outcome.NEW, landmark_id)])
+                later = [
+                    Assignment(sighting, Outcome.PLACED_LATER, landmark_id)
+                    for sighting in earlier
+                ]
+                return Decision.of(
+                    [*later, Assignment(newest, Outcome.NEW, landmark_id)]
+                )
         return UNCHANGED
 
     def is_placed(self, candidate: Candidate) -> bool:
@@ -339,14 +397,21 @@ class NamelessLandmarks(IdentityPolicy):
         if len(candidate) < self._params.sightings:
             return False
         _, P = place(candidate, self.smoother.estimates, self.landmarks.factors)
-        return bool(np.linalg.eigvalsh(P)[-1] <= (LARGEST_SIGMA_SHARE * candidate[-1].line.z[0]) ** 2)
+        return bool(
+            np.linalg.eigvalsh(P)[-1]
+            <= (LARGEST_SIGMA_SHARE * candidate[-1].line.z[0]) ** 2
+        )
 
     def forget(self, now_ns: int = 0, left: Set[int] = frozenset()) -> list[Assignment]:  # noqa: ARG002
         """Give up sightings on keyframes that are too old, or leave a bounded window."""
         oldest = self._keyframes.oldest_key(self._longest_wait_s)
         given_up = []
         for candidate in self._candidates:
-            old = [s for s in candidate if s.line.pose_key < oldest or s.line.pose_key in left]
+            old = [
+                s
+                for s in candidate
+                if s.line.pose_key < oldest or s.line.pose_key in left
+            ]
             given_up += [Assignment(sighting, Outcome.FORGOTTEN) for sighting in old]
             for sighting in old:
                 candidate.remove(sighting)
@@ -358,7 +423,9 @@ class NamelessLandmarks(IdentityPolicy):
         seen_from = {candidate[-1].line.pose_key for candidate in self._candidates}
         return [*map(L, self.landmarks.ids), *sorted(seen_from)]
 
-    def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: Set[int]) -> list[PairedDetection]:
+    def pair(
+        self, view: PredictedView, z: Floats, noise: Floats, taken: Set[int]
+    ) -> list[PairedDetection]:
         """Pair each detection of a frame with a landmark, or else with a candidate.
 
         Parameters
@@ -372,7 +439,10 @@ class NamelessLandmarks(IdentityPolicy):
         ids = [i for i in self.landmarks.ids if i not in taken]
         keys = [L(i) for i in ids]
         points = np.array([values.atPoint3(key) for key in keys])
-        sources = [source(candidate[-1], values, self.landmarks.factors) for candidate in self._candidates]
+        sources = [
+            source(candidate[-1], values, self.landmarks.factors)
+            for candidate in self._candidates
+        ]
         paired = [PairedDetection()] * len(z)
         if not keys and not sources:
             return paired
@@ -383,7 +453,10 @@ class NamelessLandmarks(IdentityPolicy):
         innovations = Innovations(e[:, :n], P[: 2 * n, : 2 * n], noise)
         of_landmarks = self._choose(innovations, z)
         for i, j in of_landmarks.items():
-            S = innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] + noise[i]
+            S = (
+                innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
+                + noise[i]
+            )
             paired[i] = PairedDetection(ids[j], None, innovations.innovation[i, j], S)
         left = [i for i in range(len(z)) if i not in of_landmarks]
         innovations = Innovations(e[left, n:], P[2 * n :, 2 * n :], noise[left])
@@ -397,12 +470,17 @@ class NamelessLandmarks(IdentityPolicy):
             return {}
         compatible = pair_jointly(innovations, self._params.gate_probability)
         # a density per area is r times that per range and azimuth
-        likely = drop_unlikely(innovations, compatible, self._params.log_rival + np.log(z[:, 0]))
+        likely = drop_unlikely(
+            innovations, compatible, self._params.log_rival + np.log(z[:, 0])
+        )
         return {i: j for i, j in enumerate(likely.landmarks) if j != UNPAIRED}
 
 
 def nearest_duplicates(
-    landmarks: LandmarkGraph, values: Known, covariance: JointCovariance, params: AssociatedUnknown
+    landmarks: LandmarkGraph,
+    values: Known,
+    covariance: JointCovariance,
+    params: AssociatedUnknown,
 ) -> tuple[int, int] | None:
     """Nearest two landmarks that are one, or None: that which stays and that which becomes part of it.
 
@@ -417,14 +495,22 @@ def nearest_duplicates(
     noise = {i: _noise_m2(landmarks.any_sighting(i)) for i in landmarks.ids}
     d = np.array([points[a] - points[b] for a, b in pairs])  # (k, 3)
     sigma2 = np.array([max(noise[a], noise[b]) for a, b in pairs])
-    of_a = np.array([covariance.rows[L(a)] for a, _ in pairs])[:, None] + np.arange(3)  # (k, 3)
+    # (k, 3)
+    of_a = np.array([covariance.rows[L(a)] for a, _ in pairs])[:, None] + np.arange(3)
     of_b = np.array([covariance.rows[L(b)] for _, b in pairs])[:, None] + np.arange(3)
 
     def P(i: NDArray[np.int64], j: NDArray[np.int64]) -> Floats:
         return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
 
-    S = P(of_a, of_a) + P(of_b, of_b) - P(of_a, of_b) - P(of_b, of_a) + sigma2[:, None, None] * np.eye(3)
-    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])  # d' S^-1 d
+    S = (
+        P(of_a, of_a)
+        + P(of_b, of_b)
+        - P(of_a, of_b)
+        - P(of_b, of_a)
+        + sigma2[:, None, None] * np.eye(3)
+    )
+    # d' S^-1 d
+    distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
     for k in np.argsort(distance).tolist():
         stays, goes = pairs[k]
         if distance[k] > chi_square_quantile(params.gate_probability, 3):
@@ -438,7 +524,9 @@ def nearest_duplicates(
 
 def _noise_m2(sighting: Sighting) -> float:
     """Variance of a sighting across or along its beam, whichever is larger, m²."""
-    return float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
+    return float(
+        max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1])
+    )
 
 
 def source(sighting: Sighting, values: Known, factors: SightingFactors) -> Source:
@@ -449,19 +537,27 @@ def source(sighting: Sighting, values: Known, factors: SightingFactors) -> Sourc
     """
     line = sighting.line
     X = values.atPose3(line.pose_key)
-    elevation = factors.elevation_on(sighting.floor, X.compose(line.body_T_sonar), line.z)
-    point, by_pose, by_polar = locate_jacobians(X, line.body_T_sonar, float(line.z[0]), float(line.z[1]), elevation)
+    elevation = factors.elevation_on(
+        sighting.floor, X.compose(line.body_T_sonar), line.z
+    )
+    point, by_pose, by_polar = locate_jacobians(
+        X, line.body_T_sonar, float(line.z[0]), float(line.z[1]), elevation
+    )
     polar_cov = np.zeros((3, 3))
     polar_cov[:2, :2] = sighting.noise
     polar_cov[2, 2] = factors.elevation_sigma_rad**2
     cov = by_polar @ polar_cov @ by_polar.T
     if sighting.floor is not None:
         # condition on p_z, a measurement of the third component
-        cov = cov - np.outer(cov[:, 2], cov[2]) / (cov[2, 2] + sighting.floor.sigma_m**2)
+        cov = cov - np.outer(cov[:, 2], cov[2]) / (
+            cov[2, 2] + sighting.floor.sigma_m**2
+        )
     return Source(line.pose_key, point, by_pose, cov)
 
 
-def place(sightings: list[Sighting], values: Known, factors: SightingFactors) -> tuple[Floats, Floats]:
+def place(
+    sightings: list[Sighting], values: Known, factors: SightingFactors
+) -> tuple[Floats, Floats]:
     """Point of several sightings, shape (3,), m, and its covariance, shape (3, 3), m².
 
     The first sighting, corrected by the others one after the other::
@@ -473,7 +569,9 @@ def place(sightings: list[Sighting], values: Known, factors: SightingFactors) ->
     P = first.cov
     for sighting in sightings[1:]:
         line = sighting.line
-        predicted, _, H = range_azimuth_jacobians(values.atPose3(line.pose_key), line.body_T_sonar, point)
+        predicted, _, H = range_azimuth_jacobians(
+            values.atPose3(line.pose_key), line.body_T_sonar, point
+        )
         K = np.linalg.solve(H @ P @ H.T + sighting.noise, H @ P).T  # (3, 2)
         point = point + K @ polar_difference(line.z, predicted)
         P = P - K @ H @ P

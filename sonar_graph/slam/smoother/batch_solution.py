@@ -61,12 +61,16 @@ class StackedGraph:
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squared errors."""
-        return float(self._rest.error(values)) + sum(stack.error(values) for stack in self._stacks)
+        return float(self._rest.error(values)) + sum(
+            stack.error(values) for stack in self._stacks
+        )
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """All factors, linearised."""
         linear = self._rest.linearize(values)
-        for factor in (factor for stack in self._stacks for factor in stack.linear_factors(values)):
+        for factor in (
+            factor for stack in self._stacks for factor in stack.linear_factors(values)
+        ):
             linear.push_back(factor)
         return linear
 
@@ -86,7 +90,9 @@ class Descent(NamedTuple):
     """Number of steps that were tried."""
 
 
-def descended(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_steps: int) -> Descent:
+def descended(
+    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_steps: int
+) -> Descent:
     """Levenberg-Marquardt from initial values, in at most so many steps.
 
     Damping multiplies the identity. It starts negligible (a Gauss-Newton step) and grows, by 10, 100, 1000 and so on,
@@ -142,7 +148,9 @@ def lowering_step(
     return step if is_lower else None
 
 
-def doubled(stacked: StackedGraph, values: gtsam.Values, step: gtsam.VectorValues) -> tuple[gtsam.Values, float]:
+def doubled(
+    stacked: StackedGraph, values: gtsam.Values, step: gtsam.VectorValues
+) -> tuple[gtsam.Values, float]:
     """Values after a step, doubled while that lowers the error, and their error."""
     reached = values.retract(step)
     error = stacked.error(reached)
@@ -160,11 +168,16 @@ def doubled(stacked: StackedGraph, values: gtsam.Values, step: gtsam.VectorValue
 def prior_of(key: int, weight: float) -> gtsam.JacobianFactor:
     """A linear factor by which a variable stays where it is, each component with a standard deviation of 1 / weight."""
     n = tangent_size(key)
-    return gtsam.JacobianFactor(key, weight * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
+    return gtsam.JacobianFactor(
+        key, weight * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)
+    )
 
 
 def damped_step(
-    linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float, ordering: gtsam.Ordering
+    linear: gtsam.GaussianFactorGraph,
+    values: gtsam.Values,
+    damping: float,
+    ordering: gtsam.Ordering,
 ) -> gtsam.VectorValues:
     """Step of a linear graph with ``damping`` times the identity in its information."""
     damped = linear
@@ -212,22 +225,30 @@ def misplaced(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
             found.append(key)
         elif len(lines) > 2:
             points = np.array([line.point(values)[:2] for line in lines])
-            scatter_m = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+            scatter_m = np.median(
+                np.linalg.norm(points - np.median(points, axis=0), axis=1)
+            )
             miss_m = np.median([line.miss_m(values, landmark) for line in lines])
             if miss_m > OUTVOTED * max(scatter_m, LEAST_SCATTER_M):
                 found.append(key)
     return found
 
 
-def placed_again(values: gtsam.Values, sightlines: Sightlines, landmark_keys: list[int]) -> gtsam.Values:
+def placed_again(
+    values: gtsam.Values, sightlines: Sightlines, landmark_keys: list[int]
+) -> gtsam.Values:
     """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
     placed = gtsam.Values(values)
     for key in landmark_keys:
-        placed.update(key, np.median([line.point(values) for line in sightlines[key]], axis=0))
+        placed.update(
+            key, np.median([line.point(values) for line in sightlines[key]], axis=0)
+        )
     return placed
 
 
-def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
+def solve_in_sight(
+    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines
+) -> gtsam.Values:
     """Solve a graph; solve it again while landmarks are misplaced and new starts for them lower the error.
 
     The repeated descents may try `MAX_STEPS` together, so that a graph whose measurements contradict each other, where
@@ -239,7 +260,9 @@ def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sig
         stuck = misplaced(best.values, sightlines)
         if not stuck:
             break
-        retried = descended(graph, placed_again(best.values, sightlines, stuck), steps_left)
+        retried = descended(
+            graph, placed_again(best.values, sightlines, stuck), steps_left
+        )
         steps_left -= retried.steps
         # the new starts do not help: most sightings of these landmarks are wrong
         if retried.error >= best.error:
@@ -287,13 +310,18 @@ class KeptCovariance:
         self._asked: set[int] = set()
 
     def of(
-        self, marginals: Marginals | gtsam.ISAM2, keys: list[int], likely: Callable[[], list[int]]
+        self,
+        marginals: Marginals | gtsam.ISAM2,
+        keys: list[int],
+        likely: Callable[[], list[int]],
     ) -> JointCovariance:
         """Joint covariance of these variables, and possibly of more; ``likely`` names those asked for next."""
         # the next joint covariance includes all variables since the update, so that no question is repeated
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
-            self._joint = JointCovariance.of(marginals, sorted(self._asked.union(likely())))
+            self._joint = JointCovariance.of(
+                marginals, sorted(self._asked.union(likely()))
+            )
         return self._joint
 
     def renew(self) -> None:
@@ -318,7 +346,9 @@ class Marginals:
 
     def marginalCovariance(self, key: int) -> Floats:
         """Covariance of one variable; the name is GTSAM's."""
-        return np.asarray(self._ask(lambda marginals: marginals.marginalCovariance(key)))
+        return np.asarray(
+            self._ask(lambda marginals: marginals.marginalCovariance(key))
+        )
 
     def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:
         """Joint covariance of some; the name is GTSAM's."""

@@ -192,7 +192,9 @@ class FactorStore:
 
     def graph(self, left_out: Container[int] = ()) -> gtsam.NonlinearFactorGraph:
         """All factors but those of some handles."""
-        return graph_of(group for handle, group in self.groups.items() if handle not in left_out)
+        return graph_of(
+            group for handle, group in self.groups.items() if handle not in left_out
+        )
 
     def __iter__(self) -> Iterator[FactorGroup]:
         return iter(self.groups.values())

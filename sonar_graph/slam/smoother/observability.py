@@ -17,7 +17,11 @@ import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.smoother.factor_store import FactorStore, tangent_size, variable_name
+from sonar_graph.slam.smoother.factor_store import (
+    FactorStore,
+    tangent_size,
+    variable_name,
+)
 
 Labelled = tuple[str, gtsam.NonlinearFactor]
 MARGINAL = "marginal of what left the window"
@@ -59,7 +63,10 @@ class Open:
 
 
 def left_open(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Iterable[int], least_said: float = 0.0
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    keys: Iterable[int],
+    least_said: float = 0.0,
 ) -> list[Open]:
     """Directions of some variables that the factors leave open, given all others; none where a derivative is NaN.
 
@@ -72,8 +79,17 @@ def left_open(
         size += tangent_size(key)
     if not size:
         return []
-    factors = [factor for factor in map(graph.at, range(graph.size())) if not places.keys().isdisjoint(factor.keys())]
-    A = np.vstack([np.zeros((1, size)), *(_rows(factor, values, places, least_said) for factor in factors)])
+    factors = [
+        factor
+        for factor in map(graph.at, range(graph.size()))
+        if not places.keys().isdisjoint(factor.keys())
+    ]
+    A = np.vstack(
+        [
+            np.zeros((1, size)),
+            *(_rows(factor, values, places, least_said) for factor in factors),
+        ]
+    )
     # such a factor is reported as spoilt
     if not np.isfinite(A).all():
         return []
@@ -92,7 +108,12 @@ def left_open(
     return found
 
 
-def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int, slice], least_said: float) -> Floats:
+def _rows(
+    factor: gtsam.NonlinearFactor,
+    values: gtsam.Values,
+    places: dict[int, slice],
+    least_said: float,
+) -> Floats:
     """A factor's whitened rows in the columns of the variables that are not known."""
     linear = factor.linearize(values)
     A, _ = linear.jacobian()
@@ -132,7 +153,12 @@ class Blame:
         Times of keyframes.
     """
 
-    def __init__(self, store: FactorStore, new_keys: Collection[int], times_s: Mapping[int, float]) -> None:
+    def __init__(
+        self,
+        store: FactorStore,
+        new_keys: Collection[int],
+        times_s: Mapping[int, float],
+    ) -> None:
         self._store, self._new_keys, self._times_s = store, new_keys, times_s
         self.graph = store.new_graph
         """New factors."""
@@ -143,13 +169,17 @@ class Blame:
         if np.isfinite(self.graph.error(values)):
             return []
         return [
-            Withheld({handle}, set(), f"{self._told([(label, factor)])} {SPOILT}; withheld")
+            Withheld(
+                {handle}, set(), f"{self._told([(label, factor)])} {SPOILT}; withheld"
+            )
             for handle, group in self._store.new.items()
             for label, factor in group.factors.items()
             if not is_finite(factor, values)
         ]
 
-    def undetermined(self, values: gtsam.Values, least_said: float = 0.0) -> list[Withheld]:
+    def undetermined(
+        self, values: gtsam.Values, least_said: float = 0.0
+    ) -> list[Withheld]:
         """New landmarks and biases that their factors leave open, whatever becomes of the poses."""
         return [
             self._without(open_)
@@ -158,48 +188,78 @@ class Blame:
             for open_ in left_open(self.graph, values, [key], least_said)
         ]
 
-    def culprits(self, window: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[Withheld]:
+    def culprits(
+        self, window: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> list[Withheld]:
         """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
 
         An `EstimatorError` where a keyframe, or what was in
         the window before, is left open.
         """
-        graph, inside = gtsam.NonlinearFactorGraph(window), {*window.keyVector(), *self._new_keys}
+        graph, inside = (
+            gtsam.NonlinearFactorGraph(window),
+            {*window.keyVector(), *self._new_keys},
+        )
         for factor in map(self.graph.at, range(self.graph.size())):
             # a new factor may be on a variable that has left the window
             if inside.issuperset(factor.keys()):
                 graph.add(factor)
         found: list[Withheld] = []
         for open_ in left_open(graph, values, sorted(inside)):
-            if gtsam.symbolChr(open_.key) == ord("x") or open_.key not in self._new_keys:
-                raise EstimatorError(f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}")
+            if (
+                gtsam.symbolChr(open_.key) == ord("x")
+                or open_.key not in self._new_keys
+            ):
+                raise EstimatorError(
+                    f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}"
+                )
             found.append(self._without(open_))
         # nothing is open, so that only weak factors can be to blame
         return found or self.undetermined(values, LEAST_SAID)
 
     def reasons(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> str:
         """Reason, in words, why a graph has no solution."""
-        if spoilt := [(label, factor) for label, factor in self._labelled(graph) if not is_finite(factor, values)]:
+        if spoilt := [
+            (label, factor)
+            for label, factor in self._labelled(graph)
+            if not is_finite(factor, values)
+        ]:
             return f"{self._told(spoilt)} {SPOILT}; leave the measurement out"
         found = left_open(graph, values, list(values.keys()))
-        return "; ".join(self._explained(open_, self._labelled(graph, open_.key)) for open_ in found) or (
+        return "; ".join(
+            self._explained(open_, self._labelled(graph, open_.key)) for open_ in found
+        ) or (
             "the graph is determined too weakly for arithmetic of sixteen digits; narrow its priors"
         )
 
-    def _labelled(self, graph: gtsam.NonlinearFactorGraph, key: int | None = None) -> list[Labelled]:
+    def _labelled(
+        self, graph: gtsam.NonlinearFactorGraph, key: int | None = None
+    ) -> list[Labelled]:
         """Factors of a graph, or those on a variable."""
-        labels = {f: label for group in self._store for label, f in group.factors.items()}
+        labels = {
+            f: label for group in self._store for label, f in group.factors.items()
+        }
         factors = [graph.at(i) for i in range(graph.size())]
-        return [(labels.get(f, MARGINAL), f) for f in factors if key is None or key in list(f.keys())]
+        return [
+            (labels.get(f, MARGINAL), f)
+            for f in factors
+            if key is None or key in list(f.keys())
+        ]
 
     def _without(self, open_: Open) -> Withheld:
         on_it = {
-            handle: [(label, f) for label, f in group.factors.items() if open_.key in list(f.keys())]
+            handle: [
+                (label, f)
+                for label, f in group.factors.items()
+                if open_.key in list(f.keys())
+            ]
             for handle, group in self._store.new.items()
         }
         factors = [labelled for group in on_it.values() for labelled in group]
         handles = {handle for handle, group in on_it.items() if group}
-        return Withheld(handles, {open_.key}, f"{self._explained(open_, factors)}; withheld")
+        return Withheld(
+            handles, {open_.key}, f"{self._explained(open_, factors)}; withheld"
+        )
 
     def _explained(self, open_: Open, factors: list[Labelled]) -> str:
         """Variable, its factors, the open directions, and what would close them, in words."""
@@ -215,8 +275,24 @@ class Blame:
         if key is None:
             key = max(keys[0], key=lambda k: gtsam.symbolChr(k) == ord("l"))
         is_pose = gtsam.symbolChr(key) == ord("x")
-        keyframes = [key] if is_pose else sorted({k for ks in keys for k in ks if gtsam.symbolChr(k) == ord("x")})
-        at = ", ".join(f"{variable_name(k)} at {self._times_s[k]:.3f} s" for k in keyframes if k in self._times_s)
-        name = at if is_pose and at else f"{variable_name(key)}, from {at}" if at else variable_name(key)
+        keyframes = (
+            [key]
+            if is_pose
+            else sorted(
+                {k for ks in keys for k in ks if gtsam.symbolChr(k) == ord("x")}
+            )
+        )
+        at = ", ".join(
+            f"{variable_name(k)} at {self._times_s[k]:.3f} s"
+            for k in keyframes
+            if k in self._times_s
+        )
+        name = (
+            at
+            if is_pose and at
+            else f"{variable_name(key)}, from {at}"
+            if at
+            else variable_name(key)
+        )
         counts = Counter(label for label, _ in factors)
         return f"{name}: {', '.join(f'{count} {label}' for label, count in counts.items()) or 'no factor'}"

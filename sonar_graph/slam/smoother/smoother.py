@@ -125,7 +125,9 @@ HistoryParams = Annotated[WholeHistory | BoundedHistory, *tagged("policy", "whol
 class Departures(Protocol):
     """Takes note of variables before they leave a bounded window for good."""
 
-    def leave(self, keys: set[int], values: "Estimates", marginals: gtsam.ISAM2) -> None:
+    def leave(
+        self, keys: set[int], values: "Estimates", marginals: gtsam.ISAM2
+    ) -> None:
         """Variables that leave, with estimates and covariances of the window, as long as they are in it."""
         ...
 
@@ -173,7 +175,11 @@ class Estimates:
         """True for a variable of the graph."""
         if self.new.exists(key):
             return True
-        return self._window is not None and key not in self._gone and self._window.holds(key)
+        return (
+            self._window is not None
+            and key not in self._gone
+            and self._window.holds(key)
+        )
 
     def is_taken_up(self, key: int) -> bool:
         """True for a variable that is in the window, not only about to be."""
@@ -268,7 +274,9 @@ class Smoother:
 
     def _empty_window(self) -> WholeWindow | FixedLagWindow:
         if isinstance(self.history, BoundedHistory):
-            return FixedLagWindow(self._thresholds, self.params.lag_s, is_by_qr=self._is_by_qr)
+            return FixedLagWindow(
+                self._thresholds, self.params.lag_s, is_by_qr=self._is_by_qr
+            )
         return WholeWindow(self._thresholds, is_by_qr=self._is_by_qr)
 
     # ---------------------------------------------------------------- what the graph is made of
@@ -334,10 +342,18 @@ class Smoother:
 
     def _insert(self, key: int, first: gtsam.Pose3 | Floats) -> None:
         if self.estimates.exists(key):
-            raise EstimatorError(f"isam2: {variable_name(key)} is in the graph already; give each its own key")
+            raise EstimatorError(
+                f"isam2: {variable_name(key)} is in the graph already; give each its own key"
+            )
         self.estimates.new.insert(key, first)
 
-    def add(self, factors: Factors, seen: tuple[int, Sightline] | None = None, *, gain: float = 0.0) -> int:
+    def add(
+        self,
+        factors: Factors,
+        seen: tuple[int, Sightline] | None = None,
+        *,
+        gain: float = 0.0,
+    ) -> int:
         """Add factors that are used together or not at all (`FactorGroup`), at the next update; returns their handle.
 
         ``gain``: expected information, predicted variance over noise variance.
@@ -359,7 +375,10 @@ class Smoother:
     @property
     def is_due(self) -> bool:
         """True when variables wait for an update, or factors that would change the estimate."""
-        return self.estimates.new.size() > 0 or self._waiting_gain > self.params.waiting_gain
+        return (
+            self.estimates.new.size() > 0
+            or self._waiting_gain > self.params.waiting_gain
+        )
 
     def update(self, time_s: float) -> Changed:
         """Update the window with all that was added; variables older than the lag leave a bounded one."""
@@ -437,7 +456,9 @@ class Smoother:
     def _update(self, time_s: float, lag_s: float) -> None:
         """Update the window with all that is new, and iterate after a large step."""
         self._solved = None  # an earlier question must not decide where the next batch solution starts
-        relinearises = time_s >= self._relinearised_s + self.params.relinearize_interval_s
+        relinearises = (
+            time_s >= self._relinearised_s + self.params.relinearize_interval_s
+        )
         # GTSAM counts updates, but their rate depends on what the sonar sees
         if relinearises:
             self._relinearised_s = time_s
@@ -448,7 +469,11 @@ class Smoother:
         # marginals of a bounded window stay linearised where their poses left
         if isinstance(self._window, FixedLagWindow):
             may_restart = time_s >= self._restarted_s + self.params.lag_s
-            if may_restart and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
+            if (
+                may_restart
+                and self._window.largest_shift(self._landmarks)
+                > self.params.stale_shift_m
+            ):
                 self._restart(time_s)
 
     def _iterate(self, time_s: float, most_steps: int, least: float) -> None:
@@ -462,7 +487,9 @@ class Smoother:
             if step <= least:
                 return
             # old variables left in the first step of this update: keep the others
-            is_solved = self._step(time_s, self._lag_that_keeps_all(time_s), relinearises=True)
+            is_solved = self._step(
+                time_s, self._lag_that_keeps_all(time_s), relinearises=True
+            )
             if not is_solved:
                 return
 
@@ -483,7 +510,9 @@ class Smoother:
                 # their covariances exist only before the update
                 self._take_leave(time_s - lag_s)
                 times_s = self._used_at(time_s)
-                window.update(store.new, self.estimates.new, times_s, lag_s, removed=self._removed)
+                window.update(
+                    store.new, self.estimates.new, times_s, lag_s, removed=self._removed
+                )
         except RuntimeError:
             if not self._go_without(time_s):
                 self._give_up_cholesky(time_s)
@@ -525,7 +554,9 @@ class Smoother:
         self._restarted_s = time_s
         self._begin(graph, values, time_s)
 
-    def _begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, time_s: float) -> None:
+    def _begin(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, time_s: float
+    ) -> None:
         """Begin a new window with all groups of factors at given values; `EstimatorError` where that is impossible."""
         # QR last: it refuses only what is not determined
         for is_by_qr in (self._is_by_qr, True):
@@ -535,11 +566,15 @@ class Smoother:
                 if isinstance(window, WholeWindow):
                     window.begin(self._store.groups, values)
                 else:
-                    window.begin(graph, self._store.groups, values, self._kept_at(time_s))
+                    window.begin(
+                        graph, self._store.groups, values, self._kept_at(time_s)
+                    )
                 break
             except RuntimeError as error:
                 if is_by_qr:
-                    raise EstimatorError(f"isam2: {self._blame().reasons(graph, values)}") from error
+                    raise EstimatorError(
+                        f"isam2: {self._blame().reasons(graph, values)}"
+                    ) from error
         self._window = window
         self._clear_new()
 
@@ -558,7 +593,11 @@ class Smoother:
 
     def _take_leave(self, oldest_s: float) -> None:
         """Let `Departures` take note of the variables that the next update marginalises."""
-        leaving = {key for key, t in self._times_s.items() if t < oldest_s and not self.estimates.new.exists(key)}
+        leaving = {
+            key
+            for key, t in self._times_s.items()
+            if t < oldest_s and not self.estimates.new.exists(key)
+        }
         # the biases in use are older than the poses that they hold for
         leaving.discard(self._newest_bias)
         if leaving and self._departures is not None:
@@ -611,7 +650,11 @@ class Smoother:
         """Solve the window without the new factors that made its update fail; True if there were any."""
         values = self._before_update()
         # the window was solved without the new factors, so that the fault is in them
-        before = self._taken_up if self.is_bounded else self._store.graph(left_out=self._store.new)
+        before = (
+            self._taken_up
+            if self.is_bounded
+            else self._store.graph(left_out=self._store.new)
+        )
         found = self._blame().culprits(before, values)
         if not found:
             return False
@@ -646,12 +689,16 @@ class Smoother:
 
     def _likely(self) -> list[int]:
         """Landmarks in the window that the next frame may show."""
-        return [key for key in self._landmarks_in_reach() if self.estimates.is_taken_up(key)]
+        return [
+            key for key in self._landmarks_in_reach() if self.estimates.is_taken_up(key)
+        ]
 
     def _asked_next(self) -> list[int]:
         """Variables whose covariance will be asked for: newest keyframe and biases, and landmarks in reach."""
         # first factors may have been withheld together with their variable
-        newest = [key for key in (self._newest_pose, self._newest_bias) if key is not None]
+        newest = [
+            key for key in (self._newest_pose, self._newest_bias) if key is not None
+        ]
         return self.in_window(newest) + self._landmarks_in_reach()
 
     def _landmarks_in_reach(self) -> list[int]:
@@ -663,7 +710,10 @@ class Smoother:
         # within the relinearisation threshold of the estimate, and known without back-substitution
         linearised_at = self._window.linearised_at
         position_m = self.estimates.atPose3(self._newest_pose).translation()
-        points_m = [(new if new.exists(key) else linearised_at).atPoint3(key) for key in self._landmarks]
+        points_m = [
+            (new if new.exists(key) else linearised_at).atPoint3(key)
+            for key in self._landmarks
+        ]
         distances_m = np.linalg.norm(np.array(points_m) - position_m, axis=1)
         return list(compress(self._landmarks, (distances_m <= reach_m).tolist()))
 
@@ -680,6 +730,8 @@ class Smoother:
         """
         if self._solved is None:
             graph = self.graph
-            values = solve_in_sight(graph, self.estimates.all(), self._store.sightlines())
+            values = solve_in_sight(
+                graph, self.estimates.all(), self._store.sightlines()
+            )
             self._solved = values, Marginals(graph, values)
         return self._solved

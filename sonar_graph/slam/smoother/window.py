@@ -14,7 +14,14 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
-from sonar_graph.slam.smoother.factor_store import BIAS, LANDMARK, TANGENT_SIZES, FactorGroup, graph_of, picked
+from sonar_graph.slam.smoother.factor_store import (
+    BIAS,
+    LANDMARK,
+    TANGENT_SIZES,
+    FactorGroup,
+    graph_of,
+    picked,
+)
 
 NEVER = 1_000_000_000
 """Updates between two relinearisations that iSAM2 would begin by itself."""
@@ -92,7 +99,9 @@ class WholeWindow:
         """
         # GTSAM would put the variables of new factors last, and in an update without new factors none
         params = gtsam.ISAM2UpdateParams()
-        params.removeFactorIndices = [slot for handle in removed for slot in self._slots.pop(handle)]
+        params.removeFactorIndices = [
+            slot for handle in removed for slot in self._slots.pop(handle)
+        ]
         params.force_relinearize = relinearises
         groups = gtsam.KeyGroupMap()
         eliminated_again = gtsam.KeyList()
@@ -137,7 +146,9 @@ class FixedLagWindow:
         Age from which variables are marginalised.
     """
 
-    def __init__(self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False) -> None:
+    def __init__(
+        self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False
+    ) -> None:
         self._params = isam2_params(thresholds, is_by_qr=is_by_qr)
         # the window is small: every update may relinearise
         self._params.relinearizeSkip = 1
@@ -146,11 +157,16 @@ class FixedLagWindow:
 
     def _begin_empty(self, lag_s: float) -> None:
         self._fixed_lag = gtsam.IncrementalFixedLagSmoother(lag_s, self._params)
-        self.linearised_at = self._fixed_lag.getLinearizationPoint()  # held as in `WholeWindow`
+        # held as in `WholeWindow`
+        self.linearised_at = self._fixed_lag.getLinearizationPoint()
         self._slots: dict[int, list[int]] = {}
 
     def begin(
-        self, graph: gtsam.NonlinearFactorGraph, groups: Mapping[int, FactorGroup], values: gtsam.Values, times_s: Times
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        groups: Mapping[int, FactorGroup],
+        values: gtsam.Values,
+        times_s: Times,
     ) -> None:
         """Begin again with some variables of a graph. RuntimeError where there is no solution.
 
@@ -182,7 +198,8 @@ class FixedLagWindow:
         self._begin_empty(self._fixed_lag.smootherLag())
         self._fixed_lag.update(inside, picked(values, times_s), dict(times_s))
         self._slots = {
-            handle: [slot_of[factor] for factor in group if factor in slot_of] for handle, group in groups.items()
+            handle: [slot_of[factor] for factor in group if factor in slot_of]
+            for handle, group in groups.items()
         }
 
     def update(
@@ -235,7 +252,11 @@ class FixedLagWindow:
             factor = present.at(i)
             if isinstance(factor, gtsam.LinearContainerFactor):
                 # without a linearisation point it could not be relinearised elsewhere
-                graph.add(gtsam.LinearContainerFactor(factor.linearize(self.linearised_at), self.linearised_at))
+                graph.add(
+                    gtsam.LinearContainerFactor(
+                        factor.linearize(self.linearised_at), self.linearised_at
+                    )
+                )
             else:
                 graph.add(factor)
         return graph
@@ -248,7 +269,11 @@ class FixedLagWindow:
 
 
 def marginal(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int], *, is_by_qr: bool
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    kept: Container[int],
+    *,
+    is_by_qr: bool,
 ) -> list[gtsam.NonlinearFactor]:
     """Marginal of factors on the kept variables, linearised at the values.
 
@@ -256,5 +281,11 @@ def marginal(
     """
     linear = graph.linearize(values)
     separator = [key for key in linear.keyVector() if key in kept]
-    found = linear.marginal(separator, gtsam.EliminateQR) if is_by_qr else linear.marginal(separator)
-    return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
+    found = (
+        linear.marginal(separator, gtsam.EliminateQR)
+        if is_by_qr
+        else linear.marginal(separator)
+    )
+    return [
+        gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())
+    ]

@@ -20,8 +20,14 @@ IMU = "sensor_msgs/msg/Imu"
 
 def interface(fields: str, **own: str) -> str:
     """Interface text of a driver: its fields, its own types (``package__Type``), and those of ROS that it may use."""
-    common = {name: text for name, text in ROS.items() if name.startswith(("builtin", "std_msgs/H", "geometry_msgs"))}
-    used = {name.replace("__", "/"): text.replace(", ", "\n") for name, text in own.items()} | common
+    common = {
+        name: text
+        for name, text in ROS.items()
+        if name.startswith(("builtin", "std_msgs/H", "geometry_msgs"))
+    }
+    used = {
+        name.replace("__", "/"): text.replace(", ", "\n") for name, text in own.items()
+    } | common
     sections = (f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in used.items())
     return "".join([fields.replace(", ", "\n"), *sections, "\n"])
 
@@ -67,9 +73,19 @@ Case = tuple[list[Entry], str, dict[str, Any], dict[str, str | None]]
 """Entries, configuration, expected values by their path in the sequence, and parts of notes, None: no such note."""
 
 
-def rows_of(topic: str, kind: str, rows: Iterable[dict[str, Any]], frame_id: str = "sensor", **common: Any) -> Entry:
+def rows_of(
+    topic: str,
+    kind: str,
+    rows: Iterable[dict[str, Any]],
+    frame_id: str = "sensor",
+    **common: Any,
+) -> Entry:
     """Messages with a header each, a tenth of a second apart."""
-    return topic, kind, [{"header": at(i, frame_id), **common, **row} for i, row in enumerate(rows)]
+    return (
+        topic,
+        kind,
+        [{"header": at(i, frame_id), **common, **row} for i, row in enumerate(rows)],
+    )
 
 
 def at(row: int, frame_id: str = "sensor") -> dict[str, Any]:
@@ -77,22 +93,43 @@ def at(row: int, frame_id: str = "sensor") -> dict[str, Any]:
 
 
 def imu(
-    rows: int = 5, force: tuple[float, ...] = (0, 0, 9.8), rate: tuple[float, ...] = (0, 0, 0), **changes: Any
+    rows: int = 5,
+    force: tuple[float, ...] = (0, 0, 9.8),
+    rate: tuple[float, ...] = (0, 0, 0),
+    **changes: Any,
 ) -> Entry:
     """Messages that are alike, but for the fields of some rows (``at_2={...}``)."""
     common = {"angular_velocity": vector(*rate), "linear_acceleration": vector(*force)}
-    return rows_of("/imu", IMU, [changes.get(f"at_{i}", {}) for i in range(rows)], "imu_link", **common)
+    return rows_of(
+        "/imu",
+        IMU,
+        [changes.get(f"at_{i}", {}) for i in range(rows)],
+        "imu_link",
+        **common,
+    )
 
 
 def dvl(rows: int = 5, **fields: Any) -> Entry:
-    message = {"velocity": vector(1, 2, 3), "velocity_mode": 1, "num_good_beams": 4, **fields}
+    message = {
+        "velocity": vector(1, 2, 3),
+        "velocity_mode": 1,
+        "num_good_beams": 4,
+        **fields,
+    }
     return rows_of("/dvl", "marine_acoustic_msgs/msg/Dvl", [message] * rows)
 
 
 def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> Entry:
     """One frame below the body; what is not given of its quaternion is zero."""
-    transform = {"translation": vector(*xyz), "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0} | rotation}
-    entry = {"header": at(0, "base_link"), "child_frame_id": link, "transform": transform}
+    transform = {
+        "translation": vector(*xyz),
+        "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0} | rotation,
+    }
+    entry = {
+        "header": at(0, "base_link"),
+        "child_frame_id": link,
+        "transform": transform,
+    }
     return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [entry]}]
 
 
@@ -111,13 +148,23 @@ class Foreign(Bench):
         """The sequence of a log of these entries, of IMU and DVL too where no IMU is among them."""
         if not any(kind == IMU for _, kind, *_ in entries):
             entries = (imu(), dvl(), *entries)
-        return read_log(self.write(*entries), config=read_log_config(self.config(toml)), **settings)
+        return read_log(
+            self.write(*entries), config=read_log_config(self.config(toml)), **settings
+        )
 
-    def check(self, entries: list[Entry], toml: str, expected: dict[str, Any], notes: dict[str, str | None]) -> Any:
+    def check(
+        self,
+        entries: list[Entry],
+        toml: str,
+        expected: dict[str, Any],
+        notes: dict[str, str | None],
+    ) -> Any:
         """Read entries, and compare values, to single precision, and notes."""
         sequence = self.read(*entries, toml=toml)
         for path, values in expected.items():
-            np.testing.assert_allclose(attrgetter(path)(sequence), values, rtol=2e-7, atol=1e-12, err_msg=path)
+            np.testing.assert_allclose(
+                attrgetter(path)(sequence), values, rtol=2e-7, atol=1e-12, err_msg=path
+            )
         for name, part in notes.items():
             assert (name in sequence.notes) == (part is not None)
             assert part is None or part in sequence.notes[name]

@@ -11,7 +11,18 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.measurements import UNMEASURED_M2
 
-from .conftest import DEFINITIONS, IMU, Case, Entry, dvl, imu, interface, rows_of, tree, vector
+from .conftest import (
+    DEFINITIONS,
+    IMU,
+    Case,
+    Entry,
+    dvl,
+    imu,
+    interface,
+    rows_of,
+    tree,
+    vector,
+)
 
 FRD_DVL = '[dvl]\nrotation = "frd"\nsound_speed = false\n'
 """Without a warning about the Doppler log."""
@@ -26,14 +37,18 @@ DEFINITIONS[FIX] = interface(
     "float64[9] position_covariance, uint8 position_covariance_type",
     sensor_msgs__NavSatStatus="int8 status, uint16 service",
 )
-DEFINITIONS[TURNED] = interface("std_msgs/Header header, geometry_msgs/Quaternion quaternion")
+DEFINITIONS[TURNED] = interface(
+    "std_msgs/Header header, geometry_msgs/Quaternion quaternion"
+)
 NAN = float("nan")
 METRE_DEG = np.degrees(1 / (6_335_439.327 + 20))
 """Of latitude at the equator and 20 m, by the meridian's radius of curvature a (1 - e²)."""
 SQUARE = [4.0, 1.0, 0.0, 1.0, 9.0, 0.0, 0.0, 0.0, 16.0]
 
 
-def oriented(rotation: Rotation, variance: float = 0.01, first: float = 0.01, topic: str = "/imu") -> Entry:
+def oriented(
+    rotation: Rotation, variance: float = 0.01, first: float = 0.01, topic: str = "/imu"
+) -> Entry:
     """IMU messages with an orientation and the first and last variance of it."""
     x, y, z, w = rotation.as_quat().tolist()
     said = {"orientation": {"x": x, "y": y, "z": z, "w": w}}
@@ -44,7 +59,12 @@ def oriented(rotation: Rotation, variance: float = 0.01, first: float = 0.01, to
 
 def fix(north_m: float = 0.0, **other: Any) -> dict[str, Any]:
     """A satellite fix near the equator, so far north of 1e-3 degrees; a metre is a metre there."""
-    at = {"latitude": 1e-3 + north_m * METRE_DEG, "longitude": 7.0, "altitude": 20.0, "status": {"status": 0}}
+    at = {
+        "latitude": 1e-3 + north_m * METRE_DEG,
+        "longitude": 7.0,
+        "altitude": 20.0,
+        "status": {"status": 0},
+    }
     return at | {"position_covariance": SQUARE, "position_covariance_type": 3} | other
 
 
@@ -137,21 +157,31 @@ EARTH: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_headings_and_fixes_of_any_driver_become_measurements(foreign: Any, case: Case) -> None:
+def test_headings_and_fixes_of_any_driver_become_measurements(
+    foreign: Any, case: Case
+) -> None:
     assert "log.origin" not in foreign.check(*case).notes
 
 
 @pytest.mark.parametrize("case", EARTH.values(), ids=EARTH)
-def test_positions_on_the_earth_become_metres_from_an_origin(foreign: Any, case: Case) -> None:
+def test_positions_on_the_earth_become_metres_from_an_origin(
+    foreign: Any, case: Case
+) -> None:
     """To a tenth of a millimetre, by the radius of curvature."""
     entries, toml, expected, notes = case
     sequence = foreign.check(entries, toml, {}, {"log.origin": "of the world"} | notes)
     for path, values in expected.items():
-        np.testing.assert_allclose(attrgetter(path)(sequence), values, rtol=0, atol=1e-4, err_msg=path)
+        np.testing.assert_allclose(
+            attrgetter(path)(sequence), values, rtol=0, atol=1e-4, err_msg=path
+        )
 
 
-@pytest.mark.parametrize("said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}])
-def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(foreign: Any, said: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
+)
+def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(
+    foreign: Any, said: dict[str, float]
+) -> None:
     log = foreign.write(oriented(YAW, **said), dvl())
     assert foreign.read(oriented(YAW, **said), dvl()).heading is None
     (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]
@@ -165,7 +195,10 @@ def test_rows_without_a_variance_and_with_the_nose_up_are_counted(foreign: Any) 
     none = oriented(YAW, variance=0.0)
     mixed = ("/imu", IMU, [*oriented(YAW)[2], *up[2], *none[2]])
     for row, message in enumerate(mixed[2]):
-        message["header"] = {"stamp": {"sec": 1_700_000_000, "nanosec": row * 10**8}, "frame_id": "imu_link"}
+        message["header"] = {
+            "stamp": {"sec": 1_700_000_000, "nanosec": row * 10**8},
+            "frame_id": "imu_link",
+        }
     sequence = foreign.read(mixed, dvl())
     assert len(sequence.heading) == 2
     said = "heading: 2 whose orientation is no measurement, 2 with the nose too steep for a heading"
@@ -178,32 +211,52 @@ def test_of_several_orientations_that_of_the_imu_in_use_counts(foreign: Any) -> 
         sequence = foreign.read(*entries, topics={"imu": topic})
         assert sequence.heading.yaw_rad.tolist() == pytest.approx([yaw_rad] * 2)
         assert f"heading: {topic};" in sequence.notes["log.topics"] + ";"
-    with pytest.raises(LogError, match=r"for heading, 2 topics fit: .*\[heading\] topic"):
-        foreign.read(*entries[:2], imu_of("/imu/third"), dvl(), topics={"imu": "/imu/third"})
+    with pytest.raises(
+        LogError, match=r"for heading, 2 topics fit: .*\[heading\] topic"
+    ):
+        foreign.read(
+            *entries[:2], imu_of("/imu/third"), dvl(), topics={"imu": "/imu/third"}
+        )
 
 
 def imu_of(topic: str) -> Entry:
     return topic, *imu()[1:]
 
 
-def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(foreign: Any) -> None:
+def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(
+    foreign: Any,
+) -> None:
     """A NavSatFix of any other name is; and an inspection offers no truth as a Doppler log."""
     truth = fixes(fix(), fix(1.0), topic="/truth/fix")
     assert foreign.read(truth).positions is None
     assert len(foreign.read(truth, topics={"positions": "/truth/fix"}).positions) == 2
     odometry = rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", [{}] * 2)
     summary = inspect_log(foreign.write(imu(), odometry))
-    assert [role.reason for role in summary.roles if role.role == "dvl" and "ground_truth" in role.reason] == []
-    assert "/ground_truth/odometry" not in summary.toml.partition("[dvl]")[2].partition("[depth]")[0]
+    assert [
+        role.reason
+        for role in summary.roles
+        if role.role == "dvl" and "ground_truth" in role.reason
+    ] == []
+    assert (
+        "/ground_truth/odometry"
+        not in summary.toml.partition("[dvl]")[2].partition("[depth]")[0]
+    )
     other = inspect_log(foreign.write(imu(), ("/odometry", *odometry[1:])))
-    assert any("/odometry only if chosen" in role.reason for role in other.roles if role.role == "dvl")
+    assert any(
+        "/odometry only if chosen" in role.reason
+        for role in other.roles
+        if role.role == "dvl"
+    )
 
 
 def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
     rows = [
         {
             "pose": {
-                "pose": {"position": vector(step_m * i, 0, 0), "orientation": {"z": np.sin(y / 2), "w": np.cos(y / 2)}}
+                "pose": {
+                    "position": vector(step_m * i, 0, 0),
+                    "orientation": {"z": np.sin(y / 2), "w": np.cos(y / 2)},
+                }
             }
         }
         for i, y in enumerate(yaws_rad)
@@ -211,10 +264,15 @@ def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
     return rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", rows)
 
 
-def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(foreign: Any) -> None:
+def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(
+    foreign: Any,
+) -> None:
     still = moving(0.3, 0.3, 0.3)
     notes = foreign.read(still, toml=FRD_DVL).notes["log.warnings"]
-    assert "truth: its orientation is the same in all 3 messages, although it moves by 2 m: if that is none" in notes
+    assert (
+        "truth: its orientation is the same in all 3 messages, although it moves by 2 m: if that is none"
+        in notes
+    )
     assert "`orientation = false` under [truth]" in notes
     for sound in (moving(0.3, 0.3, 0.4), moving(0.3, 0.3, step_m=0.5)):
         assert "log.warnings" not in foreign.read(sound, toml=FRD_DVL).notes
@@ -229,10 +287,15 @@ def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(fo
     [
         ('[heading]\ntype = "a/msg/B"', "give either orientation"),
         ('[positions]\ntype = "a/msg/B"', "give either position"),
-        ('[truth]\ntype = "a/msg/B"\norientation = ["a", "b", "c", "d"]', "give either position"),
+        (
+            '[truth]\ntype = "a/msg/B"\norientation = ["a", "b", "c", "d"]',
+            "give either position",
+        ),
     ],
 )
-def test_a_table_without_a_source_of_its_numbers_is_refused(foreign: Any, toml: str, said: str) -> None:
+def test_a_table_without_a_source_of_its_numbers_is_refused(
+    foreign: Any, toml: str, said: str
+) -> None:
     with pytest.raises(LogError, match=said):
         foreign.read(toml=toml)
 
@@ -243,7 +306,10 @@ def aided(*, wrong: int = -1) -> list[Entry]:
     places = [(3.0, 4.0, 0.5)] * 5
     rows = [turned] * 5
     if wrong >= 0:
-        rows[wrong], places[wrong] = {"quaternion": {"z": 1.0, "w": 0.0}}, (900.0, 900.0, 0.0)
+        rows[wrong], places[wrong] = (
+            {"quaternion": {"z": 1.0, "w": 0.0}},
+            (900.0, 900.0, 0.0),
+        )
     headings = rows_of("/gps/heading", TURNED, rows)
     return [headings, points(*places), dvl(velocity=vector(1, 0, 0)), imu()]
 
@@ -261,18 +327,29 @@ def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
     sequence = foreign.read(*aided(wrong=wrong), calibration=calibration)
     start = sequence.calibration.start
     assert start.rpy_rad == pytest.approx((0, 0, 2.0), abs=1e-4)
-    assert start.position_m == pytest.approx((3 - np.cos(2), 4 - np.sin(2), 0.5), abs=1e-4)
-    assert start.rpy_sigma_rad == pytest.approx((1e-3, 1e-3, 3 * np.hypot(0.02, 0.05)), abs=1e-4)
+    assert start.position_m == pytest.approx(
+        (3 - np.cos(2), 4 - np.sin(2), 0.5), abs=1e-4
+    )
+    assert start.rpy_sigma_rad == pytest.approx(
+        (1e-3, 1e-3, 3 * np.hypot(0.02, 0.05)), abs=1e-4
+    )
     assert start.position_sigma_m[0] == pytest.approx(3 * np.hypot(2.5, 0.4), abs=1e-4)
-    assert "not stated, so by the first headings and fixes: position_m = [" in sequence.notes["log.start"]
+    assert (
+        "not stated, so by the first headings and fixes: position_m = ["
+        in sequence.notes["log.start"]
+    )
     calibration.write_text(f"{ANTENNA}[start]\nrpy_rad = [0, 0, 1]")
     stated = foreign.read(*aided(), calibration=calibration)
     assert stated.calibration.start.rpy_rad == (0, 0, 1)
     assert "log.start" not in stated.notes
 
 
-def test_a_start_without_headings_or_fixes_stays_that_of_the_calibration(foreign: Any) -> None:
-    assert foreign.read(dvl(), imu()).calibration.start == foreign.read().calibration.start
+def test_a_start_without_headings_or_fixes_stays_that_of_the_calibration(
+    foreign: Any,
+) -> None:
+    assert (
+        foreign.read(dvl(), imu()).calibration.start == foreign.read().calibration.start
+    )
     only_fixes = foreign.read(*aided()[1:]).calibration.start
     assert only_fixes.rpy_rad == (0, 0, 0)
     assert only_fixes.position_m == (3, 4, 0.5)

@@ -8,39 +8,82 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
 
-from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector, water_linked_text
+from .conftest import (
+    STEP_NS,
+    T0_NS,
+    Case,
+    Entry,
+    dvl,
+    imu,
+    rows_of,
+    tree,
+    vector,
+    water_linked_text,
+)
 
 VELOCITY = (1.0, 2.0, 3.0)
 KNOWN = [0.1, 0.01, 0, 0.01, 0.2, 0, 0, 0, 0.3]
 COV, UNKNOWN = np.reshape(KNOWN, (3, 3)), np.full((3, 3), np.nan)
 DEVIATIONS = np.diag(np.sqrt(np.diag(COV)))
 INDEFINITE = [1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-ALONG = np.full(9, 1e-4, np.float32).astype(float)  # of one direction only, which is a covariance to rounding
+# of one direction only, which is a covariance to rounding
+ALONG = np.full(9, 1e-4, np.float32).astype(float)
 ROWS = T0_NS + np.arange(9) * STEP_NS
 
 
 def beam(number: int) -> dict[str, Any]:
-    return {"id": number, "velocity": 0.1 * number, "distance": 2.0, "rssi": 0.0, "nsd": 0.0, "valid": True}
+    return {
+        "id": number,
+        "velocity": 0.1 * number,
+        "distance": 2.0,
+        "rssi": 0.0,
+        "nsd": 0.0,
+        "valid": True,
+    }
 
 
-def water_linked(*rows: dict[str, Any], covariance: str = "float64 temperature") -> Entry:
-    common = {"velocity": vector(*VELOCITY), "fom": 0.02, "velocity_valid": True, "beams": [], "form": "json_v3"}
-    return (*rows_of("/dvl/data", "dvl_msgs/msg/DVL", rows, **common), water_linked_text(covariance))
+def water_linked(
+    *rows: dict[str, Any], covariance: str = "float64 temperature"
+) -> Entry:
+    common = {
+        "velocity": vector(*VELOCITY),
+        "fom": 0.02,
+        "velocity_valid": True,
+        "beams": [],
+        "form": "json_v3",
+    }
+    return (
+        *rows_of("/dvl/data", "dvl_msgs/msg/DVL", rows, **common),
+        water_linked_text(covariance),
+    )
 
 
 def simulator(*covariances: list[float]) -> Entry:
     rows = [{"velocity_covariance": covariance} for covariance in covariances]
-    return rows_of("/rov/dvl", "stonefish_ros2/msg/DVL", rows, velocity=vector(*VELOCITY), beams=[])
+    return rows_of(
+        "/rov/dvl", "stonefish_ros2/msg/DVL", rows, velocity=vector(*VELOCITY), beams=[]
+    )
 
 
 def covariances(*given: list[float]) -> Entry:
     topic, kind, messages = dvl(len(given))
-    return topic, kind, [m | {"velocity_covar": cov} for m, cov in zip(messages, given, strict=True)]
+    return (
+        topic,
+        kind,
+        [m | {"velocity_covar": cov} for m, cov in zip(messages, given, strict=True)],
+    )
 
 
-def twists(topic: str, kind: str = "geometry_msgs/msg/TwistWithCovarianceStamped", **fields: Any) -> Entry:
+def twists(
+    topic: str,
+    kind: str = "geometry_msgs/msg/TwistWithCovarianceStamped",
+    **fields: Any,
+) -> Entry:
     twist = {"linear": vector(*VELOCITY), "angular": vector(7, 8, 9)}
-    inner = {"twist": twist, "covariance": np.diag([1.0, 2, 3, 4, 5, 6]).ravel().tolist()}
+    inner = {
+        "twist": twist,
+        "covariance": np.diag([1.0, 2, 3, 4, 5, 6]).ravel().tolist(),
+    }
     return rows_of(topic, kind, [{"twist": inner, **fields}] * 3, "dvl_link")
 
 
@@ -51,7 +94,10 @@ SINE, COSINE = float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5)))
 
 def janus(tilt_deg: float, *azimuth_deg: float) -> np.ndarray:
     """Beam directions by turning the vertical: first outwards, then about itself."""
-    turns = [Rotation.from_euler("yz", [tilt_deg, azimuth], degrees=True) for azimuth in azimuth_deg]
+    turns = [
+        Rotation.from_euler("yz", [tilt_deg, azimuth], degrees=True)
+        for azimuth in azimuth_deg
+    ]
     return np.array([turn.apply([0, 0, 1]) for turn in turns])
 
 
@@ -63,7 +109,10 @@ def directed(across: float, down: float, **fields: Any) -> Entry:
 
 def packets(velocities: Any, first: float = 0.0, step: float = 0.0) -> Entry:
     """Messages of a type of which nothing is known, without a header."""
-    rows = [{"timestamp": first + step * i, "range": [1.0] * 4, "velocity": list(v)} for i, v in enumerate(velocities)]
+    rows = [
+        {"timestamp": first + step * i, "range": [1.0] * 4, "velocity": list(v)}
+        for i, v in enumerate(velocities)
+    ]
     return "/pd0", "provider_dvl/msg/PD0Packet", rows
 
 
@@ -80,7 +129,10 @@ SINES = "tilted by 67.5°, which no Doppler log is: the driver seems to publish 
 SINE_Z = "z = 0.383, the sine of the tilt of 22.5°, where its cosine 0.924 should be"
 NO_RANGE = "beam_ranges_valid is true in 5 messages that have a range of 0 or less"
 TILTED = FRD + "beams = {{tilt_deg = {}, azimuth_deg = [45, -45, 135, -135]}}"
-DIRECTED = FRD + 'beams = {{velocity = "beam_velocity", tilt_deg = 22.5, azimuth_deg = {}, sigma_m_s = 0.01}}'
+DIRECTED = (
+    FRD
+    + 'beams = {{velocity = "beam_velocity", tilt_deg = 22.5, azimuth_deg = {}, sigma_m_s = 0.01}}'
+)
 ALONG_BEAMS = {"beam_velocity": (janus(22.5, -135, 135, -45, 45) @ VELOCITY).tolist()}
 WATER_LINKED_BEAMS = """[dvl]
 valid_where = {}
@@ -182,7 +234,9 @@ CASES: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_notes(foreign: Any, case: Case) -> None:
+def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_notes(
+    foreign: Any, case: Case
+) -> None:
     entries, *others = case
     foreign.check([imu(), *entries], *others)
 
@@ -190,15 +244,37 @@ def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_n
 @pytest.mark.parametrize(
     ("entry", "toml", "message"),
     [
-        (packets([PAIR]), OF_ARRAY.replace("[2]", "[4]") + 'stamp = "log"', r"/pd0: field velocity\[4\] .* 4 elements"),
-        (packets([PAIR]), OF_ARRAY.replace("velocity[2]", "velocity") + 'stamp = "log"', "is an array of 4; name one"),
-        (packets([PAIR]), OF_ARRAY, r"/pd0: its provider_dvl/msg/PD0Packet has no field header\.stamp\.sec"),
-        (packets([PAIR]), OF_ARRAY.replace("velocity[2]", "speed"), r"\[dvl\] velocity: .*PD0Packet has no field spee"),
-        (packets([PAIR * [1, *[np.nan] * 3]] * 5), OF_SURE_BEAMS, "DVL: too few valid beams in all 5 rows"),
+        (
+            packets([PAIR]),
+            OF_ARRAY.replace("[2]", "[4]") + 'stamp = "log"',
+            r"/pd0: field velocity\[4\] .* 4 elements",
+        ),
+        (
+            packets([PAIR]),
+            OF_ARRAY.replace("velocity[2]", "velocity") + 'stamp = "log"',
+            "is an array of 4; name one",
+        ),
+        (
+            packets([PAIR]),
+            OF_ARRAY,
+            r"/pd0: its provider_dvl/msg/PD0Packet has no field header\.stamp\.sec",
+        ),
+        (
+            packets([PAIR]),
+            OF_ARRAY.replace("velocity[2]", "speed"),
+            r"\[dvl\] velocity: .*PD0Packet has no field spee",
+        ),
+        (
+            packets([PAIR * [1, *[np.nan] * 3]] * 5),
+            OF_SURE_BEAMS,
+            "DVL: too few valid beams in all 5 rows",
+        ),
         (twists("/wheels"), "", "/wheels only if chosen: --topic dvl=/wheels"),
     ],
 )
-def test_what_cannot_be_a_doppler_log_is_named(foreign: Any, entry: Entry, toml: str, message: str) -> None:
+def test_what_cannot_be_a_doppler_log_is_named(
+    foreign: Any, entry: Entry, toml: str, message: str
+) -> None:
     with pytest.raises(LogError, match=message):
         foreign.read(imu(), entry, toml=toml)
 
@@ -213,12 +289,17 @@ def test_what_cannot_be_a_doppler_log_is_named(foreign: Any, entry: Entry, toml:
         ("[30, 0, 0]", (1, 3**0.5 - 1.5, 1 + 1.5 * 3**0.5)),
     ],
 )
-def test_the_axes_of_a_driver_are_turned_into_ours(foreign: Any, rotation: str, expected: tuple[float, ...]) -> None:
+def test_the_axes_of_a_driver_are_turned_into_ours(
+    foreign: Any, rotation: str, expected: tuple[float, ...]
+) -> None:
     toml = f"[dvl]\nrotation = {rotation}"
     sequence = foreign.read(imu(), dvl(velocity_covar=KNOWN), toml=toml)
     np.testing.assert_allclose(sequence.dvl.velocity, [expected] * 5, atol=1e-15)
     # a covariance is turned as the velocity is: by the matrix that did it
-    units = [foreign.read(imu(), dvl(velocity=vector(*unit)), toml=toml).dvl.velocity[0] for unit in np.eye(3).tolist()]
+    units = [
+        foreign.read(imu(), dvl(velocity=vector(*unit)), toml=toml).dvl.velocity[0]
+        for unit in np.eye(3).tolist()
+    ]
     R = np.column_stack(units)
     np.testing.assert_allclose(sequence.dvl.velocity_cov[0], R @ COV @ R.T, atol=1e-15)
 
@@ -230,17 +311,27 @@ def test_beams_of_known_noise_count_even_alone(foreign: Any) -> None:
     kept = [[0, 1, 2, 3], [0, 1, 3], [1, 2], [3], []]
     for row, beams in zip(rows, kept, strict=True):
         row[np.setdiff1d(range(4), beams)] = np.nan
-    sequence = foreign.read(imu(), packets(rows.tolist()), toml=f"{OF_SURE_BEAMS}\nscale = 0.5")
+    sequence = foreign.read(
+        imu(), packets(rows.tolist()), toml=f"{OF_SURE_BEAMS}\nscale = 0.5"
+    )
     assert sequence.notes["log.dropped"] == "dvl: 1 without a valid beam"
     np.testing.assert_allclose(sequence.dvl.velocity[:2], [VELOCITY] * 2, atol=1e-12)
-    for beams, velocity, cov in zip(kept[:4], sequence.dvl.velocity, sequence.dvl.velocity_cov, strict=True):
+    for beams, velocity, cov in zip(
+        kept[:4], sequence.dvl.velocity, sequence.dvl.velocity_cov, strict=True
+    ):
         along = directions[beams]
         np.testing.assert_allclose(along @ velocity, along @ VELOCITY, atol=1e-12)
-        np.testing.assert_allclose(np.linalg.inv(cov), along.T @ along / 0.02**2, atol=2e-4, rtol=1e-5)
+        np.testing.assert_allclose(
+            np.linalg.inv(cov), along.T @ along / 0.02**2, atol=2e-4, rtol=1e-5
+        )
 
 
 def test_beams_that_a_driver_calls_invalid_do_not_count(foreign: Any) -> None:
     rows = [{"beams": [beam(i) for i in range(4)]} for _ in range(3)]
-    rows[1]["velocity_valid"] = rows[1]["beams"][2]["valid"] = rows[1]["beams"][3]["valid"] = False
-    cov = foreign.read(imu(), water_linked(*rows), toml=WATER_LINKED_BEAMS).dvl.velocity_cov
+    rows[1]["velocity_valid"] = rows[1]["beams"][2]["valid"] = rows[1]["beams"][3][
+        "valid"
+    ] = False
+    cov = foreign.read(
+        imu(), water_linked(*rows), toml=WATER_LINKED_BEAMS
+    ).dvl.velocity_cov
     assert (np.trace(cov, axis1=1, axis2=2) > 1).tolist() == [False, True, False]

@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.log_config import LogConfig, read_log_config, table_text, toml_value
+from sonar_graph.logs.adapters.log_config import (
+    LogConfig,
+    read_log_config,
+    table_text,
+    toml_value,
+)
 from sonar_graph.logs.inspection import inspect_log
 
 from .conftest import dvl, imu, rows_of
@@ -65,7 +70,9 @@ NO_FIELD: dict[str, str] = {
 
 
 @pytest.mark.parametrize(("toml", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_named_with_its_file_table_and_key(tmp_path: Path, toml: str | None, message: str) -> None:
+def test_a_mistake_is_named_with_its_file_table_and_key(
+    tmp_path: Path, toml: str | None, message: str
+) -> None:
     path = tmp_path / "my log.toml"
     if toml is not None:
         path.write_text(toml)
@@ -75,7 +82,9 @@ def test_a_mistake_is_named_with_its_file_table_and_key(tmp_path: Path, toml: st
 
 
 @pytest.mark.parametrize(("toml", "message"), NO_TOPIC.items())
-def test_a_topic_that_cannot_be_is_refused(foreign: Any, toml: str, message: str) -> None:
+def test_a_topic_that_cannot_be_is_refused(
+    foreign: Any, toml: str, message: str
+) -> None:
     with pytest.raises(MissingTopicError, match=message):
         foreign.read(toml=toml)
 
@@ -92,44 +101,83 @@ def test_a_field_that_messages_do_not_have_is_named_with_file_table_and_key(
 
 
 def test_a_table_changes_only_what_it_names() -> None:
-    config = LogConfig.parse({"dvl": {"scale": 2.0, "covariance": {"zero": "invalid"}, "good_beams": False}}, "x")
+    config = LogConfig.parse(
+        {"dvl": {"scale": 2.0, "covariance": {"zero": "invalid"}, "good_beams": False}},
+        "x",
+    )
     (adapter,) = config.adapters("dvl", "marine_acoustic_msgs/msg/Dvl")
     (shipped, *_) = (offer.adapter for offer in SHIPPED["dvl"])
-    changed = {name for name in type(adapter).model_fields if getattr(adapter, name) != getattr(shipped, name)}
+    changed = {
+        name
+        for name in type(adapter).model_fields
+        if getattr(adapter, name) != getattr(shipped, name)
+    }
     assert changed == {"scale", "covariance", "good_beams"}
     assert adapter.covariance.fields == ("velocity_covar",)  # type: ignore[attr-defined]
 
 
-def test_what_a_file_says_counts_is_told_and_gives_way_to_the_command_line(foreign: Any) -> None:
-    notes = foreign.read(toml='[dvl]\nrotation = "frd"\ngood_beams = false\n[imu]\ntopic = "/imu"').notes
+def test_what_a_file_says_counts_is_told_and_gives_way_to_the_command_line(
+    foreign: Any,
+) -> None:
+    notes = foreign.read(
+        toml='[dvl]\nrotation = "frd"\ngood_beams = false\n[imu]\ntopic = "/imu"'
+    ).notes
     assert notes["log.adapters"] == 'dvl: rotation = "frd", good_beams = false'
     assert "log.adapters" not in foreign.read().notes
-    pressure = rows_of("/bar30", "sensor_msgs/msg/FluidPressure", [{"fluid_pressure": 2e5}])
+    pressure = rows_of(
+        "/bar30", "sensor_msgs/msg/FluidPressure", [{"fluid_pressure": 2e5}]
+    )
     assert foreign.read(pressure).depth is not None
     assert foreign.read(pressure, toml="[depth]\nuse = false").depth is None
     _, kind, messages = dvl()
     entries = (imu(), ("/a", kind, messages[:2]), ("/b", kind, messages))
     assert len(foreign.read(*entries, toml='[dvl]\ntopic = "/a"').dvl) == 2
-    assert len(foreign.read(*entries, toml='[dvl]\ntopic = "/a"', topics={"dvl": "/b"}).dvl) == 5
+    assert (
+        len(
+            foreign.read(*entries, toml='[dvl]\ntopic = "/a"', topics={"dvl": "/b"}).dvl
+        )
+        == 5
+    )
     # fields of a topic that is not meant do not matter
     toml = '[dvl]\ntopic = "/dvl"\ngood_beams = "num_good_beams"\nstamp = "log"\nframe_id_field = false'
-    twist = rows_of("/dvl/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", [{}] * 2)
+    twist = rows_of(
+        "/dvl/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", [{}] * 2
+    )
     assert len(foreign.read(twist, toml=toml).dvl) == 5
 
 
-SHIPPED_ADAPTERS = [(role, offer.adapter) for role, offers in SHIPPED.items() for offer in offers]
+SHIPPED_ADAPTERS = [
+    (role, offer.adapter) for role, offers in SHIPPED.items() for offer in offers
+]
 
 
-@pytest.mark.parametrize(("role", "adapter"), SHIPPED_ADAPTERS, ids=lambda value: getattr(value, "type", value))
-def test_every_adapter_that_comes_along_can_be_written_as_a_table_and_read_again(role: str, adapter: Any) -> None:
+@pytest.mark.parametrize(
+    ("role", "adapter"),
+    SHIPPED_ADAPTERS,
+    ids=lambda value: getattr(value, "type", value),
+)
+def test_every_adapter_that_comes_along_can_be_written_as_a_table_and_read_again(
+    role: str, adapter: Any
+) -> None:
     values = tomllib.loads(table_text(role, "/a topic", adapter, None))
     config = LogConfig.parse(values, "x")
-    assert adapter.model_copy(update={"topic": "/a topic"}) in config.adapters(role, adapter.type)
+    assert adapter.model_copy(update={"topic": "/a topic"}) in config.adapters(
+        role, adapter.type
+    )
 
 
-LEAVES = st.booleans() | st.integers(-(2**60), 2**60) | st.floats(allow_nan=False, allow_infinity=False) | st.text()
+LEAVES = (
+    st.booleans()
+    | st.integers(-(2**60), 2**60)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text()
+)
 
 
-@given(st.dictionaries(st.text(min_size=1), LEAVES | st.lists(LEAVES, max_size=3), max_size=4))
+@given(
+    st.dictionaries(
+        st.text(min_size=1), LEAVES | st.lists(LEAVES, max_size=3), max_size=4
+    )
+)
 def test_values_are_toml(values: dict[str, Any]) -> None:
     assert tomllib.loads(f"x = {toml_value(values)}")["x"] == values

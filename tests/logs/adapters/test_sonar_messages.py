@@ -26,24 +26,45 @@ POLAR = np.arange(12).reshape(3, 4)
 GAINS = [1, 4, 9, 16]
 
 
-def image(data: bytes, dtype: int = 0, *, big: bool = False, scale: float = 1.0) -> dict[str, Any]:
+def image(
+    data: bytes, dtype: int = 0, *, big: bool = False, scale: float = 1.0
+) -> dict[str, Any]:
     # z forward, x up: then y is to the right
     directions = [vector(0, -np.sin(a), np.cos(a)) for a in AZIMUTHS.tolist()]
     pixels = {"is_bigendian": big, "dtype": dtype, "beam_count": 3, "data": data}
-    return {"beam_directions": directions, "ranges": [scale * r for r in RANGES], "image": pixels}
+    return {
+        "beam_directions": directions,
+        "ranges": [scale * r for r in RANGES],
+        "image": pixels,
+    }
 
 
 def images(*messages: dict[str, Any], topic: str = "/sonar") -> Entry:
     return rows_of(topic, "marine_acoustic_msgs/msg/ProjectedSonarImage", messages)
 
 
-def ping(*, gains: list[int] | None = None, size: int = 1, padding: int = 0, **other: Any) -> dict[str, Any]:
+def ping(
+    *, gains: list[int] | None = None, size: int = 1, padding: int = 0, **other: Any
+) -> dict[str, Any]:
     rows = [samples.astype(f"<u{size}").tobytes() for samples in POLAR.T]
     if gains is not None:
-        rows = [np.array([gain], "<u4").tobytes() + samples for gain, samples in zip(gains, rows, strict=True)]
+        rows = [
+            np.array([gain], "<u4").tobytes() + samples
+            for gain, samples in zip(gains, rows, strict=True)
+        ]
     rows = [samples + b"\xff" * padding for samples in rows]
-    message = {"range_resolution": 0.5, "has_gains": gains is not None, "n_ranges": 4, "n_beams": 3}
-    message |= {"step": len(rows[0]), "sample_size": size, "bearings": [-3000, 0, 3000], "ping_data": b"".join(rows)}
+    message = {
+        "range_resolution": 0.5,
+        "has_gains": gains is not None,
+        "n_ranges": 4,
+        "n_beams": 3,
+    }
+    message |= {
+        "step": len(rows[0]),
+        "sample_size": size,
+        "bearings": [-3000, 0, 3000],
+        "ping_data": b"".join(rows),
+    }
     return message | other
 
 
@@ -51,13 +72,18 @@ def pings(*messages: dict[str, Any]) -> Entry:
     return rows_of("/oculus", "oculus_interfaces/msg/Ping", messages)
 
 
-def frames_in(foreign: Any, *entries: Entry, toml: str = "", **settings: Any) -> list[SonarFrames]:
+def frames_in(
+    foreign: Any, *entries: Entry, toml: str = "", **settings: Any
+) -> list[SonarFrames]:
     config = read_log_config(foreign.config(toml))
     return list(read_sonar_frames(foreign.write(*entries), config=config, **settings))
 
 
 ROWS = POLAR.T.astype("u1").tobytes()
-BEAM_MAJOR, LEFT = '[sonar]\nimage_order = "beam-major"', '[sonar]\nbearing_positive = "left"'
+BEAM_MAJOR, LEFT = (
+    '[sonar]\nimage_order = "beam-major"',
+    '[sonar]\nbearing_positive = "left"',
+)
 # fmt: off
 CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     "range by range": (images(image(ROWS)), "", POLAR, AZIMUTHS),
@@ -72,7 +98,9 @@ CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
 # fmt: on
 
 
-@pytest.mark.parametrize(("entry", "toml", "intensity", "azimuths_rad"), CASES.values(), ids=CASES)
+@pytest.mark.parametrize(
+    ("entry", "toml", "intensity", "azimuths_rad"), CASES.values(), ids=CASES
+)
 def test_images_are_beams_by_bins_however_they_come(
     foreign: Any, entry: Entry, toml: str, intensity: Floats, azimuths_rad: Floats
 ) -> None:
@@ -81,25 +109,40 @@ def test_images_are_beams_by_bins_however_they_come(
     np.testing.assert_allclose(frames.azimuths_rad, azimuths_rad)
 
 
-def test_images_that_are_alike_make_a_block_and_another_range_begins_one(foreign: Any) -> None:
+def test_images_that_are_alike_make_a_block_and_another_range_begins_one(
+    foreign: Any,
+) -> None:
     alike = [image((POLAR.T + i).astype("u1").tobytes()) for i in range(3)]
     (frames,) = frames_in(foreign, images(*alike))
     np.testing.assert_array_equal(frames.intensity, [POLAR, POLAR + 1, POLAR + 2])
     np.testing.assert_allclose(frames.ranges_m, RANGES)
     assert (frames.stamps_ns - T0_NS).tolist() == [0, STEP_NS, 2 * STEP_NS]
-    blocks = frames_in(foreign, images(*(image(ROWS, scale=scale) for scale in (1, 2, 1))))
-    assert [(len(block), float(block.ranges_m[-1])) for block in blocks] == [(1, 2.5), (1, 5.0), (1, 2.5)]
+    blocks = frames_in(
+        foreign, images(*(image(ROWS, scale=scale) for scale in (1, 2, 1)))
+    )
+    assert [(len(block), float(block.ranges_m[-1])) for block in blocks] == [
+        (1, 2.5),
+        (1, 5.0),
+        (1, 2.5),
+    ]
     assert [(block.stamps_ns[0] - T0_NS) // STEP_NS for block in blocks] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("padding", [0, 2])
 @pytest.mark.parametrize("size", [1, 2])
-def test_oculus_rows_begin_with_a_gain_that_is_taken_out(foreign: Any, size: int, padding: int) -> None:
-    messages = [ping(gains=gains, size=size, padding=padding) for gains in (None, GAINS)]
-    plain, gained = sorted(frames_in(foreign, pings(*messages)), key=lambda f: f.stamps_ns[0])
+def test_oculus_rows_begin_with_a_gain_that_is_taken_out(
+    foreign: Any, size: int, padding: int
+) -> None:
+    messages = [
+        ping(gains=gains, size=size, padding=padding) for gains in (None, GAINS)
+    ]
+    plain, gained = sorted(
+        frames_in(foreign, pings(*messages)), key=lambda f: f.stamps_ns[0]
+    )
     np.testing.assert_array_equal(plain.intensity[0], POLAR)
     np.testing.assert_allclose(gained.intensity[0], POLAR / [1, 2, 3, 4])
-    np.testing.assert_allclose(plain.azimuths_rad, AZIMUTHS)  # hundredths of a degree, negative on the left
+    # hundredths of a degree, negative on the left
+    np.testing.assert_allclose(plain.azimuths_rad, AZIMUTHS)
     np.testing.assert_allclose(plain.ranges_m, [0.25, 0.75, 1.25, 1.75])
 
 
@@ -108,7 +151,10 @@ def test_oculus_rows_begin_with_a_gain_that_is_taken_out(foreign: Any, size: int
     [
         ([images(image(b"\0" * 11))], "/sonar: field .*11 bytes"),
         ([images(image(b"\0" * 12, 17))], "/sonar: field .*dtype .* is 17"),
-        ([images(image(ROWS), topic=f"/{side}") for side in ("left", "right")], "choose one: --topic sonar=/left"),
+        (
+            [images(image(ROWS), topic=f"/{side}") for side in ("left", "right")],
+            "choose one: --topic sonar=/left",
+        ),
     ],
 )
 def test_an_image_that_does_not_fit_and_a_choice_that_is_open_are_named(
@@ -119,42 +165,69 @@ def test_an_image_that_does_not_fit_and_a_choice_that_is_open_are_named(
     assert len(entries) == 1 or len(frames_in(foreign, *entries, topic="/right")) == 1
 
 
-def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(foreign: Any) -> None:
+def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(
+    foreign: Any,
+) -> None:
     sound = inspect_log(foreign.write(pings(ping()))).sonar
-    assert sound == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
-    assert "cannot be read: " in str(inspect_log(foreign.write(pings(ping(ping_data=b"\0" * 5)))).sonar)
+    assert (
+        sound == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
+    )
+    assert "cannot be read: " in str(
+        inspect_log(foreign.write(pings(ping(ping_data=b"\0" * 5)))).sonar
+    )
     assert inspect_log(foreign.write(imu())).sonar is None
     assert frames_in(foreign, imu(), dvl()) == []
 
 
 @pytest.mark.recording
-def test_a_real_oculus_ping_comes_out_as_its_own_header_says(foreign: Any, recordings: Path) -> None:
+def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
+    foreign: Any, recordings: Path
+) -> None:
     raw = (recordings / "sonar" / "one_ping_8bit.raw").read_bytes()
     bearings = np.round(np.linspace(-3000, 3000, 256)).astype(int).tolist()
-    sizes = {"range_resolution": 2.0 / 703, "n_ranges": 703, "n_beams": 256, "step": 256, "bearings": bearings}
+    sizes = {
+        "range_resolution": 2.0 / 703,
+        "n_ranges": 703,
+        "n_beams": 256,
+        "step": 256,
+        "bearings": bearings,
+    }
     entry = pings(ping(ping_data=raw[2048 : 2048 + 256 * 703], **sizes))
     (frames,) = frames_in(foreign, entry)
     assert frames.intensity.shape == (1, 256, 703)
     # neighbours along a beam and across beams look alike in the right order, and do not when it is transposed
     (wrong,) = frames_in(foreign, entry, toml=BEAM_MAJOR + "\nrow_bytes = false")
     right, other = (
-        sum(np.abs(np.diff(f.intensity[0].astype(float), axis=axis)).mean() for axis in (0, 1)) for f in (frames, wrong)
+        sum(
+            np.abs(np.diff(f.intensity[0].astype(float), axis=axis)).mean()
+            for axis in (0, 1)
+        )
+        for f in (frames, wrong)
     )
     assert right < 0.8 * other
 
 
 @pytest.mark.parametrize("bad", [[], [1], [0, 1], [3, 5], [0, 2, 3, 4, 5], [1, 2, 3]])
-def test_each_message_that_is_no_image_is_refused_once_by_its_time_of_recording(bad: list[int]) -> None:
+def test_each_message_that_is_no_image_is_refused_once_by_its_time_of_recording(
+    bad: list[int],
+) -> None:
     """Several messages may share an instant, sound ones and others."""
     kind = "marine_acoustic_msgs/msg/ProjectedSonarImage"
     times_ns = np.array([10, 10, 20, 30, 30, 30])
     values = {"ranges": np.array([RANGES]), "image.dtype": 0, "image.beam_count": 3}
-    values |= {f"beam_directions.{axis}": np.array([numbers]) for axis, numbers in zip("xyz", np.eye(3), strict=True)}
+    values |= {
+        f"beam_directions.{axis}": np.array([numbers])
+        for axis, numbers in zip("xyz", np.eye(3), strict=True)
+    }
     values |= {"image.data": np.frombuffer(ROWS, np.uint8)[None], "header.stamp.sec": 1}
-    payload = encode(parse_definition(kind, definition(kind)), 1, values, {"beam_directions": 3})[0].tobytes()
+    payload = encode(
+        parse_definition(kind, definition(kind)), 1, values, {"beam_directions": 3}
+    )[0].tobytes()
     payloads = [payload[:-8] if row in bad else payload for row in range(len(times_ns))]
     sizes = np.array([len(one) for one in payloads])
-    topic = Topic(Path("a.mcap"), "/sonar", kind, "cdr", "ros2msg", definition(kind), Keep.ALL)
+    topic = Topic(
+        Path("a.mcap"), "/sonar", kind, "cdr", "ros2msg", definition(kind), Keep.ALL
+    )
     topic.gather(b"".join(payloads), np.cumsum(sizes) - sizes, sizes, times_ns)
     (adapter,) = (one.adapter for one in SHIPPED["sonar"] if one.adapter.type == kind)
     refused: list[int] = []

@@ -20,7 +20,10 @@ from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vect
 FRD_DVL = '[dvl]\nrotation = "frd"\nsound_speed = false\n'
 """Without a warning about the Doppler log."""
 ONE_ATMOSPHERE, TEN_METRES_OF_SEA = 101_325.0, 1025 * 9.80665 * 10
-POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE, POSE_WITH_COVARIANCE = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
 HALF = float(np.sqrt(0.5))
 NAN = float("nan")
 
@@ -30,9 +33,17 @@ def pressures(*values: float, variance: float = 0.0) -> Entry:
     return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=variance)
 
 
-def poses(rotation: Rotation, covariance: Any = None, topic: str = "/ground_truth/pose", kind: str = "") -> Entry:
+def poses(
+    rotation: Rotation,
+    covariance: Any = None,
+    topic: str = "/ground_truth/pose",
+    kind: str = "",
+) -> Entry:
     x, y, z, w = rotation.as_quat().tolist()
-    pose = {"position": vector(1, 2, 3), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    pose = {
+        "position": vector(1, 2, 3),
+        "orientation": {"x": x, "y": y, "z": z, "w": w},
+    }
     if covariance is None:
         return rows_of(topic, POSE, [{"pose": pose}] * 3)
     row = {"pose": {"pose": pose, "covariance": list(covariance)}}
@@ -52,11 +63,16 @@ NO_FORCE = (
 DIGITS = "9" * 30
 
 
-def detection(position: tuple[float, ...], *results: tuple[str, float], variance: float = 0.0) -> dict[str, Any]:
+def detection(
+    position: tuple[float, ...], *results: tuple[str, float], variance: float = 0.0
+) -> dict[str, Any]:
     covariance = (np.eye(6) * variance).ravel().tolist()
     pose = {"pose": {"position": vector(*position)}, "covariance": covariance}
     centre = {"position": vector(position[0] + 10, *position[1:])}
-    results_ = [{"hypothesis": {"class_id": name, "score": score}, "pose": pose} for name, score in results]
+    results_ = [
+        {"hypothesis": {"class_id": name, "score": score}, "pose": pose}
+        for name, score in results
+    ]
     return {"results": results_, "bbox": {"center": centre}, "id": "track"}
 
 
@@ -76,8 +92,16 @@ FRAMES = [
     [detection((1, 0, 0), ("12", 0.5))],
     [detection((1, 1, 0), ("1", 0.1), ("2", 0.2), ("3", 0.3))],
 ]
-COUNTED = [detection((i + 1, 0, 0), *((str(10 * i + k), 0.1) for k in range(n))) for i, n in enumerate((2, 0, 1, 3))]
-OWN = {"range_m": [2.5], "azimuth_rad": [0.1], "covariance": [1.0, 0, 0, 1.0], "candidate_ids": [1]}
+COUNTED = [
+    detection((i + 1, 0, 0), *((str(10 * i + k), 0.1) for k in range(n)))
+    for i, n in enumerate((2, 0, 1, 3))
+]
+OWN = {
+    "range_m": [2.5],
+    "azimuth_rad": [0.1],
+    "covariance": [1.0, 0, 0, 1.0],
+    "candidate_ids": [1],
+}
 # fmt: off
 CASES: dict[str, Case] = {
     "IMU in degrees and g, z down": (
@@ -197,7 +221,9 @@ def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the
 ) -> None:
     sequence = foreign.check(*case)
     assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
-    if case[3].get("log.depth", "") is None:  # a pose in the world or a bare number has no port to mount
+    if (
+        case[3].get("log.depth", "") is None
+    ):  # a pose in the world or a bare number has no port to mount
         assert "depth" not in sequence.notes["log.calibration"]
     if said := sequence.notes.get("log.depth"):
         assert ("fresh water assumed" in said) == ("1000 kg/m3" in said)
@@ -207,20 +233,37 @@ def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the
 def test_gravity_that_is_not_felt_upwards_is_told_with_the_rotation_that_puts_it_right(
     foreign: Any, force: tuple[float, ...], warning: str | None
 ) -> None:
-    notes = foreign.check([imu(force=force), dvl()], FRD_DVL, {}, {"log.warnings": warning}).notes
-    if proposed := re.search(r'give (rotation = ("\w+"|\[.*?\]))', notes.get("log.warnings", "")):
+    notes = foreign.check(
+        [imu(force=force), dvl()], FRD_DVL, {}, {"log.warnings": warning}
+    ).notes
+    if proposed := re.search(
+        r'give (rotation = ("\w+"|\[.*?\]))', notes.get("log.warnings", "")
+    ):
         toml = f"{FRD_DVL}[imu]\n{proposed[1]}"
-        foreign.check([imu(force=force), dvl()], toml, {"imu.specific_force": [[0, 0, 9.8]] * 5}, {})
+        foreign.check(
+            [imu(force=force), dvl()],
+            toml,
+            {"imu.specific_force": [[0, 0, 9.8]] * 5},
+            {},
+        )
     assert bool(proposed) == (warning is not None and abs(sum(force)) > 9)
 
 
-@pytest.mark.parametrize(("toml", "recorded", "position", "expected"), AXES.values(), ids=AXES)
+@pytest.mark.parametrize(
+    ("toml", "recorded", "position", "expected"), AXES.values(), ids=AXES
+)
 def test_axes_of_world_and_body_become_ours(
-    foreign: Any, toml: str, recorded: Rotation, position: list[float], expected: Rotation
+    foreign: Any,
+    toml: str,
+    recorded: Rotation,
+    position: list[float],
+    expected: Rotation,
 ) -> None:
     truth = foreign.read(poses(recorded), toml=toml).truth
     np.testing.assert_array_equal(truth.positions, [position] * 3)
-    np.testing.assert_allclose(truth.rotations().as_matrix(), [expected.as_matrix()] * 3, atol=1e-12)
+    np.testing.assert_allclose(
+        truth.rotations().as_matrix(), [expected.as_matrix()] * 3, atol=1e-12
+    )
 
 
 def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -232,22 +275,39 @@ def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
 @given(st.integers(0, 1000))
 def test_ros_to_body_undoes_body_to_ros(seed: int) -> None:
     covariances, rotations = random_covariances(seed, 3)
-    np.testing.assert_allclose(ros_to_body(body_to_ros(covariances, rotations), rotations), covariances, atol=1e-12)
+    np.testing.assert_allclose(
+        ros_to_body(body_to_ros(covariances, rotations), rotations),
+        covariances,
+        atol=1e-12,
+    )
 
 
 def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
     covariances, rotations = random_covariances(1, 1)
     pose = gtsam.Pose3(gtsam.Rot3(rotations[0]), np.array([1.0, 2, 3]))
-    samples = np.random.default_rng(2).multivariate_normal(np.zeros(6), covariances[0] * 1e-8, 20_000)
+    samples = np.random.default_rng(2).multivariate_normal(
+        np.zeros(6), covariances[0] * 1e-8, 20_000
+    )
     moved = [pose.compose(gtsam.Pose3.Expmap(sample)) for sample in samples]
     translations = np.array([m.translation() - pose.translation() for m in moved])
-    turns = np.array([gtsam.Rot3.Logmap(m.rotation().compose(pose.rotation().inverse())) for m in moved])
+    turns = np.array(
+        [
+            gtsam.Rot3.Logmap(m.rotation().compose(pose.rotation().inverse()))
+            for m in moved
+        ]
+    )
     sampled = np.cov(np.hstack([translations, turns]).T) * 1e8
-    np.testing.assert_allclose(sampled, body_to_ros(covariances, rotations)[0], atol=0.05 * np.abs(sampled).max())
+    np.testing.assert_allclose(
+        sampled,
+        body_to_ros(covariances, rotations)[0],
+        atol=0.05 * np.abs(sampled).max(),
+    )
 
 
 @pytest.mark.parametrize(("entry", "toml", "message"), REFUSED.values(), ids=REFUSED)
-def test_results_that_are_no_detections_are_refused(foreign: Any, entry: Entry, toml: str, message: str) -> None:
+def test_results_that_are_no_detections_are_refused(
+    foreign: Any, entry: Entry, toml: str, message: str
+) -> None:
     with pytest.raises(LogError, match=message):
         foreign.read(entry, toml=toml)
 
@@ -260,7 +320,9 @@ def test_a_text_class_is_no_damage_of_an_intact_log(foreign: Any) -> None:
 
 
 @given(st.tuples(*[st.floats(-10, 10)] * 3), st.integers(0, 1000))
-def test_the_covariance_is_that_of_many_samples_to_first_order(position: tuple[float, ...], seed: int) -> None:
+def test_the_covariance_is_that_of_many_samples_to_first_order(
+    position: tuple[float, ...], seed: int
+) -> None:
     assume(np.hypot(*position[:2]) > 0.5)
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, 3)) * 1e-4
@@ -269,7 +331,9 @@ def test_the_covariance_is_that_of_many_samples_to_first_order(position: tuple[f
     # central differences along the columns of the root give the same matrix
     columns = []
     for column in root.T:
-        ranges, azimuths, _ = range_and_azimuth(np.array([position + column, position - column]), np.zeros((2, 3, 3)))
+        ranges, azimuths, _ = range_and_azimuth(
+            np.array([position + column, position - column]), np.zeros((2, 3, 3))
+        )
         turned = np.angle(np.exp(1j * (azimuths[0] - azimuths[1])))
         columns.append([(ranges[0] - ranges[1]) / 2, turned / 2])
     expected = np.array(columns).T @ np.array(columns)

@@ -28,7 +28,9 @@ STEP_NS = 120_000_000
 
 def images(count: int, beams: int, samples: int, seed: int = 0) -> NDArray[np.uint8]:
     """Frames (count, beams, samples) of which no two samples in a row are told apart by chance."""
-    return np.random.default_rng(seed).integers(0, 256, (count, beams, samples), dtype=np.uint8)
+    return np.random.default_rng(seed).integers(
+        0, 256, (count, beams, samples), dtype=np.uint8
+    )
 
 
 def put(header: bytearray, at: int, layout: str, *values: Any) -> None:
@@ -75,9 +77,26 @@ class Ddf(Recorded):
         count, beams, samples = self.frames.shape
         header = bytearray(512 if self.version == 3 else 1024)
         put(header, 0, "3sB", b"DDF", self.version)
-        put(header, 4, "4i", count if self.promised is None else self.promised, 8, self.high, beams)
+        put(
+            header,
+            4,
+            "4i",
+            count if self.promised is None else self.promised,
+            8,
+            self.high,
+            beams,
+        )
         put(header, 20, "fi", 400_000.0, samples)
-        put(header, 28, "5i", 20, self.start_code, self.length_code, self.reverse, self.serial)
+        put(
+            header,
+            28,
+            "5i",
+            20,
+            self.start_code,
+            self.length_code,
+            self.reverse,
+            self.serial,
+        )
         put(header, 48, "32s", b"2014-05-06")
         return bytes(header)
 
@@ -85,10 +104,19 @@ class Ddf(Recorded):
         header = bytearray(256 if self.version == 3 else 1024)
         moment = START + i * STEP
         put(header, 0, "i", i)
-        put(header, 4, "2i", int(moment.timestamp()) + 7, 0)  # the computer's clock is 7 s ahead
+        # the computer's clock is 7 s ahead
+        put(header, 4, "2i", int(moment.timestamp()) + 7, 0)
         put(header, 12, "4s", self.frame_version or b"DDF" + bytes([self.version]))
         put(header, 20, "3i", moment.year, moment.month, moment.day)
-        put(header, 32, "4i", moment.hour, moment.minute, moment.second, moment.microsecond // 10_000)
+        put(
+            header,
+            32,
+            "4i",
+            moment.hour,
+            moment.minute,
+            moment.second,
+            moment.microsecond // 10_000,
+        )
         put(header, 48, "3i", 3, self.start_code, self.length_code)
         for at, value in self.readings.items():
             put(header, at, "f", value + i)
@@ -145,24 +173,48 @@ class Oculus(Recorded):
         ranges, beams = image.shape
         rows = [row.astype(f"<u{image.itemsize}").tobytes() for row in image]
         if self.gains is not None:
-            rows = [struct.pack("<I", gain) + row for gain, row in zip(self.gains.tolist(), rows, strict=True)]
+            rows = [
+                struct.pack("<I", gain) + row
+                for gain, row in zip(self.gains.tolist(), rows, strict=True)
+            ]
         pixels = b"".join(rows)
-        bearings = struct.pack(f"<{beams}h", *np.linspace(-6500, 6000, beams).astype(int).tolist())
+        bearings = struct.pack(
+            f"<{beams}h", *np.linspace(-6500, 6000, beams).astype(int).tolist()
+        )
         extra = struct.pack("<9I", *range(9)) if self.version == 2 else b""
         flags = 0b11001 | (0b100 if self.gains is not None else 0)
-        fire = struct.pack("<5B4d", 2, 0, 255, self.gamma_code, flags, 2.0, 50.0, 0.0, 0.0) + extra
+        fire = (
+            struct.pack("<5B4d", 2, 0, 255, self.gamma_code, flags, 2.0, 50.0, 0.0, 0.0)
+            + extra
+        )
         clock_ns = self.first_clock + i * STEP_NS
         number = self.first_number + i
         if self.version == 2:
-            result = struct.pack("<2I8d", number, 0, 2.1e6, 12.5, 1.9, 45.0 + i, 3.0, -2.0, 1481.0, clock_ns * 1e-9)
+            result = struct.pack(
+                "<2I8d",
+                number,
+                0,
+                2.1e6,
+                12.5,
+                1.9,
+                45.0 + i,
+                3.0,
+                -2.0,
+                1481.0,
+                clock_ns * 1e-9,
+            )
         else:
-            result = struct.pack("<2I4dI", number, 0, 2.1e6, 12.5, 1.9, 1481.0, clock_ns % 2**32)
+            result = struct.pack(
+                "<2I4dI", number, 0, 2.1e6, 12.5, 1.9, 1481.0, clock_ns % 2**32
+            )
         result += struct.pack("<BdHH", image.itemsize - 1, self.bin_m, ranges, beams)
         result += struct.pack("<4I", 0, 0, 0, 0) if self.version == 2 else b""
         offset = 2048
         total = offset + len(pixels)
         result += struct.pack("<3I", offset, len(pixels), total)
-        header = struct.pack("<HHHHHIH", 0x4F53, 1, 2, 0x23, self.version, total - 16, 0)
+        header = struct.pack(
+            "<HHHHHIH", 0x4F53, 1, 2, 0x23, self.version, total - 16, 0
+        )
         return (header + fire + result + bearings).ljust(offset, b"\0") + pixels
 
 
@@ -199,7 +251,9 @@ class Converted:
         return {
             stamp_ns: image
             for block in self.blocks
-            for stamp_ns, image in zip(block.stamps_ns.tolist(), block.intensity, strict=True)
+            for stamp_ns, image in zip(
+                block.stamps_ns.tolist(), block.intensity, strict=True
+            )
         }
 
 

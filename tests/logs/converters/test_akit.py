@@ -25,10 +25,14 @@ def folder(tmp_path):
     run.mkdir()
 
     def write(kind, rows):
-        text = "\n".join(["header", *(",".join(map(repr, map(float, row))) for row in rows)])
+        text = "\n".join(
+            ["header", *(",".join(map(repr, map(float, row))) for row in rows)]
+        )
         (run / f"{kind}_trajectory2.csv").write_text(text + "\n")
 
-    write("IMU", [(k * 0.01000025, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03) for k in range(300)])
+    write(
+        "IMU", [(k * 0.01000025, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03) for k in range(300)]
+    )
     write("DVL", [(k * 1.0025, 1.0, 0.5, 0.25) for k in range(3)])
     at = [(0.61 + k * 1e-6, LATITUDE + k * 1e-6, -10 - k) for k in range(3)]
     write("GT", [(k, *at[k], 0, 0, 0, 0, 0, np.pi / 2) for k in range(3)])
@@ -44,15 +48,24 @@ def test_axes_times_and_start_are_those_of_the_files(folder):
     assert np.allclose(sequence.dvl.velocity[0], [1.0, -0.5, -0.25])
     assert np.allclose(sequence.imu.angular_velocity[0], [0.01, 0.02, -0.03])
     assert np.allclose(sequence.imu.specific_force[0], [0.1, 0.2, 9.8])
-    assert np.unique(np.diff(sequence.imu.stamps_ns)).tolist() == [10_000_000]  # rows are timed by their number
+    # rows are timed by their number
+    assert np.unique(np.diff(sequence.imu.stamps_ns)).tolist() == [10_000_000]
     assert sequence.dvl.stamps_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
     assert sequence.truth.stamps_ns.tolist() == [0, 10**9, 2 * 10**9]
     assert sequence.start_ns == 10**9
-    assert np.allclose(np.diff(sequence.truth.positions, axis=0), [[5.366, 6.354, -1.0]] * 2, rtol=0, atol=5e-3)
+    assert np.allclose(
+        np.diff(sequence.truth.positions, axis=0),
+        [[5.366, 6.354, -1.0]] * 2,
+        rtol=0,
+        atol=5e-3,
+    )
     assert np.allclose(sequence.truth.positions[0], [0, 0, -10], atol=1e-6)
-    assert np.allclose(sequence.truth.rotations()[0].as_matrix(), np.eye(3), atol=1e-12)  # east is along x
+    # east is along x
+    assert np.allclose(sequence.truth.rotations()[0].as_matrix(), np.eye(3), atol=1e-12)
     assert np.allclose(sequence.calibration.start.rpy_rad, 0, atol=1e-9)
-    assert np.allclose(sequence.calibration.start.position_m, sequence.truth.positions[1])
+    assert np.allclose(
+        sequence.calibration.start.position_m, sequence.truth.positions[1]
+    )
 
 
 def test_attitude_by_hand():
@@ -60,15 +73,29 @@ def test_attitude_by_hand():
         (0, 0, 0, [1, 0, 0], [0, 1, 0]),  # north
         (0, 0, np.pi / 2, [0, 1, 0], [0, 1, 0]),  # heading east, left is north
         (0, np.pi / 2, 0, [1, 0, 0], [0, 0, 1]),  # nose up
-        (np.pi / 2, 0, 0, [0, 1, 0], [0, 0, 1]),  # right side down, heading north: left is up
+        (
+            np.pi / 2,
+            0,
+            0,
+            [0, 1, 0],
+            [0, 0, 1],
+        ),  # right side down, heading north: left is up
     ):
-        assert np.allclose(enu_R_flu(*np.array([[roll], [pitch], [yaw]])).apply(body), world, atol=1e-12)
+        assert np.allclose(
+            enu_R_flu(*np.array([[roll], [pitch], [yaw]])).apply(body),
+            world,
+            atol=1e-12,
+        )
 
 
 def test_earth_centred_reproduces_known_points():
     """Equator and pole, by the semi-axes that define WGS-84."""
-    points = earth_centred(np.array([0.0, np.pi / 2]), np.array([0.0, 0.0]), np.array([10.0, 0.0]))
-    assert np.allclose(points, [[6378147.0, 0, 0], [0, 0, 6356752.3142]], rtol=0, atol=1e-4)
+    points = earth_centred(
+        np.array([0.0, np.pi / 2]), np.array([0.0, 0.0]), np.array([10.0, 0.0])
+    )
+    assert np.allclose(
+        points, [[6378147.0, 0, 0], [0, 0, 6356752.3142]], rtol=0, atol=1e-4
+    )
 
 
 @given(st.floats(-1.3, 1.3), st.floats(-3, 3))
@@ -78,10 +105,18 @@ def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, lon
     vertical = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
     heights = np.array([-5.0, -5.0, -5.0, -2.0])
     enu = east_north_up(
-        latitude + np.array([0, d, 0, 0]), longitude + np.array([0, 0, d, 0]), heights, (latitude, longitude, 0.0)
+        latitude + np.array([0, d, 0, 0]),
+        longitude + np.array([0, 0, d, 0]),
+        heights,
+        (latitude, longitude, 0.0),
     )
     assert np.allclose(enu[1] - enu[0], [0, (meridian - 5) * d, 0], rtol=0, atol=1e-4)
-    assert np.allclose(enu[2] - enu[0], [(vertical - 5) * np.cos(latitude) * d, 0, 0], rtol=0, atol=1e-4)
+    assert np.allclose(
+        enu[2] - enu[0],
+        [(vertical - 5) * np.cos(latitude) * d, 0, 0],
+        rtol=0,
+        atol=1e-4,
+    )
     assert np.allclose(enu[3] - enu[0], [0, 0, 3], rtol=0, atol=1e-4)
     assert np.allclose(enu[0], [0, 0, -5], rtol=0, atol=1e-6)
 
@@ -95,40 +130,66 @@ def test_the_start_is_where_a_reference_that_is_late_turns_as_the_gyros_do(tmp_p
         return 0.5 * np.sin(0.4 * seconds) + 0.1 * seconds
 
     def write(kind, rows):
-        text = "\n".join(["header", *(",".join(map(repr, map(float, row))) for row in rows)])
+        text = "\n".join(
+            ["header", *(",".join(map(repr, map(float, row))) for row in rows)]
+        )
         (run / f"{kind}_trajectory2.csv").write_text(text + "\n")
 
     stamps = np.arange(6000) / 100
-    write("IMU", [(t, 0, 0, -9.8, 0, 0, 0.2 * np.cos(0.4 * t) + 0.1 + 1e-5) for t in stamps])
+    write(
+        "IMU",
+        [(t, 0, 0, -9.8, 0, 0, 0.2 * np.cos(0.4 * t) + 0.1 + 1e-5) for t in stamps],
+    )
     write("DVL", [(t, 1, 0, 0) for t in range(58)])
     for late_s in (0.5, 0.0, -0.4):
-        write("GT", [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + late_s)) for t in range(60)])
+        write(
+            "GT",
+            [
+                (t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + late_s))
+                for t in range(60)
+            ],
+        )
         yaw_rad = np.pi / 2 - read_akit(tmp_path, 2).calibration.start.rpy_rad[2]
         assert yaw_rad == pytest.approx(heading(1.0), abs=0.005), late_s
         truth = read_akit(tmp_path, 2).truth
         assert truth.stamps_ns[0] >= 0
         moved_s = truth.stamps_ns[0] * 1e-9 - late_s
         assert moved_s == pytest.approx(round(moved_s), abs=0.005)
-    write("GT", [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + 2.0)) for t in range(60)])  # farther than tried
+    # farther than tried
+    write(
+        "GT",
+        [(t, 0.61, LATITUDE, 0, 0, 0, 0, 0, 0, heading(t + 2.0)) for t in range(60)],
+    )
     assert read_akit(tmp_path, 2).truth.stamps_ns[0] == 0
 
 
 @pytest.mark.recording
 @pytest.mark.parametrize("trajectory", [1, 4, 5, 6, 7])
 def test_inspect_does_not_call_the_start_heading_wrong(unpacked, trajectory):
-    sea = read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, trajectory)
+    sea = read_akit(
+        next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, trajectory
+    )
     offset = match_reference_to_imu(sea.imu, sea.truth, sea.calibration).offset
     assert not find_start_heading(sea, sea.truth, offset).acts
     assert abs(offset.value) < 1e-3
-    half_later = sea.truth.at(np.array([sea.start_ns + 450_000_000])).rotations().as_euler("ZYX")[0, 0]
+    half_later = (
+        sea.truth.at(np.array([sea.start_ns + 450_000_000]))
+        .rotations()
+        .as_euler("ZYX")[0, 0]
+    )
     start = sea.calibration.start.model_copy(update={"rpy_rad": (0.0, 0.0, half_later)})
-    spoilt = replace(sea, calibration=sea.calibration.model_copy(update={"start": start}))
-    assert find_start_heading(spoilt, sea.truth, offset).acts == (trajectory != 7)  # which starts without turning
+    spoilt = replace(
+        sea, calibration=sea.calibration.model_copy(update={"start": start})
+    )
+    # which starts without turning
+    assert find_start_heading(spoilt, sea.truth, offset).acts == (trajectory != 7)
 
 
 @pytest.fixture(scope="module", params=[1, 3, 7])
 def sequence(request, unpacked):
-    return read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, request.param)
+    return read_akit(
+        next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, request.param
+    )
 
 
 @pytest.mark.recording
@@ -136,9 +197,14 @@ class TestRecording:
     """Against the reference, which lags the IMU by a time that differs between trajectories."""
 
     @pytest.mark.slow
-    def test_gyros_follow_the_reference_once_the_earths_rotation_is_removed(self, sequence):
+    def test_gyros_follow_the_reference_once_the_earths_rotation_is_removed(
+        self, sequence
+    ):
         latitude = sequence.calibration.earth_rate_latitude_rad
-        removed = best_drift(sequence, EARTH_RATE_RAD_S * np.array([0, np.cos(latitude), np.sin(latitude)]))
+        removed = best_drift(
+            sequence,
+            EARTH_RATE_RAD_S * np.array([0, np.cos(latitude), np.sin(latitude)]),
+        )
         kept = best_drift(sequence, np.zeros(3))
         assert np.linalg.norm(removed) < 3e-6
         assert np.linalg.norm(kept) > 6e-5
@@ -150,7 +216,9 @@ class TestRecording:
         assert right < 0.6 * sideways_error(sequence, np.zeros(3))
         assert right < 0.6 * sideways_error(sequence, lever, dvl_delay_s=-1.0)
 
-    def test_accelerometers_carry_the_dvls_velocity_through_half_a_minute(self, sequence):
+    def test_accelerometers_carry_the_dvls_velocity_through_half_a_minute(
+        self, sequence
+    ):
         """With the IMU where the calibration has it, and hardly with it at the reference's point."""
         assert lost_in_gaps(sequence, sequence.calibration) < 0.4
         imu = sequence.calibration.imu.model_copy(update={"mounting": Mounting()})
@@ -169,7 +237,10 @@ def lost_in_gaps(sequence, calibration, gap_s=30):
     for first in range(20, 340, 20):
         ends = [int(dvl.stamps_ns[k]) for k in (first, first + gap_s)]
         displacements = []
-        for kept in (slice(None), np.r_[: first + 1, first + gap_s - WAITING : len(dvl)]):
+        for kept in (
+            slice(None),
+            np.r_[: first + 1, first + gap_s - WAITING : len(dvl)],
+        ):
             odometry, rows = Odometry(calibration), dvl.rows(kept)
             odometry.add(sequence.imu, rows)
             known = attitude(ends[0]).as_matrix(), sequence.end_ns
@@ -181,11 +252,16 @@ def lost_in_gaps(sequence, calibration, gap_s=30):
 def sideways_error(sequence, lever, dvl_delay_s=0.0):
     """Standard deviation of the DVL's leftward velocity error, with the reference's delay taken out."""
     knots = sequence.truth.stamps_ns * 1e-9
-    position, attitude = CubicSpline(knots, sequence.truth.positions), Slerp(knots, sequence.truth.rotations())
+    position, attitude = (
+        CubicSpline(knots, sequence.truth.positions),
+        Slerp(knots, sequence.truth.rotations()),
+    )
     rows = np.arange(5, 395)
     seconds = sequence.dvl.stamps_ns[rows] * 1e-9 + dvl_delay_s
     centre = np.round(seconds * 100).astype(int)
-    rate = np.mean([sequence.imu.angular_velocity[centre + k] for k in range(-10, 11)], axis=0)
+    rate = np.mean(
+        [sequence.imu.angular_velocity[centre + k] for k in range(-10, 11)], axis=0
+    )
     delay = reference_delay(sequence)
     body_R_world = attitude(seconds + delay).inv()
     expected = body_R_world.apply(position(seconds + delay, 1)) + np.cross(rate, lever)
@@ -195,10 +271,17 @@ def sideways_error(sequence, lever, dvl_delay_s=0.0):
 def reference_delay(sequence):
     """Seconds by which the reference's heading rate comes after the gyro's."""
     knots = sequence.truth.stamps_ns * 1e-9
-    heading = CubicSpline(knots, np.unwrap(sequence.truth.rotations().as_euler("ZYX")[:, 0]))
-    smooth = np.convolve(sequence.imu.angular_velocity[:, 2], np.ones(100) / 100, "same")
+    heading = CubicSpline(
+        knots, np.unwrap(sequence.truth.rotations().as_euler("ZYX")[:, 0])
+    )
+    smooth = np.convolve(
+        sequence.imu.angular_velocity[:, 2], np.ones(100) / 100, "same"
+    )
     seconds = np.arange(5, 390)
-    errors = [(np.std(heading(seconds + d, 1) - smooth[seconds * 100]), d) for d in np.arange(-0.7, 0.71, 0.02)]
+    errors = [
+        (np.std(heading(seconds + d, 1) - smooth[seconds * 100]), d)
+        for d in np.arange(-0.7, 0.71, 0.02)
+    ]
     return min(errors)[1]
 
 
@@ -208,7 +291,9 @@ def best_drift(sequence, earth_rate):
     attitude = truth[0]
     integrated = [attitude]
     for rate in 0.5 * (rates[1:] + rates[:-1]).reshape(-1, 3):
-        attitude = attitude * Rotation.from_rotvec((rate - attitude.inv().apply(earth_rate)) * 0.01)
+        attitude = attitude * Rotation.from_rotvec(
+            (rate - attitude.inv().apply(earth_rate)) * 0.01
+        )
         integrated.append(attitude)
     integrated = Rotation.concatenate(integrated)
     seconds, best = np.arange(1, 399), (np.inf, None)

@@ -19,13 +19,24 @@ FRD = np.array([1.0, -1.0, -1.0])
 MEASURED = ("imu", "dvl", "depth", "heading", "positions", "detections")
 
 
-def table(path: Path, names: str, *columns: np.ndarray, stamps_ns: np.ndarray | None = None, sep: str = ",") -> None:
+def table(
+    path: Path,
+    names: str,
+    *columns: np.ndarray,
+    stamps_ns: np.ndarray | None = None,
+    sep: str = ",",
+) -> None:
     """Write columns with every bit, and stamps in seconds with every nanosecond."""
     rows = np.column_stack(columns).tolist()
     texts = [[repr(value) for value in row] for row in rows]
     if stamps_ns is not None:
-        texts = [[f"{ns // 10**9}.{ns % 10**9:09d}", *row] for ns, row in zip(stamps_ns.tolist(), texts, strict=True)]
-    path.write_text("\n".join([names.replace(",", sep), *(sep.join(row) for row in texts)]) + "\n")
+        texts = [
+            [f"{ns // 10**9}.{ns % 10**9:09d}", *row]
+            for ns, row in zip(stamps_ns.tolist(), texts, strict=True)
+        ]
+    path.write_text(
+        "\n".join([names.replace(",", sep), *(sep.join(row) for row in texts)]) + "\n"
+    )
 
 
 def world():
@@ -37,32 +48,93 @@ def world():
         seen.candidate_ids, seen.id_probability, seen.track,
     )  # fmt: skip
     heading = replace(aided.heading, sigma_rad=np.full(len(aided.heading), np.nan))
-    fixes = replace(aided.positions, covariance_m2=np.full((len(aided.positions), 3, 3), np.nan))
-    landmarks = replace(small.true_landmarks, covariances=np.full((len(small.true_landmarks), 3, 3), np.nan))
-    return replace(small, detections=seen, heading=heading, positions=fixes, true_landmarks=landmarks)
+    fixes = replace(
+        aided.positions, covariance_m2=np.full((len(aided.positions), 3, 3), np.nan)
+    )
+    landmarks = replace(
+        small.true_landmarks,
+        covariances=np.full((len(small.true_landmarks), 3, 3), np.nan),
+    )
+    return replace(
+        small,
+        detections=seen,
+        heading=heading,
+        positions=fixes,
+        true_landmarks=landmarks,
+    )
 
 
 def write_tables(folder: Path, s, *, frd: bool = False, sep: str = ",") -> None:
     """Tables of a sequence; with ``frd`` in degrees, g and mm, along forward, right, down and north, east, down."""
-    turn, rate, force, mm = (FRD, 180 / np.pi, 1 / 9.80665, 1e3) if frd else (np.ones(3), 1.0, 1.0, 1.0)
+    turn, rate, force, mm = (
+        (FRD, 180 / np.pi, 1 / 9.80665, 1e3) if frd else (np.ones(3), 1.0, 1.0, 1.0)
+    )
     world_of = (lambda p: p[:, [1, 0, 2]] * [1, 1, -1]) if frd else (lambda p: p)
     of_imu = (s.imu.angular_velocity * turn * rate, s.imu.specific_force * turn * force)
-    table(folder / "imu.csv", "t,wx,wy,wz,ax,ay,az", *of_imu, stamps_ns=s.imu.stamps_ns, sep=sep)
-    table(folder / "dvl.csv", "t,vx,vy,vz", s.dvl.velocity * turn * mm, stamps_ns=s.dvl.stamps_ns, sep=sep)
-    table(folder / "depth.csv", "t,d", s.depth.z_m * (-mm if frd else 1.0), stamps_ns=s.depth.stamps_ns, sep=sep)
+    table(
+        folder / "imu.csv",
+        "t,wx,wy,wz,ax,ay,az",
+        *of_imu,
+        stamps_ns=s.imu.stamps_ns,
+        sep=sep,
+    )
+    table(
+        folder / "dvl.csv",
+        "t,vx,vy,vz",
+        s.dvl.velocity * turn * mm,
+        stamps_ns=s.dvl.stamps_ns,
+        sep=sep,
+    )
+    table(
+        folder / "depth.csv",
+        "t,d",
+        s.depth.z_m * (-mm if frd else 1.0),
+        stamps_ns=s.depth.stamps_ns,
+        sep=sep,
+    )
     yaw = np.degrees(np.pi / 2 - s.heading.yaw_rad) if frd else s.heading.yaw_rad
     table(folder / "heading.csv", "t,yaw", yaw, stamps_ns=s.heading.stamps_ns, sep=sep)
     place = world_of(s.positions.position_m) * mm
-    table(folder / "fix.csv", "t,x,y,z", place, stamps_ns=s.positions.stamps_ns, sep=sep)
+    table(
+        folder / "fix.csv", "t,x,y,z", place, stamps_ns=s.positions.stamps_ns, sep=sep
+    )
     seen, k = s.detections, s.detections.candidate_ids.shape[1]
     azimuth = -np.degrees(seen.azimuth_rad) if frd else seen.azimuth_rad
-    names = ",".join(["t", "range", "azimuth", *(f"id{i}" for i in range(k)), *(f"p{i}" for i in range(k)), "track"])
-    rows = (seen.range_m * mm, azimuth, seen.candidate_ids, seen.id_probability, seen.track)
+    names = ",".join(
+        [
+            "t",
+            "range",
+            "azimuth",
+            *(f"id{i}" for i in range(k)),
+            *(f"p{i}" for i in range(k)),
+            "track",
+        ]
+    )
+    rows = (
+        seen.range_m * mm,
+        azimuth,
+        seen.candidate_ids,
+        seen.id_probability,
+        seen.track,
+    )
     table(folder / "seen.csv", names, *rows, stamps_ns=seen.stamps_ns, sep=sep)
     true = world_of(s.truth.positions) * mm
-    table(folder / "truth.csv", "t,x,y,z,qx,qy,qz,qw", true, quaternions(s, frd), stamps_ns=s.truth.stamps_ns, sep=sep)
+    table(
+        folder / "truth.csv",
+        "t,x,y,z,qx,qy,qz,qw",
+        true,
+        quaternions(s, frd),
+        stamps_ns=s.truth.stamps_ns,
+        sep=sep,
+    )
     known = s.true_landmarks
-    table(folder / "map.csv", "id,x,y,z", known.ids, world_of(known.positions) * mm, sep=sep)
+    table(
+        folder / "map.csv",
+        "id,x,y,z",
+        known.ids,
+        world_of(known.positions) * mm,
+        sep=sep,
+    )
 
 
 def quaternions(s, frd: bool) -> np.ndarray:
@@ -77,37 +149,73 @@ def quaternions(s, frd: bool) -> np.ndarray:
 def configuration(s, *, frd: bool = False) -> dict:
     k = s.detections.candidate_ids.shape[1]
     tables = {
-        "imu": {"angular_velocity": ["wx", "wy", "wz"], "linear_acceleration": ["ax", "ay", "az"]},
+        "imu": {
+            "angular_velocity": ["wx", "wy", "wz"],
+            "linear_acceleration": ["ax", "ay", "az"],
+        },
         "dvl": {"velocity": ["vx", "vy", "vz"]},
         "depth": {"height": "d"},
         "heading": {"yaw": "yaw"},
         "positions": {"file": "fix.csv", "position": ["x", "y", "z"]},
-        "detections": {"file": "seen.csv", "range": "range", "azimuth": "azimuth", "track": "track"}
-        | {"ids": [f"id{i}" for i in range(k)], "probabilities": [f"p{i}" for i in range(k)]},
+        "detections": {
+            "file": "seen.csv",
+            "range": "range",
+            "azimuth": "azimuth",
+            "track": "track",
+        }
+        | {
+            "ids": [f"id{i}" for i in range(k)],
+            "probabilities": [f"p{i}" for i in range(k)],
+        },
         "truth": {"position": ["x", "y", "z"], "orientation": ["qx", "qy", "qz", "qw"]},
         "true_landmarks": {"file": "map.csv", "id": 1, "position": [2, 3, 4]},
     }
     if frd:
-        tables["imu"] |= {"angular_velocity_scale": "deg/s", "linear_acceleration_scale": "g", "rotation": "frd"}
+        tables["imu"] |= {
+            "angular_velocity_scale": "deg/s",
+            "linear_acceleration_scale": "g",
+            "rotation": "frd",
+        }
         tables["dvl"] |= {"scale": "mm/s", "rotation": "frd"}
         tables["depth"] |= {"scale": -0.001}
         tables["heading"] |= {"scale": "deg", "world": "ned"}
         tables["positions"] |= {"scale": "mm", "world": "ned"}
-        tables["detections"] |= {"range_scale": "mm", "azimuth_scale": "deg", "rotation": "frd"}
+        tables["detections"] |= {
+            "range_scale": "mm",
+            "azimuth_scale": "deg",
+            "rotation": "frd",
+        }
         tables["truth"] |= {"scale": "mm", "world": "ned", "rotation": "frd"}
         tables["true_landmarks"] |= {"scale": "mm", "world": "ned"}
-    return {"stamp": "t"} | {role: {"file": f"{role}.csv"} | keys for role, keys in tables.items()}
+    return {"stamp": "t"} | {
+        role: {"file": f"{role}.csv"} | keys for role, keys in tables.items()
+    }
 
 
 def assert_same(found, expected, atol: float) -> None:
     for role in MEASURED:
         for name, column in vars(getattr(expected, role)).items():
-            np.testing.assert_allclose(getattr(getattr(found, role), name), column, rtol=0, atol=atol, err_msg=role)
+            np.testing.assert_allclose(
+                getattr(getattr(found, role), name),
+                column,
+                rtol=0,
+                atol=atol,
+                err_msg=role,
+            )
     np.testing.assert_array_equal(found.truth.stamps_ns, expected.truth.stamps_ns)
-    np.testing.assert_allclose(found.truth.positions, expected.truth.positions, rtol=0, atol=atol)
-    np.testing.assert_allclose(found.truth.matrices, expected.truth.matrices, rtol=0, atol=atol)
+    np.testing.assert_allclose(
+        found.truth.positions, expected.truth.positions, rtol=0, atol=atol
+    )
+    np.testing.assert_allclose(
+        found.truth.matrices, expected.truth.matrices, rtol=0, atol=atol
+    )
     np.testing.assert_array_equal(found.true_landmarks.ids, expected.true_landmarks.ids)
-    np.testing.assert_allclose(found.true_landmarks.positions, expected.true_landmarks.positions, rtol=0, atol=atol)
+    np.testing.assert_allclose(
+        found.true_landmarks.positions,
+        expected.true_landmarks.positions,
+        rtol=0,
+        atol=atol,
+    )
 
 
 @pytest.mark.parametrize("sep", [",", ";", "\t", " "])
@@ -117,8 +225,12 @@ def test_a_log_from_tables_equals_that_from_arrays_bit_for_bit(tmp_path, sep):
     found = read_csv(tmp_path, configuration(expected))
     assert_same(found, expected, 0.0)
     write_log(tmp_path / "csv.mcap", found)
-    write_log(tmp_path / "arrays.mcap", replace(expected, calibration=found.calibration))
-    assert_same(read_log(tmp_path / "csv.mcap"), read_log(tmp_path / "arrays.mcap"), 0.0)
+    write_log(
+        tmp_path / "arrays.mcap", replace(expected, calibration=found.calibration)
+    )
+    assert_same(
+        read_log(tmp_path / "csv.mcap"), read_log(tmp_path / "arrays.mcap"), 0.0
+    )
 
 
 def test_units_and_axes_of_a_foreign_vehicle_are_turned_into_ours(tmp_path):
@@ -126,7 +238,9 @@ def test_units_and_axes_of_a_foreign_vehicle_are_turned_into_ours(tmp_path):
     write_tables(tmp_path, expected, frd=True)
     found = read_csv(tmp_path, configuration(expected, frd=True))
     assert_same(found, expected, 1e-9)
-    with pytest.raises(AssertionError):  # negative control: the same tables without units and axes
+    with pytest.raises(
+        AssertionError
+    ):  # negative control: the same tables without units and axes
         assert_same(read_csv(tmp_path, configuration(expected)), expected, 1e-9)
 
 
@@ -142,11 +256,19 @@ def test_stamps_of_every_unit_keep_their_nanoseconds(tmp_path, unit, number):
     triple = ["a", "b", "c"]
     config = {
         "stamp_unit_s": unit,
-        "imu": {"file": "imu.csv", "angular_velocity": triple, "linear_acceleration": triple},
+        "imu": {
+            "file": "imu.csv",
+            "angular_velocity": triple,
+            "linear_acceleration": triple,
+        },
     }
     config |= {"stamp_offset_s": -0.5, "dvl": {"file": "dvl.csv", "velocity": triple}}
     found = read_csv(tmp_path, config)
-    assert found.imu.stamps_ns.tolist() == found.dvl.stamps_ns.tolist() == [1893456000123456789 - 500_000_000]
+    assert (
+        found.imu.stamps_ns.tolist()
+        == found.dvl.stamps_ns.tolist()
+        == [1893456000123456789 - 500_000_000]
+    )
 
 
 @pytest.mark.parametrize("text", ["yesterday", "12", "2030-13-01T00:00:00"])
@@ -171,14 +293,19 @@ def write_headed(folder: Path) -> None:
     for name, header in HEADED.items():
         sep, count = (";" if ";" in header else ","), len(re.split("[,;]", header))
         base = 1_900_000_000
-        rows = [[repr(round((base + k) * stamps.get(name, 1))), *["0.5"] * (count - 1)] for k in range(3)]
+        rows = [
+            [repr(round((base + k) * stamps.get(name, 1))), *["0.5"] * (count - 1)]
+            for k in range(3)
+        ]
         if name == "map.csv":
             rows = [["7", "1", "2", "3"]]
         if name == "dvl.csv":
             rows = [[*row[:-1], "1"] for row in rows]
         if name == "beacons.csv":
             rows = [[row[0], "2000", "90", "7", "0.9"] for row in rows]
-        (folder / name).write_text("\n".join([header, *(sep.join(row) for row in rows)]) + "\n")
+        (folder / name).write_text(
+            "\n".join([header, *(sep.join(row) for row in rows)]) + "\n"
+        )
 
 
 def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path):
@@ -186,13 +313,19 @@ def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path)
     (tmp_path / "notes.md").write_text("no table at all\n")
     text = csv_template([tmp_path])
     (tmp_path / "dive.toml").write_text(text)
-    found = read_csv([path for path in tmp_path.iterdir() if path.suffix == ".csv"], tmp_path / "dive.toml")
+    found = read_csv(
+        [path for path in tmp_path.iterdir() if path.suffix == ".csv"],
+        tmp_path / "dive.toml",
+    )
     assert found.imu.angular_velocity[0, 0] == pytest.approx(np.radians(0.5))
     assert found.imu.specific_force[0, 2] == pytest.approx(0.5 * 9.80665)
     assert found.dvl.velocity[0, 0] == pytest.approx(0.0005)
     assert found.depth.z_m[0] == pytest.approx(-0.005)
     assert found.heading.yaw_rad[0] == pytest.approx(np.pi / 2 - np.radians(0.5))
-    assert (found.detections.range_m[0], found.detections.azimuth_rad[0]) == pytest.approx((2.0, np.pi / 2))
+    assert (
+        found.detections.range_m[0],
+        found.detections.azimuth_rad[0],
+    ) == pytest.approx((2.0, np.pi / 2))
     assert found.detections.most_probable()[0].tolist() == [7, 7, 7]
     assert found.detections.id_probability[0, 0] == 0.9
     assert found.truth.has_orientation
@@ -211,15 +344,22 @@ OF_IMU = "time,positionX,positionY,positionZ,gyro_x,gyro_y,gyro_z,acc_x,acc_y,ac
     ("tables", "live"),
     [
         ({"a_imu.log": OF_IMU, "b_dgps.log": "time,latitude,longitude"}, "b_dgps.log"),
-        ({"a_places.log": "time,x,y,z", "b_dgps.log": "time,latitude,longitude"}, "b_dgps.log"),
+        (
+            {"a_places.log": "time,x,y,z", "b_dgps.log": "time,latitude,longitude"},
+            "b_dgps.log",
+        ),
         ({"a_imu.log": OF_IMU}, None),
         ({"a_imu.log": OF_IMU, "b_places.log": "time,x,y,z"}, "b_places.log"),
         ({"a_imu.log": OF_IMU.replace("X,", "X [m],")}, "a_imu.log"),
     ],
 )
-def test_a_template_prefers_latitudes_and_asks_about_places_that_an_imu_measures(tmp_path, tables, live):
+def test_a_template_prefers_latitudes_and_asks_about_places_that_an_imu_measures(
+    tmp_path, tables, live
+):
     for name, header in tables.items():
-        (tmp_path / name).write_text(f"{header}\n" + ",".join("1" for _ in header.split(",")) + "\n")
+        (tmp_path / name).write_text(
+            f"{header}\n" + ",".join("1" for _ in header.split(",")) + "\n"
+        )
     text = csv_template([tmp_path])
     fixes = tomllib.loads(text).get("positions")
     assert (fixes and fixes["file"]) == live
@@ -228,13 +368,28 @@ def test_a_template_prefers_latitudes_and_asks_about_places_that_an_imu_measures
         assert '# position = ["positionX", "positionY", "positionZ"]' in text
 
 
-def test_columns_without_names_are_numbered_and_rows_that_say_invalid_are_left_out(tmp_path):
-    (tmp_path / "log.txt").write_text("% a log\n0 1 2 3 4 5 6\n1 1 2 3 4 5 6\n2 nan 2 3 4 5 6\n")
-    (tmp_path / "dvl.txt").write_text("0 10 20 30 true\n1 10 20 30 false\n2 10 20 30 true\n")
+def test_columns_without_names_are_numbered_and_rows_that_say_invalid_are_left_out(
+    tmp_path,
+):
+    (tmp_path / "log.txt").write_text(
+        "% a log\n0 1 2 3 4 5 6\n1 1 2 3 4 5 6\n2 nan 2 3 4 5 6\n"
+    )
+    (tmp_path / "dvl.txt").write_text(
+        "0 10 20 30 true\n1 10 20 30 false\n2 10 20 30 true\n"
+    )
     config = {
         "stamp": 1,
-        "imu": {"file": "log.txt", "angular_velocity": [2, 3, 4], "linear_acceleration": [5, 6, 7]},
-        "dvl": {"file": "dvl.txt", "velocity": [2, 3, 4], "scale": "cm/s", "valid_where": {"5": True}},
+        "imu": {
+            "file": "log.txt",
+            "angular_velocity": [2, 3, 4],
+            "linear_acceleration": [5, 6, 7],
+        },
+        "dvl": {
+            "file": "dvl.txt",
+            "velocity": [2, 3, 4],
+            "scale": "cm/s",
+            "valid_where": {"5": True},
+        },
     }
     found = read_csv(tmp_path, config)
     assert found.imu.angular_velocity.tolist() == [[1, 2, 3], [1, 2, 3]]
@@ -246,12 +401,21 @@ def test_columns_without_names_are_numbered_and_rows_that_say_invalid_are_left_o
 
 def test_truth_from_roll_pitch_yaw_and_geodetic_minutes(tmp_path):
     (tmp_path / "imu.csv").write_text("time,a,b,c\n0,0,0,1\n9,0,0,1\n")
-    (tmp_path / "gt.csv").write_text("time,lat,lon,r,p,y\n0,4212.0,306.0,0,0,90\n9,4213.0,306.0,10,20,-30\n")
+    (tmp_path / "gt.csv").write_text(
+        "time,lat,lon,r,p,y\n0,4212.0,306.0,0,0,90\n9,4213.0,306.0,10,20,-30\n"
+    )
     triple = ["a", "b", "c"]
     config = {
-        "imu": {"file": "imu.csv", "angular_velocity": triple, "linear_acceleration": triple},
+        "imu": {
+            "file": "imu.csv",
+            "angular_velocity": triple,
+            "linear_acceleration": triple,
+        },
         "dvl": {"file": "imu.csv", "velocity": triple},
-        "truth": {"file": "gt.csv", "geodetic": {"latitude": "lat", "longitude": "lon", "unit": "ddmm.mmmm"}}
+        "truth": {
+            "file": "gt.csv",
+            "geodetic": {"latitude": "lat", "longitude": "lon", "unit": "ddmm.mmmm"},
+        }
         | {"rpy": ["r", "p", "y"], "rpy_scale": "deg"},
     }
     truth = read_csv(tmp_path, config).truth
@@ -260,5 +424,8 @@ def test_truth_from_roll_pitch_yaw_and_geodetic_minutes(tmp_path):
         np.array([[0, 0, 90], [10, 20, -30]])
     )
     del config["truth"]["geodetic"]["unit"]
-    with pytest.raises(LogError, match=r'gt\.csv: \[truth\] none of its 2 rows .* \(lat is up to 4213: unit = "ddmm'):
+    with pytest.raises(
+        LogError,
+        match=r'gt\.csv: \[truth\] none of its 2 rows .* \(lat is up to 4213: unit = "ddmm',
+    ):
         read_csv(tmp_path, config)

@@ -47,13 +47,26 @@ def motion_of(velocity, rate):
 def test_twist_held_over_the_step_makes_the_step_and_its_noise(dx, dy, turn):
     cov = np.diag([4e-4, 2e-4, 0.0])
     cov[0, 1] = cov[1, 0] = 1e-4
-    (velocity,), (velocity_cov,), (rate,) = twists_of_steps(np.array([[dx, dy, turn]]), cov[None])
-    assert np.allclose(motion_of(velocity, rate), gtsam.Pose2(dx, dy, turn).matrix(), rtol=0, atol=1e-11)
+    (velocity,), (velocity_cov,), (rate,) = twists_of_steps(
+        np.array([[dx, dy, turn]]), cov[None]
+    )
+    assert np.allclose(
+        motion_of(velocity, rate),
+        gtsam.Pose2(dx, dy, turn).matrix(),
+        rtol=0,
+        atol=1e-11,
+    )
     V = np.column_stack([motion_of(axis, rate)[:2, 2] for axis in np.eye(2)])
     assert np.allclose(V @ velocity_cov @ V.T, cov[:2, :2], rtol=0, atol=1e-12)
 
 
-@given(st.floats(0.5, 20), st.floats(-3.1, 3.1), st.floats(0.01, 0.2), st.floats(0.01, 0.2), st.floats(-0.9, 0.9))
+@given(
+    st.floats(0.5, 20),
+    st.floats(-3.1, 3.1),
+    st.floats(0.01, 0.2),
+    st.floats(0.01, 0.2),
+    st.floats(-0.9, 0.9),
+)
 def test_polar_covariance_is_the_numerical_jacobians(distance, azimuth, sx, sy, rho):
     point = distance * np.array([[np.cos(azimuth), np.sin(azimuth)]])
     S = np.array([[[sx**2, rho * sx * sy], [rho * sx * sy, sy**2]]])
@@ -62,7 +75,9 @@ def test_polar_covariance_is_the_numerical_jacobians(distance, azimuth, sx, sy, 
         return np.concatenate(range_azimuth(point + offset, S)[:2])
 
     assert np.allclose(polar(0), [distance, azimuth])
-    J = np.column_stack([(polar(offset) - polar(-offset)) / 2e-6 for offset in 1e-6 * np.eye(2)])
+    J = np.column_stack(
+        [(polar(offset) - polar(-offset)) / 2e-6 for offset in 1e-6 * np.eye(2)]
+    )
     assert np.allclose(range_azimuth(point, S)[2], J @ S[0] @ J.T, rtol=1e-6, atol=1e-9)
 
 
@@ -82,11 +97,16 @@ def test_ahead_is_minus_y_and_angles_grow_to_the_right_in_the_file(tmp_path):
     assert np.allclose(poses[2], [[0, 1, 2], [-1, 0, 0], [0, 0, 1]], atol=1e-12)
     assert np.allclose(poses[3][:2, 2], [2, -1], atol=1e-12)
     assert np.allclose(s.dvl.velocity_cov[:2, :2, :2], [[2e-5, 2e-6], [2e-6, 1e-5]])
-    assert s.dvl.velocity_cov[:, 2, 2] == pytest.approx([1e-6] * 4)  # a millimetre a second
-    assert s.calibration.imu.gyro_noise_density**2 == pytest.approx(2e-4)  # the mean over the steps
-    assert not np.any([s.dvl.velocity[0], s.imu.angular_velocity[0]])  # it begins at rest
+    # a millimetre a second
+    assert s.dvl.velocity_cov[:, 2, 2] == pytest.approx([1e-6] * 4)
+    # the mean over the steps
+    assert s.calibration.imu.gyro_noise_density**2 == pytest.approx(2e-4)
+    # it begins at rest
+    assert not np.any([s.dvl.velocity[0], s.imu.angular_velocity[0]])
     assert np.isnan(s.imu.specific_force).all()
-    assert np.allclose(s.detections.range_azimuth_cov[0], [[5e-3, 2e-4 / 2], [2e-4 / 2, 1e-3 / 4]])
+    assert np.allclose(
+        s.detections.range_azimuth_cov[0], [[5e-3, 2e-4 / 2], [2e-4 / 2, 1e-3 / 4]]
+    )
     assert s.detections.range_m == pytest.approx([2, np.sqrt(5)])
     assert s.detections.azimuth_rad == pytest.approx([0, -np.arctan(0.5)])
     assert s.detections.stamps_ns.tolist() == [10**9, 2 * 10**9]
@@ -102,15 +122,23 @@ def test_several_identities_share_and_none_is_none(tmp_path):
 # ---- the recorded runs
 
 
-@pytest.fixture(scope="module", params=[pytest.param("dlr", marks=pytest.mark.recording), "park"])
+@pytest.fixture(
+    scope="module", params=[pytest.param("dlr", marks=pytest.mark.recording), "park"]
+)
 def recorded(request):
     """Name, lines of the file, and sequence."""
     is_dlr = request.param == "dlr"
     path = Path(gtsam.findExampleDataFile("victoria_park.txt"))
     if is_dlr:
-        path = next(request.getfixturevalue("unpacked")("dlr.tar.xz").rglob("map.circles"))
+        path = next(
+            request.getfixturevalue("unpacked")("dlr.tar.xz").rglob("map.circles")
+        )
     lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
-    return request.param, lines, read_dlr(path.parent) if is_dlr else read_victoria_park()
+    return (
+        request.param,
+        lines,
+        read_dlr(path.parent) if is_dlr else read_victoria_park(),
+    )
 
 
 def test_chain_of_relative_poses_is_the_composition_of_the_files_steps(recorded):
@@ -118,25 +146,50 @@ def test_chain_of_relative_poses_is_the_composition_of_the_files_steps(recorded)
     name, lines, sequence = recorded
     kind, column, body_R_file = ("ODOMETRY", 3, np.eye(3))
     if name == "dlr":
-        kind, column, body_R_file = "STEP", 2, np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, 1]])
-    steps = [gtsam.Pose2(*map(float, line[column : column + 3])).matrix() for line in lines if line[0] == kind]
+        kind, column, body_R_file = (
+            "STEP",
+            2,
+            np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, 1]]),
+        )
+    steps = [
+        gtsam.Pose2(*map(float, line[column : column + 3])).matrix()
+        for line in lines
+        if line[0] == kind
+    ]
     got = chain(hold_past_motions(sequence))
     assert len(got) == {"dlr": 3298, "park": 6969}[name]
     assert np.abs(got - body_R_file @ chain(steps) @ body_R_file).max() < 1e-9
-    chords = np.column_stack([sequence.dvl.velocity[1:, :2], sequence.imu.angular_velocity[1:, 2]])
-    assert np.abs(got - chain([gtsam.Pose2(*chord).matrix() for chord in chords])).max() > 0.05
+    chords = np.column_stack(
+        [sequence.dvl.velocity[1:, :2], sequence.imu.angular_velocity[1:, 2]]
+    )
+    assert (
+        np.abs(got - chain([gtsam.Pose2(*chord).matrix() for chord in chords])).max()
+        > 0.05
+    )
 
 
 def test_a_landmark_stays_where_it_is_from_pose_to_pose(recorded):
     """Predicted to the next pose, as it is and mirrored; in the office where the robot turns."""
     name, _, sequence = recorded
-    least_turn_rad, count, most_m = (0.05, 4000, 0.05) if name == "dlr" else (-1, 500, 0.5)
+    least_turn_rad, count, most_m = (
+        (0.05, 4000, 0.05) if name == "dlr" else (-1, 500, 0.5)
+    )
     motions, d = hold_past_motions(sequence), sequence.detections
     medians = []
     for azimuth_rad in (d.azimuth_rad, -d.azimuth_rad):
-        points = np.column_stack([d.range_m * np.cos(azimuth_rad), d.range_m * np.sin(azimuth_rad), np.ones(len(d))])
-        at = zip((d.stamps_ns // 10**9).tolist(), d.most_probable()[0].tolist(), strict=True)
-        seen = {(k, i): point for (k, i), point in zip(at, points, strict=True) if i >= 0}
+        points = np.column_stack(
+            [
+                d.range_m * np.cos(azimuth_rad),
+                d.range_m * np.sin(azimuth_rad),
+                np.ones(len(d)),
+            ]
+        )
+        at = zip(
+            (d.stamps_ns // 10**9).tolist(), d.most_probable()[0].tolist(), strict=True
+        )
+        seen = {
+            (k, i): point for (k, i), point in zip(at, points, strict=True) if i >= 0
+        }
         moved = [
             np.linalg.norm(np.linalg.solve(motions[k], point) - seen[k + 1, i])
             for (k, i), point in seen.items()
@@ -160,10 +213,16 @@ def test_detections_are_the_files(recorded):
     seen = [line for line in lines if line[0] == "LANDMARK"]
     assert len(d) == len(seen) == 3640
     points = np.array([line[3:5] for line in seen], dtype=float)
-    assert np.allclose(d.range_m[:, None] * np.column_stack([np.cos(d.azimuth_rad), np.sin(d.azimuth_rad)]), points)
+    assert np.allclose(
+        d.range_m[:, None]
+        * np.column_stack([np.cos(d.azimuth_rad), np.sin(d.azimuth_rad)]),
+        points,
+    )
     assert ids.tolist() == [int(line[2]) for line in seen]
     assert (probability == 1).all()
-    edges_before = np.cumsum([line[0] == "ODOMETRY" for line in lines])[[line[0] == "LANDMARK" for line in lines]]
+    edges_before = np.cumsum([line[0] == "ODOMETRY" for line in lines])[
+        [line[0] == "LANDMARK" for line in lines]
+    ]
     assert (d.stamps_ns // 10**9).tolist() == edges_before.tolist()
     # S = 0.4 I becomes diag(0.4, 0.4 / r²)
     expected = np.zeros((len(d), 2, 2))
@@ -171,7 +230,9 @@ def test_detections_are_the_files(recorded):
     assert np.allclose(d.range_azimuth_cov, expected, rtol=1e-12, atol=1e-12)
     imu = sequence.calibration.imu
     assert (imu.gyro_noise_density, imu.gyro_bias_sigma) == pytest.approx((2e-3, 0))
-    assert np.allclose(sequence.dvl.velocity_cov[5, :2, :2], np.diag([1e-4, 4e-6]), rtol=0, atol=1e-8)
+    assert np.allclose(
+        sequence.dvl.velocity_cov[5, :2, :2], np.diag([1e-4, 4e-6]), rtol=0, atol=1e-8
+    )
     assert sequence.calibration.odometry_interpolation == "hold-past"
 
 
@@ -184,13 +245,30 @@ NS = 10**9
 @pytest.fixture
 def folder(tmp_path):
     def write(name, rows):
-        (tmp_path / name).write_text("# Data Format:\n" + "".join(" \t ".join(map(str, row)) + "\n" for row in rows))
+        (tmp_path / name).write_text(
+            "# Data Format:\n"
+            + "".join(" \t ".join(map(str, row)) + "\n" for row in rows)
+        )
 
     write("Barcodes.dat", [(1, 5), (2, 14), (6, 63), (20, 25)])
-    write("Landmark_Groundtruth.dat", [(20, 1.5, -2.5, 0.001, 0.002), (6, 3.0, 4.0, 0.003, 0.004)])
-    write("Robot1_Odometry.dat", [(f"{T0}.100", 0.1, 0.0), (f"{T0}.300", 0.2, 0.5), (f"{T0}.400", 0.0, 0.0)])
-    write("Robot1_Groundtruth.dat", [(f"{T0}.000", 1, 2, 3.0), (f"{T0}.200", 3, 2, -3.0), (f"{T0}.200", 9, 9, 0)])
-    seen = [(".250", 25, 2.0, 0.1), (".250", 14, 2.0, 0.1), (".120", 63, 1.0, -0.2), (".350", 99, 1, 0)]
+    write(
+        "Landmark_Groundtruth.dat",
+        [(20, 1.5, -2.5, 0.001, 0.002), (6, 3.0, 4.0, 0.003, 0.004)],
+    )
+    write(
+        "Robot1_Odometry.dat",
+        [(f"{T0}.100", 0.1, 0.0), (f"{T0}.300", 0.2, 0.5), (f"{T0}.400", 0.0, 0.0)],
+    )
+    write(
+        "Robot1_Groundtruth.dat",
+        [(f"{T0}.000", 1, 2, 3.0), (f"{T0}.200", 3, 2, -3.0), (f"{T0}.200", 9, 9, 0)],
+    )
+    seen = [
+        (".250", 25, 2.0, 0.1),
+        (".250", 14, 2.0, 0.1),
+        (".120", 63, 1.0, -0.2),
+        (".350", 99, 1, 0),
+    ]
     write("Robot1_Measurement.dat", [(f"{T0}{time}", *row) for time, *row in seen])
     return tmp_path
 
@@ -206,23 +284,32 @@ def test_a_command_holds_from_its_stamp_to_the_next_and_so_does_its_noise(folder
     assert sequence.calibration.odometry_interpolation == "hold-past"
     # slip grows with time: the distance has variance sum(var * dt²) = q² T however T is divided
     dt = np.diff(sequence.dvl.stamps_ns) * 1e-9
-    assert np.sum(sequence.dvl.velocity_cov[1:, 0, 0] * dt**2) == pytest.approx(0.02**2 * dt.sum())
+    assert np.sum(sequence.dvl.velocity_cov[1:, 0, 0] * dt**2) == pytest.approx(
+        0.02**2 * dt.sum()
+    )
 
 
 def test_of_commands_with_one_stamp_the_last_holds(folder):
-    (folder / "Robot1_Odometry.dat").write_text(f"{T0}.1 0.1 0\n{T0}.2 0.9 0.9\n{T0}.2 0.3 0.4\n{T0}.3 0 0\n")
+    (folder / "Robot1_Odometry.dat").write_text(
+        f"{T0}.1 0.1 0\n{T0}.2 0.9 0.9\n{T0}.2 0.3 0.4\n{T0}.3 0 0\n"
+    )
     sequence = read_mrclam(folder, 1)
     assert sequence.dvl.velocity[:, 0].tolist() == [0.1, 0.1, 0.3]
     assert sequence.imu.angular_velocity[:, 2].tolist() == [0.0, 0.0, 0.4]
 
 
-def test_times_subjects_and_coordinates_stay_the_data_sets_own_and_robots_are_left_out(folder):
+def test_times_subjects_and_coordinates_stay_the_data_sets_own_and_robots_are_left_out(
+    folder,
+):
     sequence = read_mrclam(folder, 1)
     stamps = [T0 * NS + 100_000_000, T0 * NS + 300_000_000, T0 * NS + 400_000_000]
     assert sequence.imu.stamps_ns.tolist() == sequence.dvl.stamps_ns.tolist() == stamps
     d, landmarks = sequence.detections, sequence.true_landmarks
     assert d.stamps_ns.tolist() == [T0 * NS + 120_000_000, T0 * NS + 250_000_000]
-    assert (d.candidate_ids.tolist(), d.id_probability.tolist()) == ([[6], [20]], [[1], [1]])
+    assert (d.candidate_ids.tolist(), d.id_probability.tolist()) == (
+        [[6], [20]],
+        [[1], [1]],
+    )
     assert (d.range_m.tolist(), d.azimuth_rad.tolist()) == ([1.0, 2.0], [-0.2, 0.1])
     assert np.isnan(d.range_azimuth_cov).all()
     assert "1 of other robots, 1 with unknown" in sequence.notes["detections"]
@@ -243,7 +330,8 @@ def test_start_is_the_truth_at_the_first_command_across_the_wrap(folder):
 
 def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder):
     (folder / "Robot1_Groundtruth.dat").write_text(f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n")
-    (folder / "Robot1_Measurement.dat").write_text(f"{T0}.2 14 1 0\n")  # of another robot
+    # of another robot
+    (folder / "Robot1_Measurement.dat").write_text(f"{T0}.2 14 1 0\n")
     late = read_mrclam(folder, 1)
     assert (len(late.truth), late.detections) == (2, None)
     assert "origin" in late.notes["start"]
@@ -252,7 +340,11 @@ def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder
     assert never.truth is None
     assert never.true_landmarks is not None
     assert "no robot truth" in never.notes["truth"]
-    assert late.calibration.start.position_m == never.calibration.start.position_m == (0.0, 0.0, 0.0)
+    assert (
+        late.calibration.start.position_m
+        == never.calibration.start.position_m
+        == (0.0, 0.0, 0.0)
+    )
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3, 4, 5])
@@ -266,16 +358,22 @@ class TestSet6:
     """Against motion capture; bounds from docs/theory/datasets.md, with room."""
 
     def test_detections_point_at_the_true_landmarks(self, sequence):
-        assert set(sequence.detections.candidate_ids[:, 0].tolist()) <= set(range(6, 21))
+        assert set(sequence.detections.candidate_ids[:, 0].tolist()) <= set(
+            range(6, 21)
+        )
         assert sequence.true_landmarks.ids.tolist() == list(range(6, 21))
         assert T0 - 20 < sequence.start_ns / NS < T0 + 20
         d, truth = sequence.detections, sequence.truth
-        d = d.rows((d.stamps_ns >= truth.stamps_ns[0]) & (d.stamps_ns <= truth.stamps_ns[-1]))
+        d = d.rows(
+            (d.stamps_ns >= truth.stamps_ns[0]) & (d.stamps_ns <= truth.stamps_ns[-1])
+        )
         stamps, frame = np.unique(d.stamps_ns, return_inverse=True)
         frames = truth.at(stamps)
         world_R_body, position = frames.rotations()[frame], frames.positions[frame]
         where = np.searchsorted(sequence.true_landmarks.ids, d.candidate_ids[:, 0])
-        offset = world_R_body.inv().apply(sequence.true_landmarks.positions[where] - position)
+        offset = world_R_body.inv().apply(
+            sequence.true_landmarks.positions[where] - position
+        )
         azimuth = np.arctan2(offset[:, 1], offset[:, 0])
         assert np.median(np.abs(d.range_m - np.hypot(*offset[:, :2].T))) < 0.15
         assert np.median(np.abs(wrapped(d.azimuth_rad - azimuth))) < 0.02
@@ -293,7 +391,9 @@ class TestSet6:
     def test_turns_err_by_the_calibrated_noise(self, sequence):
         imu = sequence.calibration.imu
         for seconds in (1, 5):
-            predicted = np.hypot(imu.gyro_noise_density * np.sqrt(seconds), imu.gyro_bias_sigma * seconds)
+            predicted = np.hypot(
+                imu.gyro_noise_density * np.sqrt(seconds), imu.gyro_bias_sigma * seconds
+            )
             error = turn_error(sequence, sequence.imu.angular_velocity[1:, 2], seconds)
             assert 0.5 < error / predicted < 1.5
 
@@ -302,10 +402,16 @@ def turn_error(sequence, rates, seconds=1):
     """RMS of measured minus true heading change over windows that begin each half second."""
     stamps, truth = sequence.imu.stamps_ns, sequence.truth
     heading = np.concatenate([[0.0], np.cumsum(rates * np.diff(stamps) * 1e-9)])
-    begin = np.arange(stamps[0] + NS, min(stamps[-1], truth.stamps_ns[-1]) - (seconds + 1) * NS, NS // 2)
+    begin = np.arange(
+        stamps[0] + NS,
+        min(stamps[-1], truth.stamps_ns[-1]) - (seconds + 1) * NS,
+        NS // 2,
+    )
     end = begin + seconds * NS
     origin = stamps[0]
-    measured = np.interp(end - origin, stamps - origin, heading) - np.interp(begin - origin, stamps - origin, heading)
+    measured = np.interp(end - origin, stamps - origin, heading) - np.interp(
+        begin - origin, stamps - origin, heading
+    )
     yaw = [truth.at(t).rotations().as_euler("ZYX")[:, 0] for t in (begin, end)]
     return np.sqrt(np.mean(wrapped(measured - (yaw[1] - yaw[0])) ** 2))
 
@@ -337,17 +443,38 @@ def test_comments_and_blank_lines_are_passed_over(tmp_path):
 
 STEP, EDGE = f"STEP image 0 0 0 {COV} 1e-4\n", "ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n"
 IMU, DVL, GT = (f"Trajectory2/{kind}_trajectory2.csv" for kind in ("IMU", "DVL", "GT"))
-AKIT = {IMU: "h\n0,1,2,3,4,5,6\n", DVL: "h\n0,1,2,3\n", GT: "h\n" + "0,1,0.5,0,0,0,0,0,0,0\n" * 3}
+AKIT = {
+    IMU: "h\n0,1,2,3,4,5,6\n",
+    DVL: "h\n0,1,2,3\n",
+    GT: "h\n" + "0,1,0.5,0,0,0,0,0,0,0\n" * 3,
+}
 ODOMETRY, SEEN, BARCODES, MARKS = (
-    f"{name}.dat" for name in ("Robot1_Odometry", "Robot1_Measurement", "Barcodes", "Landmark_Groundtruth")
+    f"{name}.dat"
+    for name in (
+        "Robot1_Odometry",
+        "Robot1_Measurement",
+        "Barcodes",
+        "Landmark_Groundtruth",
+    )
 )
-MRCLAM = {ODOMETRY: "1 0 0\n", "Robot3_Odometry.dat": "1 0 0\n", SEEN: "1 63 1 0\n", BARCODES: "6 63\n"}
+MRCLAM = {
+    ODOMETRY: "1 0 0\n",
+    "Robot3_Odometry.dat": "1 0 0\n",
+    SEEN: "1 63 1 0\n",
+    BARCODES: "6 63\n",
+}
 MRCLAM |= {MARKS: "6 1 1 0 0\n"}
 READERS = {
-    "table": (lambda folder: read_table(folder / "bad.dat", ("time", "value")), {"bad.dat": "1 2\n"}),
+    "table": (
+        lambda folder: read_table(folder / "bad.dat", ("time", "value")),
+        {"bad.dat": "1 2\n"},
+    ),
     "dlr": (lambda folder: read_dlr(folder / "map.circles"), {"map.circles": STEP}),
     "dlr folder": (read_dlr, {}),
-    "park": (lambda folder: read_victoria_park(folder / "park.txt"), {"park.txt": EDGE}),
+    "park": (
+        lambda folder: read_victoria_park(folder / "park.txt"),
+        {"park.txt": EDGE},
+    ),
     "akit": (lambda folder: read_akit(folder, 2), AKIT),
     "akit 5": (lambda folder: read_akit(folder, 5), AKIT),
     "akit absent": (lambda folder: read_akit(folder / "absent", 1), AKIT),
@@ -355,7 +482,10 @@ READERS = {
     "mrclam": (lambda folder: read_mrclam(folder, 1), MRCLAM),
     "mrclam 7": (lambda folder: read_mrclam(folder, 7), MRCLAM),
     "mrclam absent": (lambda folder: read_mrclam(folder / "absent", 1), MRCLAM),
-    "mrclam inside": (lambda folder: read_mrclam(folder / "empty", 1), MRCLAM | {"empty/a": ""}),
+    "mrclam inside": (
+        lambda folder: read_mrclam(folder / "empty", 1),
+        MRCLAM | {"empty/a": ""},
+    ),
 }
 
 
@@ -369,47 +499,103 @@ def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
 @pytest.mark.parametrize(
     ("reader", "changed", "fragments"),
     [
-        ("table", {"bad.dat": None}, ("bad.dat", "No such file", "rows of time, value")),
-        ("table", {"bad.dat": "\xff\xfe\x00\x81"}, ("bad.dat", "cannot be read as text")),
+        (
+            "table",
+            {"bad.dat": None},
+            ("bad.dat", "No such file", "rows of time, value"),
+        ),
+        (
+            "table",
+            {"bad.dat": "\xff\xfe\x00\x81"},
+            ("bad.dat", "cannot be read as text"),
+        ),
         ("table", {"bad.dat": ""}, ("bad.dat", "holds no data", "time, value")),
         ("table", {"bad.dat": "# only a comment\n"}, ("bad.dat", "holds no data")),
-        ("table", {"bad.dat": "1 2\n\n1\n"}, ("bad.dat", "line 3", "1 fields", "2 numbers: time, value")),
+        (
+            "table",
+            {"bad.dat": "1 2\n\n1\n"},
+            ("bad.dat", "line 3", "1 fields", "2 numbers: time, value"),
+        ),
         ("table", {"bad.dat": "1 2\n1 two\n"}, ("bad.dat", "line 2", "two")),
         ("table", {"bad.dat": "1 nan\n"}, ("bad.dat", "line 1", "not finite")),
         ("dlr", {"map.circles": ""}, ("map.circles", "holds no data", "STEP")),
-        ("dlr", {"map.circles": "#\nLANDMARK_C 0 1 1 1 0 1 4"}, ("map.circles", "line 2", "before the first STEP")),
-        ("dlr", {"map.circles": "#\nSTEP image 1 2"}, ("line 2", "2 fields", "9 numbers")),
-        ("dlr", {"map.circles": STEP + "LANDMARK_C 0 1 1 1 0 1"}, ("line 2", "no landmark ID")),
-        ("dlr", {"map.circles": STEP + "LANDMARK_C 0 1 1 1 0 1 4.5"}, ("line 2", "4.5", "whole numbers")),
+        (
+            "dlr",
+            {"map.circles": "#\nLANDMARK_C 0 1 1 1 0 1 4"},
+            ("map.circles", "line 2", "before the first STEP"),
+        ),
+        (
+            "dlr",
+            {"map.circles": "#\nSTEP image 1 2"},
+            ("line 2", "2 fields", "9 numbers"),
+        ),
+        (
+            "dlr",
+            {"map.circles": STEP + "LANDMARK_C 0 1 1 1 0 1"},
+            ("line 2", "no landmark ID"),
+        ),
+        (
+            "dlr",
+            {"map.circles": STEP + "LANDMARK_C 0 1 1 1 0 1 4.5"},
+            ("line 2", "4.5", "whole numbers"),
+        ),
         ("dlr", {"map.circles": STEP + "CIRCLE 1"}, ("line 2", "CIRCLE")),
         ("dlr", {"map.circles": None}, ("map.circles", "No such file", "STEP")),
-        ("dlr folder", {}, ("map.circles", "STEP", "give the folder that does, or the file itself")),
+        (
+            "dlr folder",
+            {},
+            ("map.circles", "STEP", "give the folder that does, or the file itself"),
+        ),
         ("park", {"park.txt": ""}, ("park.txt", "holds no data", "ODOMETRY")),
         ("park", {"park.txt": EDGE + "EDGE 1 2"}, ("park.txt", "line 2", "EDGE")),
-        ("park", {"park.txt": EDGE + "ODOMETRY 1 2 1 0"}, ("line 2", "4 fields", "11 numbers")),
-        ("park", {"park.txt": EDGE + "ODOMETRY 0 2 1 0 0 1 0 0 1 0 1"}, ("line 2", "newest pose is 1")),
-        ("park", {"park.txt": EDGE + "LANDMARK 0 7 1 0 1 0 1"}, ("line 2", "newest pose is 1")),
+        (
+            "park",
+            {"park.txt": EDGE + "ODOMETRY 1 2 1 0"},
+            ("line 2", "4 fields", "11 numbers"),
+        ),
+        (
+            "park",
+            {"park.txt": EDGE + "ODOMETRY 0 2 1 0 0 1 0 0 1 0 1"},
+            ("line 2", "newest pose is 1"),
+        ),
+        (
+            "park",
+            {"park.txt": EDGE + "LANDMARK 0 7 1 0 1 0 1"},
+            ("line 2", "newest pose is 1"),
+        ),
         ("park", {"park.txt": "LANDMARK 0 7 1 0 1 0 1"}, ("no ODOMETRY",)),
-        ("akit", {DVL: "h\n0,1,2,3\n1,2,3\n"}, ("DVL_trajectory2.csv", "line 3", "DVL Z")),
+        (
+            "akit",
+            {DVL: "h\n0,1,2,3\n1,2,3\n"},
+            ("DVL_trajectory2.csv", "line 3", "DVL Z"),
+        ),
         ("akit", {GT: None}, ("GT_trajectory2.csv", "Longitude")),
         ("akit", {GT: "h\n0,1,0.5,0,0,0,0,0,0,0\n"}, ("fewer than two rows",)),
         ("akit 5", {}, ("no trajectory 5", "it has 2")),
         ("akit inside", {}, ("holds no TrajectoryN",)),
         ("akit absent", {}, ("absent", "not a folder")),
-        ("mrclam", {ODOMETRY: "1 0.1 0\n2 0.1\n"}, ("Robot1_Odometry.dat, line 2", "angular velocity")),
+        (
+            "mrclam",
+            {ODOMETRY: "1 0.1 0\n2 0.1\n"},
+            ("Robot1_Odometry.dat, line 2", "angular velocity"),
+        ),
         *(("mrclam", {name: None}, (name,)) for name in (SEEN, BARCODES, MARKS)),
         ("mrclam 7", {}, ("no robot 7", "1, 3")),
         ("mrclam inside", {}, ("RobotN_Odometry.dat", "Barcodes.dat")),
         ("mrclam absent", {}, ("absent", "not a folder")),
     ],
 )
-def test_a_bad_table_or_data_set_is_refused_by_file_and_line(tmp_path, reader, changed, fragments):
+def test_a_bad_table_or_data_set_is_refused_by_file_and_line(
+    tmp_path, reader, changed, fragments
+):
     read, files = READERS[reader]
     write(tmp_path, files | changed)
     with pytest.raises(DatasetError) as caught:
         read(tmp_path)
     assert "\n" not in str(caught.value)
-    assert [fragment for fragment in fragments if fragment not in str(caught.value)] == []
+    assert [
+        fragment for fragment in fragments if fragment not in str(caught.value)
+    ] == []
 
 
 def write(folder, files):

@@ -19,7 +19,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert import rosbag
-from sonar_graph.logs.convert.rosbag import convert_rosbag, limited_bz2, limited_lz4, limited_zstd
+from sonar_graph.logs.convert.rosbag import (
+    convert_rosbag,
+    limited_bz2,
+    limited_lz4,
+    limited_zstd,
+)
 from sonar_graph.logs.reading import read_log
 
 T0_NS = 1_447_550_804_242_631_687
@@ -29,24 +34,42 @@ STEP_NS = 20_000_001
 def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
     """Topic, type and message: IMU, a camera whose fields have other names in ROS 2, and a latched transform."""
     types = store.types
-    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    vector, quaternion = (
+        types["geometry_msgs/msg/Vector3"],
+        types["geometry_msgs/msg/Quaternion"],
+    )
     time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
 
     def head(row: int) -> Any:
         stamp = time(*divmod(T0_NS + row * STEP_NS, 10**9))
-        return header(seq=row, stamp=stamp, frame_id="imu") if ros1 else header(stamp=stamp, frame_id="imu")
+        return (
+            header(seq=row, stamp=stamp, frame_id="imu")
+            if ros1
+            else header(stamp=stamp, frame_id="imu")
+        )
 
     nine = np.arange(9.0)
     imu, fixed = "sensor_msgs/msg/Imu", (nine, vector(0, 0, 9.8), nine)
-    rows = [types[imu](head(row), quaternion(0, 0, 0, 1), nine, vector(row, 2, 3), *fixed) for row in range(5)]
+    rows = [
+        types[imu](head(row), quaternion(0, 0, 0, 1), nine, vector(row, 2, 3), *fixed)
+        for row in range(5)
+    ]
     found = [("/imu", imu, row) for row in rows]
     move = types["geometry_msgs/msg/Transform"](vector(1, 2, 3), quaternion(0, 0, 0, 1))
     link = types["geometry_msgs/msg/TransformStamped"](head(0), "imu", move)
-    found.append(("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"]([link])))
+    found.append(
+        (
+            "/tf_static",
+            "tf2_msgs/msg/TFMessage",
+            types["tf2_msgs/msg/TFMessage"]([link]),
+        )
+    )
     if ros1:
         roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
         matrices = np.array([0.5]), np.arange(9.0), np.arange(9.0), np.arange(12.0)
-        camera = types["sensor_msgs/msg/CameraInfo"](head(0), 480, 640, "plumb_bob", *matrices, 1, 1, roi)
+        camera = types["sensor_msgs/msg/CameraInfo"](
+            head(0), 480, 640, "plumb_bob", *matrices, 1, 1, roi
+        )
         found.append(("/camera", "sensor_msgs/msg/CameraInfo", camera))
     return found
 
@@ -59,15 +82,23 @@ def write_bag(writer: Any, store: Any, entries: list[tuple[str, str, Any]]) -> N
     with writer:
         for row, (topic, kind, message) in enumerate(entries):
             if topic not in connections:
-                latched = {"latching": 1 if topic == "/tf_static" else None} if ros1 else {}
-                connections[topic] = writer.add_connection(topic, kind, typestore=store, **latched)
+                latched = (
+                    {"latching": 1 if topic == "/tf_static" else None} if ros1 else {}
+                )
+                connections[topic] = writer.add_connection(
+                    topic, kind, typestore=store, **latched
+                )
             raw = message if isinstance(message, bytes) else serialize(message, kind)
             writer.write(connections[topic], T0_NS + row * STEP_NS, raw)
 
 
 def ros1_store() -> Any:
     store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
+    store.register(
+        get_types_from_msg(
+            "geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"
+        )
+    )
     return store
 
 
@@ -78,19 +109,27 @@ def ros1_bag(tmp_path: Path) -> Path:
     return tmp_path / "old.bag"
 
 
-def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(ros1_bag, tmp_path, decoded):
+def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(
+    ros1_bag, tmp_path, decoded
+):
     told = []
-    done = convert_rosbag(ros1_bag, tmp_path / "new.mcap", lambda at, total: told.append((at, total)))
+    done = convert_rosbag(
+        ros1_bag, tmp_path / "new.mcap", lambda at, total: told.append((at, total))
+    )
     assert (done.topics, done.messages, done.left_out) == (3, 7, {})
     assert told
     assert all(total == 7 and at <= total for at, total in told)
     found = decoded(tmp_path / "new.mcap")
-    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in found["/imu"]]
+    stamps = [
+        m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in found["/imu"]
+    ]
     assert stamps == [T0_NS + row * STEP_NS for row in range(5)]
     assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
     with (tmp_path / "new.mcap").open("rb") as stream:
         reader = make_reader(stream)
-        assert [message.log_time for _, _, message in reader.iter_messages(topics=["/imu"])] == stamps
+        assert [
+            message.log_time for _, _, message in reader.iter_messages(topics=["/imu"])
+        ] == stamps
         summary = reader.get_summary()
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     texts = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
@@ -98,7 +137,10 @@ def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(ros
     assert "seq" not in texts["sensor_msgs/msg/Imu"]
     assert "float64[] d\n" in texts["sensor_msgs/msg/CameraInfo"]
     assert found["/camera"][0].k == list(range(9))
-    assert metadata["rosbag"]["/imu"] == "sensor_msgs/Imu 6a62c6daae103f4ff57a132d6f95cec2"  # as rosmsg md5 prints it
+    # as rosmsg md5 prints it
+    assert (
+        metadata["rosbag"]["/imu"] == "sensor_msgs/Imu 6a62c6daae103f4ff57a132d6f95cec2"
+    )
     assert "durability: 1" in offers["/tf_static"]["offered_qos_profiles"]
     assert offers["/imu"] == {}
 
@@ -134,11 +176,17 @@ def test_what_unpacks_to_more_than_the_limit_is_refused_with_limit_and_remedy(
     store, folder = get_typestore(Stores.ROS2_JAZZY), tmp_path / "bag"
     writer = Ros2Writer(folder, version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
-    write_bag(writer, store, [("/a", "std_msgs/msg/String", store.types["std_msgs/msg/String"]("a" * size))])
+    write_bag(
+        writer,
+        store,
+        [("/a", "std_msgs/msg/String", store.types["std_msgs/msg/String"]("a" * size))],
+    )
     if is_read:
         assert convert_rosbag(folder, tmp_path / "new.mcap").messages == 1
         return
-    remedy = "unpack it with `zstd -d`" if mode == Compression.FILE else "`ros2 bag convert`"
+    remedy = (
+        "unpack it with `zstd -d`" if mode == Compression.FILE else "`ros2 bag convert`"
+    )
     with pytest.raises(LogError, match=rf"{limit}.*{remedy}"):
         convert_rosbag(folder, tmp_path / "new.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["bag"]
@@ -147,7 +195,9 @@ def test_what_unpacks_to_more_than_the_limit_is_refused_with_limit_and_remedy(
 def test_an_unpacked_file_alone_is_read(tmp_path, decoded):
     """As the advice about files that are too large says."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    writer = Ros2Writer(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3)
+    writer = Ros2Writer(
+        tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3
+    )
     write_bag(writer, store, messages(store, ros1=False))
     (database,) = (tmp_path / "ros2").glob("*.db3")
     database = database.rename(tmp_path / "alone.db3")
@@ -156,7 +206,11 @@ def test_an_unpacked_file_alone_is_read(tmp_path, decoded):
 
 @pytest.mark.parametrize("unpack", [limited_bz2, limited_lz4, limited_zstd])
 def test_a_chunk_that_is_cut_off_is_no_chunk(unpack):
-    pack = {limited_bz2: bz2.compress, limited_lz4: lz4.frame.compress, limited_zstd: zstandard.compress}[unpack]
+    pack = {
+        limited_bz2: bz2.compress,
+        limited_lz4: lz4.frame.compress,
+        limited_zstd: zstandard.compress,
+    }[unpack]
     content = np.random.default_rng(0).bytes(300_000)
     packed = pack(content)
     assert unpack(packed) == content
@@ -174,11 +228,21 @@ def test_a_pipe_in_the_place_of_a_bag_or_in_it_is_refused(tmp_path, name):
         convert_rosbag(source, tmp_path / "new.mcap")
 
 
-def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_told(tmp_path, decoded):
+def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_told(
+    tmp_path, decoded
+):
     store = ros1_store()
-    store.register(get_types_from_msg("Header header\nfloat64[4] velocity\n", "provider_dvl/msg/Packet"))
-    message = store.types["provider_dvl/msg/Packet"](messages(store, ros1=True)[3][2].header, np.arange(4.0))
-    entries = [("/dvl", "provider_dvl/msg/Packet", content) for content in (message, b"cut")]
+    store.register(
+        get_types_from_msg(
+            "Header header\nfloat64[4] velocity\n", "provider_dvl/msg/Packet"
+        )
+    )
+    message = store.types["provider_dvl/msg/Packet"](
+        messages(store, ros1=True)[3][2].header, np.arange(4.0)
+    )
+    entries = [
+        ("/dvl", "provider_dvl/msg/Packet", content) for content in (message, b"cut")
+    ]
     write_bag(Ros1Writer(tmp_path / "own.bag"), store, entries)
     done = convert_rosbag(tmp_path / "own.bag", tmp_path / "own.mcap")
     assert done.shortcomings() == ["left out: /dvl: 1 messages are not of their type"]
@@ -187,22 +251,54 @@ def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_t
     assert found.header.stamp.nanosec == (T0_NS + 3 * STEP_NS) % 10**9
 
 
-def test_without_the_library_the_command_that_installs_it_is_named(ros1_bag, tmp_path, monkeypatch):
+def test_without_the_library_the_command_that_installs_it_is_named(
+    ros1_bag, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(LogError, match=r"not installed: pip install 'sonar-graph\[rosbag\]'"):
+    with pytest.raises(
+        LogError, match=r"not installed: pip install 'sonar-graph\[rosbag\]'"
+    ):
         convert_rosbag(ros1_bag, tmp_path / "new.mcap")
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("broken.bag", b"#ROSBAG V2.0\nnonsense", r"broken\.bag cannot be read as a bag.*rosbag reindex"),
-        ("alone.db3", b"SQLite format 3\0", r"alone\.db3 cannot be read as a bag.*give the folder"),
-        ("text.txt", b"hello", r"text\.txt is no bag but a text that begins with 'hello'; give a ROS 1 \.bag"),
-        ("empty.bag", b"", r"empty\.bag is no bag but empty: copy it again.*wrote anything$"),
-        ("zeros.bag", bytes(99), r"zeros\.bag is no bag but zeros: copy it again.*wrote anything$"),
-        ("a.mcap", b"\x89MCAP0\r\n", r"a\.mcap is already an MCAP file: .* `sonar-graph inspect .*a\.mcap`"),
-        ("a.bag", b"\x89MCAP0\r\n", r"a\.bag is already an MCAP file: read it directly"),
+        (
+            "broken.bag",
+            b"#ROSBAG V2.0\nnonsense",
+            r"broken\.bag cannot be read as a bag.*rosbag reindex",
+        ),
+        (
+            "alone.db3",
+            b"SQLite format 3\0",
+            r"alone\.db3 cannot be read as a bag.*give the folder",
+        ),
+        (
+            "text.txt",
+            b"hello",
+            r"text\.txt is no bag but a text that begins with 'hello'; give a ROS 1 \.bag",
+        ),
+        (
+            "empty.bag",
+            b"",
+            r"empty\.bag is no bag but empty: copy it again.*wrote anything$",
+        ),
+        (
+            "zeros.bag",
+            bytes(99),
+            r"zeros\.bag is no bag but zeros: copy it again.*wrote anything$",
+        ),
+        (
+            "a.mcap",
+            b"\x89MCAP0\r\n",
+            r"a\.mcap is already an MCAP file: .* `sonar-graph inspect .*a\.mcap`",
+        ),
+        (
+            "a.bag",
+            b"\x89MCAP0\r\n",
+            r"a\.bag is already an MCAP file: read it directly",
+        ),
     ],
 )
 def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path, name, content, message):
@@ -214,15 +310,21 @@ def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path, name, content, m
 
 @pytest.mark.recording
 @pytest.mark.parametrize("name", ["sonia_imu_dvl", "husky"])
-def test_real_bags_decode_to_what_the_library_reads(recordings, tmp_path, decoded, name):
+def test_real_bags_decode_to_what_the_library_reads(
+    recordings, tmp_path, decoded, name
+):
     source = recordings / "bags" / f"{name}.bag"
     convert_rosbag(source, tmp_path / "new.mcap")
     found = decoded(tmp_path / "new.mcap")
     with AnyReader([source]) as bag:
         expected: dict[str, list[Any]] = {}
         for connection, _, raw in bag.messages():
-            expected.setdefault(connection.topic, []).append(bag.deserialize(raw, connection.msgtype))
-    assert {topic: len(rows) for topic, rows in found.items()} == {t: len(rows) for t, rows in expected.items()}
+            expected.setdefault(connection.topic, []).append(
+                bag.deserialize(raw, connection.msgtype)
+            )
+    assert {topic: len(rows) for topic, rows in found.items()} == {
+        t: len(rows) for t, rows in expected.items()
+    }
     for ours, theirs in zip(found["/imu/data"], expected["/imu/data"], strict=True):
         assert ours.header.stamp.sec == theirs.header.stamp.sec
         assert ours.header.stamp.nanosec == theirs.header.stamp.nanosec
@@ -231,20 +333,33 @@ def test_real_bags_decode_to_what_the_library_reads(recordings, tmp_path, decode
 
 
 @pytest.mark.recording
-def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(recordings, tmp_path):
+def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
+    recordings, tmp_path
+):
     convert_rosbag(recordings / "bags" / "sonia_imu_dvl.bag", tmp_path / "new.mcap")
-    table = {"topic": "/provider_dvl_PD0Packet", "type": "provider_dvl/msg/PD0Packet", "stamp": "log"}
+    table = {
+        "topic": "/provider_dvl_PD0Packet",
+        "type": "provider_dvl/msg/PD0Packet",
+        "stamp": "log",
+    }
     table["velocity"] = [f"velocity[{i}]" for i in range(3)]  # type: ignore[assignment]
-    sequence = read_log(tmp_path / "new.mcap", config=LogConfig.parse({"dvl": table}, "x"))
+    sequence = read_log(
+        tmp_path / "new.mcap", config=LogConfig.parse({"dvl": table}, "x")
+    )
     assert len(sequence.imu) == 9377
     assert len(sequence.dvl) == 643
-    assert sequence.notes["log.dropped"] == "dvl: 1 with values that are not finite or beyond 1e15"
+    assert (
+        sequence.notes["log.dropped"]
+        == "dvl: 1 with values that are not finite or beyond 1e15"
+    )
     assert "log.warnings" not in sequence.notes
     assert np.linalg.norm(sequence.dvl.velocity, axis=1).max() < 1.5
 
 
 @pytest.mark.recording
-def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(recordings, tmp_path):
+def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(
+    recordings, tmp_path
+):
     convert_rosbag(recordings / "bags" / "husky.bag", tmp_path / "new.mcap")
     topics = {"dvl": "/husky_velocity_controller/odom"}
     plain = read_log(tmp_path / "new.mcap", topics=topics)

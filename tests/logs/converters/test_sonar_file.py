@@ -17,27 +17,48 @@ from sonar_graph.logs.convert.didson_aris import convert_didson
 from sonar_graph.logs.convert.sonar_file import ByteSource, Lost
 from sonar_graph.logs.sonar_images import read_sonar_frames
 
-from .sonar_recordings import START_NS, STEP_NS, Aris, Converted, Ddf, Oculus, converted, images, put
+from .sonar_recordings import (
+    START_NS,
+    STEP_NS,
+    Aris,
+    Converted,
+    Ddf,
+    Oculus,
+    converted,
+    images,
+    put,
+)
 
 COUNT, MIB = 7, 1 << 20
 EVERY = list(range(COUNT))
 PICTURES = images(COUNT, 48, 50)
-RECORDINGS = {"ddf": Ddf(PICTURES, high=0), "aris": Aris(PICTURES, mode=1), "raw": Oculus(PICTURES)}
+RECORDINGS = {
+    "ddf": Ddf(PICTURES, high=0),
+    "aris": Aris(PICTURES, mode=1),
+    "raw": Oculus(PICTURES),
+}
 PIECES = {ending: recording.pieces() for ending, recording in RECORDINGS.items()}
 SETTING_AT = {"ddf": 52, "aris": 476, "raw": 53 + 40 + 4 + 1 + 6}
 """A byte of something that ranges depend on: window start, delay, size of a bin."""
 CLOCK_AT = {"ddf": 40, "aris": 24, "raw": 53 + 40 + 3}
 """A byte of a frame's time, worth seconds for a DIDSON, hours for an ARIS, and tenths of one for an Oculus."""
 each_kind = pytest.mark.parametrize("ending", PIECES)
-in_one_folder = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+in_one_folder = settings(
+    max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 Frames = list[bytes]
 
 
 def which(result: Converted) -> list[int]:
     """Numbers of the frames that were read: each was recorded, to the last byte, and at this time after the first."""
     known = {picture.tobytes(): i for i, picture in enumerate(PICTURES)}
-    frames = sorted((stamp_ns, known[image.tobytes()]) for stamp_ns, image in result.by_stamp().items())
-    assert sum(len(block) for block in result.blocks) == len(frames) == result.done.frames
+    frames = sorted(
+        (stamp_ns, known[image.tobytes()])
+        for stamp_ns, image in result.by_stamp().items()
+    )
+    assert (
+        sum(len(block) for block in result.blocks) == len(frames) == result.done.frames
+    )
     return [number for _, number in frames]
 
 
@@ -46,7 +67,9 @@ def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
     content = b"".join(pieces)
     result = converted(folder, content, ending)
     lost = sum(loss.end - loss.at for loss in result.done.lost)
-    assert len(PIECES[ending][0]) + len(PIECES[ending][1]) * result.done.frames + lost == len(content)
+    assert len(PIECES[ending][0]) + len(
+        PIECES[ending][1]
+    ) * result.done.frames + lost == len(content)
     numbers = which(result)
     origins_ns = np.array(sorted(result.by_stamp())) - np.array(numbers) * STEP_NS
     assert np.unique(origins_ns).size == 1  # an Oculus counts from anywhere
@@ -58,7 +81,11 @@ def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
 
 def patched(frames: Frames, which_one: int, at: int, value: bytes) -> Frames:
     frame = frames[which_one]
-    return [*frames[:which_one], frame[:at] + value + frame[at + len(value) :], *frames[which_one + 1 :]]
+    return [
+        *frames[:which_one],
+        frame[:at] + value + frame[at + len(value) :],
+        *frames[which_one + 1 :],
+    ]
 
 
 def flipped(frames: Frames, which_one: int, at: int, bit: int) -> Frames:
@@ -110,11 +137,15 @@ ARIS_FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] =
        for i in (0, 2)},
 }
 # fmt: on
-CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [("aris", name) for name in ARIS_FAULTS]
+CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [
+    ("aris", name) for name in ARIS_FAULTS
+]
 
 
 @pytest.mark.parametrize(("ending", "name"), CASES)
-def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(tmp_path, ending, name):
+def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(
+    tmp_path, ending, name
+):
     damage, expected, told = (FAULTS | ARIS_FAULTS)[name]
     head, *frames = PIECES[ending]
     numbers, said = read(tmp_path, [head, *damage(frames, ending)], ending)
@@ -142,7 +173,11 @@ def test_of_a_cut_file_every_complete_frame_is_read(tmp_path, ending, part):
 
 @each_kind
 @in_one_folder
-@given(st.floats(0, 1, exclude_max=True), st.integers(1, 3000), st.one_of(st.none(), st.integers(0, 255)))
+@given(
+    st.floats(0, 1, exclude_max=True),
+    st.integers(1, 3000),
+    st.one_of(st.none(), st.integers(0, 255)),
+)
 def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_the_one_before(
     tmp_path, ending, part, count, fill
 ):
@@ -150,9 +185,13 @@ def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_th
     head, *frames = PIECES[ending]
     size, content = len(frames[0]), b"".join(frames)
     at = size + int(part * (COUNT - 3) * size)
-    foreign, last = (b"", at + count - 1) if fill is None else (bytes([fill]) * count, at)
+    foreign, last = (
+        (b"", at + count - 1) if fill is None else (bytes([fill]) * count, at)
+    )
     numbers, said = read(
-        tmp_path, [head, content[:at], foreign, content[at + (count if fill is None else 0) :]], ending
+        tmp_path,
+        [head, content[:at], foreign, content[at + (count if fill is None else 0) :]],
+        ending,
     )
     assert set(EVERY) - set(numbers) <= set(range(at // size - 1, last // size + 1))
     assert "bytes" in said
@@ -174,14 +213,19 @@ def test_a_clock_that_is_set_back_loses_nothing(tmp_path):
         frame = bytearray(frames[i])
         put(frame, 20, "Q", int.from_bytes(frame[20:28], "little") - 3_600_000_000)
         frames[i] = bytes(frame)
-    assert sorted(which(converted(tmp_path, b"".join([head, *frames]), "aris"))) == EVERY
+    assert (
+        sorted(which(converted(tmp_path, b"".join([head, *frames]), "aris"))) == EVERY
+    )
 
 
 @pytest.mark.parametrize("ending", ["ddf", "aris"])
 def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, ending):
     head, *frames = PIECES[ending]
     if ending == "aris":
-        assert which(converted(tmp_path, b"".join([b"\xff" * 1024, *frames]), ending)) == EVERY
+        assert (
+            which(converted(tmp_path, b"".join([b"\xff" * 1024, *frames]), ending))
+            == EVERY
+        )
     result = converted(tmp_path, b"".join([head[:300], *frames]), ending)
     assert which(result) == EVERY
     assert [loss.end for loss in result.done.lost] == [300]
@@ -213,14 +257,17 @@ def long_recording(path: Path, frames: int) -> Path:
     """Frames of 96 x 512 that differ in number and time only."""
     kind = Ddf(np.broadcast_to(np.zeros((1, 96, 512), np.uint8), (frames, 96, 512)))
     with path.open("wb") as stream:
-        stream.writelines(kind.frame(i) if i >= 0 else kind.file_header() for i in range(-1, frames))
+        stream.writelines(
+            kind.frame(i) if i >= 0 else kind.file_header() for i in range(-1, frames)
+        )
     return path
 
 
 def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_path):
     told: list[tuple[int, int]] = []
     log = tmp_path / "dive.mcap"
-    convert_didson(long_recording(tmp_path / "short.ddf", 200), log)  # imports and caches
+    # imports and caches
+    convert_didson(long_recording(tmp_path / "short.ddf", 200), log)
     source = long_recording(tmp_path / "dive.ddf", 800)
     size = source.stat().st_size
     tracemalloc.start()
@@ -236,13 +283,17 @@ def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_p
     assert np.sort(stamps_ns).tolist() == [START_NS + i * STEP_NS for i in range(800)]
 
 
-def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(tmp_path):
+def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(
+    tmp_path,
+):
     log, source = tmp_path / "dive.mcap", tmp_path / "dive.ddf"
     log.write_bytes(b"precious")
     with pytest.raises(DatasetError, match=r"dive\.ddf: cannot be read: No such file"):
         convert_didson(source, log)
     source.write_bytes(Ddf(images(1, 96, 64)).content()[:600])
-    with pytest.raises(DatasetError, match="no whole frame: bytes 512 to 599: a frame cut off"):
+    with pytest.raises(
+        DatasetError, match="no whole frame: bytes 512 to 599: a frame cut off"
+    ):
         convert_didson(source, log)
     assert log.read_bytes() == b"precious"
     assert sorted(tmp_path.iterdir()) == [source, log]
@@ -256,7 +307,12 @@ def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path):
     assert result.recording.metadata["sonar_graph"]["name"] == "dive"
     assert result.notes["source"] == "ARIS recording dive.aris"
     assert "sonar.shortcomings" not in result.notes
-    assert "cut off" in converted(tmp_path, b"".join(PIECES["aris"])[:-5], "aris").notes["sonar.shortcomings"]
+    assert (
+        "cut off"
+        in converted(tmp_path, b"".join(PIECES["aris"])[:-5], "aris").notes[
+            "sonar.shortcomings"
+        ]
+    )
 
 
 def run(*arguments: object, code: int = 0) -> str:
@@ -265,12 +321,17 @@ def run(*arguments: object, code: int = 0) -> str:
     return done.output
 
 
-@pytest.mark.parametrize(("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")])
+@pytest.mark.parametrize(
+    ("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")]
+)
 def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
     source, log = tmp_path / "dive.bin", tmp_path / "dive.mcap"
     source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
     said = run("convert", kind, source, "-o", log)
-    assert all(words in said for words in ("dive.bin: 3 frames, 0.2 s", "lost: bytes", "cut off"))
+    assert all(
+        words in said
+        for words in ("dive.bin: 3 frames, 0.2 s", "lost: bytes", "cut off")
+    )
     said = run("inspect", log, code=3)  # images alone are not usable for compare
     assert all(words in said for words in ("48 beams x 50 bins of uint8", "cut off"))
 
@@ -278,8 +339,12 @@ def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
 def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path):
     header, *frames = Ddf(images(50, 96, 512)).pieces()
     source, log = tmp_path / "dive.ddf", tmp_path / "dive.mcap"
-    source.write_bytes(header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames)))
+    source.write_bytes(
+        header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames))
+    )
     said = run("convert", "didson", source, "-o", log, "--sound-speed", 1500)
     assert said.count("lost: bytes") == 10
     assert "and 15 stretches more" in said
-    assert next(iter(read_sonar_frames(log))).ranges_m[-1] == pytest.approx((1.26 + 1.25) * 1500 / 1465, abs=0.002)
+    assert next(iter(read_sonar_frames(log))).ranges_m[-1] == pytest.approx(
+        (1.26 + 1.25) * 1500 / 1465, abs=0.002
+    )

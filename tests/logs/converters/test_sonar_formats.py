@@ -9,14 +9,32 @@ from sonar_graph.errors import DatasetError
 from sonar_graph.images import decibels
 from sonar_graph.logs.sonar_images import read_sonar_frames
 
-from .sonar_recordings import CONVERTERS, START_NS, STEP_NS, Aris, Ddf, Oculus, converted, images, log_of, no_ping, put
+from .sonar_recordings import (
+    CONVERTERS,
+    START_NS,
+    STEP_NS,
+    Aris,
+    Ddf,
+    Oculus,
+    converted,
+    images,
+    log_of,
+    no_ping,
+    put,
+)
 
 ARIS_BEAMS = {1: 48, 2: 48, 3: 96, 5: 96, 6: 64, 8: 64, 9: 128, 12: 128}
 WHOLE = [
-    *(Ddf(images(5, beams, 512), version=v, high=high) for v in (3, 4) for beams, high in ((96, 1), (48, 0))),
+    *(
+        Ddf(images(5, beams, 512), version=v, high=high)
+        for v in (3, 4)
+        for beams, high in ((96, 1), (48, 0))
+    ),
     Ddf(images(3, 48, 64), high=0, frame_version=b"5.26"),
     *(Aris(images(4, beams, 700), mode=mode) for mode, beams in ARIS_BEAMS.items()),
-    Aris(images(5, 48, 64), mode=1, sound_speeds=[1480.0, 1480.1, 1480.0, 1480.2, 1480.0]),  # it drifts
+    Aris(
+        images(5, 48, 64), mode=1, sound_speeds=[1480.0, 1480.1, 1480.0, 1480.2, 1480.0]
+    ),  # it drifts
     *(
         Oculus(images(4, beams, 40).astype(kind) * factor, version=version)
         for version in (0, 2)
@@ -26,14 +44,20 @@ WHOLE = [
 ]
 
 
-@pytest.mark.parametrize("recording", WHOLE, ids=lambda r: f"{type(r).__name__}-{r.frames.dtype}-{r.frames.shape[1]}")
+@pytest.mark.parametrize(
+    "recording",
+    WHOLE,
+    ids=lambda r: f"{type(r).__name__}-{r.frames.dtype}-{r.frames.shape[1]}",
+)
 def test_frames_are_read_as_they_were_recorded(tmp_path, recording):
     result = log_of(tmp_path, recording)
     known = result.by_stamp()
     first_ns = result.done.first_ns
     assert isinstance(recording, Oculus) or first_ns == START_NS
     for i, picture in enumerate(recording.frames):
-        image = known[min(known, key=lambda stamp_ns: abs(stamp_ns - first_ns - i * STEP_NS))]
+        image = known[
+            min(known, key=lambda stamp_ns: abs(stamp_ns - first_ns - i * STEP_NS))
+        ]
         np.testing.assert_array_equal(image, picture)
         assert image.dtype == picture.dtype
     assert len(known) == result.done.frames == len(recording.frames)
@@ -51,12 +75,20 @@ WINDOWS = [  # start and length code, other fields, first range and length in me
 # fmt: on
 
 
-@pytest.mark.parametrize(("start_code", "length_code", "others", "begin_m", "length_m"), WINDOWS)
-def test_window_codes_of_a_didson_are_metres_at_1465_m_s(tmp_path, start_code, length_code, others, begin_m, length_m):
+@pytest.mark.parametrize(
+    ("start_code", "length_code", "others", "begin_m", "length_m"), WINDOWS
+)
+def test_window_codes_of_a_didson_are_metres_at_1465_m_s(
+    tmp_path, start_code, length_code, others, begin_m, length_m
+):
     beams = 96 if others.get("high", 1) else 48
-    recording = Ddf(images(2, beams, 500), start_code=start_code, length_code=length_code, **others)
+    recording = Ddf(
+        images(2, beams, 500), start_code=start_code, length_code=length_code, **others
+    )
     expected = begin_m + length_m / 500 * (np.arange(500) + 0.5)
-    np.testing.assert_allclose(log_of(tmp_path, recording).frames.ranges_m, expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        log_of(tmp_path, recording).frames.ranges_m, expected, rtol=1e-6
+    )
     warm = log_of(tmp_path, recording, sound_speed_m_s=1500.0)
     np.testing.assert_allclose(warm.frames.ranges_m, expected * 1500 / 1465, rtol=1e-6)
     assert "1500 m/s" in warm.notes["sonar.ranges"]
@@ -64,9 +96,15 @@ def test_window_codes_of_a_didson_are_metres_at_1465_m_s(tmp_path, start_code, l
 
 def test_ranges_of_an_aris_are_half_the_way_of_sound(tmp_path):
     """Bin i is sampled from delay + i period to the next, and sound goes there and back."""
-    recording = Aris(images(2, 128, 600), delay_us=1700, period_us=5, sound_speed=1480.0)
+    recording = Aris(
+        images(2, 128, 600), delay_us=1700, period_us=5, sound_speed=1480.0
+    )
     ranges_m = log_of(tmp_path, recording).frames.ranges_m
-    np.testing.assert_allclose(ranges_m[[0, 599]], [(1700 + 2.5) * 740e-6, (1700 + 599 * 5 + 2.5) * 740e-6], rtol=1e-6)
+    np.testing.assert_allclose(
+        ranges_m[[0, 599]],
+        [(1700 + 2.5) * 740e-6, (1700 + 599 * 5 + 2.5) * 740e-6],
+        rtol=1e-6,
+    )
 
 
 MARKED = np.zeros((1, 96, 512), np.uint8)
@@ -80,17 +118,25 @@ MARKED[0, 0] = 255
         (Ddf(MARKED, reverse=1), 14.25, -14.26),
         (Aris(images(2, 128, 64), mode=9, system=1), -14.705, 14.705),
         (Aris(images(2, 48, 64), mode=1, system=2, telephoto=1), -6.742, 6.742),
-        (Aris(images(2, 128, 64), mode=9, system=1, telephoto=1), -7.0 * 127 / 128, 7.0 * 127 / 128),  # no table
+        (
+            Aris(images(2, 128, 64), mode=9, system=1, telephoto=1),
+            -7.0 * 127 / 128,
+            7.0 * 127 / 128,
+        ),  # no table
         (Oculus(images(2, 26, 8)), 65.0, -60.0),
     ],
 )
 def test_azimuths_are_positive_to_the_left(tmp_path, recording, first_deg, last_deg):
     frames = log_of(tmp_path, recording).frames
-    assert np.degrees(frames.azimuths_rad)[[0, -1]] == pytest.approx([first_deg, last_deg], abs=0.01)
+    assert np.degrees(frames.azimuths_rad)[[0, -1]] == pytest.approx(
+        [first_deg, last_deg], abs=0.01
+    )
     np.testing.assert_array_equal(frames.intensity, recording.frames)
     if isinstance(recording, Oculus):
         assert np.degrees(frames.azimuths_rad)[1] == pytest.approx(60.0)
-        np.testing.assert_allclose(frames.ranges_m, 0.003 * (np.arange(8) + 0.5), rtol=1e-6)
+        np.testing.assert_allclose(
+            frames.ranges_m, 0.003 * (np.arange(8) + 0.5), rtol=1e-6
+        )
 
 
 NAN_DEPTH = bytearray(Aris(images(3, 48, 64), mode=1).content())
@@ -104,34 +150,71 @@ DEPTHS = Ddf(images(3, 96, 64), readings={128: 2.5, 152: 90.0})
     [
         ("ddf", DEPTHS.content(), {"depth": "2.5 to 4.5", "time": "UTC"}),
         ("ddf", HEADINGS.content(), {"heading": "90 to 92", "pitch": None}),
-        ("aris", Aris(images(3, 48, 64), mode=1).content(), {"depth": "1.5 to 3.5", "compass heading": "88 to 90"}),
+        (
+            "aris",
+            Aris(images(3, 48, 64), mode=1).content(),
+            {"depth": "1.5 to 3.5", "compass heading": "88 to 90"},
+        ),
         ("aris", bytes(NAN_DEPTH), {"depth": "2.5 to 3.5", "time": "since 1970"}),
-        ("raw", Oculus(images(3, 16, 8), version=2).content(), {"heading": "45 to 47", "pitch": "3 to 3"}),
-        ("raw", Oculus(images(3, 16, 8), gamma_code=127).content(), {"scale": "0.498", "time": "switched on"}),
+        (
+            "raw",
+            Oculus(images(3, 16, 8), version=2).content(),
+            {"heading": "45 to 47", "pitch": "3 to 3"},
+        ),
+        (
+            "raw",
+            Oculus(images(3, 16, 8), gamma_code=127).content(),
+            {"scale": "0.498", "time": "switched on"},
+        ),
     ],
 )
-def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(tmp_path, ending, content, expected):
+def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(
+    tmp_path, ending, content, expected
+):
     """A reading that is always zero was not measured; those that are no numbers are left out."""
     notes = converted(tmp_path, content, ending).notes
     for name, words in expected.items():
-        assert words is None if f"sonar.{name}" not in notes else words is not None and words in notes[f"sonar.{name}"]
+        assert (
+            words is None
+            if f"sonar.{name}" not in notes
+            else words is not None and words in notes[f"sonar.{name}"]
+        )
 
 
 def test_the_log_says_the_scale_of_the_samples(tmp_path):
-    for recording, span_db in ((Ddf(images(1, 96, 64)), 90), (Aris(images(1, 128, 64)), 80)):
-        levels_db = decibels(np.array([0, 51, 255], np.uint8), log_of(tmp_path, recording).image)
+    for recording, span_db in (
+        (Ddf(images(1, 96, 64)), 90),
+        (Aris(images(1, 128, 64)), 80),
+    ):
+        levels_db = decibels(
+            np.array([0, 51, 255], np.uint8), log_of(tmp_path, recording).image
+        )
         np.testing.assert_allclose(levels_db, [0, 0.2 * span_db, span_db], rtol=1e-6)
-    for kind, code, full_scale, gamma in (("u1", 0, 255, 1), ("u2", 255, 65_535, 1), ("u1", 51, 255, 0.2)):
-        image = log_of(tmp_path, Oculus(images(1, 16, 8).astype(kind), gamma_code=code)).image
+    for kind, code, full_scale, gamma in (
+        ("u1", 0, 255, 1),
+        ("u2", 255, 65_535, 1),
+        ("u1", 51, 255, 0.2),
+    ):
+        image = log_of(
+            tmp_path, Oculus(images(1, 16, 8).astype(kind), gamma_code=code)
+        ).image
         assert (image.scale, image.full_scale) == ("linear", full_scale)
         assert image.gamma == pytest.approx(gamma, abs=1e-3)
 
 
-@pytest.mark.parametrize(("system", "high", "frequency_hz"), [(1, 1, 3e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)])
-def test_frequency_and_speed_of_sound_are_in_the_messages(tmp_path, decoded, system, high, frequency_hz):
+@pytest.mark.parametrize(
+    ("system", "high", "frequency_hz"),
+    [(1, 1, 3e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)],
+)
+def test_frequency_and_speed_of_sound_are_in_the_messages(
+    tmp_path, decoded, system, high, frequency_hz
+):
     log_of(tmp_path, Aris(images(1, 128, 64), system=system, high=high))
     ((message,),) = decoded(tmp_path / "dive.mcap").values()
-    assert (message.ping_info.frequency, message.ping_info.sound_speed) == pytest.approx((frequency_hz, 1482.5))
+    assert (
+        message.ping_info.frequency,
+        message.ping_info.sound_speed,
+    ) == pytest.approx((frequency_hz, 1482.5))
 
 
 # ---- damage of each kind
@@ -188,7 +271,9 @@ LOST_PINGS = [  # place in a ping, kind of number, number
 
 
 @pytest.mark.parametrize(("ending", "content", "words"), REFUSED)
-def test_other_files_and_headers_that_make_no_sense_are_refused_by_name(tmp_path, ending, content, words):
+def test_other_files_and_headers_that_make_no_sense_are_refused_by_name(
+    tmp_path, ending, content, words
+):
     path = tmp_path / "dive"
     path.write_bytes(content)
     with pytest.raises(DatasetError, match=re.escape(words or str(path))) as caught:
@@ -206,7 +291,9 @@ def test_a_ping_whose_header_makes_no_sense_is_lost(tmp_path, at, layout, value,
         pings[3] = pings[3][:at]
     else:
         put(broken, at, layout, value)
-    done = converted(tmp_path, b"".join([pings[0], bytes(broken), *pings[2:]]), "raw").done
+    done = converted(
+        tmp_path, b"".join([pings[0], bytes(broken), *pings[2:]]), "raw"
+    ).done
     assert done.frames == 3
     assert words in str(done.lost[0])
 
@@ -217,23 +304,36 @@ def test_a_ping_whose_header_makes_no_sense_is_lost(tmp_path, at, layout, value,
 def test_only_the_older_clock_wraps_around_and_time_goes_on_there(tmp_path):
     """It has 32 bits, and begins anew after 4.3 s: here between the first and the second ping."""
     for version in (0, 2):
-        stamps_ns = log_of(tmp_path, Oculus(images(60, 16, 8), version=version)).frames.stamps_ns
+        stamps_ns = log_of(
+            tmp_path, Oculus(images(60, 16, 8), version=version)
+        ).frames.stamps_ns
         np.testing.assert_allclose(np.diff(stamps_ns), STEP_NS, atol=1)
         assert stamps_ns[0] == pytest.approx(2**32 - 100_000_000, abs=1)
     first = Oculus(images(1, 16, 8), version=2, first_clock=10**12)
-    second = Oculus(images(1, 16, 8, seed=1), version=2, first_clock=10**12 + 10**10, first_number=501)
-    stamps_ns = converted(tmp_path, first.content() + second.content(), "raw").frames.stamps_ns
+    second = Oculus(
+        images(1, 16, 8, seed=1),
+        version=2,
+        first_clock=10**12 + 10**10,
+        first_number=501,
+    )
+    stamps_ns = converted(
+        tmp_path, first.content() + second.content(), "raw"
+    ).frames.stamps_ns
     assert stamps_ns.tolist() == [10**12, 10**12 + 10**10]
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2"])
 def test_gains_of_the_rows_are_taken_out(tmp_path, kind):
     pictures = images(3, 16, 4).astype(kind)
-    frames = log_of(tmp_path, Oculus(pictures, gains=np.array([1, 4, 9, 16], np.uint32))).frames
+    frames = log_of(
+        tmp_path, Oculus(pictures, gains=np.array([1, 4, 9, 16], np.uint32))
+    ).frames
     np.testing.assert_allclose(frames.intensity, pictures / [1, 2, 3, 4], rtol=1e-6)
 
 
-def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(tmp_path):
+def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(
+    tmp_path,
+):
     pictures = images(4, 16, 8)
     _, *pings = Oculus(pictures).pieces()
     note, huge = no_ping(b"SO" * 6), bytearray(no_ping())
@@ -241,45 +341,73 @@ def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only
     begin = len(note) + len(pings[0]) + len(note)
     for between, lost in (
         (note, []),
-        (bytes(len(note)), [f"bytes {begin} to {begin + len(note) - 1}: no message begins here"]),
-        (bytes(huge), [f"bytes {begin} to {begin + len(huge) - 1}: a message of kind 0x55, version 0"]),
+        (
+            bytes(len(note)),
+            [f"bytes {begin} to {begin + len(note) - 1}: no message begins here"],
+        ),
+        (
+            bytes(huge),
+            [
+                f"bytes {begin} to {begin + len(huge) - 1}: a message of kind 0x55, version 0"
+            ],
+        ),
     ):
-        result = converted(tmp_path, b"".join([note, pings[0], note, between, *pings[1:], note]), "raw")
+        result = converted(
+            tmp_path, b"".join([note, pings[0], note, between, *pings[1:], note]), "raw"
+        )
         np.testing.assert_array_equal(result.frames.intensity, pictures)
         assert [str(loss) for loss in result.done.lost] == lost
 
 
-def test_frames_that_were_not_recorded_are_counted_but_not_where_numbers_begin_anew(tmp_path):
+def test_frames_that_were_not_recorded_are_counted_but_not_where_numbers_begin_anew(
+    tmp_path,
+):
     _, *pings = Oculus(images(6, 16, 8)).pieces()
     done = converted(tmp_path, b"".join(pings[:2] + pings[4:]), "raw").done
     assert (done.frames, done.lost) == (4, [])
-    assert done.shortcomings() == ["missing: the numbers of 2 frames between the first and the last"]
+    assert done.shortcomings() == [
+        "missing: the numbers of 2 frames between the first and the last"
+    ]
     anew = Oculus(images(3, 16, 8, seed=1), first_number=7).pieces()
     assert converted(tmp_path, b"".join(pings[:3] + anew), "raw").done.missing == 0
     promised = log_of(tmp_path, Ddf(images(3, 48, 64), high=0, promised=5)).done
-    assert promised.shortcomings() == ["missing: 2 of 5 frames that the file's header names"]
+    assert promised.shortcomings() == [
+        "missing: 2 of 5 frames that the file's header names"
+    ]
 
 
 @pytest.mark.recording
-@pytest.mark.parametrize("name", ["sample.aris", "one_ping_8bit.raw", "three_pings_8bit.raw"])
+@pytest.mark.parametrize(
+    "name", ["sample.aris", "one_ping_8bit.raw", "three_pings_8bit.raw"]
+)
 def test_recordings_of_real_sonars_are_read_to_the_byte(recordings, tmp_path, name):
     source, is_aris = recordings / "sonar" / name, name.endswith("aris")
     done = CONVERTERS[name.split(".")[1]](source, tmp_path / "dive.mcap")
     (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
     bins, beams, head_bytes = (2000, 48, 1024) if is_aris else (703, 256, 2048)
-    content = np.fromfile(source, np.uint8)[1024 if is_aris else 0 :].reshape(len(frames), -1)[:, head_bytes:]
-    np.testing.assert_array_equal(frames.intensity, content.reshape(-1, bins, beams).transpose(0, 2, 1))
+    content = np.fromfile(source, np.uint8)[1024 if is_aris else 0 :].reshape(
+        len(frames), -1
+    )[:, head_bytes:]
+    np.testing.assert_array_equal(
+        frames.intensity, content.reshape(-1, bins, beams).transpose(0, 2, 1)
+    )
     assert done.shortcomings() == []
     edges_deg = np.degrees(frames.azimuths_rad)[[0, -1]]
     if is_aris:
         assert len(frames) == 6
-        assert frames.stamps_ns[0] == 1_371_198_080_759_456_000  # 2013-06-14, by the sonar
-        assert edges_deg == pytest.approx([-6.742, 6.742])  # an ARIS 1200 with telephoto lens
+        # 2013-06-14, by the sonar
+        assert frames.stamps_ns[0] == 1_371_198_080_759_456_000
+        # an ARIS 1200 with telephoto lens
+        assert edges_deg == pytest.approx([-6.742, 6.742])
         # the header also states 3.33 m and 20.3 m, for 1450 m/s; the water had 1435.93 m/s
         assert frames.ranges_m[0] == pytest.approx(3.3299 * 1435.93 / 1450, abs=0.006)
-        assert frames.ranges_m[-1] - frames.ranges_m[0] == pytest.approx(20.3 * 1435.93 / 1450, abs=0.02)
+        assert frames.ranges_m[-1] - frames.ranges_m[0] == pytest.approx(
+            20.3 * 1435.93 / 1450, abs=0.02
+        )
     else:
         assert len(frames) == (1 if "one" in name else 3)
         assert edges_deg == pytest.approx([30.0, -30.0])
         assert frames.ranges_m[-1] == pytest.approx(2.0, abs=0.005)
-        assert np.diff(frames.stamps_ns) == pytest.approx([62_502_130, 62_502_097][: len(frames) - 1])
+        assert np.diff(frames.stamps_ns) == pytest.approx(
+            [62_502_130, 62_502_097][: len(frames) - 1]
+        )

@@ -17,17 +17,30 @@ MINUTE_M = 1852.0
 @pytest.fixture
 def folder(tmp_path):
     """Three seconds north of a level vehicle that heads north: its IMU's x axis points to the right, east."""
-    inertial = [f"{T0 + k / 10:.1f} 0 0 90 0 0 {0.0116 - 0.02} 0.3 -0.2 -9.8" for k in range(31)]
-    of_three = [f"{kind}{axis}" for kind in ("position", "velocity", "acceleration") for axis in "XYZ"]
+    inertial = [
+        f"{T0 + k / 10:.1f} 0 0 90 0 0 {0.0116 - 0.02} 0.3 -0.2 -9.8" for k in range(31)
+    ]
+    of_three = [
+        f"{kind}{axis}"
+        for kind in ("position", "velocity", "acceleration")
+        for axis in "XYZ"
+    ]
     header = f"% time, [idSensor], {', '.join(of_three)}, \n"
     (tmp_path / "MTI.log").write_text(header + "\n".join(inertial))
-    ahead, rest = 50 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)]), "0 " * (len(DVL_COLUMNS) - 15)
-    doppler = [f"{T0 + k} 2007 3 16 13 0 {k} 9 9 9 1 {ahead[0]} {ahead[1]} 2 {int(k != 1)} {rest}" for k in range(4)]
-    (tmp_path / "DVL.log").write_text("% time, ...\n" + "\n".join(doppler))
-    fixes = [f"{T0 + k} {4212.0 + 0.5 * k / MINUTE_M:.8f} 306.0 1 {-2 - k} 51.8 0 0 0 0" for k in range(4)]
-    header = (
-        b"% time, [idSensor], latitude, longitude, status, altitude(m), geoide, course(\xba), magnetic, kts, km/h\n"
+    ahead, rest = (
+        50 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)]),
+        "0 " * (len(DVL_COLUMNS) - 15),
     )
+    doppler = [
+        f"{T0 + k} 2007 3 16 13 0 {k} 9 9 9 1 {ahead[0]} {ahead[1]} 2 {int(k != 1)} {rest}"
+        for k in range(4)
+    ]
+    (tmp_path / "DVL.log").write_text("% time, ...\n" + "\n".join(doppler))
+    fixes = [
+        f"{T0 + k} {4212.0 + 0.5 * k / MINUTE_M:.8f} 306.0 1 {-2 - k} 51.8 0 0 0 0"
+        for k in range(4)
+    ]
+    header = b"% time, [idSensor], latitude, longitude, status, altitude(m), geoide, course(\xba), magnetic, kts, km/h\n"
     (tmp_path / "DGPS.log").write_bytes(header + "\n".join(fixes).encode())
     return tmp_path
 
@@ -35,47 +48,89 @@ def folder(tmp_path):
 def test_axes_units_and_biases_are_those_found_in_the_data(folder):
     sequence = read_stpere(folder)
     body_R_imu, body_R_dvl = (
-        section.mounting.pose().rotation().matrix() for section in (sequence.calibration.imu, sequence.calibration.dvl)
+        section.mounting.pose().rotation().matrix()
+        for section in (sequence.calibration.imu, sequence.calibration.dvl)
     )
-    np.testing.assert_allclose(body_R_dvl @ sequence.dvl.velocity[0], [0.5, 0, 0.02], atol=1e-12)  # forward
-    np.testing.assert_allclose(body_R_imu @ sequence.imu.angular_velocity[0], [0, 0, 0.02], atol=1e-12)
-    np.testing.assert_allclose(sequence.imu.specific_force[0], [0, 0, 9.8], atol=1e-12)  # the mean is taken off
+    # forward
+    np.testing.assert_allclose(
+        body_R_dvl @ sequence.dvl.velocity[0], [0.5, 0, 0.02], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        body_R_imu @ sequence.imu.angular_velocity[0], [0, 0, 0.02], atol=1e-12
+    )
+    # the mean is taken off
+    np.testing.assert_allclose(sequence.imu.specific_force[0], [0, 0, 9.8], atol=1e-12)
     np.testing.assert_allclose(sequence.heading.yaw_rad, np.pi / 2, atol=1e-12)  # north
     np.testing.assert_allclose(body_R_imu @ [1.0, 0, 0], [0, -1, 0], atol=1e-12)
-    assert sequence.dvl.stamps_ns.tolist() == [T0 * 10**9, (T0 + 2) * 10**9, (T0 + 3) * 10**9]  # one without lock
+    # one without lock
+    assert sequence.dvl.stamps_ns.tolist() == [
+        T0 * 10**9,
+        (T0 + 2) * 10**9,
+        (T0 + 3) * 10**9,
+    ]
     assert not sequence.truth.has_orientation
-    np.testing.assert_allclose(sequence.truth.positions[:, :2], [[0, 0.5 * k] for k in range(4)], atol=0.01)
-    np.testing.assert_allclose(sequence.truth.positions[:, 2], [0, -1, -2, -3], atol=1e-6)
-    np.testing.assert_allclose(sequence.calibration.start.rpy_rad, [0, 0, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(
+        sequence.truth.positions[:, :2], [[0, 0.5 * k] for k in range(4)], atol=0.01
+    )
+    np.testing.assert_allclose(
+        sequence.truth.positions[:, 2], [0, -1, -2, -3], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        sequence.calibration.start.rpy_rad, [0, 0, np.pi / 2], atol=1e-12
+    )
     compass = sequence.calibration.heading
     shared_and_own = np.hypot(compass.bias_sigma_rad, compass.sigma_rad)
-    assert sequence.calibration.start.rpy_sigma_rad[2] == pytest.approx(shared_and_own), "the start is a compass' row"
+    assert sequence.calibration.start.rpy_sigma_rad[2] == pytest.approx(
+        shared_and_own
+    ), "the start is a compass' row"
 
 
-def test_the_lines_of_the_page_on_data_sets_read_the_tables_as_the_converter_does(folder):
-    page = (Path(__file__).parents[3] / "docs" / "theory" / "datasets.md").read_text(encoding="utf-8")
-    (lines,) = re.findall(r"### St. Pere from its tables.*?```toml\n(.*?)```", page, re.DOTALL)
+def test_the_lines_of_the_page_on_data_sets_read_the_tables_as_the_converter_does(
+    folder,
+):
+    page = (Path(__file__).parents[3] / "docs" / "theory" / "datasets.md").read_text(
+        encoding="utf-8"
+    )
+    (lines,) = re.findall(
+        r"### St. Pere from its tables.*?```toml\n(.*?)```", page, re.DOTALL
+    )
     (folder / "stpere.toml").write_text(lines)
     found, expected = read_csv(folder, folder / "stpere.toml"), read_stpere(folder)
     body_R_imu, body_R_dvl = (
-        section.mounting.pose().rotation().matrix() for section in (expected.calibration.imu, expected.calibration.dvl)
+        section.mounting.pose().rotation().matrix()
+        for section in (expected.calibration.imu, expected.calibration.dvl)
     )
     np.testing.assert_array_equal(found.imu.stamps_ns, expected.imu.stamps_ns)
     np.testing.assert_array_equal(found.dvl.stamps_ns, expected.dvl.stamps_ns)
-    bias = np.array([0.0, 0.0, GYRO_Z_BIAS_RAD_S])  # taken off by the converter, as the mean of the level forces is
+    # taken off by the converter, as the mean of the level forces is
+    bias = np.array([0.0, 0.0, GYRO_Z_BIAS_RAD_S])
     of_body = (expected.imu.angular_velocity + bias) @ body_R_imu.T
     np.testing.assert_allclose(found.imu.angular_velocity, of_body, atol=1e-9)
-    np.testing.assert_allclose(found.imu.specific_force[:, 2], expected.imu.specific_force[:, 2], atol=1e-9)
-    np.testing.assert_allclose(found.dvl.velocity, expected.dvl.velocity @ body_R_dvl.T, atol=1e-9)
-    np.testing.assert_allclose(found.heading.yaw_rad, expected.heading.yaw_rad, atol=1e-5)
-    np.testing.assert_allclose(found.truth.positions, expected.truth.positions, atol=1e-6)
+    np.testing.assert_allclose(
+        found.imu.specific_force[:, 2], expected.imu.specific_force[:, 2], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.dvl.velocity, expected.dvl.velocity @ body_R_dvl.T, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.heading.yaw_rad, expected.heading.yaw_rad, atol=1e-5
+    )
+    np.testing.assert_allclose(
+        found.truth.positions, expected.truth.positions, atol=1e-6
+    )
 
 
 def test_a_missing_file_or_folder_is_named(folder):
-    with pytest.raises(DatasetError, match=r"absent: is not a folder; .* MTI\.log, DVL\.log, DGPS\.log$"):
+    with pytest.raises(
+        DatasetError,
+        match=r"absent: is not a folder; .* MTI\.log, DVL\.log, DGPS\.log$",
+    ):
         read_stpere(folder / "absent")
     (folder / "DVL.log").unlink()
-    with pytest.raises(DatasetError, match=rf"{folder.name}: holds no DVL\.log; give the folder that holds MTI"):
+    with pytest.raises(
+        DatasetError,
+        match=rf"{folder.name}: holds no DVL\.log; give the folder that holds MTI",
+    ):
         read_stpere(folder)
     (folder / "MTI.log").rename(folder / "mti.txt")
     with pytest.raises(DatasetError, match=r"holds no MTI\.log, DVL\.log; give"):
@@ -98,9 +153,17 @@ def reckoned_error(run, yaw_rad, mirror=False):
     velocity = run.dvl.velocity[is_sound] @ mounting.T * [1, -1 if mirror else 1, 1]
     stamps_ns = run.dvl.stamps_ns[is_sound]
     turned = np.interp(stamps_ns, run.heading.stamps_ns, yaw_rad)
-    steps = (velocity[:, 0] + 1j * velocity[:, 1])[:-1] * np.exp(1j * turned[:-1]) * np.diff(stamps_ns) * 1e-9
+    steps = (
+        (velocity[:, 0] + 1j * velocity[:, 1])[:-1]
+        * np.exp(1j * turned[:-1])
+        * np.diff(stamps_ns)
+        * 1e-9
+    )
     path = np.concatenate([[0], np.cumsum(steps)])
-    at = [np.interp(run.truth.stamps_ns, stamps_ns, part) for part in (path.real, path.imag, 0 * path.real)]
+    at = [
+        np.interp(run.truth.stamps_ns, stamps_ns, part)
+        for part in (path.real, path.imag, 0 * path.real)
+    ]
     return horizontal_aligned_rmse(np.column_stack(at), run.truth.positions)
 
 
@@ -120,7 +183,9 @@ class TestRecording:
         rate = run.imu.angular_velocity[:, 2]
 
         def integrated(rate):
-            return np.concatenate([[0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(seconds))])
+            return np.concatenate(
+                [[0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(seconds))]
+            )
 
         assert reckoned_error(run, integrated(rate)) < 8
         assert reckoned_error(run, integrated(rate - 0.0116)) > 40  # as logged
