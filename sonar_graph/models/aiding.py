@@ -262,7 +262,7 @@ def bias_jacobian(
     way = dR.T @ (body_p_dvl - dp) - body_p_dvl
     level_way = way - (vertical_j @ way) * vertical_j
     D_b = np.zeros((6, BIASES))
-    # b_tilt in the columns 0 to 2, b_heading in 3 to 5; their sum is the gyro bias, the sum of their columns D
+    # b_tilt in the columns 0 to 2, b_heading in 3 to 5; when both change alike, the gyro bias does: the sum is D
     store(D_theta - theta_by_heading, D_b)
     store(D_rho - rho_by_heading, D_b, LOWER_LEFT)
     store(theta_by_heading, D_b, UPPER_RIGHT)

@@ -190,6 +190,7 @@ class OdometryStack:
 OdometryWithBias.Stack = OdometryStack
 
 
+# GTSAM calls these for single factors: arrays, since numba takes longer to recognise a named tuple than to evaluate one
 @compiled
 def odometry_errors(
     X_i: Floats,
