@@ -123,6 +123,7 @@ class DeadReckoning:
                 epoch_ns
             )
             self._pose, self._P = self._after(motion)
+            # gravity needs the specific force over the whole interval, in one frame
             self._felt = motion if self._felt is None else self._felt.then(motion)
             epoch_ns = reached_ns
             if (

@@ -184,6 +184,7 @@ def in_order(
             kind = sample_kind[sample]
             stamp_ns = sample_ns[sample]
             row = sample
+        # an epoch counts from when its rows are known, which may be later than its own stamp
         if epoch < len(epochs_ns) and reached_ns[epoch] <= stamp_ns:
             kind = EPOCH
             stamp_ns = reached_ns[epoch]
@@ -201,6 +202,7 @@ def in_order(
                 out[5, n] = 1
                 opened_ns = node_ns
         elif kind == FRAME:
+            # the other detections of this frame are part of the same event
             frame_ns = stamp_ns
         elif kind != END:
             sample += 1

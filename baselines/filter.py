@@ -522,6 +522,7 @@ class FilterShell(ABC):
         self.check(self.node_ns)
         self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
         self.node_ns = epoch_ns
+        # gravity is compared with the specific force in the frame where its interval began
         self._impulse = self._impulse + self._turned @ motion.impulse
         self._turned = self._turned @ motion.dR
         if self.calibration.planar is not None:
@@ -538,6 +539,7 @@ class FilterShell(ABC):
             self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s
         )
         if not math.isnan(up[0]):
+            # one sigma for both ends, so that the noise of the difference is the same
             velocity_sigma = math.sqrt(0.5 * (variance_i + variance_j))
             sigma_rad = tilt_sigma(
                 duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias

@@ -90,6 +90,7 @@ class StampedRows:
         self.stamps_ns = shown[0]
         self.values = tuple(shown[1:])
         if not comes_after:
+            # a stable order: of equal stamps the row that came first is kept
             kept = np.unique(self.stamps_ns, return_index=True)[1]
             self._show(len(kept), *(column[kept] for column in columns))
         return not comes_after

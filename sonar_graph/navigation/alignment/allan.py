@@ -47,6 +47,7 @@ def allan_deviation(samples: Floats, together: int) -> Floats:
     before_first = np.zeros((1, samples.shape[1]))
     # (n + 1, columns)
     sums = np.cumsum(np.concatenate([before_first, samples]), axis=0)
+    # means over every window, each a sample later than the one before
     means = (sums[together:] - sums[:-together]) / together
     steps = means[together:] - means[:-together]
     return np.asarray(np.sqrt(0.5 * np.mean(steps**2, axis=0)))
@@ -74,6 +75,7 @@ def density(samples: Floats, rate_hz: float) -> Estimate1D:
         )
     together = max(1, round(TAU_S * rate_hz))
     tau_s = together / rate_hz
+    # white noise of density N has the deviation N / sqrt(tau)
     value = float(allan_deviation(samples, together).max()) * np.sqrt(tau_s)
     return Estimate1D(
         value, value / np.sqrt(2 * degrees_of_freedom(len(samples), together))

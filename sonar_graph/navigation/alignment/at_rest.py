@@ -154,11 +154,13 @@ def align_at_rest(
     refuse_motion(imu, calibration, dvl)
     force = imu.specific_force.mean(axis=0)
     rate = imu.angular_velocity.mean(axis=0)
+    # at rest the accelerometers measure gravity's reaction alone
     up = force / np.linalg.norm(force)
     upward, _ = earth_up_and_level(calibration)
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
     length_s = span_s * len(imu) / (len(imu) - 1)  # n samples stand for n intervals
     roll, pitch = roll_and_pitch(up)
+    # the Earth's rotation about the vertical is known; its level part has an unknown direction
     bias = rate - upward * up
     cov = covariance_at_rest(up, length_s, calibration)
     return InitialTilt(
@@ -173,6 +175,7 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
     """
     upward, level = earth_up_and_level(calibration)
     sensors = calibration.imu
+    # a tilt moves the direction across itself only
     across = np.eye(3) - np.outer(up, up)
     tilt = (
         sensors.accel_bias_sigma**2 + sensors.accel_noise_density**2 / rest_s
@@ -183,6 +186,7 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
         sensors.gyro_noise_density**2 / rest_s
         + sensors.gyro_bias_walk_density**2 * rest_s / 3.0
     )
+    # the level part of the Earth's rate counts as noise, half of its square along each axis
     covariance[2:, 2:] += noise * np.eye(3) + 0.5 * level**2 * across
     return np.asarray(covariance)
 
@@ -209,6 +213,7 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
         freedom = means.size - means.shape[1]
         squares = np.sum((means - means.mean(axis=0)) ** 2)
+        # of white noise the means over blocks have the variance density^2 / BLOCK_S
         ratio = np.sqrt(squares * BLOCK_S / freedom)
         by_chance = np.sqrt(chi_square_exceeded(FALSE_ALARM, freedom) / freedom)
         if ratio > LARGEST_NOISE_RATIO * by_chance * density:

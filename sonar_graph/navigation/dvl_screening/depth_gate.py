@@ -82,6 +82,7 @@ class DepthGate:
         sample = DepthChain(stamp_ns, z_m, variance_m2, 1)
         distance = used.distance(sample, longest_ns)
         if distance <= DEPTH_GATE:
+            # chains of refused samples end where a sample is used: they were wrong
             self._use(sample._replace(length=used.length + 1))
             return None
         # refused as it is; it may continue a chain of refused samples
@@ -96,6 +97,7 @@ class DepthGate:
             )
         else:
             sample = sample._replace(is_reachable=used.distance(sample) <= DEPTH_GATE)
+        # a chain out of reach replaces the used one only where it is the longer
         if sample.length > (FEWEST - 1 if sample.is_reachable else used.length):
             self._use(sample)
             return None

@@ -100,12 +100,14 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     n = len(stamps_ns)
     felt = imu.around(int(stamps_ns[0]), int(stamps_ns[-1]))
     if felt is None:
+        # without forces the velocity walks as a vehicle's does
         still = np.tile(np.eye(3), (n, 1, 1))
         nothing = np.zeros((n, 3))
         return Carry(
             still, nothing, nothing, calibration.dvl.velocity_walk_density, False
         )
     times_ns = np.union1d(stamps_ns, felt.stamps_ns[felt.stamps_ns > stamps_ns[0]])
+    # rates and forces are linear between rows, so that a step takes those in its middle
     middles_ns = times_ns[:-1] + np.diff(times_ns) // 2
     dt = (np.diff(times_ns) * 1e-9)[:, None]
     turns = felt.at(felt.rate, middles_ns) * dt
@@ -137,6 +139,7 @@ def walk_density(
         + bias2 * stretch_s**3 / 16.0
     )
     by_turning = (sensors.accel_bias_sigma * turned_rad) ** 2 * stretch_s / 16.0
+    # a tilt adds a share of gravity to the velocity
     by_gyro = calibration.gravity_m_s2**2 * tilting
     return float(np.sqrt(sensors.accel_noise_density**2 + by_gyro + by_turning))
 
