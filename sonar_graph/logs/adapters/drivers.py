@@ -52,6 +52,7 @@ def _water_linked(*covariance: str, meaning: str = "variance") -> DvlAdapter:
         velocity=_xyz("velocity"),
         covariance=CovarianceFields.model_validate({"fields": covariance, "meaning": meaning}),
         valid_where={"velocity_valid": True},
+        altitude="altitude",
     )
 
 
@@ -95,8 +96,10 @@ MARINE_DVL = DvlAdapter(
     type="marine_acoustic_msgs/msg/Dvl",
     velocity=_xyz("velocity"),
     covariance=CovarianceFields(fields=("velocity_covar",)),
-    valid_where={"velocity_mode": 1},
+    valid_where={"velocity_mode": 1, "beam_velocities_valid": True},
+    may_be_unfilled=("velocity_mode", "beam_velocities_valid"),
     good_beams="num_good_beams",
+    altitude="altitude",
     beam_unit_vectors=_xyz("beam_unit_vec"),
     beam_ranges="range",
     beam_ranges_valid="beam_ranges_valid",
@@ -107,6 +110,7 @@ UUV_SIMULATOR_DVLS = [
         type=f"{package}/msg/DVL",
         velocity=_xyz("velocity"),
         covariance=CovarianceFields(fields=("velocity_covariance",), negative="invalid", zero="unknown"),
+        altitude="altitude",
     )
     for package in ("uuv_sensor_ros_plugins_msgs", "stonefish_ros2", "cola2_msgs", "smarc_msgs")
 ]

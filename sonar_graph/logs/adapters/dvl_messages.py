@@ -20,7 +20,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.devices import velocity_of_beams
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, SpeedScale, field_paths, turn, turn_covariances
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
-from sonar_graph.measurements import Dvl, Floats
+from sonar_graph.measurements import Dvl, Floats, Ints
 
 LARGEST_TILT_DEG = 45.0
 """Largest tilt of beams in use; 20 to 30 degrees are usual."""
@@ -118,6 +118,19 @@ def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str 
     return f"and the configured ones differ by up to {off_deg[beam]:.0f}° (beam {beam}); check azimuth_deg"
 
 
+LARGEST_SPEED_M_S = 30.0
+"""Speed beyond which equal components are a sentinel: PD0 has -32.768 m/s for "not measured"."""
+STEP_RATIO = 5.0
+"""Factor of a step to zero over the usual steps of the velocity, from which zeros are no measurement."""
+LEAST_STEP_M_S = 0.05
+"""Steps below this are no sign: at such speeds a row of zeros does little harm."""
+FEWEST_STEPS = 10
+"""Fewest steps from which usual ones are known."""
+LEAST_REPEATED = 0.2
+"""Share of rows, and of values, that a driver repeats which holds velocities between measurements."""
+ZEROS = "with a velocity of 0 in one step"
+SENTINEL = "with one value beyond 30 m/s in all components"
+REPEATED = "that repeat the velocity before"
 Number = bool | int | float
 SAID_INVALID = "with a covariance that says invalid"
 
@@ -133,8 +146,14 @@ class DvlAdapter(Adapter):
     """Of the velocity, before `scale`; without it the calibration's noise holds."""
     valid_where: Mapping[str, Number] = {}
     """Fields, each with its value in messages to be used: {velocity_mode = 1}."""
+    may_be_unfilled: tuple[str, ...] = ()
+    """Fields of `valid_where` that some drivers never fill: where one is 0 in every message, it does not count."""
     good_beams: str | None = None
     """Field that counts good beams; messages with none are left out, where the driver counts at all."""
+    altitude: str | None = None
+    """Field that is negative without bottom lock. It counts where `valid_where` is the same in all messages."""
+    are_zeros_measured: bool = False
+    """true: a velocity of exactly 0 is measured also where it comes in one step, as without bottom lock."""
     are_beams_counted: bool = False
     """true: the driver counts, so that messages with none are left out even where no message has any."""
     beams: BeamGeometry | None = None
@@ -160,7 +179,8 @@ class DvlAdapter(Adapter):
         checked = (self.beam_ranges, self.beam_ranges_valid, self.sound_speed, self.beam_unit_vectors)
         beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
         covariance = self.covariance.fields if self.covariance else None
-        return field_paths(self.velocity, covariance, self.valid_where, self.good_beams, *checked, *beams)
+        marks = (self.valid_where, self.good_beams, self.altitude)
+        return field_paths(self.velocity, covariance, *marks, *checked, *beams)
 
     def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
@@ -177,15 +197,52 @@ class DvlAdapter(Adapter):
         if self.covariance is not None and not self._is_noise_of_beams:
             covariance, faults[SAID_INVALID] = self.covariance.read(table)
             covariance = covariance if self.scale == 1 else covariance * self.scale**2
-        for path, value in self.valid_where.items():
-            faults[f"with {path} not {str(value).lower()}"] = table.column(path) != value
-        if self.good_beams is not None:
-            beams = table.column(self.good_beams)
-            faults["without a good beam"] = (beams == 0) & (self.are_beams_counted or beams.any())
+        faults |= self._marked_invalid(table)
         faults[NOT_FINITE] = not_finite(velocity)
+        if not self._is_marked(table):
+            faults |= self._signs_of_no_lock(table, velocity)
+        faults[REPEATED] = repeats(velocity, table.stamps_ns)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         velocity, covariance = turn(self.rotation, velocity[rows]), turn_covariances(self.rotation, covariance[rows])
         return (Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None), dropped
+
+    def _filled(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
+        """Masks of valid messages by the fields of `valid_where` that the driver fills."""
+        columns = {path: table.column(path) for path in self.valid_where}
+        is_unfilled = {path: path in self.may_be_unfilled and not column.any() for path, column in columns.items()}
+        return {path: column == self.valid_where[path] for path, column in columns.items() if not is_unfilled[path]}
+
+    def _is_marked(self, table: FieldTable) -> bool:
+        """Tell whether the driver marks some messages as valid and others as invalid."""
+        return any(valid.any() and not valid.all() for valid in self._filled(table).values())
+
+    def _marked_invalid(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
+        """Masks of messages that their driver marks as invalid, by the reason."""
+        faults = {
+            f"with {path} not {str(self.valid_where[path]).lower()}": ~valid
+            for path, valid in self._filled(table).items()
+        }
+        if self.good_beams is not None:
+            beams = table.column(self.good_beams)
+            faults["without a good beam"] = (beams == 0) & (self.are_beams_counted or beams.any())
+        return faults
+
+    def _signs_of_no_lock(self, table: FieldTable, velocity: Floats) -> dict[str, NDArray[np.bool_]]:
+        """Masks of messages that look sent without bottom lock, by the reason, where no field marks them."""
+        faults: dict[str, NDArray[np.bool_]] = {}
+        if self.good_beams is not None:
+            beams = table.column(self.good_beams)
+            faults[f"with fewer than {FEWEST_BEAMS} good beams"] = (
+                (beams > 0) & (beams < FEWEST_BEAMS) & (beams.max(initial=0) >= FEWEST_BEAMS)
+            )
+        if self.altitude is not None:
+            altitude_m = table.column(self.altitude)
+            faults[f"with {self.altitude} below 0"] = (altitude_m < 0) & (altitude_m > 0).any()
+        is_sentinel = (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S) & (velocity == velocity[:, :1]).all(axis=1)
+        faults[SENTINEL] = is_sentinel
+        if not self.are_zeros_measured:
+            faults[ZEROS] = zeros_in_one_step(velocity, table.stamps_ns)
+        return faults
 
     @property
     def _is_noise_of_beams(self) -> bool:
@@ -193,7 +250,8 @@ class DvlAdapter(Adapter):
         return self.beams is not None and self.beams.velocity is not None and self.beams.sigma_m_s is not None
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
-        """Warnings about covariances, beam directions, ranges and the speed of sound that a driver gets wrong."""
+        """Warnings about validity, covariances, beam directions, ranges and the speed of sound."""
+        yield from self._validity_warnings(table)
         if self.covariance is not None and not self._is_noise_of_beams:
             yield from self.covariance.warnings(table)
         if self.beam_unit_vectors is not None:
@@ -208,3 +266,69 @@ class DvlAdapter(Adapter):
             wrong = said & ~(np.isfinite(ranges) & (ranges > 0)).all(axis=1)
             if wrong.any():
                 yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"
+
+    def _validity_warnings(self, table: FieldTable) -> Iterator[str]:
+        """Warnings about fields that mark no message, and about messages left out by other signs."""
+        if self._is_marked(table):
+            return
+        filled = self._filled(table)
+        unfilled = [path for path in self.valid_where if path not in filled]
+        if unfilled and not filled:
+            yield f"{' and '.join(unfilled)} are 0 in every message: taken as not filled, all messages as bottom track"
+        if self.velocity is None:
+            return
+        velocity = table.beside(self.velocity) * self.scale
+        accepting = {
+            ZEROS: "are_zeros_measured = true",
+            SENTINEL: "",
+            **{f"with {self.altitude} below 0": "altitude = false"},
+        }
+        for reason, has_it in self._signs_of_no_lock(table, velocity).items():
+            if has_it.any():
+                key = accepting.get(reason, "good_beams = false")
+                accept = f"; `{key}` under [dvl] in a log configuration uses them" if key else ""
+                yield f"{np.count_nonzero(has_it)} of {len(table)} messages {reason}: left out, no bottom lock{accept}"
+        if count := np.count_nonzero(repeats(velocity, table.stamps_ns)):
+            yield f"{count} of {len(table)} messages {REPEATED}: left out; the driver sends each velocity several times"
+
+
+def zeros_in_one_step(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
+    """Rows of zeros, shape (n,), that the velocity reaches or leaves by a step which no vehicle makes.
+
+    A vehicle slows down over several rows. A driver without bottom lock sends zeros from one row to the next, and the
+    step is `STEP_RATIO` times the 99 % quantile of the steps between rows with a velocity.
+    """
+    order = np.argsort(stamps_ns, kind="stable")
+    v = velocity[order]
+    is_zero: NDArray[np.bool_] = np.asarray(~v.any(axis=1))
+    step_m_s = np.linalg.norm(np.diff(v, axis=0), axis=1)
+    is_usual = ~is_zero[1:] & ~is_zero[:-1] & np.isfinite(step_m_s)
+    found = np.zeros(len(v), bool)
+    if not is_zero.any() or np.count_nonzero(is_usual) < FEWEST_STEPS:
+        return found
+    limit_m_s = max(STEP_RATIO * float(np.quantile(step_m_s[is_usual], 0.99)), LEAST_STEP_M_S)
+    is_jump = (is_zero[1:] != is_zero[:-1]) & (step_m_s > limit_m_s)
+    first = np.flatnonzero(is_zero & ~np.concatenate([[False], is_zero[:-1]]))
+    last = np.flatnonzero(is_zero & ~np.concatenate([is_zero[1:], [False]]))
+    for begin, end in zip(first, last, strict=True):
+        found[begin : end + 1] = is_jump[max(begin - 1, 0) : begin].any() or is_jump[end : end + 1].any()
+    in_file = np.empty(len(v), bool)
+    in_file[order] = found
+    return in_file
+
+
+def repeats(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
+    """Rows, shape (n,), that repeat the velocity of the row before, where the driver does so all the time.
+
+    Such a driver publishes at its own rate, or once for each of two reports of the instrument, and holds the velocity
+    between. A sensor that got stuck once repeats one value, which is not the driver's habit.
+    """
+    order = np.argsort(stamps_ns, kind="stable")
+    v = velocity[order]
+    is_same = np.concatenate([[False], (v[1:] == v[:-1]).all(axis=1) & v[1:].any(axis=1)])
+    in_file = np.zeros(len(v), bool)
+    lengths = np.diff([*np.flatnonzero(~is_same), len(v)])
+    if np.mean(is_same) < LEAST_REPEATED or np.mean(lengths > 1) < LEAST_REPEATED or len(lengths) < FEWEST_STEPS:
+        return in_file
+    in_file[order] = is_same
+    return in_file

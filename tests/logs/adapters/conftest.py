@@ -102,6 +102,11 @@ class Foreign(Bench):
     t0_ns = T0_NS
     definitions = DEFINITIONS
 
+    @staticmethod
+    def stamps(rows: int) -> np.ndarray:
+        """Stamps of the messages that `rows_of` makes, nanoseconds."""
+        return T0_NS + np.arange(rows) * STEP_NS
+
     def config(self, text: str) -> Path:
         path = self._folder / "log.toml"
         path.write_text(text, encoding="utf-8")
