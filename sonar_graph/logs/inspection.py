@@ -19,7 +19,13 @@ from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topi
 from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_each, refusal, wanted_types
 from sonar_graph.logs.sonar_images import describe_frames, read_sonar_frames, sonar_frame
-from sonar_graph.logs.vehicle_setup import read_calibration, read_notes, recorded_name, static_frames
+from sonar_graph.logs.vehicle_setup import (
+    PartialCalibration,
+    read_calibration,
+    read_notes,
+    recorded_name,
+    static_frames,
+)
 from sonar_graph.measurements import NS_PER_S, Ints
 
 _MOST_FIELDS = 24
@@ -144,6 +150,7 @@ def inspect_log(
     config: LogConfig | None = None,
     topics: Mapping[str, str] | None = None,
     window: TimeWindow | None = None,
+    calibration: PartialCalibration | None = None,
 ) -> LogSummary:
     """Summarise an MCAP file; faults of the log become part of the summary.
 
@@ -155,6 +162,8 @@ def inspect_log(
         What the user says about topics, as for `read_log`.
     window
         Part of the recording to inspect.
+    calibration
+        What the user says about the vehicle: mountings that it states are not missed in ``/tf_static``.
 
     Returns
     -------
@@ -204,7 +213,7 @@ def inspect_log(
     left_out, warnings, unusable = list[str](), list[str](), list[str]()
     try:
         frame = sonar_frame(recording, choices[SONAR].topic, config)
-        assembly = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}, sonar=frame)
+        assembly = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}, calibration, frame)
         mounted = assembly.mounted
         left_out, warnings = assembly.survey()
     except CalibrationError:

@@ -55,6 +55,7 @@ from sonar_graph.logs.vehicle_setup import (
     read_notes,
     recorded_name,
     static_frames,
+    unplaced,
     with_measured_start,
 )
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
@@ -225,6 +226,8 @@ class Assembly:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()
         self._is_mounting_known = self._is_start_stated = True
+        self._unplaced: dict[str, str] = {}
+        self._has_tree = False
         self.mounted: dict[str, str] = {}
         """Frame in ``/tf_static`` of each sensor whose mounting is from there."""
         self.calibration = calibration if isinstance(calibration, Calibration) else self._gathered(calibration)
@@ -265,6 +268,9 @@ class Assembly:
         self.mounted = {name: frames[name] for name in mountings if name not in in_record}
         mounted = mountings.keys() | stated
         self._is_mounting_known = "dvl" in mounted
+        if recorded is None:  # a record of this package states what is not zero
+            self._unplaced = {name: frame for name, frame in frames.items() if name not in mounted}
+            self._has_tree = bool(tree)
         source = "from the log"
         if not is_recorded:
             source = f"{', '.join(sorted(said))} from the log; else defaults" if said else "defaults"
@@ -356,6 +362,7 @@ class Assembly:
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
+        yield from (unplaced(name, frame, has_tree=self._has_tree) for name, frame in self._unplaced.items())
         for role, table in self._tables.items():
             yield from (f"{role}: {text}" for text in self.adapters[role].warnings(table))
         imu, dvl, depth, detections = (self.block(role) for role in ("imu", "dvl", "depth", "detections"))

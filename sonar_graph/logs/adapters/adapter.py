@@ -118,6 +118,8 @@ class Adapter(Section):
     """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
     frame_id_field: str | None = "header.frame_id"
     """Field with the name of the sensor's frame in /tf_static."""
+    other_frame_id_field: str | None = None
+    """Field with that name, where `frame_id_field` is empty."""
     frame_id: str | None = None
     """Name of the sensor's frame, where the message has none or a wrong one."""
     rotation: Rotation = "flu"
@@ -144,7 +146,10 @@ class Adapter(Section):
         """Frame of the sensor; empty where the messages do not name one."""
         if self.frame_id is not None or self.frame_id_field is None:
             return self.frame_id or ""
-        return messages[0].first_string(self.frame_id_field)
+        named = messages[0].first_string(self.frame_id_field)
+        if named or self.other_frame_id_field is None:
+            return named
+        return messages[0].first_string(self.other_frame_id_field)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
         """Contradictions and unlikely values in messages that can be read."""

@@ -119,7 +119,13 @@ TWIST = DvlAdapter(
     velocity=_xyz("twist.twist.linear"),
     covariance=CovarianceFields(fields=("twist.covariance",)),
 )
-ODOMETRY_TWIST = TWIST.model_copy(update={"type": "nav_msgs/msg/Odometry", "frame_id_field": "child_frame_id"})
+ODOMETRY_TWIST = TWIST.model_copy(
+    update={
+        "type": "nav_msgs/msg/Odometry",
+        "frame_id_field": "child_frame_id",
+        "other_frame_id_field": "header.frame_id",
+    }
+)
 PRESSURE = DepthAdapter(
     type="sensor_msgs/msg/FluidPressure", pressure="fluid_pressure", variance=CovarianceFields(fields=("variance",))
 )
