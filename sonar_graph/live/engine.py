@@ -35,7 +35,7 @@ from sonar_graph.logs import (
     rows_of,
     sonar_frame,
 )
-from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.adapters import DvlAdapter, LogConfig
 from sonar_graph.logs.mcap import Keep, Recording, Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Measurements
 from sonar_graph.sequence import Sequence
@@ -300,6 +300,8 @@ class Engine:
             recording = self._recording(held)
         try:
             self._sonar = sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
+            if isinstance(dvl := choices["dvl"].adapter, DvlAdapter):
+                choices = choices | {"dvl": replace(choices["dvl"], adapter=dvl.at_first())}
             assembly = Assembly(recording, choices, self._given, self._sonar)
             choices = {
                 role: choice if _is_of_use(assembly, role) else replace(choice, topic=None, adapter=None)

@@ -8,7 +8,7 @@ and conventions. A message type is added without code, as an instance of that su
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,10 @@ class Adapter(Section):
         if named or self.other_frame_id_field is None:
             return named
         return messages[0].first_string(self.other_frame_id_field)
+
+    def pinned(self, table: FieldTable) -> dict[str, Any]:  # noqa: ARG002  # for subclasses
+        """Settings by which single messages are read as all messages of a table are together."""
+        return {}
 
     def warnings(self, table: FieldTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
         """Contradictions and unlikely values in messages that can be read."""

@@ -11,6 +11,7 @@ and measures the velocity d . v. Three beams or more give v by least squares, fe
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +132,9 @@ LEAST_REPEATED = 0.2
 ZEROS = "with a velocity of 0 in one step"
 SENTINEL = "with one value beyond 30 m/s in all components"
 REPEATED = "that repeat the velocity before"
+FEW_BEAMS = f"with fewer than {FEWEST_BEAMS} good beams"
+ACCEPTING = {ZEROS: "are_zeros_measured = true", SENTINEL: 'lock = "marked"', REPEATED: 'lock = "signs"'}
+"""Keys that use messages which were left out, by the reason."""
 Number = bool | int | float
 SAID_INVALID = "with a covariance that says invalid"
 
@@ -154,6 +158,9 @@ class DvlAdapter(Adapter):
     """Field that is negative without bottom lock. It counts where `valid_where` is the same in all messages."""
     are_zeros_measured: bool = False
     """true: a velocity of exactly 0 is measured also where it comes in one step, as without bottom lock."""
+    lock: Literal["found", "marked", "signs"] = "found"
+    """Who decides on bottom lock: "marked": `valid_where` alone; "signs": also beams, `altitude` and sentinels of each
+    message; "found": `valid_where` where it differs between messages, else the signs, zeros and repeats."""
     are_beams_counted: bool = False
     """true: the driver counts, so that messages with none are left out even where no message has any."""
     beams: BeamGeometry | None = None
@@ -199,9 +206,7 @@ class DvlAdapter(Adapter):
             covariance = covariance if self.scale == 1 else covariance * self.scale**2
         faults |= self._marked_invalid(table)
         faults[NOT_FINITE] = not_finite(velocity)
-        if not self._is_marked(table):
-            faults |= self._signs_of_no_lock(table, velocity)
-        faults[REPEATED] = repeats(velocity, table.stamps_ns)
+        faults |= self._signs_of_no_lock(table, velocity)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         velocity, covariance = turn(self.rotation, velocity[rows]), turn_covariances(self.rotation, covariance[rows])
         return (Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None), dropped
@@ -214,7 +219,7 @@ class DvlAdapter(Adapter):
 
     def _is_marked(self, table: FieldTable) -> bool:
         """Tell whether the driver marks some messages as valid and others as invalid."""
-        return any(valid.any() and not valid.all() for valid in self._filled(table).values())
+        return self.lock == "marked" or any(valid.any() and not valid.all() for valid in self._filled(table).values())
 
     def _marked_invalid(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
         """Masks of messages that their driver marks as invalid, by the reason."""
@@ -230,19 +235,46 @@ class DvlAdapter(Adapter):
     def _signs_of_no_lock(self, table: FieldTable, velocity: Floats) -> dict[str, NDArray[np.bool_]]:
         """Masks of messages that look sent without bottom lock, by the reason, where no field marks them."""
         faults: dict[str, NDArray[np.bool_]] = {}
+        if not self._is_marked(table):
+            if self.good_beams is not None:
+                beams = table.column(self.good_beams)
+                faults[FEW_BEAMS] = (beams > 0) & (beams < FEWEST_BEAMS) & self._may_count(beams >= FEWEST_BEAMS)
+            if self.altitude is not None:
+                altitude_m = table.column(self.altitude)
+                faults[f"with {self.altitude} below 0"] = (altitude_m < 0) & self._may_count(altitude_m > 0)
+            is_same = (velocity == velocity[:, :1]).all(axis=1)
+            faults[SENTINEL] = is_same & (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S)
+            if self.lock == "found" and not self.are_zeros_measured:
+                faults[ZEROS] = zeros_in_one_step(velocity, table.stamps_ns)
+        if self.lock == "found":
+            faults[REPEATED] = repeats(velocity, table.stamps_ns)
+        return faults
+
+    def _may_count(self, is_good: NDArray[np.bool_]) -> bool:
+        """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
+        return self.lock == "signs" or bool(is_good.any())
+
+    def at_first(self) -> DvlAdapter:
+        """Adapter for the first messages of a live run, where a mode that is 0 in all of them may still come."""
+        flags = tuple(path for path in self.may_be_unfilled if self.valid_where.get(path) is True)
+        return self.model_copy(update={"may_be_unfilled": flags})
+
+    def pinned(self, table: FieldTable) -> dict[str, Any]:
+        """Settings by which single messages are read as all messages of a table are together."""
+        filled = self._filled(table)
+        settings: dict[str, Any] = {
+            "valid_where": {path: value for path, value in self.valid_where.items() if path in filled},
+            "may_be_unfilled": [],
+        }
+        can_count = True
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
-            faults[f"with fewer than {FEWEST_BEAMS} good beams"] = (
-                (beams > 0) & (beams < FEWEST_BEAMS) & (beams.max(initial=0) >= FEWEST_BEAMS)
-            )
-        if self.altitude is not None:
-            altitude_m = table.column(self.altitude)
-            faults[f"with {self.altitude} below 0"] = (altitude_m < 0) & (altitude_m > 0).any()
-        is_sentinel = (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S) & (velocity == velocity[:, :1]).all(axis=1)
-        faults[SENTINEL] = is_sentinel
-        if not self.are_zeros_measured:
-            faults[ZEROS] = zeros_in_one_step(velocity, table.stamps_ns)
-        return faults
+            settings |= {"are_beams_counted": True} if beams.any() else {"good_beams": False}
+            can_count = not beams.any() or bool((beams >= FEWEST_BEAMS).any())
+        if self.altitude is not None and not (table.column(self.altitude) > 0).any():
+            settings["altitude"] = False
+        settings["lock"] = "signs" if can_count and not self._is_marked(table) else "marked"
+        return settings
 
     @property
     def _is_noise_of_beams(self) -> bool:
@@ -269,8 +301,6 @@ class DvlAdapter(Adapter):
 
     def _validity_warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about fields that mark no message, and about messages left out by other signs."""
-        if self._is_marked(table):
-            return
         filled = self._filled(table)
         unfilled = [path for path in self.valid_where if path not in filled]
         if unfilled and not filled:
@@ -278,18 +308,13 @@ class DvlAdapter(Adapter):
         if self.velocity is None:
             return
         velocity = table.beside(self.velocity) * self.scale
-        accepting = {
-            ZEROS: "are_zeros_measured = true",
-            SENTINEL: "",
-            **{f"with {self.altitude} below 0": "altitude = false"},
-        }
         for reason, has_it in self._signs_of_no_lock(table, velocity).items():
             if has_it.any():
-                key = accepting.get(reason, "good_beams = false")
-                accept = f"; `{key}` under [dvl] in a log configuration uses them" if key else ""
-                yield f"{np.count_nonzero(has_it)} of {len(table)} messages {reason}: left out, no bottom lock{accept}"
-        if count := np.count_nonzero(repeats(velocity, table.stamps_ns)):
-            yield f"{count} of {len(table)} messages {REPEATED}: left out; the driver sends each velocity several times"
+                key = ACCEPTING.get(reason, f"{'altitude' if 'below' in reason else 'good_beams'} = false")
+                yield (
+                    f"{np.count_nonzero(has_it)} of {len(table)} messages {reason}: left out; "
+                    f"`{key}` under [dvl] in a log configuration uses them"
+                )
 
 
 def zeros_in_one_step(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:

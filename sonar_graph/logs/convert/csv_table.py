@@ -27,6 +27,8 @@ _DELIMITERS = {"tab": "\t", "space": " "}
 _EMPTY = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 """Cells without a value, in small letters."""
 _MOST_NAMED = 40
+SAMPLE_ROWS = 2000
+"""Rows from which the kind of a column is guessed."""
 
 
 class CsvForm(Section):
@@ -100,7 +102,7 @@ class CsvFile:
             delimiter = _DELIMITERS.get(self.form.delimiter or "", self.form.delimiter) or _delimiter_of(
                 line, self.form.decimal
             )
-            cells = split(line, delimiter)
+            cells = split(line, delimiter, len(split(heads[-1], delimiter)) if heads else len(self.form.columns or ()))
             if any(is_value(cell, self.form.decimal) for cell in cells):
                 return self._named(delimiter, number, cells, heads, comments)
             heads.append(line)
@@ -157,8 +159,14 @@ class CsvFile:
             + ("" if self.layout.is_named else ": without a header they are numbered from 1")
         )
 
-    def columns(self, indices: list[int]) -> tuple[Ints, list[list[str]]]:
-        """Line numbers, shape (n,), and the cells of some columns.
+    def numbers(self, name: str, most: int | None = SAMPLE_ROWS) -> Floats:
+        """Numbers of a column in its first rows, shape (n,); NaN for cells that hold none."""
+        _, (cells,) = self.columns([self.layout.names.index(name)], most)
+        plain = [_TRUTHS.get(cell.lower(), cell.replace(self.form.decimal, ".")) for cell in cells]
+        return np.array([float(cell) if _is_number(cell) else np.nan for cell in plain])
+
+    def columns(self, indices: list[int], most: int | None = None) -> tuple[Ints, list[list[str]]]:
+        """Line numbers, shape (n,), and the cells of some columns, of at most ``most`` rows.
 
         A LogError names the first line with another number of cells.
         """
@@ -168,11 +176,13 @@ class CsvFile:
         for number, line in self._lines():
             if number < layout.first_line or line.lstrip().startswith(self.form.comment):
                 continue
-            cells = split(line, layout.delimiter)
+            cells = split(line, layout.delimiter, count)
             if len(cells) != count:
                 raise LogError(
                     f"{self.path}, line {number}: has {len(cells)} cells; expected {count}, as the first row"
                 )
+            if most is not None and len(lines) == most:
+                break
             lines.append(number)
             for column, index in zip(found, indices, strict=True):
                 column.append(cells[index])
@@ -247,15 +257,15 @@ class CsvTable(FieldTable):
 _TRUTHS = {"true": "1", "false": "0"}
 
 
-def split(line: str, delimiter: str) -> list[str]:
-    """Cells of a line without the space around them; an empty one at its end is none."""
+def split(line: str, delimiter: str, count: int | None = None) -> list[str]:
+    """Cells of a line without the space around them; an empty one at its end counts only as the last of ``count``."""
     if delimiter == " ":
         return line.split()
     cells = (
         next(csv.reader([line], delimiter=delimiter, skipinitialspace=True)) if '"' in line else line.split(delimiter)
     )
     cells = [cell.strip() for cell in cells]
-    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+    return cells[:-1] if len(cells) > 1 and not cells[-1] and len(cells) != count else cells
 
 
 def _delimiter_of(line: str, decimal: str = ".") -> str:

@@ -131,3 +131,29 @@ def test_a_driver_that_holds_the_velocity_between_measurements_gives_each_once(f
 def test_a_sensor_that_got_stuck_once_is_no_driver_that_holds_velocities(foreign: Any) -> None:
     stuck = report(lost={"velocity": velocity(20)})
     assert len(foreign.read(imu(ROWS), stuck, tree("dvl_link", w=1.0)).dvl.stamps_ns) == ROWS
+
+
+def turning(row: int, **status: Any) -> dict[str, Any]:
+    return {"angular_velocity": vector(0.01 * np.sin(row), 0, 0.1), **status}
+
+
+DENIED = {
+    f"{name}_covariance": [-1.0] + [0.0] * 8 for name in ("orientation", "angular_velocity", "linear_acceleration")
+}
+
+
+def test_an_imu_that_denies_all_that_it_measures_is_used_with_a_warning(foreign: Any) -> None:
+    """A driver that has no covariances writes -1 into each, which by the definition says: not measured."""
+    rows = [turning(row, linear_acceleration=vector(0.1 * np.cos(row), 0, 9.8), **DENIED) for row in range(ROWS)]
+    entry = rows_of("/imu", "sensor_msgs/msg/Imu", rows, "imu_link")
+    sequence = foreign.read(entry, report(lost={}))
+    assert len(sequence.imu.stamps_ns) == ROWS
+    assert np.isfinite(sequence.imu.specific_force).all()
+    assert "`angular_velocity_status = false, linear_acceleration_status = false`" in sequence.notes["log.warnings"]
+
+
+def test_accelerations_of_zero_that_are_called_not_measured_are_not(foreign: Any) -> None:
+    rows = [turning(row, linear_acceleration_covariance=[-1.0] + [0.0] * 8) for row in range(ROWS)]
+    sequence = foreign.read(rows_of("/imu", "sensor_msgs/msg/Imu", rows, "imu_link"), report(lost={}))
+    assert np.isnan(sequence.imu.specific_force).all()
+    assert "not measured) in every" not in sequence.notes.get("log.warnings", "")
