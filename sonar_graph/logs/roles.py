@@ -97,6 +97,8 @@ def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_
 
 def refusal(topic: Topic) -> str | None:
     """Reason why the messages of a topic cannot be decoded, which completes "/imu ..."; None: they can."""
+    if topic.encoding == "ros1":
+        return f"has ROS 1 messages: `sonar-graph convert rosbag {topic.file} -o OUT.mcap` makes a log of them"
     if topic.encoding != "cdr":
         return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read"
     if not topic.schema_encoding:

@@ -24,6 +24,7 @@ from sonar_graph.files import regular
 MAGIC = b"\x89MCAP0\r\n"
 BAG_MAGIC = (b"#ROSBAG", b"SQLite format 3")
 """First bytes of ROS 1 bags and of the files of ROS 2 bags."""
+ALREADY_MCAP = "already an MCAP file: read it directly, "
 START_BYTES = 64
 """Leading bytes that identify the type of a file."""
 
@@ -53,7 +54,7 @@ def why_no_bag(path: Path, start: bytes) -> str | None:
     if start.startswith(BAG_MAGIC):
         return None
     if start.startswith(MAGIC):
-        return f"already an MCAP file: read it directly, `sonar-graph inspect {path}`"
+        return f"{ALREADY_MCAP}`sonar-graph inspect {path}`"
     return f"no bag but {_unknown_kind(start, 'give a ROS 1 .bag, or the folder of a ROS 2 bag')}"
 
 
