@@ -328,8 +328,11 @@ class Assembly:
         """
         for role in ("imu", "dvl"):
             if self.block(role) is None:
-                topic, faults = self.topics[role], _counts(self._dropped.get(role, {}))
-                raise topic.error(f"none of its {len(topic)} messages can be used: {faults}")
+                topic = self.topics[role]
+                faults = self._dropped.get(role, {})
+                keys = [key for fault in faults if (key := self.adapters[role].accepts(fault)) is not None]
+                way_out = f"; `{', '.join(keys)}` under [{role}] in a log configuration uses them" if keys else ""
+                raise topic.error(f"none of its {len(topic)} messages can be used: {_counts(faults)}{way_out}")
         require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
         stamps = [

@@ -23,9 +23,19 @@ HEADING = "sonar_graph_msgs/msg/Heading"
 POINT = "geometry_msgs/msg/PointStamped"
 DROPPED = "sonar_graph_msgs/msg/Dropped"
 TF = "tf2_msgs/msg/TFMessage"
+OTHER_WAYS = "record ROS 2 messages, or write tables for `sonar-graph convert csv`"
 SONAR = "sonar"
 """The role of sonar images."""
+LONGEST = 300
+"""Characters of a refusal, without the names of files."""
+MOST_TYPES = 2
+"""Most types that a reason names for a role; docs/howto/your_driver.md has all."""
 _DEFAULTS = LogConfig()
+
+
+def _some(types: list[str]) -> str:
+    more = len(types) - MOST_TYPES
+    return ", ".join(types[:MOST_TYPES]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Role:
         for offer in self.shipped:
             by_words.setdefault(offer.words, {})[offer.adapter.type] = None
         return ", or ".join(
-            ", ".join(names) + (f" on a topic with {' or '.join(map(repr, words))} in its name" if words else "")
+            _some(list(names)) + (f" on a topic with {' or '.join(map(repr, words))} in its name" if words else "")
             for words, names in by_words.items()
         )
 
@@ -100,16 +110,16 @@ def refusal(topic: Topic) -> str | None:
     if topic.encoding == "ros1":
         return f"has ROS 1 messages: `sonar-graph convert rosbag {topic.file} -o OUT.mcap` makes a log of them"
     if topic.encoding != "cdr":
-        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read"
+        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read: {OTHER_WAYS}"
     if not topic.schema_encoding:
-        return "has no definition of its messages"
+        return f"has no definition of its messages: {OTHER_WAYS}"
     if topic.schema_encoding == "ros2idl":
         return (
             "has a definition in ros2idl; only ros2msg is read: record it again where the type's .msg file is "
             "installed, or publish a type that is defined by one"
         )
     if topic.schema_encoding != "ros2msg":
-        return f"has a definition in {topic.schema_encoding}; only ros2msg is read"
+        return f"has a definition in {topic.schema_encoding}; only ros2msg is read: {OTHER_WAYS}"
     try:
         parse_definition(topic.type_name, topic.schema_text)
     except LogError as error:
@@ -243,17 +253,27 @@ def choose_topics(
             )
         is_asked_for = name in wanted or {"topic", "type"} & config.table(name).keys()
         if choice.topic is None and (is_required or (is_asked_for and not choice.is_off)):
-            listed = [
-                f"{t.name} ({t.type_name or 'no type'}{f', {reason}' if (reason := refusal(t)) else ''})"
-                for t in recording.topics.values()
-            ]
-            needed = " (IMU and Doppler log must both be in the log)"
+            needed = "" if is_asked_for else " (IMU and Doppler log must both be in the log)"
             raise MissingTopicError(
-                f"{path}: nothing for {name}: {choice.reason}{'' if is_asked_for else needed}; the log has "
-                f"{', '.join(listed) or 'no messages at all'}; describe topics of other types in a log configuration, "
-                f"which `sonar-graph inspect {path} --toml` begins{images_alone(recording, config)}"
+                _missing(recording, name, f"{choice.reason}{needed}", images_alone(recording, config))
             )
     return choices
+
+
+def _missing(recording: Recording, role: str, reason: str, images: str) -> str:
+    """Refusal of a log that lacks a role, with as many of its topics as `LONGEST` allows."""
+    path = recording.path
+    topics = [
+        f"{t.name} ({t.type_name or 'no type'}{f', {fault}' if (fault := refusal(t)) else ''})"
+        for t in recording.topics.values()
+    ]
+    way_out = f"; `sonar-graph inspect {path} --toml` begins a log configuration for other types{images}"
+    for count in range(len(topics), 0, -1):
+        more = f" and {len(topics) - count} more" if count < len(topics) else ""
+        text = f"{path}: nothing for {role}: {reason}; the log has {', '.join(topics[:count])}{more}{way_out}"
+        if len(text) - 2 * len(str(path)) <= LONGEST or count == 1:
+            return text
+    return f"{path}: nothing for {role}: {reason}; the log has no messages at all{way_out}"
 
 
 def images_alone(recording: Recording, config: LogConfig) -> str:

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
-from sonar_graph.logs.adapters.message_table import FieldTable, MessageTable, field_of
+from sonar_graph.logs.adapters.message_table import SAME_STAMP, FieldTable, MessageTable, field_of
 from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import Floats
@@ -150,6 +150,10 @@ class Adapter(Section):
         if named or self.other_frame_id_field is None:
             return named
         return messages[0].first_string(self.other_frame_id_field)
+
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        return 'stamp = "log"' if fault == SAME_STAMP else None
 
     def pinned(self, table: FieldTable) -> dict[str, Any]:  # noqa: ARG002  # for subclasses
         """Settings by which single messages are read as all messages of a table are together."""

@@ -129,14 +129,22 @@ FEWEST_STEPS = 10
 """Fewest steps from which usual ones are known."""
 LEAST_REPEATED = 0.2
 """Share of rows, and of values, that a driver repeats which holds velocities between measurements."""
+SAID_INVALID = "with a covariance that says invalid"
 ZEROS = "with a velocity of 0 in one step"
 SENTINEL = "with one value beyond 30 m/s in all components"
 REPEATED = "that repeat the velocity before"
 FEW_BEAMS = f"with fewer than {FEWEST_BEAMS} good beams"
-ACCEPTING = {ZEROS: "are_zeros_measured = true", SENTINEL: 'lock = "marked"', REPEATED: 'lock = "signs"'}
-"""Keys that use messages which were left out, by the reason."""
+NO_BEAM = "without a good beam"
+ACCEPTING = {
+    ZEROS: "are_zeros_measured = true",
+    SENTINEL: 'lock = "marked"',
+    REPEATED: 'lock = "signs"',
+    FEW_BEAMS: "good_beams = false",
+    NO_BEAM: "good_beams = false",
+    SAID_INVALID: 'covariance = {negative = "unknown", zero = "unknown"}',
+}
+"""Settings that use messages which were left out, by the reason."""
 Number = bool | int | float
-SAID_INVALID = "with a covariance that says invalid"
 
 
 class DvlAdapter(Adapter):
@@ -229,7 +237,7 @@ class DvlAdapter(Adapter):
         }
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
-            faults["without a good beam"] = (beams == 0) & (self.are_beams_counted or beams.any())
+            faults[NO_BEAM] = (beams == 0) & (self.are_beams_counted or beams.any())
         return faults
 
     def _signs_of_no_lock(self, table: FieldTable, velocity: Floats) -> dict[str, NDArray[np.bool_]]:
@@ -253,6 +261,14 @@ class DvlAdapter(Adapter):
     def _may_count(self, is_good: NDArray[np.bool_]) -> bool:
         """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
         return self.lock == "signs" or bool(is_good.any())
+
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        if fault.endswith("below 0"):
+            return "altitude = false"
+        if fault.startswith("with ") and " not " in fault and fault != NOT_FINITE:
+            return "valid_where = {}"
+        return ACCEPTING.get(fault) or super().accepts(fault)
 
     def at_first(self) -> DvlAdapter:
         """Adapter for the first messages of a live run, where a mode that is 0 in all of them may still come."""
@@ -310,10 +326,9 @@ class DvlAdapter(Adapter):
         velocity = table.beside(self.velocity) * self.scale
         for reason, has_it in self._signs_of_no_lock(table, velocity).items():
             if has_it.any():
-                key = ACCEPTING.get(reason, f"{'altitude' if 'below' in reason else 'good_beams'} = false")
                 yield (
                     f"{np.count_nonzero(has_it)} of {len(table)} messages {reason}: left out; "
-                    f"`{key}` under [dvl] in a log configuration uses them"
+                    f"`{self.accepts(reason)}` under [dvl] in a log configuration uses them"
                 )
 
 

@@ -36,6 +36,7 @@ from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
 
 Paths = tuple[str, str, str]
+WITHOUT_RATE = "without angular rate"
 LEAST_MOVE_M = 1.0
 """A vehicle that moved less may not have turned."""
 
@@ -75,7 +76,7 @@ class ImuAdapter(Adapter):
         force = np.where(unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force)
         is_unmeasured = _is_marked(table, self.angular_velocity_status, rate)
         rows, dropped = fit_rows(
-            table.stamps_ns, {"without angular rate": is_unmeasured, NOT_FINITE: not_finite(rate)}, unique=True
+            table.stamps_ns, {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)}, unique=True
         )
         rate = turn(self.rotation, rate[rows])
         force = turn(self.rotation, force[rows])
@@ -101,6 +102,10 @@ class ImuAdapter(Adapter):
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
         elif bad.any() and not bad.all():
             yield f"{names} are not finite in {bad.sum()} of {len(table)} messages: taken as not measured there"
+
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        return "angular_velocity_status = false" if fault == WITHOUT_RATE else super().accepts(fault)
 
     def pinned(self, table: FieldTable) -> dict[str, Any]:
         """Settings by which single messages are read as all messages of a table are together."""

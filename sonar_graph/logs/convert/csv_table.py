@@ -21,6 +21,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.errors import LogError
 from sonar_graph.files import regular
 from sonar_graph.logs.adapters import FieldTable
+from sonar_graph.logs.mcap import START_BYTES, foreign_kind
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 
 _DELIMITERS = {"tab": "\t", "space": " "}
@@ -84,13 +85,19 @@ class CsvFile:
         try:
             with regular(self.path).open(encoding=self.form.encoding, errors="replace", newline=None) as stream:
                 for number, line in enumerate(stream, 1):
-                    if "\0" in line:
-                        raise LogError(f"{self.path}, line {number}: is no text; expected a table of numbers")
+                    if "\0" in line or (number == 1 and "\ufffd" in line[:START_BYTES]):
+                        raise LogError(f"{self.path}, line {number}: {self._kind() or 'is no text'}; expected a table")
                     if line.strip():
                         yield number, line.rstrip("\r\n").lstrip("\ufeff")
         except (OSError, LookupError) as error:
             reason = getattr(error, "strerror", None) or error
             raise LogError(f"{self.path}: cannot be read: {reason}; expected a text file with a table") from error
+
+    def _kind(self) -> str | None:
+        """Kind of a file that holds no text, where its first bytes are known."""
+        with self.path.open("rb") as stream:
+            kind = foreign_kind(self.path, stream.read(START_BYTES))
+        return f"is no text but {kind}" if kind else None
 
     def _find_layout(self) -> CsvLayout:
         heads: list[str] = []
