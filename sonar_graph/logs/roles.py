@@ -26,16 +26,17 @@ TF = "tf2_msgs/msg/TFMessage"
 OTHER_WAYS = "record ROS 2 messages, or write tables for `sonar-graph convert csv`"
 SONAR = "sonar"
 """The role of sonar images."""
+BOTH = " (IMU and Doppler log must both be in the log)"
 LONGEST = 300
 """Characters of a refusal, without the names of files."""
-MOST_TYPES = 2
-"""Most types that a reason names for a role; docs/howto/your_driver.md has all."""
+MOST_NAMED = 1
+"""Most types or topics that a reason names; docs/howto/your_driver.md has all types."""
 _DEFAULTS = LogConfig()
 
 
 def _some(types: list[str]) -> str:
-    more = len(types) - MOST_TYPES
-    return ", ".join(types[:MOST_TYPES]) + (f" and {more} more" if more > 0 else "")
+    more = len(types) - MOST_NAMED
+    return ", ".join(types[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass(frozen=True)
@@ -114,10 +115,7 @@ def refusal(topic: Topic) -> str | None:
     if not topic.schema_encoding:
         return f"has no definition of its messages: {OTHER_WAYS}"
     if topic.schema_encoding == "ros2idl":
-        return (
-            "has a definition in ros2idl; only ros2msg is read: record it again where the type's .msg file is "
-            "installed, or publish a type that is defined by one"
-        )
+        return "has a definition in ros2idl; only ros2msg is read: record it where the type's .msg file is installed"
     if topic.schema_encoding != "ros2msg":
         return f"has a definition in {topic.schema_encoding}; only ros2msg is read: {OTHER_WAYS}"
     try:
@@ -176,7 +174,7 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
         if found is None:
             allowed = [topic for topic in topics.values() if role.may_play(topic)]
             others = tuple(t.name for t in allowed if not isinstance(adapter_for(role, t, config), str))
-            hint = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
+            hint = f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}" if others else ""
             found = Choice(role, None, f"no {role.describe()}{hint}", could_be=others)
         choice = found
     if table and not choice.candidates:
@@ -253,27 +251,31 @@ def choose_topics(
             )
         is_asked_for = name in wanted or {"topic", "type"} & config.table(name).keys()
         if choice.topic is None and (is_required or (is_asked_for and not choice.is_off)):
-            needed = "" if is_asked_for else " (IMU and Doppler log must both be in the log)"
-            raise MissingTopicError(
-                _missing(recording, name, f"{choice.reason}{needed}", images_alone(recording, config))
-            )
+            is_needed = not is_asked_for and "`" not in choice.reason
+            images = images_alone(recording, config)
+            raise MissingTopicError(_missing(recording, name, choice.reason, images, is_needed=is_needed))
     return choices
 
 
-def _missing(recording: Recording, role: str, reason: str, images: str) -> str:
+def _missing(recording: Recording, role: str, reason: str, images: str, *, is_needed: bool) -> str:
     """Refusal of a log that lacks a role, with as many of its topics as `LONGEST` allows."""
     path = recording.path
+    faults = {topic.name: refusal(topic) for topic in recording.topics.values()}
     topics = [
-        f"{t.name} ({t.type_name or 'no type'}{f', {fault}' if (fault := refusal(t)) else ''})"
-        for t in recording.topics.values()
+        f"{topic.name} ({topic.type_name or 'no type'}"
+        f"{f', {fault}' if (fault := faults[topic.name]) and fault not in reason else ''})"
+        for topic in recording.topics.values()
     ]
-    way_out = f"; `sonar-graph inspect {path} --toml` begins a log configuration for other types{images}"
-    for count in range(len(topics), 0, -1):
+    way_out = f"; `sonar-graph inspect {path} --toml` begins a log configuration{images}"
+    if any(fault and "`" in fault and fault in reason for fault in faults.values()):
+        way_out = images  # the reason has its own
+    counts = range(len(topics), 0, -1)
+    for both, count in [(needed, count) for needed in (BOTH * is_needed, "") for count in counts]:
         more = f" and {len(topics) - count} more" if count < len(topics) else ""
-        text = f"{path}: nothing for {role}: {reason}; the log has {', '.join(topics[:count])}{more}{way_out}"
-        if len(text) - 2 * len(str(path)) <= LONGEST or count == 1:
+        text = f"{path}: nothing for {role}: {reason}{both}; the log has {', '.join(topics[:count])}{more}{way_out}"
+        if len(text) - text.count(str(path)) * (len(str(path)) - len(path.name)) <= LONGEST:
             return text
-    return f"{path}: nothing for {role}: {reason}; the log has no messages at all{way_out}"
+    return f"{path}: nothing for {role}: {reason}{BOTH * is_needed}{way_out}"
 
 
 def images_alone(recording: Recording, config: LogConfig) -> str:

@@ -144,7 +144,7 @@ IDL = "module sensor_msgs { module msg { struct Imu { double x; }; }; };"
 FOREIGN = {
     "/json": ("Some", "jsonschema", b"{}", "json", "has messages in json; only ROS 2 CDR is read"),
     "/protobuf": ("pkg.Some", "protobuf", b"\x0a\xff", "protobuf", "has messages in protobuf; only ROS 2 CDR is read"),
-    "/idl": (IMU, "ros2idl", IDL.encode(), "cdr", "has a definition in ros2idl; only ros2msg is read: record it again"),
+    "/idl": (IMU, "ros2idl", IDL.encode(), "cdr", "has a definition in ros2idl; only ros2msg is read: record it"),
     "/flat": (IMU, "flatbuffer", b"\0", "cdr", "has a definition in flatbuffer; only ros2msg is read"),
     "/wide": ("a/msg/B", "ros2msg", b"wstring s\n", "cdr", "cannot be read: the definition of a/B uses wstring"),
     "/loop": ("a/msg/B", "ros2msg", b"B[] b\n", "cdr", "cannot be read: the definition of a/B uses a/B within itself"),

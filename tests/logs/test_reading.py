@@ -32,7 +32,7 @@ UNKNOWN = [-1.0] + [0.0] * 8
 
 # fmt: off
 REFUSED_CHOICES: list[tuple[str, dict[str, str], type[Exception], str]] = [
-    ("/imu", {}, MissingTopicError, r"nothing for dvl: no marine_acoustic_msgs/msg/Dvl, dvl_msgs/msg/DVL.*/imu \(sens"),
+    ("/imu", {}, MissingTopicError, r"nothing for dvl: no marine_acoustic_msgs/msg/Dvl and 5 more.*/imu \(sens"),
     ("/dvl", {}, MissingTopicError, r"nothing for imu.*IMU and Doppler log must both be in the log.*/dvl \(marine"),
     ("/imu /dvl /other", {}, LogError, r"2 topics fit: /imu, /other; choose one: --topic imu=/imu \(topics=\{'imu'"),
     ("/imu /dvl", {"imu": "/nowhere"}, MissingTopicError, "/nowhere was chosen but is not in the log; the log has .*/"),
