@@ -275,7 +275,7 @@ def _missing(recording: Recording, role: str, reason: str, images: str, *, is_ne
         text = f"{path}: nothing for {role}: {reason}{both}; the log has {', '.join(topics[:count])}{more}{way_out}"
         if len(text) - text.count(str(path)) * (len(str(path)) - len(path.name)) <= LONGEST:
             return text
-    return f"{path}: nothing for {role}: {reason}{BOTH * is_needed}{way_out}"
+    return f"{path}: nothing for {role}: {reason}{way_out}"
 
 
 def images_alone(recording: Recording, config: LogConfig) -> str:

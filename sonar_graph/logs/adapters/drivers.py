@@ -20,8 +20,8 @@ _DEPTH_WORDS = ("depth",)
 _HEADING_WORDS = ("heading", "compass", "ahrs")
 _FIX_WORDS = ("fix", "gps", "gnss", "usbl")
 _LANDMARK_WORDS = ("landmark", "sonar")
-Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl"})
-"""Types whose definition has z downwards, which not all drivers follow."""
+Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl", "dvl_msgs/msg/DVL"})
+"""Types whose definition or instrument has z downwards, which not all drivers follow."""
 
 
 @dataclass(frozen=True)
