@@ -100,10 +100,6 @@ MARINE_DVL = DvlAdapter(
     may_be_unfilled=("velocity_mode", "beam_velocities_valid"),
     good_beams="num_good_beams",
     altitude="altitude",
-    beam_unit_vectors=_xyz("beam_unit_vec"),
-    beam_ranges="range",
-    beam_ranges_valid="beam_ranges_valid",
-    sound_speed="sound_speed",
 )
 UUV_SIMULATOR_DVLS = [
     DvlAdapter(

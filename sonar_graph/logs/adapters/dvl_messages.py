@@ -23,10 +23,6 @@ from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, SpeedSc
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, FieldTable, fit_rows, not_finite
 from sonar_graph.measurements import Dvl, Floats, Ints
 
-LARGEST_TILT_DEG = 45.0
-"""Largest tilt of beams in use; 20 to 30 degrees are usual."""
-TOLERANCE_DEG = 3.0
-"""Difference allowed between published and configured directions."""
 FEWEST_BEAMS = 3
 """Beams needed for a velocity."""
 
@@ -77,46 +73,6 @@ class BeamGeometry(Section):
     def fewest(self) -> int:
         """Number of beams that a row needs."""
         return 1 if self.sigma_m_s else FEWEST_BEAMS
-
-
-def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str | None:
-    """Fault of published beam directions, shape (beams, 3); None: there is none, or nothing was published.
-
-    One driver, and one that copies it, publish z = sin(22.5°) where a beam tilted by 22.5° has cos(22.5°). Published
-    directions are never used; where velocities come from beams, the configured directions are.
-    """
-    if not np.isfinite(vectors).all() or not vectors.any():
-        return None
-    across, down = np.hypot(vectors[:, 0], vectors[:, 1]), np.abs(vectors[:, 2])
-    if np.allclose(across, down, atol=1e-3) and across.max() < np.sin(np.radians(LARGEST_TILT_DEG)) - 1e-2:
-        tilt_deg = float(np.degrees(np.arcsin(down)).mean())
-        return (
-            f"have z = {down.mean():.3f}, the sine of the tilt of {tilt_deg:.1f}°, where its cosine "
-            f"{np.cos(np.radians(tilt_deg)):.3f} should be"
-        )
-    lengths = np.linalg.norm(vectors, axis=1)
-    if np.any(np.abs(lengths - 1) > 1e-2):
-        return f"are no unit vectors (length {lengths.min():.3f} to {lengths.max():.3f})"
-    tilt_deg = float(np.degrees(np.arccos(np.clip(down, 0, 1))).max())
-    if tilt_deg > LARGEST_TILT_DEG:
-        return (
-            f"are tilted by {tilt_deg:.1f}°, which no Doppler log is: the driver seems to publish the sine of "
-            f"{90 - tilt_deg:.1f}° as z, where its cosine should be"
-        )
-    if geometry is None:
-        return None
-    if abs(tilt_deg - geometry.tilt_deg) > TOLERANCE_DEG:
-        return f"are tilted by {tilt_deg:.1f}°, the configured beams by {geometry.tilt_deg:g}°"
-    if geometry.velocity is None:
-        return None
-    if len(vectors) != len(geometry.azimuth_deg):
-        return f"are {len(vectors)}, the configured beams {len(geometry.azimuth_deg)}"
-    configured = geometry.directions() * np.sign(vectors[:, 2:]) ** np.array([0, 0, 1])  # z may point up or down
-    off_deg = np.degrees(np.arccos(np.clip((configured * vectors).sum(axis=1), -1, 1)))
-    beam = int(off_deg.argmax())
-    if off_deg[beam] <= TOLERANCE_DEG:
-        return None
-    return f"and the configured ones differ by up to {off_deg[beam]:.0f}° (beam {beam}); check azimuth_deg"
 
 
 LARGEST_SPEED_M_S = 30.0
@@ -173,15 +129,6 @@ class DvlAdapter(Adapter):
     """true: the driver counts, so that messages with none are left out even where no message has any."""
     beams: BeamGeometry | None = None
     """Directions of the beams."""
-    beam_unit_vectors: tuple[str, str, str] | None = None
-    """Array fields with x, y, z of each beam's direction: only checked, because drivers get them wrong. Velocities come
-    from the directions of `beams`."""
-    beam_ranges: str | None = None
-    """Array field with a range for each beam: only checked."""
-    beam_ranges_valid: str | None = None
-    """Field that says whether ranges are valid: only checked, because drivers leave it true."""
-    sound_speed: str | None = None
-    """Field with the speed of sound, m/s: only checked, because drivers leave it 0."""
 
     @model_validator(mode="after")
     def _has_a_velocity(self) -> DvlAdapter:
@@ -191,11 +138,10 @@ class DvlAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        checked = (self.beam_ranges, self.beam_ranges_valid, self.sound_speed, self.beam_unit_vectors)
         beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
         covariance = self.covariance.fields if self.covariance else None
         marks = (self.valid_where, self.good_beams, self.altitude)
-        return field_paths(self.velocity, covariance, *marks, *checked, *beams)
+        return field_paths(self.velocity, covariance, *marks, *beams)
 
     def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
@@ -298,22 +244,10 @@ class DvlAdapter(Adapter):
         return self.beams is not None and self.beams.velocity is not None and self.beams.sigma_m_s is not None
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
-        """Warnings about validity, covariances, beam directions, ranges and the speed of sound."""
+        """Warnings about validity and covariances."""
         yield from self._validity_warnings(table)
         if self.covariance is not None and not self._is_noise_of_beams:
             yield from self.covariance.warnings(table)
-        if self.beam_unit_vectors is not None:
-            vectors = np.stack([table.column(path)[0] for path in self.beam_unit_vectors], axis=-1)
-            if fault := beam_direction_fault(vectors, self.beams):
-                field = self.beam_unit_vectors[0].rpartition(".")[0]
-                yield f"{table.source}: {field}: beam directions {fault}; they are not used"
-        if self.sound_speed is not None and not table.column(self.sound_speed).any():
-            yield f"{self.sound_speed} is 0 in every message: the driver does not fill it"
-        if self.beam_ranges is not None and self.beam_ranges_valid is not None:
-            ranges, said = table.column(self.beam_ranges), table.column(self.beam_ranges_valid).astype(bool)
-            wrong = said & ~(np.isfinite(ranges) & (ranges > 0)).all(axis=1)
-            if wrong.any():
-                yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"
 
     def _validity_warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about fields that mark no message, and about messages left out by other signs."""

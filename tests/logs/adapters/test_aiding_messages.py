@@ -13,7 +13,7 @@ from sonar_graph.measurements import UNMEASURED_M2
 
 from .conftest import DEFINITIONS, IMU, Case, Entry, dvl, imu, interface, rows_of, tree, vector
 
-FRD_DVL = '[dvl]\nrotation = "frd"\nsound_speed = false\n'
+FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
 FIX, POINT, TURNED = (
     "sensor_msgs/msg/NavSatFix",
