@@ -25,7 +25,7 @@ from mcap.writer import Writer
 
 from sonar_graph.errors import LogError, SonarGraphError
 from sonar_graph.files import regular, written_whole
-from sonar_graph.logs.convert.driver_definitions import KNOWN
+from sonar_graph.logs.cdr import DRIVER_DEFINITIONS
 from sonar_graph.logs.mcap import (
     ALREADY_MCAP,
     LARGEST_BYTES,
@@ -92,7 +92,7 @@ def convert_rosbag(
     progress
         Called now and then with the number of messages done and in all.
     definitions
-        Folder with ``package/msg/Type.msg`` files, for types that neither the bag nor `driver_definitions` defines.
+        Folder with ``package/msg/Type.msg`` files, for types that neither the bag nor `DRIVER_DEFINITIONS` has.
 
     Raises
     ------
@@ -224,10 +224,10 @@ def _define(bag: AnyReader | Ros1InMcap, own: dict[str, list[str]]) -> None:
     for types in of_user.values():
         bag.typestore.register(types)
     for connection in bag.connections:
-        if connection.msgtype in bag.typestore.fielddefs or connection.msgtype not in KNOWN or not bag.is2:
+        if connection.msgtype in bag.typestore.fielddefs or connection.msgtype not in DRIVER_DEFINITIONS or not bag.is2:
             continue
         firsts = [raw for _, _, raw in islice(bag.messages(connections=[connection]), _MOST_TRIED)]
-        for text in KNOWN[connection.msgtype]:
+        for text in DRIVER_DEFINITIONS[connection.msgtype]:
             types = get_types_from_msg(text, connection.msgtype)
             if all(_follows(bag, types, connection.msgtype, raw) for raw in firsts):
                 bag.typestore.register({name: t for name, t in types.items() if name not in bag.typestore.fielddefs})

@@ -4,10 +4,7 @@ The sqlite3 bags of ROS 2 Humble and before hold no definitions. A driver change
 definition counts with which the first messages have the right length.
 """
 
-from itertools import chain
-
-from sonar_graph.logs.cdr import definition
-from sonar_graph.logs.cdr.definitions import DEFINITIONS
+from sonar_graph.logs.cdr.definitions import DEFINITIONS, definition
 
 _HEADER = "std_msgs/Header header"
 _VELOCITY = "geometry_msgs/Vector3 velocity"
@@ -41,13 +38,13 @@ def _simulator(package: str) -> list[str]:
     return [_with(fields, **{f"{package}__DVLBeam": beam}) for beam in beams]
 
 
-KNOWN: dict[str, list[str]] = {
+DRIVER_DEFINITIONS: dict[str, list[str]] = {
     "dvl_msgs/msg/DVL": _A50,
     "dvl_msgs/msg/DVLDR": [_A50_POSITION],
     **{f"{package}/msg/DVL": _simulator(package) for package in _SIMULATOR_PACKAGES},
     **{
         name: [definition(name)]
-        for name in (known.replace("/", "/msg/") for known in chain(DEFINITIONS))
+        for name in (known.replace("/", "/msg/") for known in DEFINITIONS)
         if name.startswith(("marine_acoustic_msgs/", "sonar_graph_msgs/"))
     },
 }
