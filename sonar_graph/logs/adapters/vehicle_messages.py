@@ -84,9 +84,8 @@ class ImuAdapter(Adapter):
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about values that the driver does not fill, or fills with what is no number."""
-        settings = self.pinned(table)
-        denied = [key for key in ("angular_velocity_status", "linear_acceleration_status") if key in settings]
-        if denied:
+        force = self._force(table)
+        if denied := self._denied(table, force):
             fields = " and ".join(str(getattr(self, key)) for key in denied)
             keys = ", ".join(f"{key} = false" for key in denied)
             yield (
@@ -95,7 +94,6 @@ class ImuAdapter(Adapter):
             )
         if self.linear_acceleration is None:
             return
-        force = self._force(table)
         names = ", ".join(self.linear_acceleration)
         bad = not_finite(force)
         if self._is_force_unfilled(table, force):
@@ -112,12 +110,18 @@ class ImuAdapter(Adapter):
         imu, _ = self.read(table)
         has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
         settings: dict[str, Any] = {"are_zeros_measured": True} if has_force else {"unfilled": "each"}
+        force = self._force(table)
+        return settings | dict.fromkeys(self._denied(table, force), False)
+
+    def _denied(self, table: FieldTable, force: Floats) -> list[str]:
+        """Keys of the statuses by which a driver calls all rows not measured, although the values change."""
         rate = table.beside(self.angular_velocity)
-        for key, values in (("angular_velocity_status", rate), ("linear_acceleration_status", self._force(table))):
+        found = []
+        for key, values in (("angular_velocity_status", rate), ("linear_acceleration_status", force)):
             status = getattr(self, key)
             if status is not None and _is_denied(table.column(status), values):
-                settings[key] = False
-        return settings
+                found.append(key)
+        return found
 
     def _force(self, table: FieldTable) -> Floats:
         """Specific force in m/s², shape (n, 3); NaN without accelerometers."""
@@ -139,17 +143,20 @@ def _scaled(values: np.ndarray, scale: float) -> np.ndarray:
 
 def _is_marked(table: FieldTable, path: str | None, values: Floats) -> np.ndarray:
     """Mask of rows whose status says that the values, shape (n, 3), were not measured, shape (n,)."""
-    if path is None or _is_denied(table.column(path), values):
+    if path is None:
         return np.zeros(len(table), bool)
-    return np.asarray(table.column(path) == -1)
+    status = table.column(path)
+    if _is_denied(status, values):
+        return np.zeros(len(table), bool)
+    return np.asarray(status == -1)
 
 
 def _is_denied(status: np.ndarray, values: Floats) -> bool:
     """Tell whether a driver calls all rows not measured, although the values change as measured ones do."""
+    if not (status == -1).all():
+        return False
     finite = values[np.isfinite(values).all(axis=1)]
-    return (
-        bool((status == -1).all()) and len(finite) > 1 and bool(np.any(finite[1:] != finite[:-1], axis=1).mean() > 0.5)
-    )
+    return len(finite) > 1 and bool(np.any(finite[1:] != finite[:-1], axis=1).mean() > 0.5)
 
 
 class DepthAdapter(Adapter):
