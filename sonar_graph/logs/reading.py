@@ -18,6 +18,7 @@ from sonar_graph.logs.adapters import (
     Adapter,
     DepthAdapter,
     Dropped,
+    DvlAdapter,
     FieldTable,
     GeodeticFields,
     HeadingAdapter,
@@ -49,6 +50,7 @@ from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
+    is_described,
     mounted_by,
     mounting_of,
     read_calibration,
@@ -233,12 +235,16 @@ class Assembly:
         self.calibration = calibration if isinstance(calibration, Calibration) else self._gathered(calibration)
         if isinstance(calibration, Calibration):
             self._notes["log.calibration"] = "given by the caller"
+        dvl = self.adapters.get("dvl")
+        is_held = self.calibration.odometry_interpolation == "hold-past"  # wheels stop, and turn evenly
+        if isinstance(dvl, DvlAdapter) and (is_held or is_described(recording)):
+            self.adapters["dvl"] = dvl.with_marks_alone()
 
     def _gathered(self, given: PartialCalibration | None) -> Calibration:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
         said = set() if recorded is None else recorded.model_fields_set
-        is_recorded = said | {"start"} == Calibration.model_fields.keys()  # not only what images and `join` bring
+        is_recorded = is_described(self._recording)
         self._is_start_stated = is_recorded or "start" in said or bool(given and given.values.get("start"))
         in_record = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated = in_record | (mounted_by(given.values) if given else set())

@@ -417,6 +417,15 @@ def read_calibration(recording: Recording) -> Calibration | None:
     return parse(Calibration, _json(recording, "calibration", text), f"{recording.path}: metadata record {METADATA!r}")
 
 
+def is_described(recording: Recording) -> bool:
+    """Tell whether a log's record states all of a calibration, as `write_log` does, not only what was added to it."""
+    try:
+        recorded = read_calibration(recording)
+    except CalibrationError:
+        return False
+    return recorded is not None and recorded.model_fields_set | {"start"} == Calibration.model_fields.keys()
+
+
 def read_notes(recording: Recording) -> dict[str, str]:
     """Notes in the log's record, which must be a JSON object."""
     notes = _json(recording, "notes", recording.metadata.get(METADATA, {}).get("notes", "{}"))

@@ -208,6 +208,10 @@ class DvlAdapter(Adapter):
         """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
         return self.lock == "signs" or bool(is_good.any())
 
+    def with_marks_alone(self) -> DvlAdapter:
+        """Adapter for velocities that were chosen before, as those in a log of `write_log`."""
+        return self.model_copy(update={"lock": "marked"}) if self.lock == "found" else self
+
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
         if fault.endswith("below 0"):

@@ -1,10 +1,14 @@
 """Messages as drivers really fill them, rebuilt field by field: bottom lock, held velocities, covariances of -1."""
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sonar_graph.logs import read_log, write_log
+from sonar_graph.testing import small_world
 from tests.logs.adapters.conftest import imu, rows_of, tree
 from tests.logs.conftest import Entry, vector
 
@@ -157,3 +161,16 @@ def test_accelerations_of_zero_that_are_called_not_measured_are_not(foreign: Any
     sequence = foreign.read(rows_of("/imu", "sensor_msgs/msg/Imu", rows, "imu_link"), report(lost={}))
     assert np.isnan(sequence.imu.specific_force).all()
     assert "not measured) in every" not in sequence.notes.get("log.warnings", "")
+
+
+def test_a_log_that_this_package_wrote_keeps_every_velocity(tmp_path: Path) -> None:
+    """Rows were chosen before it was written; wheels stop from one row to the next, and turn evenly."""
+    world = small_world()
+    velocity = world.dvl.velocity.copy()
+    velocity[40:60] = 0.0
+    velocity[60:90] = np.repeat(velocity[61:91:2], 2, axis=0)
+    written = replace(world, dvl=replace(world.dvl, velocity=velocity))
+    write_log(tmp_path / "own.mcap", written)
+    np.testing.assert_array_equal(read_log(tmp_path / "own.mcap").dvl.velocity, velocity)
+    with_whole = read_log(tmp_path / "own.mcap", calibration=world.calibration)
+    np.testing.assert_array_equal(with_whole.dvl.velocity, velocity)
