@@ -213,16 +213,29 @@ def rosbag(
     bag: Annotated[
         Path,
         typer.Argument(
-            metavar="BAG", exists=True, help="ROS 1 .bag, or folder of a ROS 2 bag."
+            metavar="BAG",
+            exists=True,
+            help="ROS 1 .bag, folder of a ROS 2 bag, or .mcap of ROS 1 messages.",
         ),
     ],
     output: OutputLog,
+    definitions: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            exists=True,
+            file_okay=False,
+            help="Holds package/msg/Type.msg of types that the bag does not define.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Any ROS 1 bag, or ROS 2 bag of the sqlite3 kind, with all its topics."""
     from sonar_graph.logs.convert import convert_rosbag
 
-    _convert_file(convert_rosbag, bag, output, overwrite)
+    _convert_file(
+        partial(convert_rosbag, definitions=definitions), bag, output, overwrite
+    )
 
 
 SonarRecording = Annotated[

@@ -65,7 +65,7 @@ def inspect(
     from sonar_graph.logs import inspect_log
 
     config, given = reading.config, reading.given
-    summary = inspect_log(log, config, reading.choices, reading.window)
+    summary = inspect_log(log, config, reading.choices, reading.window, given)
     if toml:
         echo(summary.toml, nl=False)
         return

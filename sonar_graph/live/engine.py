@@ -35,7 +35,7 @@ from sonar_graph.logs import (
     rows_of,
     sonar_frame,
 )
-from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.adapters import DvlAdapter, LogConfig
 from sonar_graph.logs.mcap import Keep, Recording, Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Measurements
 from sonar_graph.sequence import Sequence
@@ -346,6 +346,10 @@ class Engine:
             self._sonar = (
                 sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
             )
+            if isinstance(dvl := choices["dvl"].adapter, DvlAdapter):
+                choices = choices | {
+                    "dvl": replace(choices["dvl"], adapter=dvl.at_first())
+                }
             assembly = Assembly(recording, choices, self._given, self._sonar)
             choices = {
                 role: choice

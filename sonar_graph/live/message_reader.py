@@ -177,6 +177,8 @@ class PlainImu:
     @classmethod
     def like(cls, adapter: ImuAdapter, messages: Messages) -> PlainImu | None:
         """Form of a message that was read without faults; None where it takes more than numbers to read it."""
+        if adapter.linear_acceleration is None:
+            return None
         stamp = f"{adapter.stamp}.sec", f"{adapter.stamp}.nanosec"
         status = [
             path

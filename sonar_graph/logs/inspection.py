@@ -45,6 +45,7 @@ from sonar_graph.logs.sonar_images import (
     sonar_frame,
 )
 from sonar_graph.logs.vehicle_setup import (
+    PartialCalibration,
     read_calibration,
     read_notes,
     recorded_name,
@@ -185,6 +186,7 @@ def inspect_log(
     config: LogConfig | None = None,
     topics: Mapping[str, str] | None = None,
     window: TimeWindow | None = None,
+    calibration: PartialCalibration | None = None,
 ) -> LogSummary:
     """Summarise an MCAP file; faults of the log become part of the summary.
 
@@ -196,6 +198,8 @@ def inspect_log(
         What the user says about topics, as for `read_log`.
     window
         Part of the recording to inspect.
+    calibration
+        What the user says about the vehicle: mountings that it states are not missed in ``/tf_static``.
 
     Returns
     -------
@@ -252,7 +256,10 @@ def inspect_log(
     try:
         frame = sonar_frame(recording, choices[SONAR].topic, config)
         assembly = Assembly(
-            recording, {name: choices[name] for name in SEQUENCE_ROLES}, sonar=frame
+            recording,
+            {name: choices[name] for name in SEQUENCE_ROLES},
+            calibration,
+            frame,
         )
         mounted = assembly.mounted
         left_out, warnings = assembly.survey()

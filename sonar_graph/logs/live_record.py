@@ -116,8 +116,8 @@ def pinned(
 ) -> dict[str, Any]:
     """Tables of a configuration with which a log gets the same topics in the same roles, read in the same way.
 
-    What a log decides by all its messages is decided by those of an assembly: whether a driver fills the acceleration
-    and counts beams, and the origin of the world.
+    What a log decides by all its messages is decided by those of an assembly: which fields a driver fills
+    (`Adapter.pinned`), and the origin of the world.
     """
     tables: dict[str, Any] = {
         role: dict(table) for role, table in config.tables.items()
@@ -127,16 +127,9 @@ def pinned(
             tables[role] = {"use": False}
         else:
             tables.setdefault(role, {})["topic"] = choice.topic
-    imu, dvl = assembly.block("imu"), assembly.adapters["dvl"]
-    has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
-    tables["imu"] |= {"are_zeros_measured": True} if has_force else {"unfilled": "each"}
-    if dvl.good_beams is not None:
-        are_counted = bool(
-            dvl.table(assembly.topics["dvl"]).column(dvl.good_beams).any()
-        )
-        tables["dvl"] |= (
-            {"are_beams_counted": True} if are_counted else {"good_beams": False}
-        )
+    for role in ("imu", "dvl"):
+        adapter = assembly.adapters[role]
+        tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))
     for role in ("positions", "truth"):
         if role in assembly.topics and assembly.adapters[role].geodetic is not None:
             _, origin = assembly.axes_and_origin(role)

@@ -18,6 +18,7 @@ from sonar_graph.logs.adapters import (
     Adapter,
     DepthAdapter,
     Dropped,
+    DvlAdapter,
     FieldTable,
     GeodeticFields,
     HeadingAdapter,
@@ -56,12 +57,14 @@ from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
+    is_described,
     mounted_by,
     mounting_of,
     read_calibration,
     read_notes,
     recorded_name,
     static_frames,
+    unplaced,
     with_measured_start,
 )
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
@@ -279,6 +282,8 @@ class Assembly:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()
         self._is_mounting_known = self._is_start_stated = True
+        self._unplaced: dict[str, str] = {}
+        self._has_tree = False
         self.mounted: dict[str, str] = {}
         """Frame in ``/tf_static`` of each sensor whose mounting is from there."""
         self.calibration = (
@@ -288,13 +293,17 @@ class Assembly:
         )
         if isinstance(calibration, Calibration):
             self._notes["log.calibration"] = "given by the caller"
+        dvl = self.adapters.get("dvl")
+        # wheels stop, and turn evenly
+        is_held = self.calibration.odometry_interpolation == "hold-past"
+        if isinstance(dvl, DvlAdapter) and (is_held or is_described(recording)):
+            self.adapters["dvl"] = dvl.with_marks_alone()
 
     def _gathered(self, given: PartialCalibration | None) -> Calibration:
         """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
         said = set() if recorded is None else recorded.model_fields_set
-        # not only what images and `join` bring
-        is_recorded = said | {"start"} == Calibration.model_fields.keys()
+        is_recorded = is_described(self._recording)
         self._is_start_stated = (
             is_recorded or "start" in said or bool(given and given.values.get("start"))
         )
@@ -334,6 +343,11 @@ class Assembly:
         }
         mounted = mountings.keys() | stated
         self._is_mounting_known = "dvl" in mounted
+        if recorded is None:  # a record of this package states what is not zero
+            self._unplaced = {
+                name: frame for name, frame in frames.items() if name not in mounted
+            }
+            self._has_tree = bool(tree)
         source = "from the log"
         if not is_recorded:
             source = (
@@ -413,9 +427,20 @@ class Assembly:
         """
         for role in ("imu", "dvl"):
             if self.block(role) is None:
-                topic, faults = self.topics[role], _counts(self._dropped.get(role, {}))
+                topic = self.topics[role]
+                faults = self._dropped.get(role, {})
+                keys = [
+                    key
+                    for fault in faults
+                    if (key := self.adapters[role].accepts(fault)) is not None
+                ]
+                way_out = (
+                    f"; `{', '.join(keys)}` under [{role}] in a log configuration uses them"
+                    if keys
+                    else ""
+                )
                 raise topic.error(
-                    f"none of its {len(topic)} messages can be used: {faults}"
+                    f"none of its {len(topic)} messages can be used: {_counts(faults)}{way_out}"
                 )
         require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
@@ -465,6 +490,10 @@ class Assembly:
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
+        yield from (
+            unplaced(name, frame, has_tree=self._has_tree)
+            for name, frame in self._unplaced.items()
+        )
         for role, table in self._tables.items():
             yield from (
                 f"{role}: {text}" for text in self.adapters[role].warnings(table)

@@ -30,9 +30,20 @@ HEADING = "sonar_graph_msgs/msg/Heading"
 POINT = "geometry_msgs/msg/PointStamped"
 DROPPED = "sonar_graph_msgs/msg/Dropped"
 TF = "tf2_msgs/msg/TFMessage"
+OTHER_WAYS = "record ROS 2 messages, or write tables for `sonar-graph convert csv`"
 SONAR = "sonar"
 """The role of sonar images."""
+BOTH = " (IMU and Doppler log must both be in the log)"
+LONGEST = 300
+"""Characters of a refusal, without the names of files."""
+MOST_NAMED = 1
+"""Most types or topics that a reason names; docs/howto/your_driver.md has all types."""
 _DEFAULTS = LogConfig()
+
+
+def _some(types: list[str]) -> str:
+    more = len(types) - MOST_NAMED
+    return ", ".join(types[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass(frozen=True)
@@ -49,7 +60,7 @@ class Role:
         for offer in self.shipped:
             by_words.setdefault(offer.words, {})[offer.adapter.type] = None
         return ", or ".join(
-            ", ".join(names)
+            _some(list(names))
             + (
                 f" on a topic with {' or '.join(map(repr, words))} in its name"
                 if words
@@ -121,17 +132,16 @@ def wanted_types(
 
 def refusal(topic: Topic) -> str | None:
     """Reason why the messages of a topic cannot be decoded, which completes "/imu ..."; None: they can."""
+    if topic.encoding == "ros1":
+        return f"has ROS 1 messages: `sonar-graph convert rosbag {topic.file} -o OUT.mcap` makes a log of them"
     if topic.encoding != "cdr":
-        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read"
+        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read: {OTHER_WAYS}"
     if not topic.schema_encoding:
-        return "has no definition of its messages"
+        return f"has no definition of its messages: {OTHER_WAYS}"
     if topic.schema_encoding == "ros2idl":
-        return (
-            "has a definition in ros2idl; only ros2msg is read: record it again where the type's .msg file is "
-            "installed, or publish a type that is defined by one"
-        )
+        return "has a definition in ros2idl; only ros2msg is read: record it where the type's .msg file is installed"
     if topic.schema_encoding != "ros2msg":
-        return f"has a definition in {topic.schema_encoding}; only ros2msg is read"
+        return f"has a definition in {topic.schema_encoding}; only ros2msg is read: {OTHER_WAYS}"
     try:
         parse_definition(topic.type_name, topic.schema_text)
     except LogError as error:
@@ -212,7 +222,7 @@ def choose_topic(
                 if not isinstance(adapter_for(role, t, config), str)
             )
             hint = (
-                f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}"
+                f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}"
                 if others
                 else ""
             )
@@ -331,17 +341,42 @@ def choose_topics(
         if choice.topic is None and (
             is_required or (is_asked_for and not choice.is_off)
         ):
-            listed = [
-                f"{t.name} ({t.type_name or 'no type'}{f', {reason}' if (reason := refusal(t)) else ''})"
-                for t in recording.topics.values()
-            ]
-            needed = " (IMU and Doppler log must both be in the log)"
+            is_needed = not is_asked_for and "`" not in choice.reason
+            images = images_alone(recording, config)
             raise MissingTopicError(
-                f"{path}: nothing for {name}: {choice.reason}{'' if is_asked_for else needed}; the log has "
-                f"{', '.join(listed) or 'no messages at all'}; describe topics of other types in a log configuration, "
-                f"which `sonar-graph inspect {path} --toml` begins{images_alone(recording, config)}"
+                _missing(recording, name, choice.reason, images, is_needed=is_needed)
             )
     return choices
+
+
+def _missing(
+    recording: Recording, role: str, reason: str, images: str, *, is_needed: bool
+) -> str:
+    """Refusal of a log that lacks a role, with as many of its topics as `LONGEST` allows."""
+    path = recording.path
+    faults = {topic.name: refusal(topic) for topic in recording.topics.values()}
+    topics = [
+        f"{topic.name} ({topic.type_name or 'no type'}"
+        f"{f', {fault}' if (fault := faults[topic.name]) and fault not in reason else ''})"
+        for topic in recording.topics.values()
+    ]
+    way_out = (
+        f"; `sonar-graph inspect {path} --toml` begins a log configuration{images}"
+    )
+    if any(fault and "`" in fault and fault in reason for fault in faults.values()):
+        way_out = images  # the reason has its own
+    counts = range(len(topics), 0, -1)
+    for both, count in [
+        (needed, count) for needed in (BOTH * is_needed, "") for count in counts
+    ]:
+        more = f" and {len(topics) - count} more" if count < len(topics) else ""
+        text = f"{path}: nothing for {role}: {reason}{both}; the log has {', '.join(topics[:count])}{more}{way_out}"
+        if (
+            len(text) - text.count(str(path)) * (len(str(path)) - len(path.name))
+            <= LONGEST
+        ):
+            return text
+    return f"{path}: nothing for {role}: {reason}{way_out}"
 
 
 def images_alone(recording: Recording, config: LogConfig) -> str:

@@ -31,7 +31,7 @@ from sonar_graph.logs.cdr import (
     parse_definition,
     short_name,
 )
-from sonar_graph.logs.mcap import Keep, Recording, scan
+from sonar_graph.logs.mcap import Keep, Recording, earlier_parts, scan
 from sonar_graph.logs.roles import TF
 from sonar_graph.measurements import Dvl, Floats, Ints
 from sonar_graph.settings import faults_in, parse
@@ -39,6 +39,8 @@ from sonar_graph.settings import faults_in, parse
 METADATA = "sonar_graph"
 """Name of the metadata record with name, calibration and notes."""
 BODY_FRAME = "base_link"
+BODY_FRAMES = (BODY_FRAME, "base_footprint")
+"""Names of the body's frame, of which the first counts that is there."""
 FrameTree = dict[str, tuple[str, gtsam.Pose3 | str]]
 """Parent and ``parent_T_frame`` of each frame; instead of a pose the fault of one that cannot be."""
 LARGEST_LEVER_M = 1000.0
@@ -57,7 +59,21 @@ MOUNTING_FIELDS = {
 
 
 def static_frames(recording: Recording) -> FrameTree:
-    """Frames of ``/tf_static``; of several transforms to one frame the last holds."""
+    """Frames of ``/tf_static``; of several transforms to one frame the last holds.
+
+    Of a bag that is split by time, only the first file may have ``/tf_static``: the files before it are read too.
+    """
+    frames = _frames_in(recording)
+    for part in () if frames else earlier_parts(recording.path):
+        frames |= _frames_in(scan(part, _transforms))
+    return frames
+
+
+def _transforms(kind: str) -> Keep:
+    return Keep.ALL if short_name(kind) == short_name(TF) else Keep.NONE
+
+
+def _frames_in(recording: Recording) -> FrameTree:
     frames: FrameTree = {}
     for topic in recording.topics.values():
         if (
@@ -104,27 +120,82 @@ def _pose(translation_m: Floats, quaternion_wxyz: Floats) -> gtsam.Pose3 | str:
 def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
     """``body_T_frame`` through all frames in between; None where the frame does not hang on the body.
 
-    A LogError names the transform that cannot be one.
+    The body is ``base_link``, else ``base_footprint``, with or without a namespace before it; a sensor's frame is found
+    without its namespace too, where one frame alone fits. A LogError names the transform that cannot be one.
     """
-    body_T_sensor, name = gtsam.Pose3(), frame.lstrip("/")
-    for _ in range(len(frames) + 1):
-        if name == BODY_FRAME:
-            if (
-                not (lever_m := math.hypot(*body_T_sensor.translation()))
-                < LARGEST_LEVER_M
-            ):
-                raise _unusable(frame, f"is {lever_m:g} m from {BODY_FRAME}")
-            x_m, y_m, z_m = body_T_sensor.translation().tolist()
-            roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
-            return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))
-        if name not in frames:
-            break
-        child, (name, parent_T_frame) = name, frames[name]
-        if isinstance(parent_T_frame, str):
-            raise _unusable(
-                frame, f"the transform from {name} to {child} {parent_T_frame}"
-            )
-        body_T_sensor = parent_T_frame * body_T_sensor
+    above = _above(_as_in_tree(frame.lstrip("/"), frames), frames)
+    body_T_sensor = next(
+        (
+            pose
+            for root in BODY_FRAMES
+            if (pose := _from(root, above, frames)) is not None
+        ),
+        None,
+    )
+    if isinstance(body_T_sensor, str):
+        raise _unusable(frame, body_T_sensor)
+    if body_T_sensor is None:
+        return None
+    if not (lever_m := math.hypot(*body_T_sensor.translation())) < LARGEST_LEVER_M:
+        raise _unusable(frame, f"is {lever_m:g} m from {BODY_FRAME}")
+    x_m, y_m, z_m = body_T_sensor.translation().tolist()
+    roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
+    return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+def _as_in_tree(frame: str, frames: FrameTree) -> str:
+    """Name of a frame in the tree: the same, or the only one that differs by a namespace in front."""
+    if frame in frames or not frame or _last(frame) in BODY_FRAMES:
+        return frame
+    alike = [
+        name
+        for name in frames
+        if name.endswith(f"/{frame}") or frame.endswith(f"/{name}")
+    ]
+    return alike[0] if len(alike) == 1 else frame
+
+
+def _above(frame: str, frames: FrameTree) -> dict[str, gtsam.Pose3 | str]:
+    """``ancestor_T_frame`` of a frame and all its ancestors, or the fault of a transform on the way to one."""
+    above: dict[str, gtsam.Pose3 | str] = {frame: gtsam.Pose3()}
+    name = frame
+    while name in frames and frames[name][0] not in above:
+        parent, parent_T_name = frames[name]
+        name_T_frame = above[name]
+        if isinstance(name_T_frame, str):
+            above[parent] = name_T_frame
+        elif isinstance(parent_T_name, str):
+            above[parent] = f"the transform from {parent} to {name} {parent_T_name}"
+        else:
+            above[parent] = parent_T_name * name_T_frame
+        name = parent
+    return above
+
+
+def _from(
+    root: str, above: dict[str, gtsam.Pose3 | str], frames: FrameTree
+) -> gtsam.Pose3 | str | None:
+    """``body_T_frame`` of a body with a root's name above the frame, or beside it below a common ancestor.
+
+    A fault of a transform in between is given in its place; None where no such body is in the tree.
+    """
+    body = next((name for name in above if _last(name) == root), None)
+    if body is not None:
+        return above[body]
+    for beside in (name for name in frames if _last(name) == root):
+        body_above = _above(beside, frames)
+        shared = next((name for name in above if name in body_above), None)
+        if shared is None:
+            continue
+        shared_T_frame = above[shared]
+        shared_T_body = body_above[shared]
+        if isinstance(shared_T_frame, str) or isinstance(shared_T_body, str):
+            return shared_T_frame if isinstance(shared_T_frame, str) else shared_T_body
+        return shared_T_body.inverse() * shared_T_frame
     return None
 
 
@@ -300,10 +371,7 @@ def recorded_fields(path: Path) -> dict[str, Any]:
 
 def static_mounting(path: Path, frame: str) -> Mounting | None:
     """Mounting of a sensor's frame by a log's ``/tf_static``, or None; errors as of `mounting_of`."""
-    recording = scan(
-        path, lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.NONE
-    )
-    return mounting_of(frame, static_frames(recording))
+    return mounting_of(frame, static_frames(scan(path, _transforms)))
 
 
 def with_fields(recorded: Values, *changes: Values) -> str:
@@ -386,6 +454,23 @@ def _nearest(stamps_ns: Ints, at_ns: int) -> Ints:
     return np.sort(np.argsort(np.abs(stamps_ns - at_ns), kind="stable")[:NEAREST_ROWS])
 
 
+def unplaced(sensor: str, frame: str, *, has_tree: bool) -> str:
+    """Warning about a sensor whose place is not known, with what states it."""
+    key = f"[{sensor}] {MOUNTING_FIELDS[sensor]}"
+    where = f"{key} in a file for --calibration"
+    if not frame:
+        return (
+            f"{sensor}: no frame in its messages: mounting taken as zero; give {where}"
+        )
+    tree = "" if has_tree else " (the log has no /tf_static)"
+    other = (
+        f", or frame_id under [{sensor}] in a log configuration"
+        if has_tree and sensor != "sonar"
+        else ""
+    )
+    return f"{sensor}: no transform from {frame} to {BODY_FRAME}{tree}: mounting taken as zero; give {where}{other}"
+
+
 def mounted_by(values: Values) -> set[str]:
     """Sensors whose mounting is given."""
     sections = {
@@ -436,6 +521,18 @@ def read_calibration(recording: Recording) -> Calibration | None:
         Calibration,
         _json(recording, "calibration", text),
         f"{recording.path}: metadata record {METADATA!r}",
+    )
+
+
+def is_described(recording: Recording) -> bool:
+    """Tell whether a log's record states all of a calibration, as `write_log` does, not only what was added to it."""
+    try:
+        recorded = read_calibration(recording)
+    except CalibrationError:
+        return False
+    return (
+        recorded is not None
+        and recorded.model_fields_set | {"start"} == Calibration.model_fields.keys()
     )
 
 

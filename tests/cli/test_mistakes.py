@@ -146,7 +146,7 @@ MISTAKES = {
     "recognise lane.mcap -o new.mcap --set least_frames=many": "least_frames",
     "recognise lane.mcap -o new.mcap --recogniser actag --rule jeffrey": "not for actag.*use --set",
     "recognise lane.mcap -o new.mcap --recogniser bogus": "actag",
-    "compare images.mcap -o out": r"images\.mcap: nothing for imu.*IMU and Doppler log must both be in the log",
+    "compare images.mcap -o out": r"images\.mcap: nothing for imu.*`sonar-graph recognise images\.mcap` needs",
     "compare lane.mcap -o out --topic sonar=/none": "/none was chosen but is not in the log",
     "compare bare.mcap -o out --rule jeffrey": r"bare\.mcap: has no sonar images.*--rule",
     "compare lane.mcap -o out --rule bayes": r"settings of the recogniser: identity\.rule: .*virtual-evidence.*jeffrey",

@@ -225,7 +225,7 @@ FOREIGN = {
         "ros2idl",
         IDL.encode(),
         "cdr",
-        "has a definition in ros2idl; only ros2msg is read: record it again",
+        "has a definition in ros2idl; only ros2msg is read: record it",
     ),
     "/flat": (
         IMU,

@@ -529,7 +529,7 @@ OTHER_FILES = {
     b"DDF\x05"
     + bytes(
         60
-    ): r"an ARIS' recording; `sonar-graph convert aris .*log\.bag -o log\.mcap` makes one",
+    ): r"an ARIS' recording; `sonar-graph convert aris .*log\.bag -o log\.mcap` makes a log of it",
     b"DDF\x03" + bytes(60): "a DIDSON's recording; `sonar-graph convert didson ",
     b"SO\x01\0\0\0\x23\0": "an Oculus' recording; `sonar-graph convert oculus ",
     b"DDF SO": "a text that begins with 'DDF SO'",
@@ -539,6 +539,21 @@ OTHER_FILES = {
     "Überschrift\n".encode() * 9: "a text that begins with 'Überschrift'",
     b" \n ": "a text that begins with ''",
     b"\x7fELF\x02\x01\x01": "something else",
+    b"\xa3\x95\x80\x80"
+    + bytes(
+        60
+    ): r"an ArduPilot log \(.bin\); `mavlogdump.py --format csv --types IMU .*convert csv`",
+    b"ULog\x01\x12\x35\x01"
+    + bytes(60): r"a PX4 log \(.ulg\); `ulog2csv .*`sonar-graph convert csv`",
+    b"\x28\xb5\x2f\xfd" + bytes(60): "compressed by zstd; `zstd -d ",
+    b"\x1f\x8b\x08" + b"aaaa": "compressed by gzip; `gunzip ",
+    b"PK\x03\x04" + bytes(60): "a zip archive; `unzip ",
+    b"\x7f\x7f\xf0\x02"
+    + bytes(
+        60
+    ): "a PD0 recording of a Doppler log; mhkit.dolfyn .*`sonar-graph convert csv`",
+    b"\xa5\x0a\x16" + bytes(60): "a Nortek recording",
+    b"\x89HDF\r\n\x1a\n" + bytes(60): "an HDF5 file; .*`sonar-graph convert csv`",
 }
 
 
@@ -546,8 +561,9 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
     path = tmp_path / "log.bag"
     for content, kind in OTHER_FILES.items():
         path.write_bytes(content)
-        with pytest.raises(LogError, match=rf"not an MCAP file but {kind}"):
+        with pytest.raises(LogError, match=rf"not an MCAP file but {kind}") as refusal:
             scan_all(path)
+        assert len(str(refusal.value).replace(str(path), "log.bag")) <= 300
     viewer = tmp_path / "dive.oculus"
     viewer.write_bytes(b"\x44\x33\x22\x11")
     with pytest.raises(

@@ -45,6 +45,7 @@ from sonar_graph.logs.writing import (
     static_message,
     write_log,
 )
+from tests.logs.conftest import T0_NS, header, vector
 
 TREE_M = (1.0, 2.0, 3.0)
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
@@ -158,6 +159,107 @@ def test_a_frame_that_does_not_hang_on_the_body_has_no_mounting() -> None:
     assert mounting_of("base_link", frames) == Mounting()
     assert mounting_of("b", frames) is None
     assert mounting_of("c", frames) is None, "a loop ends"
+
+
+STEP = gtsam.Pose3(gtsam.Rot3.Rz(0.5), np.array([1.0, 0.0, -0.2]))
+BELOW = gtsam.Pose3(gtsam.Rot3.Rx(0.1), np.array([0.0, 0.0, 0.3]))
+NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsam.Pose3]] = {
+    "a namespace": ("bluerov2/dvl", {"bluerov2/dvl": ("bluerov2/base_link", STEP)}, STEP),
+    "a namespace in the tree alone": ("dvl", {"auv1/dvl": ("auv1/base_link", STEP)}, STEP),
+    "a namespace in the messages alone": ("auv1/dvl", {"dvl": ("base_link", STEP)}, STEP),
+    "a footprint alone": ("dvl", {"dvl": ("base_footprint", STEP)}, STEP),
+    "a footprint above the body": (
+        "dvl", {"base_link": ("base_footprint", BELOW), "dvl": ("base_link", STEP)}, STEP),
+    "a footprint that carries both": (
+        "dvl", {"base_link": ("base_footprint", BELOW), "dvl": ("base_footprint", STEP)}, BELOW.inverse() * STEP),
+    "two vehicles": (
+        "b/dvl", {"a/dvl": ("a/base_link", BELOW), "b/dvl": ("b/base_link", STEP)}, STEP),
+    "a faulty transform above the body": (
+        "dvl", {"dvl": ("base_link", STEP), "base_link": ("map", "has numbers that are not finite")}, STEP),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("frame", "frames", "body_T_sensor"), NAMED_TREES.values(), ids=NAMED_TREES
+)
+def test_a_frame_is_found_below_the_body_of_any_name(
+    frame: str,
+    frames: dict[str, tuple[str, gtsam.Pose3 | str]],
+    body_T_sensor: gtsam.Pose3,
+) -> None:
+    found = mounting_of(frame, frames)
+    assert found is not None
+    assert found.pose().equals(body_T_sensor, 1e-12)
+
+
+def test_a_frame_that_several_vehicles_have_is_not_guessed() -> None:
+    assert (
+        mounting_of(
+            "dvl", {"a/dvl": ("a/base_link", STEP), "b/dvl": ("b/base_link", STEP)}
+        )
+        is None
+    )
+
+
+def test_a_sensor_whose_frame_hangs_nowhere_is_named_with_the_lines_that_place_it(
+    bench: Any, make_sequence: Any, tmp_path: Path
+) -> None:
+    path = bench.write(*bench.basics())
+    assert (
+        "no transform from dvl_link to base_link (the log has no /tf_static): mounting taken as zero; give [dvl] "
+        in (read_log(path).notes["log.warnings"])
+    )
+    with_tree = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": [
+        bench.transform("base_link", "imu_link", (0, 0, 0))]}]))  # fmt: skip
+    warning = read_log(with_tree).notes["log.warnings"]
+    assert (
+        "dvl: no transform from dvl_link to base_link: mounting taken as zero; give [dvl] mounting in a file"
+        in warning
+    )
+    assert "imu: no transform" not in warning
+    stated = {
+        name: {"mounting": {"translation_m": [0, 0, 0]}} for name in ("imu", "dvl")
+    }
+    assert "no transform" not in read_log(path, calibration=said(**stated)).notes.get(
+        "log.warnings", ""
+    )
+
+
+def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench: Any) -> None:
+    imu, dvl = bench.basics(20)
+    tree = {"transforms": [bench.transform("base_link", "dvl_link", (1, 2, 3))]}
+    bench.write(imu, dvl, ("/tf_static", "tf", [tree]), name="dive_0.mcap")
+    bench.t0_ns += 2 * 10**9
+    later = (
+        [bench.dvl(bench.t0_ns + i * 10**8) for i in range(20)],
+        [bench.imu(bench.t0_ns + i * 10**8) for i in range(20)],
+    )
+    second = bench.write(
+        ("/dvl", "dvl", later[0]), ("/imu", "imu", later[1]), name="dive_1.mcap"
+    )
+    assert read_log(second).calibration.dvl.mounting.translation_m == (1, 2, 3)
+    bench.t0_ns += 3600 * 10**9
+    later = (
+        [bench.dvl(bench.t0_ns + i * 10**8) for i in range(20)],
+        [bench.imu(bench.t0_ns + i * 10**8) for i in range(20)],
+    )
+    another = bench.write(
+        ("/dvl", "dvl", later[0]), ("/imu", "imu", later[1]), name="dive_2.mcap"
+    )
+    assert read_log(another).calibration.dvl.mounting == Mounting(), (
+        "an hour later: another recording"
+    )
+
+
+def test_odometry_without_a_child_names_its_frame_in_the_header(bench: Any) -> None:
+    imu, _ = bench.basics()
+    rows = [{"header": header(T0_NS + i * 10**8, "dvl_link"), "twist": {"twist": {"linear": vector(1 + i, 0, 0)}}}
+            for i in range(5)]  # fmt: skip
+    tree = {"transforms": [bench.transform("base_link", "dvl_link", (1, 2, 3))]}
+    path = bench.write(
+        imu, ("/dvl/odom", "odometry", rows), ("/tf_static", "tf", [tree])
+    )
+    assert read_log(path).calibration.dvl.mounting.translation_m == (1, 2, 3)
 
 
 def test_mountings_come_from_tf_static_through_frames_in_between_and_after_a_file(

@@ -8,7 +8,7 @@ and conventions. A message type is added without code, as an instance of that su
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,12 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
-from sonar_graph.logs.adapters.message_table import FieldTable, MessageTable, field_of
+from sonar_graph.logs.adapters.message_table import (
+    SAME_STAMP,
+    FieldTable,
+    MessageTable,
+    field_of,
+)
 from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import Floats
@@ -130,6 +135,8 @@ class Adapter(Section):
     """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
     frame_id_field: str | None = "header.frame_id"
     """Field with the name of the sensor's frame in /tf_static."""
+    other_frame_id_field: str | None = None
+    """Field with that name, where `frame_id_field` is empty."""
     frame_id: str | None = None
     """Name of the sensor's frame, where the message has none or a wrong one."""
     rotation: Rotation = "flu"
@@ -156,7 +163,18 @@ class Adapter(Section):
         """Frame of the sensor; empty where the messages do not name one."""
         if self.frame_id is not None or self.frame_id_field is None:
             return self.frame_id or ""
-        return messages[0].first_string(self.frame_id_field)
+        named = messages[0].first_string(self.frame_id_field)
+        if named or self.other_frame_id_field is None:
+            return named
+        return messages[0].first_string(self.other_frame_id_field)
+
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        return 'stamp = "log"' if fault == SAME_STAMP else None
+
+    def pinned(self, table: FieldTable) -> dict[str, Any]:  # noqa: ARG002  # for subclasses
+        """Settings by which single messages are read as all messages of a table are together."""
+        return {}
 
     def warnings(self, table: FieldTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
         """Contradictions and unlikely values in messages that can be read."""

@@ -45,6 +45,7 @@ from sonar_graph.measurements import (
 ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 STEEPEST_RAD = np.radians(80.0)
 """Pitch above which roll and yaw are hardly told apart."""
+NO_MEASUREMENT = "whose orientation is no measurement"
 _WHOLE_CIRCLE = 2 * np.pi + 0.1
 
 
@@ -79,6 +80,14 @@ class HeadingAdapter(Adapter):
         variance = self.variance.fields if self.variance else None
         return field_paths(self.orientation, self.yaw, variance, self.status)
 
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        return (
+            "needs_variance = false, status = false"
+            if fault == NO_MEASUREMENT
+            else super().accepts(fault)
+        )
+
     def refusal(self, topic: Topic) -> str | None:
         """Reason why no message has a heading, which completes "/imu ..."."""
         if (
@@ -112,7 +121,7 @@ class HeadingAdapter(Adapter):
         self, table: FieldTable, body_R_sensor: Floats
     ) -> tuple[Heading | None, Dropped]:
         """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
-        faults = {"whose orientation is no measurement": ~self.is_measured(table)}
+        faults = {NO_MEASUREMENT: ~self.is_measured(table)}
         if self.orientation is not None:
             quaternions = table.beside(self.orientation).astype(float)
             lengths = np.linalg.norm(quaternions, axis=1)

@@ -32,8 +32,8 @@ _DEPTH_WORDS = ("depth",)
 _HEADING_WORDS = ("heading", "compass", "ahrs")
 _FIX_WORDS = ("fix", "gps", "gnss", "usbl")
 _LANDMARK_WORDS = ("landmark", "sonar")
-Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl"})
-"""Types whose definition has z downwards, which not all drivers follow."""
+Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl", "dvl_msgs/msg/DVL"})
+"""Types whose definition or instrument has z downwards, which not all drivers follow."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ def _water_linked(*covariance: str, meaning: str = "variance") -> DvlAdapter:
             {"fields": covariance, "meaning": meaning}
         ),
         valid_where={"velocity_valid": True},
+        altitude="altitude",
     )
 
 
@@ -120,12 +121,10 @@ MARINE_DVL = DvlAdapter(
     type="marine_acoustic_msgs/msg/Dvl",
     velocity=_xyz("velocity"),
     covariance=CovarianceFields(fields=("velocity_covar",)),
-    valid_where={"velocity_mode": 1},
+    valid_where={"velocity_mode": 1, "beam_velocities_valid": True},
+    may_be_unfilled=("velocity_mode", "beam_velocities_valid"),
     good_beams="num_good_beams",
-    beam_unit_vectors=_xyz("beam_unit_vec"),
-    beam_ranges="range",
-    beam_ranges_valid="beam_ranges_valid",
-    sound_speed="sound_speed",
+    altitude="altitude",
 )
 UUV_SIMULATOR_DVLS = [
     DvlAdapter(
@@ -134,6 +133,7 @@ UUV_SIMULATOR_DVLS = [
         covariance=CovarianceFields(
             fields=("velocity_covariance",), negative="invalid", zero="unknown"
         ),
+        altitude="altitude",
     )
     for package in (
         "uuv_sensor_ros_plugins_msgs",
@@ -148,7 +148,11 @@ TWIST = DvlAdapter(
     covariance=CovarianceFields(fields=("twist.covariance",)),
 )
 ODOMETRY_TWIST = TWIST.model_copy(
-    update={"type": "nav_msgs/msg/Odometry", "frame_id_field": "child_frame_id"}
+    update={
+        "type": "nav_msgs/msg/Odometry",
+        "frame_id_field": "child_frame_id",
+        "other_frame_id_field": "header.frame_id",
+    }
 )
 PRESSURE = DepthAdapter(
     type="sensor_msgs/msg/FluidPressure",

@@ -11,6 +11,7 @@ and measures the velocity d . v. Three beams or more give v by least squares, fe
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +34,8 @@ from sonar_graph.logs.adapters.message_table import (
     fit_rows,
     not_finite,
 )
-from sonar_graph.measurements import Dvl, Floats
+from sonar_graph.measurements import Dvl, Floats, Ints
 
-LARGEST_TILT_DEG = 45.0
-"""Largest tilt of beams in use; 20 to 30 degrees are usual."""
-TOLERANCE_DEG = 3.0
-"""Difference allowed between published and configured directions."""
 FEWEST_BEAMS = 3
 """Beams needed for a velocity."""
 
@@ -107,54 +104,32 @@ class BeamGeometry(Section):
         return 1 if self.sigma_m_s else FEWEST_BEAMS
 
 
-def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str | None:
-    """Fault of published beam directions, shape (beams, 3); None: there is none, or nothing was published.
-
-    One driver, and one that copies it, publish z = sin(22.5°) where a beam tilted by 22.5° has cos(22.5°). Published
-    directions are never used; where velocities come from beams, the configured directions are.
-    """
-    if not np.isfinite(vectors).all() or not vectors.any():
-        return None
-    across, down = np.hypot(vectors[:, 0], vectors[:, 1]), np.abs(vectors[:, 2])
-    if (
-        np.allclose(across, down, atol=1e-3)
-        and across.max() < np.sin(np.radians(LARGEST_TILT_DEG)) - 1e-2
-    ):
-        tilt_deg = float(np.degrees(np.arcsin(down)).mean())
-        return (
-            f"have z = {down.mean():.3f}, the sine of the tilt of {tilt_deg:.1f}°, where its cosine "
-            f"{np.cos(np.radians(tilt_deg)):.3f} should be"
-        )
-    lengths = np.linalg.norm(vectors, axis=1)
-    if np.any(np.abs(lengths - 1) > 1e-2):
-        return (
-            f"are no unit vectors (length {lengths.min():.3f} to {lengths.max():.3f})"
-        )
-    tilt_deg = float(np.degrees(np.arccos(np.clip(down, 0, 1))).max())
-    if tilt_deg > LARGEST_TILT_DEG:
-        return (
-            f"are tilted by {tilt_deg:.1f}°, which no Doppler log is: the driver seems to publish the sine of "
-            f"{90 - tilt_deg:.1f}° as z, where its cosine should be"
-        )
-    if geometry is None:
-        return None
-    if abs(tilt_deg - geometry.tilt_deg) > TOLERANCE_DEG:
-        return f"are tilted by {tilt_deg:.1f}°, the configured beams by {geometry.tilt_deg:g}°"
-    if geometry.velocity is None:
-        return None
-    if len(vectors) != len(geometry.azimuth_deg):
-        return f"are {len(vectors)}, the configured beams {len(geometry.azimuth_deg)}"
-    # z may point up or down
-    configured = geometry.directions() * np.sign(vectors[:, 2:]) ** np.array([0, 0, 1])
-    off_deg = np.degrees(np.arccos(np.clip((configured * vectors).sum(axis=1), -1, 1)))
-    beam = int(off_deg.argmax())
-    if off_deg[beam] <= TOLERANCE_DEG:
-        return None
-    return f"and the configured ones differ by up to {off_deg[beam]:.0f}° (beam {beam}); check azimuth_deg"
-
-
-Number = bool | int | float
+LARGEST_SPEED_M_S = 30.0
+"""Speed beyond which equal components are a sentinel: PD0 has -32.768 m/s for "not measured"."""
+STEP_RATIO = 5.0
+"""Factor of a step to zero over the usual steps of the velocity, from which zeros are no measurement."""
+LEAST_STEP_M_S = 0.05
+"""Steps below this are no sign: at such speeds a row of zeros does little harm."""
+FEWEST_STEPS = 10
+"""Fewest steps from which usual ones are known."""
+LEAST_REPEATED = 0.2
+"""Share of rows, and of values, that a driver repeats which holds velocities between measurements."""
 SAID_INVALID = "with a covariance that says invalid"
+ZEROS = "with a velocity of 0 in one step"
+SENTINEL = "with one value beyond 30 m/s in all components"
+REPEATED = "that repeat the velocity before"
+FEW_BEAMS = f"with fewer than {FEWEST_BEAMS} good beams"
+NO_BEAM = "without a good beam"
+ACCEPTING = {
+    ZEROS: "are_zeros_measured = true",
+    SENTINEL: 'lock = "marked"',
+    REPEATED: 'lock = "signs"',
+    FEW_BEAMS: "good_beams = false",
+    NO_BEAM: "good_beams = false",
+    SAID_INVALID: 'covariance = {negative = "unknown", zero = "unknown"}',
+}
+"""Settings that use messages which were left out, by the reason."""
+Number = bool | int | float
 
 
 class DvlAdapter(Adapter):
@@ -168,21 +143,21 @@ class DvlAdapter(Adapter):
     """Of the velocity, before `scale`; without it the calibration's noise holds."""
     valid_where: Mapping[str, Number] = {}
     """Fields, each with its value in messages to be used: {velocity_mode = 1}."""
+    may_be_unfilled: tuple[str, ...] = ()
+    """Fields of `valid_where` that some drivers never fill: where one is 0 in every message, it does not count."""
     good_beams: str | None = None
     """Field that counts good beams; messages with none are left out, where the driver counts at all."""
+    altitude: str | None = None
+    """Field that is negative without bottom lock. It counts where `valid_where` is the same in all messages."""
+    are_zeros_measured: bool = False
+    """true: a velocity of exactly 0 is measured also where it comes in one step, as without bottom lock."""
+    lock: Literal["found", "marked", "signs"] = "found"
+    """Who decides on bottom lock: "marked": `valid_where` alone; "signs": also beams, `altitude` and sentinels of each
+    message; "found": `valid_where` where it differs between messages, else the signs, zeros and repeats."""
     are_beams_counted: bool = False
     """true: the driver counts, so that messages with none are left out even where no message has any."""
     beams: BeamGeometry | None = None
     """Directions of the beams."""
-    beam_unit_vectors: tuple[str, str, str] | None = None
-    """Array fields with x, y, z of each beam's direction: only checked, because drivers get them wrong. Velocities come
-    from the directions of `beams`."""
-    beam_ranges: str | None = None
-    """Array field with a range for each beam: only checked."""
-    beam_ranges_valid: str | None = None
-    """Field that says whether ranges are valid: only checked, because drivers leave it true."""
-    sound_speed: str | None = None
-    """Field with the speed of sound, m/s: only checked, because drivers leave it 0."""
 
     @model_validator(mode="after")
     def _has_a_velocity(self) -> DvlAdapter:
@@ -196,22 +171,10 @@ class DvlAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        checked = (
-            self.beam_ranges,
-            self.beam_ranges_valid,
-            self.sound_speed,
-            self.beam_unit_vectors,
-        )
         beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
         covariance = self.covariance.fields if self.covariance else None
-        return field_paths(
-            self.velocity,
-            covariance,
-            self.valid_where,
-            self.good_beams,
-            *checked,
-            *beams,
-        )
+        marks = (self.valid_where, self.good_beams, self.altitude)
+        return field_paths(self.velocity, covariance, *marks, *beams)
 
     def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
@@ -232,16 +195,9 @@ class DvlAdapter(Adapter):
         if self.covariance is not None and not self._is_noise_of_beams:
             covariance, faults[SAID_INVALID] = self.covariance.read(table)
             covariance = covariance if self.scale == 1 else covariance * self.scale**2
-        for path, value in self.valid_where.items():
-            faults[f"with {path} not {str(value).lower()}"] = (
-                table.column(path) != value
-            )
-        if self.good_beams is not None:
-            beams = table.column(self.good_beams)
-            faults["without a good beam"] = (beams == 0) & (
-                self.are_beams_counted or beams.any()
-            )
+        faults |= self._marked_invalid(table)
         faults[NOT_FINITE] = not_finite(velocity)
+        faults |= self._signs_of_no_lock(table, velocity)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         velocity, covariance = (
             turn(self.rotation, velocity[rows]),
@@ -250,6 +206,112 @@ class DvlAdapter(Adapter):
         return (
             Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None
         ), dropped
+
+    def _filled(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
+        """Masks of valid messages by the fields of `valid_where` that the driver fills."""
+        columns = {path: table.column(path) for path in self.valid_where}
+        is_unfilled = {
+            path: path in self.may_be_unfilled and not column.any()
+            for path, column in columns.items()
+        }
+        return {
+            path: column == self.valid_where[path]
+            for path, column in columns.items()
+            if not is_unfilled[path]
+        }
+
+    def _is_marked(self, table: FieldTable) -> bool:
+        """Tell whether the driver marks some messages as valid and others as invalid."""
+        return self.lock == "marked" or any(
+            valid.any() and not valid.all() for valid in self._filled(table).values()
+        )
+
+    def _marked_invalid(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
+        """Masks of messages that their driver marks as invalid, by the reason."""
+        faults = {
+            f"with {path} not {str(self.valid_where[path]).lower()}": ~valid
+            for path, valid in self._filled(table).items()
+        }
+        if self.good_beams is not None:
+            beams = table.column(self.good_beams)
+            faults[NO_BEAM] = (beams == 0) & (self.are_beams_counted or beams.any())
+        return faults
+
+    def _signs_of_no_lock(
+        self, table: FieldTable, velocity: Floats
+    ) -> dict[str, NDArray[np.bool_]]:
+        """Masks of messages that look sent without bottom lock, by the reason, where no field marks them."""
+        faults: dict[str, NDArray[np.bool_]] = {}
+        if not self._is_marked(table):
+            if self.good_beams is not None:
+                beams = table.column(self.good_beams)
+                faults[FEW_BEAMS] = (
+                    (beams > 0)
+                    & (beams < FEWEST_BEAMS)
+                    & self._may_count(beams >= FEWEST_BEAMS)
+                )
+            if self.altitude is not None:
+                altitude_m = table.column(self.altitude)
+                faults[f"with {self.altitude} below 0"] = (
+                    altitude_m < 0
+                ) & self._may_count(altitude_m > 0)
+            is_same = (velocity == velocity[:, :1]).all(axis=1)
+            faults[SENTINEL] = is_same & (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S)
+            if self.lock == "found" and not self.are_zeros_measured:
+                faults[ZEROS] = zeros_in_one_step(velocity, table.stamps_ns)
+        if self.lock == "found":
+            faults[REPEATED] = repeats(velocity, table.stamps_ns)
+        return faults
+
+    def _may_count(self, is_good: NDArray[np.bool_]) -> bool:
+        """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
+        return self.lock == "signs" or bool(is_good.any())
+
+    def with_marks_alone(self) -> DvlAdapter:
+        """Adapter for velocities that were chosen before, as those in a log of `write_log`."""
+        return (
+            self.model_copy(update={"lock": "marked"}) if self.lock == "found" else self
+        )
+
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        if fault.endswith("below 0"):
+            return "altitude = false"
+        if fault.startswith("with ") and " not " in fault and fault != NOT_FINITE:
+            return "valid_where = {}"
+        return ACCEPTING.get(fault) or super().accepts(fault)
+
+    def at_first(self) -> DvlAdapter:
+        """Adapter for the first messages of a live run, where a mode that is 0 in all of them may still come."""
+        flags = tuple(
+            path for path in self.may_be_unfilled if self.valid_where.get(path) is True
+        )
+        return self.model_copy(update={"may_be_unfilled": flags})
+
+    def pinned(self, table: FieldTable) -> dict[str, Any]:
+        """Settings by which single messages are read as all messages of a table are together."""
+        filled = self._filled(table)
+        settings: dict[str, Any] = {
+            "valid_where": {
+                path: value
+                for path, value in self.valid_where.items()
+                if path in filled
+            },
+            "may_be_unfilled": [],
+        }
+        can_count = True
+        if self.good_beams is not None:
+            beams = table.column(self.good_beams)
+            settings |= (
+                {"are_beams_counted": True} if beams.any() else {"good_beams": False}
+            )
+            can_count = not beams.any() or bool((beams >= FEWEST_BEAMS).any())
+        if self.altitude is not None and not (table.column(self.altitude) > 0).any():
+            settings["altitude"] = False
+        settings["lock"] = (
+            "signs" if can_count and not self._is_marked(table) else "marked"
+        )
+        return settings
 
     @property
     def _is_noise_of_beams(self) -> bool:
@@ -261,23 +323,75 @@ class DvlAdapter(Adapter):
         )
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
-        """Warnings about covariances, beam directions, ranges and the speed of sound that a driver gets wrong."""
+        """Warnings about validity and covariances."""
+        yield from self._validity_warnings(table)
         if self.covariance is not None and not self._is_noise_of_beams:
             yield from self.covariance.warnings(table)
-        if self.beam_unit_vectors is not None:
-            vectors = np.stack(
-                [table.column(path)[0] for path in self.beam_unit_vectors], axis=-1
-            )
-            if fault := beam_direction_fault(vectors, self.beams):
-                field = self.beam_unit_vectors[0].rpartition(".")[0]
-                yield f"{table.source}: {field}: beam directions {fault}; they are not used"
-        if self.sound_speed is not None and not table.column(self.sound_speed).any():
-            yield f"{self.sound_speed} is 0 in every message: the driver does not fill it"
-        if self.beam_ranges is not None and self.beam_ranges_valid is not None:
-            ranges, said = (
-                table.column(self.beam_ranges),
-                table.column(self.beam_ranges_valid).astype(bool),
-            )
-            wrong = said & ~(np.isfinite(ranges) & (ranges > 0)).all(axis=1)
-            if wrong.any():
-                yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"
+
+    def _validity_warnings(self, table: FieldTable) -> Iterator[str]:
+        """Warnings about fields that mark no message, and about messages left out by other signs."""
+        filled = self._filled(table)
+        unfilled = [path for path in self.valid_where if path not in filled]
+        if unfilled and not filled:
+            yield f"{' and '.join(unfilled)} are 0 in every message: taken as not filled, all messages as bottom track"
+        if self.velocity is None:
+            return
+        velocity = table.beside(self.velocity) * self.scale
+        for reason, has_it in self._signs_of_no_lock(table, velocity).items():
+            if has_it.any():
+                yield (
+                    f"{np.count_nonzero(has_it)} of {len(table)} messages {reason}: left out; "
+                    f"`{self.accepts(reason)}` under [dvl] in a log configuration uses them"
+                )
+
+
+def zeros_in_one_step(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
+    """Rows of zeros, shape (n,), that the velocity reaches or leaves by a step which no vehicle makes.
+
+    A vehicle slows down over several rows. A driver without bottom lock sends zeros from one row to the next, and the
+    step is `STEP_RATIO` times the 99 % quantile of the steps between rows with a velocity.
+    """
+    order = np.argsort(stamps_ns, kind="stable")
+    v = velocity[order]
+    is_zero: NDArray[np.bool_] = np.asarray(~v.any(axis=1))
+    step_m_s = np.linalg.norm(np.diff(v, axis=0), axis=1)
+    is_usual = ~is_zero[1:] & ~is_zero[:-1] & np.isfinite(step_m_s)
+    found = np.zeros(len(v), bool)
+    if not is_zero.any() or np.count_nonzero(is_usual) < FEWEST_STEPS:
+        return found
+    limit_m_s = max(
+        STEP_RATIO * float(np.quantile(step_m_s[is_usual], 0.99)), LEAST_STEP_M_S
+    )
+    is_jump = (is_zero[1:] != is_zero[:-1]) & (step_m_s > limit_m_s)
+    first = np.flatnonzero(is_zero & ~np.concatenate([[False], is_zero[:-1]]))
+    last = np.flatnonzero(is_zero & ~np.concatenate([is_zero[1:], [False]]))
+    for begin, end in zip(first, last, strict=True):
+        found[begin : end + 1] = (
+            is_jump[max(begin - 1, 0) : begin].any() or is_jump[end : end + 1].any()
+        )
+    in_file = np.empty(len(v), bool)
+    in_file[order] = found
+    return in_file
+
+
+def repeats(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
+    """Rows, shape (n,), that repeat the velocity of the row before, where the driver does so all the time.
+
+    Such a driver publishes at its own rate, or once for each of two reports of the instrument, and holds the velocity
+    between. A sensor that got stuck once repeats one value, which is not the driver's habit.
+    """
+    order = np.argsort(stamps_ns, kind="stable")
+    v = velocity[order]
+    is_same = np.concatenate(
+        [[False], (v[1:] == v[:-1]).all(axis=1) & v[1:].any(axis=1)]
+    )
+    in_file = np.zeros(len(v), bool)
+    lengths = np.diff([*np.flatnonzero(~is_same), len(v)])
+    if (
+        np.mean(is_same) < LEAST_REPEATED
+        or np.mean(lengths > 1) < LEAST_REPEATED
+        or len(lengths) < FEWEST_STEPS
+    ):
+        return in_file
+    in_file[order] = is_same
+    return in_file

@@ -46,8 +46,8 @@ class DetectionRowsAdapter(Adapter):
     """Field with the azimuth in the sonar's frame, positive to the left; with rotation = "frd" to the right."""
     azimuth_scale: AngleScale = 1.0
     """Turns it into rad; 0.017453292519943295 or "deg" from degrees."""
-    ids: tuple[str, ...]
-    """Fields with the identities that the recogniser considers: integers; none, or -1: unknown."""
+    ids: tuple[str, ...] | None
+    """Fields with the identities that the recogniser considers: integers; empty, or -1: unknown; false: no field."""
     probabilities: tuple[str, ...] = ()
     """Fields with the posterior of each identity, at most 1 in sum; without it, or where empty, 1 for the first."""
     range_sigma: str | None = None
@@ -59,11 +59,11 @@ class DetectionRowsAdapter(Adapter):
 
     @model_validator(mode="after")
     def _has_pairs(self) -> DetectionRowsAdapter:
-        if not self.ids:
-            raise ValueError("give ids = [...], at least one field")
-        if self.probabilities and len(self.probabilities) != len(self.ids):
+        if self.ids is not None and not self.ids:
+            raise ValueError("give ids = [...], at least one field, or ids = false")
+        if self.probabilities and len(self.probabilities) != len(self.ids or ()):
             raise ValueError(
-                f"give as many probabilities as ids: {len(self.ids)}, not {len(self.probabilities)}"
+                f"give as many probabilities as ids: {len(self.ids or ())}, not {len(self.probabilities)}"
             )
         if (self.range_sigma is None) != (self.azimuth_sigma is None):
             raise ValueError("give range_sigma and azimuth_sigma, or neither")
@@ -88,10 +88,12 @@ class DetectionRowsAdapter(Adapter):
             * self.azimuth_scale
             * (-1.0 if self.rotation == "frd" else 1.0)
         )
-        ids = np.column_stack([_whole(table, path, -1) for path in self.ids])
+        columns = [_whole(table, path, -1) for path in self.ids or ()]
+        ids = np.column_stack(columns or [np.full(len(table), -1)])
         if (ids >= FIRST_TOO_LARGE_ID).any():
             table.refuse(
-                ", ".join(self.ids), f"has an identity of 2^56 or more; {ID_ADVICE}"
+                ", ".join(self.ids or ()),
+                f"has an identity of 2^56 or more; {ID_ADVICE}",
             )
         probability = np.zeros(ids.shape)
         probability[:, 0] = 1.0

@@ -14,6 +14,7 @@ from sonar_graph.measurements import NS_PER_S, Ints
 Dropped = dict[str, int]
 """Number of rows left out, by reason."""
 NOT_FINITE = "with values that are not finite or beyond 1e15"
+SAME_STAMP = "with the stamp of another"
 LARGEST = 1e15
 """No sensor gives more, in whatever unit; products of a few such numbers overflow."""
 LOG_TIME = "log"
@@ -126,7 +127,14 @@ class MessageTable(FieldTable):
 
     def _require(self, path: str) -> None:
         if not self.has(path):
-            raise self.topic.error(f"its {self.topic.type_name} has no field {path}")
+            stamp = (
+                '; stamp = "log", or the name of a field, says what the time is'
+                if path.endswith(".sec")
+                else ""
+            )
+            raise self.topic.error(
+                f"its {self.topic.type_name} has no field {path}{stamp}"
+            )
 
 
 def field_of(path: str) -> tuple[str, int | None]:
@@ -171,6 +179,6 @@ def fit_rows(
     rows = rows[np.argsort(stamps_ns[rows], kind="stable")]
     if unique and rows.size:
         again = np.diff(stamps_ns[rows], prepend=stamps_ns[rows[0]] - 1) == 0
-        counts["with the stamp of another"] = int(np.count_nonzero(again))
+        counts[SAME_STAMP] = int(np.count_nonzero(again))
         rows = rows[~again]
     return rows, {fault: count for fault, count in counts.items() if count}

@@ -11,7 +11,7 @@ of translation, then rotation, along the fixed axes of the header's frame. With 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -43,6 +43,7 @@ from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
 
 Paths = tuple[str, str, str]
+WITHOUT_RATE = "without angular rate"
 LEAST_MOVE_M = 1.0
 """A vehicle that moved less may not have turned."""
 
@@ -56,8 +57,8 @@ class ImuAdapter(Adapter):
     """Turns them into rad/s; 0.017453292519943295 or "deg/s" from degrees."""
     angular_velocity_status: str | None = None
     """Field that is -1 where the rate was not measured."""
-    linear_acceleration: Paths
-    """Fields of the specific force along x, y, z, which accelerometers measure: +9.81 upwards at rest."""
+    linear_acceleration: Paths | None
+    """Fields of the specific force along x, y, z, which accelerometers measure: +9.81 upwards at rest; false: none."""
     linear_acceleration_scale: ForceScale = 1.0
     """Turns them into m/s²; 9.80665 or "g" from g, -1 where the driver gives gravity's own direction."""
     linear_acceleration_status: str | None = None
@@ -75,43 +76,88 @@ class ImuAdapter(Adapter):
     def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
-        force = _scaled(
-            table.beside(self.linear_acceleration), self.linear_acceleration_scale
-        )
+        force = self._force(table)
         unmeasured = _is_marked(
-            table, self.linear_acceleration_status
-        ) | self._is_force_unfilled(table)
+            table, self.linear_acceleration_status, force
+        ) | self._is_force_unfilled(table, force)
         if self.unfilled == "each":
             unmeasured |= ~force.any(axis=1)
         force = np.where(
             unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force
         )
-        faults = {
-            "without angular rate": _is_marked(table, self.angular_velocity_status),
-            NOT_FINITE: not_finite(rate),
-        }
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        rate, force = turn(self.rotation, rate[rows]), turn(self.rotation, force[rows])
+        is_unmeasured = _is_marked(table, self.angular_velocity_status, rate)
+        rows, dropped = fit_rows(
+            table.stamps_ns,
+            {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)},
+            unique=True,
+        )
+        rate = turn(self.rotation, rate[rows])
+        force = turn(self.rotation, force[rows])
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
-        """Warning about a specific force that the driver does not fill, or fills with what is no number."""
-        names, bad = (
-            ", ".join(self.linear_acceleration),
-            not_finite(table.beside(self.linear_acceleration)),
-        )
-        if self._is_force_unfilled(table):
+        """Warnings about values that the driver does not fill, or fills with what is no number."""
+        force = self._force(table)
+        if denied := self._denied(table, force):
+            fields = " and ".join(str(getattr(self, key)) for key in denied)
+            keys = ", ".join(f"{key} = false" for key in denied)
+            yield (
+                f"{fields} are -1 (not measured) in every message, and yet the values change: used as measured; "
+                f"`{keys}` under [imu] in a log configuration confirms it"
+            )
+        if self.linear_acceleration is None:
+            return
+        names = ", ".join(self.linear_acceleration)
+        bad = not_finite(force)
+        if self._is_force_unfilled(table, force):
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
         elif bad.any() and not bad.all():
             yield f"{names} are not finite in {bad.sum()} of {len(table)} messages: taken as not measured there"
 
-    def _is_force_unfilled(self, table: FieldTable) -> bool:
+    def accepts(self, fault: str) -> str | None:
+        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        return (
+            "angular_velocity_status = false"
+            if fault == WITHOUT_RATE
+            else super().accepts(fault)
+        )
+
+    def pinned(self, table: FieldTable) -> dict[str, Any]:
+        """Settings by which single messages are read as all messages of a table are together."""
+        imu, _ = self.read(table)
+        has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
+        settings: dict[str, Any] = (
+            {"are_zeros_measured": True} if has_force else {"unfilled": "each"}
+        )
+        force = self._force(table)
+        return settings | dict.fromkeys(self._denied(table, force), False)
+
+    def _denied(self, table: FieldTable, force: Floats) -> list[str]:
+        """Keys of the statuses by which a driver calls all rows not measured, although the values change."""
+        rate = table.beside(self.angular_velocity)
+        found = []
+        for key, values in (
+            ("angular_velocity_status", rate),
+            ("linear_acceleration_status", force),
+        ):
+            status = getattr(self, key)
+            if status is not None and _is_denied(table.column(status), values):
+                found.append(key)
+        return found
+
+    def _force(self, table: FieldTable) -> Floats:
+        """Specific force in m/s², shape (n, 3); NaN without accelerometers."""
+        if self.linear_acceleration is None:
+            return np.full((len(table), 3), np.nan)
+        return _scaled(
+            table.beside(self.linear_acceleration), self.linear_acceleration_scale
+        )
+
+    def _is_force_unfilled(self, table: FieldTable, force: Floats) -> bool:
         """Tell whether the force is zero in all messages, which not even free fall gives."""
         if self.are_zeros_measured:
             return False
-        measured = table.beside(self.linear_acceleration)[
-            ~_is_marked(table, self.linear_acceleration_status)
-        ]
+        measured = force[~_is_marked(table, self.linear_acceleration_status, force)]
         return bool(len(measured)) and not measured.any()
 
 
@@ -119,8 +165,24 @@ def _scaled(values: np.ndarray, scale: float) -> np.ndarray:
     return values if scale == 1 else values * scale
 
 
-def _is_marked(table: FieldTable, path: str | None) -> np.ndarray:
-    return np.zeros(len(table), bool) if path is None else table.column(path) == -1
+def _is_marked(table: FieldTable, path: str | None, values: Floats) -> np.ndarray:
+    """Mask of rows whose status says that the values, shape (n, 3), were not measured, shape (n,)."""
+    if path is None:
+        return np.zeros(len(table), bool)
+    status = table.column(path)
+    if _is_denied(status, values):
+        return np.zeros(len(table), bool)
+    return np.asarray(status == -1)
+
+
+def _is_denied(status: np.ndarray, values: Floats) -> bool:
+    """Tell whether a driver calls all rows not measured, although the values change as measured ones do."""
+    if not (status == -1).all():
+        return False
+    finite = values[np.isfinite(values).all(axis=1)]
+    return len(finite) > 1 and bool(
+        np.any(finite[1:] != finite[:-1], axis=1).mean() > 0.5
+    )
 
 
 class DepthAdapter(Adapter):

@@ -14,6 +14,7 @@ of fields, and with the keys of `CsvForm`. What stands before the first table ho
     rotation = "frd"
 """
 
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, spelt, text_of
 from sonar_graph.logs.adapters import (
     ADAPTERS,
+    TIMES,
     Adapter,
     DepthAdapter,
     DetectionRowsAdapter,
@@ -41,7 +43,7 @@ from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
 from sonar_graph.logs.reading import common_origin, require_use, rows_of
 from sonar_graph.logs.vehicle_setup import with_measured_start
 from sonar_graph.sequence import Sequence
-from sonar_graph.settings import faults_in
+from sonar_graph.settings import faults_in, toml_key
 
 CSV_ADAPTERS: dict[str, type[Adapter]] = {
     role: adapter for role, adapter in ADAPTERS.items() if role != "sonar"
@@ -52,6 +54,10 @@ CSV_ADAPTERS: dict[str, type[Adapter]] = {
 """Adapter of each role that a table can play."""
 NOT_OF_TABLES = ("type", "topic", "frame_id_field", "frame_id")
 """Keys of a log configuration that have no sense for a table."""
+IMU_RATES_HZ = (5.0, 5000.0)
+"""Rates of inertial sensors, by which the unit of times is known."""
+FEWEST_ROWS = 10
+"""Rows from which a rate, and a column that never changes, are known."""
 STAMP = "time"
 """Column of the time where nothing says another."""
 
@@ -124,15 +130,19 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
 def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
     kind = CSV_ADAPTERS[role]
     base = kind.model_construct(type="csv")
-    said = {
-        key: _as_names(kind, key, value)
-        for key, value in table.items()  # false takes away, as in a log configuration, where there is nothing
-        if not (
+    said: dict[str, Any] = {}
+    for key, value in table.items():
+        is_taken_away = (
             value is False
             and key in kind.model_fields
             and not isinstance(getattr(base, key, None), bool)
         )
-    }
+        if not is_taken_away:
+            said[key] = _as_names(kind, key, value)
+        elif kind.model_fields[
+            key
+        ].is_required():  # a sensor without it, such as an IMU without accelerometers
+            said[key] = None
     form = {key: said.pop(key) for key in list(said) if key in CsvForm.model_fields}
     for key in said.keys() & NOT_OF_TABLES:
         raise LogError(
@@ -247,6 +257,7 @@ def read_csv(
             raise LogError(
                 f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {faults}"
             )
+    _require_unit(roles["imu"], found["imu"])
     require_use(source, blocks["imu"], blocks["dvl"])
     doubts = [
         f"{role}: {text}"
@@ -259,6 +270,7 @@ def read_csv(
         if role != "true_landmarks"
         for text in stamp_faults(table.stamps_ns, table.stamps_ns)
     ]
+    doubts += list(_unused_validity(roles["dvl"], found["dvl"]))
     left_out = [
         f"{role}: {count} {fault}"
         for role, faults in dropped.items()
@@ -277,6 +289,45 @@ def read_csv(
         else Path(config).stem
     )
     return Sequence(name=name, calibration=calibration, notes=notes, **blocks)
+
+
+def _require_unit(imu: CsvRole, table: CsvTable) -> None:
+    """Refuse times whose unit nothing states, and in which the IMU has the rate of none."""
+    if "stamp_unit_s" in imu.adapter.model_fields_set or len(table) < FEWEST_ROWS:
+        return
+    step_s = float(np.median(np.diff(np.unique(table.stamps_ns)))) * 1e-9
+    if not IMU_RATES_HZ[0] / 10 <= 1 / step_s <= IMU_RATES_HZ[1]:
+        likely = next(
+            (
+                unit
+                for unit in ("ms", "us", "ns")
+                if IMU_RATES_HZ[0] <= 1 / (step_s * TIMES[unit]) <= IMU_RATES_HZ[1]
+            ),
+            None,
+        )
+        guess = (
+            f'write `stamp_unit_s = "{likely}"` before the first table'
+            if likely
+            else "write stamp_unit_s"
+        )
+        raise LogError(
+            f"{table.file.path}: [imu] stamp: {imu.adapter.stamp} has steps of {step_s:g}, which in seconds are "
+            f'an IMU of {1 / step_s:.3g} Hz; {guess}, or `stamp_unit_s = "s"` where these are seconds'
+        )
+
+
+def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
+    """Warning about a column that seems to mark invalid velocities, and that nothing uses."""
+    for name in table.file.layout.names:
+        if name in dvl.keys or not re.search(r"valid|lock", name.lower()):
+            continue
+        values = table.file.numbers(name, None)
+        invalid = int(np.count_nonzero(values == 0))
+        if invalid and np.isin(values, (0.0, 1.0)).all():
+            yield (
+                f"dvl: column {name} is 0 in {invalid} of {len(values)} rows and not used: "
+                f"`valid_where = {{{toml_key(name)} = 1}}` under [dvl] leaves them out"
+            )
 
 
 def _said(one: CsvRole) -> list[str]:

@@ -21,12 +21,15 @@ from sonar_graph.calibration import Section
 from sonar_graph.errors import LogError
 from sonar_graph.files import regular
 from sonar_graph.logs.adapters import FieldTable
+from sonar_graph.logs.mcap import START_BYTES, foreign_kind
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 
 _DELIMITERS = {"tab": "\t", "space": " "}
 _EMPTY = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 """Cells without a value, in small letters."""
 _MOST_NAMED = 40
+SAMPLE_ROWS = 2000
+"""Rows from which the kind of a column is guessed."""
 
 
 class CsvForm(Section):
@@ -86,9 +89,9 @@ class CsvFile:
                 encoding=self.form.encoding, errors="replace", newline=None
             ) as stream:
                 for number, line in enumerate(stream, 1):
-                    if "\0" in line:
+                    if "\0" in line or (number == 1 and "\ufffd" in line[:START_BYTES]):
                         raise LogError(
-                            f"{self.path}, line {number}: is no text; expected a table of numbers"
+                            f"{self.path}, line {number}: {self._kind() or 'is no text'}; expected a table"
                         )
                     if line.strip():
                         yield number, line.rstrip("\r\n").lstrip("\ufeff")
@@ -97,6 +100,12 @@ class CsvFile:
             raise LogError(
                 f"{self.path}: cannot be read: {reason}; expected a text file with a table"
             ) from error
+
+    def _kind(self) -> str | None:
+        """Kind of a file that holds no text, where its first bytes are known."""
+        with self.path.open("rb") as stream:
+            kind = foreign_kind(self.path, stream.read(START_BYTES))
+        return f"is no text but {kind}" if kind else None
 
     def _find_layout(self) -> CsvLayout:
         heads: list[str] = []
@@ -110,7 +119,13 @@ class CsvFile:
             delimiter = _DELIMITERS.get(
                 self.form.delimiter or "", self.form.delimiter
             ) or _delimiter_of(line, self.form.decimal)
-            cells = split(line, delimiter)
+            cells = split(
+                line,
+                delimiter,
+                len(split(heads[-1], delimiter))
+                if heads
+                else len(self.form.columns or ()),
+            )
             if any(is_value(cell, self.form.decimal) for cell in cells):
                 return self._named(delimiter, number, cells, heads, comments)
             heads.append(line)
@@ -202,8 +217,19 @@ class CsvFile:
             )
         )
 
-    def columns(self, indices: list[int]) -> tuple[Ints, list[list[str]]]:
-        """Line numbers, shape (n,), and the cells of some columns.
+    def numbers(self, name: str, most: int | None = SAMPLE_ROWS) -> Floats:
+        """Numbers of a column in its first rows, shape (n,); NaN for cells that hold none."""
+        _, (cells,) = self.columns([self.layout.names.index(name)], most)
+        plain = [
+            _TRUTHS.get(cell.lower(), cell.replace(self.form.decimal, "."))
+            for cell in cells
+        ]
+        return np.array([float(cell) if _is_number(cell) else np.nan for cell in plain])
+
+    def columns(
+        self, indices: list[int], most: int | None = None
+    ) -> tuple[Ints, list[list[str]]]:
+        """Line numbers, shape (n,), and the cells of some columns, of at most ``most`` rows.
 
         A LogError names the first line with another number of cells.
         """
@@ -215,11 +241,13 @@ class CsvFile:
                 self.form.comment
             ):
                 continue
-            cells = split(line, layout.delimiter)
+            cells = split(line, layout.delimiter, count)
             if len(cells) != count:
                 raise LogError(
                     f"{self.path}, line {number}: has {len(cells)} cells; expected {count}, as the first row"
                 )
+            if most is not None and len(lines) == most:
+                break
             lines.append(number)
             for column, index in zip(found, indices, strict=True):
                 column.append(cells[index])
@@ -311,8 +339,8 @@ class CsvTable(FieldTable):
 _TRUTHS = {"true": "1", "false": "0"}
 
 
-def split(line: str, delimiter: str) -> list[str]:
-    """Cells of a line without the space around them; an empty one at its end is none."""
+def split(line: str, delimiter: str, count: int | None = None) -> list[str]:
+    """Cells of a line without the space around them; an empty one at its end counts only as the last of ``count``."""
     if delimiter == " ":
         return line.split()
     cells = (
@@ -321,7 +349,11 @@ def split(line: str, delimiter: str) -> list[str]:
         else line.split(delimiter)
     )
     cells = [cell.strip() for cell in cells]
-    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+    return (
+        cells[:-1]
+        if len(cells) > 1 and not cells[-1] and len(cells) != count
+        else cells
+    )
 
 
 def _delimiter_of(line: str, decimal: str = ".") -> str:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import (
     ANGLES,
@@ -19,8 +21,9 @@ from sonar_graph.logs.adapters import (
     SPEEDS,
     TIMES,
 )
-from sonar_graph.logs.convert.csv_log import table_files
-from sonar_graph.logs.convert.csv_table import CsvFile, date_ns, is_value, plain_name
+from sonar_graph.logs.convert.csv_log import FEWEST_ROWS, IMU_RATES_HZ, table_files
+from sonar_graph.logs.convert.csv_table import CsvFile, is_value, plain_name
+from sonar_graph.measurements import Floats
 from sonar_graph.settings import toml_value
 
 _SPELLINGS = {
@@ -101,6 +104,9 @@ _TRUTH, _MAP, _FIX = (
 )
 _TIME = r"^(t|time|stamp|timestamp|unix|epoch|secs?|seconds|utc|datetime|date)$|time_?stamp|^time"
 _OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
+_UNITS_OF_TIME = ("s", "ms", "us", "ns")
+_SIMILAR = 30.0
+"""Ratio of the spans of two tables up to which their times have one unit."""
 _LAST_S = 1e10
 """Seconds since 1970 of the year 2286: a larger number counts milliseconds, or what is smaller still."""
 
@@ -160,8 +166,9 @@ def csv_template(tables: list[Path]) -> str:
         "# All keys: docs/tutorials/04_your_own_log.md"
     )
     roles: dict[str, _Guess] = {}
+    units = _time_units(files)
     for name, file in files.items():
-        for guess in _guess(name, file):
+        for guess in _guess(name, file, units.get(name)):
             if guess.role not in roles or guess.rank < roles[guess.role].rank:
                 roles[guess.role] = guess
         parts.append(_listing(name, file))
@@ -218,25 +225,40 @@ def _listing(name: str, file: CsvFile) -> str:
     return "\n".join(lines)
 
 
-def _guess(name: str, file: CsvFile) -> Iterator[_Guess]:
-    """Roles that a file may play."""
+def _guess(name: str, file: CsvFile, unit: str | None) -> Iterator[_Guess]:
+    """Roles that a file may play, with the unit of its times."""
     columns, is_truth = (
         [_column(column) for column in file.layout.names],
         bool(re.search(_TRUTH, name.lower())),
     )
     stamp, where, forces = (
-        _stamp(columns, file),
+        _stamp(columns, file, unit),
         _where(columns, file),
         _triple(columns, _FORCE),
     )
     motion = _motion(columns, forces, is_truth=is_truth)
     if motion:
-        yield _Guess(motion[0], name, [*stamp, *motion[1]])
+        lines = motion[1]
+        if motion[0] == "dvl":
+            lines = [*lines, *_validity(columns, file)]
+        yield _Guess(motion[0], name, [*stamp, *lines])
+    elif (rates := _triple(columns, _RATE)) and not where:
+        lines = [
+            _list("angular_velocity", rates),
+            *_scale("angular_velocity_scale", rates[0], RATES),
+        ]
+        yield _Guess(
+            "imu",
+            name,
+            [*stamp, *lines, "linear_acceleration = false"],
+            "no accelerometer: is this the IMU?",
+        )
     spread, bearing = (
         _one(columns, r"range|distance|^r$"),
         _one(columns, r"azimuth|bearing"),
     )
     label = _one(columns, r"^id$|_id$|label|class|landmark|beacon")
+    is_timed = _one(columns, _TIME) is not None
     if spread and bearing:
         yield _Guess(
             "detections", name, [*stamp, *_detections(columns, spread, bearing, label)]
@@ -244,7 +266,7 @@ def _guess(name: str, file: CsvFile) -> Iterator[_Guess]:
         return
     turn = _named(columns, "q_?x", "q_?y", "q_?z", "q_?w")
     angles = _named(columns, "roll|phi", "pitch|theta", "yaw|psi|heading")
-    if where and label and _place(columns):
+    if where and label and _place(columns) and not is_timed:
         yield _Guess(
             "true_landmarks", name, [f"id = {toml_value(label.given)}", *where]
         )
@@ -262,7 +284,16 @@ def _guess(name: str, file: CsvFile) -> Iterator[_Guess]:
         doubt = "" if is_metric or not motion or motion[0] != "imu" else _OF_IMU
         yield _Guess("positions", name, [*stamp, *where], doubt)
     if depth := _one(columns, r"depth") or _one(columns, r"press"):
-        yield _Guess("depth", name, [*stamp, *_depth(depth)])
+        values = file.numbers(file.layout.names[columns.index(depth)])
+        is_constant = (
+            len(values) >= FEWEST_ROWS and not np.ptp(values[np.isfinite(values)]) > 0
+        )
+        yield _Guess(
+            "depth",
+            name,
+            [*stamp, *_depth(depth)],
+            "never changes: a depth?" if is_constant else "",
+        )
     if yaw := _one(columns, r"^(yaw|heading|compass|hdg|psi)"):
         lines = [
             f"yaw = {toml_value(yaw.given)}",
@@ -291,10 +322,26 @@ def _motion(
         return "imu", [*lines, '# rotation = "frd"  # where gravity is felt along -z']
     if velocity and not is_truth:
         lines = [_list("velocity", velocity), *_scale("scale", velocity[0], SPEEDS)]
-        if status := _one(columns, r"valid|lock|status"):
-            lines.append(f"# valid_where = {{{toml_value(status.given)} = 1}}")
         return "dvl", [*lines, '# rotation = "frd"']
     return None
+
+
+def _validity(columns: list[_Column], file: CsvFile) -> list[str]:
+    """Line that leaves out invalid rows; in use where a column of 0 and 1 has a name that says valid."""
+    status = _one(columns, r"valid|lock") or _one(columns, r"status")
+    if status is None:
+        return []
+    line = f"valid_where = {{{toml_value(status.given)} = 1}}"
+    is_mask = bool(
+        np.isin(
+            file.numbers(file.layout.names[columns.index(status)]), (0.0, 1.0)
+        ).all()
+    )
+    return [
+        line
+        if is_mask and "status" not in status.name
+        else f"# {line}  # which value is valid?"
+    ]
 
 
 def _detections(
@@ -310,7 +357,9 @@ def _detections(
         *_scale("range_scale", spread, LENGTHS),
         f"azimuth = {toml_value(bearing.given)}",
         *_scale("azimuth_scale", bearing, ANGLES),
-        f"ids = {toml_value([label.given if label else '...'])}",
+        f"ids = {toml_value([label.given])}"
+        if label
+        else "ids = false  # no column of identities was found",
         *([f"probabilities = [{toml_value(sure.given)}]"] if sure else []),
         *([f"track = {toml_value(track.given)}"] if track else []),
         '# rotation = "frd"  # azimuth positive to the right',
@@ -370,30 +419,61 @@ def _orientation(turn: list[_Column] | None, angles: list[_Column] | None) -> li
     )
 
 
-def _stamp(columns: list[_Column], file: CsvFile) -> list[str]:
-    """Lines for the time: its column, and its unit by the header or by the size of the first value."""
+def _time_units(files: dict[str, CsvFile]) -> dict[str, str]:
+    """Units of the times by file: that of the header, or the one in which the fastest table has the rate of an IMU.
+
+    Tables of one dive span about the same time, so one unit holds for all of a similar span. No time lies behind
+    `_LAST_S`.
+    """
+    found: dict[str, str] = {}
+    times: dict[str, Floats] = {}
+    for name, file in files.items():
+        columns = [_column(column) for column in file.layout.names]
+        time = _one(columns, _TIME) or columns[0]
+        numbers = file.numbers(file.layout.names[columns.index(time)], None)
+        if time.unit in TIMES:
+            found[name] = time.unit
+        elif np.isfinite(numbers).any():
+            times[name] = np.unique(numbers[np.isfinite(numbers)])
+    possible = {
+        name: [unit for unit in _UNITS_OF_TIME if values[-1] * TIMES[unit] < _LAST_S]
+        for name, values in times.items()
+    }
+    steps = {
+        name: np.median(np.diff(values))
+        for name, values in times.items()
+        if len(values) >= FEWEST_ROWS
+    }
+    if steps:
+        fastest = min(steps, key=lambda name: float(steps[name]))
+        slowest_hz, fastest_hz = IMU_RATES_HZ
+        for unit in possible[fastest]:
+            if slowest_hz <= 1 / (steps[fastest] * TIMES[unit]) <= fastest_hz:
+                ratios = {
+                    name: np.ptp(values) / np.ptp(times[fastest])
+                    for name, values in times.items()
+                }
+                found |= {
+                    name: unit
+                    for name, ratio in ratios.items()
+                    if 1 / _SIMILAR < ratio < _SIMILAR
+                }
+                break
+    return {name: units[0] for name, units in possible.items() if units} | found
+
+
+def _stamp(columns: list[_Column], file: CsvFile, unit: str | None) -> list[str]:
+    """Lines for the time: its column, and its unit."""
     column = _one(columns, _TIME) or (columns[0] if columns else None)
     if column is None:
         return []
     first = file.layout.first[columns.index(column)]
-    lines = [f"stamp = {toml_value(column.given)}"]
-    try:
-        value = float(first)
-    except ValueError:
-        try:
-            date_ns(first)
-        except ValueError:
-            return [f"{lines[0]}  # {first!r} is no time"]
-        return lines
-    unit = column.unit if column.unit in TIMES else None
-    if unit is None:
-        unit = next(
-            (name for name in ("s", "ms", "us", "ns") if value * TIMES[name] < _LAST_S),
-            None,
-        )
+    line = f"stamp = {toml_value(column.given)}"
+    if not is_value(first):
+        return [f"{line}  # {first!r} is no time"]
     return [
-        *lines,
-        *([f"stamp_unit_s = {toml_value(unit)}"] if unit and unit != "s" else []),
+        line,
+        *([f"stamp_unit_s = {toml_value(unit)}"] if unit not in (None, "s") else []),
     ]
 
 

@@ -1,4 +1,4 @@
-"""ROS 1 bags and the sqlite3 bags of ROS 2 as MCAP logs, through the rosbags library.
+"""ROS 1 bags, ROS 1 messages in MCAP, and the sqlite3 bags of ROS 2 as MCAP logs, through the rosbags library.
 
 Every topic is converted. Payloads become CDR. Types get the definition of ROS 2 Jazzy where it has them, with fields
 mapped where the two differ, and otherwise the definition in the bag. Stamps, in messages and of recording, stay the
@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, BinaryIO
@@ -24,7 +25,9 @@ from mcap.writer import Writer
 
 from sonar_graph.errors import LogError, SonarGraphError
 from sonar_graph.files import regular, written_whole
+from sonar_graph.logs.cdr import DRIVER_DEFINITIONS
 from sonar_graph.logs.mcap import (
+    ALREADY_MCAP,
     LARGEST_BYTES,
     LARGEST_RATIO,
     LIBRARY,
@@ -38,6 +41,7 @@ from sonar_graph.logs.mcap import (
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
+    from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
 
 
@@ -49,6 +53,8 @@ _METADATA = "metadata.yaml"
 # that of rosbags
 _ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
 _STEPS = 1000
+_MOST_TRIED = 5
+"""Messages with which a definition is tried."""
 _INSTALL = "pip install 'sonar-graph[rosbag]'"
 Recode = Callable[[bytes], memoryview]
 
@@ -78,18 +84,23 @@ class BagConversion:
 
 
 def convert_rosbag(
-    source: Path, output: Path, progress: Progress | None = None
+    source: Path,
+    output: Path,
+    progress: Progress | None = None,
+    definitions: Path | None = None,
 ) -> BagConversion:
     """Write an MCAP log of a whole bag; an existing file is replaced only when the new one is complete.
 
     Parameters
     ----------
     source
-        A ROS 1 ``.bag``; the folder of a ROS 2 bag, or the ``.db3`` file in it.
+        A ROS 1 ``.bag``; the folder of a ROS 2 bag, or the ``.db3`` file in it; an MCAP file of ROS 1 messages.
     output
         The MCAP file.
     progress
         Called now and then with the number of messages done and in all.
+    definitions
+        Folder with ``package/msg/Type.msg`` files, for types that neither the bag nor `DRIVER_DEFINITIONS` has.
 
     Raises
     ------
@@ -97,11 +108,12 @@ def convert_rosbag(
         When the rosbags library is not installed, the bag cannot be read, or the log cannot be written.
     """
     with _open_bag(Path(source)) as bag, written_whole(output) as stream:
+        _define(bag, _own_definitions(definitions) if definitions else {})
         return _BagCopy(bag, Writer(stream, chunk_size=_CHUNK_BYTES)).run(progress)
 
 
 @contextmanager
-def _open_bag(source: Path) -> Iterator[AnyReader]:
+def _open_bag(source: Path) -> Iterator[AnyReader | Ros1InMcap]:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.rosbag1 import reader as rosbag1
@@ -129,10 +141,18 @@ def _open_bag(source: Path) -> Iterator[AnyReader]:
         raise LogError(f"{error.filename} cannot be read: {error.strerror}") from error
     if source.is_file():
         with source.open("rb") as stream:
-            fault = why_no_bag(source, stream.read(START_BYTES))
+            fault = (
+                None
+                if source.suffix == ".mcap"
+                else why_no_bag(source, stream.read(START_BYTES))
+            )
         if fault is not None:
             raise LogError(f"{source} is {fault}")
     try:
+        if source.is_file() and source.suffix == ".mcap":
+            with source.open("rb") as stream:
+                yield Ros1InMcap(stream, source)
+            return
         with AnyReader(
             [path], default_typestore=get_typestore(Stores.ROS2_JAZZY)
         ) as bag:
@@ -210,10 +230,147 @@ def limited_zstd_file(packed: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
         yield SimpleNamespace(read=read)
 
 
+def _own_definitions(folder: Path) -> dict[str, list[str]]:
+    """Texts of the ``package/msg/Type.msg`` files in a folder, by type; a LogError where there are none."""
+    found = {}
+    for file in sorted(folder.rglob("*.msg")):
+        package = file.parent.parent if file.parent.name == "msg" else file.parent
+        found[f"{package.name}/msg/{file.stem}"] = [file.read_text(encoding="utf-8")]
+    if not found:
+        raise LogError(
+            f"{folder}: holds no .msg files; give the folder with package/msg/Type.msg"
+        )
+    return found
+
+
+def _define(bag: AnyReader | Ros1InMcap, own: dict[str, list[str]]) -> None:
+    """Add definitions of types that a bag has not: those of a user, or else known ones that fit the first messages."""
+    from rosbags.typesys import get_types_from_msg
+
+    known = bag.typestore.fielddefs
+    of_user = {
+        name: get_types_from_msg(texts[0], name)
+        for name, texts in own.items()
+        if name not in known
+    }
+    for types in of_user.values():
+        bag.typestore.register(types)
+    for connection in bag.connections:
+        if (
+            connection.msgtype in bag.typestore.fielddefs
+            or connection.msgtype not in DRIVER_DEFINITIONS
+            or not bag.is2
+        ):
+            continue
+        firsts = [
+            raw
+            for _, _, raw in islice(bag.messages(connections=[connection]), _MOST_TRIED)
+        ]
+        for text in DRIVER_DEFINITIONS[connection.msgtype]:
+            types = get_types_from_msg(text, connection.msgtype)
+            if all(_follows(bag, types, connection.msgtype, raw) for raw in firsts):
+                bag.typestore.register(
+                    {
+                        name: t
+                        for name, t in types.items()
+                        if name not in bag.typestore.fielddefs
+                    }
+                )
+                break
+
+
+def _follows(
+    bag: AnyReader | Ros1InMcap, types: Typesdict, kind: str, payload: bytes
+) -> bool:
+    """Tell whether a payload is a message of a type by these definitions."""
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import Stores, get_typestore
+
+    trial = get_typestore(Stores.EMPTY)
+    trial.register({**types, **bag.typestore.fielddefs})
+    try:
+        trial.deserialize_cdr(payload, kind)
+    except (SerdeError, AssertionError):
+        return False
+    return True
+
+
+class Ros1InMcap:
+    """ROS 1 messages of an MCAP file, in the form in which `AnyReader` gives those of a bag."""
+
+    is2 = False
+
+    def __init__(self, stream: BinaryIO, path: Path) -> None:
+        from mcap.reader import make_reader
+        from rosbags.interfaces import (
+            Connection,
+            ConnectionExtRosbag1,
+            MessageDefinition,
+            MessageDefinitionFormat,
+        )
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self._reader = make_reader(stream)
+        try:
+            summary = self._reader.get_summary()
+        except Exception:  # the reader raises whatever its parts raise
+            summary = None
+        if summary is None or summary.statistics is None:
+            raise LogError(
+                f"{path} is {ALREADY_MCAP}`sonar-graph inspect {path}`; where it has ROS 1 messages, "
+                "`mcap recover` first writes the summary that it lacks"
+            )
+        channels = {
+            number: one
+            for number, one in summary.channels.items()
+            if one.message_encoding == "ros1"
+        }
+        if not channels:
+            raise LogError(f"{path} is {ALREADY_MCAP}`sonar-graph inspect {path}`")
+        self.typestore = get_typestore(Stores.EMPTY)
+        self.connections: list[Connection] = []
+        counts = summary.statistics.channel_message_counts
+        self.duration = (
+            summary.statistics.message_end_time - summary.statistics.message_start_time
+        )
+        for number, channel in channels.items():
+            schema = summary.schemas[channel.schema_id]
+            kind = (
+                schema.name
+                if "/msg/" in schema.name
+                else schema.name.replace("/", "/msg/")
+            )
+            text = schema.data.decode()
+            self.typestore.register(get_types_from_msg(text, kind))
+            self.connections.append(
+                Connection(
+                    number,
+                    channel.topic,
+                    kind,
+                    MessageDefinition(MessageDefinitionFormat.MSG, text),
+                    self.typestore.generate_msgdef(kind)[1],
+                    counts.get(number, 0),
+                    ConnectionExtRosbag1(
+                        None, int(channel.topic.endswith("tf_static"))
+                    ),
+                    self,
+                )
+            )
+
+    def messages(
+        self, connections: list[Connection]
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Messages with their times of recording, in the order of these."""
+        by_number = {connection.id: connection for connection in connections}
+        for _, channel, message in self._reader.iter_messages():
+            if (connection := by_number.get(channel.id)) is not None:
+                yield connection, message.log_time, message.data
+
+
 class _BagCopy:
     """Copy of the messages of a bag to a log."""
 
-    def __init__(self, bag: AnyReader, writer: Writer) -> None:
+    def __init__(self, bag: AnyReader | Ros1InMcap, writer: Writer) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self._bag = bag
@@ -241,7 +398,7 @@ class _BagCopy:
             c for c in bag.connections if c.msgtype in bag.typestore.fielddefs
         ]
         missing = {
-            c.topic: f"{c.msgtype} is not defined in the bag"
+            c.topic: f"{c.msgtype} is not defined in the bag: add --definitions FOLDER, which holds {c.msgtype}.msg"
             for c in bag.connections
             if c not in connections
         }

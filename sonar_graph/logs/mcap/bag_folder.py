@@ -10,6 +10,8 @@ from sonar_graph.logs.mcap.file_summary import first_time_ns, read_summary
 from sonar_graph.logs.mcap.records import LogFile
 
 METADATA_FILE = "metadata.yaml"
+SPLIT_S = 10.0
+"""Longest time from the last message of a file to the first of the next, where a recorder splits one recording."""
 
 
 def log_parts(path: Path) -> list[Path]:
@@ -42,6 +44,28 @@ def log_parts(path: Path) -> list[Path]:
                 "of one; give one of them"
             )
     return [file for _, _, file in spans]
+
+
+def earlier_parts(path: Path) -> list[Path]:
+    """Files before one of a recording that is split by time, the last first: ``dive_1.mcap`` before ``dive_2.mcap``.
+
+    Each ends when the next begins, to within `SPLIT_S`; so files that only share a name are not taken for parts.
+    """
+    found: list[Path] = []
+    number = re.fullmatch(r"(.*_)(\d+)", path.stem)
+    if number is None or not path.is_file():
+        return found
+    begin_ns, _ = _span_ns(path)
+    for part in range(int(number[2]) - 1, -1, -1):
+        before = path.with_stem(f"{number[1]}{part}")
+        if not before.is_file():
+            break
+        earlier_ns, end_ns = _span_ns(before)
+        if end_ns is None or not 0 <= begin_ns - end_ns <= SPLIT_S * 1e9:
+            break
+        found.append(before)
+        begin_ns = earlier_ns
+    return found
 
 
 def _named_parts(folder: Path) -> list[Path]:

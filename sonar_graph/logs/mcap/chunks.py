@@ -21,6 +21,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.records import (
     HEAD,
     LARGEST_BYTES,
+    LARGEST_RATIO,
     LOOSE,
     SMALLER_CHUNKS,
     ChunkRecord,
@@ -136,6 +137,35 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
             f"it has {len(data)} bytes instead of {chunk.uncompressed_size}"
         )
     return data
+
+
+def is_packed(data: bytes | memoryview, offset: int) -> bool:
+    """Tell whether a payload is compressed by itself, as ``ros2 bag record --compression-mode message`` does."""
+    return bytes(data[offset : offset + len(_ZSTD)]) == _ZSTD
+
+
+def unpack_messages(
+    data: bytes | memoryview, offsets: Ints, sizes: Ints
+) -> tuple[bytes, Ints, Ints]:
+    """Payloads that are compressed one by one, one after another, with their offsets and sizes, shape (n,).
+
+    One that cannot be decompressed stays as it is, and is then no message of its type.
+    """
+    payloads = []
+    for offset, length in zip(offsets.tolist(), sizes.tolist(), strict=True):
+        packed = bytes(data[offset : offset + length])
+        try:
+            size = zstandard.get_frame_parameters(packed).content_size
+            is_known = size not in (
+                zstandard.CONTENTSIZE_UNKNOWN,
+                zstandard.CONTENTSIZE_ERROR,
+            )
+            most = _limited(size) if is_known else len(packed) * LARGEST_RATIO
+            payloads.append(_DECOMPRESSOR.decompress(packed, max_output_size=most))
+        except (zstandard.ZstdError, ChunkError, MemoryError):
+            payloads.append(packed)
+    lengths = np.array([len(payload) for payload in payloads], np.int64)
+    return b"".join(payloads), np.cumsum(lengths) - lengths, lengths
 
 
 def _limited(size: int) -> int:

@@ -21,6 +21,7 @@ from mcap.records import Channel, Schema
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Bytes, Decoder, Messages, Struct, parse_definition
+from sonar_graph.logs.mcap.chunks import is_packed, unpack_messages
 from sonar_graph.logs.mcap.file_summary import FileSummary, parse
 from sonar_graph.measurements import Ints
 
@@ -136,6 +137,8 @@ class Topic:
         self, data: bytes | memoryview, offsets: Ints, sizes: Ints, log_times_ns: Ints
     ) -> None:
         """Add the messages at some offsets of a chunk's bytes."""
+        if len(offsets) and self.encoding == "cdr" and is_packed(data, int(offsets[0])):
+            data, offsets, sizes = unpack_messages(data, offsets, sizes)
         first = self._count
         self._count += len(sizes)
         if self.keep is Keep.NONE:

@@ -1,5 +1,6 @@
 """Logs as third-party drivers write them: their own message definitions, encoded by another library than ours."""
 
+import re
 from collections.abc import Iterable
 from operator import attrgetter
 from pathlib import Path
@@ -133,11 +134,30 @@ def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> En
     return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [entry]}]
 
 
+def about_values(warnings: str) -> str:
+    """Warnings without those about frames: those of most of these messages hang on no tree (`test_vehicle_setup`)."""
+    return re.sub(
+        r"\w+: no transform from .*? for --calibration(, or frame_id .*? configuration)?(; )?",
+        "",
+        warnings,
+    )
+
+
 class Foreign(Bench):
     """Writes and reads logs of other people's messages."""
 
     t0_ns = T0_NS
     definitions = DEFINITIONS
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the log and its configuration."""
+        return self._folder
+
+    @staticmethod
+    def stamps(rows: int) -> np.ndarray:
+        """Stamps of the messages that `rows_of` makes, nanoseconds."""
+        return T0_NS + np.arange(rows) * STEP_NS
 
     def config(self, text: str) -> Path:
         path = self._folder / "log.toml"
@@ -166,8 +186,9 @@ class Foreign(Bench):
                 attrgetter(path)(sequence), values, rtol=2e-7, atol=1e-12, err_msg=path
             )
         for name, part in notes.items():
-            assert (name in sequence.notes) == (part is not None)
-            assert part is None or part in sequence.notes[name]
+            said = about_values(sequence.notes.get(name, ""))
+            assert bool(said) == (part is not None)
+            assert part is None or part in said
         return sequence
 
 

@@ -64,7 +64,7 @@ NO_FIELD: dict[str, str] = {
     "[dvl]\nvalid_where = {lock = true}": r"\[dvl\] valid_where: .* has no field lock; .*velocity_mode",
     '[dvl]\ncovariance = {fields = ["velocity_cov"]}':
         r"\[dvl\] covariance\.fields: .* has no field velocity_cov; did you mean velocity_covar\?",
-    DVL + 'sound_speed = "speed"': r"\[dvl\] sound_speed: .* has no field speed; ",
+    DVL + 'altitude = "height"': r"\[dvl\] altitude: .* has no field height; ",
 }
 # fmt: on
 

@@ -17,7 +17,7 @@ from sonar_graph.logs.adapters.vehicle_messages import body_to_ros, ros_to_body
 
 from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
 
-FRD_DVL = '[dvl]\nrotation = "frd"\nsound_speed = false\n'
+FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
 ONE_ATMOSPHERE, TEN_METRES_OF_SEA = 101_325.0, 1025 * 9.80665 * 10
 POSE, POSE_WITH_COVARIANCE = (

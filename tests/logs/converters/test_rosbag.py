@@ -1,5 +1,6 @@
 import bz2
 import os
+import sqlite3
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, StoragePlugin
@@ -25,7 +27,10 @@ from sonar_graph.logs.convert.rosbag import (
     limited_lz4,
     limited_zstd,
 )
+from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
+from sonar_graph.testing import small_world
 
 T0_NS = 1_447_550_804_242_631_687
 STEP_NS = 20_000_001
@@ -369,3 +374,184 @@ def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(
     assert "gravity" not in sequence.notes["log.warnings"]
     assert "to the last bit in" in sequence.notes["log.warnings"]  # wheels at rest
     assert np.median(sequence.imu.specific_force[:, 2]) == pytest.approx(9.8, abs=0.1)
+
+
+# --- bags without definitions, ROS 1 in MCAP, messages that are compressed by themselves ------------------------------
+
+A50 = {
+    "": "",
+    "with a matrix": "float64[9] covariance\n",
+    "with a list": "float64[] covariance\n",
+    "with rows": "geometry_msgs/Vector3[] cov\n",
+}
+"""Lines after the figure of merit in the versions of dvl_msgs/DVL."""
+
+
+def a50_store(extra: str) -> Any:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    beam = "int64 id\nfloat64 velocity\nfloat64 distance\nfloat64 rssi\nfloat64 nsd\nbool valid\n"
+    text = (
+        f"std_msgs/Header header\nfloat64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\n{extra}float64 altitude\n"
+        "dvl_msgs/DVLBeam[] beams\nbool velocity_valid\nint64 status\nstring form\n"
+    )
+    store.register(
+        get_types_from_msg(beam, "dvl_msgs/msg/DVLBeam")
+        | get_types_from_msg(text, "dvl_msgs/msg/DVL")
+    )
+    return store
+
+
+def a50_messages(store: Any, extra: str) -> list[tuple[str, str, Any]]:
+    types = store.types
+    time, header, vector = (types[f"{name}"] for name in (
+        "builtin_interfaces/msg/Time", "std_msgs/msg/Header", "geometry_msgs/msg/Vector3"))  # fmt: skip
+    covariance = {"": [], A50["with rows"]: [[vector(1e-4, 0, 0)] * 3]}.get(
+        extra, [np.full(9, 1e-4)]
+    )
+    rows = []
+    for row in range(5):
+        head = header(stamp=time(*divmod(T0_NS + row * STEP_NS, 10**9)), frame_id="dvl")
+        beams = [
+            types["dvl_msgs/msg/DVLBeam"](i, 0.1 * i, 2.0, -50.0, -90.0, True)
+            for i in range(row % 5)
+        ]
+        message = types["dvl_msgs/msg/DVL"](
+            head, 0.0, vector(row, 0.1, 0), 0.01, *covariance, 2.0, beams, True, 0, "v"
+        )
+        rows.append(("/dvl/data", "dvl_msgs/msg/DVL", message))
+    return rows
+
+
+def write_undefined(
+    folder: Path, store: Any, entries: list[tuple[str, str, Any]]
+) -> Path:
+    """A sqlite3 bag as Humble writes it: without definitions."""
+    write_bag(
+        Ros2Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3),
+        store,
+        entries,
+    )
+    (database,) = folder.glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        connection.execute("drop table message_definitions")
+        connection.execute("update schema set schema_version = 3")
+    return folder
+
+
+@pytest.mark.parametrize("version", A50)
+def test_messages_of_known_drivers_are_defined_where_a_bag_does_not(
+    tmp_path, decoded, version
+):
+    store = a50_store(A50[version])
+    bag = write_undefined(
+        tmp_path / "bag",
+        store,
+        messages(store, ros1=False) + a50_messages(store, A50[version]),
+    )
+    done = convert_rosbag(bag, tmp_path / "new.mcap")
+    assert done.left_out == {}
+    found = decoded(tmp_path / "new.mcap")["/dvl/data"]
+    assert [m.velocity.x for m in found] == [0, 1, 2, 3, 4]
+    assert all(m.velocity_valid for m in found)
+    sequence = read_log(tmp_path / "new.mcap")
+    assert sequence.dvl.velocity[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_types_of_unknown_drivers_are_defined_by_the_files_of_their_package(
+    tmp_path, decoded
+):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    text = "std_msgs/Header header\nfloat64 depth\n"
+    store.register(get_types_from_msg(text, "own_msgs/msg/Depth"))
+    imu = messages(store, ros1=False)
+    rows = [
+        (
+            "/depth",
+            "own_msgs/msg/Depth",
+            store.types["own_msgs/msg/Depth"](imu[0][2].header, 3.5),
+        )
+    ]
+    bag = write_undefined(tmp_path / "bag", store, imu + rows)
+    done = convert_rosbag(bag, tmp_path / "new.mcap")
+    assert (
+        "add --definitions FOLDER, which holds own_msgs/msg/Depth.msg"
+        in done.left_out["/depth"]
+    )
+    package = tmp_path / "ws" / "src" / "own_msgs" / "msg"
+    package.mkdir(parents=True)
+    with pytest.raises(LogError, match=r"holds no \.msg files"):
+        convert_rosbag(bag, tmp_path / "new.mcap", definitions=tmp_path / "ws")
+    (package / "Depth.msg").write_text(text)
+    assert (
+        convert_rosbag(bag, tmp_path / "new.mcap", definitions=tmp_path / "ws").left_out
+        == {}
+    )
+    assert decoded(tmp_path / "new.mcap")["/depth"][0].depth == 3.5
+
+
+def test_ros_1_messages_in_mcap_become_those_of_ros_2(tmp_path, decoded):
+    store = ros1_store()
+    path = tmp_path / "old.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start("ros1", "test")
+        channels: dict[str, int] = {}
+        for row, (topic, kind, message) in enumerate(messages(store, ros1=True)):
+            name = kind.replace("/msg/", "/")
+            if topic not in channels:
+                text = store.generate_msgdef(kind)[0].encode()
+                channels[topic] = writer.register_channel(
+                    topic, "ros1", writer.register_schema(name, "ros1msg", text)
+                )
+            at_ns = T0_NS + row * STEP_NS
+            writer.add_message(
+                channels[topic],
+                at_ns,
+                bytes(store.serialize_ros1(message, kind)),
+                at_ns,
+            )
+        writer.finish()
+    refusals = [
+        topic.refusal for topic in inspect_log(path).topics if topic.name == "/imu"
+    ]
+    assert f"`sonar-graph convert rosbag {path} -o OUT.mcap`" in refusals[0]
+    done = convert_rosbag(path, tmp_path / "new.mcap")
+    assert (done.topics, done.messages, done.left_out) == (3, 7, {})
+    found = decoded(tmp_path / "new.mcap")
+    assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
+    assert found["/tf_static"][0].transforms[0].transform.translation.y == 2
+    with pytest.raises(LogError, match="already an MCAP file: read it directly"):
+        convert_rosbag(tmp_path / "new.mcap", tmp_path / "again.mcap")
+
+
+def test_messages_that_are_compressed_one_by_one_are_read_as_they_are(
+    tmp_path, decoded
+):
+    """`ros2 bag record --compression-mode message --compression-format zstd`, storage MCAP."""
+    write_log(tmp_path / "dive.mcap", small_world())
+    pack = zstandard.ZstdCompressor().compress
+    stream_pack = zstandard.ZstdCompressor(write_content_size=False).compress
+    with (
+        (tmp_path / "dive.mcap").open("rb") as source,
+        (tmp_path / "packed.mcap").open("wb") as target,
+    ):
+        reader, writer = make_reader(source), McapWriter(target)
+        writer.start("ros2", "test")
+        channels: dict[int, int] = {}
+        for row, (schema, channel, message) in enumerate(reader.iter_messages()):
+            if channel.id not in channels:
+                number = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, "cdr", number, channel.metadata
+                )
+            payload = (stream_pack if row % 7 == 3 else pack)(message.data)
+            writer.add_message(
+                channels[channel.id], message.log_time, payload, message.publish_time
+            )
+        writer.finish()
+    packed, plain = read_log(tmp_path / "packed.mcap"), read_log(tmp_path / "dive.mcap")
+    for role in ("imu", "dvl", "depth", "truth"):
+        for name, column in vars(getattr(plain, role)).items():
+            np.testing.assert_array_equal(getattr(getattr(packed, role), name), column)
