@@ -262,7 +262,7 @@ def axes_warning(adapter: Adapter) -> str | None:
 def start_depth_warning(depth: Depth, start_ns: int, calibration: Calibration) -> str | None:
     """Warning where the heights about the start, whose instant is given, are not that of the start's pose."""
     start, port_m = calibration.start, np.array(calibration.depth.port_m)
-    if "position_m" not in start.model_fields_set:
+    if "position_m" not in start.model_fields_set or start.source != "stated":
         return None
     first = max(int(np.searchsorted(depth.stamps_ns, start_ns)) - 1, 0)
     height_m = float(np.median(depth.z_m[first : first + 5]))

@@ -44,6 +44,7 @@ from sonar_graph.logs.checks import (
 from sonar_graph.logs.geodesy import Origin
 from sonar_graph.logs.live_record import leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
+from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
 from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
@@ -55,7 +56,6 @@ from sonar_graph.logs.vehicle_setup import (
     read_notes,
     recorded_name,
     static_frames,
-    with_measured_start,
 )
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
@@ -236,7 +236,7 @@ class Assembly:
         recorded = read_calibration(self._recording)
         said = set() if recorded is None else recorded.model_fields_set
         is_recorded = said | {"start"} == Calibration.model_fields.keys()  # not only what images and `join` bring
-        self._is_start_stated = is_recorded or "start" in said or bool(given and given.values.get("start"))
+        self._is_start_stated = is_recorded and not (given and given.values.get("start"))
         in_record = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
         stated = in_record | (mounted_by(given.values) if given else set())
         frames = {
@@ -331,7 +331,7 @@ class Assembly:
             for role, table in self._tables.items()
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
-        if not self._is_start_stated:
+        if not (self._is_start_stated or is_whole(self.calibration.start)):
             self.calibration, self._notes["log.start"] = with_measured_start(self.calibration, blocks)
         findings = {
             "log.dropped": self.left_out(),
