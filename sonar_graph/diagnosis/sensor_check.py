@@ -12,15 +12,21 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
 from sonar_graph.diagnosis.aiding_check import (
+    AZIMUTH,
+    DEPTH,
     HEADING_SENSE,
-    HEADING_TURN,
+    RANGE,
+    compared,
+    findings_of,
     heading_findings,
     position_findings,
     vertical_bias,
 )
+from sonar_graph.diagnosis.dvl_axes import match_axes
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -37,7 +43,9 @@ from sonar_graph.diagnosis.findings import (
     tilt_findings,
     turned_mounting,
     with_fitted,
+    worst_first,
 )
+from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
@@ -111,23 +119,73 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
             f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}"
         )
     unknown = Estimate1D(np.nan, np.inf, "wrong unit")
-    return [Finding(quantity, unknown, "", line, acts=True) for quantity, line in advice.items()]
+    return [Finding(quantity, unknown, "", line, acts=True, grave=True) for quantity, line in advice.items()]
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Findings to act on that a run can tell at once: wrong units, else heading, gyro bias, unit and place of fixes.
+    """Grave findings: sensors that contradict others beyond doubt, so that the results of a run are doubtful.
 
-    A heading too that is turned against known positions by more than `LARGE_TURN_RAD`. What needs a Doppler log that is
-    put right (`check_sensors`) is left to ``inspect``, where these are warnings.
+    What needs the slower comparison of Doppler log and accelerometers (`check_sensors`) is never grave.
     """
     if faults := wrong_units(sequence, config):
         return faults
-    senses = list(heading_findings(sequence, config))
-    large = np.degrees(LARGE_TURN_RAD)
-    senses = [f for f in senses if f.quantity != HEADING_TURN or abs(f.estimate.value) > large]
-    if not any(f.quantity == HEADING_SENSE and f.acts for f in senses) and (vertical := vertical_bias(sequence)):
-        senses = [vertical, *senses]
-    return [finding for finding in (*senses, *position_findings(sequence, config)) if finding.acts]
+    axes, right = axes_finding(sequence)
+    return [finding for finding in (*axes, *motion_findings(right, config)) if finding.grave]
+
+
+def axes_finding(sequence: Sequence) -> tuple[list[Finding], Sequence]:
+    """Finding about axes and signs of the Doppler log, and the sequence with the axes put right."""
+    found = match_axes(sequence.imu, sequence.dvl, sequence.calibration)
+    if found is None or found.is_as_read:
+        return [], sequence
+    axes, calibration = found.axes, sequence.calibration
+    body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+    if not found.is_vertical_sure and np.linalg.det(axes) < 0:
+        motion = BodyMotion.of(turned_dvl(sequence, axes))
+        depth = None if motion is None else compared(turned_dvl(sequence, axes), motion, DEPTH)
+        if depth is not None and depth.gain.is_known and depth.gain.value + 4 * depth.gain.sigma < 0:
+            axes = np.diag([1.0, 1.0, -1.0]) @ axes
+    wrong = f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes ({found.names()})"
+    driver = body_R_dvl.T @ axes @ body_R_dvl
+    if np.linalg.det(axes) > 0:
+        rpy = Rotation.from_matrix(axes @ body_R_dvl).as_euler("ZYX")[::-1]
+        line = f"`dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}"
+        wrong += ": the Doppler log is turned on the vehicle, or the driver has other axes"
+    else:
+        names = [f'"{"-" if row.sum() < 0 else ""}{"xyz"[int(np.argmax(np.abs(row)))]}"' for row in np.round(driver)]
+        line = f"`rotation = [{', '.join(names)}]` under [dvl] {IN_LOG_CONFIG}, after which the mounting counts"
+        wrong += ": mirrored, the driver gives one axis the wrong sign"
+    unknown = Estimate1D(np.nan, np.inf, "wrong axes")
+    finding = Finding("DVL axes", unknown, "", f"{wrong}: {line}", acts=True, grave=True)
+    return [finding], turned_dvl(sequence, axes)
+
+
+def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
+    """Sequence with velocities along other axes of the body."""
+    R = sequence.calibration.dvl.mounting.pose().rotation().matrix()
+    turn = R.T @ axes @ R
+    dvl = sequence.dvl
+    turned = Dvl(dvl.stamps_ns, dvl.velocity @ turn.T, turn @ dvl.velocity_cov @ turn.T)
+    return replace(sequence, dvl=turned)
+
+
+def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
+    """Depth, heading, fixes and sightings against the motion of the body, and the gyros' bias about the vertical."""
+    motion = BodyMotion.of(right)
+    if motion is None:
+        return []
+    found = list[Finding]()
+    for check in (DEPTH, RANGE, AZIMUTH):
+        match = compared(right, motion, check)
+        if match is not None:
+            found += findings_of(check, match, right, config)
+    found += heading_findings(right, config, motion)
+    found += position_findings(right, config, motion)
+    is_heading_wrong = any(finding.quantity == HEADING_SENSE and finding.acts for finding in found)
+    vertical = vertical_bias(right)
+    if vertical is not None and not is_heading_wrong:
+        found.append(vertical)
+    return found
 
 
 def tilt_rates(imu: Imu) -> tuple[float, float] | None:
@@ -198,8 +256,6 @@ LEAST_YAW_RAD = np.radians(0.25)
 LEAST_SCALE = 0.002
 LEAST_HEADING_RAD = np.radians(1.0)
 """Smaller errors are hidden by others."""
-LARGE_TURN_RAD = np.radians(10.0)
-"""Of the heading against positions: beyond, a run's result is of little worth."""
 LARGEST_DENSITY_RATIO = 1.5
 """Ratio to the calibration's density, either way, from which on a line is advised."""
 LARGEST_RESTING_M_S = 0.1
@@ -226,6 +282,7 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     config = config or LogConfig()
     if faults := wrong_units(sequence, config):
         return faults
+    axes, sequence = axes_finding(sequence)
     imu, dvl = sequence.imu, sequence.dvl
     first_ns, last_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0]), min(imu.stamps_ns[-1], dvl.stamps_ns[-1])
     spare_ns = (int(last_ns - first_ns) - round(LONGEST_S * NS_PER_S)) // 2
@@ -240,12 +297,11 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     right = corrected_sequence(sequence, match, of_dvl)
     tilt = find_start_tilt(right)
     bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
-    aiding = [*heading_findings(right, config), *position_findings(right, config)]
-    vertical = vertical_bias(sequence)
-    is_mirrored = any(finding.quantity == HEADING_SENSE and finding.acts for finding in aiding)
-    if vertical is not None and vertical.estimate.is_known and not is_mirrored:
-        bias = [*(f for f in bias if f.estimate.is_known or f.acts), vertical]
-    return [*of_dvl, *lever, *bias, *aiding, *reference_findings(right, config, tilt), *noise_findings(sequence)]
+    by_motion = motion_findings(right, config)
+    if any(f.quantity.startswith("gyro bias about") and f.estimate.is_known for f in by_motion):
+        bias = [f for f in bias if f.estimate.is_known or f.acts]
+    found = [*axes, *of_dvl, *lever, *bias, *by_motion, *reference_findings(right, config, tilt)]
+    return worst_first([*found, *noise_findings(sequence)])
 
 
 def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list[Finding]:
