@@ -45,8 +45,8 @@ OTHER_UNIT = 1.3
 UNIT_TOLERANCE = 0.1
 HARDLY = 0.25
 """Gain below which a sensor is said to hardly change."""
-LEAST_MOVED = 5.0
-"""Motion in sigmas of a row, below which nothing is told of a sensor."""
+LEAST_MOVED, STUCK_MOVED = 1.0, 10.0
+"""Motion in sigmas of a row, below which nothing is told of a sensor, and not that it is stuck."""
 MOST_MISFIT, LARGEST_SCATTER = 0.3, 10.0
 """Share of its changes that the reference does not explain, and scatter in sigmas, from which on a sensor contradicts
 beyond doubt: normalised squares of 100."""
@@ -254,7 +254,7 @@ def findings_of(check: Check, found: Match, sequence: Sequence, config: LogConfi
     if not gain.is_known and not is_far:
         return [Finding(quantity, gain, "", "")]
     advice, grave, acts = NO_NEED, False, False
-    if size + 4 * found.gain.sigma < HARDLY and found.moved > 2 * LEAST_MOVED * sigma and not unit_of(check, size):
+    if size + 4 * found.gain.sigma < HARDLY and found.moved > STUCK_MOVED * sigma and not unit_of(check, size):
         what = (
             "it hardly turns where the gyros do"
             if check is HEADING
@@ -366,7 +366,35 @@ def vertical_bias(sequence: Sequence) -> Finding | None:
             f"by {source}, {np.degrees(bias.value):.3g}°/s beyond the calibration's sigma of {allowed:.2g}: "
             f"`imu.gyro_bias_rad_s = {numbers(whole, 5)}` {IN_CALIBRATION}"
         )
-    return Finding("gyro bias about the vertical", bias, "rad/s", advice, acts)
+    turned_rad = abs(bias.value) * sequence.duration_s
+    return Finding("gyro bias about the vertical", bias, "rad/s", advice, acts, acts and turned_rad > LARGE_TURN_RAD)
+
+
+FARTHEST_FROM_START_M = 2.0
+"""Height that a vehicle gains about the start, with its depth sensor's error."""
+FIRST_ROWS = 5
+
+
+def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
+    """A stated start that is at another height than the first depths; nothing where they agree."""
+    depth, start, calibration = sequence.depth, sequence.calibration.start, sequence.calibration
+    if depth is None or start.source != "stated" or "position_m" not in start.model_fields_set:
+        return
+    first = max(int(np.searchsorted(depth.stamps_ns, sequence.start_ns)) - 1, 0)
+    height_m = float(np.median(depth.z_m[first : first + FIRST_ROWS]))
+    off_m = height_m - float(start.pose().transformFrom(np.array(calibration.depth.port_m))[2])
+    if abs(off_m) <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]:
+        return
+    x, y, z = start.position_m
+    place = numbers((x, y, z + off_m), 2)
+    advice = (
+        f"the height begins at {height_m:.2f} m, the start of the calibration is at {height_m - off_m:.2f} m: an "
+        f"altimeter, another sign, unit or origin, or a wrong start? `use = false` under [depth] {IN_LOG_CONFIG} "
+        f"leaves the depths out, scale = -1 there is for depths downwards; `start.position_m = {place}` "
+        f"{IN_CALIBRATION} where the depths are right"
+    )
+    off = Estimate1D(off_m, calibration.depth.sigma_m)
+    yield Finding("depth: distance from the start", off, "m", advice, acts=True, grave=True)
 
 
 def heading_findings(right: Sequence, config: LogConfig, motion: BodyMotion | None = None) -> Iterator[Finding]:
@@ -390,7 +418,7 @@ def heading_findings(right: Sequence, config: LogConfig, motion: BodyMotion | No
     path = np.concatenate([np.zeros(1), np.cumsum(steps)])
     turn = match(stretches(t, places @ [1.0, 1j, 0.0], lambda at: motion.at(at, path), motion), find_lag=False)
     angle = Estimate1D(np.nan, np.inf, "too little motion beside positions")
-    if turn.gain.is_known and turn.moved > 0:
+    if turn.gain.is_known and turn.misfit < MOST_MISFIT:
         angle = turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, angle.reason)
     allowed = right.calibration.heading.bias_sigma_rad
     acts = matters(replace(angle, sigma=float(np.hypot(angle.sigma, allowed / 2))), 0.0)

@@ -112,6 +112,16 @@ def worst_first(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: (not finding.grave, not finding.acts))
 
 
+def notes_of(findings: Iterable[Finding]) -> dict[str, str]:
+    """Notes for a sequence, the findings to act on, worst first: grave ones under ``log.doubtful``."""
+    texts: dict[str, list[str]] = {"log.doubtful": [], "log.sensors": []}
+    for finding in worst_first(findings):
+        if finding.acts:
+            subject = "log.doubtful" if finding.grave else "log.sensors"
+            texts[subject].append(f"{finding.quantity}: {finding.text()}")
+    return {subject: "; ".join(said) for subject, said in texts.items() if said}
+
+
 def said_once(findings: Iterable[Finding]) -> list[Finding]:
     """Findings that share one line of advice: it stands in the first that acts, the others refer to it."""
     acting = [number for number, finding in enumerate(findings) if finding.acts]

@@ -44,8 +44,8 @@ class BodyMotion:
         """Integrate over the common time of IMU and Doppler log; None where they have less than three rows."""
         imu, dvl, calibration = sequence.imu, sequence.dvl, sequence.calibration
         origin_ns = sequence.start_ns
-        t = (dvl.stamps_ns - origin_ns) * 1e-9
-        imu_s = (imu.stamps_ns - origin_ns) * 1e-9
+        t = np.asarray((dvl.stamps_ns - origin_ns) / NS_PER_S, np.float64)
+        imu_s = np.asarray((imu.stamps_ns - origin_ns) / NS_PER_S, np.float64)
         rows = (t >= imu_s[0]) & (t <= imu_s[-1]) & np.isfinite(dvl.velocity).all(axis=1)
         rows[1:] &= np.diff(t) > 0
         t = t[rows]
@@ -67,7 +67,7 @@ class BodyMotion:
         up_at_imu = columns_at(imu_s, t, up)
         level = np.maximum(up_at_imu[:, 1] ** 2 + up_at_imu[:, 2] ** 2, 0.05)
         yaw_rate = (rate[:, 1] * up_at_imu[:, 1] + rate[:, 2] * up_at_imu[:, 2]) / level
-        yaw_rad = np.interp(t, imu_s, integral(imu_s, yaw_rate))
+        yaw_rad = np.asarray(np.interp(t, imu_s, integral(imu_s, yaw_rate)), np.float64)
         ahead = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
         ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
         left = np.cross(up, ahead)

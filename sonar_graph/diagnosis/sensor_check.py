@@ -19,11 +19,13 @@ from sonar_graph.diagnosis.aiding_check import (
     AZIMUTH,
     DEPTH,
     HEADING_SENSE,
+    HEADING_TURN,
     RANGE,
     compared,
     findings_of,
     heading_findings,
     position_findings,
+    start_depth_findings,
     vertical_bias,
 )
 from sonar_graph.diagnosis.dvl_axes import match_axes
@@ -47,6 +49,7 @@ from sonar_graph.diagnosis.findings import (
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.checks import gravity_warning
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
@@ -123,22 +126,26 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Grave findings: sensors that contradict others beyond doubt, so that the results of a run are doubtful.
+    """Findings to act on, without the slower comparison of Doppler log and accelerometers (`check_sensors`).
 
-    What needs the slower comparison of Doppler log and accelerometers (`check_sensors`) is never grave.
+    All grave ones are among them. Of a heading that is turned against known positions only a large turn.
     """
     if faults := wrong_units(sequence, config):
         return faults
     axes, right = axes_finding(sequence)
-    return [finding for finding in (*axes, *motion_findings(right, config)) if finding.grave]
+    found = worst_first([*axes, *motion_findings(right, config)])
+    return [finding for finding in found if finding.acts and (finding.grave or finding.quantity != HEADING_TURN)]
 
 
 def axes_finding(sequence: Sequence) -> tuple[list[Finding], Sequence]:
     """Finding about axes and signs of the Doppler log, and the sequence with the axes put right."""
-    found = match_axes(sequence.imu, sequence.dvl, sequence.calibration)
+    imu, calibration = sequence.imu, sequence.calibration
+    if gravity_warning(imu.specific_force, calibration.imu.mounting, calibration.gravity_m_s2):
+        return [], sequence  # the IMU's axes come first
+    found = match_axes(imu, sequence.dvl, calibration)
     if found is None or found.is_as_read:
         return [], sequence
-    axes, calibration = found.axes, sequence.calibration
+    axes = found.axes
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     if not found.is_vertical_sure and np.linalg.det(axes) < 0:
         motion = BodyMotion.of(turned_dvl(sequence, axes))
@@ -174,17 +181,18 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
     motion = BodyMotion.of(right)
     if motion is None:
         return []
-    found = list[Finding]()
+    found = list(start_depth_findings(right))
     for check in (DEPTH, RANGE, AZIMUTH):
         match = compared(right, motion, check)
         if match is not None:
             found += findings_of(check, match, right, config)
-    found += heading_findings(right, config, motion)
-    found += position_findings(right, config, motion)
-    is_heading_wrong = any(finding.quantity == HEADING_SENSE and finding.acts for finding in found)
+    of_heading = list(heading_findings(right, config, motion))
+    is_heading_wrong = any(finding.quantity == HEADING_SENSE and finding.acts for finding in of_heading)
     vertical = vertical_bias(right)
     if vertical is not None and not is_heading_wrong:
         found.append(vertical)
+    found += of_heading
+    found += position_findings(right, config, motion)
     return found
 
 

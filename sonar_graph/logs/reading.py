@@ -31,18 +31,20 @@ from sonar_graph.logs.adapters import (
 )
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
+    LEAST_MOVED,
     axes_warning,
     gap_warnings,
     gravity_warning,
     gyro_warning,
     is_partial,
+    repeats,
     spike_warning,
     stamp_faults,
-    start_depth_warning,
     stuck_warning,
+    way_by,
 )
 from sonar_graph.logs.geodesy import Origin
-from sonar_graph.logs.live_record import leave_out_dropped, recorded_config
+from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
 from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
@@ -60,7 +62,7 @@ from sonar_graph.logs.vehicle_setup import (
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 
-FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.sensors"})
+FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.sensors", "log.doubtful"})
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
 NOISE_FIELDS = {
@@ -204,6 +206,7 @@ class Assembly:
         self.adapters: dict[str, Any] = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
+        self._stuck: dict[str, str] = {}
         self._tables: dict[str, MessageTable] = {}
         for role, topic in self.topics.items():
             if self.adapters[role].reads_table:
@@ -214,6 +217,7 @@ class Assembly:
                         raise
                     self._dropped[role] = topic.unsound
         self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
+        self._is_live = LIVE_RATE in self._notes  # the record is of what the live run used
         self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self.topics.items())
         changes = {
             role: changes_text(self.adapters[role], shipped_like(role, topic.type_name, topic.definition()))
@@ -289,9 +293,28 @@ class Assembly:
             if isinstance(adapter, DepthAdapter) and (said := adapter.assumption(self.calibration.gravity_m_s2)):
                 self._notes["log.depth"] = said
             self._blocks[role], dropped = rows_of(adapter, source, self.calibration, *self.axes_and_origin(role))
+        if self._blocks[role] is not None and role in LEAST_MOVED and not self._is_live:
+            self._blocks[role], stuck = self._without_repeats(role, self._blocks[role])
+            dropped = dropped | stuck
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
         return self._blocks[role]
+
+    def _without_repeats(self, role: str, rows: Any) -> tuple[Any, Dropped]:
+        """Rows without those of a sensor that is stuck while the vehicle moves, and their number."""
+        imu, dvl = self.block("imu"), self.block("dvl")
+        if imu is None or dvl is None or len(rows) < 2:
+            return rows, {}
+        moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
+        values = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}[role]
+        stuck = repeats(getattr(rows, values).reshape(len(rows), -1), moved, LEAST_MOVED[role])
+        if not stuck.any():
+            return rows, {}
+        first = int(np.argmax(stuck))
+        late_s = (rows.stamps_ns[first] - max(imu.stamps_ns[0], dvl.stamps_ns[0])) * 1e-9
+        text = f"that repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
+        self._stuck[role] = f"{np.count_nonzero(stuck)} of {len(rows)} rows {text.removeprefix('that ')}: left out"
+        return rows.rows(np.flatnonzero(~stuck)), {text: int(np.count_nonzero(stuck))}
 
     def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
         """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
@@ -374,12 +397,9 @@ class Assembly:
             found.append(("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")))
         if depth is not None:
             found.append(("depth", stuck_warning(depth.stamps_ns, depth.z_m[:, None], "height", is_coarse=True)))
-        if imu is not None and dvl is not None and depth is not None:
-            start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
-            found.append(("depth", start_depth_warning(depth, int(start_ns), self.calibration)))
         if "dvl" in self._tables and not self._is_mounting_known:
             found.append(("dvl", axes_warning(self.adapters["dvl"])))
-        yield from (f"{role}: {text}" for role, text in found if text)
+        yield from (f"{role}: {text}" for role, text in [*found, *self._stuck.items()] if text)
         yield from unsaid_noise({role: self.block(role) for role in NOISE_FIELDS}, only_partly=True)
         stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
         if detections is not None and len(stamps) == 2:

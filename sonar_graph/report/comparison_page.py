@@ -130,6 +130,7 @@ def render_report(comparison: Comparison) -> str:
     detections = len(sequence.detections) if sequence.detections else 0
     lost = sentences.lost_runs(comparison)
     told = [sentence for sentence in sentences.finding(comparison)[len(failed) :] if sentence not in lost]
+    doubtful = sentences.doubtful_lines(comparison)
     content = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
@@ -151,7 +152,8 @@ def render_report(comparison: Comparison) -> str:
         "doubts": [
             *sentences.finding(comparison)[: len(failed)],
             *lost,
-            *sentences.warning_lines(sequence.notes),
+            *doubtful[1:],
+            *(line for line in sentences.warning_lines(sequence.notes) if line not in doubtful),
             *sentences.doubt_of_identities(comparison),
             *sentences.outliers(comparison),
             *sentences.withheld_lines(comparison),

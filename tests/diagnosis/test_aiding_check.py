@@ -40,15 +40,15 @@ def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(gy
     run = replace(RIGHT, imu=imu, truth=RIGHT.truth)
     bearing = compass(run, lambda yaw_rad: np.pi / 2 - yaw_rad)
     for given, config, world in ((bearing, {}, "ned"), (bearing, {"heading": {"world": "ned"}}, "enu")):
-        (finding,) = aiding_check.heading_findings(given, LogConfig.parse(config, "x"))
+        finding, *_ = aiding_check.heading_findings(given, LogConfig.parse(config, "x"))
         assert finding.acts
         assert "turns against the gyros, clockwise" in finding.advice
         assert line_of(finding) == {"world": world}
         assert finding.estimate.value == pytest.approx(-1.0, abs=0.1)
-    sense, _ = aiding_check.heading_findings(compass(run, lambda yaw_rad: yaw_rad + 0.01), NO_CONFIG)
+    sense, *_ = aiding_check.heading_findings(compass(run, lambda yaw_rad: yaw_rad + 0.01), NO_CONFIG)
     assert not sense.acts
     assert sense.estimate.value == pytest.approx(1.0, abs=0.1)
-    (stuck,) = aiding_check.heading_findings(compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG)
+    stuck, *_ = aiding_check.heading_findings(compass(run, lambda yaw_rad: 0 * yaw_rad), NO_CONFIG)
     assert stuck.acts
     assert "it hardly turns where the gyros do" in stuck.text()
 
@@ -73,8 +73,9 @@ UNITS = [(1e3, {"scale": 1e-3}), (1e2, {"scale": 1e-2}), (1e-3, {"scale": 1e3}),
 
 @pytest.mark.parametrize(("scale", "line"), UNITS)
 def test_fixes_in_another_unit_are_named_by_what_the_doppler_log_moves(scale, line):
-    (finding,) = aiding_check.position_findings(fixed(RIGHT, scale), NO_CONFIG)
+    finding, *others = aiding_check.position_findings(fixed(RIGHT, scale), NO_CONFIG)
     assert finding.acts == (line is not None)
+    assert not any(other.acts for other in others)
     if isinstance(line, dict):
         assert line_of(finding) == pytest.approx(line)
     elif line:
@@ -83,30 +84,30 @@ def test_fixes_in_another_unit_are_named_by_what_the_doppler_log_moves(scale, li
 
 @pytest.mark.parametrize("every_s", [1.0, 15.0])
 def test_noise_of_fixes_of_a_slow_vehicle_is_no_unit_and_no_distance(every_s: float):
-    (finding,) = aiding_check.position_findings(fixed(SLOW, sigma_m=2.5, every_s=every_s), NO_CONFIG)
-    assert not finding.acts, finding.text()
+    found = list(aiding_check.position_findings(fixed(SLOW, sigma_m=2.5, every_s=every_s), NO_CONFIG))
+    assert not any(finding.acts for finding in found), found
 
 
-@pytest.mark.parametrize("rows", [1, 2, 100])
+@pytest.mark.parametrize("rows", [1, 2, 10])
 def test_a_doppler_log_of_one_row_or_a_few_tells_nothing_of_fixes(rows: int):
-    (finding,) = aiding_check.position_findings(fixed(replace(RIGHT, dvl=RIGHT.dvl.rows(slice(rows)))), NO_CONFIG)
-    assert finding.text() == "cannot be told: too few fixes beside the Doppler log"
+    finding, *_ = aiding_check.position_findings(fixed(replace(RIGHT, dvl=RIGHT.dvl.rows(slice(rows)))), NO_CONFIG)
+    assert finding.text().startswith("cannot be told: too few")
 
 
 def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_start():
     grid = np.array([500_000.0, 4_670_000.0, 0.0])
     config = LogConfig.parse({"positions": {"origin_m": [1.0, 2.0, 3.0]}}, "x")
-    (finding,) = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
+    *_, finding = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
     assert finding.acts
     assert "from the start, the whole way is" in finding.advice
     assert line_of(finding)["origin_m"] == pytest.approx(grid + RIGHT.truth.positions[0] + [1, 2, 3], abs=2.0)
     started = RIGHT.calibration.start.model_copy(update={"position_m": tuple(grid)})
     begun = replace(RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": started}))
-    (finding,) = aiding_check.position_findings(fixed(begun, origin=grid), config)
+    *_, finding = aiding_check.position_findings(fixed(begun, origin=grid), config)
     assert "from the origin of the world, the whole way is" in finding.advice
     few = fixed(RIGHT, every_s=1000.0)
     assert [one.text() for one in aiding_check.position_findings(few, config)] == [
-        "cannot be told: too few fixes beside the Doppler log"
+        "cannot be told: too few rows beside its reference"
     ]
 
 
@@ -145,8 +146,9 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
         run = replace(run, heading=Heading(stamps_ns, said, np.full(len(said), np.nan)))
         config = LogConfig.parse({"heading": {"yaw_offset_rad": before}}, "x")
         found = list(aiding_check.heading_findings(run, config))
-        sense, *found = found
+        sense, lag, *found = found
         assert not sense.acts
+        assert not lag.acts
         if places == "neither":
             assert not found
             continue
@@ -162,7 +164,7 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
             assert not [f for f in aiding_check.heading_findings(turned, config) if f.acts]
             assert finding.quantity in [f.quantity for f in doubts(run, config)]
     still = replace(run, dvl=replace(run.dvl, velocity=0 * velocity))
-    assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[1:])
+    assert not any(f.estimate.is_known for f in list(aiding_check.heading_findings(still, LogConfig()))[2:])
 
 
 @pytest.mark.parametrize(("off_deg", "gyro_bias"), [(6.0, 0.0), (20.0, 0.0), (20.0, 0.01)])
