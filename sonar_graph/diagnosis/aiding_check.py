@@ -42,6 +42,8 @@ LARGEST_LAG_SIGMA_S = 0.5
 LARGEST_HEADING_SIGMA_RAD = 0.25
 OTHER_UNIT = 1.3
 """Gain, either way, from which on a unit is asked for, not a scale."""
+SLIPPING_UNIT = 3.0
+"""The same for sightings of a vehicle on wheels, which slip."""
 UNIT_TOLERANCE = 0.1
 HARDLY = 0.25
 """Gain below which a sensor is said to hardly change."""
@@ -80,6 +82,10 @@ class Check:
     """Cause and line where the gain is negative."""
     scaled: Callable[[LogConfig, float], str] = lambda _, __: ""
     """Line for a gain near 1."""
+    reach: Callable[[Sequence, Match], float] = lambda _, found: found.moved
+    """What a scale is multiplied by, in the sensor's unit."""
+    systematic: float = 0.0
+    """Sigma of the gain by what the comparison leaves out."""
     least_scale: float = 0.03
     least_lag_s: float = 0.1
     is_turned: bool = False
@@ -185,11 +191,11 @@ AZIMUTH = Check(
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units={"degrees": float(np.radians(1.0))},
     sense=lambda config: (
-        "they turn against the vehicle, mirrored: "
-        f'`rotation = "{_other(config, "detections", "rotation", "flu", "frd")}"` under [detections] '
-        f"{IN_LOG_CONFIG}"
+        f"they turn with the vehicle, mirrored: {_scale_line('detections', 'azimuth_scale', config, -1.0)}"
+        '; of a Detection3DArray `rotation = "frd"`'
     ),
     scaled=lambda config, gain: _scale_line("detections", "azimuth_scale", config, gain),
+    systematic=0.01,
     least_scale=0.1,
 )
 
@@ -240,40 +246,56 @@ def is_level_fix(fixes: PositionFixes) -> np.ndarray:
 def findings_of(check: Check, found: Match, sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Rows of the report for a comparison: gain and lag, with cause and line where one is wrong."""
     quantity = HEADING_SENSE if check is HEADING else f"{check.name}: change over that by {check.against}"
-    lag_quantity = f"{check.name} against {check.against}: delay"
     sigma = check.sigma(sequence)
     still = "too little turning" if check in (HEADING, AZIMUTH) else f"too little motion for {check.name}"
     if not found.gain.is_known:
         return [Finding(quantity, found.gain, "", "")]
     if not found.moved * max(1.0, abs(found.gain.value)) > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still), "", "")]
-    size = abs(found.gain.value)
-    limit = LARGEST_GAIN_SIGMA * max(1.0, size)
-    gain = found.gain.limited(limit, still)
-    is_far = found.scatter > LARGEST_SCATTER * sigma and found.misfit > MOST_MISFIT
-    if not gain.is_known and not is_far:
+    gain = found.gain.limited(LARGEST_GAIN_SIGMA * max(1.0, abs(found.gain.value)), still)
+    grave = grave_fault(check, replace(found, gain=gain), sequence, config)
+    if grave:
+        return [Finding(quantity, gain, "", grave, acts=True, grave=True)]
+    if not gain.is_known:
         return [Finding(quantity, gain, "", "")]
-    advice, grave, acts = NO_NEED, False, False
-    if size + 4 * found.gain.sigma < HARDLY and found.moved > STUCK_MOVED * sigma and not unit_of(check, size):
-        what = (
-            "it hardly turns where the gyros do"
-            if check is HEADING
-            else f"it hardly changes where {check.against} does"
+    off = replace(gain, value=abs(gain.value) - 1.0)
+    reach = check.reach(sequence, found)
+    slips = check.role == "detections" and sequence.calibration.odometry_interpolation == "hold-past"
+    acts = not slips and matters(off, check.least_scale) and abs(off.value) * reach > sigma
+    advice = NO_NEED
+    if acts:
+        size = abs(gain.value)
+        advice = (
+            f"it changes {size:.3g} times as much, up to {abs(off.value) * reach:.2g}: {check.scaled(config, size)}"
         )
-        advice = f"{what}: stuck, or not of the body; `use = false` under [{check.role}] {IN_LOG_CONFIG}"
-        grave = True
-    elif found.is_mirrored or (gain.is_known and gain.value < 0):
-        advice, grave = check.sense(config), True
-    elif gain.is_known and not 1 / OTHER_UNIT < size < OTHER_UNIT:
-        advice, grave = unit_advice(check, size, config), True
-    elif is_far:
-        advice, grave = contradiction(check, found), True
-    elif matters(replace(gain, value=size - 1.0), check.least_scale):
-        advice, acts = f"it changes {size:.3g} times as much: {check.scaled(config, size)}", True
-    rows = [Finding(quantity, gain, "", advice, acts or grave, grave)]
-    if not grave and found.lag.is_known:
-        rows.append(lag_finding(check, lag_quantity, found, sigma, config))
+    known = replace(gain, sigma=float(np.hypot(gain.sigma, check.systematic)))
+    rows = [Finding(quantity, known, "", advice, acts)]
+    if found.lag.is_known:
+        name = f"{check.name} against {check.against}: delay"
+        rows.append(lag_finding(check, name, found, sigma, config))
     return rows
+
+
+def grave_fault(check: Check, found: Match, sequence: Sequence, config: LogConfig) -> str:
+    """Cause and line of a fault beyond doubt: stuck, another sense or unit, or another thing; empty: none."""
+    gain, sigma = found.gain, check.sigma(sequence)
+    size = abs(gain.value)
+    is_stuck = size + 4 * gain.sigma < HARDLY and found.moved > STUCK_MOVED * sigma
+    slips = check.role == "detections" and sequence.calibration.odometry_interpolation == "hold-past"
+    other_unit = SLIPPING_UNIT if slips else OTHER_UNIT
+    if is_stuck and not unit_of(check, size):
+        verb = "turns" if check is HEADING else "changes"
+        return (
+            f"it hardly {verb} where {check.against} do: stuck, or not of the body; `use = false` under [{check.role}] "
+            f"{IN_LOG_CONFIG}"
+        )
+    if found.is_mirrored or (gain.is_known and gain.value < 0):
+        return check.sense(config)
+    if gain.is_known and not 1 / other_unit < size < other_unit:
+        return unit_advice(check, size, config)
+    if found.scatter > LARGEST_SCATTER * sigma and found.misfit > MOST_MISFIT:
+        return contradiction(check, found)
+    return ""
 
 
 def contradiction(check: Check, found: Match) -> str:
@@ -307,7 +329,7 @@ def unit_advice(check: Check, gain: float, config: LogConfig) -> str:
 def lag_finding(check: Check, quantity: str, found: Match, sigma: float, config: LogConfig) -> Finding:
     """Row for a delay of the sensor."""
     lag = found.lag.limited(LARGEST_LAG_SIGMA_S, "too little changes in the motion")
-    if not matters(lag, check.least_lag_s):
+    if not matters(lag, check.least_lag_s) or abs(lag.value) * found.rate < sigma:
         return Finding(quantity, lag, "s", NO_NEED)
     total_s = config.number(check.role, "stamp_offset_s", 0.0) - lag.value
     moved = abs(lag.value) * found.rate
@@ -418,7 +440,7 @@ def heading_findings(right: Sequence, config: LogConfig, motion: BodyMotion | No
     path = np.concatenate([np.zeros(1), np.cumsum(steps)])
     turn = match(stretches(t, places @ [1.0, 1j, 0.0], lambda at: motion.at(at, path), motion), find_lag=False)
     angle = Estimate1D(np.nan, np.inf, "too little motion beside positions")
-    if turn.gain.is_known and turn.misfit < MOST_MISFIT:
+    if turn.misfit < MOST_MISFIT and 0.5 < turn.gain.value < 2.0:
         angle = turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, angle.reason)
     allowed = right.calibration.heading.bias_sigma_rad
     acts = matters(replace(angle, sigma=float(np.hypot(angle.sigma, allowed / 2))), 0.0)

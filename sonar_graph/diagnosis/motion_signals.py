@@ -51,6 +51,7 @@ class BodyMotion:
         t = t[rows]
         if len(t) < 3:
             return None
+        is_held = calibration.odometry_interpolation == "hold-past"
         body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
         rate = (imu.angular_velocity - calibration.imu.gyro_bias_rad_s) @ body_R_imu.T
         force = imu.specific_force @ body_R_imu.T
@@ -67,7 +68,7 @@ class BodyMotion:
         up_at_imu = columns_at(imu_s, t, up)
         level = np.maximum(up_at_imu[:, 1] ** 2 + up_at_imu[:, 2] ** 2, 0.05)
         yaw_rate = (rate[:, 1] * up_at_imu[:, 1] + rate[:, 2] * up_at_imu[:, 2]) / level
-        yaw_rad = np.asarray(np.interp(t, imu_s, integral(imu_s, yaw_rate)), np.float64)
+        yaw_rad = np.asarray(np.interp(t, imu_s, integral(imu_s, yaw_rate, is_held=is_held)), np.float64)
         ahead = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
         ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
         left = np.cross(up, ahead)
@@ -78,8 +79,8 @@ class BodyMotion:
             up,
             v,
             yaw_rad,
-            integral(t, np.sum(v * up, axis=1)),
-            integral(t, level_v * np.exp(1j * yaw_rad)),
+            integral(t, np.sum(v * up, axis=1), is_held=is_held),
+            integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
             max(calibration.dvl.gap_s, 3.0 * float(np.median(np.diff(t)))),
         )
 
@@ -96,9 +97,10 @@ class BodyMotion:
         return np.asarray((stamps_ns - self.origin_ns) / NS_PER_S)
 
 
-def integral(t: Floats, values: Floats) -> Floats:
-    """Running integral by the trapezoid rule, from zero."""
-    steps = (values[1:] + values[:-1]) / 2 * np.diff(t)
+def integral(t: Floats, values: Floats, *, is_held: bool = False) -> Floats:
+    """Running integral from zero: by the trapezoid rule, or of values that hold for the time before them."""
+    means = values[1:] if is_held else (values[1:] + values[:-1]) / 2
+    steps = means * np.diff(t)
     return np.concatenate([np.zeros(1), np.cumsum(steps)])
 
 

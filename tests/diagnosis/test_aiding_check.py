@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import Start
 from sonar_graph.diagnosis import aiding_check, doubts
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Heading, PositionFixes
@@ -203,3 +204,17 @@ def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(refere
     again = aiding_check.vertical_bias(mended)
     assert again is not None
     assert not again.acts
+
+
+@pytest.mark.parametrize(
+    ("z_m", "stated", "is_told"),
+    [(-3.0, -3.0, False), (-4.5, -3.0, False), (3.0, -3.0, True), (-3000.0, -3.0, True), (-50.0, None, False)],
+)
+def test_heights_that_do_not_begin_at_the_stated_start_are_grave(z_m: float, stated: float | None, is_told: bool):
+    start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
+    offset_m = z_m - float(RIGHT.depth.z_m[:5].mean())
+    depth = replace(RIGHT.depth, z_m=RIGHT.depth.z_m + offset_m)
+    calibration = RIGHT.calibration.model_copy(update={"start": start})
+    found = list(aiding_check.start_depth_findings(replace(RIGHT, depth=depth, calibration=calibration)))
+    assert [finding.grave for finding in found] == [True] * is_told
+    assert all(f"the height begins at {z_m:.2f} m" in finding.advice for finding in found)

@@ -407,7 +407,8 @@ def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_w
     notes = said | {"log.topics": "imu: /imu", "log.noise": "dvl"}
     assert [line.partition(": ")[2] for line in sentences.doubt_lines(notes)] == list(said.values())
     assert sentences.warning_lines(notes) == [
-        f"Warning: <log.{name}>" for name in ("sensors", "start_pose", "warnings", "gaps")
+        "Doubtful: <log.doubtful>",
+        *(f"Warning: <log.{name}>" for name in ("sensors", "start_pose", "warnings", "gaps")),
     ]
 
 

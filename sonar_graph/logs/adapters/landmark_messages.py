@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sonar_graph.logs.adapters.adapter import Adapter, field_paths, turn, turn_covariances
+from sonar_graph.logs.adapters.adapter import Adapter, AngleScale, LengthScale, field_paths, turn, turn_covariances
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, fit_rows, header_stamps_ns, not_finite
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
@@ -86,6 +86,10 @@ class DetectionListsAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkDetections``: range, azimuth, covariance and posterior, in flat lists."""
 
     reads_table = False
+    range_scale: LengthScale = 1.0
+    """Turns ranges into metres; 0.001 or "mm" from millimetres, a ratio of sound speeds where that is wrong."""
+    azimuth_scale: AngleScale = 1.0
+    """Turns azimuths into rad, positive to the left; -1 where they are positive to the right."""
 
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
@@ -95,6 +99,11 @@ class DetectionListsAdapter(Adapter):
             return None, {}
         rows = _Joined(topic, [self._rows(topic, group, log_times_ns) for group in groups])
         ranges, azimuths, covariances, tracks = rows.values
+        if self.range_scale != 1 or self.azimuth_scale != 1:
+            scales = np.array([self.range_scale, self.azimuth_scale])
+            ranges = ranges * self.range_scale
+            azimuths = azimuths * self.azimuth_scale
+            covariances = covariances * np.outer(scales, scales)
         faults = {
             NOT_FINITE: not_finite(ranges, azimuths, rows.probabilities),
             NO_POSTERIOR: no_posterior(rows.probabilities),
