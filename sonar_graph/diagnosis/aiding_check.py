@@ -23,7 +23,7 @@ from sonar_graph.diagnosis.findings import (
     turned_mounting,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.diagnosis.signals import Match, Stretch, Values, match, unknown
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, Stretch, Values, match, unknown
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, Floats, Imu, Ints, PositionFixes
 from sonar_graph.models import wrap_angle
@@ -233,7 +233,17 @@ def compared(sequence: Sequence, motion: BodyMotion, check: Check) -> Match | No
         return match(stretches(t, fixes.position_m @ [1.0, 1j, 0.0], lambda at: motion.at(at, path), motion))
     if check in (RANGE, AZIMUTH) and sequence.detections is not None:
         changes = sightings(sequence, motion)
-        return None if changes is None else match([changes[check is AZIMUTH]], find_lag=False)
+        if changes is None:
+            return None
+        found = match([changes[1]], find_lag=False)
+        # the place of a landmark depends on its azimuth too, so that a mirrored one is more than a gain of -1
+        other = sightings(sequence, motion, sign=-1.0)
+        assert other is not None
+        mirrored = match([other[1]], find_lag=False)
+        is_mirrored = mirrored.scatter < found.scatter / CLEARLY_BETTER
+        if check is RANGE:
+            return match([other[0] if is_mirrored else changes[0]], find_lag=False)
+        return replace(mirrored if is_mirrored else found, is_mirrored=is_mirrored)
     return None
 
 
@@ -543,11 +553,11 @@ PAIR_S, LONGEST_PAIR_S = 1.0, 3.0
 FEWEST_PAIRS = 20
 
 
-def sightings(sequence: Sequence, motion: BodyMotion) -> tuple[Stretch, Stretch] | None:
+def sightings(sequence: Sequence, motion: BodyMotion, sign: float = 1.0) -> tuple[Stretch, Stretch] | None:
     """Changes of range and azimuth between two sightings of a landmark, and those by the motion; None: too few.
 
     With p = l + r u the landmark in the body, u the direction, l the sonar's place, and the body moved by d and turned
-    by R: ``p_j = R' (p_i - d)``. Elevations are taken as zero.
+    by R: ``p_j = R' (p_i - d)``. Elevations are taken as zero; azimuths count with a ``sign``.
     """
     seen, mounting = sequence.detections, sequence.calibration.sonar.mounting.pose()
     if seen is None:
@@ -567,7 +577,7 @@ def sightings(sequence: Sequence, motion: BodyMotion) -> tuple[Stretch, Stretch]
     order = np.argsort(t[second], kind="stable")
     i, j = np.array(first)[order], np.array(second)[order]
     R, lever = mounting.rotation().matrix(), mounting.translation()
-    azimuth = seen.azimuth_rad[i]
+    azimuth = sign * seen.azimuth_rad[i]
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
     place = lever + (seen.range_m[i, None] * ahead) @ R.T  # (k, 3)
     path_i, path_j, yaw_i, yaw_j = (
@@ -579,7 +589,7 @@ def sightings(sequence: Sequence, motion: BodyMotion) -> tuple[Stretch, Stretch]
     after = (np.column_stack([level.real, level.imag, place[:, 2] - climbed]) - lever) @ R
     r = np.linalg.norm(after, axis=1)
     turned = wrap_angle(np.arctan2(after[:, 1], after[:, 0]) - azimuth)
-    seen_turn = wrap_angle(seen.azimuth_rad[j] - azimuth)
+    seen_turn = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     by_range = Stretch(t[j], seen.range_m[j] - seen.range_m[i], lambda _: r - seen.range_m[i], has_offset=False)
     by_azimuth = Stretch(t[j], seen_turn, lambda _: turned, has_offset=False)
     return by_range, by_azimuth

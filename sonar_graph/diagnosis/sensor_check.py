@@ -184,7 +184,8 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
     found = list(start_depth_findings(right))
     for check in (DEPTH, RANGE, AZIMUTH):
         match = compared(right, motion, check)
-        if match is not None:
+        is_range_wrong = check is AZIMUTH and any(f.grave and f.quantity.startswith(RANGE.name) for f in found)
+        if match is not None and not is_range_wrong:  # the place of a landmark depends on its range
             found += findings_of(check, match, right, config)
     of_heading = list(heading_findings(right, config, motion))
     is_heading_wrong = any(finding.quantity == HEADING_SENSE and finding.acts for finding in of_heading)
