@@ -267,9 +267,7 @@ FAULTS = {
     "range unit": Fault((1e3, 1e2, 1 / 0.3048), scale_ranges, r"ranges.*times as much", ("detections", "dvl")),
     "range scale": Fault((1.045, 1.1, 0.9), scale_ranges, r"ranges.*times as much", ("detections", "dvl")),
     "azimuth sense": Fault((-1.0, -1.0, -1.0), scale_azimuths, r"azimuths.*mirrored", ("detections",)),
-    "azimuth unit": Fault(
-        (57.29578, 57.29578, 57.29578), scale_azimuths, r"azimuths.*(times|not used|range)", ("detections",)
-    ),
+    "azimuth unit": Fault((57.29578, 57.29578, 57.29578), scale_azimuths, r"azimuth.*degrees", ("detections",)),
     "gyro scale": Fault((1.02, 1.05, 0.95), factor_of("rate"), r"angular_velocity_scale", ("imu",)),
     "gyro unit": Fault((57.29578, 57.29578, 57.29578), factor_of("rate"), r"gyro.*degrees", ("imu",)),
     "gyro bias": Fault((0.005, 0.01, -0.02), bias_gyro, r"gyro bias", ("imu",)),

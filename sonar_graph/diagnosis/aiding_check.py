@@ -36,6 +36,7 @@ STRETCH_S = 120.0
 """Rows are compared over so long at a time; longer, a drift of the gyros would bend the path."""
 WINDOW_NS = 10 * NS_PER_S
 FEWEST_WINDOWS = 6
+LEAST_BIAS_S = 30.0
 LARGEST_GAIN_SIGMA = 0.12
 """Of a gain that is told: 1 and -1 are sixteen sigmas apart."""
 LARGEST_LAG_SIGMA_S = 0.5
@@ -52,8 +53,8 @@ LEAST_MOVED, STUCK_MOVED = 1.0, 10.0
 MOST_MISFIT, LARGEST_SCATTER = 0.3, 10.0
 """Share of its changes that the reference does not explain, and scatter in sigmas, from which on a sensor contradicts
 beyond doubt: normalised squares of 100."""
-GRAVE_LAG = 3.0
-"""Error by a lag, in sigmas of a row, from which on results are doubtful."""
+GRAVE_ERROR = 5.0
+"""Error by a scale or a lag, in sigmas of a row, from which on results are doubtful."""
 HIGH_PERCENTILE = 95.0
 JUMP_NS = 2 * WINDOW_NS
 JUMP_GATE = chi_square_quantile(1 - 1e-4, 3)
@@ -279,7 +280,8 @@ def findings_of(check: Check, found: Match, sequence: Sequence, config: LogConfi
             f"it changes {size:.3g} times as much, up to {abs(off.value) * reach:.2g}: {check.scaled(config, size)}"
         )
     known = replace(gain, sigma=float(np.hypot(gain.sigma, check.systematic)))
-    rows = [Finding(quantity, known, "", advice, acts)]
+    is_grave = acts and abs(off.value) * reach > GRAVE_ERROR * sigma
+    rows = [Finding(quantity, known, "", advice, acts, is_grave)]
     if found.lag.is_known:
         name = f"{check.name} against {check.against}: delay"
         rows.append(lag_finding(check, name, found, sigma, config))
@@ -348,7 +350,7 @@ def lag_finding(check: Check, quantity: str, found: Match, sigma: float, config:
         f"its rows come too {what}, an error of {moved:.2g} typically: `stamp_offset_s = {total_s:.3f}` under "
         f"[{check.role}] {IN_LOG_CONFIG}"
     )
-    return Finding(quantity, lag, "s", advice, acts=True, grave=moved > GRAVE_LAG * sigma)
+    return Finding(quantity, lag, "s", advice, acts=True, grave=moved > GRAVE_ERROR * sigma)
 
 
 def upwards(imu: Imu, body_R_imu: Floats) -> Floats:
@@ -368,7 +370,7 @@ def turned_about_up(imu: Imu, body_R_imu: Floats, at_ns: Ints) -> Floats:
 def vertical_bias(sequence: Sequence) -> Finding | None:
     """Bias of the gyros about the vertical, by a heading or by true orientations; None without either.
 
-    Windows of the gyros' turn x and the heading's y give ``b = mean(x - y) / T``, less the bias that is known.
+    The slope of the gyros' turn less the heading over time, less the bias that is known.
     """
     source = "the heading"
     if (heading := sequence.heading) is not None:
@@ -378,17 +380,19 @@ def vertical_bias(sequence: Sequence) -> Finding | None:
         stamps_ns, yaw_rad = truth.stamps_ns, np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
     else:
         return None
-    ends = np.arange(max(sequence.start_ns, stamps_ns[0]), min(sequence.end_ns, stamps_ns[-1]) + 1, WINDOW_NS)
+    during = (stamps_ns >= sequence.start_ns) & (stamps_ns <= sequence.end_ns)
+    stamps_ns, yaw_rad = stamps_ns[during], yaw_rad[during]
     imu, known = sequence.imu, np.array(sequence.calibration.imu.gyro_bias_rad_s)
     body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
     up = upwards(imu, body_R_imu)
-    rate = (np.diff(turned_about_up(imu, body_R_imu, ends)) - np.diff(np.interp(ends, stamps_ns, yaw_rad))) / (
-        WINDOW_NS / NS_PER_S
-    )
+    drift_rad = turned_about_up(imu, body_R_imu, stamps_ns) - yaw_rad
+    seconds = (stamps_ns - sequence.start_ns) / NS_PER_S
+    count = max(1, int(np.ceil(np.ptp(seconds) / STRETCH_S))) if len(seconds) else 1
+    parts = zip(np.array_split(seconds, count), np.array_split(drift_rad, count), strict=True)
+    found = match([Stretch(part_s, part_rad, lambda at: at) for part_s, part_rad in parts], find_lag=False).gain
     bias = Estimate1D(np.nan, np.inf, f"too little time beside {source}")
-    if len(rate) >= FEWEST_WINDOWS:
-        sigma = float(np.std(rate)) / float(np.sqrt(len(rate)))
-        bias = Estimate1D(float(np.mean(rate)) - float(up @ known), max(sigma, 1e-9))
+    if found.is_known and np.ptp(seconds) > LEAST_BIAS_S:
+        bias = Estimate1D(found.value - float(up @ known), max(found.sigma, 1e-9))
     allowed = sequence.calibration.imu.gyro_bias_sigma
     acts = matters(replace(bias, sigma=float(np.hypot(bias.sigma, allowed))), LEAST_BIAS_RAD_S)
     advice = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"

@@ -1,7 +1,8 @@
 """Motion of the body by gyros, accelerometers and Doppler log, as the reference of the other sensors.
 
-Up in the body is felt: over a second ``u = f - dv/dt - w x v``, normalised, so that no bias of a gyro adds up. Yaw is
-the integral of the gyros' rate about it. With v the velocity of the body's origin, e the level forward axis::
+Up is felt: with C the turn by the gyros alone, over a second ``C u = mean(C f) - d(C v)/dt``, normalised, so that no
+bias of a gyro adds up. Yaw is the integral of the gyros' rate about it. With v the velocity of the body's origin and e
+the level forward axis::
 
     z(t) = int u.v dt,    p(t) = int (v.e + i v.(u x e)) exp(i yaw) dt
 
@@ -12,7 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonar_graph.measurements import NS_PER_S, Floats, Ints
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
+from sonar_graph.navigation.alignment.dvl_imu import InertialPath
 from sonar_graph.sequence import Sequence
 
 UP_OVER_S = 1.0
@@ -45,27 +48,23 @@ class BodyMotion:
         imu, dvl, calibration = sequence.imu, sequence.dvl, sequence.calibration
         origin_ns = sequence.start_ns
         t = np.asarray((dvl.stamps_ns - origin_ns) / NS_PER_S, np.float64)
-        imu_s = np.asarray((imu.stamps_ns - origin_ns) / NS_PER_S, np.float64)
+        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
+        path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, imu.specific_force @ body_R_imu.T))
+        imu_s = path.seconds + (path.origin_ns - origin_ns) / NS_PER_S
+        rate = path.rate
         rows = (t >= imu_s[0]) & (t <= imu_s[-1]) & np.isfinite(dvl.velocity).all(axis=1)
         rows[1:] &= np.diff(t) > 0
         t = t[rows]
         if len(t) < 3:
             return None
         is_held = calibration.odometry_interpolation == "hold-past"
-        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
-        rate = (imu.angular_velocity - calibration.imu.gyro_bias_rad_s) @ body_R_imu.T
-        force = imu.specific_force @ body_R_imu.T
         dvl_pose = calibration.dvl.mounting.pose()
-        mean_rate = means_about(t, imu_s, rate)
+        C = path.rotations_at(path.since_origin(dvl.stamps_ns[rows]))  # (n, 3, 3)
         v = dvl.velocity[rows] @ dvl_pose.rotation().matrix().T
-        v = v - np.cross(mean_rate, dvl_pose.translation())
-        gravity = np.array([0.0, 0.0, 1.0]) * np.ones_like(v)
-        if np.isfinite(force).all() and calibration.use_gravity:
-            felt = means_about(t, imu_s, force)
-            accelerated = np.gradient(smoothed(t, v), t, axis=0) + np.cross(mean_rate, v)
-            gravity = felt - accelerated
-        up = gravity / np.maximum(np.linalg.norm(gravity, axis=1), 1e-9)[:, None]
-        up_at_imu = columns_at(imu_s, t, up)
+        v = v - np.cross(columns_at(t, imu_s, rate), dvl_pose.translation())
+        up = np.einsum("nji,nj->ni", C, felt_up(path, t, imu_s, np.einsum("nij,nj->ni", C, v), calibration))
+        up_at_imu = np.einsum("nji,nj->ni", path.rotations, columns_at(imu_s, t, np.einsum("nij,nj->ni", C, up)))
         level = np.maximum(up_at_imu[:, 1] ** 2 + up_at_imu[:, 2] ** 2, 0.05)
         yaw_rate = (rate[:, 1] * up_at_imu[:, 1] + rate[:, 2] * up_at_imu[:, 2]) / level
         yaw_rad = np.asarray(np.interp(t, imu_s, integral(imu_s, yaw_rate, is_held=is_held)), np.float64)
@@ -95,6 +94,17 @@ class BodyMotion:
     def since_origin(self, stamps_ns: Ints) -> Floats:
         """Seconds of stamps on this motion's axis."""
         return np.asarray((stamps_ns - self.origin_ns) / NS_PER_S)
+
+
+def felt_up(path: InertialPath, t: Floats, imu_s: Floats, v: Floats, calibration: Calibration) -> Floats:
+    """Up in the frame of the path at times t, shape (n, 3); v is C v. The body's z without gravity in the forces."""
+    if not (np.isfinite(path.impulse).all() and calibration.use_gravity):
+        return np.asarray(path.rotations_at(np.clip(t - imu_s[0], 0.0, path.seconds[-1]))[:, :, 2])
+    begin = np.clip(t - UP_OVER_S / 2, imu_s[0], imu_s[-1])
+    end = np.clip(t + UP_OVER_S / 2, imu_s[0], imu_s[-1])
+    gained = columns_at(end, imu_s, path.impulse) - columns_at(begin, imu_s, path.impulse)
+    up = gained / (end - begin)[:, None] - np.gradient(smoothed(t, v), t, axis=0)
+    return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1), 1e-9)[:, None])
 
 
 def integral(t: Floats, values: Floats, *, is_held: bool = False) -> Floats:

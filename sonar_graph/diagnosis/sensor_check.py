@@ -20,6 +20,7 @@ from sonar_graph.diagnosis.aiding_check import (
     DEPTH,
     HEADING_SENSE,
     HEADING_TURN,
+    LARGE_TURN_RAD,
     RANGE,
     compared,
     findings_of,
@@ -263,6 +264,8 @@ LONGEST_S = 600.0
 LEAST_OFFSET_S = 0.01
 LEAST_YAW_RAD = np.radians(0.25)
 LEAST_SCALE = 0.002
+LARGE_OFFSET_S, LARGE_SCALE = 0.2, 0.05
+"""Beyond these the Doppler log contradicts the accelerometers so much that results are doubtful."""
 LEAST_HEADING_RAD = np.radians(1.0)
 """Smaller errors are hidden by others."""
 LARGEST_DENSITY_RATIO = 1.5
@@ -324,10 +327,14 @@ def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list
     if scales:
         scale = config.number("dvl", "scale", 1.0) * found.scale.value
         scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] {IN_LOG_CONFIG}"
+    offset = _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0]
+    is_late = offset.acts and abs(offset.estimate.value) > LARGE_OFFSET_S
+    is_turned = turns and abs(found.yaw.value) > LARGE_TURN_RAD
+    is_scaled = scales and abs(found.scale.value - 1) > LARGE_SCALE
     return [
-        _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0],
-        Finding("DVL mounting yaw", in_degrees(found.yaw), "°", yaw_advice, turns),
-        Finding("DVL scale", found.scale, "", scale_advice, scales),
+        replace(offset, grave=is_late),
+        Finding("DVL mounting yaw", in_degrees(found.yaw), "°", yaw_advice, turns, is_turned),
+        Finding("DVL scale", found.scale, "", scale_advice, scales, is_scaled),
     ]
 
 
