@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
+DOUBTFUL = 3
+"""Exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``."""
 RATE_SLACK = 1.01
 """Tolerance for the IMU's rate, which is counted from its stamps."""
 LOG, PAGE = "basin.mcap", "report.html"
@@ -313,7 +315,7 @@ def compare_log(
     rate_hz: float | None,
 ) -> Comparison:
     """Read a log, recognise landmarks if it needs that, and compare estimators."""
-    from sonar_graph.diagnosis import doubts
+    from sonar_graph.diagnosis import check_sensors, notes_of
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.evaluation import expense
     from sonar_graph.logs import LIVE_RATE, no_images
@@ -323,9 +325,11 @@ def compare_log(
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     check_rate(rate_hz, sequence)
-    if doubted := doubts(sequence, reading.config or LogConfig()):
-        said = "; ".join(f"{one.quantity}: {one.text()}" for one in doubted)
-        sequence = replace(sequence, notes={**sequence.notes, "log.sensors": said})
+    with working("comparing sensors"):
+        found_in_sensors = notes_of(
+            check_sensors(sequence, reading.config or LogConfig())
+        )
+    sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
     found = None
     # what was recognised is in it: estimates are those of the live run
     is_of_live_run = LIVE_RATE in sequence.notes
@@ -365,8 +369,11 @@ def check_rate(rate_hz: float, sequence: Sequence) -> None:
 
 
 def print_outcome(comparison: Comparison, place: str) -> None:
-    """Print the table of scores and where the files are; exit with 1 if a run failed, saying why."""
-    from sonar_graph.report import published_counterpart, summary
+    """Print the table of scores and where the files are.
+
+    Exit with 1 if a run failed, with the reason, and with 3 if sensors contradict each other beyond doubt.
+    """
+    from sonar_graph.report import doubtful_lines, published_counterpart, summary
 
     out = answers()
     out.print(summary(comparison))
@@ -379,3 +386,8 @@ def print_outcome(comparison: Comparison, place: str) -> None:
         echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
     if failed:
         raise typer.Exit(1)
+    if doubtful_lines(comparison):
+        echo(
+            "sonar-graph: the results are doubtful: see the first lines above", err=True
+        )
+        raise typer.Exit(DOUBTFUL)

@@ -82,10 +82,9 @@ def inspect(
     elif summary.obstacles:
         skipped = f"not compared: {', '.join(summary.obstacles)}"
     else:
-        from sonar_graph.diagnosis import check_sensors, doubts
+        from sonar_graph.diagnosis import check_sensors
         from sonar_graph.evaluation import expense
         from sonar_graph.logs import read_log
-        from sonar_graph.logs.adapters import LogConfig
 
         is_read = False
         try:
@@ -100,10 +99,7 @@ def inspect(
                 is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
-                grave = {
-                    finding.quantity
-                    for finding in doubts(sequence, config or LogConfig())
-                }
+                grave = {finding.quantity for finding in findings if finding.grave}
         except SonarGraphError as error:
             skipped, is_usable = f"not compared: {error}", is_usable and is_read
     if as_json:

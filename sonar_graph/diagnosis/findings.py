@@ -31,6 +31,8 @@ from sonar_graph.states import Trajectory
 
 INTERVAL_SIGMAS = 1.96
 """Half width of printed intervals, 95 %."""
+ACTING_SIGMAS = 4.5
+"""A log has some twenty numbers: of faultless logs fewer than one in a thousand asks for an action by chance."""
 NO_NEED = "no need to act"
 ALSO = "put right by the line above"
 IN_CALIBRATION = "in the calibration (--calibration FILE)"
@@ -62,6 +64,8 @@ class Finding:
     """A sentence, also where nothing need be done."""
     acts: bool = False
     """True where something should be done."""
+    grave: bool = False
+    """True where a sensor contradicts another beyond doubt, so that results are doubtful."""
 
     def text(self) -> str:
         """Value with its 95 % interval and the advice; or the reason why it is not known."""
@@ -84,6 +88,7 @@ class Finding:
             **numbers,
             "reason": e.reason,
             "act": bool(self.acts),
+            "grave": bool(self.grave),
             "advice": self.advice,
         }
 
@@ -108,11 +113,26 @@ def in_degrees(angle: Estimate1D) -> Estimate1D:
 
 
 def matters(estimate: Estimate1D, least: float) -> bool:
-    """True for an estimate above a threshold whose interval excludes zero."""
+    """True for an estimate above a threshold and beyond `ACTING_SIGMAS` of zero."""
     return bool(
         estimate.is_known
-        and abs(estimate.value) > max(least, INTERVAL_SIGMAS * estimate.sigma)
+        and abs(estimate.value) > max(least, ACTING_SIGMAS * estimate.sigma)
     )
+
+
+def worst_first(findings: Iterable[Finding]) -> list[Finding]:
+    """Grave findings, then those to act on, then the others; each in the order in which to act."""
+    return sorted(findings, key=lambda finding: (not finding.grave, not finding.acts))
+
+
+def notes_of(findings: Iterable[Finding]) -> dict[str, str]:
+    """Notes for a sequence, the findings to act on, worst first: grave ones under ``log.doubtful``."""
+    texts: dict[str, list[str]] = {"log.doubtful": [], "log.sensors": []}
+    for finding in worst_first(findings):
+        if finding.acts:
+            subject = "log.doubtful" if finding.grave else "log.sensors"
+            texts[subject].append(f"{finding.quantity}: {finding.text()}")
+    return {subject: "; ".join(said) for subject, said in texts.items() if said}
 
 
 def said_once(findings: Iterable[Finding]) -> list[Finding]:

@@ -12,15 +12,24 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
 from sonar_graph.diagnosis.aiding_check import (
+    AZIMUTH,
+    DEPTH,
     HEADING_SENSE,
     HEADING_TURN,
+    LARGE_TURN_RAD,
+    RANGE,
+    compared,
+    findings_of,
     heading_findings,
     position_findings,
+    start_depth_findings,
     vertical_bias,
 )
+from sonar_graph.diagnosis.dvl_axes import match_axes
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -37,8 +46,11 @@ from sonar_graph.diagnosis.findings import (
     tilt_findings,
     turned_mounting,
     with_fitted,
+    worst_first,
 )
+from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.checks import gravity_warning
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
@@ -141,33 +153,108 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
         )
     unknown = Estimate1D(np.nan, np.inf, "wrong unit")
     return [
-        Finding(quantity, unknown, "", line, acts=True)
+        Finding(quantity, unknown, "", line, acts=True, grave=True)
         for quantity, line in advice.items()
     ]
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Findings to act on that a run can tell at once: wrong units, else heading, gyro bias, unit and place of fixes.
+    """Findings to act on, without the slower comparison of Doppler log and accelerometers (`check_sensors`).
 
-    A heading too that is turned against known positions by more than `LARGE_TURN_RAD`. What needs a Doppler log that is
-    put right (`check_sensors`) is left to ``inspect``, where these are warnings.
+    All grave ones are among them. Of a heading that is turned against known positions only a large turn.
     """
     if faults := wrong_units(sequence, config):
         return faults
-    senses = list(heading_findings(sequence, config))
-    large = np.degrees(LARGE_TURN_RAD)
-    senses = [
-        f for f in senses if f.quantity != HEADING_TURN or abs(f.estimate.value) > large
-    ]
-    if not any(f.quantity == HEADING_SENSE and f.acts for f in senses) and (
-        vertical := vertical_bias(sequence)
-    ):
-        senses = [vertical, *senses]
+    axes, right = axes_finding(sequence)
+    found = worst_first([*axes, *motion_findings(right, config)])
     return [
         finding
-        for finding in (*senses, *position_findings(sequence, config))
-        if finding.acts
+        for finding in found
+        if finding.acts and (finding.grave or finding.quantity != HEADING_TURN)
     ]
+
+
+def axes_finding(sequence: Sequence) -> tuple[list[Finding], Sequence]:
+    """Finding about axes and signs of the Doppler log, and the sequence with the axes put right."""
+    imu, calibration = sequence.imu, sequence.calibration
+    if gravity_warning(
+        imu.specific_force, calibration.imu.mounting, calibration.gravity_m_s2
+    ):
+        return [], sequence  # the IMU's axes come first
+    found = match_axes(imu, sequence.dvl, calibration)
+    if found is None or found.is_as_read:
+        return [], sequence
+    axes = found.axes
+    body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+    if not found.is_vertical_sure and np.linalg.det(axes) < 0:
+        motion = BodyMotion.of(turned_dvl(sequence, axes))
+        depth = (
+            None
+            if motion is None
+            else compared(turned_dvl(sequence, axes), motion, DEPTH)
+        )
+        if (
+            depth is not None
+            and depth.gain.is_known
+            and depth.gain.value + 4 * depth.gain.sigma < 0
+        ):
+            axes = np.diag([1.0, 1.0, -1.0]) @ axes
+    wrong = f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes ({found.names()})"
+    driver = body_R_dvl.T @ axes @ body_R_dvl
+    if np.linalg.det(axes) > 0:
+        rpy = Rotation.from_matrix(axes @ body_R_dvl).as_euler("ZYX")[::-1]
+        line = f"`dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}"
+        wrong += (
+            ": the Doppler log is turned on the vehicle, or the driver has other axes"
+        )
+    else:
+        names = [
+            f'"{"-" if row.sum() < 0 else ""}{"xyz"[int(np.argmax(np.abs(row)))]}"'
+            for row in np.round(driver)
+        ]
+        line = f"`rotation = [{', '.join(names)}]` under [dvl] {IN_LOG_CONFIG}, after which the mounting counts"
+        wrong += ": mirrored, the driver gives one axis the wrong sign"
+    unknown = Estimate1D(np.nan, np.inf, "wrong axes")
+    finding = Finding(
+        "DVL axes", unknown, "", f"{wrong}: {line}", acts=True, grave=True
+    )
+    return [finding], turned_dvl(sequence, axes)
+
+
+def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
+    """Sequence with velocities along other axes of the body."""
+    R = sequence.calibration.dvl.mounting.pose().rotation().matrix()
+    turn = R.T @ axes @ R
+    dvl = sequence.dvl
+    turned = Dvl(dvl.stamps_ns, dvl.velocity @ turn.T, turn @ dvl.velocity_cov @ turn.T)
+    return replace(sequence, dvl=turned)
+
+
+def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
+    """Depth, heading, fixes and sightings against the motion of the body, and the gyros' bias about the vertical."""
+    motion = BodyMotion.of(right)
+    if motion is None:
+        return []
+    found = list(start_depth_findings(right))
+    for check in (DEPTH, RANGE, AZIMUTH):
+        match = compared(right, motion, check)
+        is_range_wrong = check is AZIMUTH and any(
+            f.grave and f.quantity.startswith(RANGE.name) for f in found
+        )
+        if (
+            match is not None and not is_range_wrong
+        ):  # the place of a landmark depends on its range
+            found += findings_of(check, match, right, config)
+    of_heading = list(heading_findings(right, config, motion))
+    is_heading_wrong = any(
+        finding.quantity == HEADING_SENSE and finding.acts for finding in of_heading
+    )
+    vertical = vertical_bias(right)
+    if vertical is not None and not is_heading_wrong:
+        found.append(vertical)
+    found += of_heading
+    found += position_findings(right, config, motion)
+    return found
 
 
 def tilt_rates(imu: Imu) -> tuple[float, float] | None:
@@ -256,10 +343,10 @@ LONGEST_S = 600.0
 LEAST_OFFSET_S = 0.01
 LEAST_YAW_RAD = np.radians(0.25)
 LEAST_SCALE = 0.002
+LARGE_OFFSET_S, LARGE_SCALE = 0.2, 0.05
+"""Beyond these the Doppler log contradicts the accelerometers so much that results are doubtful."""
 LEAST_HEADING_RAD = np.radians(1.0)
 """Smaller errors are hidden by others."""
-LARGE_TURN_RAD = np.radians(10.0)
-"""Of the heading against positions: beyond, a run's result is of little worth."""
 LARGEST_DENSITY_RATIO = 1.5
 """Ratio to the calibration's density, either way, from which on a line is advised."""
 LARGEST_RESTING_M_S = 0.1
@@ -286,6 +373,7 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     config = config or LogConfig()
     if faults := wrong_units(sequence, config):
         return faults
+    axes, sequence = axes_finding(sequence)
     imu, dvl = sequence.imu, sequence.dvl
     first_ns, last_ns = (
         max(imu.stamps_ns[0], dvl.stamps_ns[0]),
@@ -303,21 +391,21 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     right = corrected_sequence(sequence, match, of_dvl)
     tilt = find_start_tilt(right)
     bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
-    aiding = [*heading_findings(right, config), *position_findings(right, config)]
-    vertical = vertical_bias(sequence)
-    is_mirrored = any(
-        finding.quantity == HEADING_SENSE and finding.acts for finding in aiding
-    )
-    if vertical is not None and vertical.estimate.is_known and not is_mirrored:
-        bias = [*(f for f in bias if f.estimate.is_known or f.acts), vertical]
-    return [
+    by_motion = motion_findings(right, config)
+    if any(
+        f.quantity.startswith("gyro bias about") and f.estimate.is_known
+        for f in by_motion
+    ):
+        bias = [f for f in bias if f.estimate.is_known or f.acts]
+    found = [
+        *axes,
         *of_dvl,
         *lever,
         *bias,
-        *aiding,
+        *by_motion,
         *reference_findings(right, config, tilt),
-        *noise_findings(sequence),
     ]
+    return worst_first([*found, *noise_findings(sequence)])
 
 
 def dvl_findings(
@@ -335,10 +423,16 @@ def dvl_findings(
     if scales:
         scale = config.number("dvl", "scale", 1.0) * found.scale.value
         scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] {IN_LOG_CONFIG}"
+    offset = _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0]
+    is_late = offset.acts and abs(offset.estimate.value) > LARGE_OFFSET_S
+    is_turned = turns and abs(found.yaw.value) > LARGE_TURN_RAD
+    is_scaled = scales and abs(found.scale.value - 1) > LARGE_SCALE
     return [
-        _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0],
-        Finding("DVL mounting yaw", in_degrees(found.yaw), "°", yaw_advice, turns),
-        Finding("DVL scale", found.scale, "", scale_advice, scales),
+        replace(offset, grave=is_late),
+        Finding(
+            "DVL mounting yaw", in_degrees(found.yaw), "°", yaw_advice, turns, is_turned
+        ),
+        Finding("DVL scale", found.scale, "", scale_advice, scales, is_scaled),
     ]
 
 

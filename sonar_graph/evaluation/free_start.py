@@ -35,7 +35,10 @@ def free_start(calibration: Calibration) -> tuple[bool, bool]:
     """Tell whether heading and position at the start are stated by nobody."""
     if "start" not in calibration.model_fields_set:
         return True, True
-    said = calibration.start.model_fields_set
+    start = calibration.start
+    if start.source != "stated":
+        return start.source == "vehicle", start.source != "fixes"
+    said = start.model_fields_set
     return False, "rpy_rad" in said and "position_m" not in said
 
 

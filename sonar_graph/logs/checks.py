@@ -21,7 +21,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.sequence import longest_part
 
 MOST_NAMED = 3
@@ -48,8 +48,9 @@ LARGEST_LAG_CHANGE_S = 0.5
 FEWEST_SECONDS = 60
 MOST_IMPROVED = 2.0
 """Ratio of medians of 60 distances that chance does not make of equally good ones."""
-FARTHEST_FROM_START_M = 2.0
-"""Height that a vehicle gains about the start, with its depth sensor's error."""
+LEAST_MOVED = {"positions": 1.0, "heading": 0.2, "depth": 0.5}
+"""Motion, m or rad, from which on a sensor that repeats its value is stuck, by role."""
+RESOLUTIONS = 3.0
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
@@ -315,27 +316,6 @@ def axes_warning(adapter: Adapter) -> str | None:
     )
 
 
-def start_depth_warning(
-    depth: Depth, start_ns: int, calibration: Calibration
-) -> str | None:
-    """Warning where the heights about the start, whose instant is given, are not that of the start's pose."""
-    start, port_m = calibration.start, np.array(calibration.depth.port_m)
-    if "position_m" not in start.model_fields_set:
-        return None
-    first = max(int(np.searchsorted(depth.stamps_ns, start_ns)) - 1, 0)
-    height_m = float(np.median(depth.z_m[first : first + 5]))
-    stated_m = float(start.pose().transformFrom(port_m)[2])
-    if (
-        abs(height_m - stated_m)
-        <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]
-    ):
-        return None
-    return (
-        f"the height begins at {height_m:.2f} m, the start of the calibration is at {stated_m:.2f} m: another sign, "
-        "unit or origin? Depths far from the start are not used; give scale (-1 for depths downwards), or the start"
-    )
-
-
 def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
     """Warning about single samples, shape (n, 3), that differ from both neighbours, which agree; None: there is none.
 
@@ -399,3 +379,61 @@ def stuck_warning(
     if not texts:
         return None
     return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be sending without lock"
+
+
+def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
+    """Mask of rows, shape (n,), that repeat the row before to the bit while the vehicle moves: a stuck sensor.
+
+    ``values``, shape (n, k), and ``moved``, what the vehicle has moved until each row by other sensors, have one unit.
+    A stretch counts where the vehicle moves in it by more than ``least`` and three steps of the sensor's resolution.
+    """
+    changes = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    differs = changes > 0
+    resolution = float(np.min(changes[differs], initial=np.inf))
+    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
+    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    is_stuck = np.abs(moved[last] - moved[first]) > max(
+        least, RESOLUTIONS * resolution if np.isfinite(resolution) else 0
+    )
+    mask = np.zeros(len(values), bool)
+    for begin, end in zip(
+        first[is_stuck].tolist(), last[is_stuck].tolist(), strict=True
+    ):
+        mask[begin + 1 : end + 1] = True
+    return mask
+
+
+def way_by(
+    role: str, imu: Imu, dvl: Dvl, calibration: Calibration, at_ns: Ints
+) -> Floats:
+    """What the vehicle has moved until each instant, for `repeats`: metres, or rad for a heading, shape (n,).
+
+    For depth the way up and down, for fixes the way, both by velocities averaged over a second.
+    """
+    if role == "heading":
+        stamps_ns = imu.stamps_ns
+        rate = (
+            imu.angular_velocity
+            @ calibration.imu.mounting.pose().rotation().matrix()[2]
+        )
+    else:
+        rows = dvl.rows(
+            np.flatnonzero(np.isfinite(dvl.velocity).all(axis=1) & ~is_partial(dvl))
+        )
+        stamps_ns = rows.stamps_ns
+        velocity = rows.velocity @ calibration.dvl.mounting.pose().rotation().matrix().T
+        width = (
+            max(1, round(1e9 / float(np.median(np.diff(stamps_ns)))))
+            if len(rows) > 1
+            else 1
+        )
+        width = min(width, len(rows))
+        smooth = np.column_stack(
+            [
+                np.convolve(column, np.ones(width) / width, "same")
+                for column in velocity.T
+            ]
+        )
+        rate = smooth[:, 2] if role == "depth" else np.linalg.norm(smooth, axis=1)
+    steps = (rate[1:] + rate[:-1]) / 2 * np.diff(stamps_ns) * 1e-9
+    return np.interp(at_ns, stamps_ns, np.concatenate([[0.0], np.cumsum(steps)]))

@@ -32,19 +32,22 @@ from sonar_graph.logs.adapters import (
 )
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
+    LEAST_MOVED,
     axes_warning,
     gap_warnings,
     gravity_warning,
     gyro_warning,
     is_partial,
+    repeats,
     spike_warning,
     stamp_faults,
-    start_depth_warning,
     stuck_warning,
+    way_by,
 )
 from sonar_graph.logs.geodesy import Origin
-from sonar_graph.logs.live_record import leave_out_dropped, recorded_config
+from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
+from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.logs.roles import (
     ROLES,
     SEQUENCE_ROLES,
@@ -65,12 +68,13 @@ from sonar_graph.logs.vehicle_setup import (
     recorded_name,
     static_frames,
     unplaced,
-    with_measured_start,
 )
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 
-FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise", "log.sensors"})
+FOUND_ANEW = frozenset(
+    {"log.warnings", "log.gaps", "log.noise", "log.sensors", "log.doubtful"}
+)
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
 NOISE_FIELDS = {
@@ -250,6 +254,7 @@ class Assembly:
         }
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
+        self._stuck: dict[str, str] = {}
         self._tables: dict[str, MessageTable] = {}
         for role, topic in self.topics.items():
             if self.adapters[role].reads_table:
@@ -264,6 +269,8 @@ class Assembly:
             for key, note in read_notes(recording).items()
             if key not in FOUND_ANEW
         }
+        # the record is of what the live run used
+        self._is_live = LIVE_RATE in self._notes
         self._notes["log.topics"] = "; ".join(
             f"{role}: {topic.name}" for role, topic in self.topics.items()
         )
@@ -304,8 +311,8 @@ class Assembly:
         recorded = read_calibration(self._recording)
         said = set() if recorded is None else recorded.model_fields_set
         is_recorded = is_described(self._recording)
-        self._is_start_stated = (
-            is_recorded or "start" in said or bool(given and given.values.get("start"))
+        self._is_start_stated = is_recorded and not (
+            given and given.values.get("start")
         )
         in_record = (
             mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
@@ -390,9 +397,34 @@ class Assembly:
             self._blocks[role], dropped = rows_of(
                 adapter, source, self.calibration, *self.axes_and_origin(role)
             )
+        if self._blocks[role] is not None and role in LEAST_MOVED and not self._is_live:
+            self._blocks[role], stuck = self._without_repeats(role, self._blocks[role])
+            dropped = dropped | stuck
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
         return self._blocks[role]
+
+    def _without_repeats(self, role: str, rows: Any) -> tuple[Any, Dropped]:
+        """Rows without those of a sensor that is stuck while the vehicle moves, and their number."""
+        imu, dvl = self.block("imu"), self.block("dvl")
+        if imu is None or dvl is None or len(rows) < 2:
+            return rows, {}
+        moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
+        values = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}[role]
+        stuck = repeats(
+            getattr(rows, values).reshape(len(rows), -1), moved, LEAST_MOVED[role]
+        )
+        if not stuck.any():
+            return rows, {}
+        first = int(np.argmax(stuck))
+        late_s = (
+            rows.stamps_ns[first] - max(imu.stamps_ns[0], dvl.stamps_ns[0])
+        ) * 1e-9
+        text = f"that repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
+        self._stuck[role] = (
+            f"{np.count_nonzero(stuck)} of {len(rows)} rows {text.removeprefix('that ')}: left out"
+        )
+        return rows.rows(np.flatnonzero(~stuck)), {text: int(np.count_nonzero(stuck))}
 
     def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
         """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
@@ -449,7 +481,7 @@ class Assembly:
             for role, table in self._tables.items()
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
-        if not self._is_start_stated:
+        if not (self._is_start_stated or is_whole(self.calibration.start)):
             self.calibration, self._notes["log.start"] = with_measured_start(
                 self.calibration, blocks
             )
@@ -542,14 +574,11 @@ class Assembly:
                     ),
                 )
             )
-        if imu is not None and dvl is not None and depth is not None:
-            start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
-            found.append(
-                ("depth", start_depth_warning(depth, int(start_ns), self.calibration))
-            )
         if "dvl" in self._tables and not self._is_mounting_known:
             found.append(("dvl", axes_warning(self.adapters["dvl"])))
-        yield from (f"{role}: {text}" for role, text in found if text)
+        yield from (
+            f"{role}: {text}" for role, text in [*found, *self._stuck.items()] if text
+        )
         yield from unsaid_noise(
             {role: self.block(role) for role in NOISE_FIELDS}, only_partly=True
         )

@@ -19,10 +19,9 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Mounting, Start
+from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
-from sonar_graph.logs.adapters import plain_lines
 from sonar_graph.logs.cdr import (
     Bytes,
     Value,
@@ -33,7 +32,7 @@ from sonar_graph.logs.cdr import (
 )
 from sonar_graph.logs.mcap import Keep, Recording, earlier_parts, scan
 from sonar_graph.logs.roles import TF
-from sonar_graph.measurements import Dvl, Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in, parse
 
 METADATA = "sonar_graph"
@@ -379,79 +378,6 @@ def with_fields(recorded: Values, *changes: Values) -> str:
     for change in changes:
         recorded = _over(recorded, change)
     return json.dumps(recorded)
-
-
-NEAREST_ROWS = 5
-"""Rows about the start of which the median counts, so that one wrong row does not."""
-WIDER = 3.0
-"""Factor from a row's sigma to the start's: the rows are measurements too, and so count twice by a ninth only."""
-
-
-NO_START = (
-    "start pose not stated, and neither heading nor fixes say it: the world begins at the vehicle with x forward; "
-    "state it as [start] position_m and rpy_rad in a file for --calibration where it matters"
-)
-
-
-def with_measured_start(
-    calibration: Calibration, blocks: Mapping[str, Any]
-) -> tuple[Calibration, str]:
-    """Calibration with the start by the first headings and fixes, where there are any, and a note about it."""
-    start_ns = int(max(blocks["imu"].stamps_ns[0], blocks["dvl"].stamps_ns[0]))
-    start = measured_start(calibration, start_ns, blocks["dvl"], blocks)
-    if start is None:
-        return calibration, NO_START
-    said = ", ".join(plain_lines(start.model_dump()))
-    return (
-        calibration.model_copy(update={"start": start}),
-        f"start pose not stated, so by the first headings and fixes: {said}",
-    )
-
-
-def measured_start(
-    calibration: Calibration, start_ns: int, dvl: Dvl, blocks: Mapping[str, Any]
-) -> Start | None:
-    """Start by the first headings and position fixes, for a log that states none; None without either.
-
-    Roll and pitch, and what is not measured, are the calibration's.
-    """
-    start, changes = calibration.start, dict[str, Any]()
-    roll, pitch, yaw = start.rpy_rad
-    if (heading := blocks.get("heading")) is not None:
-        near = _nearest(heading.stamps_ns, start_ns)
-        yaws = np.unwrap(heading.yaw_rad[near])
-        yaw = float(np.angle(np.exp(1j * np.median(yaws))))
-        sigma = np.hypot(
-            calibration.heading.bias_sigma_rad, calibration.heading.sigma_rad
-        )
-        changes["rpy_rad"] = (roll, pitch, yaw)
-        changes["rpy_sigma_rad"] = (*start.rpy_sigma_rad[:2], WIDER * sigma)
-    if (fixes := blocks.get("positions")) is not None:
-        near = _nearest(fixes.stamps_ns, start_ns)
-        antenna = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ np.array(
-            calibration.positions.antenna_m
-        )
-        variances = np.median(np.einsum("nii->ni", fixes.covariance_m2[near]), axis=0)
-        variances = np.where(
-            np.isnan(variances), np.square(calibration.positions.sigma_m), variances
-        )
-        moved_m = float(
-            np.median(np.linalg.norm(dvl.velocity, axis=1))
-            * np.ptp([*fixes.stamps_ns[near], start_ns])
-            * 1e-9
-        )
-        changes["position_m"] = np.median(fixes.position_m[near], axis=0) - antenna
-        changes["position_sigma_m"] = WIDER * np.sqrt(variances + moved_m**2)
-    rounded = {
-        name: tuple(round(float(value), 4) for value in values)
-        for name, values in changes.items()
-    }
-    return start.model_copy(update=rounded) if changes else None
-
-
-def _nearest(stamps_ns: Ints, at_ns: int) -> Ints:
-    """Rows nearest to an instant, at most `NEAREST_ROWS`, in their order."""
-    return np.sort(np.argsort(np.abs(stamps_ns - at_ns), kind="stable")[:NEAREST_ROWS])
 
 
 def unplaced(sensor: str, frame: str, *, has_tree: bool) -> str:

@@ -147,7 +147,7 @@ def huber_scale(e: Floats, S: Floats) -> float:
     return max(1.0, math.sqrt(e @ np.linalg.inv(S) @ e) / k)
 
 
-CONTRADICTING_SIGMAS = 5.0
+CONTRADICTING_SIGMAS, DOUBTLESS_SIGMAS = 5.0, 10.0
 CONTRADICTING_SHARE = 0.2
 """Of headings or fixes: less are outliers, which the kernel is for."""
 FEWEST_JUDGED = 10
@@ -171,6 +171,7 @@ class Contradictions:
     def __init__(self) -> None:
         self._far = Counter[str]()
         self._judged = Counter[str]()
+        self._beyond_doubt = Counter[str]()
 
     def judge(self, sensor: str, distances: Floats | float) -> None:
         """Count distances in sigmas, of one row or several."""
@@ -178,11 +179,19 @@ class Contradictions:
             np.count_nonzero(np.asarray(distances) > CONTRADICTING_SIGMAS)
         )
         self._judged[sensor] += np.size(distances)
+        self._beyond_doubt[sensor] += int(
+            np.count_nonzero(np.asarray(distances) > DOUBTLESS_SIGMAS)
+        )
 
     def messages(self) -> list[str]:
         """A line for each sensor of which more than `CONTRADICTING_SHARE` of the rows contradict the estimate."""
         return [
             f"{self._far[sensor]} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
+            + (
+                " Most are beyond doubt."
+                if self._beyond_doubt[sensor] > judged / 2
+                else ""
+            )
             for sensor, judged in self._judged.items()
             # a share of a few rows may be chance
             if judged >= FEWEST_JUDGED

@@ -11,10 +11,11 @@ if TYPE_CHECKING:
     from sonar_graph.report.console import published_counterpart, summary
     from sonar_graph.report.paper import write_paper
     from sonar_graph.report.rendering import render
+    from sonar_graph.report.sentences import doubtful_lines
 else:
     __getattr__ = at_first_use(__name__)
 
 __all__ = [
-    "lost_told", "missing_told", "published_counterpart", "render", "summary", "write_batch_report", "write_page",
-    "write_paper", "write_report",
+    "doubtful_lines", "lost_told", "missing_told", "published_counterpart", "render", "summary", "write_batch_report",
+    "write_page", "write_paper", "write_report",
 ]

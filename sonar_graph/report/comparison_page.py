@@ -142,6 +142,7 @@ def render_report(comparison: Comparison) -> str:
         for sentence in sentences.finding(comparison)[len(failed) :]
         if sentence not in lost
     ]
+    doubtful = sentences.doubtful_lines(comparison)
     content = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
@@ -166,7 +167,12 @@ def render_report(comparison: Comparison) -> str:
         "doubts": [
             *sentences.finding(comparison)[: len(failed)],
             *lost,
-            *sentences.warning_lines(sequence.notes),
+            *doubtful[1:],
+            *(
+                line
+                for line in sentences.warning_lines(sequence.notes)
+                if line not in doubtful
+            ),
             *sentences.doubt_of_identities(comparison),
             *sentences.outliers(comparison),
             *sentences.withheld_lines(comparison),

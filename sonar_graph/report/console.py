@@ -100,7 +100,13 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     """Failures, doubts of the log, what runs say that may follow from these, and the meaning of the columns."""
     lines = ensemble_sentences(comparison.ensembles)
     lines += [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
-    lines += sentences.doubt_lines(comparison.sequence.notes)
+    doubtful = sentences.doubtful_lines(comparison)
+    lines += doubtful
+    lines += [
+        line
+        for line in sentences.doubt_lines(comparison.sequence.notes)
+        if line not in doubtful
+    ]
     lines += sentences.lost_runs(comparison)
     lines += sentences.refusal_lines(comparison)
     lines += sentences.withheld_lines(comparison)

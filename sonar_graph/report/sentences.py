@@ -49,8 +49,11 @@ NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNF
 UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
 """Outcomes of detections that were refused before their landmark mattered."""
 POLICY, UNKNOWN = "identity.policy", "identity.unknown.policy"
-WARNING = "Warning"
+WARNING, DOUBTFUL = "Warning", "Doubtful"
+BEYOND_DOUBT = 100.0
+"""Ratio of squared innovations to their covariance, typical of a sensor, that no noise makes."""
 SAID_NOTES = {
+    "log.doubtful": DOUBTFUL,
     "log.sensors": WARNING,
     "log.ending": "Log",
     "log.damage": "Log",
@@ -180,8 +183,12 @@ def _doubt(score: Score) -> tuple[int, float]:
 def headline(comparison: Comparison) -> str:
     """One sentence: the estimator nearest to the truth, how far off it is, and what its covariances are worth.
 
+    Before that, where sensors contradict each other beyond doubt, that the results are doubtful.
+
     Empty where no run has a position error: then `finding` begins with what can be said.
     """
+    if doubtful := doubtful_lines(comparison):
+        return doubtful[0]
     metric = headline_metric(comparison)
     if metric is None:
         return ""
@@ -512,7 +519,50 @@ def doubt_lines(notes: Mapping[str, str]) -> list[str]:
 
 def warning_lines(notes: Mapping[str, str]) -> list[str]:
     """The lines of `doubt_lines` that put results in doubt."""
-    return [line for line in doubt_lines(notes) if line.startswith(f"{WARNING}:")]
+    return [
+        line
+        for line in doubt_lines(notes)
+        if line.startswith((f"{WARNING}:", f"{DOUBTFUL}:"))
+    ]
+
+
+def doubtful_lines(comparison: Comparison) -> list[str]:
+    """Sentences about sensors that contradict the others beyond doubt, so that the results are not to be relied on.
+
+    By the comparison of sensors, or by what estimators made of their rows: most depths refused, innovations whose
+    median is `BEYOND_DOUBT` times what their covariance allows, headings or fixes as far from the estimate.
+    """
+    sequence, lines = comparison.sequence, list[str]()
+    if "log.doubtful" in sequence.notes:
+        lines.append(f"{DOUBTFUL}: {sequence.notes['log.doubtful']}")
+    for run in comparison.runs:
+        refused = sum(
+            row.count for row in gathered(run.refused) if row.sensor == "depth"
+        )
+        if sequence.depth is not None and refused > len(sequence.depth) / 2:
+            lines.append(
+                f"{DOUBTFUL}: {run.estimator} refused {refused} of {len(sequence.depth)} depths: depth contradicts the "
+                "start or the Doppler log; `sonar-graph inspect` compares them, `use = false` under [depth] in the log "
+                "configuration leaves them out"
+            )
+        lines += [
+            f"{DOUBTFUL}: {run.estimator}: {line}"
+            for line in run.withheld
+            if "beyond doubt" in line
+        ]
+        if (log := run.detections) is not None:
+            used = np.array(
+                [outcome is Outcome.USED for outcome in log.outcomes], dtype=bool
+            )
+            ratios = normalised_squares(log.innovations, log.innovation_covs)[used] / 2
+            ratios = ratios[np.isfinite(ratios)]
+            if len(ratios) and float(np.median(ratios)) > BEYOND_DOUBT:
+                lines.append(
+                    f"{DOUBTFUL}: {run.estimator}: sightings of landmarks contradict the motion beyond doubt, "
+                    f"typically {np.median(ratios):.0f} times what their noise allows: ranges, azimuths, identities or "
+                    "the sonar's mounting; `use = false` under [detections] leaves them out"
+                )
+    return lines
 
 
 def refused_by(comparison: Comparison) -> dict[RefusedRows, list[str]]:

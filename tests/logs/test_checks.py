@@ -10,16 +10,15 @@ from sonar_graph.calibration import (
     DvlCalibration,
     ImuCalibration,
     Mounting,
-    Start,
 )
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
 from sonar_graph.logs.checks import (
     gap_warnings,
     gyro_warning,
+    repeats,
     spike_warning,
     stamp_faults,
-    start_depth_warning,
     stuck_warning,
 )
 from sonar_graph.logs.reading import require_use, unsaid_noise
@@ -264,28 +263,20 @@ def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
 
 
 @pytest.mark.parametrize(
-    ("z_m", "stated", "is_told"),
-    [
-        (-3.0, -3.0, False),
-        (-4.5, -3.0, False),
-        (3.0, -3.0, True),
-        (-3000.0, -3.0, True),
-        (-50.0, None, False),
-    ],
+    ("step_m", "least", "is_stuck"),
+    [(0.1, 1.0, True), (0.01, 1.0, False), (0.1, 5.0, False)],
 )
-def test_heights_that_do_not_begin_at_the_stated_start_are_told(
-    z_m: float, stated: float | None, is_told: bool
+def test_a_value_that_repeats_while_the_vehicle_moves_is_stuck_from_its_second_row_on(
+    step_m, least, is_stuck
 ) -> None:
-    start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
-    rows = Depth(stamps(PINGS), np.full(len(PINGS), -90.0), np.full(len(PINGS), np.nan))
-    rows.z_m[98:104] = z_m
-    found = start_depth_warning(
-        rows, int(rows.stamps_ns[100]), Calibration(start=start)
-    )
-    assert (found or "").startswith(
-        f"the height begins at {z_m:.2f} m" if is_told else ""
-    )
-    assert (found is not None) == is_told
+    """Coarse values repeat too, but not over three steps of their resolution."""
+    moved = step_m * np.arange(60)
+    values = moved[:, None] + 0.3 * np.random.default_rng(0).standard_normal((60, 3))
+    values[30:60] = values[30]
+    expected = (np.arange(60) > 30) & is_stuck
+    assert (repeats(values, moved, least) == expected).all()
+    coarse = np.round(0.1 * np.arange(60.0))[:, None]
+    assert not repeats(coarse, 0.1 * np.arange(60.0), 0.5).any()
 
 
 @pytest.mark.parametrize(

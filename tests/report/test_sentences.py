@@ -610,8 +610,11 @@ def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_w
         said.values()
     )
     assert sentences.warning_lines(notes) == [
-        f"Warning: <log.{name}>"
-        for name in ("sensors", "start_pose", "warnings", "gaps")
+        "Doubtful: <log.doubtful>",
+        *(
+            f"Warning: <log.{name}>"
+            for name in ("sensors", "start_pose", "warnings", "gaps")
+        ),
     ]
 
 

@@ -26,9 +26,22 @@ from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import Floats
 
-Rotation = Annotated[Literal["flu", "frd"] | tuple[float, float, float], Field()]
-"""Axes of a driver: ``flu`` (x forward, y left, z up, as here), ``frd`` (y right, z down), or roll, pitch, yaw in
-degrees of ``ours_R_driver = Rz(yaw) Ry(pitch) Rx(roll)``."""
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def _each_axis_once(axes: tuple[Axis, Axis, Axis]) -> tuple[Axis, Axis, Axis]:
+    if {axis[-1] for axis in axes} != {"x", "y", "z"}:
+        raise ValueError('expected each axis once, such as ["x", "-y", "z"]')
+    return axes
+
+
+SignedAxes = Annotated[tuple[Axis, Axis, Axis], AfterValidator(_each_axis_once)]
+Rotation = Annotated[
+    Literal["flu", "frd"] | tuple[float, float, float] | SignedAxes, Field()
+]
+"""Axes of a driver: ``flu`` (x forward, y left, z up, as here), ``frd`` (y right, z down), roll, pitch, yaw in degrees
+of ``ours_R_driver = Rz(yaw) Ry(pitch) Rx(roll)``, or the driver's axis along each of ours, ``["x", "-y", "z"]``, also
+mirrored."""
 
 
 def axes_matrix(rotation: Rotation) -> Floats:
@@ -37,6 +50,12 @@ def axes_matrix(rotation: Rotation) -> Floats:
         return np.eye(3)
     if rotation == "frd":
         return np.diag([1.0, -1.0, -1.0])
+    if isinstance(rotation[0], str):
+        signs = [-1.0 if str(axis).startswith("-") else 1.0 for axis in rotation]
+        return (
+            np.eye(3)[["xyz".index(str(axis)[-1]) for axis in rotation]]
+            * np.array(signs)[:, None]
+        )
     return np.asarray(
         SpatialRotation.from_euler("xyz", rotation, degrees=True).as_matrix()
     )

@@ -15,6 +15,8 @@ import numpy as np
 
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
+    AngleScale,
+    LengthScale,
     field_paths,
     turn,
     turn_covariances,
@@ -115,6 +117,10 @@ class DetectionListsAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkDetections``: range, azimuth, covariance and posterior, in flat lists."""
 
     reads_table = False
+    range_scale: LengthScale = 1.0
+    """Turns ranges into metres; 0.001 or "mm" from millimetres, a ratio of sound speeds where that is wrong."""
+    azimuth_scale: AngleScale = 1.0
+    """Turns azimuths into rad, positive to the left; -1 where they are positive to the right."""
 
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
@@ -126,6 +132,11 @@ class DetectionListsAdapter(Adapter):
             topic, [self._rows(topic, group, log_times_ns) for group in groups]
         )
         ranges, azimuths, covariances, tracks = rows.values
+        if self.range_scale != 1 or self.azimuth_scale != 1:
+            scales = np.array([self.range_scale, self.azimuth_scale])
+            ranges = ranges * self.range_scale
+            azimuths = azimuths * self.azimuth_scale
+            covariances = covariances * np.outer(scales, scales)
         faults = {
             NOT_FINITE: not_finite(ranges, azimuths, rows.probabilities),
             NO_POSTERIOR: no_posterior(rows.probabilities),

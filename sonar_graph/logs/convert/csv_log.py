@@ -40,8 +40,8 @@ from sonar_graph.logs.adapters import (
 )
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
+from sonar_graph.logs.measured_start import with_measured_start
 from sonar_graph.logs.reading import common_origin, require_use, rows_of
-from sonar_graph.logs.vehicle_setup import with_measured_start
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import faults_in, toml_key
 

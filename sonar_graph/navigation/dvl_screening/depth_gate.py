@@ -57,7 +57,7 @@ class DepthGate:
         start = calibration.start
         world_p_port = start.pose().transformFrom(np.array(calibration.depth.port_m))
         z_m = float(world_p_port[2])
-        is_stated = "position_m" in start.model_fields_set
+        is_stated = "position_m" in start.model_fields_set and start.source == "stated"
         length = LATEST_NS if is_stated else FEWEST - 1
         self._used = DepthChain(
             EARLIEST_NS, z_m, start.position_sigma_m[2] ** 2, length

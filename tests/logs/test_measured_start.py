@@ -1,0 +1,116 @@
+"""A start that is not stated is measured: height by depth, level by gravity, yaw and place where sensors know them."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration, DepthCalibration, Start
+from sonar_graph.logs.measured_start import is_whole, with_measured_start
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, PositionFixes
+
+RPY = (0.1, -0.05, 0.7)
+N = 3000
+
+
+def moving(rpy: tuple[float, float, float] = RPY, seed: int = 0) -> dict[str, Any]:
+    """A vehicle of fixed roll and pitch that turns, 60 s: IMU 50 Hz, Doppler log and depth 5 Hz, fixes 1 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(N) / 50
+    yaw = rpy[2] + 0.1 * t
+    world_R_body = Rotation.from_euler(
+        "ZYX", np.column_stack([yaw, np.full(N, rpy[1]), np.full(N, rpy[0])])
+    )
+    v = np.column_stack([0.8 * np.cos(yaw), 0.8 * np.sin(yaw), -0.05 * np.ones(N)])
+    a = np.gradient(v, t, axis=0)
+    place = np.cumsum(v, axis=0) / 50 + [100.0, 50.0, -14.0]
+    stamps_ns = np.asarray(t * 1e9, np.int64)
+    rate = world_R_body.inv().apply([0.0, 0.0, 0.1] * np.ones((N, 3)))
+    imu = Imu(stamps_ns, rate, world_R_body.inv().apply(np.add(a, [0.0, 0.0, 9.80665])))
+    body_v = world_R_body.inv().apply(v)[::10] + rng.normal(0, 0.01, (N // 10, 3))
+    nan = np.full((N // 10, 3, 3), np.nan)
+    depth = Depth(
+        stamps_ns[::10], place[::10, 2] + rng.normal(0, 0.01, N // 10), nan[:, 0, 0]
+    )
+    fixes = PositionFixes(
+        stamps_ns[::50], place[::50] + rng.normal(0, 0.3, (N // 50, 3)), nan[: N // 50]
+    )
+    return {
+        "imu": imu,
+        "dvl": Dvl(stamps_ns[::10], body_v, nan),
+        "depth": depth,
+        "positions": fixes,
+    }
+
+
+def off(found: Floats | tuple[float, ...], true: Any) -> Floats:
+    return np.abs(np.subtract(found, true))
+
+
+@pytest.mark.parametrize("rpy", [RPY, (0.0, 0.0, -2.0), (-0.2, 0.2, 3.0)])
+def test_each_part_of_the_start_is_within_its_sigma_of_the_truth(
+    rpy: tuple[float, float, float],
+) -> None:
+    blocks = moving(rpy)
+    calibration, note = with_measured_start(Calibration(), blocks)
+    start = calibration.start
+    assert (off(start.rpy_rad, rpy) < np.array(start.rpy_sigma_rad)).all()
+    assert (
+        off(start.position_m, (100.0, 50.0, -14.0))[2] < start.position_sigma_m[2] < 0.2
+    )
+    assert start.source == "fixes"
+    assert note.startswith(
+        "start pose not stated: height by the first depths; level by gravity"
+    )
+
+
+def test_without_fixes_and_headings_the_world_begins_at_the_vehicle_at_its_depth() -> (
+    None
+):
+    blocks = {role: rows for role, rows in moving().items() if role != "positions"}
+    start = with_measured_start(Calibration(), blocks)[0].start
+    assert start.source == "vehicle"
+    assert start.position_m[:2] == (0.0, 0.0)
+    assert start.position_m[2] == pytest.approx(-14.0, abs=0.1)
+    assert start.rpy_rad[2] == 0.0
+    np.testing.assert_allclose(start.rpy_rad[:2], RPY[:2], atol=0.01)
+
+
+def test_the_port_of_the_depth_sensor_is_allowed_for() -> None:
+    blocks = {
+        role: rows
+        for role, rows in moving((0.0, 0.0, 0.0)).items()
+        if role != "positions"
+    }
+    port = Calibration(depth=DepthCalibration(port_m=(0.0, 0.0, 0.6)))
+    assert with_measured_start(port, blocks)[0].start.position_m[2] == pytest.approx(
+        -14.6, abs=0.1
+    )
+
+
+def test_what_is_stated_stays_and_the_rest_is_measured() -> None:
+    blocks = moving()
+    place = Calibration(start=Start(position_m=(1.0, 2.0, 3.0)))
+    of_place = with_measured_start(place, blocks)[0].start
+    assert of_place.position_m == (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(of_place.rpy_rad[:2], RPY[:2], atol=0.01)
+    heading = Calibration(start=Start(rpy_rad=(0.0, 0.0, 1.0)))
+    assert with_measured_start(heading, blocks)[0].start.rpy_rad == (0.0, 0.0, 1.0)
+    assert is_whole(Start(position_m=(0.0, 0.0, 0.0), rpy_rad=(0.0, 0.0, 0.0)))
+    assert not is_whole(
+        of_place.model_construct(position_m=(0.0, 0.0, 0.0), _fields_set={"position_m"})
+    )
+
+
+def test_without_gravity_in_the_accelerometers_level_is_taken_with_a_wide_sigma() -> (
+    None
+):
+    blocks = moving()
+    blocks["imu"] = replace(
+        blocks["imu"], specific_force=blocks["imu"].specific_force / 9.80665
+    )
+    start = with_measured_start(Calibration(), blocks)[0].start
+    assert start.rpy_rad[:2] == (0.0, 0.0)
+    assert start.rpy_sigma_rad[:2] == (0.1, 0.1)
