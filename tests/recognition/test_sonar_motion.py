@@ -441,5 +441,5 @@ def test_a_gap_of_the_doppler_log_is_carried_by_the_accelerometers(path, exact):
         )
         for run in (lost, replace(lost, calibration=holding))
     )
-    assert carried < 0.01
+    assert carried < 0.02
     assert held > 0.1

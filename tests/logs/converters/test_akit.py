@@ -219,8 +219,11 @@ class TestRecording:
     def test_accelerometers_carry_the_dvls_velocity_through_half_a_minute(
         self, sequence
     ):
-        """With the IMU where the calibration has it, and hardly with it at the reference's point."""
-        assert lost_in_gaps(sequence, sequence.calibration) < 0.4
+        """With the IMU where the calibration has it, and hardly with it at the reference's point.
+
+        The stated bias of the accelerometers, 10 mm/s², gives a steady velocity a share of the motion.
+        """
+        assert lost_in_gaps(sequence, sequence.calibration) < 0.6
         imu = sequence.calibration.imu.model_copy(update={"mounting": Mounting()})
         elsewhere = sequence.calibration.model_copy(update={"imu": imu})
         assert lost_in_gaps(sequence, elsewhere) > 1.0
