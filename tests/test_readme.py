@@ -127,7 +127,7 @@ def test_commands_are_understood(
         if not Path(name).is_absolute():
             Path(name).parent.mkdir(parents=True, exist_ok=True)
             Path(name).touch()
-    for folder in ("results", "MRCLAM_Dataset6", "A-KIT", "STPERE"):
+    for folder in ("results", "MRCLAM_Dataset6", "A-KIT", "STPERE", "ros2_bag_folder"):
         Path(folder).mkdir(exist_ok=True)
     lines = re.findall(
         r"^ {4,8}sonar-graph ([^|\n]+)$|`sonar-graph ([a-z]+ [^`]*\.(?:mcap|toml|json)[^`]*)`",

@@ -137,7 +137,7 @@ def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> En
 def about_values(warnings: str) -> str:
     """Warnings without those about frames: those of most of these messages hang on no tree (`test_vehicle_setup`)."""
     return re.sub(
-        r"\w+: no transform from .*? for --calibration(, or frame_id .*? configuration)?(; )?",
+        r"\w+: no (?:transform|frame) .*? for --calibration(, or frame_id .*? configuration)?(; )?",
         "",
         warnings,
     )
