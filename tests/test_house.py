@@ -116,7 +116,6 @@ def test_a_package_is_a_short_table_of_contents_with_few_modules(path: Path) -> 
 KNOWN_TANGLES: list[set[str]] = []
 # Folders of which each imports files of the other. The list may only become shorter.
 KNOWN_MUTUAL_FOLDERS = {
-    ("sonar_graph/logs", "sonar_graph/logs/adapters"),
     ("sonar_graph/navigation", "sonar_graph/navigation/dvl_screening"),
     ("sonar_graph/report", "sonar_graph/report/figures"),
     ("sonar_graph/simulation", "sonar_graph/simulation/sonar_image"),

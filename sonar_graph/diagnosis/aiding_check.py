@@ -26,7 +26,7 @@ from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     Match,
-    Stretch,
+    SignalStretch,
     Values,
     match,
     unknown,
@@ -41,7 +41,7 @@ from sonar_graph.measurements import (
     PositionFixes,
 )
 from sonar_graph.models import wrap_angle
-from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.navigation.alignment import Estimate1D, holes_before
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 
@@ -238,7 +238,7 @@ def stretches(
     y: Values,
     reference: Callable[[Floats], Values],
     motion: BodyMotion,
-) -> list[Stretch]:
+) -> list[SignalStretch]:
     """Rows in parts of at most `STRETCH_S`, which end at gaps of the Doppler log."""
     gaps = np.diff(motion.seconds) > motion.gap_s
     edges = np.concatenate(
@@ -251,7 +251,7 @@ def stretches(
             first = begin + part * (end - begin) / count
             rows = (seconds >= first) & (seconds < first + (end - begin) / count)
             if np.count_nonzero(rows) >= FEWEST_WINDOWS:
-                found.append(Stretch(seconds[rows], y[rows], reference))
+                found.append(SignalStretch(seconds[rows], y[rows], reference))
     return found
 
 
@@ -473,15 +473,23 @@ def vertical_bias(sequence: Sequence) -> Finding | None:
     up = upwards(imu, body_R_imu)
     drift_rad = turned_about_up(imu, body_R_imu, stamps_ns) - yaw_rad
     seconds = (stamps_ns - sequence.start_ns) / NS_PER_S
-    count = max(1, int(np.ceil(np.ptp(seconds) / STRETCH_S))) if len(seconds) else 1
-    parts = zip(
-        np.array_split(seconds, count), np.array_split(drift_rad, count), strict=True
-    )
-    found = match(
-        [Stretch(part_s, part_rad, lambda at: at) for part_s, part_rad in parts],
-        find_lag=False,
-    ).gain
+    # a turn during a hole of the IMU is in the heading alone
+    before = np.searchsorted(imu.stamps_ns, stamps_ns, side="right") - 1
+    holes = holes_before(imu.stamps_ns)[np.maximum(before, 0)]
+    ends = np.flatnonzero(np.diff(holes)) + 1
+    parts = []
+    for run_s, run_rad in zip(
+        np.split(seconds, ends), np.split(drift_rad, ends), strict=True
+    ):
+        if len(run_s) < FEWEST_WINDOWS:
+            continue
+        count = max(1, int(np.ceil(np.ptp(run_s) / STRETCH_S)))
+        for part_s, part_rad in zip(
+            np.array_split(run_s, count), np.array_split(run_rad, count), strict=True
+        ):
+            parts.append(SignalStretch(part_s, part_rad, lambda at: at))
     bias = Estimate1D(np.nan, np.inf, f"too little time beside {source}")
+    found = match(parts, find_lag=False).gain if parts else bias
     if found.is_known and np.ptp(seconds) > LEAST_BIAS_S:
         bias = Estimate1D(found.value - float(up @ known), max(found.sigma, 1e-9))
     allowed = sequence.calibration.imu.gyro_bias_sigma
@@ -729,7 +737,7 @@ FEWEST_PAIRS = 20
 
 def sightings(
     sequence: Sequence, motion: BodyMotion, sign: float = 1.0
-) -> tuple[Stretch, Stretch] | None:
+) -> tuple[SignalStretch, SignalStretch] | None:
     """Changes of range and azimuth between two sightings of a landmark, and those by the motion; None: too few.
 
     With p = l + r u the landmark in the body, u the direction, l the sonar's place, and the body moved by d and turned
@@ -778,11 +786,11 @@ def sightings(
     r = np.linalg.norm(after, axis=1)
     turned = wrap_angle(np.arctan2(after[:, 1], after[:, 0]) - azimuth)
     seen_turn = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
-    by_range = Stretch(
+    by_range = SignalStretch(
         t[j],
         seen.range_m[j] - seen.range_m[i],
         lambda _: r - seen.range_m[i],
         has_offset=False,
     )
-    by_azimuth = Stretch(t[j], seen_turn, lambda _: turned, has_offset=False)
+    by_azimuth = SignalStretch(t[j], seen_turn, lambda _: turned, has_offset=False)
     return by_range, by_azimuth

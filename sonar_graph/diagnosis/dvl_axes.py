@@ -16,14 +16,14 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment.at_rest import in_body_axes
-from sonar_graph.navigation.alignment.dvl_imu import (
+from sonar_graph.navigation import is_partial
+from sonar_graph.navigation.alignment import (
     InertialPath,
     cross_matrices,
+    in_body_axes,
     means_over,
     stretches_of,
 )
-from sonar_graph.navigation.samples import is_partial
 
 MEAN_OVER_S = 1.0
 LEAST_GAIN = 60.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
-from sonar_graph.navigation.alignment.dvl_imu import InertialPath
+from sonar_graph.navigation.alignment import InertialPath
 from sonar_graph.sequence import Sequence
 
 UP_OVER_S = 1.0

@@ -49,8 +49,8 @@ from sonar_graph.diagnosis.findings import (
     worst_first,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.logs import gravity_warning
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.logs.checks import gravity_warning
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,

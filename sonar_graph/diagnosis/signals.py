@@ -39,7 +39,7 @@ SMALL_SAMPLE = 1.3
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class SignalStretch:
     """Rows of a sensor and its reference over some minutes."""
 
     seconds: Floats
@@ -100,7 +100,7 @@ class Fit:
 
 
 def fit(
-    stretch: Stretch,
+    stretch: SignalStretch,
     lag_s: float,
     drift_sigma: float,
     *,
@@ -160,7 +160,7 @@ def fit(
 
 
 def match(
-    stretches: list[Stretch], drift_sigma: float = 0.0, *, find_lag: bool = True
+    stretches: list[SignalStretch], drift_sigma: float = 0.0, *, find_lag: bool = True
 ) -> Match:
     """Compare a sensor with its reference.
 
@@ -197,7 +197,7 @@ def match(
 
 
 def combined(
-    parts: list[Fit], stretches: list[Stretch], lag_s: float, mirrored: bool
+    parts: list[Fit], stretches: list[SignalStretch], lag_s: float, mirrored: bool
 ) -> Match:
     """Mean of the stretches' gains, angles and lags, weighted by their certainty."""
     gains, angles, lags = [], [], []

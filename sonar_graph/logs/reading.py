@@ -24,6 +24,7 @@ from sonar_graph.logs.adapters import (
     HeadingAdapter,
     LogConfig,
     MessageTable,
+    Origin,
     PositionAdapter,
     TruthAdapter,
     changes_text,
@@ -44,10 +45,8 @@ from sonar_graph.logs.checks import (
     stuck_warning,
     way_by,
 )
-from sonar_graph.logs.geodesy import Origin
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
-from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.logs.roles import (
     ROLES,
     SEQUENCE_ROLES,
@@ -481,6 +480,11 @@ class Assembly:
             for role, table in self._tables.items()
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
+        from sonar_graph.logs.measured_start import (  # compiles
+            is_whole,
+            with_measured_start,
+        )
+
         if not (self._is_start_stated or is_whole(self.calibration.start)):
             self.calibration, self._notes["log.start"] = with_measured_start(
                 self.calibration, blocks

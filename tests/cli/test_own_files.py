@@ -228,7 +228,7 @@ def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(
     names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")
     run(command, folder / "fast.mcap", "-o", tmp_path / "out", *names)
     said = " ".join(capsys.readouterr().out.split())
-    assert "Warning: DVL: unit: velocities look 1000 times too large" in said
+    assert "Doubtful: DVL: unit: velocities look 1000 times too large" in said
     assert "`scale = 0.001` under [dvl]" in said
 
 

@@ -7,6 +7,7 @@ from sonar_graph.logs.adapters.adapter import (
 from sonar_graph.logs.adapters.aiding_messages import GeodeticFields, HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
+from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.landmark_messages import (
     DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter, detection_warnings,
 )
@@ -14,8 +15,7 @@ from sonar_graph.logs.adapters.landmark_rows import DetectionRowsAdapter, Landma
 from sonar_graph.logs.adapters.log_config import (
     ADAPTERS, LogConfig, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
-from sonar_graph.logs.adapters.message_table import (LARGEST, Dropped, FieldTable, MessageTable, field_of,
-    header_stamps_ns)
+from sonar_graph.logs.adapters.message_table import LARGEST, Dropped, FieldTable, MessageTable, field_of, header_stamps_ns
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter, body_to_ros
 
@@ -23,8 +23,8 @@ __all__ = [
     "ADAPTERS", "ANGLES", "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter",
     "DetectionRowsAdapter", "Dropped", "DvlAdapter", "FORCES", "FieldTable", "GeodeticFields", "HeadingAdapter",
     "ImuAdapter", "LARGEST", "LENGTHS", "LandmarkMapAdapter", "LandmarkRowsAdapter", "LogConfig", "MessageTable",
-    "PRESSURES", "PositionAdapter", "RATES", "Refused", "SAMPLE_TYPES", "SHIPPED", "SPEEDS", "Shipped", "SonarAdapter",
-    "TIMES", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "axes_matrix", "body_to_ros", "changes_text",
-    "detection_warnings", "field_of", "header_stamps_ns", "leaf_fields", "plain_lines", "read_log_config",
-    "shipped_for", "shipped_like", "table_text", "turned",
+    "Origin", "PRESSURES", "PositionAdapter", "RATES", "Refused", "SAMPLE_TYPES", "SHIPPED", "SPEEDS", "Shipped",
+    "SonarAdapter", "TIMES", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "axes_matrix", "body_to_ros",
+    "changes_text", "detection_warnings", "east_north_up", "field_of", "header_stamps_ns", "leaf_fields", "plain_lines",
+    "read_log_config", "shipped_for", "shipped_like", "table_text", "turned",
 ]

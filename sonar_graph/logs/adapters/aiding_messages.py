@@ -2,7 +2,7 @@
 
 A heading is the yaw of ``world_R_body = world_R_driver driver_R_body`` (Rz Ry Rx). A bearing β clockwise from north is
 a yaw of ``90° - β`` in a world with x east. Fixes in latitude and longitude become metres east, north and up of an
-origin (`sonar_graph.logs.geodesy`).
+origin (`sonar_graph.logs.adapters.geodesy`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from sonar_graph.logs.adapters.adapter import (
     axes_matrix,
     field_paths,
 )
+from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
@@ -31,7 +32,6 @@ from sonar_graph.logs.adapters.message_table import (
     fit_rows,
     not_finite,
 )
-from sonar_graph.logs.geodesy import Origin, east_north_up
 from sonar_graph.logs.mcap import Keep, Topic
 from sonar_graph.measurements import (
     FARTHEST_FIX_M,

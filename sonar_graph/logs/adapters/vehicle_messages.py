@@ -30,6 +30,7 @@ from sonar_graph.logs.adapters.adapter import (
     turn,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
+from sonar_graph.logs.adapters.geodesy import Origin
 from sonar_graph.logs.adapters.message_table import (
     LARGEST,
     NOT_FINITE,
@@ -38,7 +39,6 @@ from sonar_graph.logs.adapters.message_table import (
     fit_rows,
     not_finite,
 )
-from sonar_graph.logs.geodesy import Origin
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
 

@@ -19,8 +19,8 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import DatasetError
+from sonar_graph.logs.adapters import east_north_up
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
-from sonar_graph.logs.geodesy import east_north_up
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory

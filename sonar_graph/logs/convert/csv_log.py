@@ -40,7 +40,6 @@ from sonar_graph.logs.adapters import (
 )
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
-from sonar_graph.logs.measured_start import with_measured_start
 from sonar_graph.logs.reading import common_origin, require_use, rows_of
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import faults_in, toml_key
@@ -282,6 +281,8 @@ def read_csv(
     }
     notes |= {"csv.left_out": "; ".join(left_out)} if left_out else {}
     notes |= {"csv.warnings": "; ".join(doubts)} if doubts else {}
+    from sonar_graph.logs.measured_start import with_measured_start  # loads numba
+
     calibration, notes["log.start"] = with_measured_start(calibration, blocks)
     name = name or spelt(
         found["imu"].file.path.stem

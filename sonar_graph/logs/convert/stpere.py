@@ -23,9 +23,9 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import DatasetError
+from sonar_graph.logs.adapters import east_north_up
 from sonar_graph.logs.convert.akit import FLU_OF_FRD, enu_R_flu
 from sonar_graph.logs.convert.text_tables import NumberTable, read_table
-from sonar_graph.logs.geodesy import east_north_up
 from sonar_graph.measurements import Dvl, Floats, Heading, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory

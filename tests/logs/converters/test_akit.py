@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis.findings import find_start_heading
+from sonar_graph.logs.adapters.geodesy import earth_centred, east_north_up
 from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
-from sonar_graph.logs.geodesy import earth_centred, east_north_up
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.alignment import match_reference_to_imu
 
