@@ -381,7 +381,10 @@ def grave_fault(
         return check.sense(config)
     if gain.is_known and not 1 / other_unit < size < other_unit:
         return unit_advice(check, size, config)
-    if found.scatter > LARGEST_SCATTER * sigma and found.misfit > MOST_MISFIT:
+    # sightings that contradict the motion are wrong identities as a rule, which the estimators name
+    is_landmark = check.role == "detections"
+    is_scattered = found.scatter > LARGEST_SCATTER * sigma
+    if is_scattered and found.misfit > MOST_MISFIT and not is_landmark:
         return contradiction(check, found)
     return ""
 

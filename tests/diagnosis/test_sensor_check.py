@@ -116,7 +116,8 @@ def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]
         assert found[name].acts, name
         assert not again[name].acts, again[name].text()
         assert again[name].advice == "no need to act"
-    arms = [finding for name, finding in found.items() if name.startswith("lever arm")]
+    names = sorted(name for name in found if name.startswith("lever arm"))  # x, y, z
+    arms = [found[name] for name in names]
     assert [arm.acts for arm in arms] == [True, False, True]
     for (
         finding
@@ -210,7 +211,7 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
 def test_a_hole_of_the_imu_asks_for_nothing(
     hole_s: float, monkeypatch: pytest.MonkeyPatch
 ):
-    """Drawn straight across, 5 s of manoeuvres make a wrong scale and a wrong offset of the reference."""
+    """Drawn straight across, 5 s of manoeuvres make a wrong offset of the reference."""
     t = (RIGHT.imu.stamps_ns - RIGHT.imu.stamps_ns[0]) * 1e-9
     run = replace(RIGHT, imu=RIGHT.imu.rows((t <= 100.0) | (t >= 100.0 + hole_s)))
     found = by_name(sensor_check.check_sensors(run))
@@ -221,11 +222,7 @@ def test_a_hole_of_the_imu_asks_for_nothing(
         "sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like
     )
     blind = by_name(sensor_check.check_sensors(run))
-    assert (
-        blind["DVL scale"].acts
-        == blind["reference against IMU: time offset"].acts
-        == (hole_s > 2.0)
-    )
+    assert blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
 
 
 @pytest.mark.parametrize(
