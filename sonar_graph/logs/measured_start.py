@@ -27,10 +27,12 @@ NEAREST_ROWS = 5
 """Rows about the start of which the median counts, so that one wrong row does not."""
 WIDER = 3.0
 """Factor from a row's sigma to the start's: the rows are measurements too, and so count twice by a ninth only."""
-LEVEL_S, LONGEST_S = 20.0, 600.0
-"""Time from which roll and pitch are taken; longest time from which yaw is taken by fixes."""
+LEVEL_S = 20.0
+LONGEST_S = 600.0
+"""Longest time from which yaw is taken by fixes; roll and pitch are taken from the first `LEVEL_S`."""
 LONGEST_HOLE_S = 1.0
-FEWEST_VELOCITIES, FEWEST_FIXES = 10, 6
+FEWEST_VELOCITIES = 10
+FEWEST_FIXES = 6
 LARGEST_GRAVITY_ERROR = 0.2
 """Relative; beyond it the accelerometers have another unit, or gravity was taken out."""
 LEAST_TILT_SIGMA_RAD = 0.01
@@ -150,7 +152,9 @@ def measured_start(
     calibration: Calibration, start_ns: int, blocks: Mapping[str, Any]
 ) -> tuple[Start, list[str]]:
     """Start by the first rows, and what was not measured as it should be."""
-    start, changes, notes = calibration.start, dict[str, Any](), list[str]()
+    start = calibration.start
+    changes = dict[str, Any]()
+    notes = list[str]()
     path = FirstPath.of(blocks["imu"], blocks["dvl"], calibration, start_ns)
     roll, pitch, yaw = start.rpy_rad
     sigmas = np.array(start.rpy_sigma_rad)
@@ -182,10 +186,8 @@ def measured_start(
     changes["rpy_rad"] = (roll, pitch, yaw)
     changes["rpy_sigma_rad"] = sigmas
     R = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix()
-    position, position_sigma = (
-        np.array(start.position_m),
-        np.array(start.position_sigma_m),
-    )
+    position = np.array(start.position_m)
+    position_sigma = np.array(start.position_sigma_m)
     if fixes is not None:
         source = "fixes"
         near = _nearest(fixes.stamps_ns, start_ns)
@@ -221,7 +223,8 @@ def height_by_depth(
 
     ``up`` is the world's up in the body, shape (3,).
     """
-    depth, dvl = blocks["depth"], blocks["dvl"]
+    depth = blocks["depth"]
+    dvl = blocks["dvl"]
     near = _nearest(depth.stamps_ns, start_ns)
     first = _nearest(dvl.stamps_ns, start_ns)
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()

@@ -147,7 +147,8 @@ def huber_scale(e: Floats, S: Floats) -> float:
     return max(1.0, math.sqrt(e @ np.linalg.inv(S) @ e) / k)
 
 
-CONTRADICTING_SIGMAS, DOUBTLESS_SIGMAS = 5.0, 10.0
+CONTRADICTING_SIGMAS = 5.0
+DOUBTLESS_SIGMAS = 10.0
 CONTRADICTING_SHARE = 0.2
 """Of headings or fixes: less are outliers, which the kernel is for."""
 FEWEST_JUDGED = 10

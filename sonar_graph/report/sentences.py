@@ -49,7 +49,8 @@ NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNF
 UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
 """Outcomes of detections that were refused before their landmark mattered."""
 POLICY, UNKNOWN = "identity.policy", "identity.unknown.policy"
-WARNING, DOUBTFUL = "Warning", "Doubtful"
+WARNING = "Warning"
+DOUBTFUL = "Doubtful"
 BEYOND_DOUBT = 100.0
 """Ratio of squared innovations to their covariance, typical of a sensor, that no noise makes."""
 SAID_NOTES = {
@@ -532,7 +533,8 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
     By the comparison of sensors, or by what estimators made of their rows: most depths refused, innovations whose
     median is `BEYOND_DOUBT` times what their covariance allows, headings or fixes as far from the estimate.
     """
-    sequence, lines = comparison.sequence, list[str]()
+    sequence = comparison.sequence
+    lines = list[str]()
     if "log.doubtful" in sequence.notes:
         lines.append(f"{DOUBTFUL}: {sequence.notes['log.doubtful']}")
     for run in comparison.runs:

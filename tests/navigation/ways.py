@@ -23,7 +23,8 @@ IMU_HZ, DVL_HZ = 10.0, 2.0
 LOST_S, FOUND_S, OPEN_S, WAITS_S = 6.0, 11.0, 10.8, 1e-3
 BODY_P_IMU, BODY_P_DVL = np.array([0.2, -0.1, 0.1]), np.array([-0.5, 0.3, -0.2])
 SIGMA_M_S = (0.01, 0.02, 0.005)
-ANY_VELOCITY, STEADY = 1e3, 1e-9
+ANY_VELOCITY = 1e3
+STEADY = 1e-9
 """Walks of the velocity, m/s/√s: gaps are bridged by the accelerometers alone, or by a steady velocity."""
 NO_NOISE = {
     "gyro_noise_density": 0.0,
@@ -210,10 +211,8 @@ class Vehicle:
 
     def imu(self, at_ns):
         t = (at_ns - T0_NS) * 1e-9
-        lever, body_R_world = (
-            np.array(QUIET.mounting.translation_m),
-            self.attitude(t).inv(),
-        )
+        lever = np.array(QUIET.mounting.translation_m)
+        body_R_world = self.attitude(t).inv()
         force = body_R_world.apply(self.acceleration(t) - GRAVITY)
         force += np.cross(self.axis, np.cross(self.axis, lever))
         return Imu(at_ns, np.tile(self.axis, (len(t), 1)), force)
