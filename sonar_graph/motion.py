@@ -191,11 +191,19 @@ class MotionSource(Protocol):
         """
 
     def motions(
-        self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats
+        self,
+        start_ns: Ints,
+        end_ns: Ints,
+        known_ns: Ints,
+        bias: Floats,
+        *,
+        over_gaps: bool = False,
     ) -> Motions:
         """Motions over n intervals, each from rows stamped no later than its ``known_ns``, for one ``bias`` (3,).
 
-        Intervals with a gap are left to `motion`; the Earth's rotation is not removed.
+        Intervals with a gap are NaN and left to `motion`. With ``over_gaps``, which needs a velocity on both sides of
+        each gap, the velocity is linear there and the covariance counts its random walk. The Earth's rotation is not
+        removed.
         """
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:

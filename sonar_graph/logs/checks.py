@@ -44,6 +44,8 @@ SPIKE_RATIO = 20.0
 """A spike exceeds the 99 % quantile of all differences by this factor."""
 LARGEST_LAG_S = 1.0
 """Median time between stamp and recording that is still usual."""
+LONG_GAP_S = 1.5
+"""Time without a Doppler sample, or between the first or last samples of both sensors, that a user should know of."""
 LARGEST_LAG_CHANGE_S = 0.5
 FEWEST_SECONDS = 60
 MOST_IMPROVED = 2.0
@@ -101,18 +103,18 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
 def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     """Times without measurements and the assumption that estimators make there, in seconds after the common start.
 
-    A Doppler log has a gap where its velocity is no longer taken as linear (``dvl.gap_s``). An IMU has a hole where
+    A Doppler log has a gap worth a warning where it misses a sample for `LONG_GAP_S`. An IMU has a hole where
     estimators count with turns that were not measured (`sonar_graph.navigation.imu_gaps`). Samples that hold for the
-    time before them leave no gap. A sensor that begins or ends more than ``dvl.gap_s`` apart from the other is named
+    time before them leave no gap. A sensor that begins or ends more than `LONG_GAP_S` apart from the other is named
     first.
     """
     begin_s, end_s = (
         (int(imu.stamps_ns[row]) - int(dvl.stamps_ns[row])) * 1e-9 for row in (0, -1)
     )
-    if abs(begin_s) > calibration.dvl.gap_s:
+    if abs(begin_s) > LONG_GAP_S:
         late, early = ("IMU", "Doppler log") if begin_s > 0 else ("Doppler log", "IMU")
         yield f"{late} begins {abs(begin_s):.1f} s after the {early}; not estimated until then"
-    if abs(end_s) > calibration.dvl.gap_s:
+    if abs(end_s) > LONG_GAP_S:
         early, late = ("IMU", "Doppler log") if end_s < 0 else ("Doppler log", "IMU")
         yield f"{early} ends {abs(end_s):.1f} s before the {late}; not estimated from there"
     if calibration.odometry_interpolation == "hold-past":
@@ -132,7 +134,7 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
         )
         guess = "the turn in between is guessed from the rates before and after"
         yield f"imu: no sample {_gap_times(holes, start_ns)}: {guess}, {turns}"
-    yield from _dvl_gap_warnings(imu, dvl, round(calibration.dvl.gap_s * 1e9), start_ns)
+    yield from _dvl_gap_warnings(imu, dvl, round(LONG_GAP_S * 1e9), start_ns)
 
 
 def _dvl_gap_warnings(

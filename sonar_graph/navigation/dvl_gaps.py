@@ -18,11 +18,12 @@ accelerometers at t change s by ``[x]x theta + a R n``. White noise and constant
     cov(s) = n_g^2 sum dt [x]x [x]x^T + n_a^2 sum dt a^2 I,    cov(s, theta) = n_g^2 sum dt [x]x     (2)
     D_gyro = -sum dt [x]x R,    D_accel = -sum dt a R                                                (3)
 
-Prior: the velocity in the body stays what the Doppler log measured, and walks with root density q (m/s/√s) between both
-ends (closed) or from its last value on (open). Its displacement s_0 errs by ``W = q^2 T^3 / 12 I`` or
-``q^2 T^3 / 3 I``, besides the noise C_0 of gyros and Doppler log. The line, with its C and D, corrects the prior as a
-measurement does in a Kalman filter. In the last frame, with b the sigma of the gyro bias, and c for what a linear D
-leaves out::
+Prior: the velocity of the body's origin, in body axes, stays what the Doppler log measured, and walks with root density
+q (m/s/√s) between both ends (closed) or from its last value on (open). Its displacement s_0 errs by
+``W = q^2 T^3 / 12 I`` or ``q^2 T^3 / 3 I``, besides the noise C_0 of gyros and Doppler log. From u seconds before the end
+of a closed gap to its end that is ``W = q^2 (u^3 / 3 - u^4 / (4 T)) I``, which the motion of a late or averaged
+measurement counts. The line, with its C and D, corrects the prior as a measurement does in a Kalman filter. In the last
+frame, with b the sigma of the gyro bias, and c for what a linear D leaves out::
 
     V = C - C_0 + b^2 (D - D_0) (D - D_0)^T + c I,    c = 2 (b T)^2 |b (D - D_0)|^2
     K = W (W + V)^-1,    s_0 + K (s - s_0),    D_0 + K (D - D_0)                                     (4)
@@ -41,6 +42,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 from sonar_graph.motion import PreintegratedMotion
@@ -94,10 +96,32 @@ def closed_bridge(
     line = _by_accelerometers(rows, sensors, removed, ends, end_ns)
     # noise of such a density between the two rows has the variance of the line's samples
     doppler_cov = np.tensordot(squares_s2 / T**2, rows.cov[k : k + 2], 1)
-    prior = _prior(rows, (k, k + 1), np.array([start_ns, end_ns]), doppler_cov)
-    steady = motion_over(prior, sensors, removed, start_ns, end_ns)
-    walked_m2 = sensors.velocity_walk_density**2 * T**3 / 12.0
+    samples = Ends((k, k + 1), np.array([start_ns, end_ns]), doppler_cov)
+    steady = _prior(rows, sensors, removed, samples, (start_ns, end_ns))
+    walked_m2 = float(walked_until_end(sensors, T, T))
     return _corrected(steady, walked_m2, line, sensors.gyro_bias_sigma)
+
+
+def end_of_gap(
+    rows: Rows, sensors: Sensors, removed: Removed, start_ns: int, end_ns: int
+) -> PreintegratedMotion:
+    """Motion from an instant inside a closed gap to its end, by a velocity that is linear over the gap and walks."""
+    k = int(rows.dvl_ns.searchsorted(end_ns))
+    gap_s = (end_ns - rows.dvl_ns[k - 1]) * 1e-9
+    steady = motion_over(rows, sensors, removed, start_ns, end_ns)
+    walked_m2 = float(walked_until_end(sensors, gap_s, (end_ns - start_ns) * 1e-9))
+    return _corrected(steady, walked_m2, None, sensors.gyro_bias_sigma)
+
+
+def walked_until_end(sensors: Sensors, gap_s: ArrayLike, rest_s: ArrayLike) -> Floats:
+    """Variance of one component of the displacement over the last part of a gap with both velocities known, m².
+
+    The velocity is a Brownian bridge: the covariance of its values at s and s' before the end is ``q^2 (min(s, s') -
+    s s' / T)``, whose double integral over ``0 <= s, s' <= u`` is ``q^2 (u^3 / 3 - u^4 / (4 T))``.
+    """
+    T = np.asarray(gap_s, np.float64)
+    u = np.asarray(rest_s, np.float64)
+    return sensors.velocity_walk_density**2 * (u**3 / 3.0 - u**4 / (4.0 * T))
 
 
 def open_bridge(
@@ -151,10 +175,7 @@ def _by_accelerometers(
     is_closed = bool(cuts_ns[-1] == end_ns)
     weights_s = fit.weights_s
     lever = sensors.body_p_dvl - sensors.body_p_imu
-    # (n, 3), the same numbers however many rows come before and after
-    rate = np.column_stack(
-        [np.interp(cuts_ns, rows.imu_ns, column) for column in rows.rate.T]
-    )
+    rate = _rates_at(rows, cuts_ns)  # (n, 3)
     # of the IMU's point, (n, 3)
     velocity = rows.velocity[fit.samples] - np.cross(rate - removed.bias, lever)
     turned = weights_s[:, None] * velocity
@@ -336,19 +357,53 @@ def _open(
     k = int(rows.dvl_ns.searchsorted(start_ns))
     T = (end_ns - start_ns) * 1e-9
     # noise of this density, a second apart, has the variance of T times the last velocity
-    prior = _prior(
-        rows, (k, k), np.array([start_ns - NS_PER_S, start_ns]), T * rows.cov[k]
-    )
-    steady = motion_over(prior, sensors, removed, start_ns, end_ns)
+    samples = Ends((k, k), np.array([start_ns - NS_PER_S, start_ns]), T * rows.cov[k])
+    steady = _prior(rows, sensors, removed, samples, (start_ns, end_ns))
     walked_m2 = sensors.velocity_walk_density**2 * T**3 / 3.0
     return _corrected(steady, walked_m2, line, sensors.gyro_bias_sigma)
 
 
-def _prior(rows: Rows, ends: tuple[int, int], dvl_ns: Ints, cov: Floats) -> Rows:
-    """Rows with a Doppler log of two samples, which measure the velocities of two rows with one covariance."""
-    velocity = rows.velocity[list(ends)]
-    return rows._replace(
-        dvl_ns=dvl_ns, velocity=velocity, cov=np.array([cov, cov]), known_ns=dvl_ns
+class Ends(NamedTuple):
+    """Two Doppler samples of the prior."""
+
+    rows: tuple[int, int]
+    """Rows that measured their velocities."""
+    stamps_ns: Ints
+    """Shape (2,)."""
+    cov: Floats
+    """Of both, shape (3, 3), m²/s²."""
+
+
+def _prior(
+    rows: Rows,
+    sensors: Sensors,
+    removed: Removed,
+    ends: Ends,
+    interval_ns: tuple[int, int],
+) -> PreintegratedMotion:
+    """Motion by a velocity of the body's origin that is linear between two samples, and steady after them."""
+    measured = list(ends.rows)
+    rate = _rates_at(rows, rows.dvl_ns[measured])  # (2, 3)
+    # the origin keeps its velocity when the vehicle turns, the log beside it does not
+    swing = np.cross(rate - removed.bias - removed.earth, sensors.body_p_dvl)
+    two_samples = rows._replace(
+        dvl_ns=ends.stamps_ns,
+        velocity=rows.velocity[measured] - swing,
+        cov=np.array([ends.cov, ends.cov]),
+        known_ns=ends.stamps_ns,
+    )
+    at_origin = sensors._replace(body_p_dvl=np.zeros(3))
+    steady = motion_over(two_samples, at_origin, removed, *interval_ns)
+    # the bias changes the swing by b x l; minus the derivative of the turn is the integral of the rotation
+    D = steady.D_bias.copy()
+    D[3:] += D[:3] @ gtsam.SO3.Hat(sensors.body_p_dvl)
+    return replace(steady, D_bias=D)
+
+
+def _rates_at(rows: Rows, stamps_ns: Ints) -> Floats:
+    """Angular rates at instants, shape (n, 3), the same numbers however many rows come before and after."""
+    return np.column_stack(
+        [np.interp(stamps_ns, rows.imu_ns, column) for column in rows.rate.T]
     )
 
 

@@ -26,7 +26,13 @@ from sonar_graph.calibration import ROWS_BEFORE, Calibration, require_calibratio
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.motion import Motions, PreintegratedMotion, earth_rate_in_world
-from sonar_graph.navigation.dvl_gaps import closed_bridge, open_bridge, remaining_motion
+from sonar_graph.navigation.dvl_gaps import (
+    closed_bridge,
+    end_of_gap,
+    open_bridge,
+    remaining_motion,
+    walked_until_end,
+)
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.navigation.imu_gaps import UNTURNED, turns_of
 from sonar_graph.navigation.preintegration import (
@@ -40,6 +46,7 @@ from sonar_graph.navigation.preintegration import (
 )
 from sonar_graph.navigation.samples import (
     EARLIEST_NS,
+    LATEST_NS,
     WINDOW_NS,
     finite_vector,
     no_doppler_stamp,
@@ -240,11 +247,38 @@ class Odometry:
         return self._motion_since(start_ns, end_ns, known_ns, removed)
 
     def motions(
-        self, start_ns: Ints, end_ns: Ints, known_ns: Ints, bias: Floats
+        self,
+        start_ns: Ints,
+        end_ns: Ints,
+        known_ns: Ints,
+        bias: Floats,
+        *,
+        over_gaps: bool = False,
     ) -> Motions:
         """Motions over intervals, each from rows known at its ``known_ns``."""
-        intervals = Intervals(start_ns, end_ns, known_ns, self._sensors.longest_ns)
-        return motions_over(self.rows(), intervals, self._sensors, Removed(bias, ZERO))
+        longest_ns = LATEST_NS if over_gaps else self._sensors.longest_ns
+        intervals = Intervals(start_ns, end_ns, known_ns, longest_ns)
+        removed = Removed(bias, ZERO)
+        motions = motions_over(self.rows(), intervals, self._sensors, removed)
+        if over_gaps:
+            walked_m2 = self._walked_m2(start_ns, end_ns)  # (n,)
+            motions.C[:, 3:, 3:] += walked_m2[:, None, None] * np.eye(3)
+        return motions
+
+    def _walked_m2(self, start_ns: Ints, end_ns: Ints) -> Floats:
+        """What the walk of the velocity in closed gaps adds to the displacement over each interval, shape (n,)."""
+        first = max(int(self._dvl.stamps_ns.searchsorted(start_ns[0])) - 1, 0)
+        dvl_ns = self._dvl.stamps_ns[first:]
+        is_gap = np.diff(dvl_ns) > self._sensors.longest_ns
+        found_ns = dvl_ns[1:][is_gap]
+        gap_s = (found_ns - dvl_ns[:-1][is_gap]) * 1e-9  # (g,)
+        # from both ends of each interval to the end of each gap, (n, g)
+        from_start_s = np.clip((found_ns - start_ns[:, None]) * 1e-9, 0.0, gap_s)
+        from_end_s = np.clip((found_ns - end_ns[:, None]) * 1e-9, 0.0, gap_s)
+        walked_m2 = walked_until_end(
+            self._sensors, gap_s, from_start_s
+        ) - walked_until_end(self._sensors, gap_s, from_end_s)
+        return np.asarray(walked_m2.sum(axis=1))
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""
@@ -311,6 +345,15 @@ class Odometry:
         _, last = self._epochs_between(EARLIEST_NS, until_ns)
         return int(self._dvl.stamps_ns[last - 1]) if last > 0 else None
 
+    def _lies_in_gap(self, instant_ns: int) -> bool:
+        """True where an instant lies between the two epochs of a closed gap."""
+        k = int(self._dvl.stamps_ns.searchsorted(instant_ns))
+        if not 0 < k < len(self._dvl.stamps_ns):
+            return False
+        before_ns = int(self._dvl.stamps_ns[k - 1])
+        after_ns = int(self._dvl.stamps_ns[k])
+        return instant_ns < after_ns and self.is_gap(before_ns, after_ns)
+
     def _require_interval(self, start_ns: int, end_ns: int) -> None:
         """Raise MeasurementError where rows do not begin before an interval, or its end lies before its start."""
         imu_ns = self._imu.stamps_ns
@@ -354,6 +397,12 @@ class Odometry:
 
         if stretch.until_ns < newest_ns:
             new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
+            if stretch.until_ns < new_ns[0] and self._lies_in_gap(start_ns):
+                found_ns = int(new_ns[0])
+                over_gap = end_of_gap(
+                    rows.known(known_ns), sensors, removed, start_ns, found_ns
+                )
+                stretch = Stretch.begin(found_ns, removed.bias, over_gap)
             for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])

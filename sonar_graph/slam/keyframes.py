@@ -11,7 +11,6 @@ keyframe before it by the motion between them.
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import gtsam
@@ -45,8 +44,6 @@ from sonar_graph.states import Refusal, RefusedRow
 S_PER_NS = 1e-9
 NS_PER_S = 1_000_000_000
 Block = TypeVar("Block", Depth, Heading)
-CARRIED_IN_GAP_NS = 300_000_000
-"""Longest time over which a sample of depth or heading is carried straight on over the end of a gap."""
 LONGEST_LATE_S = 60.0
 """Age of a position fix up to which it is used, where the lag is longer."""
 FIX_GAIN = 50.0
@@ -82,8 +79,6 @@ class KeyframeParams(Section):
 class Carried(NamedTuple):
     """Motions from samples k to the keyframe j after them."""
 
-    first: int
-    """Number of the first sample that is carried."""
     k_R_j: Floats
     """Of each sample, and of j itself, shape (n + 1, 3, 3)."""
     k_p_j: Floats
@@ -530,47 +525,32 @@ class Keyframes:
         depths, self._depths = split_at(self._depths, interval)
         if depths is not None:
             carried = self._carried(depths.stamps_ns, interval, gyro_bias)
-            if carried is not None:
-                self._add_depth(j, depths, carried)
+            self._add_depth(j, depths, carried)
         headings, self._headings = split_at(self._headings, interval)
         if headings is not None:
             carried = self._carried(headings.stamps_ns, interval, gyro_bias)
-            if carried is not None:
-                self._add_heading(j, headings, carried, linearisation.biases[COMPASS])
+            self._add_heading(j, headings, carried, linearisation.biases[COMPASS])
 
     def _carried(
         self, stamps_ns: Ints, interval: Interval, gyro_bias: Floats
-    ) -> Carried | None:
-        """Motions from samples to the keyframe after them, not over a gap; None where no sample remains."""
-        epochs_ns = self.odometry.epochs(interval.start_ns, interval.node_ns).tolist()
-        gaps_end_ns = [
-            b
-            for a, b in pairwise([interval.start_ns, *epochs_ns])
-            if self.odometry.is_gap(a, b)
-        ]
-        after_ns = (
-            gaps_end_ns[-1] - CARRIED_IN_GAP_NS if gaps_end_ns else interval.start_ns
+    ) -> Carried:
+        """Motions from samples to the keyframe after them."""
+        until_ns = np.append(stamps_ns[1:], interval.node_ns)
+        known_ns = np.full(len(stamps_ns), interval.known_ns)
+        # the keyframe is an epoch: a gap before it has a velocity on both sides
+        motions = self.odometry.motions(
+            stamps_ns, until_ns, known_ns, gyro_bias, over_gaps=True
         )
-        first = int(stamps_ns.searchsorted(after_ns, side="right"))
-        from_ns = stamps_ns[first:]
-        until_ns = np.append(from_ns[1:], interval.node_ns)[: len(from_ns)]
-        known_ns = np.full(len(from_ns), interval.known_ns)
-        motions = self.odometry.motions(from_ns, until_ns, known_ns, gyro_bias)
-        # a gap shorter than a sample is carried over
-        lost = np.flatnonzero(np.isnan(motions.dp[:, 0]))
-        kept = int(lost[-1]) + 1 if len(lost) else 0
-        if kept == len(from_ns):
-            return None
+        # what is left of the gyro bias turns old samples more: b^2 t^2, of which each motion has the growth
+        age_s = np.append(interval.node_ns - stamps_ns, 0) * S_PER_NS
+        by_bias_rad2 = self.calibration.imu.gyro_bias_sigma**2 * -np.diff(age_s**2)
+        motions.C[:, :3, :3] += by_bias_rad2[:, None, None] * np.eye(3)
         k_R_j = [np.eye(3)]
         k_p_j = [np.zeros(3)]
-        for dR, dp in zip(
-            motions.dR[kept:][::-1], motions.dp[kept:][::-1], strict=True
-        ):
+        for dR, dp in zip(motions.dR[::-1], motions.dp[::-1], strict=True):
             k_p_j.append(dp + dR @ k_p_j[-1])
             k_R_j.append(dR @ k_R_j[-1])
-        return Carried(
-            first + kept, np.array(k_R_j[::-1]), np.array(k_p_j[::-1]), motions.C[kept:]
-        )
+        return Carried(np.array(k_R_j[::-1]), np.array(k_p_j[::-1]), motions.C)
 
     def _add_depth(self, j: int, depth: Depth, carried: Carried) -> None:
         """One factor for the averaged samples; at sample k the port lies at ``k_T_j^-1 port`` in frame j."""
@@ -578,8 +558,8 @@ class Keyframes:
         # only the part of the odometry's error along the vertical moves a depth
         ups = carried.k_R_j[1:] @ up_j  # (n, 3)
         wander_m2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, 3:, 3:], ups)
-        z_m = depth.z_m[carried.first :]
-        given_m2 = depth.variance_m2[carried.first :]
+        z_m = depth.z_m
+        given_m2 = depth.variance_m2
         variance_m2 = np.where(
             np.isnan(given_m2), self.calibration.depth.sigma_m**2, given_m2
         )
@@ -604,10 +584,8 @@ class Keyframes:
         yaw_rad = np.arctan2(R_k[:, 1, 0], R_k[:, 0, 0])
         ups = carried.k_R_j[1:] @ R_j[2]  # (n, 3)
         wander_rad2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, :3, :3], ups)
-        innovation = wrap_angle(
-            heading.yaw_rad[carried.first :] - yaw_rad[:-1] - compass_rad
-        )
-        given_rad = heading.sigma_rad[carried.first :]
+        innovation = wrap_angle(heading.yaw_rad - yaw_rad[:-1] - compass_rad)
+        given_rad = heading.sigma_rad
         sigma_rad = np.where(
             np.isnan(given_rad), self.calibration.heading.sigma_rad, given_rad
         )

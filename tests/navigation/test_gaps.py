@@ -6,7 +6,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, Measurements
 from sonar_graph.navigation import Odometry
@@ -348,6 +354,81 @@ def test_nothing_changes_where_no_sample_is_missing():
         )
         assert one.i_T_j.equals(other.i_T_j, 0.0)
         assert np.array_equal(one.covariance, other.covariance)
+
+
+def brisk_rows(lost_s):
+    """A level vehicle whose surge swings by 0.4 m/s within 3 s; the Doppler log, at 5 Hz, is lost after 6 s."""
+    imu_ns = stamps(50.0, 12.0)
+    dvl_ns = stamps(5.0, 12.0)
+    t = (imu_ns - T0_NS) * 1e-9
+    s = (dvl_ns - T0_NS) * 1e-9
+    w = 2.0 * np.pi / 3.0
+    force = np.column_stack([0.4 * w * np.cos(w * t), 0.0 * t, 9.80665 + 0.0 * t])
+    velocity = np.column_stack([0.5 + 0.4 * np.sin(w * s), 0.0 * s, 0.0 * s])
+    kept = (s <= 6.0) | (s > 6.0 + lost_s - 0.1)
+    end_s = float(s[s > 6.0 + lost_s - 0.1][0])
+    way_m = 0.5 * (end_s - 6.0) - 0.4 / w * (np.cos(w * end_s) - np.cos(w * 6.0))
+    return imu(imu_ns, 0.0, force), dvl(dvl_ns[kept], velocity[kept]), end_s, way_m
+
+
+@pytest.mark.parametrize("lost_s", [0.6, 0.8, 1.0, 1.2, 1.4, 2.0])
+def test_a_short_loss_of_lock_is_crossed_with_its_covariance_on_a_brisk_vehicle(lost_s):
+    """By the default calibration; a velocity that is linear for longer is far surer than it is right."""
+    inertial, doppler, end_s, way_m = brisk_rows(lost_s)
+    off = {}
+    for name, log in (
+        ("default", DvlCalibration()),
+        ("linear", DvlCalibration(gap_s=10.0)),
+    ):
+        found = motion(inertial, doppler, Calibration(dvl=log), 6.0, end_s)
+        off[name] = (found.i_T_j.x() - way_m) / found.covariance[3, 3] ** 0.5
+    assert abs(off["default"]) < 2.0
+    assert abs(off["linear"]) > 2.0 * abs(off["default"])
+
+
+def test_in_a_gap_the_body_keeps_its_velocity_not_the_place_of_the_doppler_log():
+    """A vehicle on the spot begins to turn in the gap; the log, a metre ahead of it, would swing sideways."""
+    imu_ns = stamps(50.0, 12.0)
+    dvl_ns = stamps(5.0, 12.0)
+    t = (imu_ns - T0_NS) * 1e-9
+    s = (dvl_ns - T0_NS) * 1e-9
+    turn = np.column_stack([0.0 * t, 0.0 * t, np.where((t > 7) & (t < 9), 0.3, 0.0)])
+    log = DvlCalibration(mounting=Mounting(translation_m=(1.0, 0.0, 0.0)))
+    rows = ways.blinded(imu(imu_ns, turn)), dvl(dvl_ns[(s <= 6.0)], 0.0)
+    found = motion(*rows, Calibration(dvl=log), 6.0, 8.0)
+    assert np.linalg.norm(found.i_T_j.translation()) < 1e-3
+    ahead = DvlCalibration()
+    assert motion(*rows, Calibration(dvl=ahead), 6.0, 8.0).i_T_j.rotation().yaw() > 0.2
+
+
+@pytest.mark.parametrize("start_s", [6.5, 9.0, 12.0, 15.5])
+def test_the_rest_of_a_closed_gap_errs_as_a_velocity_that_walks_between_both_ends(
+    start_s,
+):
+    """Drawn Brownian bridges; the same for a single motion and for those over intervals."""
+    imu_rows, dvl_rows = Vehicle().rows()
+    calibration = Calibration(
+        imu=QUIET, dvl=DVL.model_copy(update={"velocity_sigma_m_s": (0.0,) * 3})
+    )
+    odometry = Odometry(calibration)
+    odometry.add(imu_rows, dvl_rows)
+    start_ns, end_ns = at(start_s), at(Vehicle.FOUND_S)
+    known_ns = int(odometry.reached_ns(end_ns))
+    one = odometry.motion(start_ns, end_ns, np.zeros(3), None, known_ns)
+    stamps_ns = np.array([start_ns, (start_ns + end_ns) // 2, end_ns])
+    parts = odometry.motions(
+        stamps_ns[:-1], stamps_ns[1:], np.full(2, known_ns), np.zeros(3), over_gaps=True
+    )
+    rng = np.random.default_rng(3)
+    T, n = Vehicle.FOUND_S - Vehicle.LOST_S, 1000
+    steps = 0.1 * np.sqrt(T / n) * rng.standard_normal((4000, n))
+    walk = np.cumsum(steps, axis=1)
+    bridge = walk - np.linspace(1 / n, 1, n) * walk[:, -1:]
+    last = round(n * (Vehicle.FOUND_S - start_s) / T)
+    drawn_m2 = np.var(bridge[:, -last:].sum(axis=1) * T / n)
+    assert np.diag(one.covariance)[3:] == pytest.approx(3 * [drawn_m2], rel=0.1)
+    total = parts.C[:, 3:, 3:].sum(axis=0)
+    assert np.diag(total) == pytest.approx(np.diag(one.covariance)[3:], rel=1e-6)
 
 
 KNOWN_START = Start(position_sigma_m=(0.0,) * 3, rpy_sigma_rad=(0.0,) * 3)

@@ -107,6 +107,7 @@ def calibration(imu=None, body_p_imu=BODY_P_IMU, interpolation="linear", **dvl):
     doppler = {
         "velocity_sigma_m_s": (0.0,) * 3,
         "velocity_walk_density": ANY_VELOCITY,
+        "gap_s": 1.5,
         **dvl,
     }
     return Calibration(

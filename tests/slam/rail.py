@@ -66,7 +66,10 @@ def calibration() -> Calibration:
     """
     return Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-9, gyro_bias_sigma=0.0),
-        dvl=DvlCalibration(velocity_sigma_m_s=(VELOCITY_SIGMA_M_S,) * 3),
+        # one velocity a step, and steady motion between
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=(VELOCITY_SIGMA_M_S,) * 3, gap_s=1.5 * STEP_S
+        ),
         sonar=SonarCalibration(
             range_sigma_m=RANGE_SIGMA_M,
             azimuth_sigma_rad=0.2,

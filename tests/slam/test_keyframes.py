@@ -544,10 +544,11 @@ def test_fixes_have_the_covariance_of_the_motion_from_their_keyframe_and_share_i
     assert np.abs(expected[0] - 1e-4 * np.eye(3)).max() > 1e-5
 
 
-@pytest.mark.parametrize(("depth_s", "count"), [(1.5, 0), (5.6, 0), (6.0, 1)])
-def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_near_the_end(
-    depth_s, count
+@pytest.mark.parametrize("depth_s", [1.5, 5.6, 6.0])
+def test_a_depth_in_a_gap_is_tied_to_the_keyframe_with_the_walk_of_the_velocity(
+    depth_s,
 ):
+    """Lost from 2.0 to 6.2 s: variances add up over the walk from the depth to the end, ``q² (u³ / 3 - u⁴ / (4 T))``."""
     keyframes = keyframes_over_gaps(5.0)
     keyframes.add(None, None, Depth(at(depth_s), np.zeros(1), np.full(1, 1e-4)))
     keyframes.advance(int(at(5.9)[0]))
@@ -562,34 +563,33 @@ def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_n
     np.testing.assert_allclose(
         between.noiseModel().covariance(), motion.covariance, rtol=1e-6, atol=1e-15
     )
-    assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(1))) == count
-
-
-@pytest.mark.parametrize("lost_s", [[2.05], [2.15], [2.12, 2.17]])
-def test_depths_too_long_before_the_end_of_a_gap_leave_the_factor_of_the_others(lost_s):
-    """From 2.0 s to 2.4 s; none is carried on for longer than without a Doppler row, 0.21 s."""
-    calibration = Calibration(
-        imu=NO_BIAS, dvl=DvlCalibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.21)
+    (tie,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
+    T = 4.2
+    u = min(6.2 - depth_s, T)
+    walked_m2 = 0.1**2 * (u**3 / 3 - u**4 / (4 * T))
+    sampled_s = 6.2 - depth_s - u
+    doppler_m2 = 0.01**2 * (T * u + 0.2 * sampled_s)
+    assert tie.noiseModel().sigmas()[2] ** 2 == pytest.approx(
+        1e-4 + walked_m2 + doppler_m2, rel=1e-3
     )
-    found = []
-    for when in ([2.5, 2.7], [*lost_s, 2.5, 2.7]):
-        keyframes = keyframes_of(
-            calibration, POLICY.model_copy(update={"max_interval_s": 2.8})
-        )
-        log = steady_dvl(3.0)
-        depth = Depth(at(*when), 0.1 * np.array(when), np.full(len(when), 1e-4))
-        keyframes.add(level_imu(3.0), log.rows(log.stamps_ns != at(2.2)[0]), depth)
-        keyframes.advance(int(at(3.0)[0]))
-        assert seconds(keyframes) == [0.0, 2.8]
-        found.append(
-            (
-                error_of(keyframes, gtsam.GPSFactorArm),
-                factor_of(keyframes, gtsam.GPSFactorArm),
-            )
-        )
-    (error, factor), (expected, alone) = found[1], found[0]
-    assert error == pytest.approx(expected, abs=1e-12)
-    assert factor.noiseModel().sigmas() == pytest.approx(alone.noiseModel().sigmas())
+
+
+@pytest.mark.parametrize("headings_s", [[1.5], [1.5, 3.0, 5.0]])
+def test_a_heading_in_a_gap_is_tied_to_the_keyframe_by_the_gyros(headings_s):
+    """No velocity is needed for that; what a gyro bias may have turned since then counts as noise."""
+    keyframes = keyframes_over_gaps(5.0)
+    n = len(headings_s)
+    keyframes.add(
+        None, None, None, Heading(at(*headings_s), np.zeros(n), np.full(n, 0.02))
+    )
+    keyframes.advance(int(at(6.3)[0]))
+    (tie,) = [
+        f
+        for f in factors_of(keyframes.smoother.graph)
+        if list(f.keys()) == [X(1), B(0)] and f.dim() == 1
+    ]
+    variance = tie.noiseModel().noise().covariance().item()
+    assert variance == pytest.approx(0.02**2 / n, rel=1e-3)
 
 
 @given(
