@@ -193,7 +193,7 @@ class DvlCalibration(Section):
     velocity_sigma_m_s: Sigmas = (0.01, 0.01, 0.01)
     """White noise of one velocity sample along each axis of the DVL, where the log has no covariance."""
     mounting: Mounting = Mounting()
-    gap_s: Positive = 0.4
+    gap_s: Positive = 0.35
     """Time without a sample above which the accelerometers carry the velocity; below it the velocity is linear."""
     velocity_walk_density: Positive = 0.1
     """Random walk of the vehicle's velocity, m/s/√s: for gaps of the log and the gate of outliers."""

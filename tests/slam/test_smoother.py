@@ -7,7 +7,12 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.slam import factors
-from sonar_graph.slam.smoother import Sightline, Smoother, batch_solution
+from sonar_graph.slam.smoother import (
+    Sightline,
+    Smoother,
+    SmootherParams,
+    batch_solution,
+)
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
 from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
@@ -471,3 +476,72 @@ def test_a_factor_in_python_is_handed_no_copy_of_all_values():
     window.update({}, gtsam.Values(), removed=(), relinearises=True)
     assert len(handed) > 1
     assert all(handed)
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "moves"),
+    [
+        (Thresholds(position_m=0.02, other=0.2), (True, False)),
+        (Thresholds(position_m=0.2, other=0.02), (False, True)),
+    ],
+    ids=["position", "rotation"],
+)
+def test_a_keyframe_is_linearised_anew_by_the_threshold_of_what_moved(
+    thresholds, moves
+):
+    """A prior shifts one pose by 0.1 m, or turns it by 0.1 rad."""
+    shift = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
+    turn = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.zeros(3))
+    found = []
+    for pose in (shift, turn):
+        window = WholeWindow(thresholds)
+        loose = FactorGroup({"prior": pose_prior(X(0), gtsam.Pose3(), 10.0)})
+        sure = FactorGroup({"pull": pose_prior(X(0), pose, 1e-3)})
+        window.update(
+            {0: loose}, values_of(X0=gtsam.Pose3()), removed=(), relinearises=True
+        )
+        window.update({1: sure}, gtsam.Values(), removed=(), relinearises=True)
+        window.update({}, gtsam.Values(), removed=(), relinearises=True)
+        found.append(not window.linearised_at.atPose3(X(0)).equals(gtsam.Pose3(), 1e-6))
+    assert tuple(found) == moves
+
+
+@pytest.mark.parametrize(("range_sigma_m", "is_exact"), [(0.1, False), (0.01, True)])
+def test_positions_are_linearised_anew_within_a_fifth_of_the_noise_of_the_range(
+    range_sigma_m, is_exact
+):
+    """A step of 10 mm: of 20 mm allowed by a sonar of 0.1 m, and of 2 mm by one of 0.01 m."""
+    params = SmootherParams(relinearize_threshold=0.05)
+    smoother = Smoother(params, range_sigma_m=range_sigma_m)
+    smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 10.0)})
+    smoother.update(0.0)
+    beside = gtsam.Pose3(gtsam.Rot3(), np.array([0.01, 0.0, 0.0]))
+    for k in range(1, 4):
+        smoother.add({"pull": pose_prior(X(0), beside, 1e-3)})
+        smoother.update(float(k))
+    shift_m = smoother._window.linearised_at.atPose3(X(0)).x()
+    assert (shift_m > 0.005) == is_exact
+
+
+@pytest.mark.parametrize("is_wild", [True, False])
+def test_an_update_that_makes_the_error_larger_is_undone_by_the_batch_solution(
+    monkeypatch, is_wild
+):
+    """Gauss-Newton on ``atan x`` leaps away from 0 where it starts beyond 1.39, and converges below it."""
+    solved = counted(monkeypatch, batch_solution, "descended")
+    smoother = smoother_with(FOREVER_S, 1e-9, NEVER_M)
+
+    def error(_, values, jacobians):
+        x = values.atPose3(X(0)).x()
+        if jacobians is not None:
+            jacobians[0] = np.array([[0.0, 0.0, 0.0, 1.0 / (1.0 + x * x), 0.0, 0.0]])
+        return np.array([np.arctan(x)])
+
+    start = gtsam.Pose3(gtsam.Rot3(), np.array([3.0 if is_wild else 1.2, 0.0, 0.0]))
+    smoother.add_pose(X(0), start, 0.0)
+    smoother.add({"prior": pose_prior(X(0), start, 1e3)})
+    smoother.add({"bend": gtsam.CustomFactor(isotropic(1, 1e-2), [X(0)], error)})
+    smoother.update(0.0)
+    assert bool(solved) == is_wild
+    assert abs(smoother.values.atPose3(X(0)).x()) < 0.5

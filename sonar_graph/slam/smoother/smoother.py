@@ -671,10 +671,11 @@ class Smoother:
         self._restart(time_s)
 
     def _before_update(self) -> gtsam.Values:
-        """Values before a failed or diverged update: the linearisation point, near the last good estimate."""
-        values = gtsam.Values(self._window.linearised_at)
-        values.insert_or_assign(self.estimates.new)
-        return values
+        """Values before a failed or diverged update: the linearisation point, near the last good estimate.
+
+        iSAM2 takes in new variables before it eliminates, so that they are there after a failure too.
+        """
+        return gtsam.Values(self._window.linearised_at)
 
     # ---------------------------------------------------------------- covariances and the batch solution
 
