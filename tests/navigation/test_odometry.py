@@ -215,7 +215,7 @@ def test_forgetting_changes_nothing_afterwards(calibration):
 
 
 @given(
-    st.lists(st.floats(0.05, 0.4), min_size=3, max_size=30), st.integers(0, 2**32 - 1)
+    st.lists(st.floats(0.05, 0.3), min_size=3, max_size=30), st.integers(0, 2**32 - 1)
 )
 @settings(max_examples=30)
 def test_a_chain_has_the_variance_of_its_doppler_samples_wherever_the_imu_cuts(
