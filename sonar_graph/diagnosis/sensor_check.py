@@ -59,8 +59,7 @@ from sonar_graph.diagnosis.start import (
 )
 from sonar_graph.diagnosis.units import wrong_units
 from sonar_graph.logs import gravity_warning
-from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.logs.adapters.adapter import axes_matrix
+from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
