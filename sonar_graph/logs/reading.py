@@ -37,7 +37,6 @@ from sonar_graph.logs.checks import (
     axes_warning,
     gap_warnings,
     gravity_warning,
-    gyro_warning,
     is_partial,
     repeats,
     spike_warning,
@@ -561,10 +560,6 @@ class Assembly:
                 ("imu", stuck_warning(imu.stamps_ns, values, quantity))
                 for quantity, values in columns
             ]
-        if (
-            imu is not None and dvl is not None and is_linear and not found[0][1]
-        ):  # gravity is upwards
-            found.append(("imu", gyro_warning(imu, dvl, self.calibration)))
         if dvl is not None and is_linear:
             found.append(
                 ("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity"))
