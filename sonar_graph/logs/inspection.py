@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError, SonarGraphError
 from sonar_graph.files import as_path
 from sonar_graph.logs.adapters import (
     LogConfig,
+    as_log_config,
     leaf_fields,
     plain_lines,
     shipped_like,
@@ -27,7 +29,7 @@ from sonar_graph.logs.cdr import (
     short_name,
 )
 from sonar_graph.logs.checks import stamp_faults
-from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topic, scan
+from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, Topic, scan
 from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import (
     ROLES,
@@ -35,8 +37,11 @@ from sonar_graph.logs.roles import (
     SONAR,
     TF,
     Choice,
+    Window,
+    as_window,
     choose_each,
     refusal,
+    require_topics,
     wanted_types,
 )
 from sonar_graph.logs.sonar_images import (
@@ -45,7 +50,9 @@ from sonar_graph.logs.sonar_images import (
     sonar_frame,
 )
 from sonar_graph.logs.vehicle_setup import (
+    GIVEN,
     PartialCalibration,
+    as_calibration,
     read_calibration,
     read_notes,
     recorded_name,
@@ -183,10 +190,10 @@ class LogSummary:
 
 def inspect_log(
     path: str | Path,
-    config: LogConfig | None = None,
+    config: LogConfig | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
-    window: TimeWindow | None = None,
-    calibration: PartialCalibration | None = None,
+    window: Window | None = None,
+    calibration: Calibration | PartialCalibration | str | Path | None = None,
 ) -> LogSummary:
     """Summarise an MCAP file; faults of the log become part of the summary.
 
@@ -194,12 +201,8 @@ def inspect_log(
     ----------
     path
         The log.
-    config, topics
-        What the user says about topics, as for `read_log`.
-    window
-        Part of the recording to inspect.
-    calibration
-        What the user says about the vehicle: mountings that it states are not missed in ``/tf_static``.
+    config, topics, window, calibration
+        As of `read_log`; mountings of the calibration are not missed in ``/tf_static``.
 
     Returns
     -------
@@ -209,7 +212,10 @@ def inspect_log(
     Raises
     ------
     LogError
-        When there is no such file, it is not MCAP, or `config` names fields that the messages do not have.
+        When there is no such file, it is not MCAP, `config` names fields that the messages do not have, or `topics` one
+        that is not in the log.
+    ArgumentError
+        When an argument is of another kind.
 
     See Also
     --------
@@ -232,19 +238,24 @@ def inspect_log(
     >>> summary.warnings[0].split(":")[1]
     " gravity is felt along +y (9.81 m/s2) instead of the body's +z"
     """
-    config = config or LogConfig()
+    call = "inspect_log"
+    path = as_path(path, f"{call}(path)")
+    config = as_log_config(config, call) or LogConfig()
+    given = as_calibration(calibration, call)
+    wanted = {} if topics is None else topics
     types = wanted_types(config)
     recording = scan(
-        as_path(path, "inspect_log(path)"),
+        path,
         lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP,
-        window,
+        as_window(window, call),
     )
+    require_topics(recording, wanted, config, call)
     damage = [
         *recording.corrupt,
         *([recording.ending] if recording.ending else []),
         *recording.damage.remarks,
     ]
-    choices = choose_each(recording, topics or {}, config, ROLES)
+    choices = choose_each(recording, wanted, config, ROLES)
     mounted: dict[str, str] = {}
     try:
         notes = read_notes(recording)
@@ -258,7 +269,7 @@ def inspect_log(
         assembly = Assembly(
             recording,
             {name: choices[name] for name in SEQUENCE_ROLES},
-            calibration,
+            given,
             frame,
         )
         mounted = assembly.mounted
@@ -282,7 +293,7 @@ def inspect_log(
             RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
             for c in choices.values()
         ),
-        calibration=_calibration_source(recording, mounted),
+        calibration=_calibration_source(recording, mounted, given),
         notes=notes,
         damage=tuple(damage),
         unusable=tuple(unusable),
@@ -375,8 +386,16 @@ def _header_stamps(topic: Topic) -> Ints | None:
     return stamps_ns
 
 
-def _calibration_source(recording: Recording, mounted: Mapping[str, str]) -> str:
+def _calibration_source(
+    recording: Recording,
+    mounted: Mapping[str, str],
+    given: Calibration | PartialCalibration | None,
+) -> str:
     """Source of the calibration, given the frame of each sensor whose mounting is from ``/tf_static``."""
+    if isinstance(given, Calibration):
+        return GIVEN
+    if given is not None:
+        return given.before(_calibration_source(recording, mounted, None))
     try:
         recorded = read_calibration(recording)
         has_frames = bool(static_frames(recording))

@@ -5,6 +5,7 @@ and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of
 was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md).
 """
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from sonar_graph.logs.adapters import (
     Origin,
     PositionAdapter,
     TruthAdapter,
+    as_log_config,
     changes_text,
     detection_warnings,
     shipped_like,
@@ -52,12 +54,17 @@ from sonar_graph.logs.roles import (
     SEQUENCE_ROLES,
     SONAR,
     Choice,
+    Window,
+    as_window,
     choose_topics,
+    require_topics,
     wanted_types,
 )
 from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
+    GIVEN,
     PartialCalibration,
+    as_calibration,
     gathered,
     is_described,
     mounted_by,
@@ -71,6 +78,17 @@ from sonar_graph.logs.vehicle_setup import (
 from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 
+LOG = logging.getLogger("sonar_graph.logs")
+WARNED = (
+    "log.ending",
+    "log.damage",
+    "log.start_pose",
+    "log.stamps",
+    "log.dropped",
+    "log.warnings",
+    "log.gaps",
+)
+"""Notes that `read_log` also logs: the user may have to act on them."""
 FOUND_ANEW = frozenset(
     {"log.warnings", "log.gaps", "log.noise", "log.sensors", "log.doubtful"}
 )
@@ -92,15 +110,16 @@ def read_log(
     calibration: Calibration | PartialCalibration | str | Path | None = None,
     name: str | None = None,
     topics: Mapping[str, str] | None = None,
-    config: LogConfig | None = None,
-    window: TimeWindow | None = None,
+    config: LogConfig | str | Path | None = None,
+    window: Window | None = None,
     salvage: bool = False,
     progress: Progress | None = None,
 ) -> Sequence:
     """Read a log of ROS 2 messages as a `Sequence`.
 
-    Stamps are those of the sensors' headers. The notes of the sequence, under ``log.*``, say which topic was used for
-    what, where the calibration comes from, what was left out and what looks wrong.
+    Stamps are those of the sensors' headers. The notes of the sequence, under ``log.*``, list the topics in use, the
+    source of the calibration, the rows left out and the numbers in doubt. Those of `WARNED` are also logged as warnings
+    of the logger ``sonar_graph.logs``, which Python prints where the program has set up no logging.
 
     Parameters
     ----------
@@ -116,9 +135,10 @@ def read_log(
         Topics by role (``imu``, ``dvl``, ``depth``, ``heading``, ``positions``, ``detections``, ``truth``,
         ``true_landmarks``), where several fit or none is found by type and name; they go before those of `config`.
     config
-        Description of the topics of a foreign log; `read_log_config` reads one from a TOML file.
+        Description of the topics of a foreign log, or the path of a TOML file with one.
     window
-        Part of the recording to read; ``/tf_static`` and other latched topics are read whenever recorded.
+        Part of the recording to read: a `TimeWindow`, or start and end in seconds from its beginning, ``(0, 10)``.
+        ``/tf_static`` and other latched topics are read whenever recorded.
     salvage
         Read what is whole of a file that is damaged in its middle; the note ``log.damage`` says what is lost.
     progress
@@ -132,14 +152,14 @@ def read_log(
     Raises
     ------
     MissingTopicError
-        When the log has no IMU or no DVL; listing the topics that it has.
+        When the log has no IMU or no DVL, or no topic of a name in `topics`; listing the topics that it has.
     LogError
         When the file is not MCAP, is damaged in its middle without `salvage`, has nothing in the window, or a message
         breaks its own rules.
     CalibrationError
         When the calibration in the file is invalid, or becomes so by `calibration`, or that file cannot be read.
-    TypeError
-        When `path` or `calibration` is something else.
+    ArgumentError
+        When an argument is of another kind, such as a list of topics.
 
     See Also
     --------
@@ -160,44 +180,45 @@ def read_log(
     >>> sequence.notes["log.topics"]
     'imu: /imu/data; dvl: /dvl/data; ...'
     """
-    path = as_path(path, "read_log(path)")
-    if not isinstance(calibration, Calibration | PartialCalibration | None):
-        calibration = PartialCalibration.read(
-            as_path(calibration, "read_log(path, calibration=FILE or Calibration)")
-        )
-    recording, config = _scanned(path, config, window, progress)
+    call = "read_log"
+    path = as_path(path, f"{call}(path)")
+    given = as_calibration(calibration, call)
+    part = as_window(window, call)
+    recording, config = _scanned(path, as_log_config(config, call), part, progress)
     if not salvage:
         recording.require_sound()
+    wanted = {} if topics is None else topics
+    require_topics(recording, wanted, config, call)
     left_out = leave_out_dropped(recording)
-    choices = choose_topics(recording, topics or {}, config)
-    frame = sonar_frame(recording, (topics or {}).get(SONAR), config)
-    sequence = Assembly(recording, choices, calibration, frame).sequence(name)
-    sequence.notes.update(left_out)
-    if (
-        window is not None
-        and window.start is not None
-        and recording.beginning_ns is not None
-    ):
-        late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
-        given = (
-            calibration.values if isinstance(calibration, PartialCalibration) else {}
-        )
-        recorded = (
-            None
-            if isinstance(calibration, Calibration)
-            else read_calibration(recording)
-        )
-        if (
-            late_ns > 0
-            and "start" not in given
-            and recorded is not None
-            and "start" in recorded.model_fields_set
-        ):
-            sequence.notes["log.start_pose"] = (
-                f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was "
-                "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
-            )
+    choices = choose_topics(recording, wanted, config)
+    frame = sonar_frame(recording, wanted.get(SONAR), config)
+    sequence = Assembly(recording, choices, given, frame).sequence(name)
+    sequence.notes.update(left_out | _start_note(recording, part, given))
+    for subject in WARNED:
+        if subject in sequence.notes:
+            LOG.warning("%s: %s: %s", path.name, subject, sequence.notes[subject])
     return sequence
+
+
+def _start_note(
+    recording: Recording,
+    window: TimeWindow | None,
+    given: Calibration | PartialCalibration | None,
+) -> dict[str, str]:
+    """Note about a stated start pose that is of an earlier instant than the part that was read; empty without."""
+    begin = None if window is None else window.start
+    beginning_ns = recording.beginning_ns
+    if begin is None or beginning_ns is None or isinstance(given, Calibration):
+        return {}
+    late_s = (begin.resolve(beginning_ns) - beginning_ns) * 1e-9
+    recorded = read_calibration(recording)
+    is_stated = recorded is not None and "start" in recorded.model_fields_set
+    if late_s <= 0 or not is_stated or (given and "start" in given.values):
+        return {}
+    return {
+        "log.start_pose": f"the start pose that it states is of its beginning, {late_s:.3f} s before the part that was "
+        "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
+    }
 
 
 def _scanned(
@@ -207,23 +228,21 @@ def _scanned(
     progress: Progress | None,
 ) -> tuple[Recording, LogConfig]:
     """The messages of a log that may be needed, and the description of its topics: the given one, or its own."""
+
+    def scanned(types: frozenset[str]) -> Recording:
+        def keep(kind: str) -> Keep:
+            return Keep.ALL if short_name(kind) in types else Keep.NONE
+
+        return scan(path, keep, window, progress)
+
     types = wanted_types(config or LogConfig())
-    recording = scan(
-        path,
-        lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE,
-        window,
-        progress,
-    )
-    own = recorded_config(recording) if config is None else None
-    if own is None or wanted_types(own) <= types:
-        return recording, config or own or LogConfig()
-    types = wanted_types(own)
-    return scan(
-        path,
-        lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE,
-        window,
-        progress,
-    ), own
+    recording = scanned(types)
+    if config is not None:
+        return recording, config
+    own = recorded_config(recording) or LogConfig()
+    # the types of its own topics are known only now
+    is_enough = wanted_types(own) <= types
+    return recording if is_enough else scanned(wanted_types(own)), own
 
 
 class Assembly:
@@ -298,7 +317,7 @@ class Assembly:
             else self._gathered(calibration)
         )
         if isinstance(calibration, Calibration):
-            self._notes["log.calibration"] = "given by the caller"
+            self._notes["log.calibration"] = GIVEN
         dvl = self.adapters.get("dvl")
         # wheels stop, and turn evenly
         is_held = self.calibration.odometry_interpolation == "hold-past"
@@ -375,7 +394,7 @@ class Assembly:
                 else ""
             )
         if given:
-            source = f"from {given.source}: {', '.join(given.fields()) or 'nothing'}; else {source}"
+            source = given.before(source)
         self._notes["log.calibration"] = source
         return gathered(given, recorded, mountings)
 
@@ -586,6 +605,12 @@ class Assembly:
         yield from unsaid_noise(
             {role: self.block(role) for role in NOISE_FIELDS}, only_partly=True
         )
+        sigmas = self.calibration.dvl.velocity_sigma_m_s
+        if dvl is not None and np.isnan(dvl.velocity_cov).any() and 0 in sigmas:
+            yield (
+                "dvl: velocity_sigma_m_s of the calibration is 0 on an axis, and rows have no covariance of their own: "
+                "smoothers cannot use them; give [dvl] velocity_sigma_m_s above 0 in a file for --calibration"
+            )
         stamps = [
             self._tables[role].stamps_ns
             for role in ("imu", "dvl")

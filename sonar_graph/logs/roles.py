@@ -7,7 +7,7 @@ choice comes with its reason, for notes, error messages and `inspect_log` (docs/
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.errors import ArgumentError, LogError, MissingTopicError
 from sonar_graph.logs.adapters import (
     SHIPPED,
     TRUTH_WORDS,
@@ -17,7 +17,7 @@ from sonar_graph.logs.adapters import (
     shipped_for,
 )
 from sonar_graph.logs.cdr import parse_definition, short_name
-from sonar_graph.logs.mcap import Recording, Topic
+from sonar_graph.logs.mcap import Recording, TimeWindow, Topic
 
 IMU = "sensor_msgs/msg/Imu"
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -264,6 +264,50 @@ def _only(
     return Choice(role, None, "; ".join(reasons)) if reasons else None
 
 
+Window = TimeWindow | tuple[float | str | None, float | str | None]
+"""Part of a log: also start and end alone, in seconds from its beginning or as dates; None: no limit."""
+
+
+def as_window(value: Window | None, call: str) -> TimeWindow | None:
+    """A time window; an `ArgumentError` that names the ``call`` where a value is none."""
+    if isinstance(value, TimeWindow | None):
+        return value
+    if isinstance(value, tuple | list) and len(value) == 2:
+        limits = (None if limit is None else str(limit) for limit in value)
+        return TimeWindow.parse(*limits)
+    raise ArgumentError(
+        f"{call}(path, window=(START, END)): expected two times, in seconds from the log's beginning such as (0, 10), "
+        f"not {value!r:.60}"
+    )
+
+
+def require_roles(wanted: Mapping[str, str]) -> None:
+    """Refuse topics that are chosen for roles that do not exist."""
+    if unknown := wanted.keys() - ROLES.keys():
+        raise LogError(
+            f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}"
+        )
+
+
+def require_topics(
+    recording: Recording, wanted: Mapping[str, str], config: LogConfig, call: str
+) -> None:
+    """Refuse roles that do not exist, and topics that are not in a log, by an error that lists those that are."""
+    given: object = wanted
+    if not isinstance(given, Mapping):
+        raise ArgumentError(
+            f"{call}(path, topics={{'imu': '/imu/data'}}): expected topics by role, not {type(given).__name__}"
+        )
+    require_roles(wanted)
+    for role, topic in wanted.items():
+        if topic not in recording.topics:
+            reason = f"{topic} was chosen but is not in the log"
+            images = images_alone(recording, config)
+            raise MissingTopicError(
+                _missing(recording, role, reason, images, is_needed=False)
+            )
+
+
 _OF_THE_DRIVER = (
     "stamp",
     "stamp_unit_s",
@@ -321,11 +365,8 @@ def choose_topics(
     A needed role without a topic, and a topic that is named but not there, are a MissingTopicError, which lists the
     topics that are.
     """
-    path, unknown = recording.path, wanted.keys() - ROLES.keys()
-    if unknown:
-        raise LogError(
-            f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}"
-        )
+    path = recording.path
+    require_roles(wanted)
     choices = choose_each(recording, wanted, config, roles)
     for name, choice in choices.items():
         is_required = choice.role.is_required

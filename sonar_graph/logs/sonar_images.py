@@ -8,10 +8,22 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
+from sonar_graph.files import as_path
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters import LogConfig, Refused, SonarAdapter
+from sonar_graph.logs.adapters import (
+    LogConfig,
+    Refused,
+    SonarAdapter,
+    as_log_config,
+)
 from sonar_graph.logs.mcap import Keep, Recording, TimeWindow, scan, stream
-from sonar_graph.logs.roles import SONAR, choose_each, choose_topics
+from sonar_graph.logs.roles import (
+    SONAR,
+    Window,
+    as_window,
+    choose_each,
+    choose_topics,
+)
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
@@ -187,9 +199,9 @@ def no_images(log: Path | str, window: TimeWindow | None = None) -> str:
 def read_sonar_frames(
     path: Path,
     topic: str | None = None,
-    config: LogConfig | None = None,
+    config: LogConfig | str | Path | None = None,
     *,
-    window: TimeWindow | None = None,
+    window: Window | None = None,
     salvage: bool = False,
     refused: Refused | None = None,
 ) -> Iterator[SonarFrames]:
@@ -218,7 +230,10 @@ def read_sonar_frames(
         When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
         image is not what its message says (without ``refused``). A log without sonar images gives no block.
     """
-    config, path = config or LogConfig(), Path(path)
+    call = "read_sonar_frames"
+    path = as_path(path, f"{call}(path)")
+    config = as_log_config(config, call) or LogConfig()
+    part = as_window(window, call)
     recording = scan(path, lambda _: Keep.NONE)
     choice = choose_topics(
         recording, {SONAR: topic} if topic else {}, config, (SONAR,)
@@ -228,7 +243,7 @@ def read_sonar_frames(
     for piece in stream(
         path,
         _keeping(recording.topics[choice.topic].type_name),
-        window,
+        part,
         salvage=salvage,
     ):
         if piece.name == choice.topic:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.files import text_of
+from sonar_graph.files import as_path, text_of
 from sonar_graph.logs.cdr import (
     Bytes,
     Value,
@@ -47,6 +47,8 @@ LARGEST_LEVER_M = 1000.0
 Values = Mapping[str, Any]
 OPTIONAL = {name for name, value in Calibration().model_dump().items() if value is None}
 """Fields of a calibration that may be absent."""
+GIVEN = "given by the caller"
+"""Source of a calibration that replaces that of the log."""
 MOUNTING_FIELDS = {
     "imu": "mounting",
     "dvl": "mounting",
@@ -323,6 +325,21 @@ class PartialCalibration:
     def fields(self) -> list[str]:
         """Paths of the fields that are given, such as ``dvl.mounting.translation_m``."""
         return list(_paths(self.values))
+
+    def before(self, source: str) -> str:
+        """Source of a calibration of which these fields go before those of another source."""
+        return f"from {self.source}: {', '.join(self.fields()) or 'nothing'}; else {source}"
+
+
+def as_calibration(
+    value: Calibration | PartialCalibration | str | Path | None, call: str
+) -> Calibration | PartialCalibration | None:
+    """The given fields of a calibration, also those in a file; an `ArgumentError` that names the ``call`` for others."""
+    if isinstance(value, Calibration | PartialCalibration | None):
+        return value
+    return PartialCalibration.read(
+        as_path(value, f"{call}(path, calibration=FILE or Calibration)")
+    )
 
 
 def gathered(

@@ -239,34 +239,26 @@ class CovarianceFields(Section):
     def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
         """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
-        negative = matrices[:, 0, 0] < 0
-        zero = ~matrices.any(axis=(1, 2))
-        invalid = (negative & (self.negative == "invalid")) | (
-            zero & (self.zero == "invalid")
-        )
+        is_negative = matrices[:, 0, 0] < 0
+        is_zero = ~matrices.any(axis=(1, 2))
+        is_invalid = is_negative & (self.negative == "invalid")
+        is_invalid |= is_zero & (self.zero == "invalid")
+        is_finite = np.isfinite(matrices).all(axis=(1, 2))
+        is_unknown = is_negative | is_zero | ~is_finite | _is_impossible(matrices)
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
-        unknown = (
-            negative
-            | zero
-            | ~np.isfinite(matrices).all(axis=(1, 2))
-            | _is_indefinite(matrices)
-        )
-        return np.where(unknown[:, None, None], np.nan, matrices), invalid
+        return np.where(is_unknown[:, None, None], np.nan, matrices), is_invalid
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Number of messages whose matrix is no covariance."""
-        if self.meaning == "standard deviation":
-            return
         matrices = self._matrices(table)
-        indefinite: NDArray[np.bool_] = _is_indefinite(matrices) & (
-            matrices[:, 0, 0] >= 0
-        )
-        count = np.count_nonzero(indefinite)
+        # a negative first element and zeros alone are a driver's ways to send no covariance
+        is_stated = (matrices[:, 0, 0] >= 0) & matrices.any(axis=(1, 2))
+        count = np.count_nonzero(_is_impossible(matrices) & is_stated)
         if count:
             yield (
                 f"{', '.join(self.fields)}: no covariance in {count} of {len(table)} messages, since some direction's "
-                f"variance is negative: the calibration's noise is taken there"
+                f"variance is negative or an axis' is zero: the calibration's noise is taken there"
             )
 
     def read_variance(self, table: FieldTable) -> Floats:
@@ -300,14 +292,14 @@ class CovarianceFields(Section):
         return column.reshape(-1, side, side)[:, :3, :3]
 
 
-def _is_indefinite(matrices: Floats) -> NDArray[np.bool_]:
-    """Matrices with a negative eigenvalue beyond rounding, shape (n,); none where a number is not finite."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
-    symmetric = np.where(
-        np.asarray(finite)[:, None, None], matrices + np.swapaxes(matrices, 1, 2), 0.0
-    )
-    variances: Floats = np.linalg.eigvalsh(symmetric)
-    return np.asarray(variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1))
+def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:
+    """Matrices with a zero on the diagonal or a negative eigenvalue beyond rounding, shape (n,); False for NaN."""
+    is_finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    finite = np.where(is_finite[:, None, None], matrices, np.eye(3))
+    variances: Floats = np.linalg.eigvalsh(finite + np.swapaxes(finite, 1, 2))
+    is_negative = variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1)
+    is_zero = (np.einsum("nii->ni", finite) == 0).any(axis=1)
+    return np.asarray(is_negative | is_zero)
 
 
 def _diagonal(values: Floats) -> Floats:
