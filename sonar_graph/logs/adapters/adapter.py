@@ -134,10 +134,14 @@ TimeUnit = Annotated[float, Field(gt=0, allow_inf_nan=False), _from_units(TIMES)
 class Adapter(Section):
     """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
 
-    A subclass adds the attributes of its role, names the paths that a message must have in `fields`, and gives the
-    measurements, with the number of rows left out by reason, in ``read``.
+    A subclass adds the attributes of its role, names those that hold paths in `PATHS`, and gives the measurements, with
+    the number of rows left out by reason, in ``read``.
     """
 
+    PATHS: ClassVar[tuple[str, ...]] = ()
+    """Attributes with paths that a message must have."""
+    NEEDS: ClassVar[tuple[str, ...]] = ()
+    """Arguments of ``read`` beside the messages (`rows_of`)."""
     reads_table: ClassVar[bool] = True
     """False where ``read`` takes the topic, because its messages have lists of different lengths."""
     type: str
@@ -163,7 +167,7 @@ class Adapter(Section):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have, except for the stamp's."""
-        return field_paths()
+        return field_paths(*(getattr(self, name) for name in self.PATHS))
 
     def missing_in(self, definition: Struct) -> list[str]:
         """Paths of `fields` that a message type does not have."""
@@ -200,10 +204,24 @@ class Adapter(Section):
         yield from ()
 
 
-def field_paths(*values: str | Iterable[str] | None) -> Iterator[str]:
+class PathSection(Section):
+    """Section of an adapter with paths of its own."""
+
+    PATHS: ClassVar[tuple[str, ...]]
+    """Attributes with paths that a message must have."""
+
+    def paths(self) -> Iterator[str]:
+        """Paths that a message must have."""
+        return field_paths(*(getattr(self, name) for name in self.PATHS))
+
+
+def field_paths(*values: str | Iterable[str] | PathSection | None) -> Iterator[str]:
     """Paths in attributes of an adapter, each one path, several, or none."""
     for value in values:
-        yield from (value,) if isinstance(value, str) else value or ()
+        if isinstance(value, PathSection):
+            yield from value.paths()
+        else:
+            yield from (value,) if isinstance(value, str) else value or ()
 
 
 def leaf_fields(
@@ -223,8 +241,10 @@ ROUNDING = 1e-6
 """Part of the largest eigenvalue by which single precision may leave the smallest below zero."""
 
 
-class CovarianceFields(Section):
+class CovarianceFields(PathSection):
     """Fields of a covariance, and the meaning of their numbers."""
+
+    PATHS = ("fields",)
 
     fields: tuple[str, ...] = Field(min_length=1, max_length=3)
     """One field: a row-major matrix (3x3, or 6x6 of which the first three rows count), or one number for all axes.

@@ -15,21 +15,20 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from sonar_graph.calibration import Section
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
     CovarianceFields,
     LengthScale,
+    PathSection,
     axes_matrix,
-    field_paths,
 )
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
-    fit_rows,
+    fit_block,
     not_finite,
 )
 from sonar_graph.logs.mcap import Keep, Topic
@@ -51,6 +50,9 @@ _WHOLE_CIRCLE = 2 * np.pi + 0.1
 
 class HeadingAdapter(Adapter):
     """Yaw of the body, from an orientation or from one angle."""
+
+    PATHS = ("orientation", "yaw", "variance", "status")
+    NEEDS = ("body_R_sensor",)
 
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w: the sensor in the world."""
@@ -74,11 +76,6 @@ class HeadingAdapter(Adapter):
         if (self.orientation is None) == (self.yaw is None):
             raise ValueError("give either orientation = [x, y, z, w] or yaw")
         return self
-
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        variance = self.variance.fields if self.variance else None
-        return field_paths(self.orientation, self.yaw, variance, self.status)
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
@@ -150,15 +147,8 @@ class HeadingAdapter(Adapter):
             if self.variance
             else np.full(len(table), np.nan)
         )
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        if not rows.size:
-            return None, dropped
-        yaw_rad = (
-            yaw_rad[rows] + self.yaw_offset_rad
-            if self.yaw_offset_rad
-            else yaw_rad[rows]
-        )
-        return Heading(table.stamps_ns[rows], yaw_rad, np.sqrt(variance[rows])), dropped
+        yaw_rad = yaw_rad + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad
+        return fit_block(Heading, table.stamps_ns, faults, yaw_rad, np.sqrt(variance))
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
@@ -181,8 +171,10 @@ class HeadingAdapter(Adapter):
                 )
 
 
-class GeodeticFields(Section):
+class GeodeticFields(PathSection):
     """Fields of a position on the Earth, and the origin of the world."""
+
+    PATHS = ("latitude", "longitude", "height", "status")
 
     latitude: str
     """Degrees, north."""
@@ -196,10 +188,6 @@ class GeodeticFields(Section):
     """Field that is negative where there is no fix."""
     origin_deg_m: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
-
-    def paths(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        return field_paths(self.latitude, self.longitude, self.height, self.status)
 
     def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
         """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
@@ -289,6 +277,9 @@ class GeodeticFields(Section):
 class PositionAdapter(Adapter):
     """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
 
+    PATHS = ("geodetic", "position", "covariance", "covariance_type")
+    NEEDS = ("origin", "sigma_m")
+
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
@@ -311,12 +302,6 @@ class PositionAdapter(Adapter):
                 "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
             )
         return self
-
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        geodetic = self.geodetic.paths() if self.geodetic else None
-        covariance = self.covariance.fields if self.covariance else None
-        return field_paths(geodetic, self.position, covariance, self.covariance_type)
 
     def read(
         self,
@@ -361,13 +346,7 @@ class PositionAdapter(Adapter):
         flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
         flat[:, 2, :], flat[:, :, 2], flat[:, 2, 2] = 0.0, 0.0, UNMEASURED_M2
         covariances = np.where(has_height[:, None, None], covariances, flat)
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        fixes = (
-            PositionFixes(table.stamps_ns[rows], positions[rows], covariances[rows])
-            if rows.size
-            else None
-        )
-        return fixes, dropped
+        return fit_block(PositionFixes, table.stamps_ns, faults, positions, covariances)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about matrices that are no covariances, and places that are not on the Earth."""

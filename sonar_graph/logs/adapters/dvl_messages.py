@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from sonar_graph.calibration import Section
 from sonar_graph.devices import velocity_of_beams
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     CovarianceFields,
+    PathSection,
     SpeedScale,
-    field_paths,
     turn,
     turn_covariances,
 )
@@ -31,7 +30,7 @@ from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
-    fit_rows,
+    fit_block,
     not_finite,
 )
 from sonar_graph.measurements import Dvl, Floats, Ints
@@ -40,8 +39,10 @@ FEWEST_BEAMS = 3
 """Beams needed for a velocity."""
 
 
-class BeamGeometry(Section):
+class BeamGeometry(PathSection):
     """Directions of the beams, and their fields where the velocity is to be computed from them."""
+
+    PATHS = ("velocity", "valid")
 
     tilt_deg: float = Field(gt=0, lt=90)
     """Angle between beams and the instrument's vertical: 30 (RDI), 25 (Nortek), 22.5 (Water Linked)."""
@@ -135,6 +136,15 @@ Number = bool | int | float
 class DvlAdapter(Adapter):
     """Velocity over the bottom in the instrument's frame."""
 
+    PATHS = (
+        "velocity",
+        "covariance",
+        "valid_where",
+        "good_beams",
+        "altitude",
+        "beams",
+    )
+
     velocity: tuple[str, str, str] | None = None
     """Fields of the velocity along x, y, z; not used where `beams` have a velocity."""
     scale: SpeedScale = 1.0
@@ -169,13 +179,6 @@ class DvlAdapter(Adapter):
             )
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
-        covariance = self.covariance.fields if self.covariance else None
-        marks = (self.valid_where, self.good_beams, self.altitude)
-        return field_paths(self.velocity, covariance, *marks, *beams)
-
     def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
         faults: dict[str, NDArray[np.bool_]] = {}
@@ -198,14 +201,9 @@ class DvlAdapter(Adapter):
         faults |= self._marked_invalid(table)
         faults[NOT_FINITE] = not_finite(velocity)
         faults |= self._signs_of_no_lock(table, velocity)
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        velocity, covariance = (
-            turn(self.rotation, velocity[rows]),
-            turn_covariances(self.rotation, covariance[rows]),
-        )
-        return (
-            Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None
-        ), dropped
+        velocity = turn(self.rotation, velocity)
+        covariance = turn_covariances(self.rotation, covariance)
+        return fit_block(Dvl, table.stamps_ns, faults, velocity, covariance)
 
     def _filled(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
         """Masks of valid messages by the fields of `valid_where` that the driver fills."""

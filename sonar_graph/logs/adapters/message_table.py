@@ -2,15 +2,16 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
-from sonar_graph.measurements import NS_PER_S, Ints
+from sonar_graph.measurements import NS_PER_S, Block, Ints
 
+Rows = TypeVar("Rows", bound=Block)
 Dropped = dict[str, int]
 """Number of rows left out, by reason."""
 NOT_FINITE = "with values that are not finite or beyond 1e15"
@@ -182,3 +183,17 @@ def fit_rows(
         counts[SAME_STAMP] = int(np.count_nonzero(again))
         rows = rows[~again]
     return rows, {fault: count for fault, count in counts.items() if count}
+
+
+def fit_block(
+    kind: type[Rows],
+    stamps_ns: Ints,
+    faults: Mapping[str, NDArray[np.bool_]],
+    *columns: NDArray[Any],
+    unique: bool = True,
+) -> tuple[Rows | None, Dropped]:
+    """Block of the rows that `fit_rows` chooses, None without any, and the number of the others by fault."""
+    rows, dropped = fit_rows(stamps_ns, faults, unique=unique)
+    if not rows.size:
+        return None, dropped
+    return kind(stamps_ns[rows], *(column[rows] for column in columns)), dropped

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters.adapter import Adapter, field_paths
+from sonar_graph.logs.adapters.adapter import Adapter
 from sonar_graph.logs.adapters.message_table import MessageTable
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
@@ -41,6 +41,18 @@ class _Images(NamedTuple):
 class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
+    PATHS = (
+        "data",
+        "ranges",
+        "range_resolution",
+        "bearings",
+        "sample_type",
+        "sample_bytes",
+        "big_endian",
+        "row_gains",
+        "row_bytes",
+        "directions",
+    )
     reads_table = False
     data: str
     """Field with the image's bytes."""
@@ -77,20 +89,6 @@ class SonarAdapter(Adapter):
         if (self.bearings is None) == (self.directions is None):
             raise ValueError("give either bearings or directions")
         return self
-
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        single = (
-            self.data,
-            self.ranges,
-            self.range_resolution,
-            self.bearings,
-            self.sample_type,
-            self.sample_bytes,
-        )
-        return field_paths(
-            *single, self.big_endian, self.row_gains, self.row_bytes, self.directions
-        )
 
     def read(
         self, topic: Topic, refused: Refused | None = None

@@ -26,7 +26,6 @@ from sonar_graph.logs.adapters.adapter import (
     LengthScale,
     RateScale,
     axes_matrix,
-    field_paths,
     turn,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
@@ -36,6 +35,7 @@ from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
+    fit_block,
     fit_rows,
     not_finite,
 )
@@ -50,6 +50,13 @@ LEAST_MOVE_M = 1.0
 
 class ImuAdapter(Adapter):
     """Angular rate and specific force."""
+
+    PATHS = (
+        "angular_velocity",
+        "linear_acceleration",
+        "angular_velocity_status",
+        "linear_acceleration_status",
+    )
 
     angular_velocity: Paths
     """Fields of the rates about x, y, z."""
@@ -68,11 +75,6 @@ class ImuAdapter(Adapter):
     unfilled: Literal["all", "each"] = "all"
     """"all": zeros are not measured where all messages have them; "each": wherever a message has them."""
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        status = (self.angular_velocity_status, self.linear_acceleration_status)
-        return field_paths(self.angular_velocity, self.linear_acceleration, *status)
-
     def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
@@ -86,14 +88,10 @@ class ImuAdapter(Adapter):
             unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force
         )
         is_unmeasured = _is_marked(table, self.angular_velocity_status, rate)
-        rows, dropped = fit_rows(
-            table.stamps_ns,
-            {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)},
-            unique=True,
-        )
-        rate = turn(self.rotation, rate[rows])
-        force = turn(self.rotation, force[rows])
-        return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
+        faults = {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)}
+        rate = turn(self.rotation, rate)
+        force = turn(self.rotation, force)
+        return fit_block(Imu, table.stamps_ns, faults, rate, force)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about values that the driver does not fill, or fills with what is no number."""
@@ -188,6 +186,9 @@ def _is_denied(status: np.ndarray, values: Floats) -> bool:
 class DepthAdapter(Adapter):
     """Height of the pressure port, from a pressure or from a field in metres."""
 
+    PATHS = ("pressure", "height", "variance")
+    NEEDS = ("gravity_m_s2",)
+
     pressure: str | None = None
     """Field with a pressure."""
     height: str | None = None
@@ -206,12 +207,6 @@ class DepthAdapter(Adapter):
         if (self.pressure is None) == (self.height is None):
             raise ValueError("give either pressure or height")
         return self
-
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        return field_paths(
-            self.pressure, self.height, self.variance.fields if self.variance else None
-        )
 
     def read(
         self, table: FieldTable, gravity_m_s2: float
@@ -232,14 +227,8 @@ class DepthAdapter(Adapter):
             variance_m2 = variance_m2 / pascals_per_metre**2
         else:
             z_m = table.column(str(self.height)) * self.scale
-        rows, dropped = fit_rows(
-            table.stamps_ns, {NOT_FINITE: not_finite(z_m)}, unique=True
-        )
-        return (
-            Depth(table.stamps_ns[rows], z_m[rows], variance_m2[rows])
-            if rows.size
-            else None
-        ), dropped
+        faults = {NOT_FINITE: not_finite(z_m)}
+        return fit_block(Depth, table.stamps_ns, faults, z_m, variance_m2)
 
     def assumption(self, gravity_m_s2: float) -> str | None:
         """Formula from pressure to height for the notes; None where the message gives a height."""
@@ -266,6 +255,9 @@ class TruthAdapter(Adapter):
 
     From world and body axes of the driver (``w``, ``b``) to those of this package: ``R = enu_R_w w_R_b ours_R_b^T``.
     """
+
+    PATHS = ("position", "geodetic", "orientation", "rpy", "covariance")
+    NEEDS = ("origin",)
 
     frame_id_field: str | None = None
     position: Paths | None = None
@@ -298,13 +290,6 @@ class TruthAdapter(Adapter):
                 "give either orientation = [x, y, z, w] or rpy = [roll, pitch, yaw]"
             )
         return self
-
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        geodetic = self.geodetic.paths() if self.geodetic else None
-        return field_paths(
-            self.position, geodetic, self.orientation, self.rpy, self.covariance
-        )
 
     def read(
         self, table: FieldTable, origin: Origin | None = None
