@@ -110,7 +110,9 @@ class _AmendedCopy:
         anew: Mapping[str, str],
         added: Set[str],
     ) -> None:
-        self._source, self._anew, self._taken = source, anew, set(added - anew.keys())
+        self._source = source
+        self._anew = anew
+        self._taken = set(added - anew.keys())
         self._passages = [
             (log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs
         ]
@@ -127,7 +129,9 @@ class _AmendedCopy:
         metadata: Mapping[str, Mapping[str, str]],
         salvage: bool,
     ) -> Amended:
-        writer, amended, damage = self._writer, self._amended, Damage()
+        writer = self._writer
+        amended = self._amended
+        damage = Damage()
         with self._passages[0][0].path.open("rb") as stream:
             try:
                 head = next(iter(StreamReader(stream).records), None)
@@ -207,7 +211,8 @@ class _AmendedCopy:
                 np.arange(len(pieces)), [len(piece.found.sizes) for piece in pieces]
             )
             for row in np.lexsort((at, time_ns)).tolist():
-                begin, topic = int(at[row]), pieces[of[row]].topic.name
+                begin = int(at[row])
+                topic = pieces[of[row]].topic.name
                 payload = bytes(data[begin : begin + int(size[row])])
                 # before each payload is the head of its record
                 number, published_ns = (

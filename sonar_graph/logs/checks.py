@@ -72,7 +72,8 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     unset = (stamps_ns == 0) & (log_times_ns != 0)
     if unset.any():
         yield f"{_count(int(unset.sum()), 'message')} without a stamp: the time of recording is used"
-    stamps_ns, log_times_ns = stamps_ns[~unset], log_times_ns[~unset]
+    stamps_ns = stamps_ns[~unset]
+    log_times_ns = log_times_ns[~unset]
     if len(stamps_ns) < 2:
         return
     steps_ns = np.diff(stamps_ns)
@@ -140,10 +141,13 @@ def _dvl_gap_warnings(
 ) -> Iterator[str]:
     """Gaps of the Doppler log, grouped by how estimators bridge them."""
     partial = is_partial(dvl)
-    whole_ns, partial_ns = dvl.stamps_ns[~partial], dvl.stamps_ns[partial]
+    whole_ns = dvl.stamps_ns[~partial]
+    partial_ns = dvl.stamps_ns[partial]
     if len(whole_ns) and whole_ns[0] > start_ns:
         yield f"dvl: no whole velocity until {(whole_ns[0] - start_ns) * 1e-9:.3f} s after the start: too few beams"
-    by_beams, by_force, by_walk = [], [], []
+    by_beams = []
+    by_force = []
+    by_walk = []
     for gap in _gaps_where(np.diff(whole_ns) > longest_ns, whole_ns).tolist():
         first, last = np.searchsorted(partial_ns, gap, side="right")
         samples = imu.between(*gap)
@@ -176,10 +180,8 @@ def imu_holes(stamps_ns: Ints) -> Ints:
     An interval is a hole when it is longer than the median of the intervals before it by a factor.
     """
     intervals = np.diff(stamps_ns)
-    shorter, before = (
-        np.zeros(len(intervals)),
-        np.minimum(np.arange(len(intervals)), ROWS_BEFORE),
-    )
+    shorter = np.zeros(len(intervals))
+    before = np.minimum(np.arange(len(intervals)), ROWS_BEFORE)
     for lag in range(1, min(ROWS_BEFORE + 1, len(intervals))):
         shorter[lag:] += HOLE_INTERVALS * intervals[:-lag] < intervals[lag:]
     is_hole = (intervals > SHORTEST_HOLE_S * 1e9) & (2 * shorter >= before)
@@ -235,10 +237,8 @@ def gravity_warning(
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None
     axis = int(np.argmax(np.abs(typical)))
-    sign, rotation = (
-        ("-" if typical[axis] < 0 else "+"),
-        _ROTATIONS.get((axis, bool(typical[axis] < 0))),
-    )
+    sign = "-" if typical[axis] < 0 else "+"
+    rotation = _ROTATIONS.get((axis, bool(typical[axis] < 0)))
     advice = 'give rotation = "frd", or linear_acceleration_scale = -1 where only the sign is wrong'
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
@@ -254,10 +254,8 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     """
     # a clock may have been set meanwhile
     spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]
-    first_ns, last_ns = (
-        max(first for first, _ in spans_ns),
-        min(last for _, last in spans_ns),
-    )
+    first_ns = max(first for first, _ in spans_ns)
+    last_ns = min(last for _, last in spans_ns)
     if (last_ns - first_ns) * 1e-9 > len(imu):
         return None
     edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)
@@ -292,7 +290,8 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
         apart[axes] = 1e3 * float(
             np.sqrt(np.median(np.sum((up[1:] - carried) ** 2, axis=1)))
         )
-    best, as_is_mrad = min(apart, key=apart.__getitem__), apart["x, y, z"]
+    best = min(apart, key=apart.__getitem__)
+    as_is_mrad = apart["x, y, z"]
     if not apart[best] < as_is_mrad / MOST_IMPROVED:
         return None
     return (
@@ -369,7 +368,8 @@ def stuck_warning(
     ):
         if not chosen.any():
             continue
-        begin, end = first[chosen], last[chosen]
+        begin = first[chosen]
+        end = last[chosen]
         rows = end - begin + 1
         times = f"{_longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))} s after the first"
         more = (

@@ -263,7 +263,9 @@ def inspect_log(
         notes = {}
         damage.append(str(error))
     summaries = tuple(_summarise(topic) for topic in recording.topics.values())
-    left_out, warnings, unusable = list[str](), list[str](), list[str]()
+    left_out = list[str]()
+    warnings = list[str]()
+    unusable = list[str]()
     try:
         frame = sonar_frame(recording, choices[SONAR].topic, config)
         assembly = Assembly(
@@ -278,13 +280,15 @@ def inspect_log(
         pass  # `calibration` says so
     except SonarGraphError as error:
         unusable.append(str(error))
-    sonar, sonar_fault = None, False
+    sonar = None
+    sonar_fault = False
     if (sonar_topic := choices[SONAR].topic) is not None:
         try:
             frames = next(read_sonar_frames(recording.path, sonar_topic, config), None)
             sonar = describe_frames(frames) if frames else None
         except SonarGraphError as error:
-            sonar, sonar_fault = f"cannot be read: {error}", True
+            sonar = f"cannot be read: {error}"
+            sonar_fault = True
     return LogSummary(
         path=recording.path,
         name=recorded_name(recording),
@@ -306,7 +310,8 @@ def inspect_log(
 
 
 def _summarise(topic: Topic) -> TopicSummary:
-    header_ns, log_times_ns = _header_stamps(topic), topic.log_times_ns
+    header_ns = _header_stamps(topic)
+    log_times_ns = topic.log_times_ns
     if not len(topic):  # none of its messages is what its definition says
         faults = "has " + ", ".join(
             f"{count} messages {fault}" for fault, count in topic.unsound.items()
@@ -323,7 +328,8 @@ def _summarise(topic: Topic) -> TopicSummary:
             "log",
             refusal=faults,
         )
-    stamps_ns, lag_s = np.sort(log_times_ns), None
+    stamps_ns = np.sort(log_times_ns)
+    lag_s = None
     if header_ns is not None:
         stamps_ns = np.sort(np.where(header_ns == 0, log_times_ns, header_ns))
         stamped = (header_ns != 0) | (log_times_ns == 0)
@@ -427,7 +433,8 @@ def starting_config(
         f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."
     ]
     for choice in choices:
-        role, table = choice.role.name, config.table(choice.role.name)
+        role = choice.role.name
+        table = config.table(choice.role.name)
         named = choice.candidates or choice.could_be
         if choice.topic is not None and choice.adapter is not None:
             topic = recording.topics[choice.topic]

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 
 DROPPED_TOPIC = "/sonar_graph/dropped"
 CHUNK_BYTES = 1 << 20
-LIVE_RATE, LATENESS = "live.rate_hz", "live.lateness_s"
+LIVE_RATE = "live.rate_hz"
+LATENESS = "live.lateness_s"
 """Notes that say how often the live estimator was asked, and its lateness budget."""
 NEWEST_FRAMES = "live.newest_frames_ns"
 """Note with the log time of the newest transforms that the calibration was gathered from; later ones did not count."""
@@ -182,7 +183,8 @@ class LiveRecord:
             When the calibration in the record is invalid.
         """
         recording = scan(path, lambda _: Keep.NONE)
-        recorded, config = read_calibration(recording), recorded_config(recording)
+        recorded = read_calibration(recording)
+        config = recorded_config(recording)
         if recorded is None or config is None:
             return given
         values = {

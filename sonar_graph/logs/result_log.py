@@ -94,7 +94,8 @@ def write_result(
         When a file cannot be written, or a stamp does not fit into a ROS 2 message.
     """
     sources = dict(zip(source_names(estimates), estimates.values(), strict=True))
-    truth, landmarks = sequence.truth, sequence.true_landmarks
+    truth = sequence.truth
+    landmarks = sequence.true_landmarks
     drawn = [block.positions for estimate in estimates.values() for block in estimate]
     drawn += [block.positions for block in (truth, landmarks) if block is not None]
     scene = viewer.Scene.around(drawn)
@@ -159,7 +160,8 @@ def _estimator(
         messages.append(
             viewer.position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour)
         )
-        first_ns, last_ns = int(causal.stamps_ns[0]), int(causal.stamps_ns[-1])
+        first_ns = int(causal.stamps_ns[0])
+        last_ns = int(causal.stamps_ns[-1])
         # the path so far, now and then, and thinned: all of them together would grow with the square of time
         period_ns = max(_PATH_PERIOD_NS, (last_ns - first_ns) // _MOST_CAUSAL_PATHS)
         thinned = _thinned(

@@ -114,7 +114,8 @@ class Choice:
 
     def advice(self) -> str:
         """Advice to choose one of several topics, on the command line, in Python and in a log configuration."""
-        role, topic = self.role.name, self.candidates[0]
+        role = self.role.name
+        topic = self.candidates[0]
         return f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
 
 
@@ -180,10 +181,12 @@ def choose_topic(
     A topic that the user ``wanted`` goes before that of the configuration, and this before a search by type. A
     configuration that names fields which the messages do not have is refused.
     """
-    table, topics = config.table(role.name), recording.topics
+    table = config.table(role.name)
+    topics = recording.topics
     if table.get("use") is False and wanted is None:
         return Choice(role, None, f"switched off in {config.source}", is_off=True)
-    named, asked = wanted or table.get("topic"), table.get("type")
+    named = wanted or table.get("topic")
+    asked = table.get("type")
     if named:
         meant = [topics[named]] if named in topics else []
         adapter = adapter_for(role, meant[0], config) if meant else "is not in the log"
@@ -333,7 +336,8 @@ def choose_each(
         name: choose_topic(ROLES[name], recording, config, wanted.get(name))
         for name in roles
     }
-    imu, heading = choices.get("imu"), choices.get("heading")
+    imu = choices.get("imu")
+    heading = choices.get("heading")
     if imu is None or imu.topic is None or heading is None:
         return choices
     if imu.topic in heading.candidates:

@@ -170,7 +170,8 @@ def joined_calibration(
     What the user gives goes before both. The sonar's mounting is that of the navigation's record or ``/tf_static``, or
     else that of the images'; where nothing states one, none is stated. ``topic`` is that of the images.
     """
-    known, own = recorded_fields(navigation), recorded_fields(images).get(SONAR, {})
+    known = recorded_fields(navigation)
+    own = recorded_fields(images).get(SONAR, {})
     better = {name: own[name] for name in OF_THE_IMAGES if name in own}
     frame = sonar_frame(scan(images, lambda _: Keep.NONE), topic)
     found = None if frame is None else static_mounting(navigation, frame)

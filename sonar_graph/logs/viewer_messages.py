@@ -37,11 +37,14 @@ from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.states import LandmarkMap, Trajectory
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
-SPHERE, TEXT_VIEW_FACING = 2, 9
+SPHERE = 2
+TEXT_VIEW_FACING = 9
 UNKNOWN_DIAMETER_M = 0.2
 """Diameter of the sphere that is drawn for an unknown covariance."""
 _SMALLEST_DIAMETER_M = 1e-3
-ELLIPSOID, UNKNOWN, IDENTITY = "ellipsoid_95_percent", "covariance_unknown", "identity"
+ELLIPSOID = "ellipsoid_95_percent"
+UNKNOWN = "covariance_unknown"
+IDENTITY = "identity"
 _FAINT = 0.35
 _SIGMAS = math.sqrt(chi_square_quantile(0.95, 3))
 Colour = tuple[float, float, float, float]
@@ -149,7 +152,8 @@ def _marker_columns(
 
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_FLOAT32, _FLOAT64 = 7, 8
+_FLOAT32 = 7
+_FLOAT64 = 8
 """Types of a ``sensor_msgs/PointField``."""
 _NUMBERS = ("id", *LANDMARK_COLUMNS[4:])
 POINT = np.dtype([("xyz", "<f4", 3), ("", "<f4"), ("numbers", "<f8", len(_NUMBERS))])
@@ -210,7 +214,8 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
 
 
 PATH = "nav_msgs/msg/Path"
-FOXGLOVE_SUFFIX, RVIZ_SUFFIX = ".foxglove.json", ".rviz"
+FOXGLOVE_SUFFIX = ".foxglove.json"
+RVIZ_SUFFIX = ".rviz"
 _PLOTS = {
     "Plot!height": ("pose.pose.position.z", ("/pose", "/ground_truth/odometry")),
     "Plot!variance": ("pose.covariance[0]", ("/pose",)),
@@ -233,7 +238,8 @@ class Scene:
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return cls((0.0, 0.0, 0.0), 1.0)
-        low, high = points.min(axis=0), points.max(axis=0)
+        low = points.min(axis=0)
+        high = points.max(axis=0)
         x, y, z = np.round((low + high) / 2, 3).tolist()
         return cls((x, y, z), max(float((high - low).max()), 1.0))
 
@@ -371,7 +377,8 @@ def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     if pictures := [
         layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE
     ]:
-        panel, beside = "Image!pictures", layout["layout"]
+        panel = "Image!pictures"
+        beside = layout["layout"]
         panels[panel] = {"imageMode": {"imageTopic": pictures[0]}}
         plots = beside["second"]
         beside["second"] = {

@@ -339,10 +339,8 @@ class PositionAdapter(Adapter):
         if self.position is not None:
             covariances = covariances * self.scale**2
         if self.position is not None and self.world == "ned":
-            positions, covariances = (
-                positions @ ENU_R_NED.T,
-                ENU_R_NED @ covariances @ ENU_R_NED.T,
-            )
+            positions = positions @ ENU_R_NED.T
+            covariances = ENU_R_NED @ covariances @ ENU_R_NED.T
         flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
         flat[:, 2, :], flat[:, :, 2], flat[:, 2, 2] = 0.0, 0.0, UNMEASURED_M2
         covariances = np.where(has_height[:, None, None], covariances, flat)

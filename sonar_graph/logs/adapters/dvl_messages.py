@@ -59,8 +59,10 @@ class BeamGeometry(PathSection):
 
     def directions(self) -> Floats:
         """Unit vectors, shape (beams, 3), z down."""
-        tilt, azimuth = np.radians(self.tilt_deg), np.radians(self.azimuth_deg)
-        across, down = np.sin(tilt), np.full(azimuth.shape, np.cos(tilt))
+        tilt = np.radians(self.tilt_deg)
+        azimuth = np.radians(self.azimuth_deg)
+        across = np.sin(tilt)
+        down = np.full(azimuth.shape, np.cos(tilt))
         return np.column_stack(
             [across * np.cos(azimuth), across * np.sin(azimuth), down]
         )

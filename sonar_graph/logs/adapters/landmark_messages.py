@@ -146,16 +146,15 @@ class DetectionListsAdapter(Adapter):
 
     def _rows(self, topic: Topic, group: Messages, log_times_ns: Ints) -> _Rows:
         frames, count = group["range_m"].shape
-        ids, probabilities = group["candidate_ids"], group["id_probability"]
+        ids = group["candidate_ids"]
+        probabilities = group["id_probability"]
         # not in old logs
         tracks = (
             group["track"] if "track" in group.layout.columns else np.empty((frames, 0))
         )
         where = f"message {group.rows[0]} has {count} ranges"
-        azimuths, covariances = (
-            group["azimuth_rad"].shape[1],
-            group["covariance"].shape[1],
-        )
+        azimuths = group["azimuth_rad"].shape[1]
+        covariances = group["covariance"].shape[1]
         if (azimuths, covariances, ids.shape[1] % count) != (
             count,
             4 * count,
@@ -169,7 +168,8 @@ class DetectionListsAdapter(Adapter):
             raise topic.error(
                 f"{where} and {tracks.shape[1]} tracks; expected as many, or none"
             )
-        total, candidates = frames * count, ids.shape[1] // count
+        total = frames * count
+        candidates = ids.shape[1] // count
         return _Rows(
             np.repeat(group.rows, count),
             np.repeat(header_stamps_ns(group, log_times_ns), count),
@@ -245,21 +245,20 @@ class DetectionArrayAdapter(Adapter):
     def _rows(self, topic: Topic, group: Messages) -> _Rows:
         """Every detection, with the results of each at its own places; NaN: unknown."""
         counts = np.array(group.lengths("detections.results"), np.int64)
-        n, m, k = len(group), len(counts), max(1, int(counts.max()))
-        detection, result = (
-            np.repeat(np.arange(m), counts),
-            np.concatenate([np.arange(c) for c in counts]).astype(int),
-        )
-        scores, ids = np.zeros((n, m, k)), np.full((n, m, k), -1, np.int64)
+        n = len(group)
+        m = len(counts)
+        k = max(1, int(counts.max()))
+        detection = np.repeat(np.arange(m), counts)
+        result = np.concatenate([np.arange(c) for c in counts]).astype(int)
+        scores = np.zeros((n, m, k))
+        ids = np.full((n, m, k), -1, np.int64)
         scores[:, detection, result] = group[_SCORE]
         names = group.strings(_CLASS)
         ids[:, detection, result] = [
             [self._identity(topic, name) for name in message] for message in names
         ]
-        positions, covariances = (
-            np.full((n, m, 3), np.nan),
-            np.full((n, m, 3, 3), np.nan),
-        )
+        positions = np.full((n, m, 3), np.nan)
+        covariances = np.full((n, m, 3, 3), np.nan)
         if self.position == "bbox":
             positions[:] = np.stack(
                 [group[f"{_CENTRE}.{axis}"] for axis in "xyz"], axis=-1
@@ -299,7 +298,8 @@ def range_and_azimuth(
 ) -> tuple[Floats, Floats, Floats]:
     """Range, azimuth and their covariance, shapes (n,), (n,) and (n, 2, 2), from positions and theirs."""
     x, y, _ = positions.T
-    ranges, across_squared = np.linalg.norm(positions, axis=1), x**2 + y**2
+    ranges = np.linalg.norm(positions, axis=1)
+    across_squared = x**2 + y**2
     jacobians = np.zeros((len(positions), 2, 3))
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobians[:, 0] = positions / ranges[:, None]
@@ -323,17 +323,16 @@ class LandmarkMapAdapter(Adapter):
         ids, position, covariance = (
             last[name][-1] for name in ("ids", "position", "covariance")
         )
-        count, different = len(ids), len(np.unique(ids))
+        count = len(ids)
+        different = len(np.unique(ids))
         if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
             raise topic.error(
                 f"{count} ids ({different} different), {len(position)} position and {len(covariance)} covariance "
                 f"elements; expected n different, 3n and 9n"
             )
         order = np.argsort(ids)
-        positions, covariances = (
-            position.reshape(-1, 3)[order],
-            covariance.reshape(-1, 3, 3)[order],
-        )
+        positions = position.reshape(-1, 3)[order]
+        covariances = covariance.reshape(-1, 3, 3)[order]
         return LandmarkMap(ids[order].astype(np.int64), positions, covariances), {}
 
 
@@ -344,10 +343,8 @@ def detection_warnings(
 
     The odometry lasts from ``first_ns`` to ``last_ns``.
     """
-    is_range, is_azimuth = (
-        possible_ranges(detections.range_m),
-        np.abs(detections.azimuth_rad) <= FULL_TURN_RAD,
-    )
+    is_range = possible_ranges(detections.range_m)
+    is_azimuth = np.abs(detections.azimuth_rad) <= FULL_TURN_RAD
     faults = {
         "a range that is not above 0 and at most 100 km": ~is_range,
         "a covariance that is not positive definite": is_range

@@ -145,10 +145,8 @@ class LandmarkRowsAdapter(Adapter):
 
     def read(self, table: FieldTable) -> tuple[LandmarkMap | None, Dropped]:
         """Map of the rows, of which each has another identity."""
-        ids, positions = (
-            _whole(table, self.id, -1),
-            table.beside(self.position) * self.scale,
-        )
+        ids = _whole(table, self.id, -1)
+        positions = table.beside(self.position) * self.scale
         positions = positions @ ENU_R_NED.T if self.world == "ned" else positions
         fit = (ids >= 0) & ~not_finite(positions)
         dropped: Dropped = (

@@ -76,7 +76,8 @@ class MessageTable(FieldTable):
         stamp_unit_s: float = 1.0,
         stamp_offset_s: float = 0.0,
     ) -> None:
-        self.topic, self.source = topic, f"topic {topic.name}"
+        self.topic = topic
+        self.source = f"topic {topic.name}"
         self.groups = topic.messages()
         if not self.groups:
             faults = ", ".join(

@@ -125,7 +125,9 @@ class SonarAdapter(Adapter):
         )
         within = np.concatenate([np.arange(len(images.rows)) for images in blocks])
         order = np.argsort(rows)
-        rows, block, within = rows[order], block[order], within[order]
+        rows = rows[order]
+        block = block[order]
+        within = within[order]
         begins = (
             np.flatnonzero((np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0))
             + 1
@@ -214,7 +216,8 @@ class SonarAdapter(Adapter):
                 )
         dtype = np.dtype((">" if big_endian > 0 else "<") + name)
         data = np.ascontiguousarray(data).view(np.uint8)
-        size, head = data.shape[1], _GAIN_BYTES if row_gains > 0 else 0
+        size = data.shape[1]
+        head = _GAIN_BYTES if row_gains > 0 else 0
         if self.image_order == "range-major":
             used = head + beams * dtype.itemsize
             row_bytes = row_bytes if row_bytes > 0 else used

@@ -321,14 +321,16 @@ class TruthAdapter(Adapter):
             return None, dropped
         # unit quaternions keep every bit
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
-        positions, quaternions = positions[rows], (quaternions / scale[:, None])[rows]
+        positions = positions[rows]
+        quaternions = (quaternions / scale[:, None])[rows]
         enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
         if self.world != "enu" or self.rotation != "flu":
             matrices = SpatialRotation.from_quat(quaternions).as_matrix()
             turned = SpatialRotation.from_matrix(
                 enu_R_world @ matrices @ axes_matrix(self.rotation).T
             )
-            positions, quaternions = positions @ enu_R_world.T, turned.as_quat()
+            positions = positions @ enu_R_world.T
+            quaternions = turned.as_quat()
         truth = Trajectory.without_covariances(
             table.stamps_ns[rows], positions, quaternions
         )
@@ -369,10 +371,8 @@ class TruthAdapter(Adapter):
             or len(table) < 2
         ):
             return
-        quaternions, positions = (
-            self._quaternions(table),
-            _scaled(table.beside(self.position), self.scale),
-        )
+        quaternions = self._quaternions(table)
+        positions = _scaled(table.beside(self.position), self.scale)
         moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
         if (
             np.isfinite(moved_m)

@@ -124,7 +124,8 @@ class Decoder:
         groups = []
         for rows, stack in payloads:
             for layout, members in self._by_layout(rows, stack):
-                first, last = int(members[0]), int(members[-1])
+                first = int(members[0])
+                last = int(members[-1])
                 # a view where they lie side by side
                 found = (
                     stack[first : last + 1]
@@ -288,7 +289,8 @@ def _given_lengths(
 
 def _view(payloads: Bytes, column: PayloadColumn) -> NDArray[Any] | None:
     """Column without copying, shape (n, m); None where its parts are not evenly spaced single values."""
-    starts, size = column.starts, column.dtype.itemsize
+    starts = column.starts
+    size = column.dtype.itemsize
     if not starts:
         return np.empty((len(payloads), 0), column.dtype)
     values = payloads[:, starts[0] : starts[0] + column.counts[0] * size].view(
