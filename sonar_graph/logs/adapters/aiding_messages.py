@@ -8,7 +8,7 @@ origin (`sonar_graph.logs.adapters.geodesy`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,34 +274,70 @@ class GeodeticFields(PathSection):
         )
 
 
-class PositionAdapter(Adapter):
-    """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
+class Places(NamedTuple):
+    """Positions in the world, a row each."""
 
-    PATHS = ("geodetic", "position", "covariance", "covariance_type")
-    NEEDS = ("origin", "sigma_m")
+    position_m: Floats
+    """Shape (n, 3), z up; a height that was not measured is 0."""
+    faults: dict[str, NDArray[np.bool_]]
+    """Masks of rows without a position, by reason."""
+    has_height: NDArray[np.bool_]
 
+
+class PlaceAdapter(Adapter):
+    """Positions, in latitude and longitude or in metres of the world."""
+
+    PATHS: ClassVar[tuple[str, ...]] = ("position", "geodetic")
+    NEEDS: ClassVar[tuple[str, ...]] = ("origin",)
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
     """Fields of x, y, z in the world instead, metres."""
     scale: LengthScale = 1.0
     """Turns `position` into metres, and its covariance by the square; 0.001 or "mm" from millimetres."""
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
     world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned"; of `position`."""
-    covariance: CovarianceFields | None = None
-    """Along the world's axes; without it the calibration's noise holds."""
-    covariance_type: str | None = None
-    """Field that is 0 where the covariance is unknown."""
 
     @model_validator(mode="after")
-    def _has_one_source(self) -> PositionAdapter:
+    def _has_one_place(self) -> PlaceAdapter:
         if (self.geodetic is None) == (self.position is None):
             raise ValueError(
                 "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
             )
         return self
+
+    def scaled(self, table: FieldTable) -> Floats:
+        """Values of `position` in metres, along the driver's axes, shape (n, 3)."""
+        return table.beside(self.position or ()).astype(float) * self.scale
+
+    def places(self, table: FieldTable, origin: Origin | None) -> Places:
+        """Positions of all rows; ``origin`` in degrees and metres is for positions on the Earth."""
+        if self.geodetic is not None:
+            position_m, is_fix, has_height = self.geodetic.positions(table, origin)
+            fault = f"without a fix{self.geodetic.beyond(table)}"
+            return Places(position_m, {fault: ~is_fix}, has_height)
+        position_m = self.scaled(table)
+        faults = {NOT_FINITE: not_finite(position_m)}
+        if self.world == "ned":
+            position_m = position_m @ ENU_R_NED.T
+        return Places(position_m, faults, np.ones(len(table), bool))
+
+
+class PositionAdapter(PlaceAdapter):
+    """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
+
+    PATHS = ("geodetic", "position", "covariance", "covariance_type")
+    NEEDS = ("origin", "sigma_m")
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
+    covariance: CovarianceFields | None = None
+    """Along the world's axes; without it the calibration's noise holds."""
+    covariance_type: str | None = None
+    """Field that is 0 where the covariance is unknown."""
+
+    def scaled(self, table: FieldTable) -> Floats:
+        """Values of `position` in metres from the origin, along the driver's axes, shape (n, 3)."""
+        return super().scaled(table) - self.origin_m
 
     def read(
         self,
@@ -314,46 +350,33 @@ class PositionAdapter(Adapter):
         ``origin``, in degrees and metres, is for positions on the Earth, the calibration's ``sigma_m`` for fixes
         without height and covariance.
         """
-        faults: dict[str, NDArray[np.bool_]] = {}
-        has_height = np.ones(len(table), bool)
-        if self.geodetic is not None:
-            positions, is_fix, has_height = self.geodetic.positions(table, origin)
-            faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
-        else:
-            positions = (
-                table.beside(self.position or ()).astype(float) * self.scale
-                - self.origin_m
-            )
-            faults[NOT_FINITE] = not_finite(positions)
-        covariances = np.full((len(table), 3, 3), np.nan)
+        positions, faults, has_height = self.places(table, origin)
+        C = np.full((len(table), 3, 3), np.nan)
         if self.covariance is not None:
-            covariances, faults["with a covariance that says invalid"] = (
-                self.covariance.read(table)
+            C, faults["with a covariance that says invalid"] = self.covariance.read(
+                table
             )
         if self.covariance_type is not None:
-            covariances = np.where(
-                (table.column(self.covariance_type) == 0)[:, None, None],
-                np.nan,
-                covariances,
-            )
+            C[table.column(self.covariance_type) == 0] = np.nan
         if self.position is not None:
-            covariances = covariances * self.scale**2
-        if self.position is not None and self.world == "ned":
-            positions = positions @ ENU_R_NED.T
-            covariances = ENU_R_NED @ covariances @ ENU_R_NED.T
-        flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
-        flat[:, 2, :], flat[:, :, 2], flat[:, 2, 2] = 0.0, 0.0, UNMEASURED_M2
-        covariances = np.where(has_height[:, None, None], covariances, flat)
-        return fit_block(PositionFixes, table.stamps_ns, faults, positions, covariances)
+            C = C * self.scale**2
+            if self.world == "ned":
+                C = ENU_R_NED @ C @ ENU_R_NED.T
+        # without a height, x and y keep their noise and z gets none that counts
+        is_flat = ~has_height
+        flat = np.where(np.isnan(C), np.diag(np.square(sigma_m)), C)[is_flat]
+        flat[:, 2, :] = 0.0
+        flat[:, :, 2] = 0.0
+        flat[:, 2, 2] = UNMEASURED_M2
+        C[is_flat] = flat
+        return fit_block(PositionFixes, table.stamps_ns, faults, positions, C)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about matrices that are no covariances, and places that are not on the Earth."""
         if self.covariance is not None:
             yield from self.covariance.warnings(table)
         if self.position is not None:
-            positions = (
-                table.beside(self.position).astype(float) * self.scale - self.origin_m
-            )
+            positions = self.scaled(table)
             is_far = (np.abs(positions) > FARTHEST_FIX_M).any(axis=1)
             if is_far.any():
                 yield (

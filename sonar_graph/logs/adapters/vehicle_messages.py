@@ -11,6 +11,7 @@ of translation, then rotation, along the fixed axes of the header's frame. With 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,12 +24,11 @@ from sonar_graph.logs.adapters.adapter import (
     CovarianceFields,
     DepthScale,
     ForceScale,
-    LengthScale,
     RateScale,
     axes_matrix,
     turn,
 )
-from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
+from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, PlaceAdapter
 from sonar_graph.logs.adapters.geodesy import Origin
 from sonar_graph.logs.adapters.message_table import (
     LARGEST,
@@ -250,22 +250,15 @@ class DepthAdapter(Adapter):
             )
 
 
-class TruthAdapter(Adapter):
+class TruthAdapter(PlaceAdapter):
     """Poses of the body; a twist is not used.
 
     From world and body axes of the driver (``w``, ``b``) to those of this package: ``R = enu_R_w w_R_b ours_R_b^T``.
     """
 
     PATHS = ("position", "geodetic", "orientation", "rpy", "covariance")
-    NEEDS = ("origin",)
 
     frame_id_field: str | None = None
-    position: Paths | None = None
-    """Fields of x, y, z in the world."""
-    scale: LengthScale = 1.0
-    """Turns them into metres; 0.001 or "mm" from millimetres."""
-    geodetic: GeodeticFields | None = None
-    """Fields of a position on the Earth instead."""
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w; false: only positions are true, and no heading is scored."""
     rpy: Paths | None = None
@@ -276,15 +269,9 @@ class TruthAdapter(Adapter):
     """Array field of 36: position, then rotation, along the world's axes, as ROS has it."""
     covariance_meaning: Literal["variance", "standard deviation"] = "variance"
     """"variance", or "standard deviation" where the driver puts those on the diagonal."""
-    world: Literal["enu", "ned"] = "enu"
-    """"enu" (any world with z up), or "ned"."""
 
     @model_validator(mode="after")
-    def _has_one_source(self) -> TruthAdapter:
-        if (self.geodetic is None) == (self.position is None):
-            raise ValueError(
-                "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
-            )
+    def _has_one_turn(self) -> TruthAdapter:
         if self.orientation is not None and self.rpy is not None:
             raise ValueError(
                 "give either orientation = [x, y, z, w] or rpy = [roll, pitch, yaw]"
@@ -295,23 +282,13 @@ class TruthAdapter(Adapter):
         self, table: FieldTable, origin: Origin | None = None
     ) -> tuple[Trajectory | None, Dropped]:
         """Poses with covariances, NaN: unknown; ``origin`` in degrees and metres, of positions on the Earth."""
-        faults: dict[str, np.ndarray] = {}
-        if self.geodetic is not None:
-            positions, is_fix, _ = self.geodetic.positions(table, origin)
-            faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
-        else:
-            positions = _scaled(table.beside(self.position or ()), self.scale)
-            faults[NOT_FINITE] = not_finite(positions)
+        positions, faults, _ = self.places(table, origin)
         if self.orientation is None and self.rpy is None:
             rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-            positions = (
-                positions[rows] @ ENU_R_NED.T
-                if self.world == "ned" and self.position
-                else positions[rows]
-            )
-            return Trajectory.of_positions(
-                table.stamps_ns[rows], positions
-            ) if rows.size else None, dropped
+            if not rows.size:
+                return None, dropped
+            stamps_ns = table.stamps_ns[rows]
+            return Trajectory.of_positions(stamps_ns, positions[rows]), dropped
         quaternions = self._quaternions(table)
         lengths = np.linalg.norm(quaternions, axis=1)
         faults[NOT_FINITE] = not_finite(positions, quaternions)
@@ -321,36 +298,29 @@ class TruthAdapter(Adapter):
             return None, dropped
         # unit quaternions keep every bit
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
-        positions = positions[rows]
         quaternions = (quaternions / scale[:, None])[rows]
         enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
         if self.world != "enu" or self.rotation != "flu":
-            matrices = SpatialRotation.from_quat(quaternions).as_matrix()
-            turned = SpatialRotation.from_matrix(
-                enu_R_world @ matrices @ axes_matrix(self.rotation).T
-            )
-            positions = positions @ enu_R_world.T
-            quaternions = turned.as_quat()
+            world_R_driver = SpatialRotation.from_quat(quaternions).as_matrix()
+            driver_R_body = axes_matrix(self.rotation).T
+            quaternions = SpatialRotation.from_matrix(
+                enu_R_world @ world_R_driver @ driver_R_body
+            ).as_quat()
         truth = Trajectory.without_covariances(
-            table.stamps_ns[rows], positions, quaternions
+            table.stamps_ns[rows], positions[rows], quaternions
         )
         if self.covariance is None:
             return truth, dropped
-        covariances = table.column(self.covariance)
-        if covariances.shape[1:] != (36,):
+        C = table.column(self.covariance)
+        if C.shape[1:] != (36,):
             table.refuse(self.covariance, "is no array of 36 numbers")
-        covariances = covariances.reshape(-1, 6, 6)[rows]
+        C = C.reshape(-1, 6, 6)[rows]
         if self.covariance_meaning == "standard deviation":
-            covariances = np.where(
-                covariances < 0, covariances, covariances**2
-            ) * np.eye(6)
+            C = np.where(C < 0, C, C**2) * np.eye(6)
         if self.world != "enu":
             W = np.kron(np.eye(2), enu_R_world)
-            covariances = W @ covariances @ W.T
-        covariances = ros_to_body(covariances, truth.matrices)
-        return Trajectory(
-            truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances
-        ), dropped
+            C = W @ C @ W.T
+        return replace(truth, covariances=ros_to_body(C, truth.matrices)), dropped
 
     def _quaternions(self, table: FieldTable) -> np.ndarray:
         """Orientations x, y, z, w, shape (n, 4); zeros where an angle is not finite."""
@@ -365,20 +335,15 @@ class TruthAdapter(Adapter):
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about an orientation that never changes while the vehicle moves."""
-        if (
-            (self.orientation is None and self.rpy is None)
-            or self.position is None
-            or len(table) < 2
-        ):
+        has_turns = self.orientation is not None or self.rpy is not None
+        if not has_turns or self.position is None or len(table) < 2:
             return
         quaternions = self._quaternions(table)
-        positions = _scaled(table.beside(self.position), self.scale)
+        positions = self.scaled(table)
         moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
-        if (
-            np.isfinite(moved_m)
-            and moved_m > LEAST_MOVE_M
-            and not (quaternions != quaternions[0]).any()
-        ):
+        is_turning = (quaternions != quaternions[0]).any()
+        # False for a NaN
+        if LEAST_MOVE_M < moved_m < np.inf and not is_turning:
             yield (
                 f"its orientation is the same in all {len(table)} messages, although it moves by {moved_m:.3g} m: if "
                 "that is none, `orientation = false` under [truth] in the log configuration; no heading is then scored"
