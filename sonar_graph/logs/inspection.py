@@ -60,6 +60,7 @@ from sonar_graph.logs.vehicle_setup import (
 )
 from sonar_graph.measurements import NS_PER_S, Ints
 
+TIME = "builtin_interfaces/msg/Time"
 _MOST_FIELDS = 24
 _EXAMPLES = {
     "imu": 'angular_velocity = ["...", "...", "..."]\nlinear_acceleration = ["...", "...", "..."]',
@@ -76,14 +77,14 @@ class TopicSummary:
     type_name: str
     encoding: str
     """Such as ``cdr`` or ``protobuf``."""
-    messages: int
-    first_stamp_ns: int
-    last_stamp_ns: int
-    rate_hz: float
+    messages: int = 0
+    first_stamp_ns: int = 0
+    last_stamp_ns: int = 0
+    rate_hz: float = 0.0
     """Messages per second between the first and the last; 0 where all have one stamp."""
-    largest_gap_s: float
+    largest_gap_s: float = 0.0
     """Longest time between successive stamps."""
-    stamps_from: str
+    stamps_from: str = "log"
     """``header`` or ``log``."""
     jitter_s: float = 0.0
     """Scatter of the times between successive stamps: half of the central 68 %."""
@@ -250,11 +251,9 @@ def inspect_log(
         as_window(window, call),
     )
     require_topics(recording, wanted, config, call)
-    damage = [
-        *recording.corrupt,
-        *([recording.ending] if recording.ending else []),
-        *recording.damage.remarks,
-    ]
+    damage = [*recording.corrupt, *recording.damage.remarks]
+    if recording.ending:
+        damage.insert(len(recording.corrupt), recording.ending)
     choices = choose_each(recording, wanted, config, ROLES)
     mounted: dict[str, str] = {}
     try:
@@ -310,34 +309,22 @@ def inspect_log(
 
 
 def _summarise(topic: Topic) -> TopicSummary:
-    header_ns = _header_stamps(topic)
-    log_times_ns = topic.log_times_ns
     if not len(topic):  # none of its messages is what its definition says
-        faults = "has " + ", ".join(
-            f"{count} messages {fault}" for fault, count in topic.unsound.items()
-        )
-        return TopicSummary(
-            topic.name,
-            topic.type_name,
-            topic.encoding,
-            0,
-            0,
-            0,
-            0.0,
-            0.0,
-            "log",
-            refusal=faults,
-        )
+        counts = (f"{count} messages {fault}" for fault, count in topic.unsound.items())
+        lost = f"has {', '.join(counts)}"
+        return TopicSummary(topic.name, topic.type_name, topic.encoding, refusal=lost)
+    log_times_ns = topic.log_times_ns
+    header_ns = _header_stamps(topic)
     stamps_ns = np.sort(log_times_ns)
     lag_s = None
+    faults: tuple[str, ...] = ()
     if header_ns is not None:
-        stamps_ns = np.sort(np.where(header_ns == 0, log_times_ns, header_ns))
-        stamped = (header_ns != 0) | (log_times_ns == 0)
-        lag_s = (
-            float(np.median((log_times_ns - header_ns)[stamped])) * 1e-9
-            if stamped.any()
-            else None
-        )
+        # data sets begin at 0: recorded at 0, a stamp of 0 is right
+        is_stamped = (header_ns != 0) | (log_times_ns == 0)
+        stamps_ns = np.sort(np.where(is_stamped, header_ns, log_times_ns))
+        if is_stamped.any():
+            lag_s = float(np.median((log_times_ns - header_ns)[is_stamped])) * 1e-9
+        faults = tuple(stamp_faults(header_ns, log_times_ns))
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     steps_s = np.diff(stamps_ns) * 1e-9
     low, high = np.quantile(steps_s, [0.16, 0.84]) if len(steps_s) else (0.0, 0.0)
@@ -353,9 +340,7 @@ def _summarise(topic: Topic) -> TopicSummary:
         stamps_from="log" if header_ns is None else "header",
         jitter_s=float(high - low) / 2,
         lag_s=lag_s,
-        stamp_faults=()
-        if header_ns is None
-        else tuple(stamp_faults(header_ns, log_times_ns)),
+        stamp_faults=faults,
         refusal=refusal(topic),
     )
 
@@ -366,22 +351,16 @@ def _header_stamps(topic: Topic) -> Ints | None:
         first = topic.definition().fields[:1] if topic.is_ros2 else ()
     except SonarGraphError:
         return None
-    if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
+    kind = first[0].kind if first and not first[0].is_array else None
+    is_header = isinstance(kind, Struct) and kind.name == "std_msgs/Header"
+    if not is_header or min(topic.stacks, default=0) < STAMP_BYTES:
         return None
-    if (
-        first[0].kind.name != "std_msgs/Header"
-        or min(topic.stacks, default=0) < STAMP_BYTES
-    ):
-        return None
-    time = parse_definition(
-        "builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time")
-    )
     parts = [
         (rows, payloads[:, :STAMP_BYTES])
         for stack in topic.stacks.values()
         for rows, payloads in stack
     ]
-    decoded = decode(time, parts)
+    decoded = decode(parse_definition(TIME, definition(TIME)), parts)
     if decoded.unsound:
         return None
     stamps_ns = np.empty(len(topic), np.int64)
@@ -445,38 +424,10 @@ def starting_config(
                 "\n".join([_comment(choice.reason), f"[{role}]", *plain_lines(table)])
             )
         elif named:
-            parts.append(
-                _comment(
-                    "\n".join(
-                        [
-                            f"[{role}]  # one of",
-                            *(f'topic = "{name}"' for name in named),
-                        ]
-                    )
-                )
-            )
-        elif (
-            choice.role.is_required
-        ):  # a table to fill in, for a topic whose name contains the role
-            lines = [
-                f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
-            ]
-            likely = [
-                topic
-                for topic in recording.topics.values()
-                if role in topic.name.lower() and topic.is_ros2
-            ]
-            name, kind = (
-                (likely[0].name, likely[0].type_name)
-                if likely
-                else ("/...", "package/msg/Type")
-            )
-            lines += [f'topic = "{name}"', f'type = "{kind}"']
-            if likely and "header.stamp.sec" not in _leaves(likely[0]):
-                lines.append(
-                    'stamp = "log"  # messages without a header: when they were recorded'
-                )
-            parts.append(_comment("\n".join([*lines, _EXAMPLES[role]])))
+            topics = (f'topic = "{name}"' for name in named)
+            parts.append(_comment("\n".join([f"[{role}]  # one of", *topics])))
+        elif choice.role.is_required:
+            parts.append(_comment(_to_fill_in(role, recording)))
         else:
             parts.append(_comment(f"[{role}]  # nothing found"))
     if any(choice.topic is None and choice.role.is_required for choice in choices):
@@ -497,6 +448,26 @@ def starting_config(
             head = f"{topic.name} is a {topic.type_name} with the fields"
             parts.append(_comment("\n".join([head, *fields[:_MOST_FIELDS], *more])))
     return "\n\n".join(parts) + "\n"
+
+
+def _to_fill_in(role: str, recording: Recording) -> str:
+    """Table for a topic of an unknown type whose name contains the role, or for any."""
+    lines = [
+        f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
+    ]
+    likely = [
+        topic
+        for topic in recording.topics.values()
+        if role in topic.name.lower() and topic.is_ros2
+    ]
+    name = likely[0].name if likely else "/..."
+    kind = likely[0].type_name if likely else "package/msg/Type"
+    lines += [f'topic = "{name}"', f'type = "{kind}"']
+    if likely and "header.stamp.sec" not in _leaves(likely[0]):
+        lines.append(
+            'stamp = "log"  # messages without a header: when they were recorded'
+        )
+    return "\n".join([*lines, _EXAMPLES[role]])
 
 
 def _comment(text: str) -> str:

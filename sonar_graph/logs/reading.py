@@ -112,7 +112,6 @@ def read_log(
     path: str | Path,
     *,
     calibration: Calibration | PartialCalibration | str | Path | None = None,
-    name: str | None = None,
     topics: Mapping[str, str] | None = None,
     config: LogConfig | str | Path | None = None,
     window: Window | None = None,
@@ -133,8 +132,6 @@ def read_log(
         A `Calibration` replaces everything that the file says. A `PartialCalibration`, or the path of a TOML or JSON
         file of one, goes before it, field by field.
         Without either the file's record holds; without a record, defaults with the mountings of ``/tf_static``.
-    name
-        Name of the sequence, instead of the one in the file; without either, the file's name.
     topics
         Topics by role (``imu``, ``dvl``, ``depth``, ``heading``, ``positions``, ``detections``, ``truth``,
         ``true_landmarks``), where several fit or none is found by type and name; they go before those of `config`.
@@ -196,7 +193,7 @@ def read_log(
     left_out = leave_out_dropped(recording)
     choices = choose_topics(recording, wanted, config)
     frame = sonar_frame(recording, wanted.get(SONAR), config)
-    sequence = Assembly(recording, choices, given, frame).sequence(name)
+    sequence = Assembly(recording, choices, given, frame).sequence()
     sequence.notes.update(left_out | _start_note(recording, part, given))
     for subject in WARNED:
         if subject in sequence.notes:

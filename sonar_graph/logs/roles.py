@@ -193,44 +193,24 @@ def choose_topic(
         if isinstance(adapter, str):
             choice = Choice(role, None, f"{named} was chosen but {adapter}")
         else:
-            choice = Choice(
-                role,
-                named,
-                f"chosen {'by name' if wanted else f'in {config.source}'}",
-                adapter,
-            )
+            by = "by name" if wanted else f"in {config.source}"
+            choice = Choice(role, named, f"chosen {by}", adapter)
     elif asked:
-        meant = [
-            topic
-            for topic in topics.values()
-            if short_name(topic.type_name) == short_name(asked)
-        ]
+        type_name = short_name(asked)
+        meant = [t for t in topics.values() if short_name(t.type_name) == type_name]
         choice = _only(role, recording, config, meant) or Choice(
             role, None, f"no {asked}, which {config.source} asks for"
         )
     else:
-        telling, general = (
-            [t for t in topics.values() if role.fits(t, general=of)]
-            for of in (False, True)
+        special = [t for t in topics.values() if role.fits(t, general=False)]
+        general = [t for t in topics.values() if role.fits(t, general=True)]
+        meant = special + general
+        # a type that any sensor may send counts only where no other fits
+        choice = (
+            _only(role, recording, config, special)
+            or _only(role, recording, config, general)
+            or _none_fits(role, recording, config)
         )
-        meant = telling + general
-        found = _only(role, recording, config, telling) or _only(
-            role, recording, config, general
-        )
-        if found is None:
-            allowed = [topic for topic in topics.values() if role.may_play(topic)]
-            others = tuple(
-                t.name
-                for t in allowed
-                if not isinstance(adapter_for(role, t, config), str)
-            )
-            hint = (
-                f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}"
-                if others
-                else ""
-            )
-            found = Choice(role, None, f"no {role.describe()}{hint}", could_be=others)
-        choice = found
     if table and not choice.candidates:
         for topic in [topics[choice.topic]] if choice.topic else meant:
             if refusal(topic) is None:
@@ -238,31 +218,35 @@ def choose_topic(
     return choice
 
 
+def _none_fits(role: Role, recording: Recording, config: LogConfig) -> Choice:
+    """Choice of no topic, with those that the user may choose by name."""
+    others = tuple(
+        topic.name
+        for topic in recording.topics.values()
+        if role.may_play(topic)
+        and not isinstance(adapter_for(role, topic, config), str)
+    )
+    reason = f"no {role.describe()}"
+    if others:
+        reason += (
+            f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}"
+        )
+    return Choice(role, None, reason, could_be=others)
+
+
 def _only(
     role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]
 ) -> Choice | None:
     """Choose the only usable topic of those that fit; None where none fits."""
     adapters = {topic.name: adapter_for(role, topic, config) for topic in fitting}
-    usable = {
-        name: adapter
-        for name, adapter in adapters.items()
-        if not isinstance(adapter, str)
-    }
+    usable = {k: one for k, one in adapters.items() if not isinstance(one, str)}
     if len(usable) > 1:
-        return Choice(
-            role,
-            None,
-            f"{len(usable)} topics fit: {', '.join(usable)}",
-            candidates=tuple(usable),
-        )
+        reason = f"{len(usable)} topics fit: {', '.join(usable)}"
+        return Choice(role, None, reason, candidates=tuple(usable))
     for name, adapter in usable.items():
         as_told = f", read as {config.source} says" if config.table(role.name) else ""
-        return Choice(
-            role,
-            name,
-            f"the only {recording.topics[name].type_name} that fits{as_told}",
-            adapter,
-        )
+        reason = f"the only {recording.topics[name].type_name} that fits{as_told}"
+        return Choice(role, name, reason, adapter)
     reasons = [f"{name} {reason}" for name, reason in adapters.items()]
     return Choice(role, None, "; ".join(reasons)) if reasons else None
 
@@ -343,12 +327,8 @@ def choose_each(
     if imu.topic in heading.candidates:
         adapter = adapter_for(heading.role, recording.topics[imu.topic], config)
         if not isinstance(adapter, str):
-            heading = Choice(
-                heading.role,
-                imu.topic,
-                "the orientation of the topic in use as IMU",
-                adapter,
-            )
+            reason = "the orientation of the topic in use as IMU"
+            heading = Choice(heading.role, imu.topic, reason, adapter)
     if heading.topic == imu.topic and heading.adapter is not None:
         unsaid = [key for key in _OF_THE_DRIVER if key not in config.table("heading")]
         adapter = heading.adapter.model_copy(
