@@ -134,6 +134,7 @@ class _AmendedCopy:
         damage = Damage()
         with self._passages[0][0].path.open("rb") as stream:
             try:
+                # the profile tells viewers of ROS what they read
                 head = next(iter(StreamReader(stream).records), None)
             except McapError:
                 head = None
@@ -169,6 +170,7 @@ class _AmendedCopy:
             if record.opcode == Opcode.METADATA:
                 found = parse(Metadata.read, content)
                 writer.add_metadata(found.name, found.metadata)
+            # a CRC of zero means none
             elif content[-4:] in (
                 bytes(4),
                 zlib.crc32(content[:-4]).to_bytes(4, "little"),
@@ -207,6 +209,7 @@ class _AmendedCopy:
             data = pieces[0].data
             columns = zip(*(piece.found for piece in pieces), strict=True)
             at, size, time_ns = (np.concatenate(column) for column in columns)
+            # messages of all topics of a chunk, to be sorted by time
             of = np.repeat(
                 np.arange(len(pieces)), [len(piece.found.sizes) for piece in pieces]
             )
@@ -231,6 +234,7 @@ class _AmendedCopy:
         )
         topic = piece.topic
         wanted = self._anew.get(topic.name)
+        # two types on one topic confuse every reader
         if topic.name in self._taken or (
             wanted is not None and short_name(topic.type_name) != short_name(wanted)
         ):

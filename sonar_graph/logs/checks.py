@@ -84,6 +84,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     repeated = len(stamps_ns) - len(np.unique(stamps_ns))
     if repeated:
         yield f"{_count(repeated, 'message')} with the stamp of another"
+    # the recorder's clock is the only other one that a log has
     lag_ns = log_times_ns - stamps_ns
     typical_s = float(np.median(lag_ns)) / 1e9
     if abs(typical_s) > DAY_S:
@@ -92,6 +93,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     elif abs(typical_s) > LARGEST_LAG_S:
         side = "before" if typical_s > 0 else "after"
         yield f"stamped {abs(typical_s):.4g} s {side} recording: another clock, or a delay"
+    # medians of some messages: a single late one is no drift
     first_s, last_s = (
         float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:])
     )
@@ -118,6 +120,7 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
         yield f"{early} ends {abs(end_s):.1f} s before the {late}; not estimated from there"
     if calibration.odometry_interpolation == "hold-past":
         return
+    # estimators begin where both sensors are
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     holes = imu_holes(imu.stamps_ns)
     holes = holes[
@@ -149,6 +152,7 @@ def _dvl_gap_warnings(
     by_force = []
     by_walk = []
     for gap in _gaps_where(np.diff(whole_ns) > longest_ns, whole_ns).tolist():
+        # rows of one or two beams inside the gap shorten it
         first, last = np.searchsorted(partial_ns, gap, side="right")
         samples = imu.between(*gap)
         if last > first:
@@ -182,9 +186,11 @@ def imu_holes(stamps_ns: Ints) -> Ints:
     intervals = np.diff(stamps_ns)
     shorter = np.zeros(len(intervals))
     before = np.minimum(np.arange(len(intervals)), ROWS_BEFORE)
+    # counting shorter intervals finds the median without sorting each window
     for lag in range(1, min(ROWS_BEFORE + 1, len(intervals))):
         shorter[lag:] += HOLE_INTERVALS * intervals[:-lag] < intervals[lag:]
     is_hole = (intervals > SHORTEST_HOLE_S * 1e9) & (2 * shorter >= before)
+    # the first interval has none before it to be compared with
     is_hole[:1] &= intervals[:1] > UNTYPICAL_S * 1e9
     return _gaps_where(is_hole, stamps_ns)
 
@@ -204,6 +210,7 @@ def _gap_times(gaps: Ints | list[list[int]], start_ns: int) -> str:
 
 def _longest(first_ns: Ints, last_ns: Ints, size: Ints, origin_ns: int) -> str:
     """Times of the `MOST_NAMED` largest spans in their order: ``1.000 to 2.500, 4.000 to 4.200``."""
+    # the largest ones, in the order of the log
     named = np.sort(np.argsort(-size, kind="stable")[:MOST_NAMED])
     return ", ".join(
         f"{(first_ns[k] - origin_ns) * 1e-9:.3f} to {(last_ns[k] - origin_ns) * 1e-9:.3f}"
@@ -226,6 +233,7 @@ def gravity_warning(
     measured = specific_force[np.isfinite(specific_force).all(axis=1)]
     if not len(measured):
         return None
+    # the median forgets manoeuvres, which the mean keeps
     typical = mounting.pose().rotation().matrix() @ np.median(measured, axis=0)
     length = float(np.linalg.norm(typical))
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:
@@ -258,6 +266,7 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     last_ns = min(last for _, last in spans_ns)
     if (last_ns - first_ns) * 1e-9 > len(imu):
         return None
+    # over a second, turns and forces stand out of the noise
     edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)
     if len(edges_s) < FEWEST_SECONDS or np.isnan(imu.specific_force).any():
         return None
@@ -271,6 +280,7 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
     )
     means = []
     for values in (imu.angular_velocity, imu.specific_force):
+        # trapezoids, as estimators integrate
         steps = (
             0.5 * (values[1:] + values[:-1]) @ body_R_imu.T * np.diff(imu_s)[:, None]
         )
@@ -284,14 +294,17 @@ def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
             for axis, sign in zip(order, signs, strict=True)
         )
         turn = w[:, order] * signs
+        # what the accelerometers feel beside the change of velocity is gravity
         up = f - np.diff(v, axis=0) - np.cross(turn, 0.5 * (v[1:] + v[:-1]))
         up /= np.linalg.norm(up, axis=1)[:, None]
+        # gravity is fixed in the world: the gyros must turn it as it is seen to turn
         carried = Rotation.from_rotvec(-0.5 * (turn[1:] + turn[:-1])).apply(up[:-1])
         apart[axes] = 1e3 * float(
             np.sqrt(np.median(np.sum((up[1:] - carried) ** 2, axis=1)))
         )
     best = min(apart, key=apart.__getitem__)
     as_is_mrad = apart["x, y, z"]
+    # chance makes some axes a little better
     if not apart[best] < as_is_mrad / MOST_IMPROVED:
         return None
     return (
@@ -324,7 +337,9 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
     if len(values) < 3:
         return None
     least, unit, effect = SPIKES[quantity]
+    # a step has one neighbour on either side, a spike none
     off = np.linalg.norm(values[1:-1] - (values[:-2] + values[2:]) / 2, axis=1)
+    # a row without accelerometers is no spike
     off[np.isnan(off)] = 0.0
     agree = np.linalg.norm(values[2:] - values[:-2], axis=1) < off / 2
     spikes = (
@@ -359,6 +374,7 @@ def stuck_warning(
         last - first + 1 >= STUCK_ROWS
     )
     if is_coarse and differs.any():
+        # resolution alone makes short stretches of equal rows
         is_long &= len(values) * (1.0 - differs.mean()) ** (last - first) < 1e-3
     is_zero = ~np.any(values[first], axis=1)
     texts = []
@@ -387,6 +403,7 @@ def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     ``values``, shape (n, k), and ``moved``, what the vehicle has moved until each row by other sensors, have one unit.
     A stretch counts where the vehicle moves in it by more than ``least`` and three steps of the sensor's resolution.
     """
+    # the smallest change of a sensor is its resolution
     changes = np.linalg.norm(np.diff(values, axis=0), axis=1)
     differs = changes > 0
     resolution = float(np.min(changes[differs], initial=np.inf))
@@ -399,6 +416,7 @@ def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     for begin, end in zip(
         first[is_stuck].tolist(), last[is_stuck].tolist(), strict=True
     ):
+        # the first row of a stretch was measured
         mask[begin + 1 : end + 1] = True
     return mask
 
@@ -412,6 +430,7 @@ def way_by(
     """
     if role == "heading":
         stamps_ns = imu.stamps_ns
+        # yaw rate: the world's vertical is the body's z while it is near level
         rate = (
             imu.angular_velocity
             @ calibration.imu.mounting.pose().rotation().matrix()[2]
@@ -430,6 +449,7 @@ def way_by(
         width = min(width, len(rows))
         smooth = np.column_stack(
             [
+                # without averaging, noise adds up to a distance that was not moved
                 np.convolve(column, np.ones(width) / width, "same")
                 for column in velocity.T
             ]

@@ -175,7 +175,7 @@ class LogSummary:
     def duration_s(self) -> float:
         """Seconds between the first and the last stamp of the topics that play a role, or of all where none does."""
         used = {role.topic for role in self.roles}
-        # not the recorder's clock
+        # a log that was played has the recorder's clock of another day
         by_header = [topic for topic in self.topics if topic.stamps_from == "header"]
         topics = (
             [topic for topic in self.topics if topic.name in used]
@@ -283,6 +283,7 @@ def inspect_log(
     sonar_fault = False
     if (sonar_topic := choices[SONAR].topic) is not None:
         try:
+            # the first frames show the setting
             frames = next(read_sonar_frames(recording.path, sonar_topic, config), None)
             sonar = describe_frames(frames) if frames else None
         except SonarGraphError as error:
@@ -327,6 +328,7 @@ def _summarise(topic: Topic) -> TopicSummary:
         faults = tuple(stamp_faults(header_ns, log_times_ns))
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     steps_s = np.diff(stamps_ns) * 1e-9
+    # gaps must not count as jitter
     low, high = np.quantile(steps_s, [0.16, 0.84]) if len(steps_s) else (0.0, 0.0)
     return TopicSummary(
         name=topic.name,

@@ -418,6 +418,7 @@ class Assembly:
         count = int(np.count_nonzero(stuck))
         if not count:
             return rows, {}
+        # times are counted from where estimators begin
         start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
         late_s = (rows.stamps_ns[np.argmax(stuck)] - start_ns) * 1e-9
         text = f"repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"

@@ -136,6 +136,7 @@ def source_names(estimators: Iterable[str]) -> list[str]:
     taken = {TRUTH, "tf", "tf_static"}
     names = []
     for estimator in estimators:
+        # names of topics in ROS allow no other characters
         plain = re.sub(r"[^0-9A-Za-z]+", "_", estimator).strip("_")
         plain = plain if plain[:1].isalpha() else f"estimator_{plain}".rstrip("_")
         candidates = (
@@ -168,6 +169,7 @@ def _estimator(
             causal,
             max(_CAUSAL_PATH_STEP_NS, (last_ns - first_ns) // _MOST_CAUSAL_POSES),
         )
+        # each path holds all poses before it: few of them keep the file small
         ends_ns = np.arange(first_ns + period_ns, last_ns, period_ns)
         counts = np.searchsorted(thinned.stamps_ns, ends_ns, side="right")
         for count, end_ns in zip(counts.tolist(), ends_ns.tolist(), strict=True):
@@ -237,6 +239,7 @@ def _bodies(
     truth = sequence.true_poses
     owner = next(iter(bodies.values()), truth)
     if truth is not None and len(truth):
+        # viewers interpolate no frames: the truth needs the instants of the estimates
         drawn = list(bodies.values()) or [_drawable(truth)]
         at_ns = np.unique(np.concatenate([body.stamps_ns for body in drawn]))
         first_ns, last_ns = truth.stamps_ns[[0, -1]]

@@ -152,6 +152,7 @@ def refusal(topic: Topic) -> str | None:
 
 def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
     """Adapter for a topic in a role, or the reason why there is none."""
+    # first what no role can read
     if (reason := refusal(topic)) is not None:
         return reason
     table = config.table(role.name)
@@ -330,6 +331,7 @@ def choose_each(
             reason = "the orientation of the topic in use as IMU"
             heading = Choice(heading.role, imu.topic, reason, adapter)
     if heading.topic == imu.topic and heading.adapter is not None:
+        # one message brings both, so stamps and axes hold for both
         unsaid = [key for key in _OF_THE_DRIVER if key not in config.table("heading")]
         adapter = heading.adapter.model_copy(
             update={key: getattr(imu.adapter, key) for key in unsaid}
@@ -391,6 +393,7 @@ def _missing(
     if any(fault and "`" in fault and fault in reason for fault in faults.values()):
         way_out = images  # the reason has its own
     counts = range(len(topics), 0, -1)
+    # name as many topics as fit into one line
     for both, count in [
         (needed, count) for needed in (BOTH * is_needed, "") for count in counts
     ]:

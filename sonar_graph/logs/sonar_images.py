@@ -172,9 +172,11 @@ def joined_calibration(
     """
     known = recorded_fields(navigation)
     own = recorded_fields(images).get(SONAR, {})
+    # the sonar's own recording has its lens and scale
     better = {name: own[name] for name in OF_THE_IMAGES if name in own}
     frame = sonar_frame(scan(images, lambda _: Keep.NONE), topic)
     found = None if frame is None else static_mounting(navigation, frame)
+    # the vehicle's tree goes before that of the sonar's own log
     if found is None and frame is not None and "mounting" not in own:
         found = static_mounting(images, frame)
     mounting = {} if found is None else {"mounting": found.model_dump(mode="json")}

@@ -64,6 +64,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     poses = np.hstack([trajectory.positions, trajectory.quaternions_xyzw]).tolist()
     lines = []
     for stamp_ns, pose in zip(trajectory.stamps_ns.tolist(), poses, strict=True):
+        # a float of seconds since 1970 has no nanoseconds
         seconds, nanoseconds = divmod(abs(stamp_ns), NS_PER_S)
         stamp = f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
         lines.append(_LINE % (stamp, *pose))

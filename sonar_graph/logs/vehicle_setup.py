@@ -140,6 +140,7 @@ def _as_in_tree(frame: str, frames: FrameTree) -> str:
     """Name of a frame in the tree: the same, or the only one that differs by a namespace in front."""
     if frame in frames or not frame or _last(frame) in BODY_FRAMES:
         return frame
+    # drivers and robot descriptions disagree about namespaces
     alike = [
         name
         for name in frames
@@ -329,6 +330,7 @@ def gathered(
     # a start that nobody states is not set
     values = Calibration().model_dump(exclude={"start"})
     for sensor, mounting in mountings.items():
+        # a pressure port and an antenna have no axes
         is_place = MOUNTING_FIELDS[sensor] != "mounting"
         values[sensor][MOUNTING_FIELDS[sensor]] = (
             mounting.translation_m if is_place else mounting.model_dump()
@@ -401,6 +403,7 @@ def _over(values: Values, changes: Values) -> dict[str, Any]:
         old = merged.get(name)
         if isinstance(old, Mapping) and isinstance(change, Mapping):
             merged[name] = _over(old, change)
+        # TOML has no null
         elif change is False and name in OPTIONAL:
             merged[name] = None
         else:

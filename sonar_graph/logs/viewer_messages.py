@@ -67,6 +67,7 @@ def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
     )
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
+    # rounding may leave a variance below zero
     diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
     return np.maximum(diameters, _SMALLEST_DIAMETER_M), Rotation.from_matrix(
         axes
@@ -235,6 +236,7 @@ class Scene:
     def around(cls, positions: Iterable[Floats]) -> Scene:
         """The scene around all positions, each of shape (n, 3), without those that are not finite."""
         points = np.concatenate([np.zeros((0, 3)), *positions])
+        # an estimate that diverged must not move the camera away
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return cls((0.0, 0.0, 0.0), 1.0)

@@ -152,6 +152,7 @@ def _rows(entry: Outgoing, first: int, end: int | None = None) -> Outgoing:
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:
     """``sensor_msgs/Imu`` without orientation."""
+    # ROS marks an acceleration that was not measured by -1 in its covariance
     unmeasured = np.isnan(imu.specific_force).all(axis=1)
     values: dict[str, Value] = {
         "orientation.w": 1.0,
@@ -212,6 +213,7 @@ def _upright_poses(
 
 def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
     """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
+    # rows of one stamp are one sonar frame
     stamps_ns, first, counts = np.unique(
         detections.stamps_ns, return_index=True, return_counts=True
     )
@@ -324,6 +326,7 @@ def sonar_image_messages(
         raise LogError(
             f"{topic}: samples of type {frames.intensity.dtype} cannot be written; give {SAMPLE_TYPES}"
         )
+    # drivers send all beams of a range side by side
     samples = np.ascontiguousarray(
         frames.intensity.transpose(0, 2, 1), dtype=f"<{kind}"
     )
@@ -352,6 +355,7 @@ def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, 
 
     Raises `LogError` when a stamp lies outside what ROS 2 can express (years 1901 to 2038).
     """
+    # also before 1970 nanoseconds are positive
     seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
     if len(seconds) and not (
         _SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max

@@ -308,6 +308,7 @@ class CovarianceFields(PathSection):
                 self.fields[0],
                 f"has {column.shape[1]} numbers; a covariance has 1, 9 or 36",
             )
+        # of a pose the translation comes first
         side = 3 if column.shape[1] == 9 else 6
         return column.reshape(-1, side, side)[:, :3, :3]
 

@@ -120,6 +120,7 @@ class HeadingAdapter(Adapter):
         """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
         faults = {NO_MEASUREMENT: ~self.is_measured(table)}
         if self.orientation is not None:
+            # drivers without an attitude send zeros
             quaternions = table.beside(self.orientation).astype(float)
             lengths = np.linalg.norm(quaternions, axis=1)
             is_rotation = np.isfinite(lengths) & (lengths > 0.5)
@@ -140,6 +141,7 @@ class HeadingAdapter(Adapter):
             }
         else:
             yaw_rad = table.column(str(self.yaw)) * self.scale
+            # a bearing turns clockwise from north
             yaw_rad = np.pi / 2 - yaw_rad if self.world == "ned" else yaw_rad
             faults[NOT_FINITE] = not_finite(yaw_rad)
         variance = (
@@ -153,6 +155,7 @@ class HeadingAdapter(Adapter):
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
         if self.variance is not None:
+            # a sigma of a full turn is another unit, or means unknown
             is_beyond = self.is_measured(table) & (
                 self.variance.read_variance(table) > FULL_TURN_RAD**2
             )
@@ -198,6 +201,7 @@ class GeodeticFields(PathSection):
             [table.column(self.latitude), table.column(self.longitude)]
         ).astype(float)
         if self.unit == "ddmm.mmmm":
+            # 4807.038 is 48 degrees and 7.038 minutes
             degrees = np.trunc(place / 100)
             place = degrees + (place - 100 * degrees) / 60
         elif self.unit == "rad":

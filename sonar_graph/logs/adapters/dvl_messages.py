@@ -94,6 +94,7 @@ class BeamGeometry(PathSection):
             self.directions(), along * scale, valid, self.sigma_m_s or 1.0
         )
         count = valid.sum(axis=1)
+        # fewer beams leave a direction unmeasured, and its variance is unknown
         velocity[count < self.fewest] = np.nan
         return (
             velocity,
@@ -210,6 +211,7 @@ class DvlAdapter(Adapter):
     def _filled(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
         """Masks of valid messages by the fields of `valid_where` that the driver fills."""
         columns = {path: table.column(path) for path in self.valid_where}
+        # a field that is 0 in every message carries no mark
         is_unfilled = {
             path: path in self.may_be_unfilled and not column.any()
             for path, column in columns.items()
@@ -233,6 +235,7 @@ class DvlAdapter(Adapter):
             for path, valid in self._filled(table).items()
         }
         if self.good_beams is not None:
+            # 0 beams in all messages: the driver does not count
             beams = table.column(self.good_beams)
             faults[NO_BEAM] = (beams == 0) & (self.are_beams_counted or beams.any())
         return faults
@@ -255,6 +258,7 @@ class DvlAdapter(Adapter):
                 faults[f"with {self.altitude} below 0"] = (
                     altitude_m < 0
                 ) & self._may_count(altitude_m > 0)
+            # sentinels fill all axes alike
             is_same = (velocity == velocity[:, :1]).all(axis=1)
             faults[SENTINEL] = is_same & (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S)
             if self.lock == "found" and not self.are_zeros_measured:
@@ -351,10 +355,12 @@ def zeros_in_one_step(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
     A vehicle slows down over several rows. A driver without bottom lock sends zeros from one row to the next, and the
     step is `STEP_RATIO` times the 99 % quantile of the steps between rows with a velocity.
     """
+    # messages may be recorded out of order
     order = np.argsort(stamps_ns, kind="stable")
     v = velocity[order]
     is_zero: NDArray[np.bool_] = np.asarray(~v.any(axis=1))
     step_m_s = np.linalg.norm(np.diff(v, axis=0), axis=1)
+    # steps to and from zeros would raise the limit that is to find them
     is_usual = ~is_zero[1:] & ~is_zero[:-1] & np.isfinite(step_m_s)
     found = np.zeros(len(v), bool)
     if not is_zero.any() or np.count_nonzero(is_usual) < FEWEST_STEPS:
@@ -386,6 +392,7 @@ def repeats(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
         [[False], (v[1:] == v[:-1]).all(axis=1) & v[1:].any(axis=1)]
     )
     in_file = np.zeros(len(v), bool)
+    # runs of equal rows, which a habit makes often and a fault once
     lengths = np.diff([*np.flatnonzero(~is_same), len(v)])
     if (
         np.mean(is_same) < LEAST_REPEATED

@@ -197,6 +197,7 @@ class DetectionArrayAdapter(Adapter):
             return None, {}
         rows = _joined(topic, [self._rows(topic, group) for group in groups])
         scores = rows.probabilities
+        # scores that are no probabilities would be taken for certainty
         worst = float(np.nanmax(scores.sum(axis=1), initial=0.0))
         if worst > 1 + ROUNDING or (scores < 0).any():
             raise topic.error(
@@ -248,6 +249,7 @@ class DetectionArrayAdapter(Adapter):
             )
             positions[:, some] = found[:, first]
             pose = group[f"{_RESULT}.covariance"].reshape(n, -1, 6, 6)[:, first, :3, :3]
+            # zeros and a negative variance are unknown
             known = pose.any(axis=(2, 3)) & (pose[..., 0, 0] >= 0)
             covariances[:, some] = np.where(known[..., None, None], pose, np.nan)
         return _Rows(
@@ -301,6 +303,7 @@ class LandmarkMapAdapter(Adapter):
         groups = topic.messages()
         if not groups:
             return None, {}
+        # a map is latched: the newest counts
         last = max(groups, key=lambda group: int(group.rows[-1]))
         ids, position, covariance = (
             last[name][-1] for name in ("ids", "position", "covariance")
@@ -345,6 +348,7 @@ def detection_warnings(
             f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? Beyond a full turn they are not used"
         )
     tracked = detections.track != NO_TRACK
+    # one frame sees an object once
     pairs = np.column_stack((detections.stamps_ns[tracked], detections.track[tracked]))
     different, counts = np.unique(pairs, axis=0, return_counts=True)
     if repeated := int((counts - 1).sum()):

@@ -97,6 +97,7 @@ class DetectionRowsAdapter(Adapter):
                 f"has an identity of 2^56 or more; {ID_ADVICE}",
             )
         probability = np.zeros(ids.shape)
+        # without probabilities the recogniser is sure
         probability[:, 0] = 1.0
         if self.probabilities:
             given = table.beside(self.probabilities)

@@ -144,6 +144,7 @@ class LogConfig:
             values = base.model_dump()
             for key, value in {**table, "type": type_name}.items():
                 old = getattr(base, key, None)
+                # false takes away a field, and is a value where a switch is meant
                 if value is False and not isinstance(old, bool):
                     values[key] = None
                 elif isinstance(old, BaseModel) and isinstance(value, Mapping):
@@ -153,6 +154,7 @@ class LogConfig:
             try:
                 found.append(type(base).model_validate(values))
             except ValidationError as error:
+                # a type that is not shipped needs all of its fields
                 is_incomplete = any(
                     fault["type"] == "missing" for fault in error.errors()
                 )
@@ -184,6 +186,7 @@ class LogConfig:
                         key == "frame_id_field" and path not in known
                     )
                 if is_absent:
+                    # a misspelt field is the usual fault
                     similar = get_close_matches(path, known, 1)
                     suggestion = f"did you mean {similar[0]}? " if similar else ""
                     names = ", ".join(name + size for name, size in known.items())

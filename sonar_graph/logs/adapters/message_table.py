@@ -151,6 +151,7 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
     finite = np.where(np.isfinite(values), values, 0)
     if unit_ns < 1 or abs(unit_ns - round(unit_ns)) > 1e-9 * unit_ns:
         return np.rint(finite * unit_ns).astype(np.int64)
+    # seconds since 1970 as a double lose nanoseconds when they are multiplied
     whole = np.floor(finite)
     return whole.astype(np.int64) * round(unit_ns) + np.rint(
         (finite - whole) * unit_ns
@@ -180,6 +181,7 @@ def fit_rows(
     rows: Ints = np.flatnonzero(fit).astype(np.int64)
     rows = rows[np.argsort(stamps_ns[rows], kind="stable")]
     if unique and rows.size:
+        # estimators need increasing stamps
         again = np.diff(stamps_ns[rows], prepend=stamps_ns[rows[0]] - 1) == 0
         counts[SAME_STAMP] = int(np.count_nonzero(again))
         rows = rows[~again]

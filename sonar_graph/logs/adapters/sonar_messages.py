@@ -103,6 +103,7 @@ class SonarAdapter(Adapter):
         is_any_sound = bool(topic.messages())
         if refused is not None:
             instants, counts = np.unique(recorded_ns, return_counts=True)
+            # unsound messages are known by their times alone
             sound_ns = np.sort(topic.log_times_ns)
             sound = np.searchsorted(sound_ns, instants, "right") - np.searchsorted(
                 sound_ns, instants
@@ -172,6 +173,7 @@ class SonarAdapter(Adapter):
             azimuths_rad = sign * np.radians(
                 group[str(self.bearings)].astype(float) * self.bearing_unit_deg
             )
+        # a sonar changes range or gain between pings: each setting is a block
         same = np.column_stack([kinds, bins_m, azimuths_rad])
         _, first, block = np.unique(
             same, axis=0, return_index=True, return_inverse=True
@@ -220,6 +222,7 @@ class SonarAdapter(Adapter):
         head = _GAIN_BYTES if row_gains > 0 else 0
         if self.image_order == "range-major":
             used = head + beams * dtype.itemsize
+            # rows may be padded
             row_bytes = row_bytes if row_bytes > 0 else used
             row_count = size // max(row_bytes, 1)
         else:
@@ -243,6 +246,7 @@ class SonarAdapter(Adapter):
                 .view("<u4")
                 .astype(np.float32)
             )
+            # the gain of a row is of power, and samples are amplitudes
             values = (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32)
         return (
             values.transpose(0, 2, 1) if self.image_order == "range-major" else values

@@ -79,6 +79,7 @@ class ImuAdapter(Adapter):
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
         force = self._force(table)
+        # NaN is what estimators take as not measured
         unmeasured = _is_marked(
             table, self.linear_acceleration_status, force
         ) | self._is_force_unfilled(table, force)
@@ -177,6 +178,7 @@ def _is_denied(status: np.ndarray, values: Floats) -> bool:
     """Tell whether a driver calls all rows not measured, although the values change as measured ones do."""
     if not (status == -1).all():
         return False
+    # a driver that fills in -1 everywhere would lose its whole log
     finite = values[np.isfinite(values).all(axis=1)]
     return len(finite) > 1 and bool(
         np.any(finite[1:] != finite[:-1], axis=1).mean() > 0.5
@@ -242,6 +244,7 @@ class DepthAdapter(Adapter):
         """Warning about a pressure below the atmosphere's."""
         if self.pressure is None:
             return
+        # the first and last rows of a dive are at the surface
         typical_pa = float(np.nanmedian(table.column(self.pressure))) * self.scale
         if typical_pa < 0.5 * self.atmosphere_pa:
             yield (
@@ -362,6 +365,7 @@ def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
 def ros_to_body(covariances: Floats, rotations: Floats) -> Floats:
     """Inverse of `body_to_ros`; all zeros, or a negative variance, mean unknown and become NaN."""
     swap = _swap(rotations).transpose(0, 2, 1)
+    # ROS has no other mark for unknown
     known = np.any(covariances != 0, axis=(1, 2)) & (
         np.diagonal(covariances, axis1=1, axis2=2) >= 0
     ).all(axis=1)
