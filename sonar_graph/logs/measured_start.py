@@ -67,6 +67,7 @@ class FirstPath:
     ) -> "FirstPath":
         """Integrate with the trapezoid rule, up to the first hole of the IMU."""
         t = (imu.stamps_ns - start_ns) * 1e-9
+        # a hole of the IMU ends what can be integrated
         t_hole = np.append(t[:-1][np.diff(t) > LONGEST_HOLE_S], LONGEST_S)
         rows = (t >= -1.0) & (t <= t_hole[t_hole > 0][0])
         t = t[rows]
@@ -76,6 +77,7 @@ class FirstPath:
         ) @ body_R_imu.T
         dt = np.diff(t)[:, None]
         C = running_rotations((rate[1:] + rate[:-1]) / 2 * dt)
+        # turns are counted from the start on
         C = C[np.searchsorted(t, 0.0, side="right") - 1].T @ C
         force = np.einsum("nij,nj->ni", C, imu.specific_force[rows] @ body_R_imu.T)
         F = np.vstack(
@@ -99,6 +101,7 @@ class FirstPath:
         line = (self.velocity - self.impulse)[first]
         if len(t) < FEWEST_VELOCITIES or not np.isfinite(line).all():
             return None
+        # a constant force in the world is a straight line in time
         slope, level = np.polyfit(t, line, 1)
         size = float(np.linalg.norm(slope))
         g = calibration.gravity_m_s2
@@ -107,6 +110,7 @@ class FirstPath:
         scatter = float(np.std(line - slope * t[:, None] - level))
         # as if all scatter were one slow wave
         of_line = scatter * np.sqrt(12.0) / (g * float(np.ptp(t)))
+        # a bias of the accelerometers tilts gravity by its share of g
         of_force = calibration.imu.accel_bias_sigma / g
         of_turn = calibration.imu.gyro_bias_sigma * float(np.ptp(t))
         sigma = WIDER * float(np.sqrt(of_line**2 + of_force**2 + of_turn**2))
@@ -165,6 +169,7 @@ def measured_start(
             notes.append("roll and pitch unknown, taken as 0")
         else:
             (x, y, z), sigmas[:2] = up
+            # the world's up in the body fixes roll and pitch
             roll = float(np.arctan2(y, z))
             pitch = float(np.arctan2(-x, np.hypot(y, z)))
             notes.append("level by gravity")
@@ -174,6 +179,7 @@ def measured_start(
     if (heading := blocks.get("heading")) is not None:
         source = "heading"
         near = _nearest(heading.stamps_ns, start_ns)
+        # angles near the cut at 180 degrees have no median of their own
         yaw = float(np.angle(np.exp(1j * np.median(np.unwrap(heading.yaw_rad[near])))))
         sigmas[2] = WIDER * np.hypot(
             calibration.heading.bias_sigma_rad, calibration.heading.sigma_rad
@@ -195,8 +201,10 @@ def measured_start(
         variances = np.where(
             np.isnan(variances), np.square(calibration.positions.sigma_m), variances
         )
+        # fixes near the start were not taken at it
         speed = float(np.median(np.linalg.norm(blocks["dvl"].velocity, axis=1)))
         moved_m = speed * float(np.ptp([*fixes.stamps_ns[near], start_ns])) * 1e-9
+        # fixes are of the antenna
         position = np.median(fixes.position_m[near], axis=0) - R @ np.array(
             calibration.positions.antenna_m
         )
@@ -228,6 +236,7 @@ def height_by_depth(
     near = _nearest(depth.stamps_ns, start_ns)
     first = _nearest(dvl.stamps_ns, start_ns)
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+    # the first depths may come after the start
     climb_m_s = float(np.median(dvl.velocity[first] @ body_R_dvl.T @ up))
     late_s = (depth.stamps_ns[near] - start_ns) * 1e-9
     z_m = float(np.median(depth.z_m[near] - climb_m_s * late_s)) - float(
@@ -255,6 +264,7 @@ def yaw_by_fixes(
         return 0.0, UNKNOWN_YAW_SIGMA_RAD
     reckoned = np.interp(t[is_inside], path.seconds, p)
     seen = places[is_inside] @ [1.0, 1j, 0.0]
+    # turn about the centre: the place of the start is another unknown
     reckoned = reckoned - reckoned.mean()
     seen = seen - seen.mean()
     c = np.vdot(reckoned, seen)
@@ -267,6 +277,7 @@ def yaw_by_fixes(
         * float(np.sqrt(np.mean(np.abs(left) ** 2) / 2))
         / max(moved_m, 1e-9)
     )
+    # the path is too short for a direction
     if sigma > UNKNOWN_YAW_SIGMA_RAD / 2:
         return 0.0, UNKNOWN_YAW_SIGMA_RAD
     return float(np.angle(c)), max(sigma, LEAST_TILT_SIGMA_RAD)
