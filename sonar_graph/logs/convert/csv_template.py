@@ -7,7 +7,8 @@ a choice, the role stands as a comment that names the candidates. Under every fi
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,9 @@ _FILES = {
     "true_landmarks": r"map|landmark|beacon",
 }
 """Names of files that point to a role, by role."""
+_DEPTHS = ("height", "pressure")
+_LISTS = ("ids", "probabilities")
+"""Keys with a column for each candidate."""
 _OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
 
 
@@ -131,6 +135,7 @@ _RATE = (
 _FORCE = ("linear_acceleration_scale", (7.0, 13.0))
 _SPEED = ("scale", (0.0, 10.0), '# rotation = "frd"')
 _ANGLE = ("scale", (0.0, 2.02 * np.pi), 'world = "ned"')
+_AZIMUTH = (_ANGLE[1], '# rotation = "frd"  # azimuth positive to the right')
 QUANTITIES = (
     Quantity("angular_velocity", r"gyr|omega|angular_?vel|(ang|turn|angular)_?rate|^rate|^w$|^g$", XYZ, RATES, *_RATE),
     Quantity("angular_velocity", r"^$|body|imu", ("p", "q", "r"), RATES, *_RATE),
@@ -141,7 +146,8 @@ QUANTITIES = (
     Quantity("velocity", r"", ("u", "v", "w"), SPEEDS, *_SPEED),
     Quantity("velocity", r"", ("surge", "sway", "heave"), SPEEDS, *_SPEED),
     Quantity("range", r"range|distance|^r$", ("",), LENGTHS, "range_scale", (0.0, 300.0)),
-    Quantity("azimuth", r"azimuth|bearing", ("",), ANGLES, "azimuth_scale", _ANGLE[1]),
+    Quantity("azimuth", r"azimuth|bearing", ("",), ANGLES, "azimuth_scale", *_AZIMUTH),
+    Quantity("ids", r"^id$|_id$|label|class|landmark|beacon"),
     Quantity("id", r"^id$|_id$|label|class|landmark|beacon"),
     Quantity("probabilities", r"prob|posterior|score|confidence"),
     Quantity("track", r"track"),
@@ -188,6 +194,26 @@ class _Guess:
         return bool(self.doubt), is_weak, not is_named
 
 
+_SLOTS = {
+    "imu": (
+        ("angular_velocity", None),
+        ("linear_acceleration", "linear_acceleration = false"),
+    ),
+    "dvl": (("velocity", None),),
+    "depth": (("height pressure", None),),
+    "heading": (("yaw", None),),
+    "positions": (("geodetic position", None),),
+    "detections": (
+        ("range", None),
+        ("azimuth", None),
+        ("ids", "ids = false  # no column of identities was found"),
+        ("probabilities", ""),
+        ("track", ""),
+    ),
+    "truth": (("geodetic position", None), ("orientation rpy", "")),
+    "true_landmarks": (("id", None), ("geodetic position", None)),
+}
+"""Quantities of a role, each with the alternatives and the line without it; None: needed."""
 _EMPTY = {
     "imu": [
         'angular_velocity = ["...", "...", "..."]',
@@ -279,12 +305,7 @@ class _Table:
     def __init__(self, name: str, path: Path) -> None:
         self.name = name
         self.file, self.form_lines = _file(path)
-        names = self.file.layout.names
-        bare = [plain_name(given) for given in names]
-        self.columns = [
-            _column(given, given if bare.count(plain_name(given)) > 1 else "")
-            for given in names
-        ]
+        self.columns = [_column(given) for given in self.file.layout.names]
         self._values: dict[str, Floats] = {}
         self.time = self._time()
 
@@ -292,11 +313,8 @@ class _Table:
         """Numbers of some columns, shape (n, number of columns)."""
         for column in columns:
             if column.given not in self._values:
-                self._values[column.given] = self.file.numbers(self._name(column))
+                self._values[column.given] = self.file.numbers(column.given)
         return np.column_stack([self._values[column.given] for column in columns])
-
-    def _name(self, column: _Column) -> str:
-        return self.file.layout.names[self.columns.index(column)]
 
     def first(self, column: _Column) -> str:
         """First cell of a column."""
@@ -312,15 +330,17 @@ class _Table:
             lines.append(f"#   {number:2d}  {named}{layout.first[number - 1]}")
         return "\n".join(lines)
 
-    def find(self, key: str, columns: list[_Column]) -> "_Match | None":
-        """Columns that hold a quantity, of all whose names fit the first that change."""
-        for quantity in QUANTITIES:
-            if quantity.key != key:
-                continue
-            if found := _fitting(quantity, columns):
-                moving = [one for one in found if not self.is_constant(one)]
-                return _Match(self, quantity, moving or found)
-        return None
+    def find(self, keys: str, columns: list[_Column]) -> "_Match | None":
+        """Columns that hold one of some quantities, the first without doubt if there is one."""
+        matches = []
+        for key in keys.split():
+            fitting = (
+                _Match(self, quantity, options)
+                for quantity in QUANTITIES
+                if quantity.key == key and (options := _fitting(quantity, columns))
+            )
+            matches += [match.moving() for match in islice(fitting, 1)]
+        return min(matches, key=lambda match: bool(match.doubt()), default=None)
 
     def is_constant(self, columns: list[_Column]) -> bool:
         """True where no column ever changes."""
@@ -349,67 +369,68 @@ class _Table:
         """Roles that the table may play."""
         is_truth = bool(re.search(_TRUTH, self.name.lower()))
         true = [c for c in self.columns if is_truth or re.search(_TRUTH, c.name)]
-        live = [c for c in self.columns if c not in true and c != self.time]
-        live = [c for c in live if not re.search(_NOT_MEASURED, c.name)]
-        if true:
-            yield from self._places("truth", true)
-        yield from self._motion(live)
-        spread = self.find("range", live)
-        bearing = self.find("azimuth", live)
-        if spread and bearing:
-            yield self._detections(spread, bearing, live)
-            return
-        forces = self.find("linear_acceleration", live)
-        if self.find("id", live) and self.time is None:
-            yield from self._places("true_landmarks", live)
-            return
-        is_pose = self.find("orientation", live) or self.find("rpy", live)
-        is_fix = re.search(_FILES["positions"], self.name.lower())
-        if is_pose and not is_fix and not forces and self.find("position", live):
-            yield from self._places("truth", live)
-            return
-        yield from self._places("positions", live)
-        for role, keys in (("depth", ("height", "pressure")), ("heading", ("yaw",))):
-            found = [match for key in keys if (match := self.find(key, live))]
-            found.sort(key=lambda match: bool(match.doubt()))
-            if found:
-                yield self._guess(role, *found[:1])
-
-    def _guess(self, role: str, *matches: "_Match", doubt: str = "") -> _Guess:
-        """Guess at a role from its quantities; the first question about one of them counts."""
-        lines = [line for match in matches for line in match.lines()]
-        lines += [match.quantity.more for match in matches if match.quantity.more]
-        doubts = (match.doubt() for match in matches)
-        return _Guess(role, self.name, lines, doubt or next(filter(None, doubts), ""))
-
-    def _motion(self, live: list[_Column]) -> Iterator[_Guess]:
-        """IMU and Doppler log: velocities beside a truth are true ones."""
+        live = [
+            column
+            for column in self.columns
+            if column not in (*true, self.time)
+            and not re.search(_NOT_MEASURED, column.name)
+        ]
         rates = self.find("angular_velocity", live)
-        forces = self.find("linear_acceleration", live)
-        used = rates.chosen if rates else []
-        velocity = self.find("velocity", [c for c in live if c not in used])
-        if rates and forces and not self.values(forces.chosen).any():
-            # zeros of a driver without accelerometers
-            forces = None
-        if rates and forces:
-            yield self._guess("imu", rates, forces)
-        elif rates and not self.find("position", live):
-            guess = self._guess(
-                "imu", rates, doubt="no accelerometer: is this the IMU?"
-            )
-            guess.lines.append("linear_acceleration = false")
-            yield guess
-        elif forces:
-            names = ", ".join(c.given for c in velocity.chosen) if velocity else "none"
-            guess = self._guess(
-                "imu", forces, doubt=f"which columns are turn rates? perhaps {names}"
-            )
-            guess.lines.insert(0, _EMPTY["imu"][0])
-            yield guess
-        if velocity:
-            guess = self._guess("dvl", velocity)
-            guess.lines.extend(self._validity(velocity))
-            yield guess
+        not_rates = [c for c in live if not rates or c not in rates.chosen]
+        has_forces = self.find("linear_acceleration", live) is not None
+        has_place = self.find("position", live) is not None
+        has_angles = self.find("orientation rpy", live) is not None
+        yield from self._play("truth", true)
+        if has_forces:
+            yield from self._play("imu", live)
+        elif not has_place:
+            yield from self._play("imu", live, "no accelerometer: is this the IMU?")
+        yield from self._play("dvl", not_rates)
+        detections = list(self._play("detections", live))
+        if detections:
+            yield from detections
+        elif self.time is None and self.find("id", live):
+            yield from self._play("true_landmarks", live)
+        elif (
+            has_place
+            and has_angles
+            and not has_forces
+            and not re.search(_FILES["positions"], self.name.lower())
+        ):
+            # a pose is computed by another system
+            yield from self._play("truth", live)
+        else:
+            place = self.find("geodetic position", live)
+            is_clear = place is None or not place.is_without_unit() or not has_forces
+            yield from self._play("positions", live, "" if is_clear else _OF_IMU)
+            yield from self._play("depth", live)
+            yield from self._play("heading", live)
+
+    def _play(
+        self, role: str, columns: list[_Column], doubt: str = ""
+    ) -> Iterator[_Guess]:
+        """Guess at a role where the table has all that it needs; the first question about a quantity counts."""
+        lines: list[str] = []
+        for keys, without in _SLOTS[role]:
+            match = self.find(keys, columns)
+            if (
+                match
+                and keys == "linear_acceleration"
+                and not np.any(match.table.values(match.chosen))
+            ):
+                # zeros of a driver without accelerometers
+                match = None
+                doubt = doubt or "no accelerometer: is this the IMU?"
+            if match:
+                lines += match.lines()
+                doubt = doubt or match.doubt()
+                if role == "dvl":
+                    lines += self._validity(match)
+            elif without is None:
+                return
+            elif without:
+                lines.append(without)
+        yield _Guess(role, self.name, lines, doubt)
 
     def _validity(self, velocity: "_Match") -> list[str]:
         """Line that leaves out invalid rows; in use where the valid mark is known."""
@@ -430,38 +451,6 @@ class _Table:
             for column in marks[:1]
         ]
 
-    def _detections(
-        self, spread: "_Match", bearing: "_Match", live: list[_Column]
-    ) -> _Guess:
-        """Ranges and azimuths, with their identities."""
-        guess = self._guess("detections", spread, bearing)
-        label = self.find("id", live)
-        ids = "false  # no column of identities was found"
-        if label:
-            ids = toml_value([label.chosen[0].given])
-        guess.lines.append(f"ids = {ids}")
-        if label and (sure := self.find("probabilities", live)):
-            guess.lines.append(f"probabilities = [{toml_value(sure.chosen[0].given)}]")
-        if track := self.find("track", live):
-            guess.lines.append(f"track = {toml_value(track.chosen[0].given)}")
-        guess.lines.append('# rotation = "frd"  # azimuth positive to the right')
-        return guess
-
-    def _places(self, role: str, columns: list[_Column]) -> Iterator[_Guess]:
-        """A truth, fixes or a map, where columns hold positions."""
-        place = self.find("geodetic", columns) or self.find("position", columns)
-        if place is None:
-            return
-        more: list[_Match | None] = []
-        doubt = ""
-        if role == "truth":
-            more = [self.find("orientation", columns) or self.find("rpy", columns)]
-        elif role == "true_landmarks":
-            more = [self.find("id", columns)]
-        elif place.quantity.key == "position" and place.chosen[0].unit not in LENGTHS:
-            doubt = _OF_IMU if self.find("linear_acceleration", columns) else ""
-        yield self._guess(role, place, *(one for one in more if one), doubt=doubt)
-
 
 @dataclass(frozen=True)
 class _Match:
@@ -476,32 +465,47 @@ class _Match:
         """The likeliest columns."""
         return self.options[0]
 
+    def values(self) -> Floats:
+        """Numbers of the chosen columns, shape (n, components), without empty rows."""
+        values = self.table.values(self.chosen)
+        return values[~is_absent(values)]
+
+    def moving(self) -> "_Match":
+        """The same without columns that never change, where others do."""
+        moving = [one for one in self.options if not self.table.is_constant(one)]
+        return replace(self, options=moving or self.options)
+
+    def is_without_unit(self) -> bool:
+        """True for places of an unknown unit."""
+        units = self.quantity.units
+        return units is not None and self.chosen[0].unit not in units
+
     def doubt(self) -> str:
         """Question about the columns or their unit; empty where there is none."""
-        key = self.quantity.key
-        if key in ("id", "track", "probabilities", "orientation"):
+        quantity = self.quantity
+        if quantity.units is None:
             return ""
         # gravity may look constant to a coarse sensor, motion does not
-        if key != "linear_acceleration" and self.table.is_constant(self.chosen):
-            return f"never changes: a {'depth' if key in _DEPTHS else key}?"
+        if quantity.key != "linear_acceleration" and self.table.is_constant(
+            self.chosen
+        ):
+            return f"never changes: a {'depth' if quantity.key in _DEPTHS else quantity.key}?"
         if len(self.options) > 1:
             names = [", ".join(c.given for c in option) for option in self.options]
-            return f"{key}: {' or '.join(names)}?"
+            return f"{quantity.key}: {' or '.join(names)}?"
         stated = self.chosen[0].unit
         fits = self._fitting_units()
-        if stated in (self.quantity.units or {}):
-            if fits and stated not in fits:
-                return f"{key}: the header states {stated}, the values are those of {' or '.join(fits)}"
-            return ""
-        if len(fits) > 1 and not self._is_first(fits):
-            return f"unit of {key}: {' or '.join(fits)}?"
+        known = " or ".join(fits)
+        if fits and stated in quantity.units and stated not in fits:
+            return f"{quantity.key}: the header states {stated}, the values are those of {known}"
+        if len(fits) > 1 and self.is_without_unit() and not self._is_first(fits):
+            return f"unit of {quantity.key}: {known}?"
         return ""
 
     def _fitting_units(self) -> list[str]:
         """Units in which the values have usual magnitudes; none where that is not known."""
         lowest, highest = self.quantity.usual
-        values = self.table.values(self.chosen)
-        values = values[~is_absent(values)]
+        values = self.values()
         if len(values) < FEWEST_ROWS or not np.isfinite(highest):
             return []
         sizes = np.linalg.norm(values, axis=1)
@@ -525,14 +529,14 @@ class _Match:
             return [self._geodetic()]
         if key == "height":
             factor = LENGTHS.get(self.chosen[0].unit or "m", 1.0)
-            if np.mean(self.table.values(self.chosen) < 0) > 0.5:
+            if (self.values() < 0).all():
                 # a vehicle does not fly: these count upwards
                 factor = -factor
             return [
                 f"height = {toml_value(names[0])}",
                 f"scale = {-factor:g}  # to metres upwards",
             ]
-        is_single = self.quantity.parts == ("",)
+        is_single = self.quantity.parts == ("",) and key not in _LISTS
         more = []
         if key == "pressure" and self._is_gauge():
             more = ["atmosphere_pa = 0  # less than that of the air: from the surface"]
@@ -540,13 +544,13 @@ class _Match:
             f"{key} = {toml_value(names[0] if is_single else names)}",
             *self._unit_line(),
             *more,
+            *filter(None, [self.quantity.more]),
         ]
 
     def _is_gauge(self) -> bool:
         """True for pressures of a stated unit that are less than half that of the air."""
         factor = PRESSURES.get(self.chosen[0].unit or "", np.inf)
-        lowest = np.nanmin(self.table.values(self.chosen), initial=np.inf)
-        return bool(lowest * factor < 5e4)
+        return bool(self.values().min(initial=np.inf) * factor < 5e4)
 
     def _unit_line(self) -> list[str]:
         """The unit, where it is another than that of this package, or not stated."""
@@ -573,13 +577,9 @@ class _Match:
             if re.match(r"(.*_)?(alt|altitude|height)(_|$)", column.name):
                 more = f", height = {toml_value(column.given)}"
                 break
-        values = self.table.values(self.chosen)
-        if np.nanmax(np.abs(values[:, 0]), initial=0.0) > 90:
+        if np.abs(self.values()[:, 0]).max(initial=0.0) > 90:
             more += ', unit = "ddmm.mmmm"'
         return f"geodetic = {{latitude = {toml_value(latitude.given)}, longitude = {toml_value(longitude.given)}{more}}}"
-
-
-_DEPTHS = ("height", "pressure")
 
 
 def _file(path: Path) -> tuple[CsvFile, list[str]]:
@@ -645,8 +645,8 @@ def _stamps(
     return lines
 
 
-def _column(given: str, kept: str) -> _Column:
-    """Column with its unit, from ``[...]``, ``(...)`` or the end of its name; ``kept``: name to give instead."""
+def _column(given: str) -> _Column:
+    """Column with its unit, from ``[...]``, ``(...)`` or the end of its name."""
     bare = plain_name(given)
     unit = given[len(bare) :].strip(" []()").lower() or None
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare)
@@ -657,7 +657,7 @@ def _column(given: str, kept: str) -> _Column:
                 unit = spelling
                 name = name.removesuffix(f"_{spelling}")
                 break
-    return _Column(kept or bare, name, _SPELLINGS.get(unit or ""))
+    return _Column(given, name, _SPELLINGS.get(unit or ""))
 
 
 def _fitting(quantity: Quantity, columns: list[_Column]) -> list[list[_Column]]:

@@ -10,6 +10,7 @@ Held over the step, it composes to the step exactly. See ``docs/theory/datasets.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -119,59 +120,64 @@ def range_azimuth(points: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]
     return r, np.arctan2(y, x), J @ covs @ np.swapaxes(J, -1, -2)
 
 
-def stepped_sequence(
-    name: str,
-    steps: Floats,
-    step_covs: Floats,
-    poses: list[int],
-    points: Floats,
-    point_covs: Floats,
-    ids: list[list[int]],
-    notes: Mapping[str, str],
-) -> Sequence:
-    """Sequence of a file of steps and of landmarks seen between them; rows at the end of each step, and at rest at 0.
+@dataclass(frozen=True, eq=False)
+class StepRun:
+    """Steps of a planar robot, and landmarks seen between them."""
+
+    steps: Floats
+    """(dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians."""
+    step_covs: Floats
+    """Covariances of the steps, shape (n, 3, 3)."""
+    poses: list[int]
+    """Number of steps before each landmark, length m."""
+    points: Floats
+    """Landmarks in the body frame (x forward, y left), shape (m, 2), metres."""
+    point_covs: Floats
+    """Their covariances, shape (m, 2, 2)."""
+    ids: list[list[int]]
+    """Equally probable identities of each landmark, length m; negative ones are left out."""
+
+
+def stepped_sequence(name: str, run: StepRun, notes: Mapping[str, str]) -> Sequence:
+    """Sequence of a run; rows at the end of each step, and at rest at 0.
 
     The turn's noise is one density whose integral over a step has the mean variance of dθ, ``sqrt(mean(c_θθ) / T)``;
     that of the velocity is in the rows, and in the calibration their root mean square. The gyro has no bias.
-
-    ``steps``, ``step_covs``: as for `twists_of_steps`; ``poses``: number of steps before each landmark, length m;
-    ``points``, ``point_covs``: landmarks in the body frame (x forward, y left), shape (m, 2), and their covariances,
-    shape (m, 2, 2); ``ids``: equally probable identities of each landmark, length m; negative ones are left out.
     """
-    velocity, velocity_cov, rate_rad_s = twists_of_steps(steps, step_covs)
-    stamps_ns = np.arange(len(steps) + 1, dtype=np.int64) * NS_PER_S
-    dvl = planar_dvl(
-        stamps_ns,
-        np.vstack([np.zeros(2), velocity]),
-        np.concatenate([velocity_cov[:1], velocity_cov]),
-    )
-    x, y, z = np.sqrt(
-        np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
-    ).tolist()
-    detections = None
-    if ids:
-        candidate_ids = np.full((len(ids), max(map(len, ids))), -1, dtype=np.int64)
-        for row, found in enumerate(ids):
-            known = [identity for identity in found if identity >= 0]
-            candidate_ids[row, : len(known)] = known
-        is_known = candidate_ids >= 0
-        id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
-        polar = range_azimuth(points, point_covs)
-        detections = LandmarkDetections(
-            stamps_ns[poses], *polar, candidate_ids, id_probability
-        )
+    velocity, velocity_cov, rate_rad_s = twists_of_steps(run.steps, run.step_covs)
+    stamps_ns = np.arange(len(run.steps) + 1, dtype=np.int64) * NS_PER_S
+    # before the first step the robot rests, as uncertain as in that step
+    velocities = np.vstack([np.zeros(2), velocity])
+    velocity_covs = np.concatenate([velocity_cov[:1], velocity_cov])
+    dvl = planar_dvl(stamps_ns, velocities, velocity_covs)
+    variances = np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
+    x, y, z = np.sqrt(variances).tolist()
+    gyro_noise_density = float(np.sqrt(np.mean(run.step_covs[:, 2, 2])))
     return Sequence(
         name=name,
-        calibration=planar_calibration(
-            (float(np.sqrt(np.mean(step_covs[:, 2, 2]))), 0.0, 0.0), (x, y, z)
-        ),
+        calibration=planar_calibration((gyro_noise_density, 0.0, 0.0), (x, y, z)),
         imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
         dvl=dvl,
-        detections=detections,
+        detections=_detections(run, stamps_ns) if run.ids else None,
         notes={
             "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
             "truth": "none",
             "odometry": "each step as the constant twist that makes it in one second",
         }
         | dict(notes),
+    )
+
+
+def _detections(run: StepRun, stamps_ns: Ints) -> LandmarkDetections:
+    """Landmarks as ranges and azimuths, at the end of the step before."""
+    most = max(map(len, run.ids))
+    candidate_ids = np.full((len(run.ids), most), -1, dtype=np.int64)
+    for row, found in enumerate(run.ids):
+        known = [identity for identity in found if identity >= 0]
+        candidate_ids[row, : len(known)] = known
+    is_known = candidate_ids >= 0
+    id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
+    polar = range_azimuth(run.points, run.point_covs)
+    return LandmarkDetections(
+        stamps_ns[run.poses], *polar, candidate_ids, id_probability
     )

@@ -20,14 +20,16 @@ Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`
 ``LANDMARK`` line does. Landmarks keep their numbers.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.convert.planar import stepped_sequence
+from sonar_graph.logs.convert.planar import StepRun, stepped_sequence
 from sonar_graph.logs.convert.text_tables import numbers, read_lines
+from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 
 POINT_COV_PLACES = [[0, 1], [1, 2]]
@@ -39,21 +41,12 @@ DLR_POINT = ("pX", "pY", "quality", "cXX", "cXY", "cYY")
 DLR_LINES = "lines 'STEP image dX dY dPhi + 6 covariances' and 'LANDMARK_C pX pY quality + 3 covariances + IDs'"
 BODY_OF_FILE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """(x, y, θ) in body axes from (x, y, φ) in DLR's file."""
-PARK_STEP = (
-    "i",
-    "j",
-    "dx",
-    "dy",
-    "dtheta",
-    "c_xx",
-    "c_xy",
-    "c_xt",
-    "c_yy",
-    "c_yt",
-    "c_tt",
-)
+PARK_COV = ("c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt")
+PARK_COLUMNS = {
+    "ODOMETRY": ("i", "j", "dx", "dy", "dtheta", *PARK_COV),
+    "LANDMARK": ("i", "landmark", "x", "y", "c_xx", "c_xy", "c_yy"),
+}
 PARK_STEP_COV_PLACES = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-PARK_POINT = ("i", "landmark", "x", "y", "c_xx", "c_xy", "c_yy")
 PARK_LINES = "lines 'ODOMETRY i j dx dy dtheta + 6 covariances' and 'LANDMARK i landmark x y + 3 covariances'"
 
 
@@ -76,51 +69,45 @@ def read_dlr(path: Path) -> Sequence:
     DatasetError
         When the file is missing or malformed, or a landmark comes before the first step.
     """
-    if path.is_dir() and not (path / DLR_FILE).exists():
-        raise DatasetError(
-            f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself"
-        )
-    path = path / DLR_FILE if path.is_dir() else path
+    if path.is_dir():
+        if not (path / DLR_FILE).exists():
+            raise DatasetError(
+                f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself"
+            )
+        path = path / DLR_FILE
     steps: list[list[float]] = []
     points: list[list[float]] = []
     ids: list[list[int]] = []
     poses: list[int] = []
-    for number, (kind, *rest) in read_lines(path, DLR_LINES):
+    for number, kind, rest in _lines(path, DLR_LINES, "STEP", "LANDMARK", "LANDMARK_C"):
         if kind == "STEP":
+            # the first number is that of an image
             steps.append(numbers(path, number, rest[1:], DLR_STEP))
             continue
-        if kind not in ("LANDMARK", "LANDMARK_C"):
-            raise DatasetError(
-                f"{path}, line {number}: begins with {kind!r}; expected {DLR_LINES}"
-            )
+        place = f"{path}, line {number}:"
         if not steps:
             raise DatasetError(
-                f"{path}, line {number}: a landmark before the first STEP; expected {DLR_LINES}"
+                f"{place} a landmark before the first STEP; expected {DLR_LINES}"
             )
-        points.append(numbers(path, number, rest[: len(DLR_POINT)], DLR_POINT))
+        x, y, _, *cov = numbers(path, number, rest[: len(DLR_POINT)], DLR_POINT)
         try:
-            ids.append([int(text) for text in rest[len(DLR_POINT) :]])
+            found = [int(text) for text in rest[len(DLR_POINT) :]]
         except ValueError as error:
             raise DatasetError(
-                f"{path}, line {number}: {error}; expected whole numbers as landmark IDs"
+                f"{place} {error}; expected whole numbers as landmark IDs"
             ) from error
-        if not ids[-1]:
+        if not found:
             raise DatasetError(
-                f"{path}, line {number}: no landmark ID after the covariances; expected {DLR_LINES}"
+                f"{place} no landmark ID after the covariances; expected {DLR_LINES}"
             )
+        points.append([x, y, *cov])
+        ids.append(found)
         poses.append(len(steps))
     if not steps:
         raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
-    rows, seen = np.array(steps), np.array(points).reshape(-1, len(DLR_POINT))
-    plane = BODY_OF_FILE[:2, :2]
     return stepped_sequence(
         "dlr_spatial_cognition",
-        rows[:, :3] @ BODY_OF_FILE.T,
-        BODY_OF_FILE @ rows[:, 3:][:, DLR_STEP_COV_PLACES] @ BODY_OF_FILE.T,
-        poses,
-        seen[:, :2] @ plane.T,
-        plane @ seen[:, 3:][:, POINT_COV_PLACES] @ plane.T,
-        ids,
+        _run(steps, DLR_STEP_COV_PLACES, poses, points, ids, BODY_OF_FILE),
         {
             "data set": "DLR Spatial Cognition; Kurlbaum, Frese, SFB/TR 8 report, 2009",
             "licence": "none stated",
@@ -160,40 +147,66 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
     steps: list[list[float]] = []
     points: list[list[float]] = []
+    ids: list[list[int]] = []
     poses: list[int] = []
     newest = 0
-    for number, (kind, *rest) in read_lines(path, PARK_LINES):
-        if kind not in ("ODOMETRY", "LANDMARK"):
-            raise DatasetError(
-                f"{path}, line {number}: begins with {kind!r}; expected {PARK_LINES}"
-            )
-        values = numbers(
-            path, number, rest, PARK_STEP if kind == "ODOMETRY" else PARK_POINT
-        )
-        if values[0] != newest:
+    for number, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
+        start, end, *values = numbers(path, number, rest, PARK_COLUMNS[kind])
+        if start != newest:
             raise DatasetError(
                 f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"
                 " expected one chain of poses from 0, with landmarks seen from the newest"
             )
         if kind == "ODOMETRY":
-            newest = int(values[1])
-            steps.append(values[2:])
+            newest = int(end)
+            steps.append(values)
         else:
-            points.append(values[1:])
+            points.append(values)
+            ids.append([int(end)])
             poses.append(len(steps))
     if not steps:
         raise DatasetError(f"{path}: holds no ODOMETRY line; expected {PARK_LINES}")
-    rows, seen = np.array(steps), np.array(points).reshape(-1, len(PARK_POINT) - 1)
     return stepped_sequence(
         "victoria_park",
-        rows[:, :3],
-        rows[:, 3:][:, PARK_STEP_COV_PLACES],
-        poses,
-        seen[:, 1:3],
-        seen[:, 3:][:, POINT_COV_PLACES],
-        seen[:, :1].astype(np.int64).tolist(),
+        _run(steps, PARK_STEP_COV_PLACES, poses, points, ids, np.eye(3)),
         {
             "data set": "Victoria Park; Guivant, Nebot, IEEE T-RA 17(3), 2001; edge list of GTSAM's examples",
             "noise": "the file's covariances",
         },
+    )
+
+
+def _lines(
+    path: Path, expected: str, *kinds: str
+) -> Iterator[tuple[int, str, list[str]]]:
+    """Number, kind and other fields of each line; a `DatasetError` for other kinds."""
+    for number, (kind, *rest) in read_lines(path, expected):
+        if kind not in kinds:
+            raise DatasetError(
+                f"{path}, line {number}: begins with {kind!r}; expected {expected}"
+            )
+        yield number, kind, rest
+
+
+def _run(
+    steps: list[list[float]],
+    step_cov_places: list[list[int]],
+    poses: list[int],
+    points: list[list[float]],
+    ids: list[list[int]],
+    body_R_file: Floats,
+) -> StepRun:
+    """Steps and landmarks in body axes; the rows of the file hold a displacement, then elements of its covariance."""
+    rows = np.array(steps)  # (n, 9)
+    seen = np.array(points).reshape(-1, 5)  # (m, 5)
+    step_covs = rows[:, 3:][:, step_cov_places]
+    point_covs = seen[:, 2:][:, POINT_COV_PLACES]
+    plane = body_R_file[:2, :2]
+    return StepRun(
+        steps=rows[:, :3] @ body_R_file.T,
+        step_covs=body_R_file @ step_covs @ body_R_file.T,
+        poses=poses,
+        points=seen[:, :2] @ plane.T,
+        point_covs=plane @ point_covs @ plane.T,
+        ids=ids,
     )
