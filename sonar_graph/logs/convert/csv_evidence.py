@@ -51,6 +51,7 @@ def time_units(
     lead = next((table for table, role in roles.items() if role == "imu"), None)
     if lead is None or len(times[lead]) < FEWEST_ROWS:
         return {}
+    # units in which each table by itself is plausible
     fits = {
         table: [known[table]]
         if table in known
@@ -67,6 +68,7 @@ def time_units(
         for table, values in times.items()
         if len(values) > 1
     }
+    # then together: what a unit of the IMU leaves for the others
     possible: dict[str, dict[str, list[str]]] = {}
     for unit in fits[lead]:
         lead_s = times[lead] * TIMES[unit]
@@ -74,6 +76,7 @@ def time_units(
             table: _of_one_dive(times[table], units, lead_s, roles[table])
             for table, units in fits.items()
         } | {lead: [unit]}
+    # a Doppler log that fits no unit must not decide about the IMU
     dvls = [table for table in fits if roles[table] == "dvl"]
     complete = [unit for unit in possible if all(possible[unit][dvl] for dvl in dvls)]
     # an IMU of 1 Hz in seconds looks like one of 1 kHz in milliseconds: a date tells them apart
@@ -91,6 +94,7 @@ def _has_rate_of(role: str, times_s: Floats) -> bool:
     slowest_hz, fastest_hz = RATES_HZ.get(role, (0.0, np.inf))
     if len(times_s) < FEWEST_ROWS:
         return True
+    # the median: pauses of a sensor do not count
     return slowest_hz <= 1 / float(np.median(np.diff(times_s))) <= fastest_hz
 
 
@@ -120,6 +124,7 @@ def valid_mark(name: str, marks: Floats, velocity: Floats) -> int | None:
 
     ``name`` is that of the column, ``marks`` its values, shape (n,).
     """
+    # counts of beams and codes of errors have more than two values
     if not np.isin(marks, (0.0, 1.0)).all():
         return None
     absent = is_absent(velocity)
@@ -127,6 +132,7 @@ def valid_mark(name: str, marks: Floats, velocity: Floats) -> int | None:
         is_other = marks != mark
         if is_other.any() and absent[is_other].all() and not absent[~is_other].all():
             return mark
+    # the velocities prove nothing where a driver holds the last one
     name = name.lower()
     if re.search(r"valid|lock|good", name) and not re.search(
         r"invalid|status|unlock", name
@@ -138,6 +144,7 @@ def valid_mark(name: str, marks: Floats, velocity: Floats) -> int | None:
 def is_absent(vectors: Floats) -> NDArray[np.bool_]:
     """Rows of vectors, shape (n, m), that are not measured: empty, or one number such as -32768 in all components."""
     is_empty: NDArray[np.bool_] = ~np.isfinite(vectors).all(axis=1)
+    # one component may well be zero
     if vectors.shape[1] == 1:
         return is_empty
     return np.asarray(is_empty | (np.ptp(vectors, axis=1) == 0))

@@ -1,4 +1,4 @@
-"""Text tables as a `Sequence`: a TOML file says which columns are what, in the words of a log configuration.
+"""Text tables as a `Sequence`: a TOML file maps columns to roles, with the keys of a log configuration.
 
 Each table of the file is a role, as in a log configuration (docs/tutorials/04_your_own_log.md), with columns in place
 of fields, and with the keys of `CsvForm`. What stands before the first table holds for all::
@@ -131,11 +131,13 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
     stated: dict[str, Any] = {}
     for key, value in table.items():
         field = kind.model_fields.get(key)
+        # the form of the file, a setting of the adapter, or false: the vehicle does not have it
         if key in CsvForm.model_fields:
             form[key] = value
         elif value is not False or isinstance(getattr(defaults, key, None), bool):
             stated[key] = _as_names(kind, key, value)
         elif field is None:
+            # kept for the error that names the unknown key
             stated[key] = value
         elif field.is_required():
             # a sensor without it, such as an IMU without accelerometers
@@ -146,6 +148,7 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
         )
     place = f"{source}: [{role}]"
     adapter = _checked(kind, {"type": "csv", "stamp": STAMP} | stated, place)
+    # errors about a column name the key under which it stands
     columns = list(adapter.fields())
     paths = dict(_paths(stated))
     keys = {column: paths.get(column, column) for column in columns}
@@ -162,6 +165,7 @@ def _checked(model: type[BaseModel], values: dict[str, Any], place: str) -> Any:
 def _as_names(kind: type[Adapter], key: str, value: Any) -> Any:
     """Numbers of columns as names, where a key of an adapter names columns."""
     field = kind.model_fields.get(key)
+    # a key without texts has numbers of its own, such as an angle
     if field is None or "str" not in str(field.annotation):
         return value
     if isinstance(value, list):
@@ -191,14 +195,14 @@ def read_csv(
     tables
         Files, or a folder that holds them.
     config
-        TOML file that says which columns are what, or the same as a dict; `csv_template` begins one.
+        TOML file that maps columns to roles, or the same as a dict; `csv_template` begins one.
     name
-        Name of the sequence; the name of the configuration, or of the IMU's file, where there is none.
+        Name of the sequence; by default the name of the configuration, or of the IMU's file.
 
     Returns
     -------
     Sequence
-        Measurements with the calibration's defaults. The notes ``csv.*`` say what was left out and looks wrong.
+        Measurements with the calibration's defaults. The notes ``csv.*`` name what was left out and looks wrong.
 
     Raises
     ------
@@ -231,6 +235,7 @@ def read_csv(
         roles = read_csv_config(as_path(config, "read_csv(tables, config)"))
         name = name or spelt(Path(config).stem)
     found = {role: _table(one, files, source) for role, one in roles.items()}
+    # before anything is read: a wrong unit of time makes all other messages misleading
     _require_units(roles, found)
     blocks, notes = _measurements(roles, found)
     require_use(source, blocks["imu"], blocks["dvl"])
@@ -257,6 +262,7 @@ def _measurements(
         if isinstance(adapter, DepthAdapter):
             assumed = adapter.assumption(calibration.gravity_m_s2)
             notes |= {"log.depth": assumed} if assumed else {}
+        # axes of the vehicle: a mounting is of the calibration, which tables do not have
         rows, dropped = rows_of(adapter, table, calibration, np.eye(3), origin)
         faults = [f"{count} {fault}" for fault, count in dropped.items()]
         if rows is None:
@@ -297,10 +303,9 @@ def _require_units(
     units = time_units(times, {role: role for role in times}, known)
     for role in unknown:
         found = units.get(role, ["s"])
-        # of the slower sensors a part of the dive is plausible too, so only the IMU has to be sure
+        # only the IMU has to be sure: a slower sensor may have run for a part of the dive
         if found == ["s"] or (role != "imu" and "s" in found):
             continue
-        # where no unit fits the IMU, the fault is its, and it comes first
         step_s = float(np.median(np.diff(times[role])))
         table = tables[role]
         likely = " or ".join(f'"{unit}"' for unit in found if unit != "s")
@@ -316,6 +321,7 @@ _SENSORS = {"imu": "an IMU", "dvl": "a Doppler log"}
 
 def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
     """Warning about a column that marks invalid velocities, and that nothing uses."""
+    # velocities along beams have no components that could repeat one number
     if not isinstance(dvl.adapter, DvlAdapter) or dvl.adapter.velocity is None:
         return
     velocity = table.beside(dvl.adapter.velocity)
@@ -353,6 +359,7 @@ def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
             )
         (wanted,) = files
     if wanted not in files:
+        # a file that only the command forgot
         beside = [path.parent / wanted for path in files.values()]
         add = next((path for path in beside if path.is_file()), wanted)
         hint = f"add {add} to the command;"
@@ -388,6 +395,7 @@ def table_files(given: Iterable[Path]) -> dict[str, Path]:
             raise LogError(
                 f"{path}: holds no files; give the folder that holds the tables"
             )
+        # a configuration names files without their folders
         for one in inside:
             if not found.setdefault(one.name, one).samefile(one):
                 raise LogError(

@@ -272,6 +272,7 @@ def csv_template(tables: list[Path]) -> str:
         "# All keys: docs/tutorials/11_tables.md#the-keys"
     ]
     parts += [table.listing() for table in found.values()]
+    # the order in which a user thinks of the sensors, those that are needed first
     for role, empty in _EMPTY.items():
         options = sorted(
             (guess for guess in guesses if guess.role == role),
@@ -375,6 +376,7 @@ class _Table:
             if column not in (*true, self.time)
             and not re.search(_NOT_MEASURED, column.name)
         ]
+        # "angular_velocity" is a velocity by its name
         rates = self.find("angular_velocity", live)
         not_rates = [c for c in live if not rates or c not in rates.chosen]
         has_forces = self.find("linear_acceleration", live) is not None
@@ -481,7 +483,7 @@ class _Match:
         return units is not None and self.chosen[0].unit not in units
 
     def doubt(self) -> str:
-        """Question about the columns or their unit; empty where there is none."""
+        """Question about the columns or their unit; empty without doubt."""
         quantity = self.quantity
         if quantity.units is None:
             return ""
@@ -511,6 +513,7 @@ class _Match:
         sizes = np.linalg.norm(values, axis=1)
         if self.quantity.key in ("yaw", "azimuth", "rpy"):
             sizes = np.abs(values).max(axis=1)
+        # gravity is there all the time, the fastest motion is rare: but for spikes the largest counts
         size = float(np.percentile(sizes, 50 if lowest else 99))
         if self.quantity.key == "pressure":
             # a dive begins near the surface
@@ -525,6 +528,7 @@ class _Match:
         """Lines of the configuration: columns, and their unit."""
         key = self.quantity.key
         names = [column.given for column in self.chosen]
+        # latitudes and depths have units of their own kind
         if key == "geodetic":
             return [self._geodetic()]
         if key == "height":
@@ -584,6 +588,7 @@ class _Match:
 
 def _file(path: Path) -> tuple[CsvFile, list[str]]:
     """A file read in the form in which most cells of its first row have values, and the lines that state it."""
+    # a file that no form fits keeps the error of the usual form
     best: tuple[int, CsvFile, dict[str, str]] | None = None
     fault: LogError | None = None
     for form in _FORMS:
@@ -593,6 +598,7 @@ def _file(path: Path) -> tuple[CsvFile, list[str]]:
             fault = fault or error
             continue
         count = sum(map(file.form.is_value, file.layout.first))
+        # numbers like 1,5 have no value with a decimal point, so the wrong form has fewer
         if best is None or count > best[0]:
             best = (count, file, form)
     if best is None:
@@ -651,6 +657,7 @@ def _column(given: str) -> _Column:
     unit = given[len(bare) :].strip(" []()").lower() or None
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare)
     name = re.sub(r"[\s.\-]+", "_", apart).lower().strip("_")
+    # the longest first: m_s before s
     if unit is None:
         for spelling in sorted(_SPELLINGS, key=len, reverse=True):
             if name.endswith(f"_{spelling}"):
@@ -663,6 +670,7 @@ def _column(given: str) -> _Column:
 def _fitting(quantity: Quantity, columns: list[_Column]) -> list[list[_Column]]:
     """Columns for all components of a quantity, for each name without the component that has them all."""
     found: dict[str, dict[int, _Column]] = {}
+    # components by what is left of the name: two sensors in one table stay apart
     for column in columns:
         for place, part in enumerate(quantity.parts):
             pattern = (

@@ -54,6 +54,7 @@ def twists_of_steps(steps: Floats, covs: Floats) -> tuple[Floats, Floats, Floats
     """
     angle_rad = steps[:, 2]
     half = 0.5 * angle_rad
+    # at zero the tangent's quotient is 0 / 0
     small = np.abs(angle_rad) < SMALL_ANGLE_RAD
     h = np.where(
         small, 1.0 - angle_rad**2 / 12.0, half / np.tan(np.where(small, 1.0, half))
@@ -79,6 +80,7 @@ def planar_dvl(stamps_ns: Ints, velocity: Floats, velocity_cov: Floats) -> Dvl:
     n = len(stamps_ns)
     cov = np.zeros((n, 3, 3))
     cov[:, :2, :2] = velocity_cov
+    # the robot does not leave its plane; zero would make the covariance singular
     cov[:, 2, 2] = VERTICAL_VELOCITY_SIGMA_M_S**2
     return Dvl(stamps_ns, np.column_stack([velocity, np.zeros(n)]), cov)
 
@@ -102,6 +104,7 @@ def planar_calibration(
         start=start or Start(),
         floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
         planar=PlanarMotion(),
+        # there are no forces, and each row holds over the step before it
         use_gravity=False,
         odometry_interpolation="hold-past",
     )
@@ -175,6 +178,7 @@ def _detections(run: StepRun, stamps_ns: Ints) -> LandmarkDetections:
     for row, found in enumerate(run.ids):
         known = [identity for identity in found if identity >= 0]
         candidate_ids[row, : len(known)] = known
+    # no identity is more probable than another
     is_known = candidate_ids >= 0
     id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
     polar = range_azimuth(run.points, run.point_covs)

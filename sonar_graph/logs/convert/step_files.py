@@ -152,6 +152,7 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     newest = 0
     for number, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
         start, end, *values = numbers(path, number, rest, PARK_COLUMNS[kind])
+        # a loop closure between poses would be an odometry edge too: the format has none
         if start != newest:
             raise DatasetError(
                 f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"
@@ -201,6 +202,7 @@ def _run(
     seen = np.array(points).reshape(-1, 5)  # (m, 5)
     step_covs = rows[:, 3:][:, step_cov_places]
     point_covs = seen[:, 2:][:, POINT_COV_PLACES]
+    # a reflection in the plane, which turns the sense of angles
     plane = body_R_file[:2, :2]
     return StepRun(
         steps=rows[:, :3] @ body_R_file.T,

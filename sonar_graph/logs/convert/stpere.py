@@ -114,6 +114,7 @@ def read_stpere(dataset_dir: Path) -> Sequence:
         angular_velocity=run.imu.angular_velocity - [0.0, 0.0, GYRO_Z_BIAS_RAD_S],
         specific_force=run.imu.specific_force - mean_force,
     )
+    # the run begins where both sensors have rows
     start_ns = int(max(imu.stamps_ns[0], run.dvl.stamps_ns[0]))
     first_ns = max(start_ns, int(run.truth.stamps_ns[0]))
     x, y, _ = run.truth.at(np.array([first_ns])).positions[0].tolist()
