@@ -245,7 +245,7 @@ class CsvFile:
 
     def numbers(self, name: str) -> Floats:
         """Numbers of a column, shape (n,), without broken rows; NaN for cells that hold none."""
-        _, (cells,) = self.columns([self.layout.names.index(name)], skip_broken=True)
+        _, (cells,) = self.columns([self.index(name, "")], skip_broken=True)
         plain = map(self.form.plain, cells)
         return np.array([float(cell) if is_number(cell) else np.nan for cell in plain])
 

@@ -306,7 +306,8 @@ class _Table:
     def __init__(self, name: str, path: Path) -> None:
         self.name = name
         self.file, self.form_lines = _file(path)
-        self.columns = [_column(given) for given in self.file.layout.names]
+        names = self.file.layout.names
+        self.columns = [_column(given, names) for given in names]
         self._values: dict[str, Floats] = {}
         self.time = self._time()
 
@@ -651,7 +652,7 @@ def _stamps(
     return lines
 
 
-def _column(given: str) -> _Column:
+def _column(given: str, names: tuple[str, ...]) -> _Column:
     """Column with its unit, from ``[...]``, ``(...)`` or the end of its name."""
     bare = plain_name(given)
     unit = given[len(bare) :].strip(" []()").lower() or None
@@ -664,7 +665,9 @@ def _column(given: str) -> _Column:
                 unit = spelling
                 name = name.removesuffix(f"_{spelling}")
                 break
-    return _Column(given, name, _SPELLINGS.get(unit or ""))
+    # the short name, where no other column has it in another unit
+    is_short = [plain_name(other) for other in names].count(bare) == 1
+    return _Column(bare if is_short else given, name, _SPELLINGS.get(unit or ""))
 
 
 def _fitting(quantity: Quantity, columns: list[_Column]) -> list[list[_Column]]:
