@@ -143,7 +143,7 @@ def valid_mark(name: str, marks: Floats, velocity: Floats) -> int | None:
 
 def is_absent(vectors: Floats) -> NDArray[np.bool_]:
     """Rows of vectors, shape (n, m), that are not measured: empty, or one number such as -32768 in all components."""
-    is_empty: NDArray[np.bool_] = ~np.isfinite(vectors).all(axis=1)
+    is_empty = np.asarray(~np.isfinite(vectors).all(axis=1))
     # one component may well be zero
     if vectors.shape[1] == 1:
         return is_empty

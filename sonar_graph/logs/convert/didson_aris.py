@@ -241,14 +241,15 @@ class DidsonFormat(LensSonarFormat):
             raise DamagedFrameError(
                 f"frame {number} with window codes {start} and {length}"
             )
-        *calendar, hundredths = struct.unpack_from("<7i", content, 20)
-        year = calendar[0]
+        year, month, day, hour, minute, second, hundredths = struct.unpack_from(
+            "<7i", content, 20
+        )
         if not 1990 <= year <= LAST_YEAR or not 0 <= hundredths < 100:
             raise DamagedFrameError(
                 f"frame {number} of the year {year}, with {hundredths} hundredths of a second"
             )
         try:
-            moment = datetime(*calendar, tzinfo=UTC)
+            moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
         except (ValueError, OverflowError) as error:
             raise DamagedFrameError(
                 f"frame {number} with a time that does not exist: {error}"

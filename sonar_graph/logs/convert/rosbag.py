@@ -456,8 +456,16 @@ class _BagCopy:
         store: Typestore = self._bag.typestore
         is2 = self._bag.is2
         if not is_same_wireformat(store, self._store, own, type_name):
-            names = (store, self._store, own, type_name, {})
-            return partial(migrate_bytes, *names, src_is2=is2, dst_is2=True)
+            return partial(
+                migrate_bytes,
+                store,
+                self._store,
+                own,
+                type_name,
+                {},
+                src_is2=is2,
+                dst_is2=True,
+            )
         # CDR of the same fields needs no change
         if is2:
             return memoryview
