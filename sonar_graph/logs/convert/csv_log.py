@@ -328,7 +328,7 @@ def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
     for name in table.file.layout.names:
         if name in dvl.keys or not re.search(VALIDITY, name.lower()):
             continue
-        marks = table.file.numbers(name)
+        (marks,) = table.file.numbers(name)
         mark = valid_mark(name, marks, velocity)
         invalid = int(np.count_nonzero(marks != mark))
         if mark is not None and invalid:

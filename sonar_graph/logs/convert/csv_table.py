@@ -243,11 +243,17 @@ class CsvFile:
             f"{', '.join(names[:_MOST_NAMED])}{more}{without}"
         )
 
-    def numbers(self, name: str) -> Floats:
-        """Numbers of a column, shape (n,), without broken rows; NaN for cells that hold none."""
-        _, (cells,) = self.columns([self.index(name, "")], skip_broken=True)
-        plain = map(self.form.plain, cells)
-        return np.array([float(cell) if is_number(cell) else np.nan for cell in plain])
+    def numbers(self, *names: str) -> list[Floats]:
+        """Numbers of columns, shape (n,) each, without broken rows; NaN for cells that hold none."""
+        indices = [self.index(name, "") for name in names]
+        _, columns = self.columns(indices, skip_broken=True)
+        return [np.array(list(map(self._number, cells)), float) for cells in columns]
+
+    def _number(self, cell: str) -> float:
+        try:
+            return float(self.form.plain(cell))
+        except ValueError:
+            return np.nan
 
     def columns(
         self, indices: list[int], *, skip_broken: bool = False

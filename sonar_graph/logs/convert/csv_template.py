@@ -313,9 +313,10 @@ class _Table:
 
     def values(self, columns: list[_Column]) -> Floats:
         """Numbers of some columns, shape (n, number of columns)."""
-        for column in columns:
-            if column.given not in self._values:
-                self._values[column.given] = self.file.numbers(column.given)
+        # one pass over the file for all of them
+        new = [column.given for column in columns if column.given not in self._values]
+        if new:
+            self._values |= dict(zip(new, self.file.numbers(*new), strict=True))
         return np.column_stack([self._values[column.given] for column in columns])
 
     def first(self, column: _Column) -> str:
@@ -593,6 +594,11 @@ def _file(path: Path) -> tuple[CsvFile, list[str]]:
     best: tuple[int, CsvFile, dict[str, str]] | None = None
     fault: LogError | None = None
     for form in _FORMS:
+        if best:
+            # another encoding is needed only where the usual one fails, a decimal comma where cells have no value
+            is_read = form.get("encoding") != best[2].get("encoding")
+            if is_read or best[0] == len(best[1].layout.first):
+                break
         try:
             file = CsvFile(path, CsvForm(**form))
         except LogError as error:
