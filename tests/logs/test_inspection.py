@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from sonar_graph.cli.main import main
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.log_config import LogConfig
-from sonar_graph.logs.convert.step_files import read_victoria_park
+from sonar_graph.logs.convert.planar import read_victoria_park
 from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
 from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.topic import Keep

@@ -7,9 +7,9 @@ from sonar_graph.logs.convert.csv_template import csv_template
 from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.oculus import convert_oculus
+from sonar_graph.logs.convert.planar import read_dlr, read_victoria_park
 from sonar_graph.logs.convert.rosbag import BagConversion, convert_rosbag
 from sonar_graph.logs.convert.sonar_file import SonarConversion
-from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
 from sonar_graph.logs.convert.stpere import read_stpere
 
 __all__ = [

@@ -21,7 +21,7 @@ from sonar_graph.calibration import (
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.adapters import east_north_up
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
@@ -73,28 +73,26 @@ def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
 
 
 def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
-    """Seconds to add to the reference's stamps so that it turns when the gyros do; 0 where that cannot be told.
+    """Seconds to add to the reference's stamps so that it turns when the gyros do; 0 where the best is the last tried.
 
     The offset τ, about one of `OFFSETS_S`, whose sum of ``|Log(R_k^T R_k+1) - ∫ ω dt - mean|²`` is least. The integral
     is from ``t_k + τ`` to ``t_k+1 + τ``, and the mean is what gyro bias and the Earth add.
     """
     if len(reference) < LEAST_POSES:
         return 0.0
-    seconds, knots = (
-        (ns - imu.stamps_ns[0]) * 1e-9 for ns in (imu.stamps_ns, reference.stamps_ns)
-    )
-    steps = (
-        0.5
-        * (imu.angular_velocity[1:] + imu.angular_velocity[:-1])
-        * np.diff(seconds)[:, None]
-    )
+    first_ns = imu.stamps_ns[0]
+    seconds = (imu.stamps_ns - first_ns) * 1e-9
+    knots = (reference.stamps_ns - first_ns) * 1e-9
+    rates = imu.angular_velocity
+    steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(seconds)[:, None]
+    # integral of ω; over a second the turns are small enough to add as vectors
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    knots = knots[
-        (knots + OFFSETS_S[0] >= seconds[0]) & (knots + OFFSETS_S[-1] <= seconds[-1])
-    ]
-    rotations = reference.at(
-        imu.stamps_ns[0] + np.rint(knots * NS_PER_S).astype(np.int64)
-    ).rotations()
+    # the same knots for each offset, so that the misfits are of as many terms
+    is_inside = knots + OFFSETS_S[0] >= seconds[0]
+    is_inside &= knots + OFFSETS_S[-1] <= seconds[-1]
+    knots = knots[is_inside]
+    knots_ns = first_ns + np.rint(knots * NS_PER_S).astype(np.int64)
+    rotations = reference.at(knots_ns).rotations()
     of_reference = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
 
     def misfit(offset_s: float) -> float:
@@ -108,16 +106,10 @@ def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
     best = int(np.argmin(misfits))
     if not 0 < best < len(OFFSETS_S) - 1:
         return 0.0
-    before, least, after = misfits[
-        best - 1 : best + 2
-    ].tolist()  # the vertex of the parabola through them
-    return float(
-        OFFSETS_S[best]
-        + 0.5
-        * (before - after)
-        / (before - 2 * least + after)
-        * (OFFSETS_S[1] - OFFSETS_S[0])
-    )
+    # the vertex of the parabola through the least misfit and those beside it
+    before, least, after = misfits[best - 1 : best + 2].tolist()
+    vertex = 0.5 * (before - after) / (before - 2 * least + after)
+    return float(OFFSETS_S[best] + vertex * (OFFSETS_S[1] - OFFSETS_S[0]))
 
 
 def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
@@ -142,42 +134,31 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
         When the folder or the trajectory does not exist, or a file is missing or malformed.
     """
     folder = numbered_run(dataset_dir, "TrajectoryN", trajectory, "trajectory", FILES)
-    imu_rows, dvl_rows, reference_rows = (
-        read_table(
-            folder / f"{kind}_trajectory{trajectory}.csv",
-            columns,
-            delimiter=",",
-            header_lines=1,
-        ).values
-        for kind, columns in (
-            ("IMU", IMU_COLUMNS),
-            ("DVL", DVL_COLUMNS),
-            ("GT", REFERENCE_COLUMNS),
-        )
-    )
-    imu_ns, dvl_ns, reference_ns = (
-        np.arange(len(rows), dtype=np.int64) * period_ns
-        for rows, period_ns in (
-            (imu_rows, IMU_PERIOD_NS),
-            (dvl_rows, DVL_PERIOD_NS),
-            (reference_rows, DVL_PERIOD_NS),
-        )
-    )
+
+    def rows_of(
+        kind: str, columns: tuple[str, ...], period_ns: int
+    ) -> tuple[Ints, Floats]:
+        """Stamps and rows of a file; its own times are rounded, so that rows count by their number."""
+        path = folder / f"{kind}_trajectory{trajectory}.csv"
+        rows = read_table(path, columns, delimiter=",", header_lines=1).values
+        return np.arange(len(rows), dtype=np.int64) * period_ns, rows
+
+    imu_ns, imu_rows = rows_of("IMU", IMU_COLUMNS, IMU_PERIOD_NS)
+    dvl_ns, dvl_rows = rows_of("DVL", DVL_COLUMNS, DVL_PERIOD_NS)
+    reference_ns, reference_rows = rows_of("GT", REFERENCE_COLUMNS, DVL_PERIOD_NS)
     to_flu = FLU_OF_FRD * IMU_FRD_SIGNS
     imu = Imu(imu_ns, imu_rows[:, 4:7] * to_flu, imu_rows[:, 1:4] * to_flu)
-    dvl = Dvl(
-        DVL_DELAY_NS + dvl_ns,
-        dvl_rows[:, 1:] * FLU_OF_FRD,
-        np.full((len(dvl_ns), 3, 3), np.nan),
-    )
+    velocity = dvl_rows[:, 1:] * FLU_OF_FRD
+    unknown = np.full((len(dvl_ns), 3, 3), np.nan)
+    dvl = Dvl(DVL_DELAY_NS + dvl_ns, velocity, unknown)
     longitude, latitude, altitude = reference_rows[:, 1:4].T
     quaternions = enu_R_flu(*reference_rows[:, 7:10].T).as_quat()
-    positions = east_north_up(
-        latitude, longitude, altitude, (float(latitude[0]), float(longitude[0]), 0.0)
-    )
+    origin = (float(latitude[0]), float(longitude[0]), 0.0)
+    positions = east_north_up(latitude, longitude, altitude, origin)
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)
     offset_s = reference_offset_s(imu, truth)
     shifted_ns = reference_ns + round(offset_s * NS_PER_S)
+    # before the IMU's first row there is nothing to compare
     is_kept = shifted_ns >= 0
     truth = Trajectory.without_covariances(
         shifted_ns[is_kept], positions[is_kept], quaternions[is_kept]

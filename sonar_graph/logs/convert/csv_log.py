@@ -1,4 +1,4 @@
-"""Text tables as a `Sequence`: a TOML file says which columns are what, in the words of a log configuration.
+"""Text tables as a `Sequence`: a TOML file maps columns to roles, with the keys of a log configuration.
 
 Each table of the file is a role, as in a log configuration (docs/tutorials/04_your_own_log.md), with columns in place
 of fields, and with the keys of `CsvForm`. What stands before the first table holds for all::
@@ -23,24 +23,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, spelt, text_of
 from sonar_graph.logs.adapters import (
     ADAPTERS,
-    TIMES,
     Adapter,
     DepthAdapter,
     DetectionRowsAdapter,
-    Dropped,
+    DvlAdapter,
     LandmarkRowsAdapter,
     plain_lines,
 )
 from sonar_graph.logs.checks import stamp_faults
+from sonar_graph.logs.convert.csv_evidence import VALIDITY, time_units, valid_mark
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
 from sonar_graph.logs.reading import common_origin, require_use, rows_of
+from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import faults_in, toml_key
 
@@ -51,14 +52,16 @@ CSV_ADAPTERS: dict[str, type[Adapter]] = {
     "true_landmarks": LandmarkRowsAdapter,
 }
 """Adapter of each role that a table can play."""
-NOT_OF_TABLES = ("type", "topic", "frame_id_field", "frame_id")
+NOT_OF_TABLES = {"type", "topic", "frame_id_field", "frame_id"}
 """Keys of a log configuration that have no sense for a table."""
-IMU_RATES_HZ = (5.0, 5000.0)
-"""Rates of inertial sensors, by which the unit of times is known."""
-FEWEST_ROWS = 10
-"""Rows from which a rate, and a column that never changes, are known."""
+SHARED = CsvForm.model_fields.keys() - {"file", "columns"} | {
+    "stamp",
+    "stamp_unit_s",
+    "stamp_offset_s",
+}
+"""Keys that may stand before the first table, for all of them."""
 STAMP = "time"
-"""Column of the time where nothing says another."""
+"""Default column of the time."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +76,9 @@ class CsvRole:
 
 
 def read_csv_config(path: Path) -> dict[str, CsvRole]:
-    """Read a TOML file that says which columns of which tables are what; its roles by name.
+    """Read a TOML file that maps the columns of tables to roles; its roles by name.
 
-    A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
+    A LogError where it cannot be read, is not TOML, or has a key that cannot be; it names table and key.
     """
     try:
         values = tomllib.loads(text_of(path))
@@ -88,22 +91,17 @@ def read_csv_config(path: Path) -> dict[str, CsvRole]:
 
 def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRole]:
     """Roles from values as TOML gives them; errors as in `read_csv_config`, with the name of a ``source``."""
-    shared = {
-        key: value for key, value in values.items() if not isinstance(value, Mapping)
-    }
-    tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    for key in shared:
-        if key not in {
-            *CsvForm.model_fields,
-            "stamp",
-            "stamp_unit_s",
-            "stamp_offset_s",
-        } - {"file", "columns"}:
-            place = (
-                "it belongs into the table of a role"
-                if key not in CSV_ADAPTERS
-                else f"expected a table, [{key}]"
-            )
+    shared: dict[str, Any] = {}
+    tables: dict[str, dict[str, Any]] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            tables[key] = dict(value)
+        elif key in SHARED:
+            shared[key] = value
+        else:
+            place = "it belongs into the table of a role"
+            if key in CSV_ADAPTERS:
+                place = f"expected a table, [{key}]"
             raise LogError(
                 f"{source}: {key}: stands before the first table and so for all of them; {place}"
             )
@@ -115,8 +113,7 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
                 f"{source}: there is no role [{role}]; {hint}tables are for {', '.join(CSV_ADAPTERS)}"
             )
     found = {
-        role: _role(role, shared | dict(table), source)
-        for role, table in tables.items()
+        role: _role(role, shared | table, source) for role, table in tables.items()
     }
     for role in ("imu", "dvl"):
         if role not in found:
@@ -127,60 +124,63 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
 
 
 def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
+    """A role from its table, checked by the models of the form and of the adapter."""
     kind = CSV_ADAPTERS[role]
-    base = kind.model_construct(type="csv")
-    said: dict[str, Any] = {}
+    defaults = kind.model_construct(type="csv")
+    form: dict[str, Any] = {}
+    stated: dict[str, Any] = {}
     for key, value in table.items():
-        is_taken_away = (
-            value is False
-            and key in kind.model_fields
-            and not isinstance(getattr(base, key, None), bool)
-        )
-        if not is_taken_away:
-            said[key] = _as_names(kind, key, value)
-        elif kind.model_fields[
-            key
-        ].is_required():  # a sensor without it, such as an IMU without accelerometers
-            said[key] = None
-    form = {key: said.pop(key) for key in list(said) if key in CsvForm.model_fields}
-    for key in said.keys() & NOT_OF_TABLES:
+        field = kind.model_fields.get(key)
+        # the form of the file, a setting of the adapter, or false: the vehicle does not have it
+        if key in CsvForm.model_fields:
+            form[key] = value
+        elif value is not False or isinstance(getattr(defaults, key, None), bool):
+            stated[key] = _as_names(kind, key, value)
+        elif field is None:
+            # kept for the error that names the unknown key
+            stated[key] = value
+        elif field.is_required():
+            # a sensor without it, such as an IMU without accelerometers
+            stated[key] = None
+    for key in stated.keys() & NOT_OF_TABLES:
         raise LogError(
             f"{source}: [{role}] {key}: is for messages; a table has columns: take it out"
         )
+    place = f"{source}: [{role}]"
+    adapter = _checked(kind, {"type": "csv", "stamp": STAMP} | stated, place)
+    # errors about a column name the key under which it stands
+    columns = list(adapter.fields())
+    paths = dict(_paths(stated))
+    keys = {column: paths.get(column, column) for column in columns}
+    return CsvRole(role, _checked(CsvForm, form, place), adapter, keys)
+
+
+def _checked(model: type[BaseModel], values: dict[str, Any], place: str) -> Any:
     try:
-        as_form = CsvForm.model_validate(form)
+        return model.model_validate(values)
     except ValidationError as error:
-        raise LogError(f"{source}: [{role}] {faults_in(error, CsvForm)}") from error
-    try:
-        adapter = kind.model_validate({"type": "csv", "stamp": STAMP, **said})
-    except ValidationError as error:
-        raise LogError(f"{source}: [{role}] {faults_in(error, kind)}") from error
-    keys = {path: key for key, path in _paths(said) if path in set(adapter.fields())}
-    return CsvRole(
-        role,
-        as_form,
-        adapter,
-        {path: keys.get(path, path) for path in adapter.fields()},
-    )
+        raise LogError(f"{place} {faults_in(error, model)}") from error
 
 
 def _as_names(kind: type[Adapter], key: str, value: Any) -> Any:
-    """Numbers of columns as names, where a key of an adapter or of a form names columns."""
-    known = kind.model_fields.get(key)
-    if known is None or "str" not in str(known.annotation):
+    """Numbers of columns as names, where a key of an adapter names columns."""
+    field = kind.model_fields.get(key)
+    # a key without texts has numbers of its own, such as an angle
+    if field is None or "str" not in str(field.annotation):
         return value
     if isinstance(value, list):
-        return [str(item) if type(item) is int else item for item in value]
+        return [_as_names(kind, key, item) for item in value]
     return str(value) if type(value) is int else value
 
 
 def _paths(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Each text in a configuration, with the key under which it stands."""
     for key, value in table.items():
         if isinstance(value, Mapping):
-            yield from ((prefix + key, path) for path in value)
+            yield from ((path, prefix + key) for path in value)
             yield from _paths(value, f"{prefix}{key}.")
         for item in value if isinstance(value, list) else [value]:
-            yield prefix + key, str(item)
+            yield str(item), prefix + key
 
 
 def read_csv(
@@ -195,14 +195,14 @@ def read_csv(
     tables
         Files, or a folder that holds them.
     config
-        TOML file that says which columns are what, or the same as a dict; `csv_template` begins one.
+        TOML file that maps columns to roles, or the same as a dict; `csv_template` begins one.
     name
-        Name of the sequence; the name of the configuration, or of the IMU's file, where there is none.
+        Name of the sequence; by default the name of the configuration, or of the IMU's file.
 
     Returns
     -------
     Sequence
-        Measurements with the calibration's defaults. The notes ``csv.*`` say what was left out and looks wrong.
+        Measurements with the calibration's defaults. The notes ``csv.*`` name what was left out and looks wrong.
 
     Raises
     ------
@@ -228,146 +228,153 @@ def read_csv(
     given = [tables] if isinstance(tables, str | Path) else list(tables)
     files = table_files([as_path(one, "read_csv(tables)") for one in given])
     if isinstance(config, Mapping):
-        source, roles = "config", parse_csv_config(config, "config")
+        source = "config"
+        roles = parse_csv_config(config, source)
     else:
-        source, roles = (
-            str(config),
-            read_csv_config(as_path(config, "read_csv(tables, config)")),
-        )
+        source = str(config)
+        roles = read_csv_config(as_path(config, "read_csv(tables, config)"))
+        name = name or spelt(Path(config).stem)
     found = {role: _table(one, files, source) for role, one in roles.items()}
-    adapters = {role: one.adapter for role, one in roles.items()}
-    calibration, notes = Calibration(), dict[str, str]()
-    origin, said = common_origin(adapters, found)
-    notes |= {"log.origin": said} if said else {}
-    blocks: dict[str, Any] = {}
-    dropped: dict[str, Dropped] = {}
-    for role, table in found.items():
-        if isinstance(adapter := adapters[role], DepthAdapter) and (
-            assumed := adapter.assumption(calibration.gravity_m_s2)
-        ):
-            notes["log.depth"] = assumed
-        blocks[role], dropped[role] = rows_of(
-            adapter, table, calibration, np.eye(3), origin
-        )
-        if blocks[role] is None:
-            faults = ", ".join(
-                f"{count} {fault}" for fault, count in dropped[role].items()
-            )
-            raise LogError(
-                f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {faults}"
-            )
-    _require_unit(roles["imu"], found["imu"])
+    # before anything is read: a wrong unit of time makes all other messages misleading
+    _require_units(roles, found)
+    blocks, notes = _measurements(roles, found)
     require_use(source, blocks["imu"], blocks["dvl"])
-    doubts = [
-        f"{role}: {text}"
-        for role, table in found.items()
-        for text in adapters[role].warnings(table)
-    ]
-    doubts += [
-        f"{role}: {text}"
-        for role, table in found.items()
-        if role != "true_landmarks"
-        for text in stamp_faults(table.stamps_ns, table.stamps_ns)
-    ]
-    doubts += list(_unused_validity(roles["dvl"], found["dvl"]))
-    left_out = [
-        f"{role}: {count} {fault}"
-        for role, faults in dropped.items()
-        for fault, count in faults.items()
-    ]
-    notes |= {
-        f"csv.{role}": f"{one.file.path.name}: {'; '.join(_said(roles[role]))}"
-        for role, one in found.items()
-    }
-    notes |= {"csv.left_out": "; ".join(left_out)} if left_out else {}
-    notes |= {"csv.warnings": "; ".join(doubts)} if doubts else {}
     from sonar_graph.logs.measured_start import with_measured_start  # loads numba
 
-    calibration, notes["log.start"] = with_measured_start(calibration, blocks)
-    name = name or spelt(
-        found["imu"].file.path.stem
-        if isinstance(config, Mapping)
-        else Path(config).stem
-    )
+    calibration, notes["log.start"] = with_measured_start(Calibration(), blocks)
+    name = name or spelt(found["imu"].file.path.stem)
     return Sequence(name=name, calibration=calibration, notes=notes, **blocks)
 
 
-def _require_unit(imu: CsvRole, table: CsvTable) -> None:
-    """Refuse times whose unit nothing states, and in which the IMU has the rate of none."""
-    if "stamp_unit_s" in imu.adapter.model_fields_set or len(table) < FEWEST_ROWS:
-        return
-    step_s = float(np.median(np.diff(np.unique(table.stamps_ns)))) * 1e-9
-    if not IMU_RATES_HZ[0] / 10 <= 1 / step_s <= IMU_RATES_HZ[1]:
-        likely = next(
-            (
-                unit
-                for unit in ("ms", "us", "ns")
-                if IMU_RATES_HZ[0] <= 1 / (step_s * TIMES[unit]) <= IMU_RATES_HZ[1]
-            ),
-            None,
-        )
-        guess = (
-            f'write `stamp_unit_s = "{likely}"` before the first table'
-            if likely
-            else "write stamp_unit_s"
-        )
+def _measurements(
+    roles: Mapping[str, CsvRole], tables: Mapping[str, CsvTable]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Measurements by role, and notes about what was assumed, left out, and looks wrong."""
+    calibration = Calibration()
+    adapters = {role: one.adapter for role, one in roles.items()}
+    origin, about_origin = common_origin(adapters, tables)
+    notes = {"log.origin": about_origin} if about_origin else {}
+    blocks: dict[str, Any] = {}
+    left_out: list[str] = []
+    doubts: list[str] = []
+    for role, table in tables.items():
+        adapter = adapters[role]
+        if isinstance(adapter, DepthAdapter):
+            assumed = adapter.assumption(calibration.gravity_m_s2)
+            notes |= {"log.depth": assumed} if assumed else {}
+        # axes of the vehicle: a mounting is of the calibration, which tables do not have
+        rows, dropped = rows_of(adapter, table, calibration, np.eye(3), origin)
+        faults = [f"{count} {fault}" for fault, count in dropped.items()]
+        if rows is None:
+            raise LogError(
+                f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {', '.join(faults)}"
+            )
+        blocks[role] = rows
+        left_out += [f"{role}: {fault}" for fault in faults]
+        warnings = list(adapter.warnings(table))
+        if role != "true_landmarks":
+            warnings += stamp_faults(table.stamps_ns, table.stamps_ns)
+        if role == "dvl":
+            warnings += _unused_validity(roles[role], table)
+        doubts += [f"{role}: {text}" for text in warnings]
+        settings = "; ".join(_settings(roles[role]))
+        notes[f"csv.{role}"] = f"{table.file.path.name}: {settings}"
+    notes |= {"csv.left_out": "; ".join(left_out)} if left_out else {}
+    notes |= {"csv.warnings": "; ".join(doubts)} if doubts else {}
+    return blocks, notes
+
+
+def _require_units(
+    roles: Mapping[str, CsvRole], tables: Mapping[str, CsvTable]
+) -> None:
+    """Refuse times whose unit is not stated, where they are not plausible in seconds, or in other units too."""
+    times: dict[str, Floats] = {
+        role: np.unique(table.stamps_ns).astype(np.float64) * 1e-9
+        for role, table in tables.items()
+        if role != "true_landmarks" and len(table)
+    }
+    unknown = [
+        role
+        for role in times
+        if "stamp_unit_s" not in roles[role].adapter.model_fields_set
+        and not tables[role].has_dates
+    ]
+    known = dict.fromkeys(times.keys() - unknown, "s")
+    units = time_units(times, {role: role for role in times}, known)
+    for role in unknown:
+        found = units.get(role, ["s"])
+        # only the IMU has to be sure: a slower sensor may have run for a part of the dive
+        if found == ["s"] or (role != "imu" and "s" in found):
+            continue
+        step_s = float(np.median(np.diff(times[role])))
+        table = tables[role]
+        likely = " or ".join(f'"{unit}"' for unit in found if unit != "s")
         raise LogError(
-            f"{table.file.path}: [imu] stamp: {imu.adapter.stamp} has steps of {step_s:g}, which in seconds are "
-            f'an IMU of {1 / step_s:.3g} Hz; {guess}, or `stamp_unit_s = "s"` where these are seconds'
+            f"{table.file.path}: [{role}] stamp: {roles[role].adapter.stamp} has steps of {step_s:g}, which in seconds "
+            f"are {_SENSORS.get(role, 'rows')} of {1 / step_s:.3g} Hz; write `stamp_unit_s = {likely or '...'}` before "
+            'the first table, or `stamp_unit_s = "s"` where these are seconds'
         )
+
+
+_SENSORS = {"imu": "an IMU", "dvl": "a Doppler log"}
 
 
 def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
-    """Warning about a column that seems to mark invalid velocities, and that nothing uses."""
+    """Warning about a column that marks invalid velocities, and that nothing uses."""
+    # velocities along beams have no components that could repeat one number
+    if not isinstance(dvl.adapter, DvlAdapter) or dvl.adapter.velocity is None:
+        return
+    velocity = table.beside(dvl.adapter.velocity)
     for name in table.file.layout.names:
-        if name in dvl.keys or not re.search(r"valid|lock", name.lower()):
+        if name in dvl.keys or not re.search(VALIDITY, name.lower()):
             continue
-        values = table.file.numbers(name, None)
-        invalid = int(np.count_nonzero(values == 0))
-        if invalid and np.isin(values, (0.0, 1.0)).all():
+        (marks,) = table.file.numbers(name)
+        mark = valid_mark(name, marks, velocity)
+        invalid = int(np.count_nonzero(marks != mark))
+        if mark is not None and invalid:
             yield (
-                f"dvl: column {name} is 0 in {invalid} of {len(values)} rows and not used: "
-                f"`valid_where = {{{toml_key(name)} = 1}}` under [dvl] leaves them out"
+                f"column {name} is {1 - mark} in {invalid} of {len(marks)} rows and not used: "
+                f"`valid_where = {{{toml_key(name)} = {mark}}}` under [dvl] leaves them out"
             )
 
 
-def _said(one: CsvRole) -> list[str]:
-    """What the configuration says of a role, for the notes."""
-    base = type(one.adapter).model_construct(type="csv", stamp=STAMP)
-    said = {key: getattr(one.adapter, key) for key in type(one.adapter).model_fields}
+def _settings(one: CsvRole) -> list[str]:
+    """Settings of a role other than the defaults, for the notes."""
+    model = type(one.adapter)
+    base = model.model_construct(type="csv", stamp=STAMP)
+    values = {key: getattr(one.adapter, key) for key in model.model_fields}
     return plain_lines(
-        {key: value for key, value in said.items() if value != getattr(base, key, None)}
+        {k: value for k, value in values.items() if value != getattr(base, k, None)}
     )
 
 
 def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
     """Rows of the file that plays a role."""
     wanted = one.form.file
-    if wanted is None and len(files) != 1:
+    place = f"{source}: [{one.role}] file:"
+    if wanted is None:
+        if len(files) != 1:
+            raise LogError(
+                f"{place} is missing; expected one of {', '.join(files) or 'no files'}"
+            )
+        (wanted,) = files
+    if wanted not in files:
+        # a file that only the command forgot
+        beside = [path.parent / wanted for path in files.values()]
+        add = next((path for path in beside if path.is_file()), wanted)
+        hint = f"add {add} to the command;"
+        for name in files:
+            if name.lower() == wanted.lower():
+                hint = f"did you mean {name!r}?"
         raise LogError(
-            f"{source}: [{one.role}] file: is missing; expected one of {', '.join(files) or 'no files'}"
+            f"{place} {wanted} is not among the tables; {hint} given: {', '.join(files)}"
         )
-    if wanted is not None and wanted not in files:
-        same = next((name for name in files if name.lower() == wanted.lower()), None)
-        beside = next(
-            (
-                path
-                for given in files.values()
-                if (path := given.parent / wanted).is_file()
-            ),
-            wanted,
-        )
-        hint = f"did you mean {same!r}?" if same else f"add {beside} to the command;"
-        raise LogError(
-            f"{source}: [{one.role}] file: {wanted} is not among the tables; {hint} given: {', '.join(files)}"
-        )
-    path = next(iter(files.values())) if wanted is None else files[wanted]
-    adapter, is_timed = one.adapter, one.role != "true_landmarks"
+    adapter = one.adapter
     return CsvTable(
-        CsvFile(path, one.form),
+        CsvFile(files[wanted], one.form),
         one.role,
         one.keys,
-        adapter.stamp if is_timed else None,
+        adapter.stamp if one.role != "true_landmarks" else None,
         adapter.stamp_unit_s,
         adapter.stamp_offset_s,
     )
@@ -381,19 +388,17 @@ def table_files(given: Iterable[Path]) -> dict[str, Path]:
             raise LogError(
                 f"{path}: there is no such file; give the tables, or the folder that holds them"
             )
-        inside = (
-            sorted(one for one in path.iterdir() if one.is_file())
-            if path.is_dir()
-            else [path]
-        )
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(one for one in path.iterdir() if one.is_file())
         if not inside:
             raise LogError(
                 f"{path}: holds no files; give the folder that holds the tables"
             )
+        # a configuration names files without their folders
         for one in inside:
-            if one.name in found and not found[one.name].samefile(one):
+            if not found.setdefault(one.name, one).samefile(one):
                 raise LogError(
-                    f"{one} and {found[one.name]} share a name; rename one, a table says `file` by name"
+                    f"{one} and {found[one.name]} share a name; rename one, a table names its file by name"
                 )
-            found[one.name] = one
     return found

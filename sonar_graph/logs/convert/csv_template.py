@@ -1,12 +1,14 @@
 """A first guess at what the columns of text tables are, as a commented TOML file for the user to edit.
 
-The guess goes by names and by units in the header, such as ``gyro_x [deg/s]`` or ``depth_mm``, and by the names of the
-files where several roles have alike columns. Under every file all columns are listed with their first values.
+`QUANTITIES` lists what a column may hold, with the names and units that headers use. The values have to agree: a column
+that never changes is no motion, and a magnitude that no vehicle reaches is of another unit. Where names or values leave
+a choice, the role stands as a comment that names the candidates. Under every file all columns are listed.
 """
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,99 +23,150 @@ from sonar_graph.logs.adapters import (
     SPEEDS,
     TIMES,
 )
-from sonar_graph.logs.convert.csv_log import FEWEST_ROWS, IMU_RATES_HZ, table_files
-from sonar_graph.logs.convert.csv_table import CsvFile, is_value, plain_name
+from sonar_graph.logs.convert.csv_evidence import (
+    FEWEST_ROWS,
+    LAST_S,
+    UNITS,
+    VALIDITY,
+    is_absent,
+    time_units,
+    valid_mark,
+)
+from sonar_graph.logs.convert.csv_log import table_files
+from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, is_date, plain_name
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import toml_value
 
 _SPELLINGS = {
-    **{
-        "deg": "deg",
-        "degree": "deg",
-        "degrees": "deg",
-        "°": "deg",
-        "rad": "rad",
-        "radians": "rad",
-    },
-    **{
-        "deg/s": "deg/s",
-        "°/s": "deg/s",
-        "dps": "deg/s",
-        "degs": "deg/s",
-        "deg_s": "deg/s",
-        "rad/s": "rad/s",
-    },
-    **{
-        "rad_s": "rad/s",
-        "rads": "rad/s",
-        "mrad/s": "mrad/s",
-        "m/s2": "m/s2",
-        "m/s^2": "m/s2",
-        "m/s²": "m/s2",
-    },
-    **{
-        "m_s2": "m/s2",
+    spelling: unit
+    for unit, spellings in {
+        "deg": "deg degree degrees ° grad",
+        "rad": "rad radian radians",
+        "deg/s": "deg/s deg/sec °/s dps degs deg_s deg_sec",
+        "rad/s": "rad/s rad/sec rad_s rads rad_sec rps",
+        "mrad/s": "mrad/s mrad_s",
+        "m/s2": "m/s2 m/s^2 m/s² m/s/s m_s2 m_s_2 mps2 ms2",
         "g": "g",
         "mg": "mg",
-        "m/s": "m/s",
-        "mps": "m/s",
-        "m_s": "m/s",
-        "cm/s": "cm/s",
-    },
-    **{
-        "cm_s": "cm/s",
-        "mm/s": "mm/s",
-        "mm_s": "mm/s",
-        "mmps": "mm/s",
-        "km/h": "km/h",
-        "kn": "kn",
-        "knots": "kn",
-    },
-    **{
-        "m": "m",
+        "cm/s2": "cm/s2 cm/s^2 cm/s² cm_s2",
+        "m/s": "m/s m/sec mps m_s",
+        "cm/s": "cm/s cm/sec cm_s cmps",
+        "mm/s": "mm/s mm/sec mm_s mmps",
+        "km/h": "km/h kmh km_h",
+        "kn": "kn kt kts knot knots",
+        "m": "m meter meters metre metres",
         "cm": "cm",
         "mm": "mm",
-        "ft": "ft",
-        "pa": "Pa",
-        "hpa": "hPa",
+        "ft": "ft feet foot",
+        "Pa": "pa",
+        "hPa": "hpa",
         "mbar": "mbar",
-        "kpa": "kPa",
-    },
-    **{
+        "kPa": "kpa",
         "dbar": "dbar",
         "bar": "bar",
         "psi": "psi",
-        "s": "s",
-        "sec": "s",
-        "ms": "ms",
-        "us": "us",
-        "µs": "us",
-    },
-    **{"usec": "us", "ns": "ns", "nsec": "ns", "min": "min"},
+        "s": "s sec secs second seconds",
+        "ms": "ms msec millis milliseconds",
+        "us": "us µs μs usec micros microseconds",
+        "ns": "ns nsec nanos nanoseconds",
+        "min": "min",
+    }.items()
+    for spelling in spellings.split()
 }
 """Units as headers write them, in small letters, by their names in a log configuration."""
-_RATE, _FORCE = (
-    r"gyr|omega|angular_?vel|(?:ang|turn|angular)_?rate|^rate|^w$",
-    r"acc|force|^a$|^f$",
+XYZ = ("x", "y", "z")
+RPY = ("roll|phi", "pitch|theta", "yaw|psi|heading")
+_FORMS: tuple[dict[str, str], ...] = tuple(
+    encoding | decimal
+    for encoding in ({}, {"encoding": "cp1252"}, {"encoding": "utf-16"})
+    for decimal in ({}, {"decimal": ","})
 )
-_VELOCITY, _PLACE = r"vel|speed|^v$|dvl|bottom", r"pos|^$|^p$|^t$|translation|location"
-_TRUTH, _MAP, _FIX = (
-    r"truth|ground|^gt|_gt|reference|mocap",
-    r"landmark|beacon|marker|target|map",
-    r"gps|gnss|usbl|fix",
+"""Forms that are tried, the usual one first; the one in which most cells have values counts."""
+_TIMES = (
+    r"t|time|stamp|timestamp|unix|epoch|secs?|seconds|utc|datetime|zeit",
+    r"(.*_)?time_?stamp(_.*)?|time_.*|.*_time|date.*|.*zeit",
 )
-_TIME = r"^(t|time|stamp|timestamp|unix|epoch|secs?|seconds|utc|datetime|date)$|time_?stamp|^time"
+"""Names of columns of the time, the likeliest first."""
+_STATIC = r"^((?!rate|vel|speed|dot|acc|wind|current).)*$"
+"""Names without a word for a rate of change."""
+_NOT_MEASURED = r"(set_?point|desired|demand|command|cmd|err|error|std|sigma|var|cov|bias|uncertainty)(_|$)"
+_TRUTH = r"truth|ground(?!_?speed)|^gt|_gt(_|$)|reference|mocap"
+_FILES = {
+    "imu": r"imu|inertial|gyro|ahrs|mti|xsens",
+    "dvl": r"dvl|doppler|navquest|nucleus",
+    "depth": r"depth|press|ctd",
+    "heading": r"head|compass|ahrs",
+    "positions": r"gps|gnss|usbl|lbl|fix",
+    "detections": r"detect|sonar|beacon|seen|range",
+    "truth": _TRUTH,
+    "true_landmarks": r"map|landmark|beacon",
+}
+"""Names of files that point to a role, by role."""
+_DEPTHS = ("height", "pressure")
+_LISTS = ("ids", "probabilities")
+"""Keys with a column for each candidate."""
 _OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
-_UNITS_OF_TIME = ("s", "ms", "us", "ns")
-_SIMILAR = 30.0
-"""Ratio of the spans of two tables up to which their times have one unit."""
-_LAST_S = 1e10
-"""Seconds since 1970 of the year 2286: a larger number counts milliseconds, or what is smaller still."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What columns may hold: one column for each component, whose names differ in the component alone."""
+
+    key: str
+    """Key of the configuration."""
+    stem: str
+    """Pattern of the name without the component."""
+    parts: tuple[str, ...] = ("",)
+    """Patterns of the components; one without a name for a single column."""
+    units: Mapping[str, float] | None = None
+    scale: str = "scale"
+    """Key of the unit."""
+    usual: tuple[float, float] = (0.0, np.inf)
+    """Magnitudes of measurements, in the first unit: of nearly all, or of a typical one where the first is not 0."""
+    more: str = ""
+    """Another line of the configuration."""
+
+
+_RATE = (
+    "angular_velocity_scale",
+    (0.0, 2.5),
+    '# rotation = "frd"  # where gravity is felt along -z',
+)
+_FORCE = ("linear_acceleration_scale", (7.0, 13.0))
+_SPEED = ("scale", (0.0, 10.0), '# rotation = "frd"')
+_ANGLE = ("scale", (0.0, 2.02 * np.pi), 'world = "ned"')
+_AZIMUTH = (_ANGLE[1], '# rotation = "frd"  # azimuth positive to the right')
+QUANTITIES = (
+    Quantity("angular_velocity", r"gyr|omega|angular_?vel|(ang|turn|angular)_?rate|^rate|^w$|^g$", XYZ, RATES, *_RATE),
+    Quantity("angular_velocity", r"^$|body|imu", ("p", "q", "r"), RATES, *_RATE),
+    Quantity("angular_velocity", r"rate|speed|dot", ("roll", "pitch", "yaw"), RATES, *_RATE),
+    Quantity("linear_acceleration", r"acc|force|^a$|^f$", XYZ, FORCES, *_FORCE),
+    Quantity("velocity", r"bottom|btm", XYZ, SPEEDS, *_SPEED),
+    Quantity("velocity", r"^((?!wat).)*(vel|speed|^v$|dvl)((?!wat).)*$", XYZ, SPEEDS, *_SPEED),
+    Quantity("velocity", r"", ("u", "v", "w"), SPEEDS, *_SPEED),
+    Quantity("velocity", r"", ("surge", "sway", "heave"), SPEEDS, *_SPEED),
+    Quantity("range", r"range|distance|^r$", ("",), LENGTHS, "range_scale", (0.0, 300.0)),
+    Quantity("azimuth", r"azimuth|bearing", ("",), ANGLES, "azimuth_scale", *_AZIMUTH),
+    Quantity("ids", r"^id$|_id$|label|class|landmark|beacon"),
+    Quantity("id", r"^id$|_id$|label|class|landmark|beacon"),
+    Quantity("probabilities", r"prob|posterior|score|confidence"),
+    Quantity("track", r"track"),
+    Quantity("geodetic", r"", (r"lat(?:itude)?", r"lon(?:gitude)?|lng")),
+    Quantity("position", r"pos|^$|^p$|^t$|translation|location|gt|truth|mocap", XYZ, LENGTHS),
+    Quantity("position", _STATIC, ("east|easting|e", "north|northing|n", "up|z|alt|altitude|height"), LENGTHS),
+    Quantity("position", _STATIC, ("north|n", "east|e", "down|d"), LENGTHS, more='world = "ned"'),
+    Quantity("orientation", r"", (r"q_?x", r"q_?y", r"q_?z", r"q_?w")),
+    Quantity("rpy", _STATIC, RPY, ANGLES, "rpy_scale", _ANGLE[1]),
+    Quantity("height", r"(?<!water_)(?<!bottom_)(depth|tiefe)(?!.*_(of|cell|to|above|rate|vel|speed))", ("",), LENGTHS),
+    Quantity("pressure", r"press|druck", ("",), PRESSURES, "scale", (8e4, 2e5)),
+    Quantity("yaw", r"^(.*_)?(yaw|heading|compass|hdg|psi)(?!.*(rate|vel|speed|dot))", ("",), ANGLES, *_ANGLE),
+)  # fmt: skip
+"""What columns may hold; of several with one key the first that fits counts."""
 
 
 @dataclass(frozen=True)
 class _Column:
-    """Name of a column in small letters, its unit, and the name to give."""
+    """Name of a column to give, the same in small letters without its unit, and its unit."""
 
     given: str
     name: str
@@ -131,58 +184,36 @@ class _Guess:
     """Question for the user, where the table is to be commented out."""
 
     @property
-    def rank(self) -> tuple[bool, bool]:
-        """Order of guesses at one role, the best first: without doubt, and fixes by their latitude and longitude."""
-        is_geodetic = any(line.startswith("geodetic") for line in self.lines)
-        return bool(self.doubt), self.role == "positions" and not is_geodetic
+    def rank(self) -> tuple[bool, bool, bool]:
+        """Order of guesses at one role, the best first: without doubt, of the better source, named by the file."""
+        text = "\n".join(self.lines)
+        is_weak = (self.role == "positions" and "geodetic" not in text) or (
+            self.role == "depth" and "pressure" in text
+        )
+        is_named = bool(re.search(_FILES[self.role], self.file.lower()))
+        return bool(self.doubt), is_weak, not is_named
 
 
-def csv_template(tables: list[Path]) -> str:
-    """TOML to start from for `read_csv`: a guess for every role, and all columns with their first values.
-
-    Parameters
-    ----------
-    tables
-        Files, or folders that hold them; files that hold no table are named in a comment.
-
-    Raises
-    ------
-    LogError
-        When a file does not exist, or none holds a table.
-    """
-    files: dict[str, CsvFile] = {}
-    parts, faults = [], []
-    for name, path in table_files(tables).items():
-        try:
-            files[name] = CsvFile(path)
-        except LogError as error:
-            faults.append(str(error))
-    if not files:
-        raise LogError(faults[0])
-    parts.append(
-        "# Columns of text tables, for `sonar-graph convert csv --config`. A guess by their names: check every line.\n"
-        '# Columns are given by name or by number, counted from 1. Axes: rotation = "frd" for x forward, y right, z\n'
-        '# down, or [roll, pitch, yaw] in degrees of ours_R_driver. Units: a factor, or a name such as "deg/s".\n'
-        "# All keys: docs/tutorials/04_your_own_log.md"
-    )
-    roles: dict[str, _Guess] = {}
-    units = _time_units(files)
-    for name, file in files.items():
-        for guess in _guess(name, file, units.get(name)):
-            if guess.role not in roles or guess.rank < roles[guess.role].rank:
-                roles[guess.role] = guess
-        parts.append(_listing(name, file))
-    for role, empty in _EMPTY.items():
-        likely = next((name for name in files if role in name.lower()), "...")
-        guess = roles.get(role) or _Guess(role, likely, empty, "nothing found")
-        lines = [f"[{role}]", f"file = {toml_value(guess.file)}", *guess.lines]
-        if guess.doubt:
-            lines = [f"# {line}" for line in [f"[{role}]  # {guess.doubt}", *lines[1:]]]
-        parts.append("\n".join(lines))
-    parts += [f"# not a table: {fault}" for fault in faults]
-    return "\n\n".join(parts) + "\n"
-
-
+_SLOTS = {
+    "imu": (
+        ("angular_velocity", None),
+        ("linear_acceleration", "linear_acceleration = false"),
+    ),
+    "dvl": (("velocity", None),),
+    "depth": (("height pressure", None),),
+    "heading": (("yaw", None),),
+    "positions": (("geodetic position", None),),
+    "detections": (
+        ("range", None),
+        ("azimuth", None),
+        ("ids", "ids = false  # no column of identities was found"),
+        ("probabilities", ""),
+        ("track", ""),
+    ),
+    "truth": (("geodetic position", None), ("orientation rpy", "")),
+    "true_landmarks": (("id", None), ("geodetic position", None)),
+}
+"""Quantities of a role, each with the alternatives and the line without it; None: needed."""
 _EMPTY = {
     "imu": [
         'angular_velocity = ["...", "...", "..."]',
@@ -210,333 +241,455 @@ _EMPTY = {
 """Keys to fill in, of roles that nothing was found for."""
 
 
-def _listing(name: str, file: CsvFile) -> str:
-    layout = file.layout
-    lines = [
-        f"# {name}: {len(layout.names)} columns"
-        + f"; {layout.remark}" * bool(layout.remark)
-    ]
-    for number, (column, first) in enumerate(
-        zip(layout.names, layout.first, strict=True), 1
-    ):
-        lines.append(
-            f"#   {number:2d}  {column + ' = ' if layout.is_named else ''}{first}"
-        )
-    return "\n".join(lines)
+def csv_template(tables: list[Path]) -> str:
+    """TOML to start from for `read_csv`: a guess for every role, and all columns with their first values.
 
+    Parameters
+    ----------
+    tables
+        Files, or folders that hold them; files that hold no table are named in a comment.
 
-def _guess(name: str, file: CsvFile, unit: str | None) -> Iterator[_Guess]:
-    """Roles that a file may play, with the unit of its times."""
-    columns, is_truth = (
-        [_column(column) for column in file.layout.names],
-        bool(re.search(_TRUTH, name.lower())),
-    )
-    stamp, where, forces = (
-        _stamp(columns, file, unit),
-        _where(columns, file),
-        _triple(columns, _FORCE),
-    )
-    motion = _motion(columns, forces, is_truth=is_truth)
-    if motion:
-        lines = motion[1]
-        if motion[0] == "dvl":
-            lines = [*lines, *_validity(columns, file)]
-        yield _Guess(motion[0], name, [*stamp, *lines])
-    elif (rates := _triple(columns, _RATE)) and not where:
-        lines = [
-            _list("angular_velocity", rates),
-            *_scale("angular_velocity_scale", rates[0], RATES),
-        ]
-        yield _Guess(
-            "imu",
-            name,
-            [*stamp, *lines, "linear_acceleration = false"],
-            "no accelerometer: is this the IMU?",
-        )
-    spread, bearing = (
-        _one(columns, r"range|distance|^r$"),
-        _one(columns, r"azimuth|bearing"),
-    )
-    label = _one(columns, r"^id$|_id$|label|class|landmark|beacon")
-    is_timed = _one(columns, _TIME) is not None
-    if spread and bearing:
-        yield _Guess(
-            "detections", name, [*stamp, *_detections(columns, spread, bearing, label)]
-        )
-        return
-    turn = _named(columns, "q_?x", "q_?y", "q_?z", "q_?w")
-    angles = _named(columns, "roll|phi", "pitch|theta", "yaw|psi|heading")
-    if where and label and _place(columns) and not is_timed:
-        yield _Guess(
-            "true_landmarks", name, [f"id = {toml_value(label.given)}", *where]
-        )
-    elif where and (
-        is_truth
-        or ((turn or angles) and not re.search(_FIX, name.lower()) and not forces)
-    ):
-        yield _Guess("truth", name, [*stamp, *where, *_orientation(turn, angles)])
-        return
-    elif where:
-        place = _place(columns)
-        is_metric = where[0].startswith("geodetic") or (
-            place is not None and place[0].unit in LENGTHS
-        )
-        doubt = "" if is_metric or not motion or motion[0] != "imu" else _OF_IMU
-        yield _Guess("positions", name, [*stamp, *where], doubt)
-    if depth := _one(columns, r"depth") or _one(columns, r"press"):
-        values = file.numbers(file.layout.names[columns.index(depth)])
-        is_constant = (
-            len(values) >= FEWEST_ROWS and not np.ptp(values[np.isfinite(values)]) > 0
-        )
-        yield _Guess(
-            "depth",
-            name,
-            [*stamp, *_depth(depth)],
-            "never changes: a depth?" if is_constant else "",
-        )
-    if yaw := _one(columns, r"^(yaw|heading|compass|hdg|psi)"):
-        lines = [
-            f"yaw = {toml_value(yaw.given)}",
-            *_scale("scale", yaw, ANGLES),
-            'world = "ned"',
-        ]
-        yield _Guess("heading", name, [*stamp, *lines])
-
-
-def _motion(
-    columns: list[_Column], forces: list[_Column] | None, *, is_truth: bool
-) -> tuple[str, list[str]] | None:
-    """Role and lines of an IMU, else of a Doppler log: velocities beside a truth are true ones."""
-    rates = _triple(columns, _RATE) or _named(columns, "p", "q", "r")
-    velocity = _triple(columns, _VELOCITY) or _named(columns, "u", "v", "w")
-    if forces and (chosen := rates or velocity):
-        doubt = "" if rates else "  # by their place; are these rates?"
-        lines = [
-            _list("angular_velocity", chosen) + doubt,
-            *_scale("angular_velocity_scale", chosen[0], RATES),
-        ]
-        lines += [
-            _list("linear_acceleration", forces),
-            *_scale("linear_acceleration_scale", forces[0], FORCES),
-        ]
-        return "imu", [*lines, '# rotation = "frd"  # where gravity is felt along -z']
-    if velocity and not is_truth:
-        lines = [_list("velocity", velocity), *_scale("scale", velocity[0], SPEEDS)]
-        return "dvl", [*lines, '# rotation = "frd"']
-    return None
-
-
-def _validity(columns: list[_Column], file: CsvFile) -> list[str]:
-    """Line that leaves out invalid rows; in use where a column of 0 and 1 has a name that says valid."""
-    status = _one(columns, r"valid|lock") or _one(columns, r"status")
-    if status is None:
-        return []
-    line = f"valid_where = {{{toml_value(status.given)} = 1}}"
-    is_mask = bool(
-        np.isin(
-            file.numbers(file.layout.names[columns.index(status)]), (0.0, 1.0)
-        ).all()
-    )
-    return [
-        line
-        if is_mask and "status" not in status.name
-        else f"# {line}  # which value is valid?"
-    ]
-
-
-def _detections(
-    columns: list[_Column], spread: _Column, bearing: _Column, label: _Column | None
-) -> list[str]:
-    """Lines of ranges and azimuths, with what is said of their identities."""
-    sure, track = (
-        _one(columns, r"prob|posterior|score|confidence"),
-        _one(columns, r"track"),
-    )
-    return [
-        f"range = {toml_value(spread.given)}",
-        *_scale("range_scale", spread, LENGTHS),
-        f"azimuth = {toml_value(bearing.given)}",
-        *_scale("azimuth_scale", bearing, ANGLES),
-        f"ids = {toml_value([label.given])}"
-        if label
-        else "ids = false  # no column of identities was found",
-        *([f"probabilities = [{toml_value(sure.given)}]"] if sure else []),
-        *([f"track = {toml_value(track.given)}"] if track else []),
-        '# rotation = "frd"  # azimuth positive to the right',
-    ]
-
-
-def _place(columns: list[_Column]) -> list[_Column] | None:
-    """Columns of a position in metres, z up."""
-    east_north_up = "east|easting|e", "north|northing|n", "up|z|alt|altitude|height"
-    return _triple(columns, _PLACE) or _named(columns, *east_north_up)
-
-
-def _where(columns: list[_Column], file: CsvFile) -> list[str]:
-    """Lines of a position: geodetic, or in metres with z up or down; none without one."""
-    latitude, longitude = _one(columns, r"^lat"), _one(columns, r"^(lon|lng)")
-    if latitude and longitude:
-        height = _one(columns, r"^(alt|height)")
-        more = f", height = {toml_value(height.given)}" if height else ""
-        first = file.layout.first[columns.index(latitude)]
-        more += (
-            ', unit = "ddmm.mmmm"' if is_value(first) and abs(float(first)) > 90 else ""
-        )
-        return [
-            f"geodetic = {{latitude = {toml_value(latitude.given)}, longitude = {toml_value(longitude.given)}{more}}}"
-        ]
-    if place := _place(columns):
-        return [_list("position", place), *_scale("scale", place[0], LENGTHS)]
-    down = _named(columns, "north|n", "east|e", "down|d")
-    return (
-        [_list("position", down), *_scale("scale", down[0], LENGTHS), 'world = "ned"']
-        if down
-        else []
-    )
-
-
-def _depth(column: _Column) -> list[str]:
-    """Lines of a depth or a pressure."""
-    if column.unit in PRESSURES or "press" in column.name:
-        return [
-            f"pressure = {toml_value(column.given)}",
-            *_scale("scale", column, PRESSURES),
-        ]
-    factor = LENGTHS.get(column.unit or "m", 1.0)
-    return [
-        f"height = {toml_value(column.given)}",
-        f"scale = {-factor:g}  # downwards, to metres up",
-    ]
-
-
-def _orientation(turn: list[_Column] | None, angles: list[_Column] | None) -> list[str]:
-    if turn:
-        return [_list("orientation", turn)]
-    return (
-        [_list("rpy", angles), *_scale("rpy_scale", angles[0], ANGLES)]
-        if angles
-        else []
-    )
-
-
-def _time_units(files: dict[str, CsvFile]) -> dict[str, str]:
-    """Units of the times by file: that of the header, or the one in which the fastest table has the rate of an IMU.
-
-    Tables of one dive span about the same time, so one unit holds for all of a similar span. No time lies behind
-    `_LAST_S`.
+    Raises
+    ------
+    LogError
+        When a file does not exist, or none holds a table.
     """
-    found: dict[str, str] = {}
-    times: dict[str, Floats] = {}
-    for name, file in files.items():
-        columns = [_column(column) for column in file.layout.names]
-        time = _one(columns, _TIME) or columns[0]
-        numbers = file.numbers(file.layout.names[columns.index(time)], None)
-        if time.unit in TIMES:
-            found[name] = time.unit
-        elif np.isfinite(numbers).any():
-            times[name] = np.unique(numbers[np.isfinite(numbers)])
-    possible = {
-        name: [unit for unit in _UNITS_OF_TIME if values[-1] * TIMES[unit] < _LAST_S]
-        for name, values in times.items()
-    }
-    steps = {
-        name: np.median(np.diff(values))
-        for name, values in times.items()
-        if len(values) >= FEWEST_ROWS
-    }
-    if steps:
-        fastest = min(steps, key=lambda name: float(steps[name]))
-        slowest_hz, fastest_hz = IMU_RATES_HZ
-        for unit in possible[fastest]:
-            if slowest_hz <= 1 / (steps[fastest] * TIMES[unit]) <= fastest_hz:
-                ratios = {
-                    name: np.ptp(values) / np.ptp(times[fastest])
-                    for name, values in times.items()
-                }
-                found |= {
-                    name: unit
-                    for name, ratio in ratios.items()
-                    if 1 / _SIMILAR < ratio < _SIMILAR
-                }
-                break
-    return {name: units[0] for name, units in possible.items() if units} | found
-
-
-def _stamp(columns: list[_Column], file: CsvFile, unit: str | None) -> list[str]:
-    """Lines for the time: its column, and its unit."""
-    column = _one(columns, _TIME) or (columns[0] if columns else None)
-    if column is None:
-        return []
-    first = file.layout.first[columns.index(column)]
-    line = f"stamp = {toml_value(column.given)}"
-    if not is_value(first):
-        return [f"{line}  # {first!r} is no time"]
-    return [
-        line,
-        *([f"stamp_unit_s = {toml_value(unit)}"] if unit not in (None, "s") else []),
+    found: dict[str, _Table] = {}
+    faults: list[str] = []
+    for name, path in table_files(tables).items():
+        try:
+            found[name] = _Table(name, path)
+        except LogError as error:
+            faults.append(str(error))
+    if not found:
+        raise LogError(faults[0])
+    guesses = [guess for table in found.values() for guess in table.guesses()]
+    stamps = _stamps(found, {guess.file: guess.role for guess in reversed(guesses)})
+    parts = [
+        "# Columns of text tables, for `sonar-graph convert csv --config`. A guess by names and values: check every line.\n"
+        '# Columns are given by name or by number, counted from 1. Axes: rotation = "frd" for x forward, y right, z\n'
+        '# down, or [roll, pitch, yaw] in degrees of ours_R_driver. Units: a factor, or a name such as "deg/s".\n'
+        "# All keys: docs/tutorials/11_tables.md#the-keys"
     ]
+    parts += [table.listing() for table in found.values()]
+    # the order in which a user thinks of the sensors, those that are needed first
+    for role, empty in _EMPTY.items():
+        options = sorted(
+            (guess for guess in guesses if guess.role == role),
+            key=lambda guess: guess.rank,
+        )
+        best = [guess for guess in options if guess.rank == options[0].rank]
+        if not best:
+            likely = next((name for name in found if role in name.lower()), "...")
+            best = [_Guess(role, likely, empty, "nothing found")]
+        choice = ""
+        if len(best) > 1:
+            choice = (
+                f"which of {', '.join(guess.file for guess in best)}? uncomment one"
+            )
+        for guess in best:
+            form = found[guess.file].form_lines if guess.file in found else []
+            stamp = stamps.get(guess.file, []) if role != "true_landmarks" else []
+            lines = [f"file = {toml_value(guess.file)}", *form, *stamp, *guess.lines]
+            if doubt := guess.doubt or choice:
+                lines = [f"# {line}" for line in (f"[{role}]  # {doubt}", *lines)]
+            else:
+                lines = [f"[{role}]", *lines]
+            parts.append("\n".join(lines))
+    parts += [f"# not a table: {fault}" for fault in faults]
+    return "\n\n".join(parts) + "\n"
 
 
-def _column(given: str) -> _Column:
+class _Table:
+    """A file that holds a table, with its columns."""
+
+    def __init__(self, name: str, path: Path) -> None:
+        self.name = name
+        self.file, self.form_lines = _file(path)
+        names = self.file.layout.names
+        self.columns = [_column(given, names) for given in names]
+        self._values: dict[str, Floats] = {}
+        self.time = self._time()
+
+    def values(self, columns: list[_Column]) -> Floats:
+        """Numbers of some columns, shape (n, number of columns)."""
+        # one pass over the file for all of them
+        new = [column.given for column in columns if column.given not in self._values]
+        if new:
+            self._values |= dict(zip(new, self.file.numbers(*new), strict=True))
+        return np.column_stack([self._values[column.given] for column in columns])
+
+    def first(self, column: _Column) -> str:
+        """First cell of a column."""
+        return self.file.layout.first[self.columns.index(column)]
+
+    def listing(self) -> str:
+        """Comment with all columns and their first values."""
+        layout = self.file.layout
+        remark = f"; {layout.remark}" if layout.remark else ""
+        lines = [f"# {self.name}: {len(layout.names)} columns{remark}"]
+        for number, column in enumerate(layout.names, 1):
+            named = f"{column} = " if layout.is_named else ""
+            lines.append(f"#   {number:2d}  {named}{layout.first[number - 1]}")
+        return "\n".join(lines)
+
+    def find(self, keys: str, columns: list[_Column]) -> "_Match | None":
+        """Columns that hold one of some quantities, the first without doubt if there is one."""
+        matches = []
+        for key in keys.split():
+            fitting = (
+                _Match(self, quantity, options)
+                for quantity in QUANTITIES
+                if quantity.key == key and (options := _fitting(quantity, columns))
+            )
+            matches += [match.moving() for match in islice(fitting, 1)]
+        return min(matches, key=lambda match: bool(match.doubt()), default=None)
+
+    def is_constant(self, columns: list[_Column]) -> bool:
+        """True where no column ever changes."""
+        values = self.values(columns)
+        values = values[np.isfinite(values).all(axis=1)]
+        return len(values) >= FEWEST_ROWS and not np.ptp(values, axis=0).any()
+
+    def _time(self) -> _Column | None:
+        """Column of the time: by its name, else the first; its values have to grow."""
+        named = [
+            column
+            for pattern in _TIMES
+            for column in self.columns
+            if re.fullmatch(pattern, column.name)
+        ]
+        first = [] if self.find("id", self.columns[:1]) else self.columns[:1]
+        for column in named + first:
+            steps = np.diff(self.values([column])[:, 0])
+            # some loggers write a few rows late
+            is_growing = not len(steps) or (np.mean(steps >= 0) > 0.9 and steps.any())
+            if is_date(self.first(column)) or is_growing:
+                return column
+        return None
+
+    def guesses(self) -> Iterator[_Guess]:
+        """Roles that the table may play."""
+        is_truth = bool(re.search(_TRUTH, self.name.lower()))
+        true = [c for c in self.columns if is_truth or re.search(_TRUTH, c.name)]
+        live = [
+            column
+            for column in self.columns
+            if column not in (*true, self.time)
+            and not re.search(_NOT_MEASURED, column.name)
+        ]
+        # "angular_velocity" is a velocity by its name
+        rates = self.find("angular_velocity", live)
+        not_rates = [c for c in live if not rates or c not in rates.chosen]
+        has_forces = self.find("linear_acceleration", live) is not None
+        has_place = self.find("position", live) is not None
+        has_angles = self.find("orientation rpy", live) is not None
+        yield from self._play("truth", true)
+        if has_forces:
+            yield from self._play("imu", live)
+        elif not has_place:
+            yield from self._play("imu", live, "no accelerometer: is this the IMU?")
+        yield from self._play("dvl", not_rates)
+        detections = list(self._play("detections", live))
+        if detections:
+            yield from detections
+        elif self.time is None and self.find("id", live):
+            yield from self._play("true_landmarks", live)
+        elif (
+            has_place
+            and has_angles
+            and not has_forces
+            and not re.search(_FILES["positions"], self.name.lower())
+        ):
+            # a pose is computed by another system
+            yield from self._play("truth", live)
+        else:
+            place = self.find("geodetic position", live)
+            is_clear = place is None or not place.is_without_unit() or not has_forces
+            yield from self._play("positions", live, "" if is_clear else _OF_IMU)
+            yield from self._play("depth", live)
+            yield from self._play("heading", live)
+
+    def _play(
+        self, role: str, columns: list[_Column], doubt: str = ""
+    ) -> Iterator[_Guess]:
+        """Guess at a role where the table has all that it needs; the first question about a quantity counts."""
+        lines: list[str] = []
+        for keys, without in _SLOTS[role]:
+            match = self.find(keys, columns)
+            if (
+                match
+                and keys == "linear_acceleration"
+                and not np.any(match.table.values(match.chosen))
+            ):
+                # zeros of a driver without accelerometers
+                match = None
+                doubt = doubt or "no accelerometer: is this the IMU?"
+            if match:
+                lines += match.lines()
+                doubt = doubt or match.doubt()
+                if role == "dvl":
+                    lines += self._validity(match)
+            elif without is None:
+                return
+            elif without:
+                lines.append(without)
+        yield _Guess(role, self.name, lines, doubt)
+
+    def _validity(self, velocity: "_Match") -> list[str]:
+        """Line that leaves out invalid rows; in use where the valid mark is known."""
+        marks = [
+            column
+            for word in VALIDITY.split("|")
+            for column in self.columns
+            if word in column.name and column not in velocity.chosen
+        ]
+        for column in marks:
+            mark = valid_mark(
+                column.name, self.values([column])[:, 0], self.values(velocity.chosen)
+            )
+            if mark is not None:
+                return [f"valid_where = {{{toml_value(column.given)} = {mark}}}"]
+        return [
+            f"# valid_where = {{{toml_value(column.given)} = 1}}  # which value is valid?"
+            for column in marks[:1]
+        ]
+
+
+@dataclass(frozen=True)
+class _Match:
+    """Columns of a table that may hold a quantity, the likeliest first."""
+
+    table: _Table
+    quantity: Quantity
+    options: list[list[_Column]]
+
+    @property
+    def chosen(self) -> list[_Column]:
+        """The likeliest columns."""
+        return self.options[0]
+
+    def values(self) -> Floats:
+        """Numbers of the chosen columns, shape (n, components), without empty rows."""
+        values = self.table.values(self.chosen)
+        return values[~is_absent(values)]
+
+    def moving(self) -> "_Match":
+        """The same without columns that never change, where others do."""
+        moving = [one for one in self.options if not self.table.is_constant(one)]
+        return replace(self, options=moving or self.options)
+
+    def is_without_unit(self) -> bool:
+        """True for places of an unknown unit."""
+        units = self.quantity.units
+        return units is not None and self.chosen[0].unit not in units
+
+    def doubt(self) -> str:
+        """Question about the columns or their unit; empty without doubt."""
+        quantity = self.quantity
+        if quantity.units is None:
+            return ""
+        # gravity may look constant to a coarse sensor, motion does not
+        if quantity.key != "linear_acceleration" and self.table.is_constant(
+            self.chosen
+        ):
+            return f"never changes: a {'depth' if quantity.key in _DEPTHS else quantity.key}?"
+        if len(self.options) > 1:
+            names = [", ".join(c.given for c in option) for option in self.options]
+            return f"{quantity.key}: {' or '.join(names)}?"
+        stated = self.chosen[0].unit
+        fits = self._fitting_units()
+        known = " or ".join(fits)
+        if fits and stated in quantity.units and stated not in fits:
+            return f"{quantity.key}: the header states {stated}, the values are those of {known}"
+        if len(fits) > 1 and self.is_without_unit() and not self._is_first(fits):
+            return f"unit of {quantity.key}: {known}?"
+        return ""
+
+    def _fitting_units(self) -> list[str]:
+        """Units in which the values have usual magnitudes; none where that is not known."""
+        lowest, highest = self.quantity.usual
+        values = self.values()
+        if len(values) < FEWEST_ROWS or not np.isfinite(highest):
+            return []
+        sizes = np.linalg.norm(values, axis=1)
+        if self.quantity.key in ("yaw", "azimuth", "rpy"):
+            sizes = np.abs(values).max(axis=1)
+        # gravity is there all the time, the fastest motion is rare: but for spikes the largest counts
+        size = float(np.percentile(sizes, 50 if lowest else 99))
+        if self.quantity.key == "pressure":
+            # a dive begins near the surface
+            size = float(sizes.min())
+        units = self.quantity.units or {}
+        return [u for u, factor in units.items() if lowest <= size * factor <= highest]
+
+    def _is_first(self, fits: list[str]) -> bool:
+        return next(iter(self.quantity.units or {})) in fits
+
+    def lines(self) -> list[str]:
+        """Lines of the configuration: columns, and their unit."""
+        key = self.quantity.key
+        names = [column.given for column in self.chosen]
+        # latitudes and depths have units of their own kind
+        if key == "geodetic":
+            return [self._geodetic()]
+        if key == "height":
+            factor = LENGTHS.get(self.chosen[0].unit or "m", 1.0)
+            if (self.values() < 0).all():
+                # a vehicle does not fly: these count upwards
+                factor = -factor
+            return [
+                f"height = {toml_value(names[0])}",
+                f"scale = {-factor:g}  # to metres upwards",
+            ]
+        is_single = self.quantity.parts == ("",) and key not in _LISTS
+        more = []
+        if key == "pressure" and self._is_gauge():
+            more = ["atmosphere_pa = 0  # less than that of the air: from the surface"]
+        return [
+            f"{key} = {toml_value(names[0] if is_single else names)}",
+            *self._unit_line(),
+            *more,
+            *filter(None, [self.quantity.more]),
+        ]
+
+    def _is_gauge(self) -> bool:
+        """True for pressures of a stated unit that are less than half that of the air."""
+        factor = PRESSURES.get(self.chosen[0].unit or "", np.inf)
+        return bool(self.values().min(initial=np.inf) * factor < 5e4)
+
+    def _unit_line(self) -> list[str]:
+        """The unit, where it is another than that of this package, or not stated."""
+        units = self.quantity.units or {}
+        unit = self.chosen[0].unit
+        if not units or units.get(unit or "") == 1.0:
+            return []
+        line = f"{self.quantity.scale} = "
+        if unit is not None and unit in units:
+            return [line + toml_value(unit)]
+        fits = self._fitting_units()
+        if not fits or self._is_first(fits):
+            return [
+                f"# {line}{toml_value(list(units)[1])}  # the header states no unit"
+            ]
+        return [
+            f"{line}{toml_value(fits[0])}  # by its values; the header states no unit"
+        ]
+
+    def _geodetic(self) -> str:
+        latitude, longitude = self.chosen
+        more = ""
+        for column in self.table.columns:
+            if re.match(r"(.*_)?(alt|altitude|height)(_|$)", column.name):
+                more = f", height = {toml_value(column.given)}"
+                break
+        if np.abs(self.values()[:, 0]).max(initial=0.0) > 90:
+            more += ', unit = "ddmm.mmmm"'
+        return f"geodetic = {{latitude = {toml_value(latitude.given)}, longitude = {toml_value(longitude.given)}{more}}}"
+
+
+def _file(path: Path) -> tuple[CsvFile, list[str]]:
+    """A file read in the form in which most cells of its first row have values, and the lines that state it."""
+    # a file that no form fits keeps the error of the usual form
+    best: tuple[int, CsvFile, dict[str, str]] | None = None
+    fault: LogError | None = None
+    for form in _FORMS:
+        if best:
+            # another encoding is needed only where the usual one fails, a decimal comma where cells have no value
+            is_read = form.get("encoding") != best[2].get("encoding")
+            if is_read or best[0] == len(best[1].layout.first):
+                break
+        try:
+            file = CsvFile(path, CsvForm(**form))
+        except LogError as error:
+            fault = fault or error
+            continue
+        count = sum(map(file.form.is_value, file.layout.first))
+        # numbers like 1,5 have no value with a decimal point, so the wrong form has fewer
+        if best is None or count > best[0]:
+            best = (count, file, form)
+    if best is None:
+        raise fault or LogError(f"{path}: holds no table")
+    return best[1], [f"{key} = {toml_value(value)}" for key, value in best[2].items()]
+
+
+def _stamps(
+    tables: Mapping[str, _Table], roles: Mapping[str, str]
+) -> dict[str, list[str]]:
+    """Lines for the times by file: column and unit, which all tables together have to prove."""
+    lines: dict[str, list[str]] = {}
+    times: dict[str, Floats] = {}
+    for name, table in tables.items():
+        if table.time is None:
+            lines[name] = ['# stamp = "..."  # no column of the time was found']
+            continue
+        lines[name] = [f"stamp = {toml_value(table.time.given)}"]
+        values = table.values([table.time])
+        if np.isfinite(values).any():
+            times[name] = np.unique(values[np.isfinite(values)])
+        elif not is_date(first := table.first(table.time)):
+            lines[name].append(
+                f"# {first!r} is no time; write such as 2026-05-01T12:30:00.25Z"
+            )
+    if times and "imu" not in roles.values():
+        # the fastest table is probably that of the IMU
+        fastest = min(times, key=lambda name: np.ptp(times[name]) / len(times[name]))
+        roles = {**roles, fastest: "imu"}
+    proven = time_units(times, {name: roles.get(name, "") for name in times}, {})
+    of_imu = [proven[name] for name in proven if roles.get(name) == "imu"]
+    for name, values in times.items():
+        column = tables[name].time
+        stated = column.unit if column and column.unit in TIMES else None
+        # with too few rows for a rate: what keeps the time before the year 2286
+        early = [u for u in UNITS if values[-1] * TIMES[u] < LAST_S]
+        units = proven.get(name, early[:1])
+        if stated in (*units, "min") or (stated and name not in proven):
+            units = [str(stated)]
+        elif stated:
+            lines[name].append(f"# the header states {stated}, the steps do not fit:")
+            units = [*units, stated]
+        else:
+            units = [unit for unit in units if [unit] in of_imu] or units
+        if len(units) > 1 or not units:
+            choice = " or ".join(map(toml_value, units)) or "not plausible in any"
+            lines[name].append(f"# stamp_unit_s = ...  # which unit? {choice}")
+        elif units[0] != "s":
+            lines[name].append(f"stamp_unit_s = {toml_value(units[0])}")
+    return lines
+
+
+def _column(given: str, names: tuple[str, ...]) -> _Column:
     """Column with its unit, from ``[...]``, ``(...)`` or the end of its name."""
     bare = plain_name(given)
     unit = given[len(bare) :].strip(" []()").lower() or None
-    name = re.sub(r"[\s.\-]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare)).lower()
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare)
+    name = re.sub(r"[\s.\-]+", "_", apart).lower().strip("_")
+    # the longest first: m_s before s
     if unit is None:
         for spelling in sorted(_SPELLINGS, key=len, reverse=True):
-            if name.endswith(f"_{spelling}") and len(spelling) + 1 < len(name):
-                unit, name = spelling, name[: -len(spelling) - 1]
+            if name.endswith(f"_{spelling}"):
+                unit = spelling
+                name = name.removesuffix(f"_{spelling}")
                 break
-    return _Column(bare if bare != given else given, name, _SPELLINGS.get(unit or ""))
+    # the short name, where no other column has it in another unit
+    is_short = [plain_name(other) for other in names].count(bare) == 1
+    return _Column(bare if is_short else given, name, _SPELLINGS.get(unit or ""))
 
 
-def _triple(columns: list[_Column], pattern: str) -> list[_Column] | None:
-    """Columns x, y, z of one quantity whose name without the axis fits a pattern."""
-    stems: dict[str, dict[str, _Column]] = {}
+def _fitting(quantity: Quantity, columns: list[_Column]) -> list[list[_Column]]:
+    """Columns for all components of a quantity, for each name without the component that has them all."""
+    found: dict[str, dict[int, _Column]] = {}
+    # components by what is left of the name: two sensors in one table stay apart
     for column in columns:
-        if match := re.fullmatch(
-            r"(.*?)_?([xyz])(?:_?axis)?|([xyz])_(.*)", column.name
-        ):
-            stem, axis = (match[1], match[2]) if match[2] else (match[4], match[3])
-            stems.setdefault(stem, {})[axis] = column
-    found = [
-        axes
-        for stem, axes in stems.items()
-        if len(axes) == 3 and re.search(pattern, stem)
+        for place, part in enumerate(quantity.parts):
+            pattern = (
+                rf"(.*?)_?(?:{part})(?:_?axis)?|(?:{part})_(.*)" if part else "(.*)()"
+            )
+            if match := re.fullmatch(pattern, column.name):
+                stem = match[1] or match[2] or ""
+                found.setdefault(stem if part else column.name, {})[place] = column
+    return [
+        [of_stem[place] for place in range(len(quantity.parts))]
+        for stem, of_stem in found.items()
+        if len(of_stem) == len(quantity.parts) and re.search(quantity.stem, stem)
     ]
-    # velocity over the bottom before that through water
-    found.sort(key=lambda axes: "bottom" not in axes["x"].name)
-    return [found[0][axis] for axis in "xyz"] if found else None
-
-
-def _named(columns: list[_Column], *patterns: str) -> list[_Column] | None:
-    """Columns whose whole names fit patterns, one each."""
-    found = [
-        next(
-            (c for c in columns if re.fullmatch(f"(?:.*_)?(?:{pattern})", c.name)), None
-        )
-        for pattern in patterns
-    ]
-    chosen = [column for column in found if column is not None]
-    return chosen if len(chosen) == len(patterns) else None
-
-
-def _one(columns: list[_Column], pattern: str) -> _Column | None:
-    return next((column for column in columns if re.search(pattern, column.name)), None)
-
-
-def _list(key: str, columns: list[_Column]) -> str:
-    return f"{key} = {toml_value([column.given for column in columns])}"
-
-
-def _scale(key: str, column: _Column, units: dict[str, float]) -> list[str]:
-    """Line with the unit, where the header states another than that of this package."""
-    if column.unit not in units or units[column.unit] == 1.0:
-        return (
-            []
-            if column.unit in units
-            else [
-                f"# {key} = {toml_value(list(units)[1])}  # the header states no unit"
-            ]
-        )
-    return [f"{key} = {toml_value(column.unit)}"]

@@ -124,17 +124,15 @@ class LensSonarFormat(SonarFormat):
 
     def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
         """True where some bytes can begin the frame after, by its number and signature."""
+        # the bytes may end before the signature, or within it
         signed = content[self.signature_at :]
         is_next = (earlier.number + 1).to_bytes(4, "little").startswith(content[:4])
         return is_next and self.signature.startswith(signed[: len(self.signature)])
 
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
         """Image of a frame, shape (beams, bins)."""
-        return (
-            np.frombuffer(frame, np.uint8, offset=self.head_bytes)
-            .reshape(-1, self.beams(settings))
-            .T
-        )
+        rows = np.frombuffer(frame, np.uint8, offset=self.head_bytes)
+        return rows.reshape(-1, self.beams(settings)).T
 
 
 HEADER_BYTES = {3: (512, 256), 4: (1024, 1024)}
@@ -146,8 +144,10 @@ DIDSON_DECIBEL_SPAN = 90.0
 LAST_YEAR = 2037
 """Last year whose stamps ROS 2 can hold."""
 NOMINAL_SOUND_SPEED_M_S = 1465.0
-HIGH_FREQUENCY_HZ, LOW_FREQUENCY_HZ = 1.8e6, 1.1e6
-CLASSIC, LONG_RANGE = 1, 2
+HIGH_FREQUENCY_HZ = 1.8e6
+LOW_FREQUENCY_HZ = 1.1e6
+CLASSIC = 1
+LONG_RANGE = 2
 """Bits of a frame's configuration flags."""
 START_STEP_M = {0: 0.42, CLASSIC: 0.375, LONG_RANGE: 0.42, CLASSIC | LONG_RANGE: 0.375}
 LENGTHS_M = {
@@ -158,9 +158,9 @@ LENGTHS_M = {
 }
 """Lengths of the window by flags; low frequency begins with the third."""
 LOW_FREQUENCY_SHIFT = 2
-FIRST_EXTENDED_SERIAL, LONG_RANGE_SERIAL = 19, 15
-"""Sonars of earlier serial numbers are classic whatever the flags say, and one of them has a long range."""
-_TIME_AT, _WINDOW_AT, _FLAGS_AT = 20, 52, 192
+FIRST_EXTENDED_SERIAL = 19
+LONG_RANGE_SERIAL = 15
+"""Sonars of earlier serial numbers are classic whatever their flags, and one of them has a long range."""
 
 
 class DidsonFormat(LensSonarFormat):
@@ -182,11 +182,9 @@ class DidsonFormat(LensSonarFormat):
             )
         self._version = start[-1] if len(start) > len(MAGIC) else 0
         if self._version not in HEADER_BYTES:
-            advice = (
-                "use `convert aris`"
-                if self._version == 5
-                else "versions 3 and 4 are read"
-            )
+            advice = "versions 3 and 4 are read"
+            if self._version == 5:
+                advice = "use `convert aris`"
             raise DatasetError(
                 f"{source.path}: is of DDF version {self._version}; {advice}"
             )
@@ -200,34 +198,21 @@ class DidsonFormat(LensSonarFormat):
             struct.unpack_from("<4ifi", header, 4)
         )
         self._reverse, self._serial = struct.unpack_from("<2i", header, 40)
-        if (
-            self._beams not in BEAMS
-            or resolution not in (0, 1)
-            or not 0 < self._samples <= MOST_SAMPLES
-        ):
-            said = (
-                f"{self._beams} beams, {self._samples} samples, resolution {resolution}"
-            )
-            expected = (
-                f"48 or 96 beams, at most {MOST_SAMPLES} samples, resolution 0 or 1"
-            )
+        is_plausible = self._beams in BEAMS and resolution in (0, 1)
+        if not is_plausible or not 0 < self._samples <= MOST_SAMPLES:
             raise DatasetError(
-                f"{source.path}: its header is damaged: it says {said}; expected {expected}"
+                f"{source.path}: its header is damaged: it says {self._beams} beams, {self._samples} samples, "
+                f"resolution {resolution}; expected 48 or 96 beams, at most {MOST_SAMPLES} samples, resolution 0 or 1"
             )
         self._is_high = resolution == 1
         self._sound_speed_m_s = sound_speed_m_s or NOMINAL_SOUND_SPEED_M_S
         # frames usually repeat the file's version in their headers, and otherwise all have the same bytes there
         usual = MAGIC + bytes([self._version])
-        first_frames = source.read(
-            len(usual),
-            self.first_at + 2 * (self.head_bytes + self._beams * self._samples),
-        )
-        is_usual = usual in first_frames
-        self.signature = (
-            usual
-            if is_usual
-            else source.read(self.first_at + self.signature_at, len(usual))
-        )
+        frame_bytes = self.head_bytes + self._beams * self._samples
+        self.signature = usual
+        if usual not in source.read(len(usual), self.first_at + 2 * frame_bytes):
+            in_first_frame = self.first_at + self.signature_at
+            self.signature = source.read(in_first_frame, len(usual))
         self.image = SonarImage(scale="decibel", decibel_span=DIDSON_DECIBEL_SPAN)
         self.notes = {
             "source": f"DIDSON recording {source.path.name}, DDF version {self._version}",
@@ -240,19 +225,24 @@ class DidsonFormat(LensSonarFormat):
 
     def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
         """Time, samples a beam and settings: window codes, flags, beams, samples."""
-        start, length = struct.unpack_from("<2i", content, _WINDOW_AT)
-        (flags,) = struct.unpack_from("<I", content, _FLAGS_AT)
+        start, length = struct.unpack_from("<2i", content, 52)
+        (flags,) = struct.unpack_from("<I", content, 192)
         if self._serial < FIRST_EXTENDED_SERIAL:
-            flags = CLASSIC | (LONG_RANGE if self._serial == LONG_RANGE_SERIAL else 0)
+            flags = CLASSIC
+            if self._serial == LONG_RANGE_SERIAL:
+                flags |= LONG_RANGE
+        elif self._version == 3:
+            # the other bits are of the sonar's state
+            flags &= CLASSIC | LONG_RANGE
         else:
-            flags = flags & (CLASSIC | LONG_RANGE) if self._version == 3 else 0
+            flags = 0
         shift = 0 if self._is_high else LOW_FREQUENCY_SHIFT
         if not 0 <= start <= 31 or not 0 <= length < len(LENGTHS_M[flags]) - shift:
             raise DamagedFrameError(
                 f"frame {number} with window codes {start} and {length}"
             )
         year, month, day, hour, minute, second, hundredths = struct.unpack_from(
-            "<7i", content, _TIME_AT
+            "<7i", content, 20
         )
         if not 1990 <= year <= LAST_YEAR or not 0 <= hundredths < 100:
             raise DamagedFrameError(
@@ -265,11 +255,8 @@ class DidsonFormat(LensSonarFormat):
                 f"frame {number} with a time that does not exist: {error}"
             ) from error
         clock_ns = round(moment.timestamp()) * 10**9 + hundredths * 10**7
-        return (
-            clock_ns,
-            self._samples,
-            (start, length, flags, self._beams, self._samples),
-        )
+        settings = (start, length, flags, self._beams, self._samples)
+        return clock_ns, self._samples, settings
 
     def beams(self, settings: Settings) -> int:
         """Number of beams, the same in all frames."""
@@ -278,37 +265,27 @@ class DidsonFormat(LensSonarFormat):
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins that divide the window evenly."""
         start, length, flags, beams, samples = map(int, settings)
+        step_m = START_STEP_M[flags]
+        frequency_hz = HIGH_FREQUENCY_HZ
+        if not self._is_high:
+            # at low frequency windows begin in double steps, and the two shortest lengths are missing
+            step_m *= 2
+            length += LOW_FREQUENCY_SHIFT
+            frequency_hz = LOW_FREQUENCY_HZ
+        # the sonar measures times: its metres hold for the nominal speed of sound
         scale = self._sound_speed_m_s / NOMINAL_SOUND_SPEED_M_S
-        begin_m = start * START_STEP_M[flags] * (1 if self._is_high else 2) * scale
-        length_m = (
-            LENGTHS_M[flags][length + (0 if self._is_high else LOW_FREQUENCY_SHIFT)]
-            * scale
-        )
-        ranges_m = begin_m + (np.arange(samples, dtype=float) + 0.5) * (
-            length_m / samples
-        )
+        bin_m = LENGTHS_M[flags][length] * scale / samples
+        middles = np.arange(samples, dtype=float) + 0.5
+        ranges_m = start * step_m * scale + middles * bin_m
         azimuths_rad = didson_azimuths(beams)[:: -1 if self._reverse else 1]
-        frequency_hz = HIGH_FREQUENCY_HZ if self._is_high else LOW_FREQUENCY_HZ
         return FrameGeometry(
             ranges_m, azimuths_rad, frequency_hz, self._sound_speed_m_s
         )
 
 
-BEAMS_OF_PING_MODE = {
-    1: 48,
-    2: 48,
-    3: 96,
-    4: 96,
-    5: 96,
-    6: 64,
-    7: 64,
-    8: 64,
-    9: 128,
-    10: 128,
-    11: 128,
-    12: 128,
-}
-HALF_ANGLE_DEG, TELEPHOTO_HALF_ANGLE_DEG = 14.0, 7.0
+BEAMS_OF_PING_MODE = dict(enumerate([48] * 2 + [96] * 3 + [64] * 3 + [128] * 4, 1))
+HALF_ANGLE_DEG = 14.0
+TELEPHOTO_HALF_ANGLE_DEG = 7.0
 """Field of view for combinations of beams and lens without a table."""
 FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), 1: (1.8e6, 3.0e6), 2: (0.7e6, 1.2e6)}
 """Low and high frequency by system type: ARIS 1800, 3000, 1200."""
@@ -334,6 +311,7 @@ class ArisFormat(LensSonarFormat):
 
     def __init__(self, source: ByteSource) -> None:
         start = source.read(0, len(self.signature))
+        # a damaged file header is no reason to refuse: all settings are in the frames
         in_first_frame = source.read(
             self.first_at + self.signature_at, len(self.signature)
         )
@@ -400,12 +378,15 @@ class ArisFormat(LensSonarFormat):
         _, high, period_us, sound_speed, samples, delay_us, lens, system = map(
             float, settings
         )
-        beams, telephoto = self.beams(settings), bool(lens)
+        beams = self.beams(settings)
+        telephoto = bool(lens)
         azimuths = aris_azimuths(beams, telephoto=telephoto)
         if azimuths is None:
+            # the manufacturer publishes no table for this lens and number of beams
             azimuths = even_azimuths(
                 beams, TELEPHOTO_HALF_ANGLE_DEG if telephoto else HALF_ANGLE_DEG
             )
+        # half of the way of the sound, there and back
         middles_us = delay_us + (np.arange(int(samples), dtype=float) + 0.5) * period_us
         frequency_hz = FREQUENCIES_HZ[int(system)][int(high)]
         return FrameGeometry(

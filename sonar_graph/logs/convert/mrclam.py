@@ -83,11 +83,13 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
         ),
         read_table(dataset_dir / "Barcodes.dat", ("subject", "bar code")),
     )
-    truth, start = None, None
+    truth = None
+    start = None
     if Path(f"{prefix}_Groundtruth.dat").exists():
         table = read_table(
             Path(f"{prefix}_Groundtruth.dat"), ("time", "x", "y", "orientation")
         )
+        # motion capture repeats some stamps; the first row of each counts
         stamps_ns, rows = np.unique(table.stamps_ns(), return_index=True)
         x_m, y_m, heading_rad = table.values[rows, 1:].T
         quaternions = Rotation.from_euler("z", heading_rad[:, None]).as_quat()
@@ -104,17 +106,21 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     values = read_table(dataset_dir / "Landmark_Groundtruth.dat", columns).values
     values = values[np.argsort(values[:, 0])]
     covariances = np.zeros((len(values), 3, 3))
-    covariances[:, 0, 0], covariances[:, 1, 1] = values[:, 3] ** 2, values[:, 4] ** 2
+    covariances[:, 0, 0] = values[:, 3] ** 2
+    covariances[:, 1, 1] = values[:, 4] ** 2
     positions = np.column_stack([values[:, 1:3], np.zeros(len(values))])
-    noises = (FORWARD_NOISE_M_SQRT_S, SIDEWAYS_NOISE_M_SQRT_S)
-    forward_sigma_m_s, sideways_sigma_m_s = (
-        float(noise / np.sqrt(TYPICAL_INTERVAL_S)) for noise in noises
+    # the rows have their own noise; that of the calibration is for a typical interval
+    interval_sqrt = float(np.sqrt(TYPICAL_INTERVAL_S))
+    velocity_sigma_m_s = (
+        FORWARD_NOISE_M_SQRT_S / interval_sqrt,
+        SIDEWAYS_NOISE_M_SQRT_S / interval_sqrt,
+        VERTICAL_VELOCITY_SIGMA_M_S,
     )
     return Sequence(
         name=f"{dataset_dir.resolve().name}_robot{robot}",
         calibration=planar_calibration(
             GYRO,
-            (forward_sigma_m_s, sideways_sigma_m_s, VERTICAL_VELOCITY_SIGMA_M_S),
+            velocity_sigma_m_s,
             SonarCalibration(
                 range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD
             ),
@@ -148,8 +154,10 @@ def _odometry(table: NumberTable) -> tuple[Imu, Dvl]:
     """Sensor rows of the commanded velocities; of several commands at one stamp the last counts."""
     stamps_ns, first_from_end = np.unique(table.stamps_ns()[::-1], return_index=True)
     commands = table.values[len(table.values) - 1 - first_from_end, 1:]
+    # a command holds until the next, a row of a sequence over the interval before it
     in_force = np.concatenate([commands[:1], commands[:-1]])
     interval_s = np.concatenate([[TYPICAL_INTERVAL_S], np.diff(stamps_ns) * 1e-9])
+    # slip is a random walk: its variance as a velocity falls with the interval
     noise = np.diag(np.square([FORWARD_NOISE_M_SQRT_S, SIDEWAYS_NOISE_M_SQRT_S]))
     velocity = np.column_stack([in_force[:, 0], np.zeros(len(stamps_ns))])
     dvl = planar_dvl(stamps_ns, velocity, noise / interval_s[:, None, None])
@@ -162,6 +170,7 @@ def _detections(
     """Detections of landmarks in the order of time, and a note about those left out."""
     subjects = {int(barcode): int(subject) for subject, barcode in barcodes.values}
     stamps_ns = table.stamps_ns()
+    # stable: detections of one image keep their order
     order = np.argsort(stamps_ns, kind="stable")
     seen = np.array(
         [subjects.get(int(barcode), -1) for barcode in table.values[:, 1]],

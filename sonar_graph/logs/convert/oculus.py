@@ -78,7 +78,8 @@ class OculusFormat(SonarFormat):
 
     first_at = 0
     head_bytes = RESULT_AT[2] + RESULTS[2].size + 2 * MOST_BEAMS
-    signature, signature_at = SIGNATURE, 0
+    signature = SIGNATURE
+    signature_at = 0
 
     def __init__(self, source: ByteSource) -> None:
         first = next(
@@ -97,11 +98,9 @@ class OculusFormat(SonarFormat):
         self.image = SonarImage(
             scale="linear", full_scale=2 ** (8 * sample_bytes) - 1, gamma=gamma
         )
-        clock = (
-            ", a 32-bit number taken as nanoseconds and continued where it wraps around"
-            if wraps
-            else ""
-        )
+        clock = ""
+        if wraps:
+            clock = ", a 32-bit number taken as nanoseconds and continued where it wraps around"
         self.notes = {
             "source": f"Oculus recording {source.path.name}",
             "sonar.time": f"since the sonar was switched on, not since 1970{clock}",
@@ -118,12 +117,14 @@ class OculusFormat(SonarFormat):
         signature, _, _, kind, version, payload, _ = HEADER.unpack_from(content)
         if struct.pack("<H", signature) != SIGNATURE:
             raise DamagedFrameError("no message begins here")
+        # between the pings, and without a time of their own
         if kind in OTHERS and payload <= MOST_OTHER_BYTES:
             return FrameHead(at, HEADER.size + payload, 0, 0, (), has_image=False)
         if kind != PING or version not in RESULTS:
             raise DamagedFrameError(f"a message of kind {kind:#x}, version {version}")
         total = HEADER.size + payload
-        start, layout = RESULT_AT[version], RESULTS[version]
+        start = RESULT_AT[version]
+        layout = RESULTS[version]
         if len(content) < start + layout.size:
             raise DamagedFrameError(
                 f"a ping cut off, {len(content)} of {total} bytes are there"
@@ -132,6 +133,7 @@ class OculusFormat(SonarFormat):
         number, _, frequency_hz, temperature, pressure, *others = layout.unpack_from(
             content, start
         )
+        # version 2 alone has an attitude, before the speed of sound
         attitude = others[:3] if version == 2 else ()
         sound_speed, clock, size_code, bin_m, ranges, beams = others[len(attitude) :][
             :6
@@ -145,13 +147,11 @@ class OculusFormat(SonarFormat):
             raise DamagedFrameError(
                 f"ping {number} cut off, {len(content)} of {total} bytes are there"
             )
-        hundredths = np.frombuffer(bearings[: len(bearings) // 2 * 2], "<i2").astype(
-            np.int64
-        )
-        increase = bool(
-            np.all(np.diff(hundredths) > 0)
-            and np.abs(hundredths).max(initial=0) <= MOST_BEARING
-        )
+        whole = bearings[: len(bearings) // 2 * 2]
+        # wider integers: differences of two of 16 bits overflow
+        hundredths = np.frombuffer(whole, "<i2").astype(np.int64)
+        are_wide = np.abs(hundredths).max(initial=0) > MOST_BEARING
+        increase = bool(np.all(np.diff(hundredths) > 0)) and not are_wide
         faults = {
             f"{size} bytes a sample": size not in (1, 2, 4),
             f"{beams} beams": not 0 < beams <= MOST_BEAMS,
@@ -171,6 +171,7 @@ class OculusFormat(SonarFormat):
                 f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}"
             )
         layout_of_image = version, mode, gamma, flags, size, offset, ranges, beams
+        # bearings as bytes: frames of one fan compare equal at once
         settings = (*layout_of_image, bin_m, sound_speed, frequency_hz, bearings)
         clock_ns = round(clock * 1e9) if version == 2 else clock
         readings = dict(zip(("heading", "pitch", "roll"), attitude, strict=False))
@@ -197,11 +198,11 @@ class OculusFormat(SonarFormat):
         kind = np.dtype(f"<u{size}")
         row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
         row_bytes = row_gain + beams * size
-        rows = np.frombuffer(frame, np.uint8, ranges * row_bytes, offset).reshape(
-            ranges, row_bytes
-        )
+        rows = np.frombuffer(frame, np.uint8, ranges * row_bytes, offset)
+        rows = rows.reshape(ranges, row_bytes)
         values = np.ascontiguousarray(rows[:, row_gain:]).view(kind)
         if not row_gain:
             return values.T
         gains = np.ascontiguousarray(rows[:, :row_gain]).view("<u4").astype(np.float32)
+        # a gain of 0 would be none at all
         return (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32).T

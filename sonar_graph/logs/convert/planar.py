@@ -7,10 +7,34 @@ it, the logarithm of SE(2). With ``p = V(dθ) v T`` and ``V`` the left Jacobian 
     v = V(dθ)^-1 (dx, dy) / T,    V(θ)^-1 = [[h, θ/2], [-θ/2, h]],    h = (θ/2) / tan(θ/2)
 
 Held over the step, it composes to the step exactly. See ``docs/theory/datasets.md``.
+
+Files of odometry steps and landmarks seen between them: DLR Spatial Cognition and Victoria Park; neither has times.
+
+DLR: a wheeled robot in an office building, white discs on the floor as landmarks (Kurlbaum, Frese, "A benchmark data
+set for data association", Universität Bremen, SFB/TR 8 report, 2009). Its file ``map.circles`` holds
+
+``STEP image dx dy dφ  c_xx c_xy c_yy c_xφ c_yφ c_φφ``        the pose after the step in the frame before it
+``LANDMARK_C px py quality  c_xx c_xy c_yy  id [id ...]``     a disc in the frame of the newest pose
+
+with −y forward and x to the right. Body axes (x forward, y left) are therefore ``(x, y)_body = (−y, −x)_file``, a
+reflection, so that angles change their sign: ``θ = −φ``.
+
+Victoria Park: a truck among trees in Sydney, recognised in laser scans, as the edge list that GTSAM ships (Guivant,
+Nebot, "Optimization of the simultaneous localization and map-building algorithm for real-time implementation", IEEE
+T-RA 17(3), 2001).
+
+``ODOMETRY i j dx dy dθ  c_xx c_xy c_xθ c_yy c_yθ c_θθ``   pose j in the frame of pose i (x forward, y left)
+``LANDMARK i l x y  c_xx c_xy c_yy``                       landmark l in the frame of pose i
+
+Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`` line ends and a landmark where a
+``LANDMARK`` line does. Landmarks keep their numbers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from sonar_graph.calibration import (
@@ -22,6 +46,8 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
+from sonar_graph.errors import DatasetError
+from sonar_graph.logs.convert.text_tables import numbers, read_lines
 from sonar_graph.measurements import (
     NS_PER_S,
     Dvl,
@@ -38,6 +64,22 @@ SMALL_ANGLE_RAD = 1e-4
 """Angle below which the series for h is exact to 1e-18."""
 VERTICAL_VELOCITY_SIGMA_M_S = 1e-3
 """Sigma of the vertical velocity, which is zero by construction; the planar prior does the rest."""
+POINT_COV_PLACES = [[0, 1], [1, 2]]
+"""Columns of the elements of a landmark's covariance, in both files."""
+DLR_FILE = "map.circles"
+DLR_STEP = ("dX", "dY", "dPhi", "cXX", "cXY", "cYY", "cXPhi", "cYPhi", "cPhiPhi")
+DLR_STEP_COV_PLACES = [[0, 1, 3], [1, 2, 4], [3, 4, 5]]
+DLR_POINT = ("pX", "pY", "quality", "cXX", "cXY", "cYY")
+DLR_LINES = "lines 'STEP image dX dY dPhi + 6 covariances' and 'LANDMARK_C pX pY quality + 3 covariances + IDs'"
+BODY_OF_FILE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""(x, y, θ) in body axes from (x, y, φ) in DLR's file."""
+PARK_COV = ("c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt")
+PARK_COLUMNS = {
+    "ODOMETRY": ("i", "j", "dx", "dy", "dtheta", *PARK_COV),
+    "LANDMARK": ("i", "landmark", "x", "y", "c_xx", "c_xy", "c_yy"),
+}
+PARK_STEP_COV_PLACES = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+PARK_LINES = "lines 'ODOMETRY i j dx dy dtheta + 6 covariances' and 'LANDMARK i landmark x y + 3 covariances'"
 
 
 def twists_of_steps(steps: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]:
@@ -53,6 +95,7 @@ def twists_of_steps(steps: Floats, covs: Floats) -> tuple[Floats, Floats, Floats
     """
     angle_rad = steps[:, 2]
     half = 0.5 * angle_rad
+    # at zero the tangent's quotient is 0 / 0
     small = np.abs(angle_rad) < SMALL_ANGLE_RAD
     h = np.where(
         small, 1.0 - angle_rad**2 / 12.0, half / np.tan(np.where(small, 1.0, half))
@@ -78,6 +121,7 @@ def planar_dvl(stamps_ns: Ints, velocity: Floats, velocity_cov: Floats) -> Dvl:
     n = len(stamps_ns)
     cov = np.zeros((n, 3, 3))
     cov[:, :2, :2] = velocity_cov
+    # the robot does not leave its plane; zero would make the covariance singular
     cov[:, 2, 2] = VERTICAL_VELOCITY_SIGMA_M_S**2
     return Dvl(stamps_ns, np.column_stack([velocity, np.zeros(n)]), cov)
 
@@ -101,6 +145,7 @@ def planar_calibration(
         start=start or Start(),
         floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
         planar=PlanarMotion(),
+        # there are no forces, and each row holds over the step before it
         use_gravity=False,
         odometry_interpolation="hold-past",
     )
@@ -119,59 +164,229 @@ def range_azimuth(points: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]
     return r, np.arctan2(y, x), J @ covs @ np.swapaxes(J, -1, -2)
 
 
-def stepped_sequence(
-    name: str,
-    steps: Floats,
-    step_covs: Floats,
-    poses: list[int],
-    points: Floats,
-    point_covs: Floats,
-    ids: list[list[int]],
-    notes: Mapping[str, str],
-) -> Sequence:
-    """Sequence of a file of steps and of landmarks seen between them; rows at the end of each step, and at rest at 0.
+@dataclass(frozen=True, eq=False)
+class StepRun:
+    """Steps of a planar robot, and landmarks seen between them."""
+
+    steps: Floats
+    """(dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians."""
+    step_covs: Floats
+    """Covariances of the steps, shape (n, 3, 3)."""
+    poses: list[int]
+    """Number of steps before each landmark, length m."""
+    points: Floats
+    """Landmarks in the body frame (x forward, y left), shape (m, 2), metres."""
+    point_covs: Floats
+    """Their covariances, shape (m, 2, 2)."""
+    ids: list[list[int]]
+    """Equally probable identities of each landmark, length m; negative ones are left out."""
+
+
+def stepped_sequence(name: str, run: StepRun, notes: Mapping[str, str]) -> Sequence:
+    """Sequence of a run; rows at the end of each step, and at rest at 0.
 
     The turn's noise is one density whose integral over a step has the mean variance of dθ, ``sqrt(mean(c_θθ) / T)``;
     that of the velocity is in the rows, and in the calibration their root mean square. The gyro has no bias.
-
-    ``steps``, ``step_covs``: as for `twists_of_steps`; ``poses``: number of steps before each landmark, length m;
-    ``points``, ``point_covs``: landmarks in the body frame (x forward, y left), shape (m, 2), and their covariances,
-    shape (m, 2, 2); ``ids``: equally probable identities of each landmark, length m; negative ones are left out.
     """
-    velocity, velocity_cov, rate_rad_s = twists_of_steps(steps, step_covs)
-    stamps_ns = np.arange(len(steps) + 1, dtype=np.int64) * NS_PER_S
-    dvl = planar_dvl(
-        stamps_ns,
-        np.vstack([np.zeros(2), velocity]),
-        np.concatenate([velocity_cov[:1], velocity_cov]),
-    )
-    x, y, z = np.sqrt(
-        np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
-    ).tolist()
-    detections = None
-    if ids:
-        candidate_ids = np.full((len(ids), max(map(len, ids))), -1, dtype=np.int64)
-        for row, found in enumerate(ids):
-            known = [identity for identity in found if identity >= 0]
-            candidate_ids[row, : len(known)] = known
-        is_known = candidate_ids >= 0
-        id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
-        polar = range_azimuth(points, point_covs)
-        detections = LandmarkDetections(
-            stamps_ns[poses], *polar, candidate_ids, id_probability
-        )
+    velocity, velocity_cov, rate_rad_s = twists_of_steps(run.steps, run.step_covs)
+    stamps_ns = np.arange(len(run.steps) + 1, dtype=np.int64) * NS_PER_S
+    # before the first step the robot rests, as uncertain as in that step
+    velocities = np.vstack([np.zeros(2), velocity])
+    velocity_covs = np.concatenate([velocity_cov[:1], velocity_cov])
+    dvl = planar_dvl(stamps_ns, velocities, velocity_covs)
+    variances = np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
+    x, y, z = np.sqrt(variances).tolist()
+    gyro_noise_density = float(np.sqrt(np.mean(run.step_covs[:, 2, 2])))
     return Sequence(
         name=name,
-        calibration=planar_calibration(
-            (float(np.sqrt(np.mean(step_covs[:, 2, 2]))), 0.0, 0.0), (x, y, z)
-        ),
+        calibration=planar_calibration((gyro_noise_density, 0.0, 0.0), (x, y, z)),
         imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
         dvl=dvl,
-        detections=detections,
+        detections=_detections(run, stamps_ns) if run.ids else None,
         notes={
             "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
             "truth": "none",
             "odometry": "each step as the constant twist that makes it in one second",
         }
         | dict(notes),
+    )
+
+
+def _detections(run: StepRun, stamps_ns: Ints) -> LandmarkDetections:
+    """Landmarks as ranges and azimuths, at the end of the step before."""
+    most = max(map(len, run.ids))
+    candidate_ids = np.full((len(run.ids), most), -1, dtype=np.int64)
+    for row, found in enumerate(run.ids):
+        known = [identity for identity in found if identity >= 0]
+        candidate_ids[row, : len(known)] = known
+    # no identity is more probable than another
+    is_known = candidate_ids >= 0
+    id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
+    polar = range_azimuth(run.points, run.point_covs)
+    return LandmarkDetections(
+        stamps_ns[run.poses], *polar, candidate_ids, id_probability
+    )
+
+
+def read_dlr(path: Path) -> Sequence:
+    """Sequence of the run, one odometry step a second.
+
+    Parameters
+    ----------
+    path
+        ``map.circles``, or the folder that holds it.
+
+    Returns
+    -------
+    Sequence
+        Without truth; the pose after n steps is at n seconds. A detection with several IDs has them as equally
+        probable candidates; one with ID −1 (no known disc) has none.
+
+    Raises
+    ------
+    DatasetError
+        When the file is missing or malformed, or a landmark comes before the first step.
+    """
+    if path.is_dir():
+        if not (path / DLR_FILE).exists():
+            raise DatasetError(
+                f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself"
+            )
+        path = path / DLR_FILE
+    steps: list[list[float]] = []
+    points: list[list[float]] = []
+    ids: list[list[int]] = []
+    poses: list[int] = []
+    for number, kind, rest in _lines(path, DLR_LINES, "STEP", "LANDMARK", "LANDMARK_C"):
+        if kind == "STEP":
+            # the first number is that of an image
+            steps.append(numbers(path, number, rest[1:], DLR_STEP))
+            continue
+        place = f"{path}, line {number}:"
+        if not steps:
+            raise DatasetError(
+                f"{place} a landmark before the first STEP; expected {DLR_LINES}"
+            )
+        x, y, _, *cov = numbers(path, number, rest[: len(DLR_POINT)], DLR_POINT)
+        try:
+            found = [int(text) for text in rest[len(DLR_POINT) :]]
+        except ValueError as error:
+            raise DatasetError(
+                f"{place} {error}; expected whole numbers as landmark IDs"
+            ) from error
+        if not found:
+            raise DatasetError(
+                f"{place} no landmark ID after the covariances; expected {DLR_LINES}"
+            )
+        points.append([x, y, *cov])
+        ids.append(found)
+        poses.append(len(steps))
+    if not steps:
+        raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
+    return stepped_sequence(
+        "dlr_spatial_cognition",
+        _run(steps, DLR_STEP_COV_PLACES, poses, points, ids, BODY_OF_FILE),
+        {
+            "data set": "DLR Spatial Cognition; Kurlbaum, Frese, SFB/TR 8 report, 2009",
+            "licence": "none stated",
+            "noise": "the file's covariances; of the turn their mean, and not their correlation with the displacement",
+            "detections": f"{sum(found == [-1] for found in ids)} of {len(ids)} have no identity (-1)",
+        },
+    )
+
+
+def read_victoria_park(path: Path | None = None) -> Sequence:
+    """Sequence of the run, one odometry edge a second.
+
+    Parameters
+    ----------
+    path
+        File in the format above; None: the file in the installed gtsam.
+
+    Returns
+    -------
+    Sequence
+        Without truth. The pose after n edges is at n seconds.
+
+    Raises
+    ------
+    DatasetError
+        When the file is missing or malformed, or its odometry is no single chain.
+
+    Examples
+    --------
+    The file comes with gtsam:
+
+    >>> from sonar_graph.logs.convert import read_victoria_park
+    >>> sequence = read_victoria_park()
+    >>> round(sequence.duration_s), len(sequence.detections)
+    (6968, 3640)
+    """
+    path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
+    steps: list[list[float]] = []
+    points: list[list[float]] = []
+    ids: list[list[int]] = []
+    poses: list[int] = []
+    newest = 0
+    for number, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
+        start, end, *values = numbers(path, number, rest, PARK_COLUMNS[kind])
+        # a loop closure between poses would be an odometry edge too: the format has none
+        if start != newest:
+            raise DatasetError(
+                f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"
+                " expected one chain of poses from 0, with landmarks seen from the newest"
+            )
+        if kind == "ODOMETRY":
+            newest = int(end)
+            steps.append(values)
+        else:
+            points.append(values)
+            ids.append([int(end)])
+            poses.append(len(steps))
+    if not steps:
+        raise DatasetError(f"{path}: holds no ODOMETRY line; expected {PARK_LINES}")
+    return stepped_sequence(
+        "victoria_park",
+        _run(steps, PARK_STEP_COV_PLACES, poses, points, ids, np.eye(3)),
+        {
+            "data set": "Victoria Park; Guivant, Nebot, IEEE T-RA 17(3), 2001; edge list of GTSAM's examples",
+            "noise": "the file's covariances",
+        },
+    )
+
+
+def _lines(
+    path: Path, expected: str, *kinds: str
+) -> Iterator[tuple[int, str, list[str]]]:
+    """Number, kind and other fields of each line; a `DatasetError` for other kinds."""
+    for number, (kind, *rest) in read_lines(path, expected):
+        if kind not in kinds:
+            raise DatasetError(
+                f"{path}, line {number}: begins with {kind!r}; expected {expected}"
+            )
+        yield number, kind, rest
+
+
+def _run(
+    steps: list[list[float]],
+    step_cov_places: list[list[int]],
+    poses: list[int],
+    points: list[list[float]],
+    ids: list[list[int]],
+    body_R_file: Floats,
+) -> StepRun:
+    """Steps and landmarks in body axes; the rows of the file hold a displacement, then elements of its covariance."""
+    rows = np.array(steps)  # (n, 9)
+    seen = np.array(points).reshape(-1, 5)  # (m, 5)
+    step_covs = rows[:, 3:][:, step_cov_places]
+    point_covs = seen[:, 2:][:, POINT_COV_PLACES]
+    # a reflection in the plane, which turns the sense of angles
+    plane = body_R_file[:2, :2]
+    return StepRun(
+        steps=rows[:, :3] @ body_R_file.T,
+        step_covs=body_R_file @ step_covs @ body_R_file.T,
+        poses=poses,
+        points=seen[:, :2] @ plane.T,
+        point_covs=plane @ point_covs @ plane.T,
+        ids=ids,
     )

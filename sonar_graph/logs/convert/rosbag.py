@@ -132,46 +132,49 @@ def _open_bag(source: Path) -> Iterator[AnyReader | Ros1InMcap]:
     vars(rosbag2).update(
         zstd=SimpleNamespace(open=limited_zstd_file, decompress=limited_zstd)
     )
-    is_file_in_bag = source.suffix == ".db3" and (source.parent / _METADATA).exists()
-    path = source.parent if is_file_in_bag else source
+    path = source
+    if source.suffix == ".db3" and (source.parent / _METADATA).exists():
+        path = source.parent
+    parts = path.iterdir() if path.is_dir() else ()
     try:
-        for part in [source, *(path.iterdir() if path.is_dir() else ())]:
+        # a pipe or a device among the files would block the library
+        for part in [source, *parts]:
             regular(part)
     except OSError as error:
         raise LogError(f"{error.filename} cannot be read: {error.strerror}") from error
-    if source.is_file():
+    is_mcap = source.is_file() and source.suffix == ".mcap"
+    if source.is_file() and not is_mcap:
         with source.open("rb") as stream:
-            fault = (
-                None
-                if source.suffix == ".mcap"
-                else why_no_bag(source, stream.read(START_BYTES))
-            )
+            fault = why_no_bag(source, stream.read(START_BYTES))
         if fault is not None:
             raise LogError(f"{source} is {fault}")
     try:
-        if source.is_file() and source.suffix == ".mcap":
+        if is_mcap:
             with source.open("rb") as stream:
                 yield Ros1InMcap(stream, source)
             return
-        with AnyReader(
-            [path], default_typestore=get_typestore(Stores.ROS2_JAZZY)
-        ) as bag:
+        # types of bags that do not define them, as those of Humble and before
+        typestore = get_typestore(Stores.ROS2_JAZZY)
+        with AnyReader([path], default_typestore=typestore) as bag:
             yield bag
     except SonarGraphError:
         raise
     except Exception as error:  # the library raises whatever its parts raise
+        # of the log, such as a full disk
         if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
             raise
-        advice = {
-            ".bag": "of one that was not closed `rosbag reindex` makes a whole one",
-            ".db3": "give the folder with the .db3 file and its metadata.yaml (`ros2 bag reindex` makes one)",
-        }.get(
-            source.suffix,
-            "give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml",
-        )
+        advice = _ADVICE.get(source.suffix, _ADVICE[""])
         raise LogError(
             f"{source} cannot be read as a bag: {error}; {advice}"
         ) from error
+
+
+_ADVICE = {
+    ".bag": "of one that was not closed `rosbag reindex` makes a whole one",
+    ".db3": "give the folder with the .db3 file and its metadata.yaml (`ros2 bag reindex` makes one)",
+    "": "give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml",
+}
+"""What to do about a bag that cannot be read, by the end of its name."""
 
 
 def limited_bz2(packed: bytes) -> bytes:
@@ -188,12 +191,15 @@ def limited_zstd(packed: bytes) -> bytes:
 
 def limited_lz4(packed: bytes) -> bytes:
     """Content of an lz4 chunk; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
-    chunk, content = lz4.frame.LZ4FrameDecompressor(), bytearray()
+    chunk = lz4.frame.LZ4FrameDecompressor()
+    content = bytearray()
+    # in pieces: the decompressor reserves as much memory as it is allowed to fill
     while not chunk.eof and len(content) <= LARGEST_BYTES:
         part = chunk.decompress(packed, max_length=_PIECE_BYTES)
         if not part and chunk.needs_input:
             break
         content += part
+        # the decompressor keeps what it has not used
         packed = b""
     return _whole(bytes(content), is_whole=chunk.eof)
 
@@ -212,7 +218,8 @@ def _whole(content: bytes, *, is_whole: bool) -> bytes:
 @contextmanager
 def limited_zstd_file(packed: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
     """Open a compressed file of a bag; a LogError where it unpacks to far more than a recording of its size does."""
-    size, unpacked = os.fstat(packed.fileno()).st_size, 0
+    size = os.fstat(packed.fileno()).st_size
+    unpacked = 0
     most = max(LARGEST_BYTES, size * LARGEST_RATIO)
     with import_module(_ZSTD).open(packed, mode) as stream:
 
@@ -230,12 +237,12 @@ def limited_zstd_file(packed: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
         yield SimpleNamespace(read=read)
 
 
-def _own_definitions(folder: Path) -> dict[str, list[str]]:
-    """Texts of the ``package/msg/Type.msg`` files in a folder, by type; a LogError where there are none."""
+def _own_definitions(folder: Path) -> dict[str, str]:
+    """Texts of the ``package/msg/Type.msg`` files in a folder, by type; a LogError without any."""
     found = {}
     for file in sorted(folder.rglob("*.msg")):
         package = file.parent.parent if file.parent.name == "msg" else file.parent
-        found[f"{package.name}/msg/{file.stem}"] = [file.read_text(encoding="utf-8")]
+        found[f"{package.name}/msg/{file.stem}"] = file.read_text(encoding="utf-8")
     if not found:
         raise LogError(
             f"{folder}: holds no .msg files; give the folder with package/msg/Type.msg"
@@ -243,51 +250,43 @@ def _own_definitions(folder: Path) -> dict[str, list[str]]:
     return found
 
 
-def _define(bag: AnyReader | Ros1InMcap, own: dict[str, list[str]]) -> None:
+def _define(bag: AnyReader | Ros1InMcap, own: dict[str, str]) -> None:
     """Add definitions of types that a bag has not: those of a user, or else known ones that fit the first messages."""
     from rosbags.typesys import get_types_from_msg
 
-    known = bag.typestore.fielddefs
-    of_user = {
-        name: get_types_from_msg(texts[0], name)
-        for name, texts in own.items()
-        if name not in known
-    }
-    for types in of_user.values():
-        bag.typestore.register(types)
+    store = bag.typestore
+    of_bag = set(store.fielddefs)
+    for name, text in own.items():
+        if name not in of_bag:
+            store.register(get_types_from_msg(text, name))
     for connection in bag.connections:
-        if (
-            connection.msgtype in bag.typestore.fielddefs
-            or connection.msgtype not in DRIVER_DEFINITIONS
-            or not bag.is2
-        ):
+        kind = connection.msgtype
+        # a bag of ROS 1 defines its types itself
+        if kind in store.fielddefs or not bag.is2:
             continue
-        firsts = [
-            raw
-            for _, _, raw in islice(bag.messages(connections=[connection]), _MOST_TRIED)
-        ]
-        for text in DRIVER_DEFINITIONS[connection.msgtype]:
-            types = get_types_from_msg(text, connection.msgtype)
-            if all(_follows(bag, types, connection.msgtype, raw) for raw in firsts):
-                bag.typestore.register(
-                    {
-                        name: t
-                        for name, t in types.items()
-                        if name not in bag.typestore.fielddefs
-                    }
-                )
+        messages = bag.messages(connections=[connection])
+        firsts = [raw for _, _, raw in islice(messages, _MOST_TRIED)]
+        # versions of a driver differ in their fields: the first that fits counts
+        for text in DRIVER_DEFINITIONS.get(kind, ()):
+            types = get_types_from_msg(text, kind)
+            if all(_follows(store, types, kind, raw) for raw in firsts):
+                _add_types(store, types)
                 break
 
 
-def _follows(
-    bag: AnyReader | Ros1InMcap, types: Typesdict, kind: str, payload: bytes
-) -> bool:
-    """Tell whether a payload is a message of a type by these definitions."""
+def _add_types(store: Typestore, types: Typesdict) -> None:
+    """Add the types that a store does not define."""
+    known = store.fielddefs
+    store.register({name: t for name, t in types.items() if name not in known})
+
+
+def _follows(store: Typestore, types: Typesdict, kind: str, payload: bytes) -> bool:
+    """True where a payload is a message of a type by these definitions."""
     from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, get_typestore
 
     trial = get_typestore(Stores.EMPTY)
-    trial.register({**types, **bag.typestore.fielddefs})
+    trial.register({**types, **store.fielddefs})
     try:
         trial.deserialize_cdr(payload, kind)
     except (SerdeError, AssertionError):
@@ -320,26 +319,20 @@ class Ros1InMcap:
                 f"{path} is {ALREADY_MCAP}`sonar-graph inspect {path}`; where it has ROS 1 messages, "
                 "`mcap recover` first writes the summary that it lacks"
             )
-        channels = {
-            number: one
-            for number, one in summary.channels.items()
-            if one.message_encoding == "ros1"
-        }
+        every = summary.channels.items()
+        channels = {k: one for k, one in every if one.message_encoding == "ros1"}
         if not channels:
             raise LogError(f"{path} is {ALREADY_MCAP}`sonar-graph inspect {path}`")
         self.typestore = get_typestore(Stores.EMPTY)
         self.connections: list[Connection] = []
-        counts = summary.statistics.channel_message_counts
-        self.duration = (
-            summary.statistics.message_end_time - summary.statistics.message_start_time
-        )
+        statistics = summary.statistics
+        counts = statistics.channel_message_counts
+        self.duration = statistics.message_end_time - statistics.message_start_time
         for number, channel in channels.items():
             schema = summary.schemas[channel.schema_id]
-            kind = (
-                schema.name
-                if "/msg/" in schema.name
-                else schema.name.replace("/", "/msg/")
-            )
+            kind = schema.name
+            if "/msg/" not in kind:
+                kind = kind.replace("/", "/msg/")
             text = schema.data.decode()
             self.typestore.register(get_types_from_msg(text, kind))
             self.connections.append(
@@ -350,6 +343,7 @@ class Ros1InMcap:
                     MessageDefinition(MessageDefinitionFormat.MSG, text),
                     self.typestore.generate_msgdef(kind)[1],
                     counts.get(number, 0),
+                    # the file does not state which topics were latched
                     ConnectionExtRosbag1(
                         None, int(channel.topic.endswith("tf_static"))
                     ),
@@ -376,17 +370,16 @@ class _BagCopy:
         self._bag = bag
         self._writer = writer
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        known, own = self._store.fielddefs, bag.typestore.fielddefs
-        self._store.register(
-            {name: fields for name, fields in own.items() if name not in known}
-        )
+        # of types that both define, that of Jazzy counts: readers of the log know it
+        _add_types(self._store, bag.typestore.fielddefs)
         self._schemas: dict[str, int] = {}
         self._recoders: dict[str, Recode] = {}
 
     def run(self, progress: Progress | None) -> BagConversion:
         from rosbags.serde import SerdeError
 
-        bag, writer = self._bag, self._writer
+        bag = self._bag
+        writer = self._writer
         writer.start(profile="ros2", library=LIBRARY)
         writer.add_metadata("rosbag2", ROSBAG2_METADATA)
         stated = {
@@ -394,14 +387,14 @@ class _BagCopy:
             for c in bag.connections
         }
         writer.add_metadata(SOURCE_METADATA, stated)
-        connections = [
-            c for c in bag.connections if c.msgtype in bag.typestore.fielddefs
-        ]
+        known = bag.typestore.fielddefs
+        connections = [c for c in bag.connections if c.msgtype in known]
         missing = {
             c.topic: f"{c.msgtype} is not defined in the bag: add --definitions FOLDER, which holds {c.msgtype}.msg"
             for c in bag.connections
             if c not in connections
         }
+        # numbers of connections repeat in the files of a bag that is split
         channels = {(c.id, id(c.owner)): self._channel(c) for c in connections}
         conversion = BagConversion(
             len({c.topic for c in connections}),
@@ -410,9 +403,9 @@ class _BagCopy:
         )
         broken: dict[str, int] = {}
         total = sum(c.msgcount for c in connections)
-        for number, (connection, time_ns, raw) in enumerate(
-            bag.messages(connections=connections) if connections else ()
-        ):
+        # without connections the library would give the messages of all
+        messages = bag.messages(connections=connections) if connections else ()
+        for number, (connection, time_ns, raw) in enumerate(messages):
             try:
                 payload = bytes(self._recoders[connection.msgtype](raw))
             except SerdeError:
@@ -447,10 +440,8 @@ class _BagCopy:
                 type_name, "ros2msg", text.encode()
             )
         if isinstance(connection.ext, ConnectionExtRosbag2):
-            is_latched = any(
-                profile.durability.value == 1
-                for profile in connection.ext.offered_qos_profiles
-            )
+            profiles = connection.ext.offered_qos_profiles
+            is_latched = any(one.durability.value == 1 for one in profiles)
         else:
             is_latched = bool(connection.ext.latching)
         offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if is_latched else {}
@@ -463,20 +454,19 @@ class _BagCopy:
         from rosbags.convert.converter import is_same_wireformat, migrate_bytes
 
         store: Typestore = self._bag.typestore
-        if is_same_wireformat(store, self._store, own, type_name):
-            return (
-                memoryview
-                if self._bag.is2
-                else partial(self._store.ros1_to_cdr, typename=type_name)
-            )
         is2 = self._bag.is2
-        return partial(
-            migrate_bytes,
-            store,
-            self._store,
-            own,
-            type_name,
-            {},
-            src_is2=is2,
-            dst_is2=True,
-        )
+        if not is_same_wireformat(store, self._store, own, type_name):
+            return partial(
+                migrate_bytes,
+                store,
+                self._store,
+                own,
+                type_name,
+                {},
+                src_is2=is2,
+                dst_is2=True,
+            )
+        # CDR of the same fields needs no change
+        if is2:
+            return memoryview
+        return partial(self._store.ros1_to_cdr, typename=type_name)

@@ -33,18 +33,19 @@ TOPIC = "/sonar/image"
 _SEARCH_BYTES = 1 << 20
 _IMAGE_BYTES = 1 << 22
 _MOST_MISSING = 100_000
-"""A larger jump of the frame number means that counting began anew."""
+"""A larger jump of the frame number means that counting began at 0 again."""
 _NEIGHBOURS = 4
 """Number of frames on either side with which a frame's settings are compared."""
 _DRIFT = 1e-3
 """Relative change below which settings given as floats (speed of sound) agree."""
-_ODD_GAP, _ODD_GAP_NS = 10, 1_000_000_000
+_ODD_GAP = 10
+_ODD_GAP_NS = 1_000_000_000
 """The first and last interval may be this many times the one beside it, and this much more."""
 Settings = tuple[int | float | bytes, ...]
 
 
 class DamagedFrameError(Exception):
-    """Bytes that cannot be the header of a frame; the text tells why."""
+    """Bytes that cannot be the header of a frame, with the reason."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +172,7 @@ class ByteSource:
     def places(self, pattern: bytes, start: int) -> Iterator[int]:
         """Offsets of a pattern, from ``start`` on."""
         for at in range(start, self.size, _SEARCH_BYTES):
+            # blocks overlap: the pattern may lie across the end of one
             block = self.read(at, _SEARCH_BYTES + len(pattern) - 1)
             found = block.find(pattern)
             while found >= 0:
@@ -195,8 +197,10 @@ def frames_and_losses(
     source: ByteSource, kind: SonarFormat
 ) -> Iterator[FrameHead | Lost]:
     """Headers of all trustworthy frames in the order of the file, and the losses between them."""
+    # a frame is judged by those before it that are trusted and by as many after it
     accepted: deque[FrameHead] = deque(maxlen=_NEIGHBOURS)
     waiting: deque[FrameHead] = deque()
+    # "None" at the end: the last frames have fewer after them
     for found in chain(_whole_frames(source, kind), repeat(None, _NEIGHBOURS)):
         if isinstance(found, Lost):
             yield found
@@ -215,43 +219,43 @@ def frames_and_losses(
 
 def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
     """Frames followed by another header or the end of the file; not yet compared with their neighbours."""
-    at, pending = kind.first_at, None
+    at = kind.first_at
+    # the newest header, whose frame is whole only when another one follows at its end
+    pending = None
     while at < source.size:
         try:
             head = kind.head(source.read(at, kind.head_bytes), at)
             if head.end > source.size and next(
                 plausible_headers(source, kind, at + 1), None
             ):
-                reason = f"frame {head.number} claims to be longer than the file, in which others follow"
-                raise DamagedFrameError(reason)
+                raise DamagedFrameError(
+                    f"frame {head.number} claims to be longer than the file, in which others follow"
+                )
         except DamagedFrameError as error:
             # bytes may be missing from the frame before, or from the file's header
             start = pending.at + 1 if pending else 0 if at == kind.first_at else at + 1
-            found = next(
-                (
-                    other
-                    for other in plausible_headers(source, kind, start)
-                    if other.at != at
-                ),
-                None,
-            )
+            headers = plausible_headers(source, kind, start)
+            found = next((other for other in headers if other.at != at), None)
             end = found.at if found else source.size
             if pending and _is_shifted(source, kind, pending, found):
-                yield Lost(
-                    pending.at,
-                    end,
-                    f"frame {pending.number} and what follows: bytes are missing or too many",
-                )
+                reason = f"frame {pending.number} and what follows: bytes are missing or too many"
+                yield Lost(pending.at, end, reason)
             else:
+                # the damage begins after the frame before, which is whole
                 if pending and pending.has_image:
                     yield pending
-                too_short = f"the file's header is {at - end} bytes too short"
-                yield Lost(at, end, str(error)) if end > at else Lost(0, end, too_short)
-            pending, at = None, end
+                if end > at:
+                    yield Lost(at, end, str(error))
+                else:
+                    reason = f"the file's header is {at - end} bytes too short"
+                    yield Lost(0, end, reason)
+            pending = None
+            at = end
             continue
         if pending and pending.has_image:
             yield pending
-        pending, at = head, head.end
+        pending = head
+        at = head.end
     if pending and pending.end > source.size:
         have = f"{source.size - pending.at} of {pending.size} bytes are there"
         yield Lost(pending.at, source.size, f"frame {pending.number}: cut off, {have}")
@@ -263,6 +267,7 @@ def _is_shifted(
     source: ByteSource, kind: SonarFormat, pending: FrameHead, found: FrameHead | None
 ) -> bool:
     """True where the frame before a bad header may lack bytes, or have too many."""
+    # whole frames between two headers may be lost; a part of one shifts all that follows
     if found is not None:
         return (found.at - pending.end) % pending.size != 0
     rest = source.size - pending.end
@@ -287,31 +292,27 @@ def _fault(
         return f"a repetition of the frame at byte {accepted[-1].at}"
     others = [*accepted, *waiting]
     is_like_another = any(_agree(judged, other) for other in others)
-    if not is_like_another and any(
-        _agree(one, other) for one, other in combinations(others, 2)
-    ):
+    # two others that agree are needed: each frame may have settings of its own
+    are_alike = any(_agree(one, other) for one, other in combinations(others, 2))
+    if are_alike and not is_like_another:
         return "its settings are those of no frame beside it"
-    if accepted and waiting:
-        before, after = (
-            _elapsed(accepted[-1], judged, period_ns),
-            _elapsed(judged, waiting[0], period_ns),
-        )
-        total = _elapsed(accepted[-1], waiting[0], period_ns)
-        # where time runs back over both steps, the clock was set, and nothing can be told
-        fits = total < 0 or (before >= 0 and after >= 0 and before + after == total)
-    elif (
-        len(others) > 1
-    ):  # the first or last frame: its interval against the one beside it, unless that runs back
-        row = (judged, *waiting) if waiting else (*accepted, judged)
-        first, middle, last = row[:3] if waiting else row[-3:]
-        before, after = (
-            _elapsed(first, middle, period_ns),
-            _elapsed(middle, last, period_ns),
-        )
-        gap_ns, usual_ns = (before, after) if waiting else (after, before)
-        fits = usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
-    else:
+    if len(others) < 2:
         return None
+    row = [*accepted, judged, *waiting]
+    # the first or the last frame is judged by the two beside it
+    middle = min(max(len(accepted), 1), len(row) - 2)
+    before_ns = _elapsed(row[middle - 1], row[middle], period_ns)
+    after_ns = _elapsed(row[middle], row[middle + 1], period_ns)
+    if accepted and waiting:
+        total_ns = _elapsed(row[middle - 1], row[middle + 1], period_ns)
+        is_between = min(before_ns, after_ns) >= 0 and before_ns + after_ns == total_ns
+        # where time runs back over both steps, the clock was set, and no frame is at fault
+        fits = total_ns < 0 or is_between
+    else:
+        gap_ns, usual_ns = before_ns, after_ns
+        if accepted:
+            gap_ns, usual_ns = after_ns, before_ns
+        fits = usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
     return None if fits else "its time does not fit those of the frames beside it"
 
 
@@ -387,37 +388,30 @@ def convert_sonar_file(
         "name": spelt(source.path.stem),
         "calibration": recorded_calibration(calibration),
     }
-    with recording(
-        output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}
-    ) as out:
-        for block in _blocks(
-            frames_and_losses(source, kind), kind.clock_period_ns, conversion
-        ):
+    # a conversion that is interrupted leaves a log with the notes that are known before
+    first_record = record | {"notes": json.dumps(dict(kind.notes))}
+    found = frames_and_losses(source, kind)
+    with recording(output, {METADATA: first_record}) as out:
+        for block in _blocks(found, kind.clock_period_ns, conversion):
             heads, stamps_ns = zip(*block, strict=True)
             geometry = kind.geometry(heads[0].settings)
-            images = np.stack(
-                [
-                    kind.samples(source.read(head.at, head.size), head.settings)
-                    for head in heads
-                ]
-            )
+            images = [
+                kind.samples(source.read(head.at, head.size), head.settings)
+                for head in heads
+            ]
             frames = SonarFrames(
-                np.array(stamps_ns), images, geometry.ranges_m, geometry.azimuths_rad
+                np.array(stamps_ns),
+                np.stack(images),
+                geometry.ranges_m,
+                geometry.azimuths_rad,
             )
-            frequency_hz, sound_speed_m_s = (
-                geometry.frequency_hz,
-                geometry.sound_speed_m_s,
+            messages = sonar_image_messages(
+                TOPIC,
+                frames,
+                frequency_hz=geometry.frequency_hz,
+                sound_speed_m_s=geometry.sound_speed_m_s,
             )
-            out.write(
-                [
-                    sonar_image_messages(
-                        TOPIC,
-                        frames,
-                        frequency_hz=frequency_hz,
-                        sound_speed_m_s=sound_speed_m_s,
-                    )
-                ]
-            )
+            out.write([messages])
             if progress:
                 progress(heads[-1].end, source.size)
         if not conversion.frames:
@@ -425,12 +419,11 @@ def convert_sonar_file(
             raise DatasetError(
                 f"{source.path}: holds no whole frame{first}; is it a recording of this sonar?"
             )
-        spans = conversion.readings.items()
-        notes = dict(kind.notes) | {
-            f"sonar.{n}": f"{low:g} to {high:g}"
-            for n, (low, high) in spans
-            if low or high
-        }
+        notes = dict(kind.notes)
+        for name, (low, high) in conversion.readings.items():
+            # sonars without such a sensor write zeros
+            if low or high:
+                notes[f"sonar.{name}"] = f"{low:g} to {high:g}"
         shortcomings = conversion.shortcomings()
         if shortcomings:
             notes["sonar.shortcomings"] = "; ".join(shortcomings)
@@ -459,7 +452,8 @@ def _blocks(
         conversion.missing += jump if 0 < jump < _MOST_MISSING else 0
         step_ns = head.clock_ns - (earlier.clock_ns if earlier else 0)
         stamp_ns += step_ns if period_ns is None else step_ns % period_ns
-        conversion.first_ns = conversion.first_ns if conversion.frames else stamp_ns
+        if not conversion.frames:
+            conversion.first_ns = stamp_ns
         conversion.last_ns = stamp_ns
         conversion.frames += 1
         for name, value in head.readings.items():
@@ -469,13 +463,10 @@ def _blocks(
         earlier = head
         if block:
             last, last_ns = block[-1]
-            full = (len(block) + 1) * head.size > _IMAGE_BYTES
-            if (
-                full
-                or last.settings != head.settings
-                or last.size != head.size
-                or stamp_ns < last_ns
-            ):
+            is_full = (len(block) + 1) * head.size > _IMAGE_BYTES
+            is_alike = (last.settings, last.size) == (head.settings, head.size)
+            # a block's stamps ascend: where the clock was set back, another begins
+            if is_full or not is_alike or stamp_ns < last_ns:
                 yield block
                 block = []
         block.append((head, stamp_ns))

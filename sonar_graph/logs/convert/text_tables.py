@@ -40,7 +40,7 @@ def read_table(
     """Read a table whose every field is a finite number.
 
     Blank lines and lines that begin with ``comment`` are skipped, and so many ``header_lines``; ``columns`` are for the
-    error and for their number; ``delimiter``: None is white space.
+    error and for their number; ``delimiter``: white space by default.
 
     Raises `DatasetError` when the file is missing, has no row, or a row does not hold as many numbers as there are
     columns.
@@ -66,8 +66,8 @@ def read_lines(
 ) -> Iterator[tuple[int, list[str]]]:
     """Line number (from 1) and fields of every line with content.
 
-    Raises `DatasetError` when the file cannot be read or holds no such line; ``expected`` says what should have been
-    there.
+    Raises `DatasetError` when the file cannot be read or holds no such line; ``expected`` describes what should have
+    been there.
     """
     try:
         lines = text_of(path, encoding).splitlines()
@@ -75,6 +75,7 @@ def read_lines(
         raise DatasetError(
             f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error}); expected {expected}"
         ) from error
+    # a header alone is no data
     empty = True
     for number, line in enumerate(lines[header_lines:], start=header_lines + 1):
         if line.strip() and not line.lstrip().startswith(comment):
@@ -95,6 +96,7 @@ def numbers(
         values = [float(field) for field in fields]
     except ValueError as error:
         raise DatasetError(f"{path}, line {number}: {error}; {expected}") from error
+    # "nan" is a number to Python, and no measurement in these data sets
     if not np.isfinite(values).all():
         raise DatasetError(f"{path}, line {number}: a number is not finite; {expected}")
     return values
@@ -113,6 +115,7 @@ def numbered_run(
         raise DatasetError(
             f"{folder}: is not a folder; give the folder that holds {expected}"
         )
+    # the runs that there are belong into the error about one that is not
     pattern = re.escape(entry).replace("N", r"(\d+)")
     found = sorted(
         int(match[1])

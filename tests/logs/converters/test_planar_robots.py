@@ -13,8 +13,12 @@ from scipy.linalg import expm
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.logs.convert.mrclam import read_mrclam
-from sonar_graph.logs.convert.planar import range_azimuth, twists_of_steps
-from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
+from sonar_graph.logs.convert.planar import (
+    range_azimuth,
+    read_dlr,
+    read_victoria_park,
+    twists_of_steps,
+)
 from sonar_graph.logs.convert.text_tables import read_table
 
 metres = st.floats(-10, 10)

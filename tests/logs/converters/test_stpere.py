@@ -7,7 +7,7 @@ import pytest
 from sonar_graph.errors import DatasetError
 from sonar_graph.evaluation.metrics import horizontal_aligned_rmse
 from sonar_graph.logs.convert import read_csv
-from sonar_graph.logs.convert.stpere import DVL_COLUMNS, GYRO_Z_BIAS_RAD_S, read_stpere
+from sonar_graph.logs.convert.stpere import GYRO_Z_BIAS_RAD_S, read_stpere
 
 T0 = 1_000
 MINUTE_M = 1852.0
@@ -29,7 +29,7 @@ def folder(tmp_path):
     (tmp_path / "MTI.log").write_text(header + "\n".join(inertial))
     ahead, rest = (
         50 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)]),
-        "0 " * (len(DVL_COLUMNS) - 15),
+        "0 " * 17,
     )
     doppler = [
         f"{T0 + k} 2007 3 16 13 0 {k} 9 9 9 1 {ahead[0]} {ahead[1]} 2 {int(k != 1)} {rest}"
@@ -137,7 +137,7 @@ def test_a_missing_file_or_folder_is_named(folder):
         read_stpere(folder)
     (folder / "mti.txt").rename(folder / "MTI.log")
     (folder / "DVL.log").mkdir()
-    with pytest.raises(DatasetError, match=r"DVL\.log: cannot be read"):
+    with pytest.raises(DatasetError, match=r"DVL\.log: holds no files"):
         read_stpere(folder)
 
 

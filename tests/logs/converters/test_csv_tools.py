@@ -1,0 +1,491 @@
+"""Tables as tools write them are read right by the template's guess, or the template asks."""
+
+import re
+import tomllib
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.convert import csv_template, read_csv
+
+ROWS = 600
+EPOCH_S = 1_777_638_600.0
+"""2026-05-01T12:30:00Z."""
+
+
+def dive(imu_hz: float = 50.0, every: int = 10) -> SimpleNamespace:
+    """Rates, forces, velocities, depths and bearings of a dive; the Doppler log has every n-th time of the IMU."""
+    rng = np.random.default_rng(7)
+    s = np.arange(ROWS) / imu_hz
+    return SimpleNamespace(
+        s=s,
+        slow=slice(0, ROWS, every),
+        rate=rng.normal(0, 0.1, (ROWS, 3)),
+        force=rng.normal([0, 0, 9.81], 0.05, (ROWS, 3)),
+        velocity=np.column_stack(
+            [0.8 + 0.3 * np.sin(s), 0.1 * np.cos(s), 0.05 * np.sin(2 * s)]
+        ),
+        depth=4 + np.sin(0.3 * s),
+        bearing=(300 + 40 * np.sin(0.5 * s)) % 360,
+    )
+
+
+def write(
+    path: Path, header: str, *columns, sep: str = ",", number=repr, **how
+) -> None:
+    """Write a header and rows of columns, each text or numbers."""
+    rows = [
+        sep.join(
+            cell if isinstance(cell, str) else number(float(cell))
+            for cell in np.atleast_1d(np.array(row, dtype=object))
+        )
+        for row in zip(*columns, strict=True)
+    ]
+    text = "\n".join([header, *rows]) + "\n"
+    path.write_bytes(text.encode(how.get("encoding", "utf-8")))
+
+
+def dates(s: np.ndarray, form: str, tail: int = 3) -> list[str]:
+    """Dates with a fraction of a second of some digits where the form has an ``@``."""
+    whole = [datetime.fromtimestamp(EPOCH_S, UTC) + timedelta(seconds=t) for t in s]
+    return [
+        when.strftime(form).replace("@", f"{when.microsecond:06d}"[:tail])
+        for when in whole
+    ]
+
+
+def template(folder: Path) -> tuple[str, dict]:
+    text = csv_template([folder])
+    return text, tomllib.loads(text)
+
+
+def guessed(folder: Path, tmp_path: Path, text: str | None = None):
+    config = tmp_path / "guess.toml"
+    config.write_text(csv_template([folder]) if text is None else text)
+    return read_csv(folder, config)
+
+
+def uncommented(text: str, role: str) -> str:
+    """The template after its user has taken the first commented table of a role into use."""
+    blocks = text.split("\n\n")
+    at = next(k for k, block in enumerate(blocks) if block.startswith(f"# [{role}]"))
+    blocks[at] = re.sub(r"(?m)^# ", "", blocks[at])
+    return "\n\n".join(blocks)
+
+
+def assert_is(sequence, dive: SimpleNamespace, atol: float = 1e-9) -> None:
+    np.testing.assert_allclose(
+        (sequence.imu.stamps_ns - sequence.imu.stamps_ns[0]) * 1e-9,
+        dive.s,
+        rtol=0,
+        atol=1e-3,
+    )
+    np.testing.assert_allclose(
+        sequence.imu.angular_velocity, dive.rate, rtol=0, atol=atol
+    )
+    np.testing.assert_allclose(
+        sequence.dvl.velocity, dive.velocity[dive.slow], rtol=0, atol=atol
+    )
+    np.testing.assert_allclose(
+        -sequence.depth.z_m, dive.depth[dive.slow], rtol=0, atol=atol
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    return folder
+
+
+def plain(folder: Path, d: SimpleNamespace, *names: str, scale: float = 1.0) -> None:
+    """The tables of a dive that a test does not write in its own way."""
+    k = d.slow
+    t = np.round(d.s * scale, 9)
+    if "imu" in names:
+        header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
+        write(folder / "imu.csv", header, t, *d.rate.T, *d.force.T)
+    if "dvl" in names:
+        write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", t[k], *d.velocity[k].T)
+    if "depth" in names:
+        write(folder / "depth.csv", "time,depth", t[k], d.depth[k])
+
+
+def test_excel_in_german_with_semicolons_decimal_commas_and_degree_signs(
+    folder, tmp_path
+):
+    d = dive()
+    k = d.slow
+
+    def comma(value: float) -> str:
+        return repr(value).replace(".", ",")
+
+    how = {"sep": ";", "number": comma, "encoding": "cp1252"}
+    stamps = dates(d.s, "%d.%m.%Y %H:%M:%S,@")
+    header = '"Zeit";"Gyro X (°/s)";"Gyro Y (°/s)";"Gyro Z (°/s)";"Acc X [g]";"Acc Y [g]";"Acc Z [g]"'
+    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665).T)
+    write(folder / "imu.csv", header, stamps, *columns, **how)
+    header = '"Zeit";"Vel X [cm/s]";"Vel Y [cm/s]";"Vel Z [cm/s]";"Tiefe [m]"'
+    columns = (*(100 * d.velocity[k]).T, d.depth[k])
+    write(folder / "dvl.csv", header, stamps[k], *columns, **how)
+    _, config = template(folder)
+    assert (config["imu"]["decimal"], config["imu"]["encoding"]) == (",", "cp1252")
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_a_byte_order_mark_and_times_of_day_and_seconds_with_commas(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    for name in ("imu", "dvl"):
+        path = folder / f"{name}.csv"
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    k = d.slow
+    write(folder / "depth.csv", '"time","Depth (ft)"', d.s[k], d.depth[k] / 0.3048)
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_matlab_writetable_with_its_dates_and_mangled_units(folder, tmp_path):
+    d = dive()
+    k = d.slow
+    stamps = dates(d.s, "%d-%b-%Y %H:%M:%S.@")
+    header = "Time,gyro_x_deg_s_,gyro_y_deg_s_,gyro_z_deg_s_,acc_x_m_s2_,acc_y_m_s2_,acc_z_m_s2_"
+    write(folder / "imu.txt", header, stamps, *np.degrees(d.rate).T, *d.force.T)
+    header = "Time,vel_x_mm_s_,vel_y_mm_s_,vel_z_mm_s_,depth_m_"
+    columns = (*(1000 * d.velocity[k]).T, d.depth[k])
+    write(folder / "dvl.txt", header, stamps[k], *columns)
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_pandas_with_an_index_and_an_outer_merge(folder, tmp_path):
+    d = dive()
+    stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@+00:00", 6)
+    is_slow = np.arange(ROWS) % 10 == 0
+
+    def sparse(column):
+        return [
+            repr(float(value)) if slow else ""
+            for value, slow in zip(column, is_slow, strict=True)
+        ]
+
+    header = ",timestamp,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z,vel_x,vel_y,vel_z,depth"
+    index = [str(row) for row in range(ROWS)]
+    slow = [sparse(column) for column in (*d.velocity.T, d.depth)]
+    path = folder / "merged.csv"
+    write(path, header, index, stamps, *d.rate.T, *d.force.T, *slow)
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_linkquest_navquest_whose_flag_marks_rows_without_lock(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "depth")
+    k = d.slow
+    flag = np.ones(ROWS)[k]
+    flag[20:30] = 0
+    velocity = np.round(1000 * d.velocity[k]) * flag[:, None]
+    header = "time velo_x velo_y velo_z velo_flag altitude"
+    columns = (d.s[k], *velocity.T, flag, np.full(len(flag), 12.5))
+    write(folder / "navquest.txt", header, *columns, sep=" ")
+    assert template(folder)[1]["dvl"]["scale"] == "mm/s"
+    sequence = guessed(folder, tmp_path)
+    assert len(sequence.dvl) == len(flag) - 10
+    np.testing.assert_allclose(
+        sequence.dvl.velocity, d.velocity[k][flag == 1], atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("name", ["error_flag", "bottom_lost_status"])
+def test_the_mark_of_valid_rows_is_known_from_the_velocities_beside_it(
+    folder, tmp_path, name
+):
+    d = dive()
+    plain(folder, d, "imu", "depth")
+    k = d.slow
+    lost = np.zeros(ROWS)[k]
+    lost[5:9] = 1
+    velocity = np.where(lost[:, None] == 1, -32.768, d.velocity[k])
+    header = f"time,vel_x,vel_y,vel_z,{name}"
+    write(folder / "dvl.csv", header, d.s[k], *velocity.T, lost)
+    assert template(folder)[1]["dvl"]["valid_where"] == {name: 0}
+    assert len(guessed(folder, tmp_path).dvl) == len(lost) - 4
+
+
+def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
+    d = dive(imu_hz=10.0, every=1)
+    stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@")
+    header = "Timestamp,roll,pitch,heading,rollRate,pitchRate,yawRate,groundSpeed,altitudeRelative,battery0.id"
+    flat = np.zeros(ROWS)
+    columns = (*d.rate.T, *np.degrees(d.rate).T, flat, -d.depth, flat)
+    columns = (columns[0], columns[1], d.bearing, *columns[3:])
+    write(folder / "vehicle.csv", header, stamps, *columns)
+    seconds = EPOCH_S + d.s
+    write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", seconds, *d.velocity.T)
+    text, config = template(folder)
+    assert "imu" not in config
+    assert "# [imu]  # no accelerometer: is this the IMU?" in text
+    assert config["heading"]["scale"] == "deg"
+    with pytest.raises(LogError, match=r"has no table \[imu\]"):
+        guessed(folder, tmp_path)
+    taken = uncommented(text, "imu").replace(
+        'angular_velocity_scale = "deg/s"', 'angular_velocity_scale = "deg/s"\n'
+    )
+    taken = taken.replace(
+        '# angular_velocity_scale = "deg/s"', 'angular_velocity_scale = "deg/s"'
+    )
+    sequence = guessed(folder, tmp_path, taken)
+    np.testing.assert_allclose(sequence.imu.angular_velocity, d.rate, atol=1e-9)
+    assert np.isnan(sequence.imu.specific_force).all()
+    expected = np.unwrap(np.radians(90 - d.bearing))
+    np.testing.assert_allclose(np.unwrap(sequence.heading.yaw_rad), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("imu_hz", "every"), [(1000.0, 200), (100.0, 20), (200.0, 40)])
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e9])
+def test_units_of_times_follow_from_the_rates_of_imu_and_doppler_log_together(
+    folder, tmp_path, imu_hz, every, scale
+):
+    d = dive(imu_hz, every)
+    # enough rows of the Doppler log for a rate
+    d.slow = slice(0, ROWS, every // 4)
+    plain(folder, d, "imu", "dvl", "depth", scale=scale)
+    sequence = guessed(folder, tmp_path)
+    assert sequence.duration_s == pytest.approx(d.s[-1], rel=0.1)
+    assert sequence.depth.stamps_ns[-1] == pytest.approx(
+        sequence.dvl.stamps_ns[-1], abs=1
+    )
+
+
+def test_an_imu_that_may_be_of_1_hz_or_of_1_khz_is_asked_about(folder, tmp_path):
+    d = dive(1.0, every=10)
+    plain(folder, d, "imu", "dvl", "depth")
+    text, _ = template(folder)
+    assert '# stamp_unit_s = ...  # which unit? "s" or "ms"' in text
+    with pytest.raises(LogError, match=r'stamp_unit_s = "ms"` .*`stamp_unit_s = "s"`'):
+        guessed(folder, tmp_path)
+    stated = guessed(folder, tmp_path, 'stamp_unit_s = "s"\n' + text)
+    assert stated.duration_s == pytest.approx(ROWS, abs=20)
+
+
+def test_tables_may_count_time_in_different_units(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", scale=1e6)
+    plain(folder, d, "dvl", scale=1e3)
+    plain(folder, d, "depth")
+    _, config = template(folder)
+    units = [config[r].get("stamp_unit_s") for r in ("imu", "dvl", "depth")]
+    assert units == ["us", "ms", None]
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_depths_in_another_unit_of_time_are_refused_where_nothing_states_it(folder):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    plain(folder, d, "depth", scale=1e3)
+    config = {
+        "imu": {"file": "imu.csv", "angular_velocity": [2, 3, 4], "linear_acceleration": [5, 6, 7]},
+        "dvl": {"file": "dvl.csv", "velocity": [2, 3, 4]},
+        "depth": {"file": "depth.csv", "height": 2, "scale": -1},
+    }  # fmt: skip
+    with pytest.raises(LogError, match=r'depth\.csv: \[depth\].*stamp_unit_s = "ms"'):
+        read_csv(folder, config)
+
+
+def test_a_header_that_states_a_unit_which_the_steps_contradict_is_asked_about(
+    folder, tmp_path
+):
+    d = dive()
+    plain(folder, d, "imu", "dvl", "depth", scale=1e3)
+    for path in folder.iterdir():
+        path.write_text(path.read_text().replace("time", "time [s]"))
+    assert "# the header states s, the steps do not fit:" in template(folder)[0]
+    with pytest.raises(LogError, match='stamp_unit_s = "ms"'):
+        guessed(folder, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("depth", "time,depth"),
+        ("dvl", "time,vel_x,vel_y,vel_z"),
+        ("heading", "time,yaw"),
+    ],
+)
+def test_a_column_that_never_changes_is_no_motion(folder, name, header):
+    d = dive()
+    plain(folder, d, "imu", "dvl", "depth")
+    count = header.count(",")
+    write(folder / f"{name}.csv", header, d.s, *np.full((count, ROWS), 0.5))
+    text, config = template(folder)
+    assert name not in config
+    assert f"# [{name}]  # never changes" in text
+
+
+def test_accelerations_that_are_zero_throughout_are_those_of_no_accelerometer(
+    folder, tmp_path
+):
+    d = dive()
+    d.force[:] = 0
+    plain(folder, d, "imu", "dvl", "depth")
+    text, config = template(folder)
+    assert "imu" not in config
+    assert "linear_acceleration = false" in text
+    sequence = guessed(folder, tmp_path, uncommented(text, "imu"))
+    assert np.isnan(sequence.imu.specific_force).all()
+
+
+def test_two_files_that_fit_alike_are_both_named(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "dvl", "depth")
+    (folder / "imu_2.csv").write_text((folder / "imu.csv").read_text())
+    text, config = template(folder)
+    assert "imu" not in config
+    assert text.count("# [imu]  # which of imu.csv, imu_2.csv? uncomment one") == 2
+    assert_is(guessed(folder, tmp_path, uncommented(text, "imu")), d)
+
+
+def test_a_turn_rate_is_no_heading_and_a_set_point_no_depth(folder):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    header = "time,yaw_rate,depth_setpoint,heading_error"
+    write(folder / "control.csv", header, d.s, d.rate[:, 0], d.depth, d.rate[:, 1])
+    _, config = template(folder)
+    assert not {"heading", "depth"} & config.keys()
+
+
+def test_slow_velocities_in_millimetres_or_centimetres_are_asked_about(folder):
+    d = dive()
+    plain(folder, d, "imu", "depth")
+    k = d.slow
+    write(folder / "dvl.csv", "time,u,v,w", d.s[k], *(100 * d.velocity[k]).T)
+    text, config = template(folder)
+    assert "dvl" not in config
+    assert "# [dvl]  # unit of velocity: cm/s or mm/s?" in text
+
+
+def test_forces_and_bearings_without_a_unit_are_known_by_their_size_and_fast_turns_asked(
+    folder, tmp_path
+):
+    d = dive()
+    plain(folder, d, "dvl", "depth")
+    header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
+    columns = (d.s, *d.rate.T, *(d.force / 9.80665).T)
+    write(folder / "imu.csv", header, *columns)
+    np.testing.assert_allclose(
+        guessed(folder, tmp_path).imu.specific_force, d.force, atol=1e-9
+    )
+    write(folder / "imu.csv", header, d.s, *np.degrees(d.rate).T, *d.force.T)
+    text, config = template(folder)
+    assert "imu" not in config
+    assert "# [imu]  # unit of angular_velocity: deg/s or mrad/s?" in text
+
+
+# --- tables of other tools, and what they must not be taken for -------------------------------------------------------
+
+
+def test_velocities_along_the_world_are_no_positions(folder):
+    d = dive()
+    plain(folder, d, "imu", "depth")
+    k = d.slow
+    header = "time,vel_east,vel_north,vel_up"
+    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T)
+    _, config = template(folder)
+    assert not {"positions", "truth"} & config.keys()
+
+
+def test_a_rate_of_depth_and_the_depth_of_the_water_are_no_depths(folder):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    header = "time,depth_rate,water_depth,depth_above_bottom"
+    write(folder / "nav.csv", header, d.s, d.rate[:, 0], d.depth + 9, d.depth)
+    assert "depth" not in template(folder)[1]
+
+
+def test_depths_below_zero_count_upwards(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    k = d.slow
+    write(folder / "depth.csv", "time,depth (ft)", d.s[k], -d.depth[k] / 0.3048)
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    k = d.slow
+    decibar = d.depth[k] * 9.80665 / 10
+    write(folder / "ctd.csv", "time;Pressure (dbar)", d.s[k], decibar, sep=";")
+    depth_m = -guessed(folder, tmp_path).depth.z_m
+    np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
+
+
+def test_a_second_line_of_the_header_with_units(folder, tmp_path):
+    d = dive()
+    k = d.slow
+    header = "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg"
+    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665e-3).T)
+    write(folder / "imu.csv", header, 1e3 * d.s, *columns, sep=";")
+    header = "Time;VelX;VelY;VelZ\nms;mm/s;mm/s;mm/s"
+    write(folder / "dvl.csv", header, 1e3 * d.s[k], *(1e3 * d.velocity[k]).T, sep=";")
+    header = "Time;Depth\nms;cm"
+    write(folder / "depth.csv", header, 1e3 * d.s[k], 100 * d.depth[k], sep=";")
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
+    d = dive()
+    k = d.slow
+    paths = [f"/imu/{kind}/{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz"]  # fmt: skip
+    header = ",".join(["__time", *paths])
+    write(folder / "imu.csv", header, EPOCH_S + d.s, *d.rate.T, *d.force.T)
+    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.s[k]]
+    header = "%time,field.header.frame_id,field.velocity.x,field.velocity.y,field.velocity.z,field.depth"
+    columns = (ns, ["dvl"] * len(ns), *d.velocity[k].T, d.depth[k])
+    write(folder / "dvl.csv", header, *columns)
+    assert_is(guessed(folder, tmp_path), d)
+
+
+@pytest.mark.parametrize(
+    "form", ["%m/%d/%Y %H:%M:%S.@", "%H:%M:%S.@", "%Y-%m-%d", "%d.%m.%Y %H:%M"]
+)
+def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form):
+    d = dive()
+    plain(folder, d, "dvl", "depth")
+    header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
+    write(folder / "imu.csv", header, dates(d.s, form), *d.rate.T, *d.force.T)
+    with pytest.raises(LogError, match=r"is no time; expected a number .* or a date"):
+        guessed(folder, tmp_path)
+
+
+def test_days_since_another_epoch_are_no_seconds(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "dvl", scale=1 / 86_400)
+    with pytest.raises(LogError, match="stamp_unit_s"):
+        guessed(folder, tmp_path)
+
+
+def test_velocities_over_the_bottom_come_before_those_through_water(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "depth")
+    k = d.slow
+    names = [f"{kind}_vel_{axis}" for kind in ("water", "bottom") for axis in "xyz"]
+    header = ",".join(["time", *names])
+    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T / 2, *d.velocity[k].T)
+    assert_is(guessed(folder, tmp_path), d)
+    short = header.replace("bottom_vel", "spare")
+    write(folder / "dvl.csv", short, d.s[k], *d.velocity[k].T / 2, *d.velocity[k].T)
+    assert "dvl" not in template(folder)[1]
+
+
+def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    k = d.slow
+    cells = [f"{depth:,.1f}" for depth in 1000 * d.depth[k]]
+    write(folder / "depth.csv", "time;depth [mm]", d.s[k], cells, sep=";")
+    with pytest.raises(
+        LogError, match=r"depth\.csv, line 2: .*'4,000\.0' is no number"
+    ):
+        guessed(folder, tmp_path)
