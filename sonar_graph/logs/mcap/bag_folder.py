@@ -6,8 +6,8 @@ from pathlib import Path
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import text_of
-from sonar_graph.logs.mcap.file_summary import first_time_ns, read_summary
-from sonar_graph.logs.mcap.records import LogFile
+from sonar_graph.logs.mcap.log_file import LogFile
+from sonar_graph.logs.mcap.reader import first_time_ns
 
 METADATA_FILE = "metadata.yaml"
 SPLIT_S = 10.0
@@ -99,10 +99,6 @@ def _named_parts(folder: Path) -> list[Path]:
 def _span_ns(file: Path) -> tuple[int, int | None]:
     """Times of the first message and, where the file's summary says it, of the last."""
     with LogFile(file) as log:
-        summary, _ = read_summary(log)
-        end_ns = (
-            None
-            if summary is None or summary.statistics is None
-            else int(summary.statistics.message_end_time)
-        )
-        return first_time_ns(log, summary), end_ns
+        statistics = log.summary.statistics if log.summary else None
+        end_ns = int(statistics.message_end_time) if statistics else None
+        return first_time_ns(log), end_ns

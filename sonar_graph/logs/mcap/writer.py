@@ -23,7 +23,8 @@ from mcap.writer import Writer
 
 from sonar_graph.files import regular, written_whole
 from sonar_graph.logs.cdr import Bytes, definition
-from sonar_graph.logs.mcap.records import MAGIC, seal
+from sonar_graph.logs.foreign_files import MCAP_MAGIC
+from sonar_graph.logs.mcap.log_file import seal
 from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
@@ -109,7 +110,7 @@ def recording(
 def is_own_log(path: Path) -> bool:
     """True for a log that this package wrote, of whatever profile, by the header of the file."""
     with regular(path).open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
+        if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             return False
         stream.seek(_HEAD_AT)
         profile_size = int.from_bytes(stream.read(4), "little")
