@@ -6,7 +6,7 @@ The places are columns, because `sonar_graph.logs.cdr` decodes the payloads of m
 from __future__ import annotations
 
 import zlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import lz4.frame
 import numpy as np
@@ -47,7 +47,7 @@ class Found(NamedTuple):
     """Bytes of each payload."""
     log_times_ns: Ints
 
-    def of(self, rows: NDArray[np.bool_]) -> Found:
+    def of(self, rows: Ints | NDArray[np.bool_]) -> Found:
         """Some of the messages."""
         return Found(self.offsets[rows], self.sizes[rows], self.log_times_ns[rows])
 
@@ -116,35 +116,34 @@ def unpack_beginning(chunk: Chunk) -> bytes:
 
 def find_messages(data: bytes | memoryview, *, is_covered: bool = False) -> Content:
     """Places of the whole messages in some bytes, up to the first record that is not whole."""
-    starts = record_starts(data)
-    bounds = np.array(starts, np.int64)  # (n + 1,)
-    is_message = np.frombuffer(data, np.uint8)[bounds[:-1]] == Opcode.MESSAGE
-    described = []
-    for row in np.flatnonzero(~is_message).tolist():
-        start = starts[row]
-        described.append(
-            (data[start], bytes(data[start + HEAD.size : starts[row + 1]]))
-        )
-    offsets = bounds[:-1][is_message] + _MESSAGE.itemsize  # (m,), of the payloads
-    heads = _heads(data)[offsets - _MESSAGE.itemsize]
-    every = Found(
-        offsets,
-        bounds[1:][is_message] - offsets,
-        heads["log"].astype(np.int64),
-    )
-    channels = {
-        channel: every.of(heads["channel"] == channel)
-        for channel in np.unique(heads["channel"]).tolist()
-    }
-    times_ns = every.log_times_ns
-    span_ns = (int(times_ns.min()), int(times_ns.max())) if len(times_ns) else None
-    return Content(data, channels, described, span_ns, starts[-1], is_covered)
-
-
-def _heads(data: bytes | memoryview) -> NDArray[Any]:
-    """View of the bytes as the head of a message at every offset."""
+    bounds = np.array(record_starts(data), np.int64)  # (n + 1,)
+    opcodes = np.frombuffer(data, np.uint8)[bounds[:-1]]  # (n,)
+    is_message = opcodes == Opcode.MESSAGE
+    # a message that is shorter than its own fields is none, and what follows it is not to be trusted
+    is_short = is_message & (np.diff(bounds) < _MESSAGE.itemsize)
+    if is_short.any():
+        whole = int(np.argmax(is_short))
+        bounds = bounds[: whole + 1]
+        is_message = is_message[:whole]
+    described = [
+        (int(opcodes[row]), bytes(data[bounds[row] + HEAD.size : bounds[row + 1]]))
+        for row in np.flatnonzero(~is_message)
+    ]
+    starts = bounds[:-1][is_message]  # (m,)
+    offsets = starts + _MESSAGE.itemsize
+    sizes = bounds[1:][is_message] - offsets
+    # the bytes as the head of a message at every offset
     count = max(len(data) - _MESSAGE.itemsize + 1, 0)
-    return np.ndarray((count,), _MESSAGE, data, strides=(1,))
+    heads = np.ndarray((count,), _MESSAGE, data, strides=(1,))
+    channels = heads["channel"][starts]
+    times_ns = heads["log"][starts].astype(np.int64)
+    every = Found(offsets, sizes, times_ns)
+    found = {
+        channel: every.of(np.flatnonzero(channels == channel))
+        for channel in np.flatnonzero(np.bincount(channels)).tolist()
+    }
+    span_ns = (int(times_ns.min()), int(times_ns.max())) if len(times_ns) else None
+    return Content(data, found, described, span_ns, int(bounds[-1]), is_covered)
 
 
 def is_packed(data: bytes | memoryview, offset: int) -> bool:

@@ -18,9 +18,12 @@ HOLE = 0
 """Opcode, which MCAP does not use, of bytes that are not records."""
 PRIVATE = 0x80
 """Kinds of records from here on are private to a writer."""
-LOOSE: dict[int, int] = {Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: 22}
-"""Fewest bytes of the records within chunks; outside where the writer makes no chunks."""
-_SMALLEST: dict[int, int] = LOOSE | {
+LOOSE = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)))
+"""Kinds of the records within chunks; outside where the writer makes no chunks."""
+_SMALLEST: dict[int, int] = {
+    Opcode.SCHEMA: 14,
+    Opcode.CHANNEL: 16,
+    Opcode.MESSAGE: 22,
     Opcode.HEADER: 8,
     Opcode.CHUNK: 40,
     Opcode.MESSAGE_INDEX: 6,
@@ -63,17 +66,20 @@ def record_starts(data: bytes | memoryview) -> list[int]:
     """
     starts = [0]
     at = 0
-    size = len(data)
-    never = size + 1
+    last = len(data) - HEAD.size
+    # looked up once: attributes cost as much as the step itself
     unpack = HEAD.unpack_from
-    fewest = LOOSE.get
-    while at + HEAD.size <= size:
+    append = starts.append
+    head_bytes = HEAD.size
+    loose = LOOSE
+    while at <= last:
         opcode, length = unpack(data, at)
-        end = at + HEAD.size + length
-        if length < fewest(opcode, never) or end > size:
+        if opcode not in loose:
             break
-        starts.append(end)
-        at = end
+        at += head_bytes + length
+        append(at)
+    if at > len(data):
+        starts.pop()
     return starts
 
 
