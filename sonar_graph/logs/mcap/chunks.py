@@ -146,18 +146,16 @@ def find_messages(data: bytes | memoryview, *, is_covered: bool = False) -> Cont
     return Content(data, found, described, span_ns, int(bounds[-1]), is_covered)
 
 
-def is_packed(data: bytes | memoryview, offset: int) -> bool:
-    """Tell whether a payload is compressed by itself, as ``ros2 bag record --compression-mode message`` does."""
-    return bytes(data[offset : offset + len(_ZSTD)]) == _ZSTD
-
-
 def unpack_messages(
     data: bytes | memoryview, offsets: Ints, sizes: Ints
-) -> tuple[bytes, Ints, Ints]:
-    """Payloads that are compressed one by one, one after another, with their offsets and sizes, shape (n,).
+) -> tuple[bytes | memoryview, Ints, Ints]:
+    """Payloads, one after another, with their offsets and sizes, shape (n,), where they are compressed one by one.
 
-    One that cannot be decompressed stays as it is, and is then no message of its type.
+    ``ros2 bag record --compression-mode message`` does so; other payloads are given as they are. One that cannot be
+    decompressed stays as it is, and is then no message of its type.
     """
+    if bytes(data[offsets[0] : offsets[0] + len(_ZSTD)]) != _ZSTD:
+        return data, offsets, sizes
     payloads = [
         _unpack_message(bytes(data[offset : offset + length]))
         for offset, length in zip(offsets.tolist(), sizes.tolist(), strict=True)

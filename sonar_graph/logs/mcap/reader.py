@@ -138,11 +138,8 @@ class Passage:
 
     def __iter__(self) -> Iterator[ChunkPart]:
         for record in self._walk:
-            if record.opcode == Opcode.CHUNK:
-                yield from self._take_chunk(record)
-            elif record.opcode == Opcode.MESSAGE:
-                self._is_loose = True
-                yield from self._take_content(record)
+            if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                yield from self._take_messages(record)
             elif record.opcode == HOLE:
                 yield from self._take_hole(record)
             else:
@@ -165,15 +162,6 @@ class Passage:
             or (topic.keep is not Keep.NONE and (is_inside or topic.is_latched))
             for topic in topics
         )
-
-    def _take_chunk(self, record: Record) -> Iterator[ChunkPart]:
-        self._report(record)
-        self.chunks += 1
-        index = self._walk.chunks.get(record.at)
-        if self._may_skip and index is not None and not self._is_wanted(index):
-            self.skipped += 1
-            return
-        yield from self._take_content(record)
 
     def _take_hole(self, hole: Record) -> Iterator[ChunkPart]:
         """Messages at the beginning of a chunk that is cut off; any other hole is a loss."""
@@ -205,7 +193,7 @@ class Passage:
         elif record.opcode == Opcode.ATTACHMENT:
             self.others.append(record)
         elif record.opcode >= PRIVATE:
-            self._remark(
+            self.damage.remarks.append(
                 f"bytes {record.at} to {record.end}: a record of private kind {record.opcode:#x}, not read"
             )
 
@@ -221,8 +209,17 @@ class Passage:
         if not is_sealed:
             self._unsealed.append(found.name)
 
-    def _take_content(self, record: Record) -> Iterator[ChunkPart]:
+    def _take_messages(self, record: Record) -> Iterator[ChunkPart]:
         """Wanted messages of a chunk or of a run of loose records."""
+        is_chunk = record.opcode == Opcode.CHUNK
+        self.chunks += is_chunk
+        self._is_loose |= not is_chunk
+        if self._progress:
+            self._progress(record.end, self._file.size)
+        index = self._walk.chunks.get(record.at)
+        if self._may_skip and index is not None and not self._is_wanted(index):
+            self.skipped += 1
+            return
         try:
             content = _content(self._file, record)
         except LogError as error:
@@ -231,8 +228,7 @@ class Passage:
         unread = len(content.data) - content.end
         if unread:
             self._lose(record, f"chunk {self.chunks} ends in {unread} bytes unread")
-        if record.opcode == Opcode.CHUNK:
-            self._without_crc += not content.is_covered
+        self._without_crc += is_chunk and not content.is_covered
         yield from self._take(content, record)
 
     def _take(self, content: Content, record: Record) -> Iterator[ChunkPart]:
@@ -277,13 +273,6 @@ class Passage:
         self.damage.losses.append(loss)
         self._open_losses.append(loss)
 
-    def _remark(self, text: str) -> None:
-        self.damage.remarks.append(text)
-
-    def _report(self, record: Record) -> None:
-        if self._progress:
-            self._progress(record.end, self._file.size)
-
     def _finish(self) -> None:
         """Complete the account of the damage at the end of the file."""
         damage = self.damage
@@ -293,7 +282,9 @@ class Passage:
             reason = f"the file is cut off: it ends after a whole record, at byte {size}, without a summary"
             damage.ending = Loss(size, size, reason)
         elif self._file.fault and damage.ending is None:
-            self._remark(f"{self._file.fault}; the data before its end is whole")
+            damage.remarks.append(
+                f"{self._file.fault}; the data before its end is whole"
+            )
         if damage.ending is not None:
             damage.ending.start_ns = self._last_ns
         unprotected = []

@@ -7,12 +7,21 @@ record, and it makes a Python object of every entry of the message indexes, whic
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
+from mcap.records import Metadata
 
+from sonar_graph.errors import LogError
 from sonar_graph.logs.foreign_files import MCAP_MAGIC
-from sonar_graph.logs.mcap.log_file import DATA_END_BYTES, HEAD, LARGEST_BYTES, LogFile
+from sonar_graph.logs.mcap.log_file import (
+    DATA_END_BYTES,
+    HEAD,
+    LARGEST_BYTES,
+    LogFile,
+    parse,
+)
 
 HOLE = 0
 """Opcode, which MCAP does not use, of bytes that are not records."""
@@ -33,14 +42,13 @@ _SMALLEST: dict[int, int] = {
 }
 _STRETCH = 1 << 20
 _BLOCK = 1 << 16
-_CHUNK_FIELDS = 28
-_LENGTH = 8
-_CHUNK = re.compile(
-    rb"\x06(?=(.{5}\0{3}).{28}(\x04\0{3}zstd|\x03\0{3}lz4|\0{4})(.{8}))", re.DOTALL
-)
-_LONGEST_CHUNK_HEAD = 61
-_LOOSE_HEAD = re.compile(rb"[\x03-\x05](?=.{4}\0{4})", re.DOTALL)
-_CHAIN = 3
+_LONGEST_PATTERN = 45
+# a chunk: three high bytes of its length are zero, and the name of its compression follows its times, size and CRC
+_CHUNK = rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}))"
+_METADATA = rb"\x0c(?=.{3}\0{5})"
+_LOOSE = rb"[\x03-\x05](?=.{4}\0{4})"
+_AMONG_CHUNKS = re.compile(_CHUNK + b"|" + _METADATA, re.DOTALL)
+_ANY = re.compile(_AMONG_CHUNKS.pattern + b"|" + _LOOSE, re.DOTALL)
 
 
 class Record(NamedTuple):
@@ -87,21 +95,15 @@ class RecordWalk:
     """Walk through the data of a file.
 
     A length counts only where a record begins after it, or where a summary under a CRC states it. Elsewhere the walk
-    searches for the next chunk, in a file without chunks for loose records, and gives the bytes between as a hole.
+    searches for the next such record, and gives the bytes between as a hole.
     """
 
     def __init__(self, file: LogFile) -> None:
         self._file = file
         self._stop_at = file.data_end_at
-        summary = file.summary
-        indexes = summary.chunk_indexes if summary else []
+        indexes = file.summary.chunk_indexes if file.summary else []
         self.chunks = {index.chunk_start_offset: index for index in indexes}
         """Chunks by their offsets, as the summary places them."""
-        self._starts = list(self.chunks)
-        if summary:
-            self._starts += [index.offset for index in summary.metadata_indexes]
-            self._starts += [index.offset for index in summary.attachment_indexes]
-        self._starts.sort()
         self._has_chunks = bool(indexes)
 
     def __iter__(self) -> Iterator[Record]:
@@ -133,16 +135,12 @@ class RecordWalk:
         opcode, size = HEAD.unpack(head)
         end = at + HEAD.size + size
         is_known = opcode >= PRIVATE or size >= _SMALLEST.get(opcode, self._file.size)
-        if opcode == Opcode.DATA_END:
-            is_known = end == at + DATA_END_BYTES
-        # the end of the file may cut a record off, but then not one of a length that is damaged
+        # the end of the file may cut a record off, but a length beyond any record is damaged
         is_likely = end <= self._stop_at or size <= LARGEST_BYTES
         return Record(opcode, at, end) if is_known and is_likely else None
 
     def _is_confirmed(self, record: Record) -> bool:
-        if record.end > self._stop_at:
-            return False
-        return (
+        return record.end <= self._stop_at and (
             record.at in self.chunks
             or record.opcode == Opcode.DATA_END
             or self._stop_at - record.end < HEAD.size
@@ -152,50 +150,33 @@ class RecordWalk:
     def _run(self, first: Record) -> Record | None:
         """Loose records from one on, each followed by another record."""
         count = max(_STRETCH, first.end - first.at)
-        starts = record_starts(
-            self._file.read(first.at, min(count, self._stop_at - first.at))
-        )
-        run = Record(Opcode.MESSAGE, first.at, first.at + starts[-1])
-        if not self._is_confirmed(run):
-            run = run._replace(end=first.at + starts[-2])
-        return run if run.end > run.at else None
+        block = self._file.read(first.at, min(count, self._stop_at - first.at))
+        for size in record_starts(block)[:-3:-1]:
+            run = Record(Opcode.MESSAGE, first.at, first.at + size)
+            if size and self._is_confirmed(run):
+                return run
+        return None
 
     def _next(self, at: int) -> int:
         """Offset of the next record after a damaged one.
 
         In a file with chunks, bytes that look like a message are not trusted: they may lie within a damaged chunk.
         """
-        known = next((start for start in self._starts if start > at), None)
-        if known is not None:
-            return known
         self._has_chunks |= self._file.read(at, 1) == bytes([Opcode.CHUNK])
-        found = self._search(_CHUNK, at + 1)
-        if found is None and not self._has_chunks:
-            found = self._search(_LOOSE_HEAD, at + 1)
-        return self._stop_at if found is None else found
-
-    def _search(self, pattern: re.Pattern[bytes], start: int) -> int | None:
-        for block_at in range(start, self._stop_at, _BLOCK):
-            block = self._file.read(block_at, _BLOCK + _LONGEST_CHUNK_HEAD)
+        pattern = _AMONG_CHUNKS if self._has_chunks else _ANY
+        for block_at in range(at + 1, self._stop_at, _BLOCK):
+            block = self._file.read(block_at, _BLOCK + _LONGEST_PATTERN)
             for match in pattern.finditer(block):
-                at = block_at + match.start()
-                if self._is_chunk(match) if pattern is _CHUNK else self._is_chain(at):
-                    return at
-        return None
+                record = self._record(block_at + match.start())
+                if record is not None and self._is_found(record):
+                    return record.at
+        return self._stop_at
 
-    def _is_chunk(self, head: re.Match[bytes]) -> bool:
-        """A chunk states its length twice; true where the two agree."""
-        outer = int.from_bytes(head[1], "little")
-        inner = int.from_bytes(head[3], "little")
-        return outer == _CHUNK_FIELDS + len(head[2]) + _LENGTH + inner
-
-    def _is_chain(self, at: int) -> bool:
-        """Tell whether three likely records follow each other, or fewer up to the end."""
-        for _ in range(_CHAIN):
-            record = self._record(at)
-            if record is None or record.end > self._stop_at:
-                return False
-            at = record.end
-            if at == self._stop_at:
+    def _is_found(self, record: Record) -> bool:
+        """Tell whether a record is one, and not bytes within a damaged chunk that look like its head."""
+        if record.opcode == Opcode.METADATA and record.end <= self._stop_at:
+            with suppress(LogError):
+                parse(Metadata.read, content_of(self._file, record))
                 return True
-        return True
+            return False
+        return self._is_confirmed(record)

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Bytes, Decoder, Messages, Struct, parse_definition
-from sonar_graph.logs.mcap.chunks import is_packed, unpack_messages
+from sonar_graph.logs.mcap.chunks import unpack_messages
 from sonar_graph.measurements import Ints
 
 STAMP_BYTES = 12
@@ -116,25 +117,17 @@ class Topic:
         for fault, rows in decoded.unsound.items():
             is_sound[rows] = False
             self.unsound[fault] = self.unsound.get(fault, 0) + len(rows)
-        number = np.cumsum(is_sound) - 1  # rows count sound messages only
-        groups = [
+        number = self._keep_rows(is_sound)
+        return [
             Messages(number[group.rows], group.payloads, group.layout)
             for group in decoded.groups
         ]
-        self.times, self._count = (
-            [self.log_times_ns[is_sound]],
-            int(np.count_nonzero(is_sound)),
-        )
-        self.stacks.clear()
-        for group in groups:
-            self.stacks[group.payloads.shape[1]].append((group.rows, group.payloads))
-        return groups
 
     def gather(
         self, data: bytes | memoryview, offsets: Ints, sizes: Ints, log_times_ns: Ints
     ) -> None:
         """Add the messages at some offsets of a chunk's bytes."""
-        if len(offsets) and self.encoding == "cdr" and is_packed(data, int(offsets[0])):
+        if len(offsets) and self.encoding == "cdr":
             data, offsets, sizes = unpack_messages(data, offsets, sizes)
         first = self._count
         self._count += len(sizes)
@@ -160,17 +153,19 @@ class Topic:
 
     def leave_out(self, log_times_ns: Ints) -> None:
         """Remove the messages that were recorded at some times."""
-        is_kept = ~np.isin(self.log_times_ns, log_times_ns)
+        self._keep_rows(~np.isin(self.log_times_ns, log_times_ns))
+
+    def _keep_rows(self, is_kept: NDArray[np.bool_]) -> Ints:
+        """Remove the other messages; the new row of each message that stays, shape (n,)."""
         number = np.cumsum(is_kept) - 1
         for size, parts in self.stacks.items():
             self.stacks[size] = [
                 (number[rows[is_kept[rows]]], payloads[is_kept[rows]])
                 for rows, payloads in parts
             ]
-        self.times, self._count = (
-            [self.log_times_ns[is_kept]],
-            int(np.count_nonzero(is_kept)),
-        )
+        self.times = [self.log_times_ns[is_kept]]
+        self._count = int(np.count_nonzero(is_kept))
+        return number
 
     def extend(self, later: Topic) -> None:
         """Add the messages of the same topic in the next file of a log; a LogError where it has another type."""
@@ -264,12 +259,11 @@ class Damage:
 
     def extend(self, later: Damage, file: str) -> None:
         """Add the damage of the next file of a log: the end of any but the last is a loss in the middle."""
-        self.losses += [self.ending] if self.ending is not None else []
-        for loss in (
-            *later.losses,
-            *([later.ending] if later.ending is not None else []),
-        ):
-            loss.file = file
+        if self.ending is not None:
+            self.losses.append(self.ending)
+        for loss in (*later.losses, later.ending):
+            if loss is not None:
+                loss.file = file
         self.losses += later.losses
         self.ending = later.ending
         place = f"{file}: " if file else ""
