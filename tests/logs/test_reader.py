@@ -205,7 +205,7 @@ UNREPEATED = LOOSE | {
 }
 SECOND = "chunk 2 is lost: .*; lost: 35 of /bytes, 35 of /json$"
 MOVED, ENDING = (
-    "its summary is damaged: the CRC does not fit",
+    "bytes are missing or doubled in it",
     "does not end as an MCAP file",
 )
 TWICE = r"schema 1 \(test_msgs/msg/Bytes\) is described in two ways; the first holds"
@@ -223,6 +223,9 @@ FAULTS = {
     ),
     "the first chunk, with the descriptions": Fault(
         in_chunk(0, 100), 0, "chunk 1 is lost"
+    ),
+    "bytes missing in the first chunk": Fault(
+        missing_in_chunk(0, 10), 0, "no valid record", MOVED
     ),
     "a message index": Fault(in_index(15), None, "", "", PLAIN),
     "a longer message outside chunks": Fault(

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Channel, Schema
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
@@ -30,8 +32,9 @@ LARGEST_RATIO = 64
 SMALLER_CHUNKS = (
     "`mcap compress LOG -o OUT.mcap --chunk-size 4194304` writes smaller chunks"
 )
-_END = struct.Struct("<BQQQI8s")
+_END_BYTES = HEAD.size + 20 + len(MCAP_MAGIC)
 _CRC_AND_MAGIC_BYTES = 4 + len(MCAP_MAGIC)
+_LARGEST_MOVED = 1 << 26
 DATA_END_BYTES = HEAD.size + 4
 _SEAL = "crc32"
 T = TypeVar("T", bound=Any)
@@ -78,10 +81,15 @@ class LogFile:
             )
         self.summary: Summary | None = None
         """Summary under a CRC that fits; None where the file has no such summary."""
+        self.described: list[Schema | Channel] = []
+        """Schemas and channels under that CRC, also where the rest of the summary does not fit the file."""
         self.data_end_at = self.size
         """End of the data by the summary; without a summary that of the file."""
-        self.fault = self._read_summary()
-        """Damage of the end of the file; None where there is none."""
+        try:
+            self.fault = self._read_summary()
+            """Damage of the end of the file; None where there is none."""
+        except Exception as error:  # the package raises whatever its parts raise
+            self.fault = f"its summary is damaged: {error or type(error).__name__}"
 
     def __enter__(self) -> Self:
         return self
@@ -110,27 +118,39 @@ class LogFile:
         return self._stream.read(count)
 
     def _read_summary(self) -> str | None:
-        ending = self.read(max(self.size - _END.size, 0), _END.size)
+        ending = self.read(max(self.size - _END_BYTES, 0), _END_BYTES)
         try:
             # the package also compares the magic bytes after the footer
             footer: Any
             (footer,) = StreamReader(BytesIO(ending), skip_magic=True).records
         except Exception:  # the package raises whatever its parts raise
             return "it does not end as an MCAP file"
-        start = footer.summary_start
         # without a CRC a damaged summary could hide chunks
-        if not start or not footer.summary_crc:
+        if not footer.summary_start or not footer.summary_crc:
             return None
-        try:
-            content = self.read(start, self.size - _CRC_AND_MAGIC_BYTES - start)
-            if zlib.crc32(content) != footer.summary_crc:
-                return "its summary is damaged: the CRC does not fit"
+        content = self.read(footer.summary_start, self.size)
+        if _fits(content, footer.summary_crc):
+            self.described = _described(content)
             self._stream.seek(0)
             self.summary = make_reader(self._stream).get_summary()
-        except Exception as error:
-            return f"its summary is damaged: {error}"
-        self.data_end_at = start - DATA_END_BYTES
-        return None
+            self.data_end_at = footer.summary_start - DATA_END_BYTES
+            return None
+        # bytes that are missing or doubled before it have moved the summary: the end of the data is before it
+        content = self.read(max(self.size - _LARGEST_MOVED, 0), _LARGEST_MOVED)
+        content = content.rpartition(HEAD.pack(Opcode.DATA_END, 4))[2][4:]
+        if not _fits(content, footer.summary_crc):
+            return "its summary is damaged: the CRC does not fit"
+        self.described = _described(content)
+        return "bytes are missing or doubled in it, so that its index does not fit"
+
+
+def _fits(summary: bytes, crc: int) -> bool:
+    return zlib.crc32(summary[:-_CRC_AND_MAGIC_BYTES]) == crc
+
+
+def _described(summary: bytes) -> list[Schema | Channel]:
+    records = StreamReader(BytesIO(summary), skip_magic=True).records
+    return [one for one in records if isinstance(one, Schema | Channel)]
 
 
 def seal(metadata: Mapping[str, str]) -> dict[str, str]:

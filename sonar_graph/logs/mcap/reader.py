@@ -117,12 +117,8 @@ class Passage:
         self._unsealed: list[str] = []
         self._is_loose = False
         # those of the summary come first: they replace any that are lost in the data
-        summary = file.summary
-        if summary:
-            for schema in summary.schemas.values():
-                self._described.add(schema)
-            for channel in summary.channels.values():
-                self._described.add(channel)
+        for described in file.described:
+            self._described.add(described)
 
     @property
     def counts(self) -> dict[str, int] | None:

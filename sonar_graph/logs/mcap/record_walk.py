@@ -45,7 +45,8 @@ _BLOCK = 1 << 16
 _LONGEST_PATTERN = 45
 # a chunk: three high bytes of its length are zero, and the name of its compression follows its times, size and CRC
 _CHUNK = rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}))"
-_METADATA = rb"\x0c(?=.{3}\0{5})"
+# of at most 64 KiB: each that looks like one is parsed
+_METADATA = rb"\x0c(?=.{2}\0{6})"
 _LOOSE = rb"[\x03-\x05](?=.{4}\0{4})"
 _AMONG_CHUNKS = re.compile(_CHUNK + b"|" + _METADATA, re.DOTALL)
 _ANY = re.compile(_AMONG_CHUNKS.pattern + b"|" + _LOOSE, re.DOTALL)
