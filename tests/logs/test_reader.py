@@ -336,6 +336,18 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
         assert recording.corrupt or recording.ending
 
 
+def test_a_chunk_before_a_damaged_record_is_whole_also_without_summary(
+    path: Path,
+) -> None:
+    written = write(path)
+    first = chunk_indexes(path)[0]
+    path.write_bytes(path.read_bytes()[: chunk_indexes(path)[5].chunk_start_offset])
+    flip(path, chunk_end(first), 0x40)  # the opcode of its message index
+    found = read(path)
+    assert found == written[: len(found)]
+    assert "no valid record after a whole chunk" in scan_all(path).corrupt[0]
+
+
 def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
     path: Path,
 ) -> None:

@@ -160,25 +160,28 @@ class Passage:
         )
 
     def _take_hole(self, hole: Record) -> Iterator[ChunkPart]:
-        """Messages at the beginning of a chunk that is cut off; any other hole is a loss."""
-        if hole.end < self._file.size:
-            self._lose(hole, "no valid record")
-            return
-        reason = f"the file is cut off: its last whole record ends at byte {hole.at} of {hole.end}"
-        ending = Loss(hole.at, hole.end, reason)
-        self.damage.ending = ending
-        if self._file.read(hole.at, 1) != bytes([Opcode.CHUNK]):
-            return
-        self.chunks += 1
-        try:
-            chunk = read_record(Chunk.read, content_of(self._file, hole))
-            content = find_messages(unpack_beginning(chunk))
-        except LogError:
-            return
-        count = sum(len(found.sizes) for found in content.channels.values())
-        if count:
-            ending.reason += f"; of the messages, {count} are from the beginning of a chunk, which no CRC covers"
-        yield from self._take(content, hole)
+        """Loss of a hole, except for a chunk at its beginning that is whole, or cut off with the file."""
+        content = None
+        is_cut = hole.end == self._file.size
+        if self._file.read(hole.at, 1) == bytes([Opcode.CHUNK]):
+            self.chunks += 1
+            with suppress(LogError):
+                chunk = read_record(Chunk.read, content_of(self._file, hole))
+                if is_cut:
+                    content = find_messages(unpack_beginning(chunk))
+                elif chunk.uncompressed_crc:  # its length is not confirmed
+                    content = find_messages(unpack_whole(chunk), is_covered=True)
+        if is_cut:
+            reason = f"the file is cut off: its last whole record ends at byte {hole.at} of {hole.end}"
+            if content is not None and content.channels:
+                count = sum(len(found.sizes) for found in content.channels.values())
+                reason += f"; of the messages, {count} are from the beginning of a chunk, which no CRC covers"
+            self.damage.ending = Loss(hole.at, hole.end, reason)
+        else:
+            after = "" if content is None else " after a whole chunk"
+            self._lose(hole, f"no valid record{after}")
+        if content is not None:
+            yield from self._take(content, hole)
 
     def _take_other(self, record: Record) -> None:
         """Metadata, an attachment, a private record, or the end of the data."""
