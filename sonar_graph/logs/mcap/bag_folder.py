@@ -38,6 +38,7 @@ def log_parts(path: Path) -> list[Path]:
         key=lambda span: (span[0], span[2].name),
     )
     for (_, end_ns, before), (begin_ns, _, after) in pairwise(spans):
+        # two vehicles' recordings in one folder would be mixed into one
         if end_ns is not None and begin_ns < end_ns:
             raise LogError(
                 f"{path}: {after.name} begins before {before.name} ends: these are two recordings and not parts "
@@ -79,6 +80,7 @@ def _named_parts(folder: Path) -> list[Path]:
             f"{folder}: is a ROS 2 bag of the {storage[1]} kind; `sonar-graph convert rosbag {folder} -o "
             f"{folder.name}.mcap` makes a log of it"
         )
+    # two forms of a list; a YAML parser would be a dependency for two lines
     listed = re.search(r"relative_file_paths:[ \t]*\n((?:[ \t]*-[^\n]*\n?)+)", text)
     flow = re.search(r"relative_file_paths:[ \t]*\[(.*?)\]", text, re.DOTALL)
     rows = listed[1].split("\n") if listed else flow[1].split(",") if flow else []

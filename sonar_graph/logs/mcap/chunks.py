@@ -71,8 +71,8 @@ class Content(NamedTuple):
 def unpack(chunk: Chunk) -> bytes:
     """Bytes of a chunk as far as they can be decompressed, and at most one more than the chunk states.
 
-    The mcap package's own ``get_chunk_data_stream`` has no limit (a chunk of 1 MB may unpack to 255 MB of zeros by lz4,
-    and to far more by zstd) and gives nothing of a chunk that is cut off.
+    The mcap package's own ``get_chunk_data_stream`` has no limit, so that a chunk of zeros could fill all memory, and gives
+    nothing of a chunk that is cut off.
     """
     most = chunk.uncompressed_size
     if most > LARGEST_BYTES:
@@ -166,6 +166,7 @@ def unpack_messages(
 
 def _unpack_message(packed: bytes) -> bytes:
     try:
+        # the limit below counts only where the frame does not state its size
         if zstandard.frame_content_size(packed) > LARGEST_BYTES:
             return packed
         return zstandard.decompress(packed, len(packed) * LARGEST_RATIO)

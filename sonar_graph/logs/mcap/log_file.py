@@ -109,6 +109,7 @@ class LogFile:
         if at >= self.size:  # a damaged length may point anywhere
             return b""
         count = min(count, self.size - at)
+        # a damaged length could ask for all memory
         if count > LARGEST_BYTES:
             raise LogError(
                 f"{self.path}: bytes {at} to {at + count} are one record, and at most {LARGEST_BYTES} are read at "

@@ -146,6 +146,7 @@ class Passage:
         """True where a chunk may hold a wanted topic in the wanted time."""
         start_ns = index.message_start_time
         end_ns = index.message_end_time
+        # without a window every chunk is inside
         first_ns, after_ns = self._limits_ns or (start_ns, end_ns + 1)
         is_inside = start_ns < after_ns and end_ns >= first_ns
         topics = [
@@ -171,6 +172,7 @@ class Passage:
                     content = find_messages(unpack_beginning(chunk))
                 elif chunk.uncompressed_crc:  # its length is not confirmed
                     content = find_messages(unpack_whole(chunk), is_covered=True)
+        # a cut end misleads nobody, so it is no hole that must be accepted by --salvage
         if is_cut:
             reason = f"the file is cut off: its last whole record ends at byte {hole.at} of {hole.end}"
             if content is not None and content.channels:
@@ -227,6 +229,7 @@ class Passage:
         unread = len(content.data) - content.end
         if unread:
             self._lose(record, f"chunk {self.chunks} ends in {unread} bytes unread")
+        # what no CRC covers is named, because a wrong bit in it cannot be seen
         self._without_crc += is_chunk and not content.is_covered
         yield from self._take(content, record)
 
@@ -246,6 +249,7 @@ class Passage:
             self._open_losses.clear()
             self._last_ns = max(self._last_ns or 0, last_ns)
         for channel, found in content.channels.items():
+            # a payload without a definition cannot be decoded
             topic = self._described.by_channel.get(channel)
             if topic is None:
                 self._lose(
@@ -277,6 +281,7 @@ class Passage:
         damage = self.damage
         size = self._file.size
         damage.remarks += self._described.remarks
+        # without the record that ends the data, records after the last one may be missing
         if self._data_end is None and damage.ending is None:
             reason = f"the file is cut off: it ends after a whole record, at byte {size}, without a summary"
             damage.ending = Loss(size, size, reason)
@@ -303,6 +308,7 @@ class Passage:
         if not expected.data_section_crc:
             return
         crc = 0
+        # in blocks: the file may be larger than the memory
         for at in range(0, data_end.at, _BLOCK):
             crc = zlib.crc32(self._file.read(at, min(_BLOCK, data_end.at - at)), crc)
         if crc == expected.data_section_crc:

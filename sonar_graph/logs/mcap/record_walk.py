@@ -1,8 +1,7 @@
 """Places of the records in the data of a file, in their order, also where some of the bytes are damaged.
 
-The mcap package parses the records. It does not find them here, for two reasons. It cannot go on after a damaged
-record, and it makes a Python object of every entry of the message indexes, which are not needed: of the log of
-``benchmarks/performance/log_reading.py`` its ``StreamReader`` alone takes 0.6 times the time of our whole reading.
+The mcap package parses the records. It does not find them here, for two reasons: it cannot go on after a damaged record,
+and it makes Python objects of all entries of the message indexes, one for each message, which are not needed.
 """
 
 import re
@@ -71,7 +70,7 @@ def content_of(file: LogFile, record: Record) -> bytes:
 def record_starts(data: bytes | memoryview) -> list[int]:
     """Offsets of the whole schemas, channels and messages that follow each other in some bytes, and the end of the last.
 
-    This loop is the one step that is done for each message; parsing messages by the package takes 20 times as long.
+    This loop is the one step that is done for each message; the package would make an object of each.
     """
     starts = [0]
     at = 0
@@ -127,6 +126,7 @@ class RecordWalk:
 
     def _record(self, at: int) -> Record | None:
         """Record at an offset by the summary, or else by its head; None where the data cannot have such a record."""
+        # the summary is under a CRC, the head of a chunk is not
         index = self.chunks.get(at)
         if index is not None:
             return Record(Opcode.CHUNK, at, at + index.chunk_length)
@@ -152,6 +152,7 @@ class RecordWalk:
         """Loose records from one on, each followed by another record."""
         count = max(_STRETCH, first.end - first.at)
         block = self._file.read(first.at, min(count, self._stop_at - first.at))
+        # the last one may have a damaged length: then the run ends before it
         for size in record_starts(block)[:-3:-1]:
             run = Record(Opcode.MESSAGE, first.at, first.at + size)
             if size and self._is_confirmed(run):
@@ -164,7 +165,9 @@ class RecordWalk:
         In a file with chunks, bytes that look like a message are not trusted: they may lie within a damaged chunk.
         """
         self._has_chunks |= self._file.read(at, 1) == bytes([Opcode.CHUNK])
+        # a loose record cannot be told from one within a chunk
         pattern = _AMONG_CHUNKS if self._has_chunks else _ANY
+        # small blocks: hostile files have many heads, and each search reads a block again
         for block_at in range(at + 1, self._stop_at, _BLOCK):
             block = self._file.read(block_at, _BLOCK + _LONGEST_PATTERN)
             for match in pattern.finditer(block):

@@ -116,6 +116,7 @@ def _join(whole: Recording, file: LogFile, passage: Passage) -> None:
     is_complete = not passage.skipped and passage.part is None
     settle(passage.damage, passage.topics, counts if is_complete else None)
     for name, topic in passage.topics.items():
+        # topics that are only counted are listed, although their chunks were skipped
         is_in_skipped = topic.keep is Keep.NONE and bool((counts or {}).get(name))
         if not len(topic) and not is_in_skipped:
             continue
@@ -142,6 +143,7 @@ def _gather_all(passage: Passage, file: LogFile) -> None:
         before = piece.topic.held_bytes
         piece.topic.gather(piece.data, *piece.found)
         held += piece.topic.held_bytes - before
+        # compression of zeros could fill all memory
         if held > most:
             raise LogError(
                 f"{file.path}: its {file.size} bytes unpack to more than {most} bytes of messages, as no sensor's do; "
@@ -170,6 +172,7 @@ def stream(
                 held[piece.topic.name] = piece.topic.empty()
             topic = held[piece.topic.name]
             topic.gather(piece.data, *piece.found)
+            # small pieces would be decoded one by one
             if topic.held_bytes >= _PIECE_BYTES:
                 yield held.pop(topic.name)
         yield from (topic for topic in held.values() if topic.keep is not Keep.NONE)

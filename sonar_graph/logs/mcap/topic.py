@@ -113,6 +113,7 @@ class Topic:
         )
         if not decoded.unsound:
             return decoded.groups
+        # a message that breaks its definition would shift the rows of all after it
         is_sound = np.ones(len(self), bool)
         for fault, rows in decoded.unsound.items():
             is_sound[rows] = False
@@ -133,6 +134,7 @@ class Topic:
         self._count += len(sizes)
         if self.keep is Keep.NONE:
             return
+        # payloads of one size are one block, which decodes without a copy
         kept = sizes if self.keep is Keep.ALL else np.minimum(sizes, self.keep.value)
         self.times.append(log_times_ns)
         self.held_bytes += int(kept.sum())
@@ -144,6 +146,7 @@ class Topic:
                     (first + rows, np.empty((len(rows), 0), np.uint8))
                 )
                 continue
+            # one gather of whole payloads instead of a copy of each
             windows = np.ndarray(
                 (len(data) - size + 1,), f"V{size}", data, strides=(1,)
             )
@@ -157,6 +160,7 @@ class Topic:
 
     def _keep_rows(self, is_kept: NDArray[np.bool_]) -> Ints:
         """Remove the other messages; the new row of each message that stays, shape (n,)."""
+        # rows count only the messages that stay
         number = np.cumsum(is_kept) - 1
         for size, parts in self.stacks.items():
             self.stacks[size] = [
@@ -169,6 +173,7 @@ class Topic:
 
     def extend(self, later: Topic) -> None:
         """Add the messages of the same topic in the next file of a log; a LogError where it has another type."""
+        # rows of two definitions cannot be decoded together
         if (self.type_name, self.encoding, self.schema_text) != (
             later.type_name,
             later.encoding,
@@ -259,6 +264,7 @@ class Damage:
 
     def extend(self, later: Damage, file: str) -> None:
         """Add the damage of the next file of a log: the end of any but the last is a loss in the middle."""
+        # another file follows, so this end is in the middle of the log
         if self.ending is not None:
             self.losses.append(self.ending)
         for loss in (*later.losses, later.ending):
@@ -288,6 +294,7 @@ def settle(
         if count > found + known:
             missing[name] = count - found - known
     unknown = [loss for loss in damage.losses if loss.messages is None]
+    # the statistics do not state which of several losses had which messages
     if missing and len(unknown) != 1:
         reason = "fewer messages than the file's statistics count"
         damage.losses.append(Loss(0, 0, reason, messages=missing))
@@ -344,5 +351,6 @@ class Descriptions:
             is_latched=channel.topic.endswith("_static")
             or bool(_TRANSIENT_LOCAL.search(offered)),
         )
+        # two channels of one topic are the same topic, as two publishers make them
         self.as_written.setdefault(channel.topic, (channel, schema))
         self.by_channel[channel.id] = self.by_name.setdefault(channel.topic, topic)

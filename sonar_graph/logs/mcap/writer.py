@@ -134,6 +134,7 @@ class RecordingWriter:
     def offer_latched(self) -> None:
         """State once in the form of rosbag2 that there are latched topics."""
         if not self._offers_latched:
+            # without it newer rosbag2 cannot read the offers
             self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
             self._offers_latched = True
 
