@@ -32,6 +32,7 @@ from sonar_graph.logs.mcap import (
     Outgoing,
     Passage,
     Recording,
+    content_of,
     log_parts,
     parse,
     seal,
@@ -166,7 +167,7 @@ class _AmendedCopy:
             for log, passage in self._passages
             for record in passage.others
         ):
-            content = log.content(record)
+            content = content_of(log, record)
             if record.opcode == Opcode.METADATA:
                 found = parse(Metadata.read, content)
                 writer.add_metadata(found.name, found.metadata)

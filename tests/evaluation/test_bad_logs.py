@@ -9,7 +9,7 @@ import pytest
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
+from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.recognition.recognition_record import NO_FLOOR, Recognition

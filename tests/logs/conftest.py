@@ -15,9 +15,9 @@ from mcap_ros2.writer import Writer
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.logs.cdr.definitions import definition
-from sonar_graph.logs.mcap.file_summary import TimeWindow
 from sonar_graph.logs.mcap.reader import Recording
 from sonar_graph.logs.mcap.scanning import scan
+from sonar_graph.logs.mcap.time_window import TimeWindow
 from sonar_graph.logs.mcap.topic import Keep, Topic
 from sonar_graph.measurements import (
     Depth,

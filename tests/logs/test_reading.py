@@ -23,8 +23,8 @@ from sonar_graph.logs.adapters.landmark_messages import (
 )
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
 from sonar_graph.logs.mcap.scanning import scan
+from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import text_of
-from sonar_graph.logs.mcap.file_summary import first_time_ns, read_summary
-from sonar_graph.logs.mcap.records import LogFile
+from sonar_graph.logs.mcap.log_file import LogFile
+from sonar_graph.logs.mcap.reader import first_time_ns
 
 METADATA_FILE = "metadata.yaml"
 SPLIT_S = 10.0
@@ -38,6 +38,7 @@ def log_parts(path: Path) -> list[Path]:
         key=lambda span: (span[0], span[2].name),
     )
     for (_, end_ns, before), (begin_ns, _, after) in pairwise(spans):
+        # two vehicles' recordings in one folder would be mixed into one
         if end_ns is not None and begin_ns < end_ns:
             raise LogError(
                 f"{path}: {after.name} begins before {before.name} ends: these are two recordings and not parts "
@@ -79,6 +80,7 @@ def _named_parts(folder: Path) -> list[Path]:
             f"{folder}: is a ROS 2 bag of the {storage[1]} kind; `sonar-graph convert rosbag {folder} -o "
             f"{folder.name}.mcap` makes a log of it"
         )
+    # two forms of a list; a YAML parser would be a dependency for two lines
     listed = re.search(r"relative_file_paths:[ \t]*\n((?:[ \t]*-[^\n]*\n?)+)", text)
     flow = re.search(r"relative_file_paths:[ \t]*\[(.*?)\]", text, re.DOTALL)
     rows = listed[1].split("\n") if listed else flow[1].split(",") if flow else []
@@ -99,10 +101,6 @@ def _named_parts(folder: Path) -> list[Path]:
 def _span_ns(file: Path) -> tuple[int, int | None]:
     """Times of the first message and, where the file's summary says it, of the last."""
     with LogFile(file) as log:
-        summary, _ = read_summary(log)
-        end_ns = (
-            None
-            if summary is None or summary.statistics is None
-            else int(summary.statistics.message_end_time)
-        )
-        return first_time_ns(log, summary), end_ns
+        statistics = log.summary.statistics if log.summary else None
+        end_ns = int(statistics.message_end_time) if statistics else None
+        return first_time_ns(log), end_ns

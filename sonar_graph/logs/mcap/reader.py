@@ -1,58 +1,43 @@
 """Reading of an MCAP file in its own order: messages gathered by topic, and an account of what is damaged.
 
-Each chunk from which anything is taken is decompressed whole and its CRC checked. Its messages are found by the message
-index where that agrees with the chunk in every record, or else by a walk through the records. A chunk is skipped,
-unread and unchecked, only when a summary that agrees with the chunk's head states that it holds no wanted topic, or
-nothing of the wanted time. See ``docs/design/0004-logs.md``.
+Each chunk from which anything is taken is decompressed whole and its CRC checked. A chunk is skipped, unread and
+unchecked, only when a summary under a CRC states that it holds no wanted topic, or nothing of the wanted time. See
+``docs/design/0004-logs.md``.
 """
 
 import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Metadata
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Metadata, Schema
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.chunks import (
     Content,
     Found,
-    Index,
-    find_by_index,
-    find_by_walk,
-    unpack,
+    find_messages,
     unpack_beginning,
+    unpack_whole,
 )
-from sonar_graph.logs.mcap.file_summary import (
-    TimeWindow,
-    first_time_ns,
-    parse,
-    read_summary,
-)
-from sonar_graph.logs.mcap.records import (
+from sonar_graph.logs.mcap.log_file import LogFile, open_seal, parse, read_record
+from sonar_graph.logs.mcap.record_walk import (
+    HOLE,
     PRIVATE,
-    ByteRange,
-    ChunkRecord,
-    Hole,
-    LogFile,
     Record,
     RecordWalk,
-    open_seal,
+    content_of,
 )
+from sonar_graph.logs.mcap.time_window import TimeWindow
 from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic
 
 _BLOCK = 1 << 22
 _NS_PER_S = 1_000_000_000
-_PIECE_BYTES = 1 << 20
 Progress = Callable[[int, int], None]
 """Function called with the bytes done and the bytes in all."""
-
-
-class IndexMismatchError(LogError):
-    """An index that does not describe its chunks, so that chunks may have been skipped wrongly."""
 
 
 class ChunkPart(NamedTuple):
@@ -63,10 +48,33 @@ class ChunkPart(NamedTuple):
     found: Found
 
 
+def first_time_ns(file: LogFile) -> int:
+    """Earliest log time by the statistics, or else that of the first messages that can be read; 0 without messages."""
+    statistics = file.summary.statistics if file.summary else None
+    if statistics is not None and statistics.message_count:
+        return int(statistics.message_start_time)
+    for record in RecordWalk(file):
+        if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+            with suppress(LogError):
+                content = _content(file, record)
+                if content.span_ns is not None:
+                    return content.span_ns[0]
+    return 0
+
+
+def _content(file: LogFile, record: Record) -> Content:
+    """Messages of a chunk or of a run of loose records; a LogError where the chunk is damaged."""
+    if record.opcode == Opcode.MESSAGE:
+        return find_messages(file.read(record.at, record.end - record.at))
+    chunk = read_record(Chunk.read, content_of(file, record))
+    data = unpack_whole(chunk)
+    return find_messages(data, is_covered=chunk.uncompressed_crc != 0)
+
+
 class Passage:
     """One pass through a file, in the order of the file: the wanted messages of each chunk, topic by topic.
 
-    ``keep`` tells the wanted part of a message by the name of its type; ``window`` the wanted time of recording, but of
+    ``keep`` gives the wanted part of a message by the name of its type; ``window`` the wanted time of recording, but of
     latched topics everything is wanted. With ``may_skip`` chunks without wanted messages are skipped by the summary.
     """
 
@@ -86,254 +94,174 @@ class Passage:
         self.skipped = 0
         """Number of skipped chunks."""
         self.chunks = 0
+        self.part: str | None = None
+        """Text of the wanted time, if not all is wanted."""
         self._file = file
         self._may_skip = may_skip
         self._progress = progress
-        self._summary, self._ending_fault = read_summary(file)
-        self.part: str | None = None
-        """Text of the wanted time, if not all is wanted."""
         self._limits_ns: tuple[int, int] | None = None
         if window is not None and (window.start or window.end):
-            beginning_ns = first_time_ns(file, self._summary)
-            self._limits_ns, self.part = (
-                window.resolve(beginning_ns),
-                window.describe(beginning_ns),
-            )
+            beginning_ns = first_time_ns(file)
+            self._limits_ns = window.resolve(beginning_ns)
+            self.part = window.describe(beginning_ns)
         self._described = Descriptions(file.path, keep)
         self.topics = self._described.by_name
         """All described topics by name."""
         self.as_written = self._described.as_written
         """Channel and schema of each topic."""
-        self._walk = RecordWalk(
-            file, self._summary.data_end_at if self._summary else None
-        )
+        self._walk = RecordWalk(file)
+        self._data_end: Record | None = None
         self._last_ns: int | None = None
         self._open_losses: list[Loss] = []
         self._without_crc = 0
         self._unsealed: list[str] = []
         self._is_loose = False
-        if self._summary:
-            self._described.add_summary(self._summary)
+        # those of the summary come first: they replace any that are lost in the data
+        for described in file.described:
+            self._described.add(described)
 
     @property
     def counts(self) -> dict[str, int] | None:
         """Number of messages of each topic by the file's own statistics; None without statistics."""
-        statistics = self._summary.statistics if self._summary else None
-        if statistics is None or not statistics.channel_message_counts:
+        summary = self._file.summary
+        if summary is None or summary.statistics is None:
             return None
         found: dict[str, int] = {}
-        for channel, count in statistics.channel_message_counts.items():
+        for channel, count in summary.statistics.channel_message_counts.items():
             name = self._name(channel)
             found[name] = found.get(name, 0) + count
-        return found
+        return found or None
 
     def __iter__(self) -> Iterator[ChunkPart]:
-        chunk: ChunkRecord | None = None
-        index: dict[int, np.ndarray] = {}
-        for item in self._walk:
-            if (
-                chunk is not None
-                and isinstance(item, Record)
-                and item.opcode == Opcode.MESSAGE_INDEX
-            ):
-                content = self._file.content(item)
-                rows = np.frombuffer(
-                    content, "<u8", offset=6, count=(len(content) - 6) // 16 * 2
-                ).reshape(-1, 2)
-                index[int.from_bytes(content[:2], "little")] = rows
-                continue
-            before_hole = isinstance(item, Hole)
-            is_told = chunk is not None and (
-                yield from self._take_chunk(chunk, index, before_hole=before_hole)
-            )
-            chunk, index = None, {}
-            if isinstance(item, ChunkRecord):
-                self._report(item.end)
-                self.chunks += 1
-                said = self._indexed(item) if self._may_skip else None
-                if said is None or self._is_wanted(item, said):
-                    chunk = item
-                else:
-                    self.skipped += 1
-                    self._walk.jump(item.end + said.message_index_length)
-            elif isinstance(item, ByteRange):
-                self._report(item.end)
-                self._is_loose = True
-                loose = find_by_walk(self._file.read(item.at, item.end - item.at))
-                yield from self._take_content(
-                    loose, item.at, item.end, is_covered=False
-                )
-            elif isinstance(item, Hole) and not is_told:
-                yield from self._take_hole(item)
-            elif isinstance(item, Record):
-                self._take_other(item)
-        if chunk is not None:
-            yield from self._take_chunk(chunk, index, before_hole=False)
+        for record in self._walk:
+            if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                yield from self._take_messages(record)
+            elif record.opcode == HOLE:
+                yield from self._take_hole(record)
+            else:
+                self._take_other(record)
         self._finish()
 
-    def _is_wanted(self, chunk: ChunkRecord, index: ChunkIndex) -> bool:
+    def _is_wanted(self, index: ChunkIndex) -> bool:
         """True where a chunk may hold a wanted topic in the wanted time."""
+        start_ns = index.message_start_time
+        end_ns = index.message_end_time
+        # without a window every chunk is inside
+        first_ns, after_ns = self._limits_ns or (start_ns, end_ns + 1)
+        is_inside = start_ns < after_ns and end_ns >= first_ns
         topics = [
             self._described.by_channel.get(channel)
             for channel in index.message_index_offsets
         ]
-        first_ns, after_ns = self._limits_ns or (chunk.start_ns, chunk.end_ns + 1)
-        is_inside = chunk.start_ns < after_ns and chunk.end_ns >= first_ns
-        return any(
+        # without message indexes the summary does not state which topics a chunk holds
+        return not topics or any(
             topic is None
             or (topic.keep is not Keep.NONE and (is_inside or topic.is_latched))
             for topic in topics
         )
 
-    def _take_chunk(
-        self, chunk: ChunkRecord, index: Index, *, before_hole: bool
-    ) -> Generator[ChunkPart, None, bool]:
-        """Messages of a chunk; returns True where the chunk is lost, together with a hole after it."""
-        try:
-            data = unpack(chunk, self._file.read(chunk.data_at, chunk.data_size))
-        except LogError as error:
-            reason = f"chunk {self.chunks} is lost: {error}"
-            # before a hole the chunk may have a wrong length: the next record is searched from its beginning
-            end = self._walk.search(chunk.at).end if before_hole else chunk.end
-            if end == self._file.size and not self._walk.reached_end:
-                self.damage.ending = Loss(
-                    chunk.at,
-                    end,
-                    f"the file is cut off, or overwritten from there: {reason}",
-                )
-            else:
-                counted = {
-                    self._name(channel): len(rows) for channel, rows in index.items()
-                }
-                self._lose(chunk.at, end, reason, chunk, counted or None)
-            return True
-        content = find_by_index(data, index) if index else None
-        if content is None:
-            content = find_by_walk(data)
-            if index:
-                self._remark(
-                    f"the message index of chunk {self.chunks} (byte {chunk.at}) does not fit; read without"
-                )
-            if content.end < len(data):
-                self._lose(
-                    chunk.at,
-                    chunk.end,
-                    f"chunk {self.chunks} ends in {len(data) - content.end} bytes unread",
-                )
-        said = self._indexed(chunk)
-        if said is not None and content.channels:
-            first_ns, last_ns = content.times_ns()
-            is_inside = chunk.start_ns <= first_ns and last_ns <= chunk.end_ns
-            if not (
-                is_inside
-                and content.channels.keys() <= said.message_index_offsets.keys()
-            ):
-                self._remark(
-                    f"the summary's index does not fit chunk {self.chunks} (byte {chunk.at}); read without"
-                )
-                if self._may_skip:
-                    raise IndexMismatchError(
-                        f"{self._file.path}: its index does not fit its chunks"
-                    )
-        self._without_crc += not chunk.crc
-        yield from self._take_content(
-            content, chunk.at, chunk.end, is_covered=chunk.crc != 0
-        )
-        return False
-
-    def _indexed(self, chunk: ChunkRecord) -> ChunkIndex | None:
-        """Index of a chunk in the summary, where it agrees with the chunk's own head."""
-        index = self._summary.chunks.get(chunk.at) if self._summary else None
-        if index is None or not index.message_index_offsets:
-            return None
-        said = (
-            index.message_start_time,
-            index.message_end_time,
-            index.compressed_size,
-            index.uncompressed_size,
-        )
-        return (
-            index
-            if said
-            == (chunk.start_ns, chunk.end_ns, chunk.data_size, chunk.uncompressed_size)
-            else None
-        )
-
-    def _take_hole(self, hole: Hole) -> Iterator[ChunkPart]:
-        """Messages at the beginning of a chunk that is cut off; any other hole is a loss."""
-        if hole.end < self._file.size or self._walk.reached_end:
-            self._lose(hole.at, hole.end, "no valid record")
-            return
-        chunk = self._file.record(hole.at)
-        reason = f"the file is cut off: its last whole record ends at byte {hole.at} of {hole.end}"
-        if not isinstance(chunk, ChunkRecord) or chunk.end <= self._file.size:
-            self.damage.ending = Loss(hole.at, hole.end, reason, self._last_ns)
-            return
-        self.chunks += 1
-        content = find_by_walk(
-            unpack_beginning(chunk, self._file.read(chunk.data_at, chunk.data_size))
-        ).trusted()
-        if len(content):
-            reason += f"; of the messages, {len(content)} are from the beginning of a chunk, which no CRC covers"
-        self.damage.ending = Loss(hole.at, hole.end, reason, self._last_ns)
-        yield from self._take_content(content, hole.at, hole.end, is_covered=False)
+    def _take_hole(self, hole: Record) -> Iterator[ChunkPart]:
+        """Loss of a hole, except for a chunk at its beginning that is whole, or cut off with the file."""
+        content = None
+        is_cut = hole.end == self._file.size
+        if self._file.read(hole.at, 1) == bytes([Opcode.CHUNK]):
+            self.chunks += 1
+            with suppress(LogError):
+                chunk = read_record(Chunk.read, content_of(self._file, hole))
+                if is_cut:
+                    content = find_messages(unpack_beginning(chunk))
+                elif chunk.uncompressed_crc:  # its length is not confirmed
+                    content = find_messages(unpack_whole(chunk), is_covered=True)
+        # a cut end misleads nobody, so it is no hole that must be accepted by --salvage
+        if is_cut:
+            reason = f"the file is cut off: its last whole record ends at byte {hole.at} of {hole.end}"
+            if content is not None and content.channels:
+                count = sum(len(found.sizes) for found in content.channels.values())
+                reason += f"; of the messages, {count} are from the beginning of a chunk, which no CRC covers"
+            self.damage.ending = Loss(hole.at, hole.end, reason)
+        else:
+            after = "" if content is None else " after a whole chunk"
+            self._lose(hole, f"no valid record{after}")
+        if content is not None:
+            yield from self._take(content, hole)
 
     def _take_other(self, record: Record) -> None:
-        """Metadata, an attachment, or a private record."""
-        if record.opcode == Opcode.METADATA:
-            try:
-                found = parse(Metadata.read, self._file.content(record))
-                content, is_sealed = open_seal(found.metadata)
-            except LogError as error:
-                end = self._walk.search(record.at).end  # the length may be damaged
-                self._lose(
-                    record.at, end, f"a metadata record is lost: {error}", messages={}
-                )
-                return
-            self.metadata[found.name] = content
-            self.others.append(record)
-            if not is_sealed:
-                self._unsealed.append(found.name)
+        """Metadata, an attachment, a private record, or the end of the data."""
+        if record.opcode == Opcode.DATA_END:
+            self._data_end = record
+        elif record.opcode == Opcode.METADATA:
+            self._take_metadata(record)
         elif record.opcode == Opcode.ATTACHMENT:
             self.others.append(record)
         elif record.opcode >= PRIVATE:
-            self._remark(
+            self.damage.remarks.append(
                 f"bytes {record.at} to {record.end}: a record of private kind {record.opcode:#x}, not read"
             )
 
-    def _take_content(
-        self, content: Content, at: int, end: int, *, is_covered: bool
-    ) -> Iterator[ChunkPart]:
+    def _take_metadata(self, record: Record) -> None:
+        try:
+            found = parse(Metadata.read, content_of(self._file, record))
+            content, is_sealed = open_seal(found.metadata)
+        except LogError as error:
+            self._lose(record, f"a metadata record is lost: {error}", {})
+            return
+        self.metadata[found.name] = content
+        self.others.append(record)
+        if not is_sealed:
+            self._unsealed.append(found.name)
+
+    def _take_messages(self, record: Record) -> Iterator[ChunkPart]:
+        """Wanted messages of a chunk or of a run of loose records."""
+        is_chunk = record.opcode == Opcode.CHUNK
+        self.chunks += is_chunk
+        self._is_loose |= not is_chunk
+        if self._progress:
+            self._progress(record.end, self._file.size)
+        index = self._walk.chunks.get(record.at)
+        if self._may_skip and index is not None and not self._is_wanted(index):
+            self.skipped += 1
+            return
+        try:
+            content = _content(self._file, record)
+        except LogError as error:
+            self._lose(record, f"chunk {self.chunks} is lost: {error}")
+            return
+        unread = len(content.data) - content.end
+        if unread:
+            self._lose(record, f"chunk {self.chunks} ends in {unread} bytes unread")
+        # what no CRC covers is named, because a wrong bit in it cannot be seen
+        self._without_crc += is_chunk and not content.is_covered
+        yield from self._take(content, record)
+
+    def _take(self, content: Content, record: Record) -> Iterator[ChunkPart]:
         """Wanted messages of some bytes; their schemas and channels are added to the descriptions."""
         for opcode, described in content.described:
+            kind = Schema if opcode == Opcode.SCHEMA else Channel
             try:
-                self._described.add(opcode, described, is_covered=is_covered)
+                self._described.add(parse(kind.read, described))
             except LogError as error:
-                self._lose(
-                    at,
-                    end,
-                    f"the description of a channel is lost: {error}",
-                    messages={},
-                )
-        if content.channels:
-            first_ns, last_ns = content.times_ns()
-            for loss in self._open_losses:  # lost messages were recorded before these
+                self._lose(record, f"the description of a channel is lost: {error}", {})
+        if content.span_ns is not None:
+            first_ns, last_ns = content.span_ns
+            # what was lost was recorded before these messages
+            for loss in self._open_losses:
                 loss.end_ns = first_ns
             self._open_losses.clear()
             self._last_ns = max(self._last_ns or 0, last_ns)
         for channel, found in content.channels.items():
+            # a payload without a definition cannot be decoded
             topic = self._described.by_channel.get(channel)
             if topic is None:
-                reason = f"messages of channel {channel}, whose description is lost"
                 self._lose(
-                    at, end, reason, messages={self._name(channel): len(found.sizes)}
+                    record,
+                    f"messages of channel {channel}, whose description is lost",
+                    {self._name(channel): len(found.sizes)},
                 )
                 continue
             if self._limits_ns and not topic.is_latched:
                 first_ns, after_ns = self._limits_ns
-                found = found.of(
-                    (found.log_times_ns >= first_ns) & (found.log_times_ns < after_ns)
-                )
+                times_ns = found.log_times_ns
+                found = found.of((times_ns >= first_ns) & (times_ns < after_ns))
             if len(found.sizes):
                 yield ChunkPart(topic, content.data, found)
 
@@ -342,62 +270,53 @@ class Passage:
         return f"channel {channel}" if topic is None else topic.name
 
     def _lose(
-        self,
-        at: int,
-        end: int,
-        reason: str,
-        chunk: ChunkRecord | None = None,
-        messages: dict[str, int] | None = None,
+        self, record: Record, reason: str, messages: dict[str, int] | None = None
     ) -> None:
-        loss = Loss(at, end, reason, self._last_ns, None, messages)
+        loss = Loss(record.at, record.end, reason, self._last_ns, None, messages)
         self.damage.losses.append(loss)
-        if chunk is not None and self._indexed(chunk) is not None:
-            loss.start_ns, loss.end_ns = chunk.start_ns, chunk.end_ns
-        else:
-            self._open_losses.append(loss)
-
-    def _remark(self, text: str) -> None:
-        self.damage.remarks.append(text)
-
-    def _report(self, done: int) -> None:
-        if self._progress:
-            self._progress(done, self._file.size)
+        self._open_losses.append(loss)
 
     def _finish(self) -> None:
         """Complete the account of the damage at the end of the file."""
-        damage, summary = self.damage, self._summary
+        damage = self.damage
+        size = self._file.size
         damage.remarks += self._described.remarks
-        if self._ending_fault and damage.ending is None:
-            if summary is None and not self._walk.reached_end:
-                size = self._file.size
-                reason = f"the file is cut off: it ends after a whole record, at byte {size}, without a summary"
-                damage.ending = Loss(size, size, reason, self._last_ns)
-            else:
-                self._remark(f"{self._ending_fault}; the data before its end is whole")
+        # without the record that ends the data, records after the last one may be missing
+        if self._data_end is None and damage.ending is None:
+            reason = f"the file is cut off: it ends after a whole record, at byte {size}, without a summary"
+            damage.ending = Loss(size, size, reason)
+        elif self._file.fault and damage.ending is None:
+            damage.remarks.append(
+                f"{self._file.fault}; the data before its end is whole"
+            )
         if damage.ending is not None:
             damage.ending.start_ns = self._last_ns
-        unprotected = (
-            [f"{self._without_crc} chunks carry no CRC"] if self._without_crc else []
-        )
-        unprotected += ["messages lie outside chunks"] if self._is_loose else []
+        unprotected = []
+        if self._without_crc:
+            unprotected.append(f"{self._without_crc} chunks carry no CRC")
+        if self._is_loose:
+            unprotected.append("messages lie outside chunks")
         unprotected += [f"metadata record {name!r}" for name in self._unsealed]
-        if (
-            unprotected
-            and not self.skipped
-            and not damage.losses
-            and summary is not None
-            and summary.data_crc
-        ):
-            crc = 0
-            for at in range(0, summary.data_end_at, _BLOCK):
-                crc = zlib.crc32(
-                    self._file.read(at, min(_BLOCK, summary.data_end_at - at)), crc
-                )
-            if crc == summary.data_crc:  # the CRC over all data protects them
-                return
-            reason = f"the CRC over all data does not fit, and {', '.join(unprotected)}: somewhere in these a bit is wrong"
-            damage.losses.append(Loss(0, summary.data_end_at, reason, messages={}))
         damage.unprotected = unprotected
+        # where something is skipped or lost, the CRC over all data says nothing about the rest
+        if unprotected and not self.skipped and not damage.losses and self._data_end:
+            self._check_data(self._data_end)
+
+    def _check_data(self, data_end: Record) -> None:
+        """Compare the CRC over all data, where the file has one, which protects what no other CRC covers."""
+        expected = read_record(DataEnd.read, content_of(self._file, data_end))
+        if not expected.data_section_crc:
+            return
+        crc = 0
+        # in blocks: the file may be larger than the memory
+        for at in range(0, data_end.at, _BLOCK):
+            crc = zlib.crc32(self._file.read(at, min(_BLOCK, data_end.at - at)), crc)
+        if crc == expected.data_section_crc:
+            self.damage.unprotected = []
+            return
+        parts = ", ".join(self.damage.unprotected)
+        reason = f"the CRC over all data does not fit, and {parts}: somewhere in these a bit is wrong"
+        self.damage.losses.append(Loss(0, data_end.at, reason, messages={}))
 
 
 @dataclass

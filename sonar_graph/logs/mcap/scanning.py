@@ -1,25 +1,14 @@
 """Reading of whole logs, a file or several: messages gathered by topic, or given piece by piece."""
 
 from collections.abc import Callable, Iterator
+from itertools import accumulate
 from pathlib import Path
-
-import numpy as np
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.bag_folder import log_parts
-from sonar_graph.logs.mcap.file_summary import (
-    Instant,
-    TimeWindow,
-    first_time_ns,
-    read_summary,
-)
-from sonar_graph.logs.mcap.reader import (
-    IndexMismatchError,
-    Passage,
-    Progress,
-    Recording,
-)
-from sonar_graph.logs.mcap.records import LARGEST_BYTES, LARGEST_RATIO, LogFile
+from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile
+from sonar_graph.logs.mcap.reader import Passage, Progress, Recording, first_time_ns
+from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 
 _PIECE_BYTES = 1 << 20
@@ -49,139 +38,112 @@ def scan(
     LogError
         When the log does not exist, is not MCAP, or nothing in it was recorded in the window.
     """
-    parts = log_parts(path)
-    if parts == [path]:
-        whole = _scan_file(path, keep, window, progress)
-    else:
-        whole = Recording(path)
-        steps = _progress_of(parts, progress)
-        for part, file in _opened(parts, whole.damage):
-            window = window if whole.beginning_ns is not None else _fixed(window, file)
-            _join(whole, _scan_file(part, keep, window, steps[part]))
-        whole.topics = dict(sorted(whole.topics.items()))
-    if whole.part and not any(
-        len(topic) and not topic.is_latched for topic in whole.topics.values()
-    ):
+    whole = Recording(path)
+    for file, passage in _passages(path, keep, window, progress, whole.damage):
+        _join(whole, file, passage)
+    whole.topics = dict(sorted(whole.topics.items()))
+    is_empty = all(
+        topic.is_latched or not len(topic) for topic in whole.topics.values()
+    )
+    if whole.part and is_empty:
         raise LogError(f"{path}: nothing was recorded from {whole.part}")
     return whole
 
 
-def _scan_file(
+def _passages(
     path: Path,
     keep: Callable[[str], Keep],
     window: TimeWindow | None,
     progress: Progress | None,
-) -> Recording:
-    with LogFile(path) as file:
-        passage = Passage(file, keep, window, progress=progress)
-        try:
-            _gather_all(passage, file)
-        except IndexMismatchError:
-            remarks = passage.damage.remarks
-            passage = Passage(file, keep, window, may_skip=False, progress=progress)
-            _gather_all(passage, file)
-            passage.damage.remarks[:0] = remarks
-    counts = passage.counts
-    topics = {
-        name: topic
-        for name, topic in sorted(passage.topics.items())
-        if len(topic)
-        or (
-            topic.keep is Keep.NONE and (counts or {}).get(name)
-        )  # those of skipped chunks
-    }
-    # every message that can be read was counted
-    is_complete = not passage.skipped and passage.part is None
-    settle(passage.damage, topics, counts if is_complete else None)
-    return Recording(
-        path,
-        topics,
-        passage.metadata,
-        passage.damage,
-        min(
-            (int(topic.log_times_ns.min()) for topic in topics.values() if topic.times),
-            default=None,
-        ),
-        passage.chunks,
-        passage.skipped,
-        passage.part,
-    )
+    damage: Damage,
+) -> Iterator[tuple[LogFile, Passage]]:
+    """A passage through each file of a log; its damage is added to that of the log when the next is asked for.
 
-
-def _opened(parts: list[Path], damage: Damage) -> Iterator[tuple[Path, LogFile]]:
-    """Files of a log that can be opened; the others are losses, each with the name of the file."""
+    A file that cannot be opened is a loss with the name of the file, and a LogError where there is no other.
+    """
+    parts = log_parts(path)
+    sizes = [part.stat().st_size if part.exists() else 0 for part in parts]
+    ends = list(accumulate(sizes))
     failures = []
-    for part in parts:
+    is_first = True
+    for part, size, end in zip(parts, sizes, ends, strict=True):
+        name = part.name if parts != [path] else ""
         try:
             file = LogFile(part)
         except LogError as error:
-            reason = (
-                "is missing"
-                if not part.exists()
-                else str(error).removeprefix(f"{part} ")
-            )
-            damage.extend(Damage([Loss(0, 0, reason)]), part.name)
-            failures.append(str(error))
+            failures.append(error)
+            reason = str(error).removeprefix(f"{part} ")
+            if not part.exists():
+                reason = "is missing"
+            damage.extend(Damage([Loss(0, 0, reason)]), name)
             continue
         with file:
-            yield part, file
+            # a part of the time is counted from the beginning of the first file
+            window = _fixed(window, file) if is_first else window
+            is_first = False
+            shown = _shifted(progress, end - size, ends[-1])
+            passage = Passage(file, keep, window, progress=shown)
+            yield file, passage
+        damage.extend(passage.damage, name)
     if len(failures) == len(parts):
-        raise LogError(failures[0])
+        raise failures[0]
 
 
 def _fixed(window: TimeWindow | None, first: LogFile) -> TimeWindow | None:
     """The same window in absolute times, by the beginning of the first file of a log."""
     if window is None or not (window.start or window.end):
         return window
-    beginning_ns = first_time_ns(first, read_summary(first)[0])
-    ends = [
-        None if end is None else Instant(absolute_ns=end.resolve(beginning_ns))
-        for end in (window.start, window.end)
-    ]
-    return TimeWindow(*ends)
+    beginning_ns = first_time_ns(first)
+    start, end = (
+        None if limit is None else Instant(absolute_ns=limit.resolve(beginning_ns))
+        for limit in (window.start, window.end)
+    )
+    return TimeWindow(start, end)
 
 
-def _progress_of(
-    parts: list[Path], progress: Progress | None
-) -> dict[Path, Progress | None]:
-    """Progress of each file as a part of the progress of all."""
-    sizes = [part.stat().st_size if part.exists() else 0 for part in parts]
-    before = np.concatenate([[0], np.cumsum(sizes)]).tolist()
-
-    def of(first: int) -> Progress | None:
-        return (
-            None
-            if progress is None
-            else lambda done, _: progress(first + done, before[-1])
-        )
-
-    return {part: of(first) for part, first in zip(parts, before, strict=False)}
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Progress of a file as a part of the progress of all."""
+    if progress is None:
+        return None
+    return lambda done, _: progress(before + done, total)
 
 
-def _join(whole: Recording, part: Recording) -> None:
-    """Add the next file of a log."""
-    for name, topic in part.topics.items():
+def _join(whole: Recording, file: LogFile, passage: Passage) -> None:
+    """Read the next file of a log, and add what is in it."""
+    _gather_all(passage, file)
+    counts = passage.counts
+    # where chunks are skipped or left out, not every message that can be read was counted
+    is_complete = not passage.skipped and passage.part is None
+    settle(passage.damage, passage.topics, counts if is_complete else None)
+    for name, topic in passage.topics.items():
+        # topics that are only counted are listed, although their chunks were skipped
+        is_in_skipped = topic.keep is Keep.NONE and bool((counts or {}).get(name))
+        if not len(topic) and not is_in_skipped:
+            continue
+        if topic.times:
+            first_ns = int(topic.log_times_ns.min())
+            known = whole.beginning_ns
+            whole.beginning_ns = first_ns if known is None else min(known, first_ns)
         if name in whole.topics:
             whole.topics[name].extend(topic)
         else:
             whole.topics[name] = topic
             topic.file = whole.path
-    whole.metadata |= part.metadata
-    whole.damage.extend(part.damage, part.path.name)
-    starts = [ns for ns in (whole.beginning_ns, part.beginning_ns) if ns is not None]
-    whole.beginning_ns = min(starts, default=None)
-    whole.chunks += part.chunks
-    whole.skipped_chunks += part.skipped_chunks
-    whole.part = whole.part or part.part
+    whole.metadata |= passage.metadata
+    whole.chunks += passage.chunks
+    whole.skipped_chunks += passage.skipped
+    whole.part = whole.part or passage.part
 
 
 def _gather_all(passage: Passage, file: LogFile) -> None:
     """Gather the wanted messages by topic; a LogError where they are more than a log of this size can honestly hold."""
-    held, most = 0, max(LARGEST_BYTES, file.size * LARGEST_RATIO)
+    held = 0
+    most = max(LARGEST_BYTES, file.size * LARGEST_RATIO)
     for piece in passage:
         before = piece.topic.held_bytes
         piece.topic.gather(piece.data, *piece.found)
         held += piece.topic.held_bytes - before
+        # compression of zeros could fill all memory
         if held > most:
             raise LogError(
                 f"{file.path}: its {file.size} bytes unpack to more than {most} bytes of messages, as no sensor's do; "
@@ -202,23 +164,17 @@ def stream(
     A piece is given as soon as it has 1 MiB, so memory does not grow with the file. Parameters and errors are those of
     `scan`; without ``salvage`` also a file with holes is a LogError, at the end: what was given before is whole.
     """
-    parts, damage, is_first = log_parts(path), Damage(), True
-    steps = _progress_of(parts, progress) if parts != [path] else {path: progress}
-    for part, file in (
-        _opened(parts, damage) if parts != [path] else [(path, LogFile(path))]
-    ):
-        window, is_first = (_fixed(window, file) if is_first else window), False
-        with file:
-            passage = Passage(file, keep, window, progress=steps[part])
-            held: dict[str, Topic] = {}
-            for piece in passage:
-                topic = held.get(piece.topic.name) or held.setdefault(
-                    piece.topic.name, piece.topic.empty()
-                )
-                topic.gather(piece.data, *piece.found)
-                if topic.held_bytes >= _PIECE_BYTES:
-                    yield held.pop(topic.name)
-            yield from (topic for topic in held.values() if topic.keep is not Keep.NONE)
-        damage.extend(passage.damage, part.name if parts != [path] else "")
+    damage = Damage()
+    for _, passage in _passages(path, keep, window, progress, damage):
+        held: dict[str, Topic] = {}
+        for piece in passage:
+            if piece.topic.name not in held:
+                held[piece.topic.name] = piece.topic.empty()
+            topic = held[piece.topic.name]
+            topic.gather(piece.data, *piece.found)
+            # small pieces would be decoded one by one
+            if topic.held_bytes >= _PIECE_BYTES:
+                yield held.pop(topic.name)
+        yield from (topic for topic in held.values() if topic.keep is not Keep.NONE)
     if not salvage:
         Recording(path, damage=damage).require_sound()

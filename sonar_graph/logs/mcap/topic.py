@@ -2,7 +2,7 @@
 
 A topic is described by a channel and a schema, which a file states in several places; `Descriptions` compares them.
 A `Loss` states the bytes, the times and the number of messages that are lost; `settle` counts them by the statistics of
-the file, or estimates them from the rates of the topics.
+the file.
 """
 
 from __future__ import annotations
@@ -13,16 +13,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Bytes, Decoder, Messages, Struct, parse_definition
-from sonar_graph.logs.mcap.chunks import is_packed, unpack_messages
-from sonar_graph.logs.mcap.file_summary import FileSummary, parse
+from sonar_graph.logs.mcap.chunks import unpack_messages
 from sonar_graph.measurements import Ints
 
 STAMP_BYTES = 12
@@ -115,34 +113,28 @@ class Topic:
         )
         if not decoded.unsound:
             return decoded.groups
+        # a message that breaks its definition would shift the rows of all after it
         is_sound = np.ones(len(self), bool)
         for fault, rows in decoded.unsound.items():
             is_sound[rows] = False
             self.unsound[fault] = self.unsound.get(fault, 0) + len(rows)
-        number = np.cumsum(is_sound) - 1  # rows count sound messages only
-        groups = [
+        number = self._keep_rows(is_sound)
+        return [
             Messages(number[group.rows], group.payloads, group.layout)
             for group in decoded.groups
         ]
-        self.times, self._count = (
-            [self.log_times_ns[is_sound]],
-            int(np.count_nonzero(is_sound)),
-        )
-        self.stacks.clear()
-        for group in groups:
-            self.stacks[group.payloads.shape[1]].append((group.rows, group.payloads))
-        return groups
 
     def gather(
         self, data: bytes | memoryview, offsets: Ints, sizes: Ints, log_times_ns: Ints
     ) -> None:
         """Add the messages at some offsets of a chunk's bytes."""
-        if len(offsets) and self.encoding == "cdr" and is_packed(data, int(offsets[0])):
+        if len(offsets) and self.encoding == "cdr":
             data, offsets, sizes = unpack_messages(data, offsets, sizes)
         first = self._count
         self._count += len(sizes)
         if self.keep is Keep.NONE:
             return
+        # payloads of one size are one block, which decodes without a copy
         kept = sizes if self.keep is Keep.ALL else np.minimum(sizes, self.keep.value)
         self.times.append(log_times_ns)
         self.held_bytes += int(kept.sum())
@@ -154,6 +146,7 @@ class Topic:
                     (first + rows, np.empty((len(rows), 0), np.uint8))
                 )
                 continue
+            # one gather of whole payloads instead of a copy of each
             windows = np.ndarray(
                 (len(data) - size + 1,), f"V{size}", data, strides=(1,)
             )
@@ -163,20 +156,24 @@ class Topic:
 
     def leave_out(self, log_times_ns: Ints) -> None:
         """Remove the messages that were recorded at some times."""
-        is_kept = ~np.isin(self.log_times_ns, log_times_ns)
+        self._keep_rows(~np.isin(self.log_times_ns, log_times_ns))
+
+    def _keep_rows(self, is_kept: NDArray[np.bool_]) -> Ints:
+        """Remove the other messages; the new row of each message that stays, shape (n,)."""
+        # rows count only the messages that stay
         number = np.cumsum(is_kept) - 1
         for size, parts in self.stacks.items():
             self.stacks[size] = [
                 (number[rows[is_kept[rows]]], payloads[is_kept[rows]])
                 for rows, payloads in parts
             ]
-        self.times, self._count = (
-            [self.log_times_ns[is_kept]],
-            int(np.count_nonzero(is_kept)),
-        )
+        self.times = [self.log_times_ns[is_kept]]
+        self._count = int(np.count_nonzero(is_kept))
+        return number
 
     def extend(self, later: Topic) -> None:
         """Add the messages of the same topic in the next file of a log; a LogError where it has another type."""
+        # rows of two definitions cannot be decoded together
         if (self.type_name, self.encoding, self.schema_text) != (
             later.type_name,
             later.encoding,
@@ -219,8 +216,6 @@ class Loss:
     """Log time until which messages may be missing."""
     messages: dict[str, int] | None = None
     """Number of lost messages by topic; None: not known."""
-    is_estimate: bool = False
-    """True where the numbers are estimated from the topics' rates."""
     file: str = ""
     """Name of the file, where a log has several."""
 
@@ -240,10 +235,8 @@ class Loss:
             )
             text += f"; {start_s:.3f} s to {end_s:.3f} s of the log"
         if self.messages:
-            about = "about " if self.is_estimate else ""
             parts = [
-                f"{about}{count} of {name}"
-                for name, count in sorted(self.messages.items())
+                f"{count} of {name}" for name, count in sorted(self.messages.items())
             ]
             more = (
                 f" and of {len(parts) - _TOPICS_NAMED} more topics"
@@ -271,12 +264,12 @@ class Damage:
 
     def extend(self, later: Damage, file: str) -> None:
         """Add the damage of the next file of a log: the end of any but the last is a loss in the middle."""
-        self.losses += [self.ending] if self.ending is not None else []
-        for loss in (
-            *later.losses,
-            *([later.ending] if later.ending is not None else []),
-        ):
-            loss.file = file
+        # another file follows, so this end is in the middle of the log
+        if self.ending is not None:
+            self.losses.append(self.ending)
+        for loss in (*later.losses, later.ending):
+            if loss is not None:
+                loss.file = file
         self.losses += later.losses
         self.ending = later.ending
         place = f"{file}: " if file else ""
@@ -287,71 +280,40 @@ class Damage:
 def settle(
     damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int] | None
 ) -> None:
-    """Find the number of lost messages where the loss itself does not tell it.
+    """Find the number of lost messages by the file's statistics, where the losses themselves do not have it.
 
-    By the statistics: counted messages less those read and those in losses of known number. Otherwise by the rate of
-    each topic: the time between the messages on both sides of the loss over the median interval before it. ``counts``
-    are the messages of each topic by the file's statistics; None: not known.
+    These are the counted messages without those read and those in losses of known number. ``counts`` are the messages
+    of each topic by the statistics; None: not known.
     """
-    missing: dict[str, int] | None = None
-    if counts is not None:
-        missing = {}
-        for name, count in counts.items():
-            found = len(topics[name]) if name in topics else 0
-            known = sum((loss.messages or {}).get(name, 0) for loss in damage.losses)
-            if count > found + known:
-                missing[name] = count - found - known
+    if counts is None:
+        return
+    missing = {}
+    for name, count in counts.items():
+        found = len(topics[name]) if name in topics else 0
+        known = sum((loss.messages or {}).get(name, 0) for loss in damage.losses)
+        if count > found + known:
+            missing[name] = count - found - known
     unknown = [loss for loss in damage.losses if loss.messages is None]
-    if missing and not unknown:
-        damage.losses.append(
-            Loss(
-                0,
-                0,
-                "fewer messages than the file's statistics count",
-                messages=missing,
-            )
-        )
+    # the statistics do not state which of several losses had which messages
+    if missing and len(unknown) != 1:
+        reason = "fewer messages than the file's statistics count"
+        damage.losses.append(Loss(0, 0, reason, messages=missing))
+        return
     for loss in unknown:
-        loss.is_estimate = missing is None or len(unknown) > 1
-        if missing is not None and (not missing or len(unknown) == 1):
-            loss.messages = missing
-        elif loss.start_ns is not None and loss.end_ns is not None:
-            lost = {}
-            for name, topic in topics.items():
-                times_ns = topic.log_times_ns
-                before, after = (
-                    times_ns[times_ns <= loss.start_ns],
-                    times_ns[times_ns >= loss.end_ns],
-                )
-                if len(before) < 2 or not len(after):
-                    continue
-                step_ns = float(np.median(np.diff(before[-100:])))
-                count = (
-                    round((after.min() - before.max()) / step_ns) - 1
-                    if step_ns > 0
-                    else 0
-                )
-                if count > 0:
-                    lost[name] = count
-            loss.messages = lost or None
+        loss.messages = missing
 
 
-_NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
 _TRANSIENT_LOCAL = re.compile(r"durability:\s*(1\b|transient_local)")
 
 
 class Descriptions:
-    """Schemas and channels by their numbers.
-
-    The first description of a number counts, but one under a CRC goes before one without. Those of the summary come
-    first, so that they replace any that are lost in the data.
-    """
+    """Schemas and channels by their numbers; the first description of a number counts."""
 
     def __init__(self, path: Path, keep: Callable[[str], Keep]) -> None:
         self._path = path
         self._keep = keep
-        self._schemas: dict[int, tuple[Schema, bool]] = {}
-        self._channels: dict[int, tuple[Channel, bool]] = {}
+        self._schemas: dict[int, Schema] = {0: Schema(0, b"", "", "")}
+        self._channels: dict[int, Channel] = {}
         self.by_channel: dict[int, Topic] = {}
         self.by_name: dict[str, Topic] = {}
         self.as_written: dict[str, tuple[Channel, Schema]] = {}
@@ -359,35 +321,24 @@ class Descriptions:
         self.remarks: dict[str, None] = {}
         """Texts in their order."""
 
-    def add_summary(self, summary: FileSummary) -> None:
-        """Add the copies in the summary."""
-        for schema in summary.schemas:
-            self._add_schema(schema, is_covered=summary.has_crc)
-        for channel in summary.channels:
-            self._add_channel(channel, is_covered=summary.has_crc)
-
-    def add(self, opcode: int, content: bytes, *, is_covered: bool) -> None:
-        """Add a record; ``is_covered``: a CRC fits it. Content that is no record of this kind is a LogError."""
-        if opcode == Opcode.SCHEMA:
-            self._add_schema(parse(Schema.read, content), is_covered=is_covered)
-        elif opcode == Opcode.CHANNEL:
-            self._add_channel(parse(Channel.read, content), is_covered=is_covered)
-
-    def _add_schema(self, schema: Schema, *, is_covered: bool) -> None:
-        self._holds(
-            self._schemas, schema, f"schema {schema.id}", "name", is_covered=is_covered
-        )
-
-    def _add_channel(self, channel: Channel, *, is_covered: bool) -> None:
-        if not self._holds(
-            self._channels,
-            channel,
-            f"channel {channel.id}",
-            "topic",
-            is_covered=is_covered,
-        ):
+    def add(self, record: Schema | Channel) -> None:
+        """Add a description; one that differs from an earlier one of the same number is remarked upon."""
+        if isinstance(record, Schema):
+            first = self._schemas.setdefault(record.id, record)
+            if first != record:
+                self._remark(f"schema {record.id} ({first.name})")
             return
-        schema, _ = self._schemas.get(channel.schema_id, (_NO_SCHEMA, True))
+        known = self._channels.setdefault(record.id, record)
+        if known is record:
+            self._add_topic(record)
+        elif known != record:
+            self._remark(f"channel {record.id} ({known.topic})")
+
+    def _remark(self, what: str) -> None:
+        self.remarks[f"{what} is described in two ways; the first holds"] = None
+
+    def _add_topic(self, channel: Channel) -> None:
+        schema = self._schemas.get(channel.schema_id, self._schemas[0])
         offered = channel.metadata.get("offered_qos_profiles", "")
         topic = Topic(
             file=self._path,
@@ -400,29 +351,6 @@ class Descriptions:
             is_latched=channel.topic.endswith("_static")
             or bool(_TRANSIENT_LOCAL.search(offered)),
         )
+        # two channels of one topic are the same topic, as two publishers make them
         self.as_written.setdefault(channel.topic, (channel, schema))
         self.by_channel[channel.id] = self.by_name.setdefault(channel.topic, topic)
-
-    def _holds(
-        self,
-        known: dict[int, tuple[Any, bool]],
-        new: Any,
-        what: str,
-        name: str,
-        *,
-        is_covered: bool,
-    ) -> bool:
-        """Keep a description that is the first of its number, or the first under a CRC; tells whether it is kept."""
-        old, was_covered = known.get(new.id, (None, False))
-        holds = old is None or (old != new and is_covered and not was_covered)
-        if holds:
-            known[new.id] = new, is_covered
-        if old is not None and old != new:
-            which = (
-                "the one under a CRC holds"
-                if is_covered or was_covered
-                else "the first holds"
-            )
-            remark = f"{what} ({getattr(old, name)}) is described in two ways; {which}"
-            self.remarks[remark] = None
-        return holds

@@ -10,20 +10,18 @@ Topics for viewers that join late carry the quality of service "transient local"
 
 from __future__ import annotations
 
-import os
-import struct
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from sonar_graph.files import regular, written_whole
 from sonar_graph.logs.cdr import Bytes, definition
-from sonar_graph.logs.mcap.records import MAGIC, seal
+from sonar_graph.logs.mcap.log_file import seal
 from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
@@ -35,8 +33,6 @@ TRANSIENT_LOCAL = (
 """Keep last, reliable, transient local, by the numbers of rmw's enumerations as rosbag2 has them up to version 8."""
 LIBRARY = "sonar-graph"
 """Library in the header of a log that this package wrote."""
-_HEAD_AT = 17  # after the magic bytes, an opcode and a length
-_LONGEST_PROFILE = 64
 ROSBAG2_METADATA = {"serialized_metadata": ""}
 """Record that makes newer versions of rosbag2, which write words, read numbers in the offer of a channel."""
 
@@ -108,16 +104,10 @@ def recording(
 
 def is_own_log(path: Path) -> bool:
     """True for a log that this package wrote, of whatever profile, by the header of the file."""
-    with regular(path).open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
-            return False
-        stream.seek(_HEAD_AT)
-        profile_size = int.from_bytes(stream.read(4), "little")
-        if profile_size > _LONGEST_PROFILE:
-            return False
-        stream.seek(profile_size, os.SEEK_CUR)
-        own = struct.pack(f"<I{len(LIBRARY)}s", len(LIBRARY), LIBRARY.encode())
-        return stream.read(len(own)) == own
+    with regular(path).open("rb") as stream, suppress(Exception):
+        # the package raises whatever its parts raise
+        return bool(make_reader(stream).get_header().library == LIBRARY)
+    return False
 
 
 class RecordingWriter:
@@ -144,54 +134,44 @@ class RecordingWriter:
     def offer_latched(self) -> None:
         """State once in the form of rosbag2 that there are latched topics."""
         if not self._offers_latched:
+            # without it newer rosbag2 cannot read the offers
             self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
             self._offers_latched = True
 
     def write(self, messages: Sequence[Outgoing]) -> None:
         """Write messages in the order of their log times; those of one instant in the order of the list."""
         for entry in messages:
-            if entry.type_name not in self._schemas:
-                text = definition(entry.type_name).encode()
-                self._schemas[entry.type_name] = self._writer.register_schema(
-                    entry.type_name, "ros2msg", text
-                )
-            if entry.topic not in self._channels:
-                if entry.is_latched:
-                    self.offer_latched()
-                offers = (
-                    {"offered_qos_profiles": TRANSIENT_LOCAL}
-                    if entry.is_latched
-                    else {}
-                )
-                schema = self._schemas[entry.type_name]
-                self._channels[entry.topic] = self._writer.register_channel(
-                    entry.topic, "cdr", schema, offers
-                )
-        channels = [self._channels[entry.topic] for entry in messages]
-        times_ns = np.concatenate(
-            [np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)]
+            self._offer(entry)
+        rows = sorted(
+            (max(time_ns, 0), of, row)
+            for of, entry in enumerate(messages)
+            for row, time_ns in enumerate(entry.log_times_ns.tolist())
         )
-        source = np.repeat(
-            np.arange(len(messages)), [len(m.log_times_ns) for m in messages]
-        )
-        row = np.concatenate(
-            [np.arange(len(m.log_times_ns)) for m in messages]
-            or [np.empty(0, np.int64)]
-        )
-        order = np.argsort(times_ns, kind="stable")
         written = self._stream.tell()
-        for time_ns, of, at in zip(
-            times_ns[order].tolist(),
-            source[order].tolist(),
-            row[order].tolist(),
-            strict=True,
-        ):
-            self._writer.add_message(
-                channels[of], time_ns, messages[of].payloads[at].tobytes(), time_ns
-            )
-            if self._stream.tell() != written:  # a chunk was full
+        for time_ns, of, row in rows:
+            channel = self._channels[messages[of].topic]
+            payload = messages[of].payloads[row].tobytes()
+            self._writer.add_message(channel, time_ns, payload, time_ns)
+            # a chunk was full: on the disk it survives the end of this process
+            if self._stream.tell() != written:
                 self._stream.flush()
                 written = self._stream.tell()
+
+    def _offer(self, entry: Outgoing) -> None:
+        """Make a topic known to the file, once."""
+        kind = entry.type_name
+        if kind not in self._schemas:
+            text = definition(kind).encode()
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
+        if entry.topic in self._channels:
+            return
+        offers = {}
+        if entry.is_latched:
+            self.offer_latched()
+            offers["offered_qos_profiles"] = TRANSIENT_LOCAL
+        self._channels[entry.topic] = self._writer.register_channel(
+            entry.topic, "cdr", self._schemas[kind], offers
+        )
 
     def finish(self) -> None:
         """Write the summary."""

@@ -1,0 +1,106 @@
+"""Time window of a reading: the part of a log between two times of recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from sonar_graph.errors import LogError
+
+_NS_PER_S = 1_000_000_000
+_FIRST_NS, _LAST_NS = -(1 << 63), (1 << 63) - 1
+
+
+@dataclass(frozen=True)
+class Instant:
+    """Time in a log: seconds from its beginning, or absolute."""
+
+    seconds: float | None = None
+    """Seconds from the earliest recorded message."""
+    absolute_ns: int | None = None
+    """Nanoseconds since 1970, UTC."""
+
+    @classmethod
+    def parse(cls, text: str) -> Instant:
+        """Instant from a number of seconds from the log's beginning, or from a date and time, in UTC without a zone.
+
+        Any other text is a LogError.
+        """
+        try:
+            seconds = float(text)
+        except ValueError:
+            try:
+                when = datetime.fromisoformat(text)
+            except ValueError:
+                expected = "seconds from its beginning such as 90.5, or a date and time such as 2026-05-01T12:30:00Z"
+                raise LogError(
+                    f"{text!r} is no time in a log: give {expected}"
+                ) from None
+            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(
+                1970, 1, 1, tzinfo=UTC
+            )
+            return cls(
+                absolute_ns=(since.days * 86_400 + since.seconds) * _NS_PER_S
+                + since.microseconds * 1000
+            )
+        if not 0 <= seconds < _LAST_NS / _NS_PER_S:
+            raise LogError(
+                f"{text!r} is no time in a log: give seconds from its beginning, 0 or more"
+            )
+        return cls(seconds=seconds)
+
+    def resolve(self, beginning_ns: int) -> int:
+        """Nanoseconds since 1970, given those of the log's beginning."""
+        if self.absolute_ns is not None:
+            return self.absolute_ns
+        return beginning_ns + round((self.seconds or 0.0) * _NS_PER_S)
+
+
+@dataclass(frozen=True)
+class TimeWindow:
+    """Part of a log from ``start`` up to but not including ``end``; None: from the beginning, to the end.
+
+    The times of recording count, not the sensors' stamps, because only the former are in a file's index.
+
+    Examples
+    --------
+    >>> from sonar_graph import TimeWindow
+    >>> TimeWindow.parse("10", None).start
+    Instant(seconds=10.0, absolute_ns=None)
+    """
+
+    start: Instant | None = None
+    end: Instant | None = None
+
+    @classmethod
+    def parse(cls, start: str | None, end: str | None) -> TimeWindow:
+        """Window between two times in text, as `Instant.parse` takes them; None: no limit."""
+        first, last = (
+            None if text is None else Instant.parse(text) for text in (start, end)
+        )
+        return cls(first, last)
+
+    def describe(self, beginning_ns: int) -> str:
+        """Text with the limits in seconds after the log's beginning."""
+        start_ns, end_ns = self.resolve(beginning_ns)
+        start = (
+            "the beginning"
+            if self.start is None
+            else f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        )
+        end = (
+            "the end"
+            if self.end is None
+            else f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        )
+        return f"{start} to {end} of the recording"
+
+    def resolve(self, beginning_ns: int) -> tuple[int, int]:
+        """First instant within and first instant after the window, nanoseconds since 1970."""
+        start_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
+        end_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
+        if start_ns >= end_ns:
+            raise LogError(
+                "the wanted part of the log ends before it starts: --start must be less than --end"
+            )
+        return start_ns, end_ns
