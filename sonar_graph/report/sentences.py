@@ -338,7 +338,9 @@ def beside_the_paper(comparison: Comparison) -> str | None:
     sequence = comparison.sequence
     calibration = sequence.calibration
     params = flattened(run.params)
-    has_gaps = "log.gaps" in sequence.notes
+    longest_s = float(np.diff(sequence.dvl.stamps_ns).max(initial=0)) * 1e-9
+    is_held = calibration.odometry_interpolation == "hold-past"
+    has_gaps = longest_s > calibration.dvl.gap_s and not is_held
     additions = {
         "depth": sequence.depth is not None,
         "gravity for roll and pitch": calibration.use_gravity,
@@ -347,7 +349,7 @@ def beside_the_paper(comparison: Comparison) -> str | None:
         "headings with Huber's kernel and the compass' bias": sequence.heading
         is not None,
         "position fixes with Huber's kernel": sequence.positions is not None,
-        "larger noise in gaps of the Doppler log": has_gaps,
+        "accelerometers and larger noise where the Doppler log has no sample for long": has_gaps,
         "far_views": has_gaps and params.get("far_views", False),
         "gate_probability": params.get("gate_probability", 1.0) < 1.0,
         "kernel_width": params.get("kernel_width", 0.0) > 0.0,
