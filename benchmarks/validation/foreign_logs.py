@@ -1,22 +1,25 @@
 """Logs by another hand: every fault of the table of checks at three sizes, and logs without a fault.
 
-    python benchmarks/validation/foreign_logs.py [--quick] [--faultless 50] [--only FAULT ...] [--keep FOLDER]
+    python benchmarks/validation/foreign_logs.py [--quick] [--seed 1] [--faultless 50] [--coverage 100]
+        [--only WORD ...] [--results FILE] [--table docs/theory/foreign_logs.md]
 
-World, sensors and writer share no code with the package: splines of scipy, messages of `rosbags`, files of `mcap`.
-Errors of sensors are white and correlated (Gauss-Markov). A log is judged by ``sonar-graph compare``, by its exit code,
-its printed lines and the trajectories that it writes:
+Worlds and files are those of `foreign_world.py`. A log is judged by ``sonar-graph compare``, by its exit code, its
+printed lines and the trajectories that it writes:
 
 * ``silent``: the error is over five times that of the log without the fault, and no line names the cause;
 * ``warned``: a line names the cause, the error is over five times as large, and the exit code is 0;
 * ``misled``: a line asks for a change of a sensor that is right;
+* ``unhelpful``: no results, and no line names the cause;
 * ``false_alarms``: a log without a fault whose lines ask for a change, or whose exit code is not 0.
 
-``coverage`` counts how often the 95 % intervals of ``sonar-graph inspect --json`` hold the true value on logs without a
-fault. docs/theory/sensor_check.md has the table of checks.
+Rows that their driver marks as not measured are judged against the log without these rows. ``--coverage`` counts how
+often the 95 % intervals of ``sonar-graph inspect --json`` hold the true value on logs without a fault. Each log's
+outcome is added to ``--results`` at once; a second run with the same file goes on where the first stopped.
 """
 
 import argparse
 import contextlib
+import copy
 import io
 import json
 import os
@@ -25,196 +28,124 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer
-from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
+from foreign_world import EPOCH_S, Floats, Log, Mask, calibration_of, make_log, write
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import make_parser, note, print_figures, print_table
 
 os.environ.setdefault("COLUMNS", "2000")  # before rich: a warning stays on its line
+from sonar_graph import report
 from sonar_graph.cli.main import main as main_command
+from sonar_graph.evaluation import write_comparison
 
-Floats = NDArray[np.float64]
-DURATION_S = 60.0
-EPOCH_S = 1_760_000_000
-GRAVITY_M_S2 = 9.80665
-DVL_ARM_M = np.array([0.3, 0.0, -0.1])
+report.write_report = write_comparison  # the page is not judged, and its figures take half of the time
+
 WORSE = 5.0
 """Ratio of errors above which a fault matters."""
 LEAST_ERROR_M = 0.05
-SONAR = """std_msgs/Header header
-float64[] range_m
-float64[] azimuth_rad
-float64[] covariance
-int64[] candidate_ids
-float64[] id_probability
-int64[] track"""
-
-
-@dataclass
-class Log:
-    """Rows of every sensor; times in seconds from the start."""
-
-    imu_s: Floats
-    rate: Floats
-    force: Floats
-    dvl_s: Floats
-    velocity: Floats
-    depth_s: Floats
-    z_m: Floats
-    heading_s: Floats
-    yaw_rad: Floats
-    fix_s: Floats
-    fix_m: Floats
-    frame_s: Floats
-    sightings: list[tuple[NDArray[np.int64], Floats, Floats]]
-    """Identities, ranges and azimuths of each frame."""
-    start: tuple[Floats, Floats]
-    """Position, and roll, pitch, yaw."""
-    truth: Floats
-    """Seconds and position, shape (n, 4)."""
-
-
-def gauss_markov(
-    rng: np.random.Generator, times: Floats, sigma: float, time_s: float
-) -> Floats:
-    """An error that holds for some time, shape (n,)."""
-    keep = np.exp(-np.diff(times, prepend=times[0]) / time_s)
-    drawn = sigma * np.sqrt(1 - keep**2) * rng.standard_normal(len(times))
-    value = sigma * float(rng.standard_normal())
-    found = np.empty(len(times))
-    for k in range(len(times)):
-        value = keep[k] * value + drawn[k]
-        found[k] = value
-    return found
-
-
-def make_log(seed: int) -> Log:
-    """One dive of `DURATION_S` without a fault."""
-    rng = np.random.default_rng(seed)
-    knots = np.arange(-6.0, DURATION_S + 12.0, 3.0)
-    turns = np.cumsum(rng.normal(0.0, 0.35, len(knots)))
-    yaw = turns + rng.uniform(-np.pi, np.pi)
-    speed = rng.uniform(0.4, 1.0) + 0.15 * rng.standard_normal(len(knots))
-    sway = 0.12 * rng.standard_normal(len(knots))
-    steps = 3.0 * (speed + 1j * sway) * np.exp(1j * yaw)
-    level = np.cumsum(steps)
-    z = -4.0 + np.cumsum(rng.normal(0.0, 0.5, len(knots)))
-    z = np.minimum(z, -0.5)
-    place = CubicSpline(knots, np.column_stack([level.real, level.imag, z]))
-    tilt = 0.04 * rng.standard_normal((2, len(knots)))
-    attitude = RotationSpline(
-        knots, Rotation.from_euler("ZYX", np.column_stack([yaw, tilt[0], tilt[1]]))
-    )
-
-    def instants(rate_hz: float) -> Floats:
-        return np.arange(0.0, DURATION_S, 1.0 / rate_hz)
-
-    imu_s, dvl_s, depth_s, heading_s, fix_s, frame_s = map(
-        instants, (50.0, 5.0, 5.0, 5.0, 1.0, 2.0)
-    )
-    gravity = np.array([0.0, 0.0, GRAVITY_M_S2])
-    rate = (
-        attitude(imu_s, 1)
-        + rng.normal(0, 7e-4, (len(imu_s), 3))
-        + rng.normal(0, 5e-5, 3)
-    )
-    force = attitude(imu_s).inv().apply(place(imu_s, 2) + gravity)
-    force = force + rng.normal(0, 7e-3, force.shape) + rng.normal(0, 5e-3, 3)
-    velocity = attitude(dvl_s).inv().apply(place(dvl_s, 1)) + np.cross(
-        attitude(dvl_s, 1), DVL_ARM_M
-    )
-    slow = np.column_stack([gauss_markov(rng, dvl_s, 0.002, 5.0) for _ in range(3)])
-    velocity = (
-        velocity * (1 + rng.normal(0, 0.001))
-        + slow
-        + rng.normal(0, 0.01, velocity.shape)
-    )
-    z_m = (
-        place(depth_s)[:, 2]
-        + gauss_markov(rng, depth_s, 0.01, 3.0)
-        + rng.normal(0, 0.01, len(depth_s))
-    )
-    yaw_rad = attitude(heading_s).as_euler("ZYX")[:, 0]
-    yaw_rad = (
-        yaw_rad
-        + gauss_markov(rng, heading_s, 0.01, 20.0)
-        + rng.normal(0, 0.01, len(heading_s))
-    )
-    wander = np.column_stack([gauss_markov(rng, fix_s, 0.15, 10.0) for _ in range(3)])
-    fix_m = place(fix_s) + wander + rng.normal(0, 0.3, (len(fix_s), 3))
-    first = place(imu_s[0])
-    spread = place(np.linspace(0, DURATION_S, 25)) + np.column_stack(
-        [rng.normal(0, 5.0, (25, 2)), np.zeros(25)]
-    )
-    spread[:, 2] += rng.normal(0, 0.3, 25)
-    sightings = []
-    for second in frame_s:
-        seen = attitude(second).inv().apply(spread - place(second))
-        distance = np.linalg.norm(seen, axis=1)
-        azimuth = np.arctan2(seen[:, 1], seen[:, 0])
-        elevation = np.arcsin(seen[:, 2] / distance)
-        visible = (
-            (distance > 1.0)
-            & (distance < 12.0)
-            & (np.abs(azimuth) < 0.8)
-            & (np.abs(elevation) < 0.12)
-        )
-        ids = np.flatnonzero(visible)
-        noisy_r = distance[ids] + rng.normal(0, 0.02, len(ids))
-        noisy_a = azimuth[ids] + rng.normal(0, 0.009, len(ids))
-        sightings.append((ids.astype(np.int64), noisy_r, noisy_a))
-    yaw_0, pitch_0, roll_0 = attitude(0.0).as_euler("ZYX")
-    start = (first, np.array([roll_0, pitch_0, yaw_0]))
-    truth = np.column_stack([imu_s, place(imu_s)])
-    return Log(
-        *(
-            imu_s,
-            rate,
-            force,
-            dvl_s,
-            velocity,
-            depth_s,
-            z_m,
-            heading_s,
-            yaw_rad,
-            fix_s,
-            fix_m,
-            frame_s,
-            sightings,
-        ),
-        start=start,
-        truth=truth,
-    )
+BURST_S = 2.0
+"""Typical length of a stretch without measurements."""
+FAULTLESS = "faultless"
+QUANTITIES = ("angular rate", "specific force", "velocity", "depth", "heading", "position", "range", "azimuth")
+KINDS = ("stuck", "late", "axes or sense", "unit", "scale", "marked invalid")
 
 
 # --- faults ------------------------------------------------------------------------------------------------------
+
+Spoil = Callable[[Log, float], None]
 
 
 @dataclass(frozen=True)
 class Fault:
     """A fault, its sizes, and what a line must contain to name its cause."""
 
+    quantity: str
+    kind: str
+    detail: str
+    """What the sizes are."""
     sizes: tuple[float, ...]
-    spoil: Callable[[Log, float], None]
+    spoil: Spoil
     words: str
     """Regular expression of the cause."""
-    roles: tuple[str, ...]
+    roles: frozenset[str]
     """Tables and sections that a line may ask to change."""
+    needs: frozenset[str] = frozenset()
+    """Sensors beside IMU and Doppler log, without which the fault has no effect or no witness."""
+
+    @property
+    def name(self) -> str:
+        """Name for the results."""
+        return f"{self.quantity}: {self.kind}, {self.detail}"
 
 
-def stuck(times: Floats, values: Floats, from_s: float) -> None:
+def stuck(times: str, values: str) -> Spoil:
     """Repeat one value from an instant on."""
-    later = times >= from_s
-    values[later] = values[np.argmax(later)]
+
+    def spoil(log: Log, from_s: float) -> None:
+        later = getattr(log, times) >= from_s
+        column = getattr(log, values)
+        column[later] = column[np.argmax(later)]
+
+    return spoil
+
+
+def late(times: str) -> Spoil:
+    """Add seconds to the stamps."""
+
+    def spoil(log: Log, seconds: float) -> None:
+        setattr(log, times, getattr(log, times) + seconds)
+
+    return spoil
+
+
+def scaled(values: str) -> Spoil:
+    """Multiply the values."""
+
+    def spoil(log: Log, factor: float) -> None:
+        setattr(log, values, getattr(log, values) * factor)
+
+    return spoil
+
+
+def turned(values: str, axes: list[list[float]]) -> Spoil:
+    """Turn or mirror vectors: new = axes @ old; the size does not matter."""
+    matrix = np.array(axes)
+
+    def spoil(log: Log, _: float) -> None:
+        setattr(log, values, getattr(log, values) @ matrix.T)
+
+    return spoil
+
+
+def one_axis_negated(values: str) -> Spoil:
+    """Negate the axis that the size numbers."""
+
+    def spoil(log: Log, axis: float) -> None:
+        getattr(log, values)[:, int(axis)] *= -1
+
+    return spoil
+
+
+def added(values: str, factor: float = 1.0) -> Spoil:
+    """Add a constant, the size times a factor."""
+
+    def spoil(log: Log, size: float) -> None:
+        setattr(log, values, getattr(log, values) + size * factor)
+
+    return spoil
+
+
+def clockwise(log: Log, _: float) -> None:
+    log.yaw_rad = np.pi / 2 - log.yaw_rad
+
+
+def bias_of_yaw_rate(log: Log, rad_s: float) -> None:
+    log.rate[:, 2] += rad_s
 
 
 def scale_ranges(log: Log, factor: float) -> None:
@@ -225,357 +156,187 @@ def scale_azimuths(log: Log, factor: float) -> None:
     log.sightings = [(ids, r, a * factor) for ids, r, a in log.sightings]
 
 
-def turn_velocity(log: Log, axes: tuple[float, float, float]) -> None:
-    log.velocity *= np.array(axes)
+def repeat_frames(log: Log, from_s: float) -> None:
+    first = int(np.argmax(log.frame_s >= from_s))
+    first = next((k for k in range(first, len(log.frame_s)) if len(log.sightings[k][0])), first)
+    log.sightings[first:] = [log.sightings[first]] * (len(log.frame_s) - first)
 
 
-def late(name: str) -> Callable[[Log, float], None]:
-    def spoil(log: Log, seconds: float) -> None:
-        setattr(log, name, getattr(log, name) + seconds)
-
-    return spoil
-
-
-def factor_of(name: str) -> Callable[[Log, float], None]:
-    def spoil(log: Log, factor: float) -> None:
-        setattr(log, name, getattr(log, name) * factor)
-
-    return spoil
+def hold_azimuths(log: Log, from_s: float) -> None:
+    """Every landmark keeps the azimuth at which it was first seen from an instant on."""
+    held: dict[int, float] = {}
+    for k in np.flatnonzero(log.frame_s >= from_s):
+        ids, r, a = log.sightings[k]
+        log.sightings[k] = (ids, r, np.array([held.setdefault(i, v) for i, v in zip(ids.tolist(), a, strict=True)]))
 
 
-def mirrored(axes: tuple[float, float, float]) -> Callable[[Log, float], None]:
-    return lambda log, _: turn_velocity(log, axes)
+def bursts(times: Floats, share: float) -> Mask:
+    """Rows in stretches of some seconds, a share of all; the first five seconds are whole."""
+    rng = np.random.default_rng(round(1e3 * share))
+    period_s = BURST_S / share
+    phase_s = rng.uniform(0.0, period_s)
+    return ((times + phase_s) % period_s < BURST_S) & (times > 5.0)
 
 
-def rotated_90(log: Log, _: float) -> None:
-    log.velocity = log.velocity[:, [1, 0, 2]] * np.array([1.0, -1.0, 1.0])
+@dataclass(frozen=True)
+class Marked:
+    """Rows that hold no measurement and are marked by their driver, or are not finite.
+
+    ``without``: the same log as it is where a driver sends nothing instead.
+    """
+
+    sensor: str
+    times: str
+    values: str
+    is_finite: bool
+
+    def __call__(self, log: Log, share: float) -> None:
+        """Put zeros into marked rows, or NaN."""
+        times = getattr(log, self.times)
+        rows = bursts(times, share)
+        getattr(log, self.values)[rows] = 0.0 if self.is_finite else np.nan
+        if self.is_finite:
+            log.unmeasured[self.sensor] = rows
+
+    def without(self, log: Log, share: float) -> None:
+        """Leave the rows out; of an IMU without forces, the forces."""
+        rows = bursts(getattr(log, self.times), share)
+        if self.sensor == "force":
+            log.force[rows] = np.nan
+            return
+        of_message = ("rate", "force") if self.sensor == "rate" else (self.values,)
+        for name in (self.times, *of_message):
+            setattr(log, name, getattr(log, name)[~rows])
 
 
-def swap_fixes(log: Log, _: float) -> None:
-    log.fix_m = log.fix_m[:, [1, 0, 2]]
+@dataclass(frozen=True)
+class MarkedSightings:
+    """Sightings whose range (1) or azimuth (2) is not finite."""
+
+    column: int
+
+    def __call__(self, log: Log, share: float) -> None:
+        """Put NaN into the frames of some stretches."""
+        for k in np.flatnonzero(bursts(log.frame_s, share)):
+            of_frame = list(log.sightings[k])
+            of_frame[self.column] = np.full(len(of_frame[0]), np.nan)
+            log.sightings[k] = tuple(of_frame)
+
+    def without(self, log: Log, share: float) -> None:
+        """Leave the sightings out."""
+        for k in np.flatnonzero(bursts(log.frame_s, share)):
+            log.sightings[k] = tuple(part[:0] for part in log.sightings[k])
 
 
-def add_depth(log: Log, metres: float) -> None:
-    log.z_m = log.z_m + metres
+FROM_S = (15.0, 30.0, 45.0)
+SHARES = (0.1, 0.3, 0.5)
+AGAIN = (0.0, 1.0, 2.0)
+"""Of faults without a size: three worlds."""
+DEGREES = float(np.degrees(1.0))
+FOOT = 1 / 0.3048
+ANY = r"left out|not measured|no velocity|no sample|not finite"
 
 
-def clockwise(log: Log, _: float) -> None:
-    log.yaw_rad = np.pi / 2 - log.yaw_rad
+def roles(*names: str) -> frozenset[str]:
+    return frozenset(names)
 
 
-def turn_heading(log: Log, degrees: float) -> None:
-    log.yaw_rad = log.yaw_rad + np.radians(degrees)
+def table() -> Iterator[Fault]:
+    """Every fault."""
+    imu, dvl = roles("imu"), roles("dvl")
+    q = "angular rate"
+    gyro = r"angular rate|gyro"
+    yield Fault(q, "stuck", "from a second on", FROM_S, stuck("imu_s", "rate"), r"angular rate.*same|gyro", imu)
+    yield Fault(q, "late", "seconds, of the whole IMU", (0.5, 1.0, 1.5), late("imu_s"), r"DVL against IMU", roles("imu", "dvl"))
+    yield Fault(q, "axes or sense", "axis negated", (0.0, 1.0, 2.0), one_axis_negated("rate"), gyro, imu)
+    yield Fault(q, "axes or sense", "x and z exchanged", AGAIN, turned("rate", [[0, 0, 1], [0, 1, 0], [1, 0, 0]]), gyro, imu)
+    yield Fault(q, "unit", "degrees", (DEGREES,) * 3, scaled("rate"), r"gyro.*degrees", imu)
+    yield Fault(q, "scale", "factor", (1.02, 1.05, 0.95), scaled("rate"), r"angular_velocity_scale", imu, roles("heading"))
+    yield Fault(q, "scale", "bias of yaw rate, rad/s", (0.005, 0.01, -0.02), bias_of_yaw_rate, r"gyro bias", imu, roles("heading"))
+    yield Fault(q, "marked invalid", "share, -1 in the covariance", SHARES, Marked("rate", "imu_s", "rate", True), ANY, imu)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, Marked("rate", "imu_s", "rate", False), ANY, imu)
 
+    q = "specific force"
+    force = r"specific force|accelerometer|gravity"
+    yield Fault(q, "stuck", "from a second on", FROM_S, stuck("imu_s", "force"), r"specific force.*same", imu)
+    yield Fault(q, "axes or sense", "negated", AGAIN, turned("force", [[-1, 0, 0], [0, -1, 0], [0, 0, -1]]), force, imu)
+    yield Fault(q, "axes or sense", "x and z exchanged", AGAIN, turned("force", [[0, 0, 1], [0, 1, 0], [1, 0, 0]]), force, imu)
+    yield Fault(q, "axes or sense", "x and y exchanged", AGAIN, turned("force", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]), force, imu)
+    yield Fault(q, "unit", "g, mg, cm/s2", (1 / 9.80665, 1e3 / 9.80665, 1e2), scaled("force"), force, imu)
+    yield Fault(q, "scale", "factor", (1.05, 1.25, 0.8), scaled("force"), force, imu)
+    yield Fault(q, "marked invalid", "share, -1 in the covariance", SHARES, Marked("force", "imu_s", "force", True), ANY, imu)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, Marked("force", "imu_s", "force", False), ANY, imu)
 
-def bias_gyro(log: Log, rad_s: float) -> None:
-    log.rate[:, 2] += rad_s
+    q = "velocity"
+    axes = r"DVL axes"
+    scale = r"DVL.*(unit|scale)|Doppler"
+    by_scale = roles("dvl", "positions", "detections", "depth")
+    yield Fault(q, "stuck", "from a second on", FROM_S, stuck("dvl_s", "velocity"), r"velocity.*same|DVL.*(same|stuck|repeat)", dvl)
+    yield Fault(q, "late", "seconds", (0.5, 1.0, 1.5), late("dvl_s"), r"DVL against IMU", dvl)
+    yield Fault(q, "axes or sense", "y negated", AGAIN, turned("velocity", [[1, 0, 0], [0, -1, 0], [0, 0, 1]]), axes, dvl)
+    yield Fault(q, "axes or sense", "x and y negated", AGAIN, turned("velocity", [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]), axes, dvl)
+    yield Fault(q, "axes or sense", "z negated", AGAIN, turned("velocity", [[1, 0, 0], [0, 1, 0], [0, 0, -1]]), axes, dvl)
+    yield Fault(q, "axes or sense", "y and z negated", AGAIN, turned("velocity", [[1, 0, 0], [0, -1, 0], [0, 0, -1]]), axes, dvl)
+    yield Fault(q, "axes or sense", "negated", AGAIN, turned("velocity", [[-1, 0, 0], [0, -1, 0], [0, 0, -1]]), axes, dvl)
+    yield Fault(q, "axes or sense", "turned by 90 degrees", AGAIN, turned("velocity", [[0, -1, 0], [1, 0, 0], [0, 0, 1]]), r"DVL axes|mounting yaw", dvl)
+    yield Fault(q, "unit", "mm/s, cm/s, knots", (1e3, 1e2, 1 / 0.5144), scaled("velocity"), scale, by_scale)
+    yield Fault(q, "scale", "factor", (1.1, 0.9, 1.2), scaled("velocity"), scale, by_scale)
+    yield Fault(q, "marked invalid", "share, huge variance", SHARES, Marked("velocity", "dvl_s", "velocity", True), ANY, dvl)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, Marked("velocity", "dvl_s", "velocity", False), ANY, dvl)
 
+    q = "depth"
+    depth = roles("depth", "start")
+    needs = roles("depth")
+    times = r"depth.*\d times as much|depth.*height begins|depth.*(rises|another sign|times)"
+    yield Fault(q, "stuck", "from a second on", FROM_S, stuck("depth_s", "z_m"), r"depth.*(repeat|stuck|same)", depth, needs)
+    yield Fault(q, "late", "seconds", (1.0, 2.0, 3.0), late("depth_s"), r"depth.*too late", depth, needs)
+    yield Fault(q, "axes or sense", "factor", (-1.0, -FOOT, -100.0), scaled("z_m"), times, depth, needs)
+    yield Fault(q, "unit", "feet, cm, decimetres", (FOOT, 100.0, 10.0), scaled("z_m"), times, depth, needs)
+    yield Fault(q, "scale", "factor", (1.15, 0.8, 1.25), scaled("z_m"), times, depth, needs)
+    yield Fault(q, "scale", "origin, m", (5.0, 20.0, -10.0), added("z_m"), r"depth.*height begins", depth, needs)
+    yield Fault(q, "marked invalid", "share, huge variance", SHARES, Marked("depth", "depth_s", "z_m", True), ANY, depth, needs)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, Marked("depth", "depth_s", "z_m", False), ANY, depth, needs)
 
-def flip_gyro(log: Log, axis: float) -> None:
-    log.rate[:, int(axis)] *= -1
+    q = "heading"
+    heading = roles("heading")
+    needs = roles("heading")
+    yield Fault(q, "stuck", "from a second on", FROM_S, stuck("heading_s", "yaw_rad"), r"heading.*(repeat|stuck|same)", heading, needs)
+    yield Fault(q, "late", "seconds", (0.7, 1.5, 2.5), late("heading_s"), r"heading.*too late", heading, needs)
+    yield Fault(q, "axes or sense", "clockwise from north", AGAIN, clockwise, r"heading.*(clockwise|height)", heading, needs)
+    yield Fault(q, "axes or sense", "turned, degrees", (25.0, 60.0, -90.0), added("yaw_rad", np.pi / 180), r"heading.*towards the positions", roles("heading", "dvl"), needs | {"fixes"})
+    yield Fault(q, "unit", "degrees", (DEGREES,) * 3, scaled("yaw_rad"), r"heading.*degrees|heading.*(another|of its changes)|yaw_rad.*degrees", heading, needs)
+    yield Fault(q, "scale", "factor", (1.1, 0.9, 1.3), scaled("yaw_rad"), r"heading", roles("heading", "imu"), needs)
+    yield Fault(q, "marked invalid", "share, huge sigma or no quaternion", SHARES, Marked("heading", "heading_s", "yaw_rad", True), ANY, heading, needs)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, Marked("heading", "heading_s", "yaw_rad", False), ANY, heading, needs)
 
+    q = "position"
+    positions = roles("positions", "start")
+    needs = roles("fixes")
+    yield Fault(q, "stuck", "from a second on", FROM_S, stuck("fix_s", "fix_m"), r"position.*(repeat|stuck|same)", positions, needs)
+    yield Fault(q, "late", "seconds", (1.5, 2.0, 3.0), late("fix_s"), r"position.*too late", positions, needs)
+    yield Fault(q, "axes or sense", "x and y exchanged", AGAIN, turned("fix_m", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]), r"position.*(exchanged|begin|of its changes)|towards the positions", positions | {"heading", "dvl"}, needs)
+    yield Fault(q, "unit", "mm, feet, cm", (1e3, FOOT, 1e2), scaled("fix_m"), r"position.*(times as much|begin)", positions, needs)
+    yield Fault(q, "scale", "factor", (1.1, 0.9, 1.25), scaled("fix_m"), r"position.*(times as much|begin)", positions | {"dvl"}, needs)
+    yield Fault(q, "marked invalid", "share, huge variance", SHARES, Marked("fixes", "fix_s", "fix_m", True), ANY, positions, needs)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, Marked("fixes", "fix_s", "fix_m", False), ANY, positions, needs)
 
-FAULTS = {
-    "depth unit": Fault(
-        (1 / 0.3048, 100.0, 10.0),
-        factor_of("z_m"),
-        r"depth.*\d times as much",
-        ("depth", "start"),
-    ),
-    "depth sense": Fault(
-        (-1.0, -1 / 0.3048, -100.0),
-        factor_of("z_m"),
-        r"depth.*(rises|another sign)",
-        ("depth", "start"),
-    ),
-    "depth scale": Fault(
-        (1.15, 0.8, 1.25), factor_of("z_m"), r"depth.*times as much", ("depth", "start")
-    ),
-    "depth late": Fault(
-        (1.0, 2.0, 3.0), late("depth_s"), r"depth.*too late", ("depth",)
-    ),
-    "depth stuck": Fault(
-        (15.0, 30.0, 45.0),
-        lambda log, s: stuck(log.depth_s, log.z_m, s),
-        r"depth.*repeat",
-        ("depth",),
-    ),
-    "depth origin": Fault(
-        (5.0, 20.0, -10.0), add_depth, r"depth.*height begins", ("depth", "start")
-    ),
-    "heading sense": Fault(
-        (0.0, 1.0, 2.0), clockwise, r"heading.*clockwise", ("heading",)
-    ),
-    "heading late": Fault(
-        (0.7, 1.5, 2.5), late("heading_s"), r"heading.*too late", ("heading",)
-    ),
-    "heading stuck": Fault(
-        (15.0, 30.0, 45.0),
-        lambda log, s: stuck(log.heading_s, log.yaw_rad, s),
-        r"heading.*repeat",
-        ("heading",),
-    ),
-    "heading turned": Fault(
-        (25.0, 60.0, -90.0),
-        turn_heading,
-        r"heading.*towards the positions",
-        ("heading", "dvl"),
-    ),
-    "fix unit": Fault(
-        (1e3, 1 / 0.3048, 1e2),
-        factor_of("fix_m"),
-        r"position.*times as much",
-        ("positions", "start"),
-    ),
-    "fix late": Fault(
-        (1.5, 2.0, 3.0), late("fix_s"), r"position.*too late", ("positions",)
-    ),
-    "fix stuck": Fault(
-        (15.0, 28.0, 45.0),
-        lambda log, s: stuck(log.fix_s, log.fix_m, s),
-        r"positions.*repeat",
-        ("positions",),
-    ),
-    "fix axes": Fault(
-        (0.0, 1.0, 2.0),
-        swap_fixes,
-        r"position.*(exchanged|begin)",
-        ("positions", "heading", "dvl"),
-    ),
-    "velocity left is right": Fault(
-        (0.0, 1.0, 2.0), mirrored((1, -1, 1)), r"DVL axes.*mirrored", ("dvl",)
-    ),
-    "velocity backwards": Fault(
-        (0.0, 1.0, 2.0), mirrored((-1, -1, 1)), r"DVL axes", ("dvl",)
-    ),
-    "velocity z turned": Fault(
-        (0.0, 1.0, 2.0), mirrored((1, 1, -1)), r"DVL axes", ("dvl",)
-    ),
-    "velocity down": Fault(
-        (0.0, 1.0, 2.0), mirrored((1, -1, -1)), r"DVL axes", ("dvl",)
-    ),
-    "velocity negated": Fault(
-        (0.0, 1.0, 2.0), mirrored((-1, -1, -1)), r"DVL axes", ("dvl",)
-    ),
-    "velocity across": Fault(
-        (0.0, 1.0, 2.0), rotated_90, r"DVL axes|mounting yaw", ("dvl",)
-    ),
-    "velocity unit": Fault(
-        (1e3, 1e2, 1 / 0.5144),
-        factor_of("velocity"),
-        r"DVL.*(unit|scale)",
-        ("dvl", "positions"),
-    ),
-    "velocity scale": Fault(
-        (1.1, 0.9, 1.2),
-        factor_of("velocity"),
-        r"DVL scale|Doppler",
-        ("dvl", "positions", "detections"),
-    ),
-    "velocity late": Fault(
-        (0.5, 1.0, 1.5), late("dvl_s"), r"DVL against IMU", ("dvl",)
-    ),
-    "range unit": Fault(
-        (1e3, 1e2, 1 / 0.3048),
-        scale_ranges,
-        r"ranges.*times as much",
-        ("detections", "dvl"),
-    ),
-    "range scale": Fault(
-        (1.045, 1.1, 0.9), scale_ranges, r"ranges.*times as much", ("detections", "dvl")
-    ),
-    "azimuth sense": Fault(
-        (-1.0, -1.0, -1.0), scale_azimuths, r"azimuths.*mirrored", ("detections",)
-    ),
-    "azimuth unit": Fault(
-        (57.29578, 57.29578, 57.29578),
-        scale_azimuths,
-        r"azimuth.*degrees",
-        ("detections",),
-    ),
-    "gyro scale": Fault(
-        (1.02, 1.05, 0.95), factor_of("rate"), r"angular_velocity_scale", ("imu",)
-    ),
-    "gyro unit": Fault(
-        (57.29578, 57.29578, 57.29578), factor_of("rate"), r"gyro.*degrees", ("imu",)
-    ),
-    "gyro bias": Fault((0.005, 0.01, -0.02), bias_gyro, r"gyro bias", ("imu",)),
-    "gyro sense": Fault(
-        (0.0, 1.0, 2.0),
-        flip_gyro,
-        r"gyro rates|turns against the gyros",
-        ("imu", "heading"),
-    ),
-}
-
-
-# --- messages ----------------------------------------------------------------------------------------------------
-
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-STORE.register(get_types_from_msg(SONAR, "sonar_graph_msgs/msg/LandmarkDetections"))
-TYPES = STORE.types
-
-
-def header(seconds: float, frame: str) -> Any:
-    """Header at some seconds after the epoch."""
-    ns = round(seconds * 1e9) + EPOCH_S * 1_000_000_000
-    stamp = TYPES["builtin_interfaces/msg/Time"](
-        sec=ns // 1_000_000_000, nanosec=ns % 1_000_000_000
-    )
-    return TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
-
-
-def vector(values: Floats) -> Any:
-    """Vector3."""
-    return TYPES["geometry_msgs/msg/Vector3"](*map(float, values))
-
-
-def point(values: Any) -> Any:
-    """Point."""
-    return TYPES["geometry_msgs/msg/Point"](*map(float, values))
-
-
-def pose(seconds: float, values: Any, variance: float) -> Any:
-    """PoseWithCovarianceStamped of a position."""
-    covariance = np.zeros(36)
-    covariance[[0, 7, 14]] = variance
-    quaternion = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    inner = TYPES["geometry_msgs/msg/Pose"](point(values), quaternion)
-    with_covariance = TYPES["geometry_msgs/msg/PoseWithCovariance"](inner, covariance)
-    return TYPES["geometry_msgs/msg/PoseWithCovarianceStamped"](
-        header(seconds, "map"), with_covariance
-    )
-
-
-def messages(log: Log, sensors: set[str]) -> Iterator[tuple[float, str, str, Any]]:
-    """Time, topic, type and message of every row."""
-    none = np.full(9, 0.0)
-    unknown = none.copy()
-    unknown[0] = -1.0
-    no_turn = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    for t, w, f in zip(log.imu_s, log.rate, log.force, strict=True):
-        kind = "sensor_msgs/msg/Imu"
-        yield (
-            t,
-            "/imu/data",
-            kind,
-            TYPES[kind](
-                header(t, "imu_link"),
-                no_turn,
-                unknown,
-                vector(w),
-                none,
-                vector(f),
-                none,
-            ),
-        )
-    for t, v in zip(log.dvl_s, log.velocity, strict=True):
-        kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-        twist = TYPES["geometry_msgs/msg/Twist"](vector(v), vector(np.zeros(3)))
-        covariance = np.zeros(36)
-        covariance[[0, 7, 14]] = 1e-4
-        yield (
-            t,
-            "/dvl/twist",
-            kind,
-            TYPES[kind](
-                header(t, "dvl_link"),
-                TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, covariance),
-            ),
-        )
-    for t, z in zip(log.depth_s, log.z_m, strict=True):
-        yield (
-            t,
-            "/depth/pose",
-            "geometry_msgs/msg/PoseWithCovarianceStamped",
-            pose(t, (0.0, 0.0, z), 4e-4),
-        )
-    if "heading" in sensors:
-        for t, yaw in zip(log.heading_s, log.yaw_rad, strict=True):
-            kind = "geometry_msgs/msg/QuaternionStamped"
-            x, y, z, w = Rotation.from_euler("z", yaw).as_quat()
-            yield (
-                t,
-                "/heading",
-                kind,
-                TYPES[kind](
-                    header(t, "map"), TYPES["geometry_msgs/msg/Quaternion"](x, y, z, w)
-                ),
-            )
-    if "fixes" in sensors:
-        for t, p in zip(log.fix_s, log.fix_m, strict=True):
-            yield (
-                t,
-                "/usbl/fix_pose",
-                "geometry_msgs/msg/PoseWithCovarianceStamped",
-                pose(t, p, 0.12),
-            )
-    if "sonar" in sensors:
-        for t, (ids, r, a) in zip(log.frame_s, log.sightings, strict=True):
-            kind = "sonar_graph_msgs/msg/LandmarkDetections"
-            covariance = np.tile(np.array([4e-4, 0.0, 0.0, 8.1e-5]), len(ids))
-            yield (
-                t,
-                "/sonar/landmarks",
-                kind,
-                TYPES[kind](
-                    header(t, "sonar_link"),
-                    r,
-                    a,
-                    covariance,
-                    ids,
-                    np.ones(len(ids)),
-                    np.full(len(ids), -1),
-                ),
-            )
-
-
-def write(log: Log, sensors: set[str], path: Path) -> None:
-    """Write an MCAP file."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2", library="foreign_logs")
-        channels: dict[str, int] = {}
-        for t, topic, kind, message in sorted(
-            messages(log, sensors), key=lambda row: row[0]
-        ):
-            if topic not in channels:
-                definition, _ = STORE.generate_msgdef(kind, ros_version=2)
-                schema = writer.register_schema(kind, "ros2msg", definition.encode())
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            ns = round(t * 1e9) + EPOCH_S * 1_000_000_000
-            writer.add_message(
-                channels[topic], ns, bytes(STORE.serialize_cdr(message, kind)), ns
-            )
-        writer.finish()
-
-
-def calibration_of(log: Log) -> str:
-    """TOML of what the owner knows."""
-    position, rpy = (
-        ", ".join(f"{value:.4f}" for value in values) for values in log.start
-    )
-    arm = ", ".join(map(str, DVL_ARM_M))
-    return f"""[start]
-position_m = [{position}]
-rpy_rad = [{rpy}]
-position_sigma_m = [0.05, 0.05, 0.05]
-rpy_sigma_rad = [0.02, 0.02, 0.02]
-[imu]
-gyro_noise_density = 1e-4
-accel_noise_density = 1e-3
-[dvl]
-velocity_sigma_m_s = [0.01, 0.01, 0.01]
-[dvl.mounting]
-translation_m = [{arm}]
-[depth]
-sigma_m = 0.02
-[heading]
-sigma_rad = 0.015
-bias_sigma_rad = 0.02
-[positions]
-sigma_m = [0.35, 0.35, 0.35]
-"""
+    seen = roles("detections", "sonar")
+    needs = roles("sonar", "names")
+    ranges = r"ranges.*(times as much|grow|hardly)"
+    azimuths = r"azimuths?.*(times as much|mirrored|degrees|hardly)"
+    q = "range"
+    yield Fault(q, "stuck", "frame repeated from a second on", FROM_S, repeat_frames, r"(sonar|landmark|detections).*(same|repeat|hardly)", seen, needs)
+    yield Fault(q, "late", "seconds, of the frame", (0.5, 1.0, 2.0), late("frame_s"), r"(sonar|landmark|detections|azimuths|ranges).*late", seen, needs)
+    yield Fault(q, "axes or sense", "backwards", AGAIN, lambda log, _: scale_azimuths(log, -1.0), azimuths, seen, needs)
+    yield Fault(q, "unit", "mm, cm, feet", (1e3, 1e2, FOOT), scale_ranges, ranges, seen | {"dvl"}, needs)
+    yield Fault(q, "scale", "factor", (1.045, 1.1, 0.9), scale_ranges, ranges, seen | {"dvl"}, needs)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, MarkedSightings(1), ANY, seen, needs)
+    q = "azimuth"
+    yield Fault(q, "stuck", "held from a second on", FROM_S, hold_azimuths, r"azimuths|contradict|landmark", seen, needs)
+    yield Fault(q, "axes or sense", "mirrored", AGAIN, lambda log, _: scale_azimuths(log, -1.0), azimuths, seen, needs)
+    yield Fault(q, "unit", "degrees", (DEGREES,) * 3, scale_azimuths, azimuths, seen, needs)
+    yield Fault(q, "scale", "factor", (1.1, 0.8, 1.25), scale_azimuths, azimuths, seen, needs)
+    yield Fault(q, "marked invalid", "share, NaN", SHARES, MarkedSightings(2), ANY, seen, needs)
 
 
 # --- judging -----------------------------------------------------------------------------------------------------
@@ -591,11 +352,30 @@ class Outcome:
 
     def asks_for(self) -> set[str]:
         """Tables and sections that its doubts and warnings ask to change."""
-        text = " ".join(
-            line for line in self.lines if line.startswith(("Doubtful", "Warning"))
-        )
+        text = " ".join(line for line in self.lines if line.startswith(("Doubtful", "Warning")))
         asked = set(re.findall(r"under \[(\w+)\]", text))
         return asked | set(re.findall(r"`(\w+)\.[\w.]+ = ", text))
+
+    def names(self, words: str) -> bool:
+        """True where a line names a cause."""
+        return any(re.search(words, line) for line in self.lines)
+
+
+@dataclass
+class Judgement:
+    """One log, for the file of results."""
+
+    fault: str
+    size: float
+    seed: list[int]
+    verdict: str
+    is_named: bool
+    code: int
+    error_m: float
+    without_m: float | None
+    """Error of the log without the fault, where it decided."""
+    world: str
+    lines: list[str]
 
 
 def command(*words: str | Path) -> tuple[int, str]:
@@ -605,20 +385,21 @@ def command(*words: str | Path) -> tuple[int, str]:
         try:
             main_command([str(word) for word in words])
         except SystemExit as end:
-            return int(end.code or 0), printed.getvalue()
+            code = int(end.code or 0)
+            if "interrupted" in printed.getvalue():
+                raise
+            return code, printed.getvalue()
     return 0, printed.getvalue()
 
 
-def judge(log: Log, sensors: set[str], folder: Path) -> Outcome:
+def outcome_of(log: Log, folder: Path) -> Outcome:
     """Run ``compare`` as the owner of the log would."""
-    path, vehicle, results = (
-        folder / "dive.mcap",
-        folder / "vehicle.toml",
-        folder / "results",
-    )
-    write(log, sensors, path)
+    path = folder / "dive.mcap"
+    vehicle = folder / "vehicle.toml"
+    results = folder / "results"
+    write(log, path)
     vehicle.write_text(calibration_of(log))
-    options = ["--calibration", vehicle, "-o", results, "--overwrite"]
+    options = ["--calibration", vehicle, "-o", results, "--overwrite", "--estimators", "isam2,ekf-slam"]
     code, text = command("compare", path, *options)
     errors = [0.0]
     for name in ("isam2", "ekf-slam"):
@@ -626,195 +407,194 @@ def judge(log: Log, sensors: set[str], folder: Path) -> Outcome:
         if code in (0, 3) and file.exists():
             rows = np.loadtxt(file)
             seconds = rows[:, 0] - EPOCH_S
-            true = np.column_stack(
-                [
-                    np.interp(seconds, log.truth[:, 0], column)
-                    for column in log.truth[:, 1:].T
-                ]
-            )
-            errors.append(
-                float(np.sqrt(np.mean(np.sum((rows[:, 1:4] - true) ** 2, axis=1))))
-            )
+            true = np.column_stack([np.interp(seconds, log.truth[:, 0], column) for column in log.truth[:, 1:].T])
+            errors.append(float(np.sqrt(np.mean(np.sum((rows[:, 1:4] - true) ** 2, axis=1)))))
     return Outcome(code, text.splitlines(), max(errors))
 
 
-def sensors_of(fault: str, seed: int) -> set[str]:
-    """Sensors of a log beside IMU, Doppler log and depth: those of the fault, and others by its number."""
-    every = ({"sonar"}, {"heading", "fixes"}, {"sonar", "heading"})[seed % 3]
-    needed = {
-        "heading": {"heading"},
-        "fix": {"fixes"},
-        "range": {"sonar"},
-        "azimuth": {"sonar"},
+def judge(fault: Fault, size: float, seed: list[int], folder: Path) -> Judgement:
+    """Verdict on a log with a fault; the log without it is only run where it decides."""
+    right = make_log(seed, fault.needs)
+    log = copy.deepcopy(right)
+    fault.spoil(log, size)
+    outcome = outcome_of(log, folder)
+    is_named = outcome.names(fault.words)
+    is_wrong_line = bool(outcome.asks_for() - fault.roles)
+    without_m = None
+    is_worse = False
+    if outcome.code in (0, 3) and not (is_named and outcome.code == 3) and outcome.error_m > LEAST_ERROR_M:
+        if isinstance(fault.spoil, Marked | MarkedSightings):
+            fault.spoil.without(right, size)
+        without_m = outcome_of(right, folder).error_m
+        is_worse = outcome.error_m > WORSE * max(without_m, LEAST_ERROR_M / WORSE)
+    verdict = "right"
+    if outcome.code not in (0, 3):
+        verdict = "refused" if is_named else "unhelpful"
+    elif is_wrong_line:
+        verdict = "misled"
+    elif is_worse and not is_named:
+        verdict = "silent"
+    elif is_worse and outcome.code == 0:
+        verdict = "warned"
+    return judgement(fault.name, size, seed, verdict, outcome, right, is_named=is_named, without_m=without_m)
+
+
+def judge_faultless(seed: list[int], folder: Path) -> Judgement:
+    """Verdict on a log without a fault."""
+    log = make_log(seed)
+    outcome = outcome_of(log, folder)
+    is_alarm = bool(outcome.asks_for()) or outcome.code != 0
+    return judgement(FAULTLESS, float(seed[-1]), seed, "false alarm" if is_alarm else "right", outcome, log)
+
+
+def judgement(
+    fault: str,
+    size: float,
+    seed: list[int],
+    verdict: str,
+    outcome: Outcome,
+    log: Log,
+    *,
+    is_named: bool = False,
+    without_m: float | None = None,
+) -> Judgement:
+    """The record of a log."""
+    world = log.world
+    text = (
+        f"{world.style} {world.speed_m_s:.2f} m/s, IMU {world.imu_hz:g} Hz, DVL {world.dvl_hz:g} Hz, noise "
+        f"{world.noise:g}, {', '.join(sorted(world.sensors))}, {len(world.gaps_s)} gaps"
+        f"{'' if world.is_start_stated else ', start not stated'}"
+    )
+    lines = [line for line in outcome.lines if line.startswith(("Doubt", "Warn", "sonar", "Log"))]
+    return Judgement(fault, size, seed, verdict, is_named, outcome.code, outcome.error_m, without_m, text, lines)
+
+
+def measure(arguments: argparse.Namespace, folder: Path) -> list[Judgement]:
+    """Judge every log that the file of results does not have, one size after the other."""
+    file = arguments.results
+    done: list[Judgement] = []
+    if file is not None and file.exists():
+        done = [Judgement(**json.loads(line)) for line in file.read_text().splitlines()]
+    known = {(one.fault, tuple(one.seed)) for one in done}
+    faults = list(table())
+    wanted: list[tuple[Fault | None, float, list[int]]] = []
+    for place in range(arguments.sizes):
+        for number, fault in enumerate(faults):
+            if not arguments.only or any(word in fault.name for word in arguments.only):
+                wanted.append((fault, fault.sizes[place], [arguments.seed, number, place]))
+    wanted += [(None, 0.0, [arguments.seed, len(faults), place]) for place in range(arguments.faultless)]
+    wanted = [one for one in wanted if (one[0].name if one[0] else FAULTLESS, tuple(one[2])) not in known]
+    for count, (fault, size, seed) in enumerate(wanted):
+        one = judge_faultless(seed, folder) if fault is None else judge(fault, size, seed, folder)
+        done.append(one)
+        note(f"{count + 1} of {len(wanted)}: {one.fault} {one.size:.4g}: {one.verdict}, {one.error_m:.2f} m")
+        if one.verdict not in ("right", "refused"):
+            note("\n".join([f"  {one.world}", *(f"  {line[:600]}" for line in one.lines)]))
+        if file is not None:
+            with file.open("a") as opened:
+                opened.write(json.dumps(asdict(one)) + "\n")
+    return done
+
+
+def true_values(log: Log) -> dict[str, float]:
+    """What the quantities of ``inspect`` are, by the beginning of their names."""
+    arm = log.world.dvl_arm_m - log.world.imu_arm_m
+    return {
+        "DVL against IMU: time offset": 0.0,
+        "DVL mounting yaw": 0.0,
+        "DVL scale": 1.0,
+        "lever arm from IMU to DVL, x": arm[0],
+        "lever arm from IMU to DVL, y": arm[1],
+        "lever arm from IMU to DVL, z": arm[2],
+        "depth: change over": 1.0,
+        "depth against": 0.0,
+        "heading: turn over": 1.0,
+        "heading against": 0.0,
+        "position fixes: change": 1.0,
+        "position fixes against": 0.0,
+        "ranges to landmarks: change": 1.0,
+        "azimuths of landmarks: change": 1.0,
     }
-    of_fault = needed.get(fault.partition(" ")[0], set())
-    if fault in ("heading turned", "heading late", "heading stuck"):
-        of_fault = {"heading", "fixes"}
-    if fault in ("gyro scale", "gyro bias"):
-        of_fault = {"heading"}
-    return every | of_fault
 
 
-def measure(
-    arguments: argparse.Namespace, folder: Path
-) -> tuple[Counter[str], list[tuple[Any, ...]]]:
-    """Counts, and a row for each log."""
-    counts, rows = Counter[str](), list[tuple[Any, ...]]()
-    for seed in range(arguments.faultless):
-        outcome = judge(make_log(1000 + seed), sensors_of("", seed), folder)
-        is_alarm = bool(outcome.asks_for()) or outcome.code != 0
-        counts["faultless"] += 1
-        counts["false_alarms"] += is_alarm
-        rows.append(
-            (
-                "faultless",
-                seed,
-                outcome.code,
-                outcome.error_m,
-                "",
-                "false alarm" if is_alarm else "",
-            )
-        )
-        if is_alarm:
-            note(
-                "\n".join(
-                    line[:400]
-                    for line in outcome.lines
-                    if line.startswith(("Doubt", "Warn", "sonar"))
-                )
-            )
-    for name, fault in FAULTS.items():
-        if arguments.only and name not in arguments.only:
-            continue
-        for place, size in enumerate(fault.sizes[: arguments.sizes]):
-            seed = place + 3 * list(FAULTS).index(name)
-            sensors = sensors_of(name, seed)
-            right = judge(make_log(seed), sensors, folder)
-            log = make_log(seed)
-            fault.spoil(log, size)
-            outcome = judge(log, sensors, folder)
-            is_worse = outcome.error_m > WORSE * max(
-                right.error_m, LEAST_ERROR_M / WORSE
-            )
-            is_named = any(re.search(fault.words, line) for line in outcome.lines)
-            verdict = ""
-            if outcome.code not in (0, 3):
-                verdict = "refused" if is_named else "unhelpful"
-            elif outcome.asks_for() - set(fault.roles):
-                verdict = "misled"
-            elif is_worse and not is_named:
-                verdict = "silent"
-            elif is_worse and outcome.code == 0:
-                verdict = "warned"
-            counts["logs"] += 1
-            counts[verdict or "right"] += 1
-            rows.append(
-                (name, size, outcome.code, outcome.error_m, right.error_m, verdict)
-            )
-            if verdict:
-                note(
-                    f"{name} {size:g}: {verdict}, {outcome.error_m:.2f} m, {sorted(sensors)}"
-                )
-                note(
-                    "\n".join(
-                        line[:400]
-                        for line in outcome.lines
-                        if line.startswith(("Doubt", "Warn", "sonar"))
-                    )
-                )
-    return counts, rows
+@dataclass
+class Coverage:
+    """How often the 95 % intervals of a quantity hold the true value."""
+
+    quantity: str
+    logs: int
+    share: float
+    rms: float
+    """Of error over sigma."""
 
 
-TRUE_VALUES = {
-    "DVL against IMU: time offset": 0.0,
-    "DVL mounting yaw": 0.0,
-    "DVL scale": 1.0,
-    "lever arm from IMU to DVL, x": DVL_ARM_M[0],
-    "lever arm from IMU to DVL, y": DVL_ARM_M[1],
-    "depth: change over": 1.0,
-    "depth against": 0.0,
-    "heading: turn over": 1.0,
-    "heading against": 0.0,
-    "position fixes: change": 1.0,
-    "position fixes against": 0.0,
-    "ranges to landmarks: change": 1.0,
-    "azimuths of landmarks: change": 1.0,
-}
-
-
-def coverage(count: int, folder: Path) -> list[tuple[str, int, float, float]]:
-    """How often the intervals of ``inspect`` hold the true value: quantity, logs, share, rms of error over sigma."""
+def coverage(arguments: argparse.Namespace, folder: Path) -> list[Coverage]:
+    """Run ``inspect`` on logs without a fault."""
     ratios: dict[str, list[float]] = {}
-    for seed in range(count):
-        log = make_log(2000 + seed)
-        path, vehicle = folder / "dive.mcap", folder / "vehicle.toml"
-        write(log, {"sonar", "heading", "fixes"}, path)
+    for place in range(arguments.coverage):
+        log = make_log([arguments.seed, 10_000, place], roles("depth", "heading", "fixes", "sonar", "names"))
+        path = folder / "dive.mcap"
+        vehicle = folder / "vehicle.toml"
+        write(log, path)
         vehicle.write_text(calibration_of(log))
         _, text = command("inspect", path, "--calibration", vehicle, "--json")
+        true = true_values(log)
         for finding in json.loads(text)["sensors"]:
-            for name, true in TRUE_VALUES.items():
-                if (
-                    finding["quantity"].startswith(name)
-                    and finding["value"] is not None
-                ):
-                    ratios.setdefault(name, []).append(
-                        (finding["value"] - true) / finding["sigma"]
-                    )
-    return [
-        (
-            name,
-            len(found),
-            float(np.mean(np.abs(found) < 1.96)),
-            float(np.sqrt(np.mean(np.square(found)))),
-        )
-        for name, found in ratios.items()
-    ]
+            for name, value in true.items():
+                if finding["quantity"].startswith(name) and finding["value"] is not None:
+                    ratios.setdefault(name, []).append((finding["value"] - value) / finding["sigma"])
+        note(f"coverage: {place + 1} of {arguments.coverage}")
+    found = []
+    for name, errors in ratios.items():
+        held = float(np.mean(np.abs(errors) < 1.96))
+        found.append(Coverage(name, len(errors), held, float(np.sqrt(np.mean(np.square(errors))))))
+    return found
+
+
+def cell(done: list[Judgement], quantity: str, kind: str) -> str:
+    """What was found of one cell of the table: sizes named, sizes that did not matter, and the rest."""
+    texts = []
+    for fault in table():
+        if (fault.quantity, fault.kind) != (quantity, kind):
+            continue
+        of_fault = [one for one in done if one.fault == fault.name]
+        sizes = []
+        for one in of_fault:
+            told = {"right": "named" if one.is_named else "no harm"}.get(one.verdict, one.verdict)
+            sizes.append(f"{one.size:.3g} {told}")
+        if sizes:
+            texts.append(f"{fault.detail}: {', '.join(sizes)}")
+    return "; ".join(texts) or "no such fault"
 
 
 def main() -> None:
     """Measure and print."""
     parser = make_parser(__doc__)
-    parser.add_argument(
-        "--faultless", type=int, default=50, help="logs without a fault"
-    )
+    parser.add_argument("--seed", type=int, default=1, help="of all logs")
+    parser.add_argument("--faultless", type=int, default=50, help="logs without a fault")
     parser.add_argument("--sizes", type=int, default=3, help="sizes of each fault")
-    parser.add_argument(
-        "--coverage", type=int, default=0, help="logs for the coverage of intervals"
-    )
-    parser.add_argument(
-        "--only", nargs="*", default=[], metavar="FAULT", help="faults to measure"
-    )
+    parser.add_argument("--coverage", type=int, default=0, help="logs for the coverage of intervals")
+    parser.add_argument("--only", nargs="*", default=[], metavar="WORD", help="faults with a word in their names")
+    parser.add_argument("--results", type=Path, help="file of results, to go on with")
+    parser.add_argument("--table", type=Path, help="page to write the table of faults to")
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.faultless = min(arguments.faultless, 2)
         arguments.sizes = 1
-        arguments.only = arguments.only or [
-            "depth unit",
-            "fix stuck",
-            "velocity left is right",
-            "azimuth sense",
-        ]
-    with tempfile.TemporaryDirectory() as folder:
-        counts, rows = measure(arguments, Path(folder))
-        print_table(
-            ("fault", "size", "exit code", "error (m)", "without (m)", "verdict"), rows
-        )
-        if arguments.coverage:
-            print_table(
-                ("quantity", "logs", "95 % held", "rms error / sigma"),
-                coverage(arguments.coverage, Path(folder)),
-            )
-    wanted = (
-        "logs",
-        "right",
-        "silent",
-        "warned",
-        "misled",
-        "unhelpful",
-        "refused",
-        "faultless",
-        "false_alarms",
-    )
+        arguments.only = arguments.only or ["depth: unit", "position: stuck", "velocity: axes", "azimuth: axes"]
+    with tempfile.TemporaryDirectory() as name:
+        done = measure(arguments, Path(name))
+        covered = coverage(arguments, Path(name))
+    rows = [(one.fault, one.size, one.code, one.error_m, one.without_m, one.verdict) for one in done]
+    print_table(("fault", "size", "exit code", "error (m)", "without (m)", "verdict"), rows)
+    if covered:
+        print_table(("quantity", "logs", "95 % held", "rms error / sigma"), [tuple(asdict(one).values()) for one in covered])
+    counts = Counter[str]()
+    for one in done:
+        is_faultless = one.fault == FAULTLESS
+        counts["faultless" if is_faultless else "logs"] += 1
+        counts["false_alarms" if one.verdict == "false alarm" else "faultless_right" if is_faultless else one.verdict] += 1
+    wanted = ("logs", "right", "silent", "warned", "misled", "unhelpful", "refused", "faultless", "false_alarms")
     print_figures({name: counts[name] for name in wanted})
 
 

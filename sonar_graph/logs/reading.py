@@ -39,9 +39,11 @@ from sonar_graph.logs.checks import (
     gravity_warning,
     gyro_warning,
     is_partial,
+    repeated_frames,
     repeats,
     spike_warning,
     stamp_faults,
+    stuck_doubt,
     stuck_warning,
     way_by,
 )
@@ -68,7 +70,7 @@ from sonar_graph.logs.vehicle_setup import (
     static_frames,
     unplaced,
 )
-from sonar_graph.measurements import Block, Dvl, Floats, Imu
+from sonar_graph.measurements import Block, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 
 FOUND_ANEW = frozenset(
@@ -409,10 +411,17 @@ class Assembly:
         if imu is None or dvl is None or len(rows) < 2:
             return rows, {}
         moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
-        values = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}[role]
-        stuck = repeats(
-            getattr(rows, values).reshape(len(rows), -1), moved, LEAST_MOVED[role]
-        )
+        least = LEAST_MOVED[role]
+        if isinstance(rows, LandmarkDetections):
+            seen = np.column_stack((rows.range_m, rows.azimuth_rad))
+            stuck = repeated_frames(rows.stamps_ns, seen, moved, least)
+        else:
+            values = {
+                "positions": "position_m",
+                "heading": "yaw_rad",
+                "depth": "z_m",
+            }[role]
+            stuck = repeats(getattr(rows, values).reshape(len(rows), -1), moved, least)
         if not stuck.any():
             return rows, {}
         first = int(np.argmax(stuck))
@@ -492,6 +501,7 @@ class Assembly:
         findings = {
             "log.dropped": self.left_out(),
             "log.stamps": stamps,
+            "log.doubtful": list(self.doubts()),
             "log.warnings": list(self.warnings()),
             "log.gaps": list(
                 gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)
@@ -516,13 +526,45 @@ class Assembly:
             if imu is not None and dvl is not None
             else ()
         )
-        return self.left_out(), [*self.warnings(), *gaps]
+        return self.left_out(), [*self.doubts(), *self.warnings(), *gaps]
 
     def left_out(self) -> list[str]:
         """Numbers of rows that were left out of the blocks read so far, by role and reason."""
         return [
             f"{role}: {_counts(dropped)}" for role, dropped in self._dropped.items()
         ]
+
+    def doubts(self) -> Iterator[str]:
+        """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
+
+        Axes of the IMU that gravity and velocity contradict, and quantities that are stuck.
+        """
+        imu = self.block("imu")
+        dvl = self.block("dvl")
+        if imu is None:
+            return
+        gravity = gravity_warning(
+            imu.specific_force,
+            self.calibration.imu.mounting,
+            self.calibration.gravity_m_s2,
+        )
+        if gravity:
+            yield f"imu: {gravity}"
+        # wheels turn evenly, and their rates jump
+        if dvl is None or self.calibration.odometry_interpolation != "linear":
+            return
+        if not gravity and (axes := gyro_warning(imu, dvl, self.calibration)):
+            yield f"imu: {axes}"
+        rows = {
+            "angular rate": (imu.stamps_ns, imu.angular_velocity),
+            "specific force": (imu.stamps_ns, imu.specific_force),
+            "velocity": (dvl.stamps_ns, dvl.velocity),
+        }
+        for quantity, (stamps_ns, values) in rows.items():
+            others = {name: other for name, other in rows.items() if name != quantity}
+            role = "dvl" if quantity == "velocity" else "imu"
+            if doubt := stuck_doubt(stamps_ns, values, quantity, others):
+                yield f"{role}: {doubt}"
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
@@ -537,17 +579,9 @@ class Assembly:
         imu, dvl, depth, detections = (
             self.block(role) for role in ("imu", "dvl", "depth", "detections")
         )
-        mounting, gravity_m_s2 = (
-            self.calibration.imu.mounting,
-            self.calibration.gravity_m_s2,
-        )
         # otherwise rates jump, and wheels turn evenly
         is_linear = self.calibration.odometry_interpolation == "linear"
         found: list[tuple[str, str | None]] = []
-        if imu is not None:
-            found.append(
-                ("imu", gravity_warning(imu.specific_force, mounting, gravity_m_s2))
-            )
         if imu is not None and is_linear:
             columns = (
                 ("angular rate", imu.angular_velocity),
@@ -561,10 +595,6 @@ class Assembly:
                 ("imu", stuck_warning(imu.stamps_ns, values, quantity))
                 for quantity, values in columns
             ]
-        if (
-            imu is not None and dvl is not None and is_linear and not found[0][1]
-        ):  # gravity is upwards
-            found.append(("imu", gyro_warning(imu, dvl, self.calibration)))
         if dvl is not None and is_linear:
             found.append(
                 ("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity"))
