@@ -357,6 +357,7 @@ class Refusal(StrEnum):
     WAITED = (
         "not used: it came after a gap, and only the velocity that confirmed it was"
     )
+    IN_GAP = "not used: in a gap of the Doppler log, or before it in the same interval of keyframes"
     UNSOUND = "refused: its covariance is not positive definite, or no sensor gives its value or its noise"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
     BEYOND_SENSOR = "refused: no gyro or accelerometer measures this"

@@ -28,7 +28,7 @@ from sonar_graph.evaluation import (
 )
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
-from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, Refusal
 
 TOO_CLOSE = 0.05
 """Relative difference below which one run says nothing about which of two errors is the smaller one."""
@@ -539,7 +539,9 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
         lines.append(f"{DOUBTFUL}: {sequence.notes['log.doubtful']}")
     for run in comparison.runs:
         refused = sum(
-            row.count for row in gathered(run.refused) if row.sensor == "depth"
+            row.count
+            for row in gathered(run.refused)
+            if row.sensor == "depth" and row.reason != Refusal.IN_GAP
         )
         if sequence.depth is not None and refused > len(sequence.depth) / 2:
             lines.append(

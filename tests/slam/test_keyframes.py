@@ -27,6 +27,7 @@ from sonar_graph.numerics import cross_matrix
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, average_at_end
+from sonar_graph.states import Refusal
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
@@ -563,6 +564,24 @@ def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_n
         between.noiseModel().covariance(), motion.covariance, rtol=1e-6, atol=1e-15
     )
     assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(1))) == count
+    # used or listed, never neither
+    listed = [row for row in keyframes.refused if row.reason is Refusal.IN_GAP]
+    assert [row.stamp_ns for row in listed] == at(depth_s).tolist() * (1 - count)
+
+
+def test_late_fixes_in_a_gap_share_the_error_of_its_motion():
+    """The second of two that are equal has three times the noise of the motion that the first has."""
+    keyframes = keyframes_over_gaps()
+    keyframes.advance(int(at(4.0)[0]))
+    (fix_ns,) = at(3.5).tolist()
+    for _ in range(2):
+        keyframes.add_fix(fix_ns, np.zeros(3), 1e-12 * np.eye(3))
+        keyframes.update_if_due()
+    first, second = (
+        factor.noiseModel().noise().covariance()
+        for factor in factors_on(keyframes, gtsam.GPSFactorArm, X(0))
+    )
+    assert second == pytest.approx(3 * first, rel=1e-4, abs=1e-9)
 
 
 @pytest.mark.parametrize("lost_s", [[2.05], [2.15], [2.12, 2.17]])
