@@ -6,20 +6,29 @@ the level forward axis::
 
     z(t) = int u.v dt,    p(t) = int (v.e + i v.(u x e)) exp(i yaw) dt
 
-Complex numbers stand for level vectors.
+Complex numbers stand for level vectors. The integrals mean nothing across a hole of the IMU or a gap of the Doppler
+log: rows are numbered by the part without one that they belong to, and references are unknown between parts.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.diagnosis.signals import SignalStretch, Values
 from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
 from sonar_graph.navigation.alignment import InertialPath
 from sonar_graph.sequence import Sequence
 
 UP_OVER_S = 1.0
 """Time over which the felt direction of up is averaged."""
+STRETCH_S = 120.0
+"""Rows are compared over so long at a time; longer, a drift of the gyros would bend the path."""
+FEWEST_ROWS = 6
+GAP_INTERVALS = 3.0
+LEAST_LEVEL = 0.05
+"""Squared cosine of the pitch below which forward is not a level direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,115 +38,138 @@ class BodyMotion:
     origin_ns: int
     seconds: Floats
     """Since ``origin_ns``, shape (n,)."""
+    parts: Ints
+    """Number of holes of the IMU and gaps of the Doppler log before each row, shape (n,)."""
     up: Floats
     """Shape (n, 3), in the body."""
-    velocity: Floats
-    """Shape (n, 3), in the body, m/s."""
     yaw_rad: Floats
     """Shape (n,), since the first row."""
     height_m: Floats
     """Shape (n,), since the first row."""
-    path_m: Floats
+    path_m: Values
     """Complex, shape (n,), level, in axes that are the body's at the first row."""
-    gap_s: float
-    """Longest time between two rows that is no gap."""
 
     @classmethod
     def of(cls, sequence: Sequence) -> "BodyMotion | None":
         """Integrate over the common time of IMU and Doppler log; None where they have less than three rows."""
-        imu, dvl, calibration = sequence.imu, sequence.dvl, sequence.calibration
-        origin_ns = sequence.start_ns
-        t = np.asarray((dvl.stamps_ns - origin_ns) / NS_PER_S, np.float64)
+        dvl = sequence.dvl
+        calibration = sequence.calibration
+        imu = sequence.imu
         body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
         unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
-        path = InertialPath.of(
-            Imu(
-                imu.stamps_ns,
-                unbiased @ body_R_imu.T,
-                imu.specific_force @ body_R_imu.T,
-            )
-        )
-        imu_s = path.seconds + (path.origin_ns - origin_ns) / NS_PER_S
-        rate = path.rate
-        rows = (
-            (t >= imu_s[0]) & (t <= imu_s[-1]) & np.isfinite(dvl.velocity).all(axis=1)
-        )
+        force = imu.specific_force @ body_R_imu.T
+        path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, force))
+        t = path.since_origin(dvl.stamps_ns)  # (n,)
+        rows = path.covers(t) & np.isfinite(dvl.velocity).all(axis=1)
         rows[1:] &= np.diff(t) > 0
         t = t[rows]
         if len(t) < 3:
             return None
-        is_held = calibration.odometry_interpolation == "hold-past"
         dvl_pose = calibration.dvl.mounting.pose()
-        C = path.rotations_at(path.since_origin(dvl.stamps_ns[rows]))  # (n, 3, 3)
+        rate = path.linear_at(t, path.rate)  # (n, 3)
         v = dvl.velocity[rows] @ dvl_pose.rotation().matrix().T
-        v = v - np.cross(columns_at(t, imu_s, rate), dvl_pose.translation())
-        up = np.einsum(
-            "nji,nj->ni",
-            C,
-            felt_up(path, t, imu_s, np.einsum("nij,nj->ni", C, v), calibration),
+        v = v - np.cross(rate, dvl_pose.translation())
+        intervals = np.diff(t)
+        longest_s = max(
+            calibration.dvl.gap_s, GAP_INTERVALS * float(np.median(intervals))
         )
-        up_at_imu = np.einsum(
-            "nji,nj->ni",
-            path.rotations,
-            columns_at(imu_s, t, np.einsum("nij,nj->ni", C, up)),
+        breaks = (intervals > longest_s) | (np.diff(path.parts_at(t)) > 0)
+        C = path.rotations_at(t)  # (n, 3, 3)
+        up_in_path = felt_up(path, t, np.einsum("nij,nj->ni", C, v), calibration)
+        up = np.einsum("nji,nj->ni", C, up_in_path)
+        is_held = calibration.odometry_interpolation == "hold-past"
+        yaw_at_imu = integral(
+            path.seconds, yaw_rate(path, t, up_in_path), is_held=is_held
         )
-        level = np.maximum(up_at_imu[:, 1] ** 2 + up_at_imu[:, 2] ** 2, 0.05)
-        yaw_rate = (rate[:, 1] * up_at_imu[:, 1] + rate[:, 2] * up_at_imu[:, 2]) / level
-        yaw_rad = np.asarray(
-            np.interp(t, imu_s, integral(imu_s, yaw_rate, is_held=is_held)), np.float64
-        )
+        yaw_rad = np.interp(t, path.seconds, yaw_at_imu)
         ahead = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
-        ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
         left = np.cross(up, ahead)
         level_v = np.sum(v * ahead, axis=1) + 1j * np.sum(v * left, axis=1)
         return cls(
-            origin_ns,
-            t,
-            up,
-            v,
-            yaw_rad,
-            integral(t, np.sum(v * up, axis=1), is_held=is_held),
-            integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
-            max(calibration.dvl.gap_s, 3.0 * float(np.median(np.diff(t)))),
+            origin_ns=path.origin_ns,
+            seconds=t,
+            parts=np.concatenate([[0], np.cumsum(breaks)]),
+            up=up,
+            yaw_rad=np.asarray(yaw_rad, np.float64),
+            height_m=integral(t, np.sum(v * up, axis=1), is_held=is_held),
+            path_m=integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
         )
 
-    def at(self, seconds: Floats, values: Floats) -> Floats:
-        """Values of the rows at other times; NaN outside and in gaps."""
-        after = np.clip(
-            np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1
-        )
-        is_gap = self.seconds[after] - self.seconds[after - 1] > self.gap_s
-        is_outside = (seconds < self.seconds[0]) | (seconds > self.seconds[-1])
-        found = np.interp(seconds, self.seconds, values)
-        return np.where(is_gap | is_outside, np.nan, found)
+    def reference(self, values: Values) -> Callable[[Floats], Values]:
+        """Values of the rows at other times, linear; NaN outside and between parts."""
+
+        def at(seconds: Floats) -> Values:
+            row = np.searchsorted(self.seconds, seconds)
+            after = np.clip(row, 1, len(self.seconds) - 1)
+            is_between = self.parts[after] != self.parts[after - 1]
+            is_between &= self.seconds[after] != seconds
+            is_outside = (seconds < self.seconds[0]) | (seconds > self.seconds[-1])
+            found = np.interp(seconds, self.seconds, values)
+            return np.where(is_between | is_outside, np.nan, found)
+
+        return at
+
+    def part_at(self, seconds: Floats) -> Ints:
+        """Part of the last row before each instant, shape (n,)."""
+        row = np.searchsorted(self.seconds, seconds, side="right") - 1
+        return self.parts[np.maximum(row, 0)]
 
     def since_origin(self, stamps_ns: Ints) -> Floats:
         """Seconds of stamps on this motion's axis."""
         return np.asarray((stamps_ns - self.origin_ns) / NS_PER_S)
 
+    def stretches(
+        self, seconds: Floats, y: Values, reference: Callable[[Floats], Values]
+    ) -> Iterator[SignalStretch]:
+        """Rows of a sensor within each part, in stretches of at most `STRETCH_S`."""
+        first = np.flatnonzero(np.diff(self.parts, prepend=-1))
+        last = np.append(first[1:] - 1, len(self.parts) - 1)
+        for begin, end in zip(self.seconds[first], self.seconds[last], strict=True):
+            count = max(1, int(np.ceil((end - begin) / STRETCH_S)))
+            inside = np.flatnonzero((seconds >= begin) & (seconds <= end))
+            which = (seconds[inside] - begin) / max(end - begin, 1e-9) * count
+            for part in range(count):
+                rows = inside[np.minimum(which.astype(int), count - 1) == part]
+                if len(rows) >= FEWEST_ROWS:
+                    yield SignalStretch(seconds[rows], y[rows], reference)
+
+
+def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
+    """Rate about the vertical at the IMU's samples, shape (n,), rad/s, with up known at times t."""
+    up_at_imu = columns_at(path.seconds, t, up_in_path)
+    up = np.einsum("nji,nj->ni", path.rotations, up_at_imu)
+    along = path.rate[:, 1] * up[:, 1] + path.rate[:, 2] * up[:, 2]
+    return np.asarray(along / np.maximum(up[:, 1] ** 2 + up[:, 2] ** 2, LEAST_LEVEL))
+
 
 def felt_up(
-    path: InertialPath, t: Floats, imu_s: Floats, v: Floats, calibration: Calibration
+    path: InertialPath, t: Floats, v: Floats, calibration: Calibration
 ) -> Floats:
     """Up in the frame of the path at times t, shape (n, 3); v is C v. The body's z without gravity in the forces."""
     if not (np.isfinite(path.impulse).all() and calibration.use_gravity):
-        return np.asarray(
-            path.rotations_at(np.clip(t - imu_s[0], 0.0, path.seconds[-1]))[:, :, 2]
-        )
-    begin = np.clip(t - UP_OVER_S / 2, imu_s[0], imu_s[-1])
-    end = np.clip(t + UP_OVER_S / 2, imu_s[0], imu_s[-1])
-    gained = columns_at(end, imu_s, path.impulse) - columns_at(
-        begin, imu_s, path.impulse
-    )
-    up = gained / (end - begin)[:, None] - np.gradient(smoothed(t, v), t, axis=0)
+        return np.asarray(path.rotations_at(t)[:, :, 2])
+    # a window that goes over a hole of the IMU would hold what nobody measured
+    begin = np.maximum(t - UP_OVER_S / 2, part_edges(path, t, "left"))
+    end = np.minimum(t + UP_OVER_S / 2, part_edges(path, t, "right"))
+    gained = path.linear_at(end, path.impulse) - path.linear_at(begin, path.impulse)
+    accelerated = np.gradient(smoothed(t, v), t, axis=0)
+    up = gained / np.maximum(end - begin, 1e-9)[:, None] - accelerated
     return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1), 1e-9)[:, None])
 
 
-def integral(t: Floats, values: Floats, *, is_held: bool = False) -> Floats:
+def part_edges(path: InertialPath, t: Floats, side: str) -> Floats:
+    """First (left) or last time of the part of the path that each instant is in, shape (n,)."""
+    part = path.parts_at(t)
+    if side == "left":
+        return path.seconds[np.searchsorted(path.parts, part, side="left")]
+    return path.seconds[np.searchsorted(path.parts, part, side="right") - 1]
+
+
+def integral(t: Floats, values: Values, *, is_held: bool = False) -> Values:
     """Running integral from zero: by the trapezoid rule, or of values that hold for the time before them."""
     means = values[1:] if is_held else (values[1:] + values[:-1]) / 2
-    steps = means * np.diff(t)
-    return np.concatenate([np.zeros(1), np.cumsum(steps)])
+    return np.concatenate([np.zeros(1), np.cumsum(means * np.diff(t))])
 
 
 def columns_at(at: Floats, t: Floats, values: Floats) -> Floats:
@@ -145,17 +177,12 @@ def columns_at(at: Floats, t: Floats, values: Floats) -> Floats:
     return np.column_stack([np.interp(at, t, column) for column in values.T])
 
 
-def means_about(at: Floats, t: Floats, values: Floats) -> Floats:
-    """Means of columns over `UP_OVER_S` about other times."""
-    total = np.column_stack([integral(t, column) for column in values.T])
-    begin = np.clip(at - UP_OVER_S / 2, t[0], t[-1])
-    end = np.clip(at + UP_OVER_S / 2, t[0], t[-1])
-    span = np.maximum(end - begin, 1e-9)
-    return (columns_at(end, t, total) - columns_at(begin, t, total)) / span[:, None]
-
-
 def smoothed(t: Floats, values: Floats) -> Floats:
     """Columns averaged over `UP_OVER_S`, or as they are where rows are farther apart."""
-    return (
-        means_about(t, t, values) if np.median(np.diff(t)) < UP_OVER_S / 2 else values
-    )
+    if np.median(np.diff(t)) >= UP_OVER_S / 2:
+        return values
+    total = np.column_stack([integral(t, column) for column in values.T])
+    begin = np.maximum(t - UP_OVER_S / 2, t[0])
+    end = np.minimum(t + UP_OVER_S / 2, t[-1])
+    gained = columns_at(end, t, total) - columns_at(begin, t, total)
+    return np.asarray(gained / np.maximum(end - begin, 1e-9)[:, None])

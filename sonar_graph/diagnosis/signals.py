@@ -7,7 +7,7 @@ some minutes each. With the lag tau of y, an offset a per stretch and a drift b 
 
 A wrong sense is ``c < 0``, a wrong unit or scale is ``|c|``, a turned world is ``arg c``, a stuck sensor is ``c = 0``.
 tau minimises the squares of e over a grid and is refined by one Gauss-Newton step. Rows far from the fit are left out.
-Errors of successive rows are alike, so that covariances are of blocks of rows, a dozen in all (a sandwich)::
+Errors of successive rows are alike, so that covariances are of blocks of rows, a dozen in each stretch (a sandwich)::
 
     cov(p) = (A^H A)^-1 sum_blocks (A_k^H e_k)(A_k^H e_k)^H (A^H A)^-1 n / (n - p)
 
@@ -16,11 +16,11 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.diagnosis.findings import unknown
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.alignment import Estimate1D
 
@@ -28,6 +28,7 @@ Values = NDArray[np.floating | np.complexfloating]
 LAGS_S = np.arange(-4.0, 4.01, 0.25)
 BLOCKS = 12
 FEWEST_ROWS = 8
+ROUNDS = 4
 OUTLYING = 6.0
 """Rows beyond so many robust sigmas of the fit are left out."""
 MOST_OUTLYING = 0.25
@@ -47,9 +48,19 @@ class SignalStretch:
     y: Values
     """Shape (n,)."""
     reference: Callable[[Floats], Values]
-    """x at any times; NaN where it is not known."""
+    """x at times of any shape; NaN where it is not known."""
     has_offset: bool = True
     """False for changes, which have none."""
+
+    def shifted(self, lags_s: Floats) -> Values:
+        """Reference at the rows for each lag, shape (k, n)."""
+        at = self.seconds - lags_s[:, None]
+        return np.broadcast_to(self.reference(at), at.shape)
+
+    def slope(self, lag_s: float) -> Values:
+        """Derivative of x by time at the rows, shape (n,)."""
+        before, after = self.shifted(lag_s + LAG_STEP_S * np.array([1.0, -1.0]))
+        return np.asarray((after - before) / (2 * LAG_STEP_S))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,101 +73,99 @@ class Match:
     """``arg c``, rad, of complex signals."""
     lag: Estimate1D
     """Of the sensor, s: its rows come so much too late."""
-    scatter: float
+    scatter: float = np.nan
     """Root mean square of e, of the rows that fit."""
-    moved: float
+    moved: float = np.nan
     """Root mean square of the reference about its mean."""
-    misfit: float
+    misfit: float = 0.0
     """Share of y's squares that the reference does not explain."""
     rate: float = 0.0
     """Root mean square of the sensor's change a second."""
     is_mirrored: bool = False
     """True where the conjugate of the reference fits."""
-    outlying: float = 0.0
-    """Share of rows that were left out."""
 
-
-def unknown(reason: str) -> Match:
-    """A comparison that could not be made."""
-    nothing = Estimate1D(np.nan, np.inf, reason)
-    return Match(nothing, nothing, nothing, np.nan, np.nan, 0.0)
+    @classmethod
+    def unknown(cls, reason: str) -> "Match":
+        """A comparison that could not be made."""
+        nothing = unknown(reason)
+        return cls(nothing, nothing, nothing)
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """Least squares of one stretch."""
+class RobustFit:
+    """Least squares of one stretch for k candidates of the reference at once."""
 
+    A: Values
+    """Columns of the reference, of the offset and of the drift, shape (k, n, p)."""
     p: Values
-    """Coefficients: c, then -c tau where it was asked for."""
-    cov: Values
+    """Coefficients, shape (k, p)."""
+    inverse: Values
+    """Of the information, shape (k, p, p)."""
     residuals: Values
+    """Shape (k, n); zero where the reference is not known."""
+    usable: NDArray[np.bool_]
+    """Rows with a reference, shape (k, n)."""
     kept: NDArray[np.bool_]
+    """Rows that fit, shape (k, n)."""
+
+    @classmethod
+    def of(
+        cls, columns: Values, stretch: SignalStretch, drift_sigma: float
+    ) -> "RobustFit":
+        """Fit columns of the reference, shape (k, n, q), and what drifts, without outlying rows."""
+        t = stretch.seconds - stretch.seconds.mean()
+        slow = [np.ones_like(t)] * stretch.has_offset + [t] * (drift_sigma > 0)
+        nuisance = np.reshape(slow, (len(slow), len(t))).T
+        shape = (len(columns), *nuisance.shape)
+        A = np.concatenate([columns, np.broadcast_to(nuisance, shape)], axis=2)
+        usable = np.isfinite(A).all(axis=2) & np.isfinite(stretch.y)
+        A = np.where(usable[:, :, None], A, 0.0)
+        # the far origin of a map grid would cost digits
+        offset = np.nanmean(stretch.y) if stretch.has_offset else 0.0
+        y = np.where(usable, stretch.y - offset, 0.0)
+        kept = usable
+        prior = np.zeros(len(A))
+        for _ in range(ROUNDS):
+            AH = np.swapaxes((A * kept[:, :, None]).conj(), 1, 2)  # (k, p, n)
+            information = AH @ A
+            information[:, -1, -1] += prior
+            inverse = np.linalg.pinv(information, hermitian=True)
+            p = (inverse @ AH @ y[:, :, None])[:, :, 0]
+            residuals = np.where(usable, y - (A @ p[:, :, None])[:, :, 0], 0.0)
+            size = np.abs(residuals)
+            if drift_sigma > 0:
+                # a drift counts in units of what the fit leaves
+                variance = np.mean(
+                    size**2, axis=1, where=kept | ~kept.any(axis=1)[:, None]
+                )
+                prior = np.maximum(variance, 1e-24) / drift_sigma**2
+            known = np.where(usable | ~usable.any(axis=1)[:, None], size, np.nan)
+            robust = 1.5 * np.nanmedian(known, axis=1)
+            near = usable & (size <= OUTLYING * np.maximum(robust, 1e-12)[:, None])
+            fewest = (1 - MOST_OUTLYING) * usable.sum(axis=1)
+            is_most = near.sum(axis=1) >= fewest
+            kept = np.where(is_most[:, None], near, usable)
+        return cls(A, p, inverse, residuals, usable, kept)
 
     @property
-    def squares(self) -> float:
-        """Sum of all squares, in which a far row counts as much as the farthest one that fits."""
-        limit = np.abs(self.residuals[self.kept]).max(initial=0.0)
-        return float(np.sum(np.minimum(np.abs(self.residuals), limit) ** 2))
+    def squares(self) -> Floats:
+        """Mean square of each candidate, shape (k,); a far row counts as the farthest that fits. Infinite: too few rows."""
+        size = np.abs(self.residuals)
+        limit = np.max(size, axis=1, where=self.kept, initial=0.0)
+        total = np.sum(np.minimum(size, limit[:, None]) ** 2, axis=1)
+        rows = self.usable.sum(axis=1)
+        return np.where(rows < FEWEST_ROWS, np.inf, total / np.maximum(rows, 1))
 
-
-def fit(
-    stretch: SignalStretch,
-    lag_s: float,
-    drift_sigma: float,
-    *,
-    mirrored: bool = False,
-    slope: bool = False,
-) -> Fit | None:
-    """Fit one stretch at a lag; with ``slope`` with the derivative by the lag. None: too few rows."""
-    at = stretch.seconds - lag_s
-    x = stretch.reference(at)
-    columns = [x]
-    if slope:
-        after = stretch.reference(at + LAG_STEP_S)
-        before = stretch.reference(at - LAG_STEP_S)
-        columns.append((after - before) / (2 * LAG_STEP_S))
-    A = np.column_stack(columns)
-    A = A.conj() if mirrored else A
-    usable = np.isfinite(A).all(axis=1) & np.isfinite(stretch.y)
-    if np.count_nonzero(usable) < FEWEST_ROWS:
-        return None
-    t = stretch.seconds - stretch.seconds.mean()
-    nuisance = [np.ones_like(t)] if stretch.has_offset else []
-    if drift_sigma > 0:
-        nuisance.append(t)
-    whole = np.column_stack([A, *nuisance])
-    p = whole.shape[1]
-    kept = usable
-    prior = np.zeros((0, p))
-    for _ in range(4):
-        rows = whole[kept]
-        solution = np.linalg.lstsq(
-            np.vstack([rows, prior]), np.append(stretch.y[kept], np.zeros(len(prior)))
-        )[0]
-        residuals = np.where(
-            usable, stretch.y - np.where(usable[:, None], whole, 0.0) @ solution, 0.0
-        )
-        size = float(np.sqrt(np.mean(np.abs(residuals[kept]) ** 2)))
-        if drift_sigma > 0:
-            prior = np.zeros((1, p))
-            prior[0, -1] = max(size, 1e-12) / drift_sigma
-        robust = 1.5 * float(np.median(np.abs(residuals[usable])))
-        near = usable & (np.abs(residuals) <= OUTLYING * max(robust, 1e-12))
-        kept = (
-            near
-            if np.count_nonzero(near) >= (1 - MOST_OUTLYING) * np.count_nonzero(usable)
-            else usable
-        )
-    rows = whole[kept]
-    information = rows.conj().T @ rows + prior.T @ prior
-    inverse = np.linalg.pinv(information, hermitian=True)
-    edges = np.linspace(0, len(rows), BLOCKS + 1).astype(int)
-    scores = rows.conj() * residuals[kept][:, None]
-    sums = np.array([scores[i:j].sum(axis=0) for i, j in pairwise(edges.tolist())])
-    meat = sums.T @ sums.conj() * BLOCKS / max(BLOCKS - p, 1)
-    cov = inverse @ meat @ inverse.conj().T
-    n = A.shape[1]
-    return Fit(solution[:n], cov[:n, :n], residuals, kept)
+    def sigmas(self) -> Floats:
+        """Standard deviations of the first candidate's coefficients, by blocks of rows, shape (p,)."""
+        rows = self.kept[0]
+        scores = self.A[0, rows].conj() * self.residuals[0, rows, None]  # (m, p)
+        sums = np.array([part.sum(axis=0) for part in np.array_split(scores, BLOCKS)])
+        p = scores.shape[1]
+        small_sample = BLOCKS / max(BLOCKS - p, 1)
+        meat = sums.T @ sums.conj() * small_sample
+        cov = self.inverse[0] @ meat @ self.inverse[0].conj().T
+        return SMALL_SAMPLE * np.sqrt(np.abs(np.diag(cov)))
 
 
 def match(
@@ -166,93 +175,92 @@ def match(
 
     ``drift_sigma``: how fast the reference may drift, in its unit a second; 0: not at all.
     """
-    fits = {}
-    lags = LAGS_S if find_lag else np.zeros(1)
-    for mirrored in (False, True):
-        for lag_s in lags.tolist():
-            found = [fit(s, lag_s, drift_sigma, mirrored=mirrored) for s in stretches]
-            known = [one for one in found if one is not None]
-            if known:
-                squares = sum(one.squares for one in known) / sum(
-                    len(one.kept) for one in known
-                )
-                fits[mirrored, lag_s] = squares
-        if not any(np.iscomplexobj(s.y) for s in stretches):
-            break
-    if (False, 0.0) not in fits:
-        return unknown("too few rows beside its reference")
-    mirrored, lag_s = min(fits, key=fits.__getitem__)
-    if mirrored and not fits[True, lag_s] * CLEARLY_BETTER**2 < min(
-        fits[key] for key in fits if not key[0]
-    ):
-        mirrored, lag_s = min((key for key in fits if not key[0]), key=fits.__getitem__)
-    if fits[mirrored, lag_s] * CLEARLY_BETTER > fits.get((mirrored, 0.0), np.inf):
-        lag_s = 0.0  # a vehicle that circles fits as well half a turn later
-    parts = [
-        fit(s, lag_s, drift_sigma, mirrored=mirrored, slope=find_lag) for s in stretches
-    ]
-    return combined(
-        [one for one in parts if one is not None], stretches, lag_s, mirrored
-    )
+    is_plane = any(np.iscomplexobj(s.y) for s in stretches)
+    lags_s = LAGS_S if find_lag else np.zeros(1)
+    squares = np.zeros((1 + is_plane, len(lags_s)))
+    rows = np.zeros_like(squares)
+    for stretch in stretches:
+        x = stretch.shifted(lags_s)
+        candidates = np.concatenate([x, x.conj()] if is_plane else [x])
+        found = RobustFit.of(candidates[:, :, None], stretch, drift_sigma)
+        of_stretch = found.squares.reshape(squares.shape)
+        count = found.usable.sum(axis=1).reshape(squares.shape)
+        squares += np.where(np.isfinite(of_stretch), count * of_stretch, 0.0)
+        rows += np.where(np.isfinite(of_stretch), count, 0)
+    mean_squares = np.where(rows > 0, squares / np.maximum(rows, 1), np.inf)
+    now = int(np.argmin(np.abs(lags_s)))
+    if not rows[0, now]:
+        return Match.unknown("too few rows beside its reference")
+    least = mean_squares.min(axis=1)
+    is_mirrored = is_plane and bool(least[-1] * CLEARLY_BETTER**2 < least[0])
+    of_lags = mean_squares[int(is_mirrored)]
+    best = int(np.argmin(of_lags))
+    # a vehicle that circles fits as well half a turn later
+    if of_lags[best] * CLEARLY_BETTER > of_lags[now]:
+        best = now
+    return refined(stretches, drift_sigma, float(lags_s[best]), is_mirrored, find_lag)
 
 
-def combined(
-    parts: list[Fit], stretches: list[SignalStretch], lag_s: float, mirrored: bool
+def refined(
+    stretches: list[SignalStretch],
+    drift_sigma: float,
+    lag_s: float,
+    is_mirrored: bool,
+    find_lag: bool,
 ) -> Match:
-    """Mean of the stretches' gains, angles and lags, weighted by their certainty."""
-    gains, angles, lags = [], [], []
-    for one in parts:
-        c = one.p[0]
-        sigma = SMALL_SAMPLE * float(np.sqrt(np.abs(one.cov[0, 0])))
-        size = abs(c)
-        is_plane = np.iscomplexobj(one.p)
-        gains.append((float(size if is_plane else c.real), sigma))
-        angles.append((float(np.angle(c)), sigma / max(size, 1e-12)))
-        if len(one.p) > 1:
-            lag = lag_s - float(np.real(one.p[1] * np.conj(c))) / max(size**2, 1e-12)
-            lags.append(
-                (
-                    lag,
-                    SMALL_SAMPLE
-                    * float(np.sqrt(np.abs(one.cov[1, 1])))
-                    / max(size, 1e-12),
-                )
-            )
-    residuals = np.concatenate([one.residuals[one.kept] for one in parts])
-    y = np.concatenate([s.y - np.nanmean(s.y) * s.has_offset for s in stretches])
-    x = [s.reference(s.seconds) for s in stretches]
-    x_about = np.concatenate(
-        [
-            one - np.nanmean(one) * s.has_offset
-            for one, s in zip(x, stretches, strict=True)
-        ]
-    )
-    speeds = [
-        np.abs(
-            s.reference(s.seconds + LAG_STEP_S) - s.reference(s.seconds - LAG_STEP_S)
-        )
-        ** 2
-        / (2 * LAG_STEP_S) ** 2
-        for s in stretches
-    ]
-    scatter = float(np.sqrt(np.mean(np.abs(residuals) ** 2)))
+    """Fits about the best lag, with the derivative by the lag; means of the stretches by their certainty."""
+    gains = list[tuple[float, float]]()
+    angles = list[tuple[float, float]]()
+    lags = list[tuple[float, float]]()
+    residuals = list[Values]()
+    for stretch in stretches:
+        columns = [stretch.shifted(np.array([lag_s]))[0]]
+        if find_lag:
+            columns.append(stretch.slope(lag_s))
+        x = np.stack(columns, axis=1)[None]  # (1, n, 1 or 2)
+        found = RobustFit.of(x.conj() if is_mirrored else x, stretch, drift_sigma)
+        if not np.isfinite(found.squares[0]):
+            continue
+        c = found.p[0, 0]
+        sigmas = found.sigmas()
+        size = max(abs(c), 1e-12)
+        gains.append((abs(c) if np.iscomplexobj(c) else float(c), sigmas[0]))
+        angles.append((float(np.angle(c)), sigmas[0] / size))
+        if find_lag:
+            # the coefficient of the derivative is -c tau
+            step_s = -float(np.real(found.p[0, 1] * np.conj(c))) / size**2
+            lags.append((lag_s + step_s, sigmas[1] / size))
+        residuals.append(found.residuals[0, found.kept[0]])
+    if not gains:
+        return Match.unknown("too few rows beside its reference")
+    scatter = root_mean_square(residuals)
+    signal = root_mean_square([centred(s.y, s) for s in stretches])
     return Match(
         weighted(gains),
         weighted(angles),
-        weighted(lags) if lags else Estimate1D(np.nan, np.inf, "not asked for"),
+        weighted(lags) if find_lag else unknown("not estimated"),
         scatter,
-        float(np.sqrt(np.nanmean(np.abs(x_about) ** 2))),
-        scatter**2 / max(float(np.nanmean(np.abs(y) ** 2)), 1e-24),
-        float(np.sqrt(np.nanmean(np.concatenate(speeds)))),
-        mirrored,
-        1.0 - float(np.mean(np.concatenate([one.kept for one in parts]))),
+        root_mean_square([centred(s.shifted(np.zeros(1))[0], s) for s in stretches]),
+        scatter**2 / max(signal**2, 1e-24),
+        root_mean_square([s.slope(0.0) for s in stretches]),
+        is_mirrored,
     )
 
 
-def weighted(values: list[tuple[float, float]]) -> Estimate1D:
-    """Mean weighted by inverse variances; its sigma holds the scatter between stretches."""
-    value, sigma = np.array(values).T
-    weights = 1.0 / np.maximum(sigma, 1e-9) ** 2
-    mean = float(weights @ value / weights.sum())
-    of_scatter = float(weights @ (value - mean) ** 2) / max(len(value) - 1, 1)
-    return Estimate1D(mean, float(np.sqrt(max(of_scatter, 1.0) / weights.sum())))
+def centred(values: Values, stretch: SignalStretch) -> Values:
+    """Values about their mean, but for changes."""
+    return np.asarray(values - np.nanmean(values) * stretch.has_offset)
+
+
+def root_mean_square(parts: list[Values]) -> float:
+    """Of the finite values of all parts."""
+    return float(np.sqrt(np.nanmean(np.abs(np.concatenate(parts)) ** 2)))
+
+
+def weighted(estimates: list[tuple[float, float]]) -> Estimate1D:
+    """Mean weighted by inverse variances; its sigma includes the scatter between stretches."""
+    values, sigmas = np.array(estimates).T
+    weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
+    mean = float(weights @ values / weights.sum())
+    scatter = float(weights @ (values - mean) ** 2) / max(len(values) - 1, 1)
+    return Estimate1D(mean, float(np.sqrt(max(scatter, 1.0) / weights.sum())))

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, ImuCalibration, Start
-from sonar_graph.diagnosis.findings import (
-    Finding,
+from sonar_graph.diagnosis.findings import Finding, with_interval
+from sonar_graph.diagnosis.start import (
     StartHeading,
     StartTilt,
     bias_findings,
@@ -19,7 +19,6 @@ from sonar_graph.diagnosis.findings import (
     lever_findings,
     tilt_findings,
     with_fitted,
-    with_interval,
 )
 from sonar_graph.measurements import Dvl, Heading, Imu
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch

@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import sensor_check
-from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt
+from sonar_graph.diagnosis.findings import Finding
+from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
+from sonar_graph.diagnosis.units import range_changes, wrong_units
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import InitialTilt
@@ -344,7 +346,7 @@ def units(
         Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan)),
     )
     sequence = Sequence("hand", Calibration(gravity_m_s2=gravity), imu, dvl)
-    return sensor_check.wrong_units(sequence, LogConfig.parse(scales, "x"))
+    return wrong_units(sequence, LogConfig.parse(scales, "x"))
 
 
 # fmt: off
@@ -382,10 +384,10 @@ def test_velocities_that_a_vehicle_has_are_in_another_unit_where_ranges_change_b
     factor: float,
 ):
     run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=factor * SLOW.dvl.velocity))
-    measured_m, by_dvl_m = sensor_check.range_changes(run)
+    measured_m, by_dvl_m = range_changes(run)
     assert by_dvl_m / measured_m == pytest.approx(factor, rel=0.4)
     (said,) = [
-        fault.advice for fault in sensor_check.wrong_units(run, LogConfig())
+        fault.advice for fault in wrong_units(run, LogConfig())
     ] or [""]
     assert ("cm/s? `scale = 0.01`" in said) == (factor > 10.0)
     assert ("ranges to landmarks change by" in said) == (factor > 10.0)
@@ -396,22 +398,22 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     spikes = velocity + 8.0 * (rng.random((len(velocity), 1)) < 0.2)
     for wrong in (velocity[:, [1, 2, 0]], -velocity, spikes):
         run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=wrong))
-        assert not sensor_check.wrong_units(run, LogConfig())
+        assert not wrong_units(run, LogConfig())
     astern = replace(SLOW, dvl=replace(SLOW.dvl, velocity=-100.0 * velocity))
-    assert sensor_check.wrong_units(astern, LogConfig())
+    assert wrong_units(astern, LogConfig())
     sonar = SLOW.calibration.sonar.model_copy(update={"range_sigma_m": 0.05})
     coarse = replace(SLOW.detections, range_m=np.full(len(SLOW.detections), 2.0))
     calibration = SLOW.calibration.model_copy(update={"sonar": sonar})
-    assert not sensor_check.wrong_units(
+    assert not wrong_units(
         replace(SLOW, detections=coarse, calibration=calibration), LogConfig()
     )
     few = SLOW.detections.rows(slice(0, 15))
     far = replace(SLOW.dvl, velocity=100.0 * velocity)
-    assert sensor_check.range_changes(replace(SLOW, detections=few)) is None
-    assert not sensor_check.wrong_units(
+    assert range_changes(replace(SLOW, detections=few)) is None
+    assert not wrong_units(
         replace(SLOW, detections=few, dvl=far), LogConfig()
     )
-    assert not sensor_check.wrong_units(
+    assert not wrong_units(
         replace(SLOW, detections=None, dvl=far), LogConfig()
     )
 
@@ -456,12 +458,12 @@ def test_slow_rates_in_degrees_are_told_by_gravity():
             RIGHT,
             imu=replace(imu, angular_velocity=rates * [1, 1, 0] + [0.5, -0.5, 0.0]),
         )
-        faults = sensor_check.wrong_units(slow, LogConfig())
+        faults = wrong_units(slow, LogConfig())
         assert [fault.quantity for fault in faults] == ["gyro: unit"] * acts
         unmeasured = replace(
             slow.imu, specific_force=np.full_like(imu.specific_force, np.nan)
         )
-        assert not sensor_check.wrong_units(replace(slow, imu=unmeasured), LogConfig())
+        assert not wrong_units(replace(slow, imu=unmeasured), LogConfig())
         if acts:
             assert line_of(faults[0]) == pytest.approx(
                 {"angular_velocity_scale": np.pi / 180}, rel=1e-4

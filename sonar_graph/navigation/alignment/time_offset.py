@@ -25,7 +25,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from sonar_graph.measurements import Floats
 
@@ -112,42 +111,62 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
     A column of A that holds the same noise as y, since it was integrated from the same sensor, shifts the parameters by
     its column of their covariance times this (errors in variables).
     """
-    powers = []
+    power = 0.0
+    for group in _grouped(stretches):
+        count, m = group.duration_s.shape
+        differences = np.diff(np.eye(m + 1), axis=0)[:, None, :]
+        whole = np.broadcast_to(differences, (count, m, 3, m + 1))
+        white, _ = _whitened(group, group.B, ratios)
+        own, _, rank = _orthonormal(white.reshape(count, 3 * m, -1))
+        of_samples, _ = _whitened(group, whole, ratios)  # (s, 3, m, m + 1)
+        basis = own.reshape(count, 3, m, -1)
+        projected = np.swapaxes(basis, 2, 3) @ of_samples
+        power += 3.0 * m * count - rank
+        power -= float(np.sum(of_samples**2) - np.sum(projected**2))
+    return power
+
+
+def _grouped(stretches: Sequence[SampleSeries]) -> list[SampleSeries]:
+    """Stretches of one length and kind together, each field with a leading axis: one call of LAPACK serves all."""
+    groups: dict[tuple[object, ...], list[SampleSeries]] = {}
     for stretch in stretches:
-        m = len(stretch.y)
-        differences = np.diff(np.eye(m + 1), axis=0)
-        factors = _factors(stretch, ratios)
-        own_columns = [
-            _whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)
-        ]
-        own, _ = _orthonormal(np.concatenate(own_columns))
-        power = 3.0 * m - own.shape[1]
-        for axis in range(3):
-            of_samples = _whitened(factors[axis], differences)
-            basis = own[axis * m : (axis + 1) * m]
-            projected = basis.T @ of_samples
-            power -= float(np.sum(of_samples**2) - np.sum(projected**2))
-        powers.append(power)
-    return sum(powers)
+        kind = (stretch.A.shape, stretch.B.shape, stretch.walks)
+        groups.setdefault(kind, []).append(stretch)
+    return [
+        SampleSeries(
+            np.array([one.y for one in group]),
+            np.array([one.A for one in group]),
+            np.array([one.B for one in group]),
+            np.array([one.duration_s for one in group]),
+            group[0].walks,
+        )
+        for group in groups.values()
+    ]
 
 
-def _factors(stretch: SampleSeries, ratios: Floats) -> list[Floats]:
-    """Cholesky factor of K, shape (m, m), for each axis."""
-    T = stretch.duration_s
-    m = len(T)
-    middle = np.cumsum(T) - 0.5 * T
-    walk = np.outer(T, T) * np.minimum.outer(middle, middle)
-    steady = np.diag(2.0 + ratios[0] * T) - np.eye(m, k=1) - np.eye(m, k=-1)
-    # axes of a kind have the same K: one factor each
-    by_kind = {
-        walks: np.linalg.cholesky(steady + walks * ratios[1] * walk)
-        for walks in set(stretch.walks)
-    }
-    return [np.asarray(by_kind[walks], dtype=np.float64) for walks in stretch.walks]
-
-
-def _whitened(factor: Floats, columns: Floats) -> Floats:
-    return np.asarray(solve_triangular(factor, columns, lower=True, check_finite=False))
+def _whitened(
+    group: SampleSeries, columns: Floats, ratios: Floats
+) -> tuple[Floats, float]:
+    """Columns, shape (s, m, 3, k), by the inverse of the Cholesky factor of K, shape (s, 3, m, k); ``sum 3 log|K|``."""
+    T = group.duration_s  # (s, m)
+    count, m = T.shape
+    middle = np.cumsum(T, axis=1) - 0.5 * T
+    both = np.minimum(middle[:, :, None], middle[:, None, :])
+    walk = T[:, :, None] * T[:, None, :] * both
+    neighbours = np.eye(m, k=1) + np.eye(m, k=-1)
+    steady = (2.0 + ratios[0] * T)[:, :, None] * np.eye(m) - neighbours
+    white = np.empty((count, 3, m, columns.shape[3]))
+    log_determinant = 0.0
+    # axes of a kind have the same K: one factor for all of them
+    for walks in set(group.walks):
+        axes = [axis for axis in range(3) if group.walks[axis] == walks]
+        factor = np.linalg.cholesky(steady + walks * ratios[1] * walk)
+        of_axes = columns[:, :, axes].reshape(count, m, -1)
+        solved = np.linalg.solve(factor, of_axes).reshape(count, m, len(axes), -1)
+        white[:, axes] = np.swapaxes(solved, 1, 2)
+        roots = np.log(np.diagonal(factor, axis1=1, axis2=2))
+        log_determinant += 2.0 * len(axes) * float(roots.sum())
+    return white, log_determinant
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,31 +184,28 @@ class NormalEquations:
     @classmethod
     def of(cls, stretches: Sequence[SampleSeries], ratios: Floats) -> NormalEquations:
         """Reduce each stretch and sum."""
-        parts = []
-        for stretch in stretches:
-            m, _, p = stretch.A.shape
-            # (m, 3, 1 + p + q)
-            columns = np.concatenate(
-                [stretch.y[:, :, None], stretch.A, stretch.B], axis=2
-            )
-            factors = _factors(stretch, ratios)
-            # (3 m, ...)
-            white = np.concatenate(
-                [_whitened(factors[axis], columns[:, axis]) for axis in range(3)]
-            )
-            own, size = _orthonormal(white[:, 1 + p :])
-            kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
-            squares = kept.T @ kept  # of [y, A], (1 + p, 1 + p)
-            log_roots = [float(np.log(np.diag(factor)).sum()) for factor in factors]
-            size = 2.0 * sum(log_roots) + size
-            parts.append((squares, 3 * m - own.shape[1], size))
-        squares = [part[0] for part in parts]
+        p = stretches[0].A.shape[2]
+        squares = np.zeros((1 + p, 1 + p))  # of [y, A]
+        freedom = 0
+        log_determinants = 0.0
+        for group in _grouped(stretches):
+            count, m = group.duration_s.shape
+            # (s, m, 3, 1 + p + q)
+            columns = np.concatenate([group.y[:, :, :, None], group.A, group.B], axis=3)
+            white, log_size = _whitened(group, columns, ratios)
+            white = white.reshape(count, 3 * m, -1)
+            own, log_own, rank = _orthonormal(white[:, :, 1 + p :])
+            data = white[:, :, : 1 + p]
+            data = data - own @ (np.swapaxes(own, 1, 2) @ data)
+            squares += np.einsum("smi,smj->ij", data, data, optimize=True)
+            log_determinants += log_size + log_own
+            freedom += 3 * m * count - rank
         return cls(
-            sum((one[1:, 1:] for one in squares[1:]), squares[0][1:, 1:]),
-            sum((one[1:, 0] for one in squares[1:]), squares[0][1:, 0]),
-            sum(float(one[0, 0]) for one in squares),
-            sum(part[1] for part in parts),
-            sum(part[2] for part in parts),
+            squares[1:, 1:],
+            squares[1:, 0],
+            float(squares[0, 0]),
+            freedom,
+            log_determinants,
         )
 
     def solve(self, prior_sigmas: Floats) -> tuple[Floats, Floats, float, float]:
@@ -215,14 +231,15 @@ class NormalEquations:
         return float(freedom * np.log(rss) + self.log_determinants + log_information)
 
 
-def _orthonormal(B: Floats) -> tuple[Floats, float]:
-    """A basis of the columns' span, and ``log|B'B|`` over it."""
+def _orthonormal(B: Floats) -> tuple[Floats, float, int]:
+    """A basis of the columns' span of each matrix, shape (s, m, q), ``sum log|B'B|`` over them, and their rank."""
     # without parameters of their own there is nothing to project out
-    if not B.shape[1]:
-        return B, 0.0
+    if not B.shape[2]:
+        return B, 0.0, 0
     U, s, _ = np.linalg.svd(B, full_matrices=False)
-    kept = s > RANK_TOLERANCE * max(float(s[0]), 1e-300)
-    return U[:, kept], 2.0 * float(np.log(s[kept]).sum())
+    kept = s > RANK_TOLERANCE * np.maximum(s[:, :1], 1e-300)
+    log_size = 2.0 * float(np.log(s[kept]).sum())
+    return U * kept[:, None, :], log_size, int(kept.sum())
 
 
 RANGE_S = 2.0

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
-from sonar_graph.diagnosis.findings import find_start_heading
+from sonar_graph.diagnosis.start import find_start_heading
 from sonar_graph.logs.adapters.geodesy import earth_centred, east_north_up
 from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
 from sonar_graph.navigation import Odometry

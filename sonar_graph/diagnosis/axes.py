@@ -1,0 +1,215 @@
+"""Axes and signs of gyros and Doppler log, by gravity and the accelerations that both share with the accelerometers.
+
+With G and P permutations with signs, rates G w, velocities P v and the arm l from IMU to log, all in body axes, the
+right ones leave only gravity and its slow turning::
+
+    C <- C Exp(G w dt),    F = int C f dt,    r(G, P) = C P v - C [G w]x l - F - (v_0 + gamma t + gamma' t^2)
+
+Differences of means over a second are linear in the entries of P: for each of 48 G the sum of squares is a quadratic
+form in them, so that 48 P cost as much as one. A wrong G tilts gravity and turns accelerations, a wrong P only what the
+Doppler log measures, so that the two are told apart where the vehicle turns and moves.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation import is_partial
+from sonar_graph.navigation.alignment import (
+    cross_matrices,
+    holes_before,
+    means_over,
+    stretches_of,
+)
+from sonar_graph.numerics import running_rotations
+
+MEAN_OVER_S = 1.0
+LONGEST_S = 240.0
+"""Rows in the middle of a longer log are enough for a choice among a few axes."""
+STEP_S = 0.1
+"""Longest step of the integrals: a vehicle turns by a tenth of a radian in it."""
+FEWEST_CHANGES = 6
+LEAST_GAIN = 60.0
+"""Least drop of chi-square, by the noise that the best candidate leaves; 48 candidates come by chance to some 15."""
+LEAST_RATIO = 1.3
+"""Least ratio of the sums of squares as they are and at the best candidate."""
+MOST_LEFT = 1.6
+"""Largest ratio of the sum of squares at the best candidate and with any matrix: beyond it no candidate fits."""
+
+
+@dataclass(frozen=True, eq=False)
+class AxesMatch:
+    """The candidates that fit best."""
+
+    gyro: Floats
+    """G, shape (3, 3): the body's rate is G times the one as read."""
+    dvl: Floats
+    """P, shape (3, 3): the body's velocity is P times the one as read."""
+    ratio: float = 1.0
+    """Typical misfit as read over that of the candidates."""
+    is_vertical_sure: bool = True
+    """False where the sign of the Doppler log's vertical axis does not matter for the fit."""
+
+    @classmethod
+    def as_read(cls) -> "AxesMatch":
+        """Nothing need be changed."""
+        return cls(np.eye(3), np.eye(3))
+
+
+def signed_permutations() -> Floats:
+    """All 48 axes, shape (48, 3, 3); as read first."""
+    found = np.zeros((48, 3, 3))
+    orders = product(permutations(range(3)), product((1.0, -1.0), repeat=3))
+    for P, (order, signs) in zip(found, orders, strict=True):
+        P[np.arange(3), order] = signs
+    return found
+
+
+def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None:
+    """Find the axes; None where the motion does not determine them."""
+    rows = SharedRows.of(imu, dvl, calibration)
+    if rows is None:
+        return None
+    candidates = signed_permutations()
+    ones = np.ones((len(candidates), 1))
+    entries = np.hstack([ones, candidates.reshape(-1, 9)])  # (48, 10)
+    squares = np.empty((48, 48))
+    least = np.empty(48)
+    for k, G in enumerate(candidates):
+        Q = rows.quadratic_form(G)
+        squares[k] = np.einsum("ki,ij,kj->k", entries, Q, entries)
+        # the least that any matrix leaves
+        free = np.linalg.lstsq(Q[1:, 1:], -Q[1:, 0])[0]
+        least[k] = max(Q[0, 0] + free @ Q[1:, 0], 1e-12)
+    k, j = np.unravel_index(np.argmin(squares), squares.shape)
+    best = squares[k, j]
+    variance = best / rows.freedom
+    is_better = squares[0, 0] - best > LEAST_GAIN * variance
+    is_clear = squares[0, 0] > LEAST_RATIO * best
+    if not (is_better and is_clear and best <= MOST_LEFT * least[k]):
+        return AxesMatch.as_read()
+    # of candidates that fit as well the one that changes least
+    traces = np.trace(candidates, axis1=1, axis2=2)
+    handed = np.linalg.det(candidates)
+    close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
+    k, j = max(
+        close,
+        key=lambda kj: (
+            traces[kj[0]] + traces[kj[1]],
+            handed[kj[0]] + handed[kj[1]],
+            -squares[kj[0], kj[1]],
+        ),
+    )
+    other = np.diag([1.0, 1.0, -1.0]) @ candidates[j]
+    is_sure = not any(g == k and (candidates[p] == other).all() for g, p in close)
+    ratio = float(np.sqrt(squares[0, 0] / squares[k, j]))
+    return AxesMatch(candidates[k], candidates[j], ratio, is_sure)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedRows:
+    """Increments of the IMU over steps of at most `STEP_S`, and the Doppler log's rows among them."""
+
+    turn: Floats
+    """Integral of the rate over each step, shape (n - 1, 3), body axes, rad."""
+    impulse: Floats
+    """Integral of the specific force, shape (n - 1, 3), m/s."""
+    row: np.ndarray
+    """Step at which each row of the Doppler log is, shape (k,)."""
+    rate: Floats
+    """At the rows of the Doppler log, shape (k, 3), rad/s."""
+    velocity: Floats
+    """Shape (k, 3), body axes, m/s."""
+    lever: Floats
+    """From IMU to Doppler log, shape (3,), m."""
+    runs: list[tuple[slice, int]]
+    """Rows without a gap or a hole, and how many of them are averaged."""
+
+    @classmethod
+    def of(cls, imu: Imu, dvl: Dvl, calibration: Calibration) -> "SharedRows | None":
+        """Rows in the middle of the log; None where too few are without a hole."""
+        if not np.isfinite(imu.specific_force).all():
+            return None
+        stamps_ns, first = np.unique(imu.stamps_ns, return_index=True)
+        imu_s = (stamps_ns - stamps_ns[0]) * 1e-9
+        t = (dvl.stamps_ns - stamps_ns[0]) * 1e-9
+        inside = (t >= 0) & (t <= imu_s[-1]) & ~is_partial(dvl.velocity_cov)
+        inside[1:] &= np.diff(t) > 0
+        if not inside.any():
+            return None
+        inside &= np.abs(t - np.median(t[inside])) <= LONGEST_S / 2
+        t = t[inside]
+        holes = holes_before(stamps_ns)[np.searchsorted(imu_s, t, side="right") - 1]
+        runs = list(runs_of(t, holes))
+        if not runs:
+            return None
+        steps = np.maximum(np.ceil(np.diff(t) / STEP_S), 1).astype(int)
+        row = np.concatenate([[0], np.cumsum(steps)])
+        grid_s = np.interp(np.arange(row[-1] + 1), row, t)
+        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        w = imu.angular_velocity[first] @ body_R_imu.T
+        f = imu.specific_force[first] @ body_R_imu.T
+        body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+        return cls(
+            increments(imu_s, w, grid_s),
+            increments(imu_s, f, grid_s),
+            row,
+            np.column_stack([np.interp(t, imu_s, column) for column in w.T]),
+            dvl.velocity[inside] @ body_R_dvl.T,
+            np.subtract(
+                calibration.dvl.mounting.translation_m,
+                calibration.imu.mounting.translation_m,
+            ),
+            runs,
+        )
+
+    @property
+    def freedom(self) -> int:
+        """Number of differences less the parameters of the stretches and of P."""
+        changes = [(r.stop - r.start) // together - 1 for r, together in self.runs]
+        return sum(3 * (m - 2) for m in changes) - 9
+
+    def quadratic_form(self, G: Floats) -> Floats:
+        """Q, shape (10, 10), of ``(1, P)``: the sum of squares of r(G, P)."""
+        turn = self.turn @ G.T
+        C = running_rotations(turn)  # (n, 3, 3)
+        half = Rotation.from_rotvec(turn / 2).apply(self.impulse)
+        steps = np.einsum("nij,nj->ni", C[:-1], half)
+        F = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        C = C[self.row]  # (k, 3, 3)
+        turning = C @ (cross_matrices(self.rate @ G.T) @ self.lever)[:, :, None]
+        rest = -F[self.row][:, :, None] - turning
+        by_entries = np.einsum("nai,nj->naij", C, self.velocity)
+        columns = np.concatenate([rest, by_entries.reshape(len(C), 3, 9)], axis=2)
+        Q = np.zeros((10, 10))
+        for run, together in self.runs:
+            changes = np.diff(means_over(columns[run], together), axis=0)
+            flat = changes.reshape(len(changes), 30)
+            # gravity and its turning are of no interest
+            slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(flat)), 1)
+            left = flat - slow @ (np.linalg.pinv(slow) @ flat)
+            left = left.reshape(-1, 10)
+            Q += left.T @ left
+        return Q
+
+
+def runs_of(t: Floats, holes: np.ndarray) -> Iterator[tuple[slice, int]]:
+    """Stretches with enough differences of means over `MEAN_OVER_S`, and the number of rows in a mean."""
+    for run in stretches_of(t, holes):
+        interval_s = float(np.median(np.diff(t[run])))
+        together = max(1, round(MEAN_OVER_S / interval_s))
+        if (run.stop - run.start) // together > FEWEST_CHANGES:
+            yield run, together
+
+
+def increments(t: Floats, values: Floats, grid_s: Floats) -> Floats:
+    """Integrals of columns over the steps of a grid, by the trapezoid rule, shape (n - 1, 3)."""
+    areas = (values[1:] + values[:-1]) / 2 * np.diff(t)[:, None]
+    total = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
+    at_grid = np.column_stack([np.interp(grid_s, t, column) for column in total.T])
+    return np.diff(at_grid, axis=0)

@@ -1,0 +1,90 @@
+"""Changes of range and azimuth between two sightings of a landmark, measured and by the motion of the body."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.signals import SignalStretch
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.models import wrap_angle
+from sonar_graph.sequence import Sequence
+
+PAIR_S = 1.0
+"""Time between two sightings of a landmark that are compared: long enough to move."""
+LONGEST_PAIR_S = 3.0
+"""And short enough to turn little."""
+FEWEST_PAIRS = 20
+
+
+def sighting_pairs(seen: LandmarkDetections, t: Floats, last_s: float) -> Ints | None:
+    """Rows of the first and the next sighting of a landmark, shape (k, 2), by the time of the next; None: too few.
+
+    ``t``: times of the detections; those before 0 or after ``last_s`` are left out.
+    """
+    ids = seen.most_probable()[0]
+    is_usable = seen.are_sound() & (t >= 0) & (t <= last_s) & (ids >= 0)
+    pairs = [np.zeros((0, 2), int)]
+    for landmark_id in np.unique(ids[is_usable]).tolist():
+        rows = np.flatnonzero(is_usable & (ids == landmark_id))
+        next_row = np.searchsorted(t[rows], t[rows] + PAIR_S)
+        later = rows[np.minimum(next_row, len(rows) - 1)]
+        apart_s = t[later] - t[rows]
+        is_pair = (apart_s >= PAIR_S) & (apart_s <= LONGEST_PAIR_S)
+        pairs.append(np.column_stack([rows, later])[is_pair])
+    found = np.concatenate(pairs)
+    if len(found) < FEWEST_PAIRS:
+        return None
+    return found[np.argsort(t[found[:, 1]], kind="stable")]
+
+
+@dataclass(frozen=True, eq=False)
+class SightingChanges:
+    """Changes between two sightings with those by the motion as reference."""
+
+    range: SignalStretch
+    azimuth: SignalStretch
+
+
+def sighting_changes(
+    sequence: Sequence, motion: BodyMotion, sign: float = 1.0
+) -> SightingChanges | None:
+    """Changes of all pairs; None: too few.
+
+    With p = l + r u the landmark in the body, u the direction, l the sonar's place, and the body moved by d and turned
+    by R: ``p_j = R' (p_i - d)``. Elevations are taken as zero; azimuths count with a ``sign``.
+    """
+    seen = sequence.detections
+    if seen is None:
+        return None
+    t = motion.since_origin(seen.stamps_ns)
+    pairs = sighting_pairs(seen, t, motion.seconds[-1])
+    if pairs is None:
+        return None
+    i, j = pairs.T
+    mounting = sequence.calibration.sonar.mounting.pose()
+    R = mounting.rotation().matrix()  # body_R_sonar
+    lever = mounting.translation()
+    azimuth = sign * seen.azimuth_rad[i]
+    ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
+    place = lever + (seen.range_m[i, None] * ahead) @ R.T  # (k, 3)
+    path = motion.reference(motion.path_m)
+    yaw = motion.reference(motion.yaw_rad)
+    height = motion.reference(motion.height_m)
+    # level, in axes of the body at the first sighting
+    moved = (path(t[j]) - path(t[i])) * np.exp(-1j * yaw(t[i]))
+    turned = np.exp(-1j * (yaw(t[j]) - yaw(t[i])))
+    level = (place[:, 0] + 1j * place[:, 1] - moved) * turned
+    z = place[:, 2] - (height(t[j]) - height(t[i]))
+    # a hole between the two sightings makes the motion unknown
+    is_known = motion.part_at(t[i]) == motion.part_at(t[j])
+    after = (np.column_stack([level.real, level.imag, z]) - lever) @ R
+    after[~is_known] = np.nan
+    by_range = np.linalg.norm(after, axis=1) - seen.range_m[i]
+    by_azimuth = wrap_angle(np.arctan2(after[:, 1], after[:, 0]) - azimuth)
+    changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
+    longer = seen.range_m[j] - seen.range_m[i]
+    return SightingChanges(
+        SignalStretch(t[j], longer, lambda _: by_range, has_offset=False),
+        SignalStretch(t[j], changed, lambda _: by_azimuth, has_offset=False),
+    )

@@ -1,0 +1,342 @@
+"""Findings about what holds for a whole log: lever arm from IMU to Doppler log, gyro bias, and the start.
+
+Roll and pitch at the start come from a rest or, if the vehicle moves there, from its first minute
+(docs/theory/alignment.md); the heading needs a reference. Derivation: docs/theory/sensor_check.md.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
+from sonar_graph.diagnosis.findings import (
+    IN_CALIBRATION,
+    NO_NEED,
+    Finding,
+    gravity_of,
+    in_degrees,
+    judged,
+    matters,
+    numbers,
+    said_once,
+    unknown,
+)
+from sonar_graph.errors import AlignmentError
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu
+from sonar_graph.models import wrap_angle
+from sonar_graph.navigation.alignment import (
+    LONGEST_S,
+    DvlMatch,
+    Estimate1D,
+    Estimates3D,
+    InitialTilt,
+    align_at_rest,
+    align_in_motion,
+    until_hole,
+)
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Trajectory
+
+LEAST_LEVER_M = 0.05
+"""A turn of 0.2 rad/s makes 0.01 m/s of it, the noise of a good Doppler log."""
+LEAST_BIAS_RAD_S = 1e-4
+"""The Earth's rotation, 7.3e-5 rad/s, may be in the bias."""
+AXES = "xyz"
+ARM = "lever arm from IMU to DVL"
+BIAS = "gyro bias"
+
+
+def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
+    """One row for each axis; a single row where no axis is known.
+
+    The arm is a difference of two places, and nothing shows which of them is wrong.
+    """
+    if not any(estimate.is_known for estimate in found.lever):
+        return [Finding(ARM, found.lever[0], "m")]
+    given = given_arm(calibration)
+    wrong = arm_error(found, calibration)
+    imu = np.subtract(calibration.imu.mounting.translation_m, wrong)
+    dvl = np.add(calibration.dvl.mounting.translation_m, wrong)
+    line = (
+        f"`imu.mounting.translation_m = {numbers(imu, 3)}` {IN_CALIBRATION} or, if that place is sure, "
+        f"`dvl.mounting.translation_m = {numbers(dvl, 3)}`"
+    )
+    rows = list[Finding]()
+    for axis, estimate, place, error in zip(
+        AXES, found.lever, given, wrong, strict=True
+    ):
+        fits = f"the calibration's {place:+.2f} m fits, {NO_NEED}"
+        row = Finding(f"{ARM}, {axis}", estimate, "m", fits)
+        if error:
+            cause = f"not the calibration's {place:+.2f} m"
+            row = replace(row, cause=cause, line=line, gravity=gravity_of(True, False))
+        rows.append(row)
+    return said_once(rows)
+
+
+def given_arm(calibration: Calibration) -> Floats:
+    """The calibration's arm from IMU to Doppler log, shape (3,), m."""
+    place = calibration.dvl.mounting.translation_m
+    return np.subtract(place, calibration.imu.mounting.translation_m)
+
+
+def arm_error(found: DvlMatch, calibration: Calibration) -> Floats:
+    """Error of the calibration's arm, shape (3,), m; 0 along an axis on which nothing need be done."""
+    errors = [
+        replace(estimate, value=estimate.value - given)
+        for estimate, given in zip(found.lever, given_arm(calibration), strict=True)
+    ]
+    return np.array([e.value if matters(e, LEAST_LEVER_M) else 0.0 for e in errors])
+
+
+def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
+    """Calibration with the changes that the findings advise: place of the IMU, sigma of the gyro bias."""
+    imu = calibration.imu
+    place = np.subtract(imu.mounting.translation_m, arm_error(found, calibration))
+    moved = imu.mounting.model_copy(update={"translation_m": tuple(place.tolist())})
+    sigma = imu.gyro_bias_sigma
+    if any(matters(bias, LEAST_BIAS_RAD_S, sigma) for bias in found.gyro_bias):
+        sigma = largest(found.gyro_bias)
+    changed = imu.model_copy(update={"mounting": moved, "gyro_bias_sigma": sigma})
+    return calibration.model_copy(update={"imu": changed})
+
+
+def bias_findings(
+    bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration
+) -> list[Finding]:
+    """One row for each body axis with its source, such as "from 12 s of rest"; a single row where no axis is known."""
+    if not any(estimate.is_known for estimate in bias):
+        return [Finding(BIAS, bias[0], "rad/s")]
+    allowed = imu.gyro_bias_sigma
+    line = f"`imu.gyro_bias_sigma = {largest(bias):.2g}` {IN_CALIBRATION}, for estimators that find the bias"
+    rows = list[Finding]()
+    for axis, estimate, source in zip(AXES, bias, sources, strict=True):
+        fits = (
+            f"{source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+        )
+        row = Finding(f"{BIAS}, {axis}", estimate, "rad/s", fits)
+        if matters(estimate, LEAST_BIAS_RAD_S, allowed):
+            cause = f"{source}, beyond the calibration's sigma of {allowed:.2g}"
+            row = replace(row, cause=cause, line=line, gravity=gravity_of(True, False))
+        rows.append(row)
+    return said_once(rows)
+
+
+def largest(bias: Estimates3D) -> float:
+    """Largest of the biases that are known, without sign."""
+    return max((abs(one.value) for one in bias if one.is_known), default=0.0)
+
+
+def turned_mounting(dvl: DvlCalibration, yaw_rad: float) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of the mounting after a turn about the body's z axis."""
+    before = Rotation.from_euler("ZYX", dvl.mounting.rpy_rad[::-1])
+    after = Rotation.from_euler("z", yaw_rad) * before
+    yaw, pitch, roll = after.as_euler("ZYX").tolist()
+    return roll, pitch, yaw
+
+
+FEWEST_HEADINGS = 5
+RESTS_S = (10, 20, 40, 80, 160)
+"""Tried lengths of a rest at the start; the longest that holds counts."""
+LEAST_TILT_RAD = np.radians(0.25)
+LEAST_HEADING_RAD = np.radians(1.0)
+"""Smaller errors are hidden by others."""
+TURN_OVER_NS = NS_PER_S
+LEAST_SPREAD_RAD = np.radians(0.1)
+
+
+@dataclass(frozen=True)
+class StartTilt:
+    """Alignment at the start of a log, or the reason why there is none."""
+
+    tilt: InitialTilt | None
+    said: str
+    """Source, such as "from 20 s of rest", or the reason why there is none."""
+    is_rest: bool = False
+
+    def angle(self, axis: int) -> Estimate1D:
+        """Roll (0) or pitch (1), rad."""
+        if self.tilt is None:
+            return unknown(self.said)
+        value = (self.tilt.roll_rad, self.tilt.pitch_rad)[axis]
+        return Estimate1D(value, float(np.sqrt(self.tilt.covariance[axis, axis])))
+
+    def gyro_bias(self) -> Estimates3D | None:
+        """Bias from a rest; None in motion, where the whole drive tells more than its first minute."""
+        if self.tilt is None or not self.is_rest:
+            return None
+        sigmas = np.sqrt(np.diag(self.tilt.covariance)[2:]).tolist()
+        x, y, z = map(Estimate1D, self.tilt.gyro_bias.tolist(), sigmas)
+        return x, y, z
+
+
+def find_start_tilt(sequence: Sequence) -> StartTilt:
+    """Alignment at rest if the vehicle rests at the start, else in motion, of a log with the other faults corrected."""
+    if np.isnan(sequence.imu.specific_force).all():
+        return StartTilt(None, "no accelerometers")
+    found = rest_tilt(sequence)
+    imu, dvl = beginning(sequence, LONGEST_S)
+    if found.tilt is not None or imu is None or dvl is None:
+        return found
+    imu = until_hole(imu)
+    try:
+        tilt = align_in_motion(imu, dvl, sequence.calibration)
+    except AlignmentError as error:
+        reason = without_advice(error)
+    except np.linalg.LinAlgError:
+        reason = "the calibration's noise is zero"
+    else:
+        return StartTilt(tilt, f"from {span_s(imu):.0f} s in motion")
+    return StartTilt(None, f"at rest: {found.said}; in motion: {reason}")
+
+
+def rest_tilt(sequence: Sequence) -> StartTilt:
+    """Alignment at the longest rest at the start, or why there is none."""
+    found = StartTilt(None, "no rows")
+    for rest_s in RESTS_S:
+        imu, dvl = beginning(sequence, rest_s)
+        if imu is None:
+            break
+        try:
+            tilt = align_at_rest(imu, sequence.calibration, dvl)
+        except AlignmentError as error:
+            if found.tilt is None:
+                return StartTilt(None, without_advice(error))
+            break
+        source = f"from {span_s(imu):.0f} s of rest"
+        turned = turn_by_heading(sequence.heading, imu, tilt)
+        if turned is not None:
+            source += ", less the turn of the heading"
+        found = StartTilt(turned or tilt, source, is_rest=True)
+    return found
+
+
+def span_s(imu: Imu) -> float:
+    """Time from the first to the last row."""
+    return float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S
+
+
+def turn_by_heading(
+    heading: Heading | None, imu: Imu, tilt: InitialTilt
+) -> InitialTilt | None:
+    """Alignment at rest whose gyro bias is without a turn that the heading confirms; None where it confirms none.
+
+    A vehicle that turns slowly and steadily looks like one at rest whose gyros have a bias. The heading's rate, by
+    least squares over the rest, counts where it is most of that of the gyros about the vertical, and four of its sigmas
+    (as if all of its scatter were one slow wave).
+    """
+    if heading is None:
+        return None
+    rows = heading.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    if rows is None or len(rows) < FEWEST_HEADINGS:
+        return None
+    t = (rows.stamps_ns - rows.stamps_ns.mean()) / NS_PER_S
+    yaw_rad = np.unwrap(rows.yaw_rad)
+    yaw_rad = yaw_rad - yaw_rad.mean()
+    rate = float(t @ yaw_rad / (t @ t))
+    sigma = 2.0 * float(np.std(yaw_rad - rate * t)) / float(np.ptp(t))
+    body_R_level = Rotation.from_euler("YX", [tilt.pitch_rad, tilt.roll_rad]).inv()
+    up = body_R_level.apply([0.0, 0.0, 1.0])
+    by_gyros = float(up @ tilt.gyro_bias)
+    rate = float(np.copysign(rate, by_gyros))  # also of a compass that runs mirrored
+    if abs(rate) < 4.0 * sigma or abs(rate - by_gyros) > 0.5 * abs(by_gyros):
+        return None
+    covariance = tilt.covariance.copy()
+    covariance[2:, 2:] += sigma**2 * np.outer(up, up)
+    return replace(tilt, gyro_bias=tilt.gyro_bias - rate * up, covariance=covariance)
+
+
+def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Finding]:
+    """One row each for roll and pitch, and a line for the calibration with this heading; a single row without them."""
+    roll = found.angle(0)
+    pitch = found.angle(1)
+    if found.tilt is None:
+        return [Finding("start roll and pitch", roll, "°")]
+    line = (
+        f"`start.rpy_rad = {numbers((roll.value, pitch.value, yaw_rad), 4)}`, `start.rpy_sigma_rad = "
+        f"[{roll.sigma:.2g}, {pitch.sigma:.2g}, {start.rpy_sigma_rad[2]:.2g}]` {IN_CALIBRATION}"
+    )
+    rows = list[Finding]()
+    for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
+        given = start.rpy_rad[axis]
+        stated = f"the calibration's {np.degrees(given):+.2f}°"
+        error = replace(angle, value=wrap_angle(angle.value - given))
+        row = Finding(
+            f"start {name}: value",
+            in_degrees(angle),
+            "°",
+            f"{found.said}; {stated} fits, {NO_NEED}",
+        )
+        if matters(error, LEAST_TILT_RAD, start.rpy_sigma_rad[axis]):
+            cause = f"{found.said}, not {stated}"
+            row = replace(row, cause=cause, line=line, gravity=gravity_of(True, False))
+        rows.append(row)
+    return said_once(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class StartHeading:
+    """Pose of the reference at the start, and error of the calibration's heading."""
+
+    rpy_rad: tuple[float, float, float]
+    position_m: tuple[float, float, float]
+    error: Estimate1D
+    """Rad."""
+
+    @property
+    def acts(self) -> bool:
+        """True where the calibration's heading should be changed."""
+        return matters(self.error, LEAST_HEADING_RAD)
+
+    def finding(self, tilt: StartTilt) -> Finding:
+        """The row, with roll and pitch of the alignment if known, so that rows agree; else those of the reference."""
+        rpy = self.rpy_rad
+        of_tilt = ""
+        if tilt.tilt is not None:
+            rpy = (tilt.tilt.roll_rad, tilt.tilt.pitch_rad, self.rpy_rad[2])
+            of_tilt = f", with roll and pitch {tilt.said}"
+        row = Finding(
+            "start heading: error",
+            in_degrees(self.error),
+            "°",
+            f"the calibration's start heading is wrong; by the reference, its stamps put right{of_tilt}",
+            line=f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` "
+            f"{IN_CALIBRATION}; the position too is the reference's, so that both are of one pose",
+        )
+        return judged(row, self.error, LEAST_HEADING_RAD)
+
+
+def find_start_heading(
+    sequence: Sequence, reference: Trajectory, offset: Estimate1D
+) -> StartHeading:
+    """Compare the calibration's start with the reference at that instant, its stamps corrected by an offset in s."""
+    first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
+    corrected_ns = sequence.start_ns - round(offset.value * NS_PER_S)
+    at_ns = int(np.clip(corrected_ns, first_ns, last_ns))
+    pose = reference.at(np.array([at_ns]))
+    yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
+    x, y, z = pose.positions[0].tolist()
+    error = wrap_angle(sequence.calibration.start.rpy_rad[2] - yaw)
+    begin_ns = max(at_ns - TURN_OVER_NS // 2, first_ns)
+    end_ns = min(at_ns + TURN_OVER_NS // 2, last_ns)
+    turn_rate = 0.0
+    if end_ns > begin_ns:
+        begin, end = reference.at(np.array([begin_ns, end_ns])).rotations()
+        turned_rad = float((begin.inv() * end).magnitude())
+        turn_rate = turned_rad * NS_PER_S / (end_ns - begin_ns)
+    spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
+    return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
+
+
+def beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | None]:
+    """Rows of so long from the start on."""
+    before_ns = sequence.start_ns - 1
+    until_ns = sequence.start_ns + round(seconds * NS_PER_S)
+    imu = sequence.imu.between(before_ns, until_ns)
+    return imu, sequence.dvl.between(before_ns, until_ns)
+
+
+def without_advice(error: AlignmentError) -> str:
+    """The finding of an error; other rows have the advice."""
+    return str(error).partition(";")[0]

@@ -1,0 +1,175 @@
+"""Units of velocities, rates and forces, where the values as configured are implausible for a vehicle.
+
+A common factor must make them plausible. A slow vehicle's rates in degrees can pass for rates in radians: no finding is
+no proof. docs/theory/sensor_check.md.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from sonar_graph.diagnosis.findings import IN_LOG_CONFIG, Finding, Gravity, unknown
+from sonar_graph.diagnosis.sightings import sighting_pairs
+from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.measurements import NS_PER_S, Floats, Imu
+from sonar_graph.sequence import Sequence
+
+FASTEST_M_S = 20.0
+"""Implausible over the bottom for a twentieth of a log."""
+FASTEST_TURN_RAD_S = 2.0
+"""Implausible for a twentieth of a log, 115 degrees a second."""
+SPEEDS = {"cm/s": 1e-2, "mm/s": 1e-3}
+"""Factor to m/s."""
+FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
+"""Factor to m/s²; mg and cm/s² differ by a fiftieth, so that the nearest counts."""
+SHARE_OF_GRAVITY = 0.2
+"""Relative difference allowed between a typical specific force and gravity."""
+USUAL_SPEED_M_S = 3.0
+MEDIAN_ROWS = 9
+LARGEST_RANGE_RATIO = 10.0
+"""Changes of range by the Doppler log over those measured: 1 but for noise and turns, 100 in cm/s."""
+HIGH_PERCENTILE = 95.0
+LEAST_SECONDS = 30
+LEAST_TILTING_RAD_S = 0.02
+LARGEST_TILT_RATIO = 10.0
+"""Tilting by gyros over that by gravity: below 1 in rad/s but for the gyros' noise, up to 57 in degrees."""
+
+
+def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
+    """Velocities, rates and specific forces in an implausible unit; the configured scales enter the lines."""
+    checks = (velocity_unit, rate_unit, force_unit)
+    return [finding for check in checks for finding in check(sequence, config)]
+
+
+def unit_finding(sensor: str, cause: str, line: str) -> Finding:
+    """A grave finding without a number."""
+    return Finding(
+        f"{sensor}: unit",
+        unknown("wrong unit"),
+        cause=cause,
+        line=line,
+        gravity=Gravity.GRAVE,
+    )
+
+
+def velocity_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Speeds that no vehicle has, or that change ranges to landmarks far too much."""
+    speed_m_s = exceeded_by_few(sequence.dvl.velocity)
+    measured_m, by_dvl_m = range_changes(sequence) or (1.0, 0.0)
+    is_far = by_dvl_m > LARGEST_RANGE_RATIO * measured_m
+    if not (speed_m_s > FASTEST_M_S or is_far):
+        return
+    slow = [unit for unit in SPEEDS if speed_m_s * SPEEDS[unit] <= USUAL_SPEED_M_S]
+    unit = slow[0] if slow else "mm/s"
+    scale = config.number("dvl", "scale", 1.0) * SPEEDS[unit]
+    why = f"up to {speed_m_s:.3g} m/s"
+    if is_far:
+        why += f"; ranges to landmarks change by {measured_m:.3g} m, by them by {by_dvl_m:.3g} m"
+    line = f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
+    if speed_m_s > FASTEST_M_S and unit != "mm/s":
+        line += f"; mm/s if the vehicle moves at {speed_m_s * SPEEDS['mm/s']:.2g} m/s"
+    times = 1 / SPEEDS[unit]
+    yield unit_finding(
+        "DVL", f"velocities look {times:.0f} times too large ({why}): {unit}?", line
+    )
+
+
+def rate_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Rates that no vehicle has, or that tilt it far more than gravity does in the accelerometers."""
+    rate_rad_s = exceeded_by_few(sequence.imu.angular_velocity)
+    by_gyros, by_gravity = tilt_rates(sequence.imu) or (0.0, 0.0)
+    if rate_rad_s > FASTEST_TURN_RAD_S:
+        doubt = f"57 times too large (up to {rate_rad_s:.3g} rad/s)"
+    elif by_gyros > max(LEAST_TILTING_RAD_S, LARGEST_TILT_RATIO * by_gravity):
+        doubt = f"too large (they tilt the vehicle by {by_gyros:.2g} rad/s, gravity by {by_gravity:.2g})"
+    else:
+        return
+    scale = config.number("imu", "angular_velocity_scale", 1.0) * np.radians(1.0)
+    yield unit_finding(
+        "gyro",
+        f"rates look {doubt}: degrees a second?",
+        f"`angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}",
+    )
+
+
+def force_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Typical specific forces that are gravity in another unit."""
+    forces = lengths(sequence.imu.specific_force)
+    if not len(forces):
+        return
+    typical = float(np.median(forces))
+    gravity = sequence.calibration.gravity_m_s2
+    unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
+    if abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
+        return
+    scale = config.number("imu", "linear_acceleration_scale", 1.0) * FORCES[unit]
+    yield unit_finding(
+        "accelerometer",
+        f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}?",
+        f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}",
+    )
+
+
+def tilt_rates(imu: Imu) -> tuple[float, float] | None:
+    """Median rates of tilting by the gyros and by the accelerometers, rad/s; None where these show nothing.
+
+    From second to second gravity turns in the sensor by ``u_k+1 - u_k = -θ x u_k``, and the force also by what
+    accelerates the vehicle: the accelerometers' rate is too large, never too small.
+    """
+    seconds = (imu.stamps_ns - imu.stamps_ns[0]) // NS_PER_S
+    names, first, count = np.unique(seconds, return_index=True, return_counts=True)
+    force = np.add.reduceat(imu.specific_force, first, axis=0)
+    is_next = np.diff(names) == 1
+    is_measured = np.isfinite(force).all() and force.any(axis=1).all()
+    if np.count_nonzero(is_next) < LEAST_SECONDS or not is_measured:
+        return None
+    up = force / np.linalg.norm(force, axis=1)[:, None]
+    rate = np.add.reduceat(imu.angular_velocity, first, axis=0) / count[:, None]
+    rate = rate - np.median(rate, axis=0)  # a bias turns nothing
+    by_gyros = np.linalg.norm(np.cross((rate[1:] + rate[:-1]) / 2, up[:-1]), axis=1)
+    by_gravity = np.linalg.norm(np.diff(up, axis=0), axis=1)
+    return float(np.median(by_gyros[is_next])), float(np.median(by_gravity[is_next]))
+
+
+def range_changes(sequence: Sequence) -> tuple[float, float] | None:
+    """Median change of the range to a landmark between sightings, and by the Doppler log, m; None where few are known.
+
+    With u the direction in which it is seen, `r_j - r_i = -∫ u·v dt`. The noise of ranges makes the first one larger.
+    """
+    seen = sequence.detections
+    dvl = sequence.dvl
+    rows = np.flatnonzero(np.isfinite(dvl.velocity).all(axis=1))
+    if seen is None or len(rows) < MEDIAN_ROWS:
+        return None
+    origin_ns = dvl.stamps_ns[rows[0]]
+    dvl_s = (dvl.stamps_ns[rows] - origin_ns) / NS_PER_S
+    t = (seen.stamps_ns - origin_ns) / NS_PER_S
+    pairs = sighting_pairs(seen, t, dvl_s[-1])
+    if pairs is None:
+        return None
+    i, j = pairs.T
+    calibration = sequence.calibration
+    v = dvl.velocity[rows] @ calibration.dvl.mounting.pose().rotation().matrix().T
+    v = median_filter(v, size=(MEDIAN_ROWS, 1))  # outliers would add up
+    steps = (v[1:] + v[:-1]) / 2 * np.diff(dvl_s)[:, None]
+    path = np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    moved = [np.interp(t[j], dvl_s, p) - np.interp(t[i], dvl_s, p) for p in path.T]
+    azimuth = seen.azimuth_rad
+    ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
+    u = ahead @ calibration.sonar.mounting.pose().rotation().matrix().T
+    by_dvl = np.abs(np.einsum("ak,ka->k", moved, (u[i] + u[j]) / 2))
+    measured = np.abs(seen.range_m[j] - seen.range_m[i])
+    least = calibration.sonar.range_sigma_m
+    return max(float(np.median(measured)), least), float(np.median(by_dvl))
+
+
+def exceeded_by_few(vectors: Floats) -> float:
+    """Length that one in twenty vectors exceeds, so that spikes do not count."""
+    found = lengths(vectors)
+    return float(np.percentile(found, HIGH_PERCENTILE)) if len(found) else 0.0
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Lengths of the finite rows."""
+    return np.asarray(np.linalg.norm(vectors[np.isfinite(vectors).all(axis=1)], axis=1))
