@@ -163,11 +163,12 @@ def repeat_frames(log: Log, from_s: float) -> None:
 
 
 def hold_azimuths(log: Log, from_s: float) -> None:
-    """Every landmark keeps the azimuth at which it was first seen from an instant on."""
-    held: dict[int, float] = {}
-    for k in np.flatnonzero(log.frame_s >= from_s):
-        ids, r, a = log.sightings[k]
-        log.sightings[k] = (ids, r, np.array([held.setdefault(i, v) for i, v in zip(ids.tolist(), a, strict=True)]))
+    """All landmarks have one azimuth from an instant on."""
+    later = np.flatnonzero(log.frame_s >= from_s)
+    held = next((float(a[0]) for _, _, a in log.sightings[later[0] :] if len(a)), 0.0)
+    for k in later:
+        ids, r, _ = log.sightings[k]
+        log.sightings[k] = (ids, r, np.full(len(ids), held))
 
 
 def bursts(times: Floats, share: float) -> Mask:
@@ -332,7 +333,7 @@ def table() -> Iterator[Fault]:
     yield Fault(q, "scale", "factor", (1.045, 1.1, 0.9), scale_ranges, ranges, seen | {"dvl"}, needs)
     yield Fault(q, "marked invalid", "share, NaN", SHARES, MarkedSightings(1), ANY, seen, needs)
     q = "azimuth"
-    yield Fault(q, "stuck", "held from a second on", FROM_S, hold_azimuths, r"azimuths|contradict|landmark", seen, needs)
+    yield Fault(q, "stuck", "one value from a second on", FROM_S, hold_azimuths, r"(sonar|landmark|detections).*(same|repeat|hardly)", seen, needs)
     yield Fault(q, "axes or sense", "mirrored", AGAIN, lambda log, _: scale_azimuths(log, -1.0), azimuths, seen, needs)
     yield Fault(q, "unit", "degrees", (DEGREES,) * 3, scale_azimuths, azimuths, seen, needs)
     yield Fault(q, "scale", "factor", (1.1, 0.8, 1.25), scale_azimuths, azimuths, seen, needs)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.diagnosis.findings import (
+    ACTING_SIGMAS,
     IN_CALIBRATION,
     IN_LOG_CONFIG,
     NO_NEED,
@@ -23,7 +24,7 @@ from sonar_graph.diagnosis.findings import (
     numbers,
     unknown,
 )
-from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
@@ -103,8 +104,12 @@ class Check:
     scale_key: str = "scale"
     systematic: float = 0.0
     """Sigma of the gain by what the comparison leaves out."""
+    slow_sigma: Callable[[Sequence], float] = lambda _: 0.0
+    """Error of sensor and reference that changes as slowly as the motion, in the sensor's unit: blocks of rows hide it."""
     least_scale: float = 0.03
     least_lag_s: float = 0.1
+    reach: Callable[[Sequence, Match], float] = lambda _, found: found.moved
+    """What the error of a gain is multiplied by, in the sensor's unit."""
     quantity: str = ""
     """Name of the gain where it is not made from the others."""
     is_angle: bool = False
@@ -146,6 +151,17 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     t = motion.since_origin(depth.stamps_ns)
     rows = motion.stretches(t, depth.z_m, motion.reference(height))
     return match(list(rows), drift_sigma=0.03)
+
+
+def path_sigma(sequence: Sequence) -> float:
+    """Error of a coordinate reckoned by the Doppler log over the log, about a line, m.
+
+    The integral of white noise is a random walk, and about a line an eighth of its end's error is left in a gain.
+    """
+    interval_s = float(np.median(np.diff(sequence.dvl.stamps_ns))) / NS_PER_S
+    duration_s = min(sequence.duration_s, STRETCH_S)
+    velocity_m_s = max(sequence.calibration.dvl.velocity_sigma_m_s)
+    return velocity_m_s * float(np.sqrt(interval_s * duration_s)) / 8.0
 
 
 def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -203,6 +219,7 @@ DEPTH = Check(
     against="the Doppler log's vertical velocity",
     compare=depth_match,
     sigma=lambda sequence: max(sequence.calibration.depth.sigma_m, 0.02),
+    slow_sigma=path_sigma,
     units=LENGTHS | PRESSURES,
     sense=lambda config: Advice(
         "it rises where the vehicle sinks by the Doppler log: depths downwards, or an altimeter?",
@@ -219,6 +236,7 @@ HEADING = Check(
     against="the gyros",
     compare=heading_match,
     sigma=lambda sequence: sequence.calibration.heading.sigma_rad,
+    slow_sigma=lambda sequence: 0.1 * sequence.calibration.heading.bias_sigma_rad,
     units=DEGREES,
     sense=lambda config: Advice(
         "it turns against the gyros, clockwise", other_world(config, "heading")
@@ -238,6 +256,9 @@ POSITIONS = Check(
     against="the path by gyros and Doppler log",
     compare=fix_match,
     sigma=lambda sequence: level_sigma_m(sequence.calibration.positions.sigma_m),
+    slow_sigma=lambda sequence: (
+        0.1 * level_sigma_m(sequence.calibration.positions.sigma_m)
+    ),
     units=LENGTHS | {"degrees": 1.1e5},
     sense=lambda config: Advice(
         "north and east are exchanged",
@@ -258,6 +279,8 @@ RANGE = Check(
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
     units=LENGTHS,
     scale_key="range_scale",
+    # landmarks are wrong by the error of the whole range, not of its changes
+    reach=lambda sequence, _: typical_range_m(sequence),
     sense=lambda _: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}",
@@ -290,6 +313,14 @@ AZIMUTH = Check(
 CHECKS = (DEPTH, RANGE, AZIMUTH, HEADING, POSITIONS)
 
 
+def typical_range_m(sequence: Sequence) -> float:
+    """Median range of the sightings that can be used; 0 without any."""
+    seen = sequence.detections
+    if seen is None or not (is_sound := seen.are_sound()).any():
+        return 0.0
+    return float(np.median(seen.range_m[is_sound]))
+
+
 def level_sigma_m(sigma_m: tuple[float, float, float]) -> float:
     """Standard deviation of a level position, both axes together."""
     return float(np.hypot(*sigma_m[:2]))
@@ -307,6 +338,9 @@ def findings_of(
     size = abs(found.gain.value)
     if not found.gain.is_known:
         return [Finding(quantity, found.gain)]
+    by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
+    whole_sigma = float(np.sqrt(found.gain.sigma**2 + by_slow**2 + check.systematic**2))
+    found = replace(found, gain=replace(found.gain, sigma=whole_sigma))
     if not found.moved * max(1.0, size) > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
     gain = found.gain.limited(LARGEST_GAIN_SIGMA * max(1.0, size), still)
@@ -323,11 +357,10 @@ def findings_of(
         ]
     if not gain.is_known:
         return [Finding(quantity, gain)]
-    error = abs(size - 1.0) * found.moved
+    error = abs(size - 1.0) * check.reach(sequence, found)
     is_off = matters(replace(gain, value=size - 1.0), check.least_scale)
     acts = is_off and error > sigma and not check.slips(sequence)
-    known = replace(gain, sigma=float(np.hypot(gain.sigma, check.systematic)))
-    row = Finding(quantity, known, cause=NO_NEED)
+    row = Finding(quantity, gain, cause=NO_NEED)
     if acts:
         advice = check.scaled(config, size)
         row = replace(
@@ -357,7 +390,8 @@ def grave_fault(
     if found.is_mirrored or (gain.is_known and gain.value < 0):
         return check.sense(config)
     other_unit = SLIPPING_UNIT if check.slips(sequence) else OTHER_UNIT
-    if gain.is_known and not 1 / other_unit < size < other_unit:
+    is_sure = matters(replace(gain, value=size - 1.0), 0.0)
+    if is_sure and not 1 / other_unit < size < other_unit:
         return unit_advice(check, size, config)
     # sightings that contradict the motion are wrong identities as a rule, which the estimators name
     is_scattered = found.scatter > LARGEST_SCATTER * sigma and not check.is_sighting
@@ -443,7 +477,12 @@ def vertical_bias(
         bias = replace(found, sigma=max(found.sigma, 1e-9))
     imu = sequence.calibration.imu
     allowed = imu.gyro_bias_sigma
-    if not matters(bias, LEAST_BIAS_RAD_S, allowed):
+    # a deviation that changes over the log looks like a bias too
+    deviation_rad = 0.0
+    if sequence.heading is not None:
+        deviation_rad = sequence.calibration.heading.bias_sigma_rad
+    by_deviation = np.sqrt(2.0) * deviation_rad / max(sequence.duration_s, 1.0)
+    if not matters(bias, LEAST_BIAS_RAD_S, float(np.hypot(allowed, by_deviation))):
         cause = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
         return Finding(quantity, bias, "rad/s", cause)
     up = np.median(motion.up, axis=0) @ imu.mounting.pose().rotation().matrix()
@@ -460,8 +499,8 @@ def vertical_bias(
     )
 
 
-FARTHEST_FROM_START_M = 2.0
-"""Height that a vehicle gains about the start, with its depth sensor's error."""
+FARTHEST_FROM_START_M = 0.5
+"""Height that a vehicle gains about the start, with waves and its depth sensor's error."""
 FIRST_ROWS = 5
 
 
@@ -476,7 +515,10 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     height_m = float(np.median(depth.z_m[first : first + FIRST_ROWS]))
     port = np.array(sequence.calibration.depth.port_m)
     off_m = height_m - float(start.pose().transformFrom(port)[2])
-    if abs(off_m) <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]:
+    sigma_m = float(
+        np.hypot(start.position_sigma_m[2], sequence.calibration.depth.sigma_m)
+    )
+    if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
     x, y, z = start.position_m
     yield Finding(
@@ -639,12 +681,13 @@ def distance_finding(
 ) -> Finding:
     """Distance of the first fixes from the start, and whether they begin far from it or from the world's origin."""
     calibration = right.calibration
-    order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))
-    near = np.median(fixes.position_m[order[:NEAR_START]], axis=0)
+    order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
+    near = np.median(fixes.position_m[order], axis=0)
     from_start_m = float(np.hypot(*(near - calibration.start.position_m)[:2]))
     from_origin_m = float(np.hypot(*near[:2]))
     noise_m = level_sigma_m(calibration.positions.sigma_m)
-    path_m = float(way_m(right, right.dvl.stamps_ns[-1:])[0])
+    # how far the vehicle can be from the start by then
+    path_m = float(way_m(right, fixes.stamps_ns[order]).max())
     start_m = level_sigma_m(calibration.start.position_sigma_m)
     allowed_m = 5.0 * float(np.hypot(noise_m, start_m)) + path_m
     quantity = "position fixes: distance from the start"
@@ -661,7 +704,8 @@ def distance_finding(
     origin = numbers(before + np.round(near), 0)
     return replace(
         row,
-        cause=f"they begin {distance_m:.3g} m from {place}, the whole way is {path_m:.3g} m: a map grid (UTM)?",
+        cause=f"they begin {distance_m:.3g} m from {place}, the way to them is {path_m:.3g} m: a map grid (UTM), or another "
+        "scale or place?",
         line=f"`origin_m = {origin}` under [positions] {IN_LOG_CONFIG} moves the origin to the first; or state the "
         "start there",
         gravity=Gravity.GRAVE,

@@ -57,7 +57,7 @@ from sonar_graph.diagnosis.start import (
     turned_mounting,
     with_fitted,
 )
-from sonar_graph.diagnosis.units import wrong_units
+from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import gravity_warning
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.adapters.adapter import axes_matrix
@@ -112,6 +112,7 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     config = config or LogConfig()
     if faults := wrong_units(sequence, config):
         return faults
+    forces, sequence = force_findings(sequence, config)
     axes, sequence = axes_findings(sequence, config)
     imu, dvl = middle_rows(sequence)
     match = match_dvl_to_imu(imu, dvl, sequence.calibration)
@@ -125,7 +126,7 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         bias = [f for f in bias if f.estimate.is_known or f.acts]
     reference = reference_findings(right, config, tilt)
     noise = noise_findings(sequence)
-    return worst_first([*axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise])
+    return worst_first([*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise])
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -137,8 +138,9 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """
     if faults := wrong_units(sequence, config):
         return faults
-    axes, right = axes_findings(sequence, config)
-    found = worst_first([*axes, *motion_findings(right, config)])
+    forces, right = force_findings(sequence, config)
+    axes, right = axes_findings(right, config)
+    found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
 
 
@@ -159,6 +161,20 @@ def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
     inner_imu = imu.between(first_ns + spare_ns, last_ns - spare_ns)
     inner_dvl = dvl.between(first_ns + spare_ns, last_ns - spare_ns)
     return inner_imu or imu, inner_dvl or dvl
+
+
+def force_findings(
+    sequence: Sequence, config: LogConfig
+) -> tuple[list[Finding], Sequence]:
+    """Scale of the accelerometers by gravity, and the sequence with the scale put right."""
+    found = force_scale(sequence, config)
+    if found is None:
+        return [], sequence
+    if found.acts:
+        imu = sequence.imu
+        force = imu.specific_force / found.estimate.value
+        sequence = replace(sequence, imu=replace(imu, specific_force=force))
+    return [found], sequence
 
 
 def axes_findings(

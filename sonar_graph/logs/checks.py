@@ -456,14 +456,33 @@ def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     return _repeated_while_moving(differs, moved, least)
 
 
+def repeated_sightings(
+    frame: Ints, sightings: Floats, moved: Floats, least: float
+) -> NDArray[np.bool_]:
+    """Mask of sightings, shape (n,), that repeat what came before to the bit while the vehicle moves.
+
+    Either a whole frame repeats the frame before, or one coordinate has one value for all landmarks of several frames.
+
+    ``frame``: number of each sighting's frame, in order, shape (n,). ``sightings``: range and azimuth, shape (n, 2).
+    ``moved``: the way until each sighting, m.
+    """
+    mask = repeated_frames(frame, sightings, moved, least)
+    has_company = np.zeros(len(frame), bool)
+    has_company[1:] = frame[1:] == frame[:-1]
+    for column in sightings.T:
+        differs = column[1:] != column[:-1]
+        is_held = _repeated_while_moving(differs, moved, least)
+        # a single landmark straight ahead keeps the azimuth of a beam; two landmarks do not share it
+        run = np.concatenate([[0], np.cumsum(differs)])
+        shares = np.bincount(run, weights=is_held & has_company)
+        mask |= is_held & (shares[run] > 0)
+    return mask
+
+
 def repeated_frames(
     frame: Ints, sightings: Floats, moved: Floats, least: float
 ) -> NDArray[np.bool_]:
-    """Mask of sightings, shape (n,), whose whole frame repeats the frame before to the bit while the vehicle moves.
-
-    ``frame``: number of each sighting's frame, in order, shape (n,). ``sightings``: what a frame repeats, shape (n, k).
-    ``moved``: the way until each sighting, m.
-    """
+    """Mask of sightings, shape (n,), whose whole frame repeats the frame before, as of `repeated_sightings`."""
     begins = np.flatnonzero(np.diff(frame, prepend=frame[0] - 1))
     parts = np.split(sightings, begins[1:])
     differs = np.array(

@@ -37,9 +37,8 @@ from sonar_graph.logs.checks import (
     axes_warning,
     gap_warnings,
     gravity_warning,
-    gyro_warning,
     is_partial,
-    repeated_frames,
+    repeated_sightings,
     repeats,
     spike_warning,
     stamp_faults,
@@ -414,7 +413,7 @@ class Assembly:
         least = LEAST_MOVED[role]
         if isinstance(rows, LandmarkDetections):
             seen = np.column_stack((rows.range_m, rows.azimuth_rad))
-            stuck = repeated_frames(rows.stamps_ns, seen, moved, least)
+            stuck = repeated_sightings(rows.stamps_ns, seen, moved, least)
         else:
             values = {
                 "positions": "position_m",
@@ -537,24 +536,19 @@ class Assembly:
     def doubts(self) -> Iterator[str]:
         """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
 
-        Axes of the IMU that gravity and velocity contradict, and quantities that are stuck.
+        Axes of the accelerometers that gravity contradicts, and quantities that are stuck.
         """
         imu = self.block("imu")
         dvl = self.block("dvl")
         if imu is None:
             return
-        gravity = gravity_warning(
-            imu.specific_force,
-            self.calibration.imu.mounting,
-            self.calibration.gravity_m_s2,
-        )
-        if gravity:
+        mounting = self.calibration.imu.mounting
+        g = self.calibration.gravity_m_s2
+        if gravity := gravity_warning(imu.specific_force, mounting, g):
             yield f"imu: {gravity}"
         # wheels turn evenly, and their rates jump
         if dvl is None or self.calibration.odometry_interpolation != "linear":
             return
-        if not gravity and (axes := gyro_warning(imu, dvl, self.calibration)):
-            yield f"imu: {axes}"
         rows = {
             "angular rate": (imu.stamps_ns, imu.angular_velocity),
             "specific force": (imu.stamps_ns, imu.specific_force),
