@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.batch.plan import sources_now, versions_of
-from sonar_graph.batch.sources import fingerprint, read_source
+from sonar_graph.batch.result_table import FINDINGS
+from sonar_graph.batch.sources import fingerprint, read_source, with_findings
 from sonar_graph.batch.store import PlannedRun, Preparation, Row, RunOutcome
 from sonar_graph.errors import BatchError, EstimatorError
 from sonar_graph.estimator import load_estimator
@@ -120,6 +121,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     else:
         write_comparison(comparison, folder)
         row = measured(comparison)
+        row |= {name: sequence.notes.get(f"log.{name}") for name in FINDINGS}
     row |= {**clock.seconds, "cpu_s": time.process_time() - cpu_before_s}
     now = sources_now(target)  # modules may be imported as late as during the run
     if differing := [
@@ -162,6 +164,7 @@ def _sequence(
     values = json.loads(options)
     _check_content(kind, values, content)
     sequence = read_source(kind, values, seed, json.loads(landmarks))
+    sequence = with_findings(kind, values, sequence)
     _check_content(kind, values, content)
     return sequence
 

@@ -127,6 +127,8 @@ def metrics_of(keys: list[str]) -> list[Metric]:
 
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
+FINDINGS = ("doubtful", "sensors")
+"""Notes of the comparison of a log's sensors with each other, as of `sonar-graph compare`."""
 VERSIONS = (
     "sonar_graph",
     "source",
@@ -142,6 +144,7 @@ COLUMNS = {
     **dict.fromkeys(TEXTS, "string"),
     "seed": "int64",
     **dict.fromkeys(SETTINGS, "string"),
+    **dict.fromkeys(FINDINGS, "string"),
     "rate_hz": "float64",
     **dict.fromkeys(VERSIONS, "string"),
     **dict.fromkeys(TIMINGS, "float64"),

@@ -201,13 +201,20 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
 def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
     """Write the page and the tables of a batch from its results, and warn of runs that are missing."""
     from sonar_graph.batch import read_batch
-    from sonar_graph.report import lost_told, missing_told, write_batch_report
+    from sonar_graph.report import (
+        lost_told,
+        missing_told,
+        sensors_told,
+        write_batch_report,
+    )
 
     with working("drawing"):
         batch = read_batch(folder)
         page = write_batch_report(batch, folder, overwrite=overwrite)
     for sentence in [*missing_told(batch), *lost_told(batch)]:
         echo(f"Warning: {sentence}", err=True)
+    for sentence in sensors_told(batch):
+        echo(sentence, err=True)
     return page
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,6 +98,7 @@ def live(
     """
     import numpy as np
 
+    from sonar_graph.diagnosis import check_sensors, notes_of
     from sonar_graph.evaluation import (
         RunResult,
         check_request,
@@ -114,6 +116,7 @@ def live(
         recorded_messages,
     )
     from sonar_graph.logs import LiveRecord, read_log
+    from sonar_graph.report import doubt_lines
 
     reading = ReadingOptions(calibration, topics, log_config)
     record = output / RECORD
@@ -186,13 +189,18 @@ def live(
         finish_s=outcome.finish_s,
     )
     with working("writing results"):
-        comparison = judge(read_log(record), outcome.causal.stamps_ns, [result])
+        sequence = read_log(record)
+        notes = notes_of(check_sensors(sequence, reading.config))
+        sequence = replace(sequence, notes={**sequence.notes, **notes})
+        comparison = judge(sequence, outcome.causal.stamps_ns, [result])
         with result_written(output, COMPARISON):
             write_comparison(comparison, output)
             write_viewer_files(comparison, output)
     echo(
         f"{sum(counts['received'].values())} messages, {sum(counts['lost'].values())} lost"
     )
+    for line in doubt_lines(notes):
+        echo(line, err=True)
     for what in ("lost", "dropped"):
         for name, number in counts[what].items():
             echo(f"{what}: {number} of {name}")

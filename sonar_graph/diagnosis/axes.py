@@ -86,29 +86,29 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
         # the least that any matrix leaves
         free = np.linalg.lstsq(Q[1:, 1:], -Q[1:, 0])[0]
         least[k] = max(Q[0, 0] + free @ Q[1:, 0], 1e-12)
-    k, j = np.unravel_index(np.argmin(squares), squares.shape)
-    best = squares[k, j]
+    best = squares.min()
     variance = best / rows.freedom
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
     is_clear = squares[0, 0] > LEAST_RATIO * best
-    if not (is_better and is_clear and best <= MOST_LEFT * least[k]):
+    is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
+    if not (is_better and is_clear and is_fit):
         return AxesMatch.as_read()
     # of candidates that fit as well the one that changes least
-    traces = np.trace(candidates, axis1=1, axis2=2)
+    changes_least = np.trace(candidates, axis1=1, axis2=2)
     handed = np.linalg.det(candidates)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
-    k, j = max(
-        close,
-        key=lambda kj: (
-            traces[kj[0]] + traces[kj[1]],
-            handed[kj[0]] + handed[kj[1]],
-            -squares[kj[0], kj[1]],
-        ),
-    )
-    other = np.diag([1.0, 1.0, -1.0]) @ candidates[j]
-    is_sure = not any(g == k and (candidates[p] == other).all() for g, p in close)
-    ratio = float(np.sqrt(squares[0, 0] / squares[k, j]))
-    return AxesMatch(candidates[k], candidates[j], ratio, is_sure)
+
+    def preference(pair: list[int]) -> tuple[float, float, float]:
+        k, j = pair
+        kept = changes_least[k] + changes_least[j]
+        return kept, handed[k] + handed[j], -squares[k, j]
+
+    gyro, dvl = max(close, key=preference)
+    other = np.diag([1.0, 1.0, -1.0]) @ candidates[dvl]
+    rivals = [candidates[j] for k, j in close if k == gyro]
+    is_sure = not any((rival == other).all() for rival in rivals)
+    ratio = float(np.sqrt(squares[0, 0] / squares[gyro, dvl]))
+    return AxesMatch(candidates[gyro], candidates[dvl], ratio, is_sure)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,10 @@ log: rows are numbered by the part without one that they belong to, and referenc
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis.signals import SignalStretch, Values
@@ -21,6 +23,7 @@ from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
 from sonar_graph.navigation.alignment import InertialPath
 from sonar_graph.sequence import Sequence
 
+Number = TypeVar("Number", np.float64, np.complex128)
 UP_OVER_S = 1.0
 """Time over which the felt direction of up is averaged."""
 STRETCH_S = 120.0
@@ -166,10 +169,12 @@ def part_edges(path: InertialPath, t: Floats, side: str) -> Floats:
     return path.seconds[np.searchsorted(path.parts, part, side="right") - 1]
 
 
-def integral(t: Floats, values: Values, *, is_held: bool = False) -> Values:
+def integral(
+    t: Floats, values: NDArray[Number], *, is_held: bool = False
+) -> NDArray[Number]:
     """Running integral from zero: by the trapezoid rule, or of values that hold for the time before them."""
     means = values[1:] if is_held else (values[1:] + values[:-1]) / 2
-    return np.concatenate([np.zeros(1), np.cumsum(means * np.diff(t))])
+    return np.concatenate([np.zeros(1, values.dtype), np.cumsum(means * np.diff(t))])
 
 
 def columns_at(at: Floats, t: Floats, values: Floats) -> Floats:

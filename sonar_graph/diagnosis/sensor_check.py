@@ -90,8 +90,6 @@ CERTAIN_SIGMAS = 4.0
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 
 
-# matrices are small: threads of BLAS would only wait for each other
-@threadpool_limits.wrap(limits=1, user_api="blas")
 def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[Finding]:
     """Findings in the order in which to act; wrong units alone, since they spoil the rest.
 
@@ -109,7 +107,13 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     >>> [finding.quantity for finding in check_sensors(small_world()) if finding.acts]
     []
     """
-    config = config or LogConfig()
+    # matrices are small: threads of BLAS would only wait for each other
+    with threadpool_limits(1, user_api="blas"):
+        return worst_first(all_findings(sequence, config or LogConfig()))
+
+
+def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
+    """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
     forces, sequence = force_findings(sequence, config)
@@ -126,10 +130,9 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         bias = [f for f in bias if f.estimate.is_known or f.acts]
     reference = reference_findings(right, config, tilt)
     noise = noise_findings(sequence)
-    return worst_first([*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise])
+    return [*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise]
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Findings to act on, without the slower comparison of Doppler log and accelerometers (`check_sensors`).
 

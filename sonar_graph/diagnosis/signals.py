@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.diagnosis.findings import unknown
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import Estimate1D
 
 Values = NDArray[np.floating | np.complexfloating]
@@ -148,13 +148,18 @@ class RobustFit:
         return cls(A, p, inverse, residuals, usable, kept)
 
     @property
+    def rows(self) -> Ints:
+        """Number of rows with a reference of each candidate, shape (k,); 0 where they are too few."""
+        rows = self.usable.sum(axis=1)
+        return np.where(rows < FEWEST_ROWS, 0, rows)
+
+    @property
     def squares(self) -> Floats:
-        """Mean square of each candidate, shape (k,); a far row counts as the farthest that fits. Infinite: too few rows."""
+        """Sum of squares of each candidate, shape (k,), in which a far row counts as the farthest that fits."""
         size = np.abs(self.residuals)
         limit = np.max(size, axis=1, where=self.kept, initial=0.0)
-        total = np.sum(np.minimum(size, limit[:, None]) ** 2, axis=1)
-        rows = self.usable.sum(axis=1)
-        return np.where(rows < FEWEST_ROWS, np.inf, total / np.maximum(rows, 1))
+        squares = np.sum(np.minimum(size, limit[:, None]) ** 2, axis=1)
+        return np.where(self.rows > 0, squares, 0.0)
 
     def sigmas(self) -> Floats:
         """Standard deviations of the first candidate's coefficients, by blocks of rows, shape (p,)."""
@@ -183,10 +188,8 @@ def match(
         x = stretch.shifted(lags_s)
         candidates = np.concatenate([x, x.conj()] if is_plane else [x])
         found = RobustFit.of(candidates[:, :, None], stretch, drift_sigma)
-        of_stretch = found.squares.reshape(squares.shape)
-        count = found.usable.sum(axis=1).reshape(squares.shape)
-        squares += np.where(np.isfinite(of_stretch), count * of_stretch, 0.0)
-        rows += np.where(np.isfinite(of_stretch), count, 0)
+        squares += found.squares.reshape(squares.shape)
+        rows += found.rows.reshape(squares.shape)
     mean_squares = np.where(rows > 0, squares / np.maximum(rows, 1), np.inf)
     now = int(np.argmin(np.abs(lags_s)))
     if not rows[0, now]:
@@ -219,7 +222,7 @@ def refined(
             columns.append(stretch.slope(lag_s))
         x = np.stack(columns, axis=1)[None]  # (1, n, 1 or 2)
         found = RobustFit.of(x.conj() if is_mirrored else x, stretch, drift_sigma)
-        if not np.isfinite(found.squares[0]):
+        if not found.rows[0]:
             continue
         c = found.p[0, 0]
         sigmas = found.sigmas()

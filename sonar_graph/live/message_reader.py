@@ -179,6 +179,8 @@ class PlainImu:
         """Form of a message that was read without faults; None where it takes more than numbers to read it."""
         if adapter.linear_acceleration is None:
             return None
+        if adapter.angular_velocity_axes is not None:
+            return None
         stamp = f"{adapter.stamp}.sec", f"{adapter.stamp}.nanosec"
         status = [
             path

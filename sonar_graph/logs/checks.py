@@ -5,11 +5,10 @@ Nothing is corrected here. Each check returns sentences for the notes of a seque
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import pairwise, permutations, product
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import (
     HOLE_INTERVALS,
@@ -22,7 +21,6 @@ from sonar_graph.calibration import (
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.sequence import longest_part
 
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
@@ -45,9 +43,6 @@ SPIKE_RATIO = 20.0
 LARGEST_LAG_S = 1.0
 """Median time between stamp and recording that is still usual."""
 LARGEST_LAG_CHANGE_S = 0.5
-FEWEST_SECONDS = 60
-MOST_IMPROVED = 2.0
-"""Ratio of medians of 60 distances that chance does not make of equally good ones."""
 LEAST_MOVED = {"positions": 1.0, "heading": 0.2, "depth": 0.5, "detections": 0.5}
 """Motion, m or rad, from which on a sensor that repeats its value is stuck, by role."""
 RESOLUTIONS = 3.0
@@ -248,67 +243,6 @@ def gravity_warning(
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
     return f"gravity is felt along {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
-
-
-def gyro_warning(imu: Imu, dvl: Dvl, calibration: Calibration) -> str | None:
-    """Warning where rates about other axes or of other signs fit forces and velocities much better.
-
-    Over seconds with mean specific force f, turn w T and velocities v of the Doppler log, in body axes, the world's up
-    is ``u = f - dv / T - w x v``, normalised, and ``u_j = Exp(-w T) u_i`` from one second to the next. Compared is the
-    median of the squared differences, over all permutations and signs of the rates. docs/theory/sensor_check.md.
-    """
-    # a clock may have been set meanwhile
-    spans_ns = [longest_part(rows.stamps_ns) for rows in (imu, dvl)]
-    first_ns, last_ns = (
-        max(first for first, _ in spans_ns),
-        min(last for _, last in spans_ns),
-    )
-    if (last_ns - first_ns) * 1e-9 > len(imu):
-        return None
-    edges_s = np.arange(0.0, (last_ns - first_ns) * 1e-9, 1.0)
-    if len(edges_s) < FEWEST_SECONDS or np.isnan(imu.specific_force).any():
-        return None
-    imu_s, dvl_s = (
-        np.asarray((rows.stamps_ns - first_ns) * 1e-9, np.float64)
-        for rows in (imu, dvl)
-    )
-    body_R_imu, body_R_dvl = (
-        part.mounting.pose().rotation().matrix()
-        for part in (calibration.imu, calibration.dvl)
-    )
-    means = []
-    for values in (imu.angular_velocity, imu.specific_force):
-        steps = (
-            0.5 * (values[1:] + values[:-1]) @ body_R_imu.T * np.diff(imu_s)[:, None]
-        )
-        total = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-        means.append(np.diff(_between(edges_s, imu_s, total), axis=0))
-    (w, f), v = means, _between(edges_s, dvl_s, dvl.velocity @ body_R_dvl.T)
-    apart = {}
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        axes = ", ".join(
-            "-"[: sign < 0] + "xyz"[axis]
-            for axis, sign in zip(order, signs, strict=True)
-        )
-        turn = w[:, order] * signs
-        up = f - np.diff(v, axis=0) - np.cross(turn, 0.5 * (v[1:] + v[:-1]))
-        up /= np.linalg.norm(up, axis=1)[:, None]
-        carried = Rotation.from_rotvec(-0.5 * (turn[1:] + turn[:-1])).apply(up[:-1])
-        apart[axes] = 1e3 * float(
-            np.sqrt(np.median(np.sum((up[1:] - carried) ** 2, axis=1)))
-        )
-    best, as_is_mrad = min(apart, key=apart.__getitem__), apart["x, y, z"]
-    if not apart[best] < as_is_mrad / MOST_IMPROVED:
-        return None
-    return (
-        f"gravity and velocity turn, by {apart[best]:.2g} mrad a second instead of {as_is_mrad:.2g}, as gyro rates "
-        f"about the axes ({best}) would: give rotation, the IMU's mounting, or angular_velocity_scale = -1"
-    )
-
-
-def _between(at_s: Floats, times_s: Floats, values: Floats) -> Floats:
-    """Columns of values at other times, linear, shape (n, 3)."""
-    return np.column_stack([np.interp(at_s, times_s, column) for column in values.T])
 
 
 def axes_warning(adapter: Adapter) -> str | None:

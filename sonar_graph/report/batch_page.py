@@ -122,6 +122,7 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
             *summary.missing_told(batch),
             *summary.absent_told(batch),
             *summary.failures_told(batch),
+            *summary.sensors_told(batch),
         ],
         "warnings": [
             *summary.reference_told(batch),

@@ -367,6 +367,20 @@ def missing_told(batch: RecordedBatch) -> list[str]:
     ]
 
 
+def sensors_told(batch: RecordedBatch) -> list[str]:
+    """What the sensors of each log contradict, grave findings first."""
+    words = {"doubtful": "Doubtful", "sensors": "Warning"}
+    found = {
+        (subject, run.log): run.texts[subject]
+        for subject in words
+        for run in batch.runs
+        if subject in run.texts
+    }
+    return [
+        f"{words[subject]}: {log}: {text}" for (subject, log), text in found.items()
+    ]
+
+
 def absent_told(batch: RecordedBatch) -> list[str]:
     """The logs that were left out because their data was not there, and where it is from."""
     return [

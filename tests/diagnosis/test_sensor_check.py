@@ -386,9 +386,7 @@ def test_velocities_that_a_vehicle_has_are_in_another_unit_where_ranges_change_b
     run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=factor * SLOW.dvl.velocity))
     measured_m, by_dvl_m = range_changes(run)
     assert by_dvl_m / measured_m == pytest.approx(factor, rel=0.4)
-    (said,) = [
-        fault.advice for fault in wrong_units(run, LogConfig())
-    ] or [""]
+    (said,) = [fault.advice for fault in wrong_units(run, LogConfig())] or [""]
     assert ("cm/s? `scale = 0.01`" in said) == (factor > 10.0)
     assert ("ranges to landmarks change by" in said) == (factor > 10.0)
 
@@ -410,12 +408,8 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     few = SLOW.detections.rows(slice(0, 15))
     far = replace(SLOW.dvl, velocity=100.0 * velocity)
     assert range_changes(replace(SLOW, detections=few)) is None
-    assert not wrong_units(
-        replace(SLOW, detections=few, dvl=far), LogConfig()
-    )
-    assert not wrong_units(
-        replace(SLOW, detections=None, dvl=far), LogConfig()
-    )
+    assert not wrong_units(replace(SLOW, detections=few, dvl=far), LogConfig())
+    assert not wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
 
 
 @pytest.mark.parametrize(("unit", "factor", "shares"), FORCES)

@@ -9,13 +9,11 @@ from sonar_graph.calibration import (
     Calibration,
     DvlCalibration,
     ImuCalibration,
-    Mounting,
 )
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
 from sonar_graph.logs.checks import (
     gap_warnings,
-    gyro_warning,
     repeats,
     spike_warning,
     stamp_faults,
@@ -24,7 +22,6 @@ from sonar_graph.logs.checks import (
 from sonar_graph.logs.reading import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.navigation.imu_gaps import hole_ns
-from sonar_graph.simulation import MissionOptions, simulate_mission
 
 PINGS, SAMPLES = np.arange(1500) * 0.2, np.arange(30000) * 0.01
 NAN = (np.nan,) * 3
@@ -277,42 +274,6 @@ def test_a_value_that_repeats_while_the_vehicle_moves_is_stuck_from_its_second_r
     assert (repeats(values, moved, least) == expected).all()
     coarse = np.round(0.1 * np.arange(60.0))[:, None]
     assert not repeats(coarse, 0.1 * np.arange(60.0), 0.5).any()
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (np.eye(3), None),
-        (-np.eye(3), "(-x, -y, -z)"),
-        (np.diag([1.0, 1.0, -1.0]), "(x, y, -z)"),
-        (np.eye(3)[[1, 0, 2]], "(y, x, z)"),
-        (np.eye(3)[[1, 2, 0]], "(z, x, y)"),
-        (0.9 * np.eye(3), None),
-    ],
-)
-def test_rates_about_other_axes_are_told_by_how_gravity_turns(
-    change: Floats, told: str | None
-) -> None:
-    world = simulate_mission(MissionOptions(duration_s=90.0))
-    mounted = world.calibration.imu.model_copy(
-        update={"mounting": Mounting(rpy_rad=(0.3, -0.2, 1.0))}
-    )
-    sensor_R_body = mounted.mounting.pose().rotation().matrix().T
-    rate, force = (
-        world.imu.angular_velocity @ change.T @ sensor_R_body.T,
-        world.imu.specific_force @ sensor_R_body.T,
-    )
-    known = world.calibration.model_copy(update={"imu": mounted})
-    found = gyro_warning(Imu(world.imu.stamps_ns, rate, force), world.dvl, known)
-    assert (found is None) if told is None else (told in (found or ""))
-    assert (
-        gyro_warning(
-            Imu(world.imu.stamps_ns, rate, np.full_like(force, np.nan)),
-            world.dvl,
-            known,
-        )
-        is None
-    )
 
 
 def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:

@@ -25,6 +25,7 @@ from sonar_graph.logs.adapters.adapter import (
     ForceScale,
     LengthScale,
     RateScale,
+    SignedAxes,
     axes_matrix,
     field_paths,
     turn,
@@ -55,6 +56,8 @@ class ImuAdapter(Adapter):
     """Fields of the rates about x, y, z."""
     angular_velocity_scale: RateScale = 1.0
     """Turns them into rad/s; 0.017453292519943295 or "deg/s" from degrees."""
+    angular_velocity_axes: SignedAxes | None = None
+    """Rates alone, after `rotation`: the axis of each, ["x", "y", "-z"] where the driver has yaw with the wrong sign."""
     angular_velocity_status: str | None = None
     """Field that is -1 where the rate was not measured."""
     linear_acceleration: Paths | None
@@ -92,6 +95,8 @@ class ImuAdapter(Adapter):
             unique=True,
         )
         rate = turn(self.rotation, rate[rows])
+        if self.angular_velocity_axes is not None:
+            rate = turn(self.angular_velocity_axes, rate)
         force = turn(self.rotation, force[rows])
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
 

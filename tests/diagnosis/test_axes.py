@@ -1,0 +1,95 @@
+"""Axes of gyros and Doppler log: each wrong candidate is found, told apart, and a right log is left as it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Mounting
+from sonar_graph.diagnosis import check_sensors
+from sonar_graph.diagnosis.axes import match_axes, signed_permutations
+from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+from .test_sensor_check import line_of
+
+WORLD = simulate_mission(MissionOptions(duration_s=90.0, landmarks=1))
+MOUNTED = Mounting(rpy_rad=(0.3, -0.2, 1.0))
+IDENTITY = np.eye(3)
+
+
+def spoilt(gyro: np.ndarray, dvl: np.ndarray) -> Sequence:
+    """Rates about other axes of the body, of an IMU that sits askew, and velocities along others."""
+    sensor_R_body = MOUNTED.pose().rotation().matrix().T
+    imu = replace(
+        WORLD.imu,
+        angular_velocity=WORLD.imu.angular_velocity @ gyro @ sensor_R_body.T,
+        specific_force=WORLD.imu.specific_force @ sensor_R_body.T,
+    )
+    R = WORLD.calibration.dvl.mounting.pose().rotation().matrix()
+    velocity = WORLD.dvl.velocity @ R.T @ dvl @ R
+    section = WORLD.calibration.imu.model_copy(update={"mounting": MOUNTED})
+    return replace(
+        WORLD,
+        imu=imu,
+        dvl=replace(WORLD.dvl, velocity=velocity),
+        calibration=WORLD.calibration.model_copy(update={"imu": section}),
+    )
+
+
+@pytest.mark.parametrize("k", range(48))
+def test_every_axis_and_sign_of_the_gyros_is_found_and_the_doppler_log_left_alone(
+    k: int,
+) -> None:
+    G = signed_permutations()[k]
+    run = spoilt(G, IDENTITY)
+    found = match_axes(run.imu, run.dvl, run.calibration)
+    assert found is not None
+    assert (found.gyro == G).all()
+    assert (found.dvl == IDENTITY).all()
+
+
+@pytest.mark.parametrize("axes", [(1, -1, 1), (-1, -1, 1), (-1, 1, 1), (1, -1, -1)])
+def test_signs_of_the_doppler_log_are_found_and_the_gyros_left_alone(
+    axes: tuple[float, float, float],
+) -> None:
+    run = spoilt(IDENTITY, np.diag(axes))
+    found = match_axes(run.imu, run.dvl, run.calibration)
+    assert found is not None
+    assert (found.gyro == IDENTITY).all()
+    assert (found.dvl == np.diag(axes)).all()
+
+
+def test_signs_of_both_at_once_are_told_apart() -> None:
+    wrong_yaw = np.diag([1.0, 1.0, -1.0])
+    mirrored = np.diag([1.0, -1.0, 1.0])
+    run = spoilt(wrong_yaw, mirrored)
+    found = match_axes(run.imu, run.dvl, run.calibration)
+    assert found is not None
+    assert (found.gyro == wrong_yaw).all()
+    assert (found.dvl == mirrored).all()
+
+
+def test_without_accelerometers_or_motion_nothing_is_known() -> None:
+    none = np.full_like(WORLD.imu.specific_force, np.nan)
+    imu = replace(WORLD.imu, specific_force=none)
+    assert match_axes(imu, WORLD.dvl, WORLD.calibration) is None
+    few = WORLD.dvl.rows(slice(20))
+    assert match_axes(WORLD.imu, few, WORLD.calibration) is None
+
+
+@pytest.mark.parametrize("given", [("x", "y", "z"), ("x", "-y", "z")])
+def test_a_gyro_whose_yaw_is_negated_is_named_first_with_the_line_that_mends_it(
+    given: tuple[str, str, str],
+) -> None:
+    """The line replaces that of the configuration."""
+    rate = WORLD.imu.angular_velocity * [1.0, 1.0, -1.0]
+    run = replace(WORLD, imu=replace(WORLD.imu, angular_velocity=rate))
+    table = {"imu": {"angular_velocity_axes": list(given)}}
+    finding, *others = check_sensors(run, LogConfig.parse(table, "x"))
+    assert finding.quantity == "gyro axes"
+    assert finding.grave
+    wanted = [given[0], given[1], "-z"]
+    assert line_of(finding) == {"angular_velocity_axes": wanted}
+    assert [other.quantity for other in others if other.acts] == []
