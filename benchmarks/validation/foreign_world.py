@@ -23,6 +23,7 @@ Mask = NDArray[np.bool_]
 DURATION_S = 60.0
 EPOCH_S = 1_760_000_000
 GRAVITY_M_S2 = 9.80665
+GRAVITY = np.array([0.0, 0.0, GRAVITY_M_S2])
 ATMOSPHERE_PA = 101_325.0
 PASCALS_PER_METRE = 1000.0 * GRAVITY_M_S2
 KNOT_S = 3.0
@@ -76,10 +77,21 @@ class World:
     @classmethod
     def draw(cls, rng: np.random.Generator, needs: frozenset[str]) -> "World":
         """World with at least the sensors that a fault needs."""
-        share = {"depth": 0.85, "heading": 0.6, "fixes": 0.5, "sonar": 0.6, "names": 0.7}
-        sensors = frozenset(name for name, p in share.items() if rng.random() < p) | needs
+        share = {
+            "depth": 0.85,
+            "heading": 0.6,
+            "fixes": 0.5,
+            "sonar": 0.6,
+            "names": 0.7,
+        }
+        sensors = (
+            frozenset(name for name, p in share.items() if rng.random() < p) | needs
+        )
         is_measured = {"heading", "fixes", "depth"} <= sensors
-        gaps_s = [(float(begin), float(begin + rng.uniform(2.0, 6.0))) for begin in rng.uniform(8.0, 50.0, rng.integers(3))]
+        gaps_s = [
+            (float(begin), float(begin + rng.uniform(2.0, 6.0)))
+            for begin in rng.uniform(8.0, 50.0, rng.integers(3))
+        ]
         return cls(
             style=str(rng.choice(["wander", "wander", "straight", "mower", "hover"])),
             depth_m=float(rng.uniform(1.0, 60.0)),
@@ -132,7 +144,9 @@ class Log:
 # --- world and sensors -------------------------------------------------------------------------------------------
 
 
-def gauss_markov(rng: np.random.Generator, times: Floats, sigma: float, time_s: float) -> Floats:
+def gauss_markov(
+    rng: np.random.Generator, times: Floats, sigma: float, time_s: float
+) -> Floats:
     """An error that holds for some time, shape (n,)."""
     keep = np.exp(-np.diff(times, prepend=times[0]) / time_s)
     drawn = sigma * np.sqrt(1 - keep**2) * rng.standard_normal(len(times))
@@ -144,7 +158,9 @@ def gauss_markov(rng: np.random.Generator, times: Floats, sigma: float, time_s: 
     return found
 
 
-def motion(world: World, rng: np.random.Generator) -> tuple[CubicSpline, RotationSpline]:
+def motion(
+    world: World, rng: np.random.Generator
+) -> tuple[CubicSpline, RotationSpline]:
     """Position and attitude of the body over the dive."""
     knots = np.arange(-2 * KNOT_S, DURATION_S + 4 * KNOT_S, KNOT_S)
     n = len(knots)
@@ -156,7 +172,11 @@ def motion(world: World, rng: np.random.Generator) -> tuple[CubicSpline, Rotatio
         climbs_m *= 0.1
     elif world.style == "mower":
         place = np.arange(n) % 12
-        steps_rad = 0.05 * steps_rad + np.pi / 2 * np.isin(place, (4, 5)) - np.pi / 2 * np.isin(place, (10, 11))
+        steps_rad = (
+            0.05 * steps_rad
+            + np.pi / 2 * np.isin(place, (4, 5))
+            - np.pi / 2 * np.isin(place, (10, 11))
+        )
     elif world.style == "hover":
         is_hovering = knots < DURATION_S / 2
         speed[is_hovering] *= 0.03
@@ -164,11 +184,15 @@ def motion(world: World, rng: np.random.Generator) -> tuple[CubicSpline, Rotatio
         climbs_m[is_hovering] *= 0.05
     yaw = np.cumsum(steps_rad) + rng.uniform(-np.pi, np.pi)
     sway = 0.12 * world.speed_m_s * rng.standard_normal(n)
-    level = np.cumsum(KNOT_S * (speed + 1j * sway) * np.exp(1j * yaw)) + complex(*rng.uniform(-50.0, 50.0, 2))
+    level = np.cumsum(KNOT_S * (speed + 1j * sway) * np.exp(1j * yaw)) + complex(
+        *rng.uniform(-50.0, 50.0, 2)
+    )
     z = np.minimum(-world.depth_m + np.cumsum(climbs_m), -0.5)
     tilt = 0.04 * rng.standard_normal((2, n))
     attitudes = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt[0], tilt[1]]))
-    return CubicSpline(knots, np.column_stack([level.real, level.imag, z])), RotationSpline(knots, attitudes)
+    return CubicSpline(
+        knots, np.column_stack([level.real, level.imag, z])
+    ), RotationSpline(knots, attitudes)
 
 
 def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
@@ -179,7 +203,13 @@ def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
     noise = world.noise
     imu_s = np.arange(0.0, DURATION_S, 1.0 / world.imu_hz)
     dvl_s = np.arange(0.0, DURATION_S, 1.0 / world.dvl_hz)
-    has_lock = ~np.any([(dvl_s > begin) & (dvl_s < end) for begin, end in [*world.gaps_s, (-2.0, -1.0)]], axis=0)
+    has_lock = ~np.any(
+        [
+            (dvl_s > begin) & (dvl_s < end)
+            for begin, end in [*world.gaps_s, (-2.0, -1.0)]
+        ],
+        axis=0,
+    )
     dvl_s = dvl_s[has_lock]
     depth_s = np.arange(0.0, DURATION_S, 1.0 / world.aiding_hz)
     heading_s = depth_s.copy()
@@ -190,20 +220,38 @@ def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
     rate = attitude(imu_s, 1)
     arm = world.imu_arm_m
     swing = np.cross(attitude(imu_s, 2), arm) + np.cross(rate, np.cross(rate, arm))
-    force = attitude(imu_s).inv().apply(place(imu_s, 2) + [0.0, 0.0, GRAVITY_M_S2]) + swing
+    force = attitude(imu_s).inv().apply(place(imu_s, 2) + GRAVITY) + swing
     rate = rate + rng.normal(0, 1e-4 * white, rate.shape) + rng.normal(0, 4e-5, 3)
     force = force + rng.normal(0, 1e-3 * white, force.shape) + rng.normal(0, 5e-3, 3)
 
-    velocity = attitude(dvl_s).inv().apply(place(dvl_s, 1)) + np.cross(attitude(dvl_s, 1), world.dvl_arm_m)
-    slow = np.column_stack([gauss_markov(rng, dvl_s, 0.002 * noise, 5.0) for _ in range(3)])
-    velocity = velocity * (1 + rng.normal(0, 0.001)) + slow + rng.normal(0, 0.01 * noise, velocity.shape)
+    velocity = attitude(dvl_s).inv().apply(place(dvl_s, 1)) + np.cross(
+        attitude(dvl_s, 1), world.dvl_arm_m
+    )
+    slow = np.column_stack(
+        [gauss_markov(rng, dvl_s, 0.002 * noise, 5.0) for _ in range(3)]
+    )
+    velocity = (
+        velocity * (1 + rng.normal(0, 0.001))
+        + slow
+        + rng.normal(0, 0.01 * noise, velocity.shape)
+    )
 
     z_m = place(depth_s)[:, 2] + attitude(depth_s).apply(world.port_m)[:, 2]
-    z_m = z_m + gauss_markov(rng, depth_s, 0.01 * noise, 3.0) + rng.normal(0, 0.01 * noise, len(depth_s))
+    z_m = (
+        z_m
+        + gauss_markov(rng, depth_s, 0.01 * noise, 3.0)
+        + rng.normal(0, 0.01 * noise, len(depth_s))
+    )
     yaw_rad = attitude(heading_s).as_euler("ZYX")[:, 0]
-    yaw_rad = yaw_rad + gauss_markov(rng, heading_s, 0.01 * noise, 20.0) + rng.normal(0, 0.01 * noise, len(heading_s))
+    yaw_rad = (
+        yaw_rad
+        + gauss_markov(rng, heading_s, 0.01 * noise, 20.0)
+        + rng.normal(0, 0.01 * noise, len(heading_s))
+    )
     fix_m = place(fix_s) + attitude(fix_s).apply(world.antenna_m)
-    wander = np.column_stack([gauss_markov(rng, fix_s, 0.15 * noise, 10.0) for _ in range(3)])
+    wander = np.column_stack(
+        [gauss_markov(rng, fix_s, 0.15 * noise, 10.0) for _ in range(3)]
+    )
     fix_m = fix_m + wander + rng.normal(0, 0.3 * noise, (len(fix_s), 3))
 
     yaw_0, pitch_0, roll_0 = attitude(0.0).as_euler("ZYX")
@@ -228,18 +276,28 @@ def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
 
 
 def sightings(
-    world: World, rng: np.random.Generator, place: CubicSpline, attitude: RotationSpline, frame_s: Floats
+    world: World,
+    rng: np.random.Generator,
+    place: CubicSpline,
+    attitude: RotationSpline,
+    frame_s: Floats,
 ) -> Iterator[tuple[NDArray[np.int64], Floats, Floats]]:
     """Identities, ranges and azimuths of the landmarks that each frame shows."""
     way = place(np.linspace(0, DURATION_S, LANDMARKS))
-    landmarks = way + np.column_stack([rng.normal(0, 5.0, (LANDMARKS, 2)), rng.normal(0, 0.3, LANDMARKS)])
+    landmarks = way + np.column_stack(
+        [rng.normal(0, 5.0, (LANDMARKS, 2)), rng.normal(0, 0.3, LANDMARKS)]
+    )
     for second in frame_s:
-        seen = attitude(second).inv().apply(landmarks - place(second)) - world.sonar_arm_m
+        seen = (
+            attitude(second).inv().apply(landmarks - place(second)) - world.sonar_arm_m
+        )
         distance = np.linalg.norm(seen, axis=1)
         azimuth = np.arctan2(seen[:, 1], seen[:, 0])
         elevation = np.arcsin(seen[:, 2] / distance)
         is_near = (distance > 1.0) & (distance < LONGEST_RANGE_M)
-        ids = np.flatnonzero(is_near & (np.abs(azimuth) < FIELD_OF_VIEW_RAD) & (np.abs(elevation) < 0.12))
+        ids = np.flatnonzero(
+            is_near & (np.abs(azimuth) < FIELD_OF_VIEW_RAD) & (np.abs(elevation) < 0.12)
+        )
         noisy_r = distance[ids] + rng.normal(0, 0.02 * world.noise, len(ids))
         noisy_a = azimuth[ids] + rng.normal(0, 0.009 * world.noise, len(ids))
         yield ids.astype(np.int64), noisy_r, noisy_a
@@ -248,7 +306,9 @@ def sightings(
 # --- messages ----------------------------------------------------------------------------------------------------
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-STORE.register(get_types_from_msg(DETECTIONS, "sonar_graph_msgs/msg/LandmarkDetections"))
+STORE.register(
+    get_types_from_msg(DETECTIONS, "sonar_graph_msgs/msg/LandmarkDetections")
+)
 STORE.register(get_types_from_msg(HEADING, "sonar_graph_msgs/msg/Heading"))
 TYPES = STORE.types
 IMU = "sensor_msgs/msg/Imu"
@@ -265,7 +325,9 @@ Row = tuple[float, str, str, Any]
 def header(seconds: float, frame: str) -> Any:
     """Header at some seconds after the epoch."""
     ns = round(seconds * 1e9) + EPOCH_S * 1_000_000_000
-    stamp = TYPES["builtin_interfaces/msg/Time"](sec=ns // 1_000_000_000, nanosec=ns % 1_000_000_000)
+    stamp = TYPES["builtin_interfaces/msg/Time"](
+        sec=ns // 1_000_000_000, nanosec=ns % 1_000_000_000
+    )
     return TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
 
 
@@ -276,7 +338,11 @@ def vector(values: Floats) -> Any:
 
 def quaternion(yaw_rad: float) -> Any:
     """Quaternion of a yaw; without a direction for NaN."""
-    xyzw = np.zeros(4) if np.isnan(yaw_rad) else Rotation.from_euler("z", yaw_rad).as_quat()
+    xyzw = (
+        np.zeros(4)
+        if np.isnan(yaw_rad)
+        else Rotation.from_euler("z", yaw_rad).as_quat()
+    )
     return TYPES["geometry_msgs/msg/Quaternion"](*map(float, xyzw))
 
 
@@ -308,7 +374,14 @@ def imu_rows(log: Log) -> Iterator[Row]:
         of_force = absent if forces_marked[k] else unknown
         rate = vector(log.rate[k])
         force = vector(log.force[k])
-        yield t, "/imu/data", IMU, TYPES[IMU](header(t, "imu_link"), no_turn, absent, rate, of_rate, force, of_force)
+        yield (
+            t,
+            "/imu/data",
+            IMU,
+            TYPES[IMU](
+                header(t, "imu_link"), no_turn, absent, rate, of_rate, force, of_force
+            ),
+        )
 
 
 def dvl_rows(log: Log) -> Iterator[Row]:
@@ -316,10 +389,21 @@ def dvl_rows(log: Log) -> Iterator[Row]:
     is_marked = marked(log, "velocity", len(log.dvl_s))
     for k, t in enumerate(log.dvl_s):
         covariance = np.zeros(36)
-        covariance[[0, 7, 14]] = HUGE_VARIANCE if is_marked[k] else (0.01 * log.world.noise) ** 2
-        twist = TYPES["geometry_msgs/msg/Twist"](vector(log.velocity[k]), vector(np.zeros(3)))
-        with_covariance = TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, covariance)
-        yield t, "/dvl/twist", TWIST, TYPES[TWIST](header(t, "dvl_link"), with_covariance)
+        covariance[[0, 7, 14]] = (
+            HUGE_VARIANCE if is_marked[k] else (0.01 * log.world.noise) ** 2
+        )
+        twist = TYPES["geometry_msgs/msg/Twist"](
+            vector(log.velocity[k]), vector(np.zeros(3))
+        )
+        with_covariance = TYPES["geometry_msgs/msg/TwistWithCovariance"](
+            twist, covariance
+        )
+        yield (
+            t,
+            "/dvl/twist",
+            TWIST,
+            TYPES[TWIST](header(t, "dvl_link"), with_covariance),
+        )
 
 
 def depth_rows(log: Log) -> Iterator[Row]:
@@ -329,7 +413,9 @@ def depth_rows(log: Log) -> Iterator[Row]:
         variance = HUGE_VARIANCE if is_marked[k] else (0.015 * log.world.noise) ** 2
         if log.world.has_pressure:
             pascals = ATMOSPHERE_PA - PASCALS_PER_METRE * log.z_m[k]
-            message = TYPES[PRESSURE](header(t, "depth_link"), float(pascals), variance * PASCALS_PER_METRE**2)
+            message = TYPES[PRESSURE](
+                header(t, "depth_link"), float(pascals), variance * PASCALS_PER_METRE**2
+            )
             yield t, "/depth/pressure", PRESSURE, message
         else:
             yield t, "/depth/pose", POSE, pose(t, (0.0, 0.0, log.z_m[k]), variance)
@@ -341,7 +427,12 @@ def heading_rows(log: Log) -> Iterator[Row]:
     for k, t in enumerate(log.heading_s):
         if log.world.has_yaw_message:
             sigma = HUGE_VARIANCE if is_marked[k] else 0.014 * log.world.noise
-            yield t, "/heading", YAW, TYPES[YAW](header(t, "map"), float(log.yaw_rad[k]), sigma)
+            yield (
+                t,
+                "/heading",
+                YAW,
+                TYPES[YAW](header(t, "map"), float(log.yaw_rad[k]), sigma),
+            )
         else:
             turn = quaternion(np.nan if is_marked[k] else log.yaw_rad[k])
             yield t, "/heading", QUATERNION, TYPES[QUATERNION](header(t, "map"), turn)
@@ -365,14 +456,21 @@ def sonar_rows(log: Log) -> Iterator[Row]:
         tracks = np.full(n, -1) if is_named else ids
         probability = np.full(n, 1.0 if is_named else 0.0)
         covariance = np.tile(covariance_of_one, n)
-        message = TYPES[SEEN](header(t, "sonar_link"), r, a, covariance, names, probability, tracks)
+        message = TYPES[SEEN](
+            header(t, "sonar_link"), r, a, covariance, names, probability, tracks
+        )
         yield t, "/sonar/landmarks", SEEN, message
 
 
 def write(log: Log, path: Path) -> None:
     """Write an MCAP file with the sensors of the world."""
     rows = [*imu_rows(log), *dvl_rows(log)]
-    for sensor, of_sensor in {"depth": depth_rows, "heading": heading_rows, "fixes": fix_rows, "sonar": sonar_rows}.items():
+    for sensor, of_sensor in {
+        "depth": depth_rows,
+        "heading": heading_rows,
+        "fixes": fix_rows,
+        "sonar": sonar_rows,
+    }.items():
         if sensor in log.world.sensors:
             rows += of_sensor(log)
     with path.open("wb") as file:
@@ -385,7 +483,9 @@ def write(log: Log, path: Path) -> None:
                 schema = writer.register_schema(kind, "ros2msg", definition.encode())
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             ns = round(t * 1e9) + EPOCH_S * 1_000_000_000
-            writer.add_message(channels[topic], ns, bytes(STORE.serialize_cdr(message, kind)), ns)
+            writer.add_message(
+                channels[topic], ns, bytes(STORE.serialize_cdr(message, kind)), ns
+            )
         writer.finish()
 
 

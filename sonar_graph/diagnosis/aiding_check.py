@@ -150,7 +150,8 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     height = motion.height_m + motion.up @ sequence.calibration.depth.port_m
     t = motion.since_origin(depth.stamps_ns)
     rows = motion.stretches(t, depth.z_m, motion.reference(height))
-    return match(list(rows), drift_sigma=0.03)
+    found = match(list(rows), drift_sigma=0.03)
+    return found.less_certain(motion.sampling_error(motion.height_m))
 
 
 def path_sigma(sequence: Sequence) -> float:
@@ -185,7 +186,8 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    return match(list(motion.stretches(t, level, motion.reference(path))))
+    found = match(list(motion.stretches(t, level, motion.reference(path))))
+    return found.less_certain(motion.sampling_error(motion.path_m))
 
 
 def is_level_fix(fixes: PositionFixes) -> NDArray[np.bool_]:
@@ -339,8 +341,7 @@ def findings_of(
     if not found.gain.is_known:
         return [Finding(quantity, found.gain)]
     by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
-    whole_sigma = float(np.sqrt(found.gain.sigma**2 + by_slow**2 + check.systematic**2))
-    found = replace(found, gain=replace(found.gain, sigma=whole_sigma))
+    found = found.less_certain(float(np.hypot(by_slow, check.systematic)))
     if not found.moved * max(1.0, size) > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
     gain = found.gain.limited(LARGEST_GAIN_SIGMA * max(1.0, size), still)

@@ -15,7 +15,7 @@ docs/theory/sensor_check.md.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,11 @@ class Match:
     """Root mean square of the sensor's change a second."""
     is_mirrored: bool = False
     """True where the conjugate of the reference fits."""
+
+    def less_certain(self, sigma: float) -> "Match":
+        """The same with an error of the gain by what the comparison leaves out."""
+        whole = float(np.hypot(self.gain.sigma, sigma))
+        return replace(self, gain=replace(self.gain, sigma=whole))
 
     @classmethod
     def unknown(cls, reason: str) -> "Match":
