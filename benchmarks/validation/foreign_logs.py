@@ -1,7 +1,7 @@
 """Logs by another hand: every fault of the table of checks at three sizes, and logs without a fault.
 
     python benchmarks/validation/foreign_logs.py [--quick] [--seed 1] [--faultless 50] [--coverage 100]
-        [--only WORD ...] [--results FILE] [--table docs/theory/foreign_logs.md]
+        [--only WORD ...] [--results FILE] [--write]
 
 Worlds and files are those of `foreign_world.py`, faults those of `foreign_faults.py`. A log is judged by
 ``sonar-graph compare``, by its exit code, its printed lines and the trajectories that it writes:
@@ -35,7 +35,7 @@ from foreign_faults import Fault, Marked, MarkedSightings, roles, table
 from foreign_world import EPOCH_S, Log, calibration_of, make_log, write
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from common import make_parser, note, print_figures, print_table
+from common import make_parser, note, print_figures, print_table, write_results
 
 os.environ.setdefault("COLUMNS", "2000")  # before rich: a warning stays on its line
 from sonar_graph import report
@@ -412,51 +412,33 @@ def counts_of(done: list[Judgement]) -> dict[str, int]:
     return {name: counts[name] for name in FIGURES}
 
 
-def write_page(
-    path: Path, seed: int, done: list[Judgement], covered: list[Coverage]
-) -> None:
-    """Write what was found of each cell, at which size, and the coverage of intervals."""
-    counts = counts_of(done)
-    lines = [
-        "# Faults of foreign logs that are found",
-        "",
-        f"Written by `benchmarks/validation/foreign_logs.py --seed {seed} --table`; its docstring explains the words. A",
-        "fault is *harmless* where the error stays below five times that of the log without it and no line names it.",
-        "",
-        "| " + " | ".join(counts) + " |",
-        "|" + "---|" * len(counts),
-        "| " + " | ".join(map(str, counts.values())) + " |",
-        "",
-        "| quantity | " + " | ".join(KINDS) + " |",
-        "|---|" + "---|" * len(KINDS),
+def write_tables(done: list[Judgement], covered: list[Coverage]) -> None:
+    """Write what was found of each cell, at which size, what was not, and the coverage of intervals."""
+    counts = ", ".join(f"{name} {count}" for name, count in counts_of(done).items())
+    cells = [
+        (quantity, *(cell(done, quantity, kind) for kind in KINDS))
+        for quantity in QUANTITIES
     ]
-    for quantity in QUANTITIES:
-        cells = [cell(done, quantity, kind) for kind in KINDS]
-        lines.append(f"| {quantity} | " + " | ".join(cells) + " |")
-    if missed := [one for one in done if one.verdict in FAILURES]:
-        lines += [
-            "",
-            "| not as it should be | size | verdict | error | world |",
-            "|---|---|---|---|---|",
-        ]
-        for one in missed:
-            error = (
-                f"{one.error_m:.2f} m, without the fault {one.without_m or 0.0:.2f} m"
-            )
-            lines.append(
-                f"| {one.fault} | {one.size:.3g} | {one.verdict} | {error} | {one.world} |"
-            )
+    title = f"Faults of foreign logs by what became of them: {counts}"
+    write_results("foreign_logs.md", title, ("quantity", *KINDS), cells)
+    missed = [
+        (one.fault, one.size, one.verdict, one.error_m, one.without_m, one.world)
+        for one in done
+        if one.verdict in FAILURES
+    ]
+    headers = ("fault", "size", "verdict", "error (m)", "without it (m)", "world")
+    write_results(
+        "foreign_misses.md",
+        "Foreign logs not judged as they should be",
+        headers,
+        missed,
+    )
     if covered:
-        lines += [
-            "",
-            "| 95 % interval of | logs | held | rms error / sigma |",
-            "|---|---|---|---|",
-        ]
-        lines += [
-            f"| {one.quantity} | {one.logs} | {one.share:.2f} | {one.rms:.2f} |"
-            for one in covered
-        ]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        headers = ("95 % interval of", "logs", "held", "rms error / sigma")
+        rows = [tuple(asdict(one).values()) for one in covered]
+        write_results(
+            "foreign_coverage.md", "Coverage of the intervals of inspect", headers, rows
+        )
 
 
 def main() -> None:
@@ -479,7 +461,7 @@ def main() -> None:
     )
     parser.add_argument("--results", type=Path, help="file of results, to go on with")
     parser.add_argument(
-        "--table", type=Path, help="page to write the table of faults to"
+        "--write", action="store_true", help="write the tables to benchmarks/results"
     )
     arguments = parser.parse_args()
     if arguments.quick:
@@ -506,8 +488,8 @@ def main() -> None:
             ("quantity", "logs", "95 % held", "rms error / sigma"),
             [tuple(asdict(one).values()) for one in covered],
         )
-    if arguments.table is not None:
-        write_page(arguments.table, arguments.seed, done, covered)
+    if arguments.write:
+        write_tables(done, covered)
     print_figures(counts_of(done))
 
 

@@ -24,7 +24,7 @@ from sonar_graph.diagnosis.findings import (
     numbers,
     unknown,
 )
-from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
+from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
@@ -61,6 +61,9 @@ LARGEST_SCATTER = 10.0
 """Scatter in sigmas, from which on a sensor contradicts beyond doubt: normalised squares of 100."""
 GRAVE_ERROR = 5.0
 """Error by a scale or a lag, in sigmas of a row, from which on results are doubtful."""
+CLIMB_S = 40.0
+"""Time in which a vehicle climbs or dives by much more than the Doppler log's noise adds up to."""
+FEWEST_DEPTHS = 30
 LARGE_TURN_RAD = np.radians(10.0)
 """Of the heading against positions: beyond, a run's result is of little worth."""
 LENGTHS = {
@@ -149,18 +152,21 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
         return None
     height = motion.height_m + motion.up @ sequence.calibration.depth.port_m
     t = motion.since_origin(depth.stamps_ns)
-    rows = motion.stretches(t, depth.z_m, motion.reference(height))
-    found = match(list(rows), drift_sigma=0.03)
+    # the noise of velocities adds up to a walk of the height, which grows with the time compared
+    interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
+    rows = motion.stretches(t, depth.z_m, motion.reference(height), longest_s)
+    found = match(rows, drift_sigma=0.03)
     return found.less_certain(motion.sampling_error(motion.height_m))
 
 
-def path_sigma(sequence: Sequence) -> float:
-    """Error of a coordinate reckoned by the Doppler log over the log, about a line, m.
+def climb_sigma(sequence: Sequence) -> float:
+    """Error of a height reckoned by the Doppler log over `CLIMB_S`, about a line, m.
 
     The integral of white noise is a random walk, and about a line an eighth of its end's error is left in a gain.
     """
     interval_s = float(np.median(np.diff(sequence.dvl.stamps_ns))) / NS_PER_S
-    duration_s = min(sequence.duration_s, STRETCH_S)
+    duration_s = min(sequence.duration_s, CLIMB_S)
     velocity_m_s = max(sequence.calibration.dvl.velocity_sigma_m_s)
     return velocity_m_s * float(np.sqrt(interval_s * duration_s)) / 8.0
 
@@ -173,7 +179,7 @@ def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     t = motion.since_origin(heading.stamps_ns)
     yaw_rad = np.unwrap(heading.yaw_rad)
     rows = motion.stretches(t, yaw_rad, motion.reference(motion.yaw_rad))
-    return match(list(rows), drift_sigma=0.02)
+    return match(rows, drift_sigma=0.02)
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -186,7 +192,7 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = match(list(motion.stretches(t, level, motion.reference(path))))
+    found = match(motion.stretches(t, level, motion.reference(path)))
     return found.less_certain(motion.sampling_error(motion.path_m))
 
 
@@ -221,7 +227,7 @@ DEPTH = Check(
     against="the Doppler log's vertical velocity",
     compare=depth_match,
     sigma=lambda sequence: max(sequence.calibration.depth.sigma_m, 0.02),
-    slow_sigma=path_sigma,
+    slow_sigma=climb_sigma,
     units=LENGTHS | PRESSURES,
     sense=lambda config: Advice(
         "it rises where the vehicle sinks by the Doppler log: depths downwards, or an altimeter?",
@@ -471,7 +477,7 @@ def vertical_bias(
     t = motion.since_origin(stamps_ns)
     drift_rad = motion.reference(motion.yaw_rad)(t) - yaw_rad
     # against time itself, whose gain is the rate
-    rows = list(motion.stretches(t, drift_rad, lambda seconds: seconds))
+    rows = motion.stretches(t, drift_rad, lambda seconds: seconds)
     duration_s = sum(float(np.ptp(part.seconds)) for part in rows)
     if rows and duration_s > LEAST_BIAS_S:
         found = match(rows, find_lag=False).gain
@@ -562,7 +568,7 @@ def heading_turn(
     path = np.append(0.0, np.cumsum(steps))
     t = motion.since_origin(known.stamps_ns)
     level = places @ [1.0, 1j, 0.0]
-    rows = list(motion.stretches(t, level, motion.reference(path)))
+    rows = motion.stretches(t, level, motion.reference(path))
     turn = match(rows, find_lag=False)
     angle = unknown("too little motion beside positions")
     if turn.misfit < MOST_MISFIT and 0.5 < turn.gain.value < 2.0:

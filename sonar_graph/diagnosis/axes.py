@@ -103,12 +103,12 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
         kept = changes_least[k] + changes_least[j]
         return kept, handed[k] + handed[j], -squares[k, j]
 
-    gyro, dvl = max(close, key=preference)
-    other = np.diag([1.0, 1.0, -1.0]) @ candidates[dvl]
-    rivals = [candidates[j] for k, j in close if k == gyro]
+    g, p = max(close, key=preference)
+    other = np.diag([1.0, 1.0, -1.0]) @ candidates[p]
+    rivals = [candidates[j] for k, j in close if k == g]
     is_sure = not any((rival == other).all() for rival in rivals)
-    ratio = float(np.sqrt(squares[0, 0] / squares[gyro, dvl]))
-    return AxesMatch(candidates[gyro], candidates[dvl], ratio, is_sure)
+    ratio = float(np.sqrt(squares[0, 0] / squares[g, p]))
+    return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
 @dataclass(frozen=True, eq=False)

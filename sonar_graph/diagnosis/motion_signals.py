@@ -10,7 +10,7 @@ Complex numbers stand for level vectors. The integrals mean nothing across a hol
 log: rows are numbered by the part without one that they belong to, and references are unknown between parts.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -137,19 +137,28 @@ class BodyMotion:
         return np.asarray((stamps_ns - self.origin_ns) / NS_PER_S)
 
     def stretches(
-        self, seconds: Floats, y: Values, reference: Callable[[Floats], Values]
-    ) -> Iterator[SignalStretch]:
-        """Rows of a sensor within each part, in stretches of at most `STRETCH_S`."""
+        self,
+        seconds: Floats,
+        y: Values,
+        reference: Callable[[Floats], Values],
+        longest_s: float = STRETCH_S,
+    ) -> list[SignalStretch]:
+        """Rows of a sensor within each part, in stretches of at most ``longest_s``."""
         first = np.flatnonzero(np.diff(self.parts, prepend=-1))
         last = np.append(first[1:] - 1, len(self.parts) - 1)
+        found = list[SignalStretch]()
         for begin, end in zip(self.seconds[first], self.seconds[last], strict=True):
-            count = max(1, int(np.ceil((end - begin) / STRETCH_S)))
+            count = max(1, int(np.ceil((end - begin) / longest_s)))
             inside = np.flatnonzero((seconds >= begin) & (seconds <= end))
-            which = (seconds[inside] - begin) / max(end - begin, 1e-9) * count
-            for part in range(count):
-                rows = inside[np.minimum(which.astype(int), count - 1) == part]
-                if len(rows) >= FEWEST_ROWS:
-                    yield SignalStretch(seconds[rows], y[rows], reference)
+            share = (seconds[inside] - begin) / max(end - begin, 1e-9)
+            which = np.minimum((share * count).astype(int), count - 1)
+            stretches = (inside[which == part] for part in range(count))
+            found += [
+                SignalStretch(seconds[rows], y[rows], reference)
+                for rows in stretches
+                if len(rows) >= FEWEST_ROWS
+            ]
+        return found
 
 
 def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
