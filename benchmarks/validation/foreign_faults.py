@@ -266,7 +266,7 @@ def of_depth() -> Iterator[Fault]:
     yield row(SENSE, "factor", (-1.0, -FOOT, -100.0), scaled("z_m"), times)
     yield row("unit", "feet, cm, decimetres", (FOOT, 100.0, 10.0), scaled("z_m"), times)
     yield row("scale", "factor", (1.15, 0.8, 1.25), scaled("z_m"), times)
-    yield row("scale", "origin, m", (5.0, 20.0, -10.0), added("z_m"), r"depth.*height begins")
+    yield row("scale", "origin, m", (5.0, 20.0, -10.0), added("z_m"), r"depth.*height (begins|of the)")
     yield row("marked invalid", "share, huge variance", SHARES, Marked("depth", "depth_s", "z_m", True), LEFT_OUT)
     yield row("marked invalid", "share, NaN", SHARES, Marked("depth", "depth_s", "z_m", False), LEFT_OUT)
 

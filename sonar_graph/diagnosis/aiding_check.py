@@ -511,6 +511,33 @@ FARTHEST_FROM_START_M = 0.5
 FIRST_ROWS = 5
 
 
+def fix_height_findings(sequence: Sequence) -> Iterator[Finding]:
+    """Depths at another height than the position fixes, where no start decides which of them is wrong."""
+    depth = sequence.depth
+    fixes = sequence.positions
+    if depth is None or fixes is None or sequence.calibration.start.source == "stated":
+        return
+    heights_m2 = fixes.covariance_m2[:, 2, 2]
+    inside = fixes.are_sound() & ~(heights_m2 >= 0.5 * UNMEASURED_M2)
+    inside &= fixes.stamps_ns >= depth.stamps_ns[0]
+    inside &= fixes.stamps_ns <= depth.stamps_ns[-1]
+    if np.count_nonzero(inside) < NEAR_START:
+        return
+    by_depth = np.interp(fixes.stamps_ns[inside], depth.stamps_ns, depth.z_m)
+    off_m = float(np.median(fixes.position_m[inside, 2] - by_depth))
+    sigma_m = sequence.calibration.positions.sigma_m[2]
+    if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
+        return
+    yield Finding(
+        "depth: height of the position fixes over it",
+        Estimate1D(off_m, sigma_m),
+        "m",
+        cause="another origin, sign or unit of the depths, or another height of the fixes?",
+        line=f"{unused('depth')} leaves the depths out",
+        gravity=Gravity.GRAVE,
+    )
+
+
 def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     """A stated start that is at another height than the first depths; nothing where they agree."""
     depth = sequence.depth

@@ -119,7 +119,7 @@ class BodyMotion:
         Between rows the velocity counts as linear. The integral of a sine of frequency w is too small by ``(w T)^2 / 12``;
         ``(w T)^2`` is the ratio of second differences of the velocity and the velocity.
         """
-        step = np.diff(values) / np.diff(self.seconds)
+        step = np.asarray(np.diff(values) / np.diff(self.seconds), values.dtype)
         bent = step[2:] - 2.0 * step[1:-1] + step[:-2]
         inside = self.parts[3:] == self.parts[:-3]
         if not inside.any():

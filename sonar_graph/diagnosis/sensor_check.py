@@ -24,6 +24,7 @@ from sonar_graph.diagnosis.aiding_check import (
     POSITIONS,
     RANGE,
     findings_of,
+    fix_height_findings,
     heading_findings,
     position_findings,
     start_depth_findings,
@@ -309,6 +310,7 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
     found += start_depth_findings(right)
+    found += fix_height_findings(right)
     for check in (DEPTH, RANGE, AZIMUTH):
         match = matches[check]
         # the place of a landmark depends on its range
