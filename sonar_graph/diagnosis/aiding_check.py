@@ -507,7 +507,7 @@ def vertical_bias(
 
 
 FARTHEST_FROM_START_M = 0.5
-"""Height that a vehicle gains about the start, with waves and its depth sensor's error."""
+"""Difference between the height of a start and that of the first depths that waves and a rough start make."""
 FIRST_ROWS = 5
 
 
@@ -546,13 +546,15 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     if depth is None or not is_stated:
         return
     first = max(int(np.searchsorted(depth.stamps_ns, sequence.start_ns)) - 1, 0)
-    height_m = float(np.median(depth.z_m[first : first + FIRST_ROWS]))
+    rows_m = depth.z_m[first : first + FIRST_ROWS]
+    height_m = float(np.median(rows_m))
     port = np.array(sequence.calibration.depth.port_m)
     off_m = height_m - float(start.pose().transformFrom(port)[2])
     sigma_m = float(
         np.hypot(start.position_sigma_m[2], sequence.calibration.depth.sigma_m)
     )
-    if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
+    climbed_m = float(np.ptp(rows_m))
+    if abs(off_m) <= FARTHEST_FROM_START_M + climbed_m + ACTING_SIGMAS * sigma_m:
         return
     x, y, z = start.position_m
     yield Finding(
