@@ -29,7 +29,7 @@ PASCALS_PER_METRE = 1000.0 * GRAVITY_M_S2
 KNOT_S = 3.0
 FIELD_OF_VIEW_RAD = 0.8
 LONGEST_RANGE_M = 12.0
-LANDMARKS = 40
+LANDMARKS = 30
 HUGE_VARIANCE = 1e9
 """With which some drivers mark what they did not measure."""
 DETECTIONS = """std_msgs/Header header
@@ -214,7 +214,7 @@ def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
     depth_s = np.arange(0.0, DURATION_S, 1.0 / world.aiding_hz)
     heading_s = depth_s.copy()
     fix_s = np.arange(0.0, DURATION_S, 1.0 / world.fix_hz)
-    frame_s = np.arange(0.0, DURATION_S, 0.5)
+    frame_s = np.arange(0.0, DURATION_S, 1.0)
 
     white = noise * np.sqrt(world.imu_hz)
     rate = attitude(imu_s, 1)
