@@ -480,8 +480,10 @@ def vertical_bias(
     rows = motion.stretches(t, drift_rad, lambda seconds: seconds)
     duration_s = sum(float(np.ptp(part.seconds)) for part in rows)
     if rows and duration_s > LEAST_BIAS_S:
-        found = match(rows, find_lag=False).gain
-        bias = replace(found, sigma=max(found.sigma, 1e-9))
+        found = match(rows, find_lag=False)
+        # a slow wave of the heading looks like a bias: as if all of its scatter were one in each stretch
+        slope = 2.0 * found.scatter * float(np.sqrt(len(rows))) / duration_s
+        bias = replace(found.gain, sigma=max(found.gain.sigma, slope, 1e-9))
     imu = sequence.calibration.imu
     allowed = imu.gyro_bias_sigma
     # a deviation that changes over the log looks like a bias too

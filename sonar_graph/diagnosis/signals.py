@@ -7,7 +7,7 @@ some minutes each. With the lag tau of y, an offset a per stretch and a drift b 
 
 A wrong sense is ``c < 0``, a wrong unit or scale is ``|c|``, a turned world is ``arg c``, a stuck sensor is ``c = 0``.
 tau minimises the squares of e over a grid and is refined by one Gauss-Newton step. Rows far from the fit are left out.
-Errors of successive rows are alike, so that covariances are of blocks of rows, a dozen in each stretch (a sandwich)::
+Errors of successive rows are alike, so that covariances are of blocks of rows, six or a dozen in each stretch (a sandwich)::
 
     cov(p) = (A^H A)^-1 sum_blocks (A_k^H e_k)(A_k^H e_k)^H (A^H A)^-1 n / (n - p)
 
@@ -26,7 +26,8 @@ from sonar_graph.navigation.alignment import Estimate1D
 
 Values = NDArray[np.floating | np.complexfloating]
 LAGS_S = np.arange(-4.0, 4.01, 0.25)
-BLOCKS = 12
+BLOCKS = (12, 6)
+"""Numbers of blocks of a stretch, of which the larger variance counts."""
 FEWEST_ROWS = 8
 ROUNDS = 4
 OUTLYING = 6.0
@@ -35,8 +36,8 @@ MOST_OUTLYING = 0.25
 LAG_STEP_S = 0.05
 CLEARLY_BETTER = 1.5
 """Ratio of sums of squares from which on another lag, or the mirrored reference, counts."""
-SMALL_SAMPLE = 1.3
-"""Quantiles of Student's t for a dozen blocks over those of the normal distribution, at 4 sigma and more."""
+SMALL_SAMPLE = 1.2
+"""Quantile of Student's t for a dozen blocks over that of the normal distribution, between 2 and 4 sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +171,17 @@ class RobustFit:
         """Standard deviations of the first candidate's coefficients, by blocks of rows, shape (p,)."""
         rows = self.kept[0]
         scores = self.A[0, rows].conj() * self.residuals[0, rows, None]  # (m, p)
-        sums = np.array([part.sum(axis=0) for part in np.array_split(scores, BLOCKS)])
         p = scores.shape[1]
-        small_sample = BLOCKS / max(BLOCKS - p, 1)
-        meat = sums.T @ sums.conj() * small_sample
-        cov = self.inverse[0] @ meat @ self.inverse[0].conj().T
-        return SMALL_SAMPLE * np.sqrt(np.abs(np.diag(cov)))
+        variances = list[Floats]()
+        # errors that last longer than a short block show in the longer ones
+        for count in BLOCKS:
+            blocks = np.array_split(scores, count)
+            sums = np.array([block.sum(axis=0) for block in blocks])
+            small_sample = count / max(count - p, 1)
+            meat = sums.T @ sums.conj() * small_sample
+            cov = self.inverse[0] @ meat @ self.inverse[0].conj().T
+            variances.append(np.abs(np.diag(cov)))
+        return SMALL_SAMPLE * np.sqrt(np.max(variances, axis=0))
 
 
 def match(

@@ -1,0 +1,107 @@
+"""Motion of the body by its own sensors is the motion of the simulated vehicle, and breaks at holes and gaps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.diagnosis import aiding_check
+from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
+from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.measurements import Heading
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+RUN = simulate_mission(MissionOptions(seed=4, duration_s=100.0, landmarks=1))
+
+
+def motion_of(run: Sequence) -> BodyMotion:
+    motion = BodyMotion.of(run)
+    assert motion is not None
+    return motion
+
+
+def true_poses(motion: BodyMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, unwrapped yaw and up in the body at the rows."""
+    at_ns = motion.origin_ns + np.round(motion.seconds * 1e9).astype(np.int64)
+    at_ns = np.clip(at_ns, RUN.truth.stamps_ns[0], RUN.truth.stamps_ns[-1])
+    poses = RUN.truth.at(at_ns)
+    yaw = np.unwrap(poses.rotations().as_euler("ZYX")[:, 0])
+    return poses.positions, yaw, poses.rotations().as_matrix()[:, 2]
+
+
+def without_imu(run: Sequence, begin_s: float, end_s: float) -> Sequence:
+    t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    return replace(run, imu=run.imu.rows((t <= begin_s) | (t >= end_s)))
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.01])
+def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
+    """A bias that the calibration knows is taken off."""
+    rate = RUN.imu.angular_velocity + np.array([0.0, 0.0, bias])
+    section = RUN.calibration.imu.model_copy(update={"gyro_bias_rad_s": (0, 0, bias)})
+    run = replace(
+        RUN,
+        imu=replace(RUN.imu, angular_velocity=rate),
+        calibration=RUN.calibration.model_copy(update={"imu": section}),
+    )
+    motion = motion_of(run)
+    places, yaw, up = true_poses(motion)
+    level = places @ [1.0, 1j, 0.0]
+    assert motion.yaw_rad == pytest.approx(yaw - yaw[0], abs=0.03)
+    assert motion.height_m == pytest.approx(places[:, 2] - places[0, 2], abs=0.3)
+    ours = motion.path_m * np.exp(1j * yaw[0])
+    assert np.abs(ours - (level - level[0])).max() < 0.8
+    assert np.sum(motion.up * up, axis=1).min() > np.cos(0.03)
+    assert np.all(motion.parts == 0)
+
+
+def test_a_hole_of_the_imu_breaks_the_motion_and_a_reference_is_unknown_in_it():
+    motion = motion_of(without_imu(RUN, 40.0, 46.0))
+    assert set(motion.parts) == {0, 1}
+    yaw = motion.reference(motion.yaw_rad)
+    assert np.isnan(yaw(np.array([41.0, 43.0, 45.0]))).all()
+    assert np.isfinite(yaw(np.array([39.0, 47.0]))).all()
+    assert np.isnan(yaw(motion.seconds[[0, -1]] + [-1.0, 1.0])).all()
+    rows = motion.stretches(np.arange(100.0), np.arange(100.0), yaw)
+    assert all(part.seconds[-1] <= 41 or part.seconds[0] >= 45 for part in rows)
+
+
+def test_a_gap_of_the_doppler_log_breaks_the_motion_too():
+    t = (RUN.dvl.stamps_ns - RUN.dvl.stamps_ns[0]) * 1e-9
+    run = replace(RUN, dvl=RUN.dvl.rows((t <= 40.0) | (t >= 46.0)))
+    motion = motion_of(run)
+    assert set(motion.parts) == {0, 1}
+    assert np.isnan(motion.reference(motion.height_m)(np.array([43.0]))).all()
+
+
+def test_stretches_are_no_longer_than_they_may_be_and_lose_no_row():
+    motion = motion_of(RUN)
+    inside = np.linspace(motion.seconds[0], motion.seconds[-1], 301)
+    for longest_s, count in ((STRETCH_S, 1), (40.0, 3)):
+        rows = motion.stretches(inside, inside, motion.reference(inside), longest_s)
+        assert len(rows) == count
+        assert sum(len(part.seconds) for part in rows) == len(inside)
+        assert all(np.ptp(part.seconds) <= longest_s for part in rows)
+
+
+@pytest.mark.parametrize("is_broken", [True, False])
+def test_a_turn_in_a_hole_of_the_imu_is_no_bias_of_the_gyros(
+    is_broken: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """The heading has a turn that no gyro felt; drawn straight across the hole it is a bias."""
+    t = (RUN.imu.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
+    poses = RUN.truth
+    at_s = (poses.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
+    rows = slice(0, len(poses), 10)
+    yaw = np.unwrap(poses.rotations().as_euler("ZYX")[:, 0]) + 1.0 * (at_s > 43.0)
+    heading = Heading(poses.stamps_ns[rows], yaw[rows], np.full(len(yaw[rows]), np.nan))
+    run = replace(RUN, imu=RUN.imu.rows((t <= 40.0) | (t >= 46.0)), heading=heading)
+    motion = motion_of(run)
+    if not is_broken:
+        motion = replace(motion, parts=np.zeros_like(motion.parts))
+    found = aiding_check.vertical_bias(run, motion)
+    assert found is not None
+    assert (abs(found.estimate.value) < 1e-3) == is_broken
+    rows_of = aiding_check.heading_findings(run, LogConfig(), motion)
+    assert any(row.acts for row in rows_of) != is_broken

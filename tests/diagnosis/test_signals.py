@@ -1,0 +1,140 @@
+"""Laws of the comparison of two signals: what was done to a signal is found, with an interval that holds it."""
+
+import numpy as np
+import pytest
+
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER, SignalStretch, match
+from sonar_graph.measurements import Floats
+
+T = np.arange(0.0, 120.0, 0.2)
+NOISE = 0.02
+
+
+def wave(seconds: Floats) -> Floats:
+    """A motion that repeats nowhere."""
+    return np.sin(0.4 * seconds) + 0.5 * np.sin(0.151 * seconds + 1.0)
+
+
+def level(seconds: Floats) -> np.ndarray:
+    """A way that is no mirror image of itself."""
+    return 0.3 * seconds * np.exp(0.02j * seconds) + wave(seconds)
+
+
+def noise(seed: int, n: int = len(T)) -> Floats:
+    return NOISE * np.random.default_rng(seed).standard_normal(n)
+
+
+def correlated(seed: int) -> Floats:
+    """A Gauss-Markov error of 3 s and white noise."""
+    white = np.random.default_rng(seed).standard_normal((2, len(T)))
+    keep = np.exp(-0.2 / 3.0)
+    error = np.empty(len(T))
+    error[0] = white[0, 0]
+    for k in range(1, len(T)):
+        error[k] = keep * error[k - 1] + np.sqrt(1 - keep**2) * white[0, k]
+    return NOISE * (error + white[1])
+
+
+@pytest.mark.parametrize("gain", [-1.0, 0.3048, 1.0, 3.3])
+@pytest.mark.parametrize("lag_s", [-1.3, 0.0, 0.7])
+def test_gain_and_lag_are_what_was_done_to_the_signal(gain: float, lag_s: float):
+    y = 5.0 + gain * wave(T - lag_s) + noise(1)
+    found = match([SignalStretch(T, y, wave)], drift_sigma=0.001)
+    assert found.gain.value == pytest.approx(gain, abs=4.5 * found.gain.sigma)
+    assert found.lag.value == pytest.approx(lag_s, abs=4.5 * found.lag.sigma)
+    assert found.gain.sigma < 0.02
+    assert found.scatter == pytest.approx(NOISE, rel=0.2)
+    assert not found.is_mirrored
+
+
+@pytest.mark.parametrize("angle", [-2.0, 0.0, 0.5])
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_a_level_way_is_turned_and_mirrored_as_it_was(angle: float, is_mirrored: bool):
+    x = level(T)
+    y = 2.0 * np.exp(1j * angle) * (x.conj() if is_mirrored else x) + noise(2)
+    found = match([SignalStretch(T, y, level)])
+    assert found.is_mirrored == is_mirrored
+    assert found.gain.value == pytest.approx(2.0, abs=0.01)
+    assert found.angle.value == pytest.approx(angle, abs=0.01)
+    assert found.lag.value == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_straight_way_is_not_said_to_be_mirrored():
+    """Its mirror image is a turned one."""
+    straight = [
+        SignalStretch(T, 0.3 * T * np.exp(0.4j) + noise(3), lambda at: 0.3 * at)
+    ]
+    found = match(straight)
+    assert not found.is_mirrored
+    assert found.angle.value == pytest.approx(0.4, abs=0.01)
+
+
+@pytest.mark.parametrize(("share", "is_found"), [(0.1, True), (0.5, False)])
+def test_few_outliers_change_nothing_and_many_do(share: float, is_found: bool):
+    rng = np.random.default_rng(4)
+    y = wave(T) + noise(4) + 20.0 * (rng.random(len(T)) < share)
+    found = match([SignalStretch(T, y, wave)])
+    assert (found.scatter < 2 * NOISE) == is_found
+    assert (abs(found.gain.value - 1.0) < 0.02) == is_found
+
+
+def test_a_lag_counts_only_where_it_is_clearly_better():
+    """Of a motion that hardly changes any lag fits; the sensor is then taken as in time."""
+    slow = SignalStretch(T, 1e-4 * T + noise(5), lambda at: 1e-4 * at)
+    assert abs(match([slow]).lag.value) < match([slow]).lag.sigma * 4
+    late = match([SignalStretch(T, wave(T - 3.0) + noise(5), wave)])
+    assert late.lag.value == pytest.approx(3.0, abs=0.05)
+    assert CLEARLY_BETTER > 1.0
+
+
+def test_what_drifts_is_no_gain_where_a_drift_is_allowed():
+    """Without one it bends the gain."""
+    y = wave(T) + 0.02 * T + noise(6)
+    allowed = match([SignalStretch(T, y, lambda at: wave(at) + 0.001 * at)], 0.03)
+    refused = match([SignalStretch(T, y, lambda at: wave(at) + 0.001 * at)])
+    assert allowed.gain.value == pytest.approx(1.0, abs=0.01)
+    assert refused.scatter > 5 * allowed.scatter
+
+
+def test_intervals_hold_the_truth_as_often_as_they_claim_with_correlated_errors():
+    """Of 100 logs 95 % intervals hold 90 or more; sigmas by independent rows would hold far fewer."""
+    held = 0
+    naive = 0
+    for seed in range(100):
+        found = match([SignalStretch(T, wave(T) + correlated(seed), wave)])
+        error = abs(found.gain.value - 1.0)
+        held += error < 1.96 * found.gain.sigma
+        naive += error < 1.96 * found.scatter / (np.std(wave(T)) * np.sqrt(len(T)))
+    assert held >= 90
+    assert naive < 80
+
+
+def test_stretches_share_a_gain_and_have_an_offset_each():
+    second = T + 500.0
+    y = 1.1 * wave(second) + 40.0 + noise(8)
+    parts = [
+        SignalStretch(T, 1.1 * wave(T) - 3.0 + noise(7), wave),
+        SignalStretch(second, y, wave),
+    ]
+    found = match(parts)
+    assert found.gain.value == pytest.approx(1.1, abs=4.5 * found.gain.sigma)
+    assert found.scatter == pytest.approx(NOISE, rel=0.2)
+
+
+def test_changes_have_no_offset():
+    """An offset would hide the gain of changes that all have one sign."""
+    x = 1.0 + 0.01 * wave(T)
+    found = match(
+        [SignalStretch(T, 2.0 * x + noise(9), lambda _: x, has_offset=False)],
+        find_lag=False,
+    )
+    assert found.gain.value == pytest.approx(2.0, abs=0.01)
+
+
+def test_too_few_rows_or_no_reference_are_unknown():
+    few = SignalStretch(T[:7], wave(T[:7]), wave)
+    blind = SignalStretch(T, wave(T), lambda at: np.full(np.shape(at), np.nan))
+    for part in (few, blind):
+        found = match([part])
+        assert not found.gain.is_known
+        assert found.gain.reason.startswith("too few rows")
