@@ -486,12 +486,7 @@ def vertical_bias(
         bias = replace(found.gain, sigma=max(found.gain.sigma, slope, 1e-9))
     imu = sequence.calibration.imu
     allowed = imu.gyro_bias_sigma
-    # a deviation that changes over the log looks like a bias too
-    deviation_rad = 0.0
-    if sequence.heading is not None:
-        deviation_rad = sequence.calibration.heading.bias_sigma_rad
-    by_deviation = np.sqrt(2.0) * deviation_rad / max(sequence.duration_s, 1.0)
-    if not matters(bias, LEAST_BIAS_RAD_S, float(np.hypot(allowed, by_deviation))):
+    if not matters(bias, LEAST_BIAS_RAD_S, allowed):
         cause = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
         return Finding(quantity, bias, "rad/s", cause)
     up = np.median(motion.up, axis=0) @ imu.mounting.pose().rotation().matrix()
