@@ -30,6 +30,7 @@ from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     Match,
     match,
+    root_mean_square,
 )
 from sonar_graph.diagnosis.start import LEAST_BIAS_RAD_S, turned_mounting
 from sonar_graph.logs.adapters import LogConfig
@@ -212,13 +213,16 @@ def sighting_match(
         changes = sighting_changes(sequence, motion, sign)
         if changes is None:
             return None
-        found[sign] = (changes, match([changes.azimuth], find_lag=False))
+        # only turns show a delay: ranges change evenly
+        found[sign] = (changes, match([changes.azimuth], find_lag=not of_range))
     # a landmark's place depends on its azimuth: a mirrored one is more than a gain of -1
     is_mirrored = found[-1.0][1].scatter < found[1.0][1].scatter / CLEARLY_BETTER
     changes, by_azimuth = found[-1.0 if is_mirrored else 1.0]
     if of_range:
         return match([changes.range], find_lag=False)
-    return replace(by_azimuth, is_mirrored=is_mirrored)
+    # a delay turns landmarks about the vehicle as fast as it turns, not as changes of the azimuth change
+    turn_rate = root_mean_square([np.diff(motion.yaw_rad) / np.diff(motion.seconds)])
+    return replace(by_azimuth, is_mirrored=is_mirrored, rate=turn_rate)
 
 
 DEPTH = Check(

@@ -310,7 +310,6 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
     found += start_depth_findings(right)
-    found += fix_height_findings(right)
     for check in (DEPTH, RANGE, AZIMUTH):
         match = matches[check]
         # the place of a landmark depends on its range
@@ -328,6 +327,9 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
         found.append(vertical)
     found += of_heading
     found += position_findings(right, config, motion)
+    # a wrong unit of either makes another height too
+    if not any(f.grave for f in found):
+        found += fix_height_findings(right)
     return found
 
 

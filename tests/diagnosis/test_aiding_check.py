@@ -397,3 +397,22 @@ def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: 
     )
     expected = (2 * np.sin(w / 2)) ** 2 / 12
     assert motion.sampling_error(height_m) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1.0])
+def test_a_delay_of_the_sonar_is_found_by_the_turns_between_sightings(late_s: float):
+    run = simulate_mission(MissionOptions(seed=5, duration_s=120.0))
+    seen = run.detections
+    assert seen is not None
+    late = replace(seen, stamps_ns=seen.stamps_ns + round(late_s * 1e9))
+    run = replace(run, detections=late)
+    motion = BodyMotion.of(run)
+    assert motion is not None
+    match = aiding_check.AZIMUTH.compare(run, motion)
+    assert match is not None
+    assert match.lag.sigma < 0.1
+    assert abs(match.lag.value - late_s) < 4 * match.lag.sigma
+    *_, delay = aiding_check.findings_of(aiding_check.AZIMUTH, match, run, NO_CONFIG)
+    assert delay.acts == (late_s > 0)
+    if late_s:
+        assert line_of(delay)["stamp_offset_s"] == pytest.approx(-late_s, abs=0.1)
