@@ -88,6 +88,8 @@ LARGEST_DENSITY_RATIO = 1.5
 LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
 CERTAIN_SIGMAS = 4.0
+LEAST_TOGETHER_S = 0.1
+"""Difference between two delays that counts as none."""
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 
 
@@ -131,6 +133,7 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         bias = [f for f in bias if f.estimate.is_known or f.acts]
     reference = reference_findings(right, config, tilt)
     noise = noise_findings(sequence)
+    of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
     return [*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise]
 
 
@@ -146,6 +149,30 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     axes, right = axes_findings(right, config)
     found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
+
+
+def by_late_imu(
+    of_dvl: list[Finding], by_motion: list[Finding], config: LogConfig
+) -> tuple[list[Finding], list[Finding]]:
+    """Findings of the Doppler log and of others, where all are early against a late IMU with one line for the IMU."""
+    late, *others = of_dvl
+    delays = [f for f in by_motion if f.quantity.endswith(": delay") and f.acts]
+    if not (late.acts and delays):
+        return of_dvl, by_motion
+    for delay in delays:
+        together = replace(
+            delay.estimate, value=delay.estimate.value + late.estimate.value
+        )
+        if matters(together, LEAST_TOGETHER_S, late.estimate.sigma):
+            return of_dvl, by_motion
+    total_s = config.number("imu", "stamp_offset_s", 0.0) - late.estimate.value
+    names = " and ".join(delay.quantity.partition(" against")[0] for delay in delays)
+    of_imu = replace(
+        late,
+        cause=f"{names} differ from the IMU by as much: the IMU's own stamps are wrong",
+        line=f"`stamp_offset_s = {total_s:.3f}` under [imu] {IN_LOG_CONFIG}",
+    )
+    return [of_imu, *others], [f for f in by_motion if f not in delays]
 
 
 def is_vertical_bias(finding: Finding) -> bool:
