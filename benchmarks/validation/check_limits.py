@@ -413,7 +413,7 @@ def main() -> None:
         found = [f for key in by_name if key.startswith(name) for f in by_name[key]]
         covers.append((name, *cover(found, true)))
     rows = [row[:3] for row in limits]
-    head = ("check", "fires in 95 of 100 logs from", "false alarms")
+    head = ("check", "fires in 95 % of logs from", "false alarms")
     print_table(head, rows)
     cover_head = ("quantity", "logs", "95 % held", "rms error / sigma")
     print_table(cover_head, covers)

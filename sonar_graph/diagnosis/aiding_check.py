@@ -369,6 +369,7 @@ def findings_of(
     if not gain.is_known:
         return [Finding(quantity, gain)]
     error = abs(size - 1.0) * check.reach(sequence, found)
+    # a scale matters only where its error shows beside the noise of a row
     is_off = matters(replace(gain, value=size - 1.0), check.least_scale)
     acts = is_off and error > sigma and not check.slips(sequence)
     row = Finding(quantity, gain, cause=NO_NEED)
@@ -393,6 +394,7 @@ def grave_fault(
     gain = found.gain
     size = abs(gain.value)
     sigma = check.sigma(sequence)
+    # a wrong unit may make a gain small too
     is_flat = size + 4 * gain.sigma < HARDLY and found.moved > STUCK_MOVED * sigma
     if is_flat and not unit_of(check, size):
         verb = "turns" if check is HEADING else "changes"
@@ -493,6 +495,7 @@ def vertical_bias(
     if not matters(bias, LEAST_BIAS_RAD_S, allowed):
         cause = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
         return Finding(quantity, bias, "rad/s", cause)
+    # the line is in the axes of the IMU
     up = np.median(motion.up, axis=0) @ imu.mounting.pose().rotation().matrix()
     whole = np.add(imu.gyro_bias_rad_s, bias.value * up / np.linalg.norm(up))
     turned_rad = abs(bias.value) * sequence.duration_s
@@ -594,6 +597,7 @@ def heading_turn(
     places = known.position_m if isinstance(known, PositionFixes) else known.positions
     heading_s = motion.since_origin(right.heading.stamps_ns)
     yaw_rad = np.interp(motion.seconds, heading_s, np.unwrap(right.heading.yaw_rad))
+    # the way of the Doppler log, laid along the heading instead of the gyros' yaw
     steps = np.diff(motion.path_m) * np.exp(1j * (yaw_rad - motion.yaw_rad))[1:]
     path = np.append(0.0, np.cumsum(steps))
     t = motion.since_origin(known.stamps_ns)
@@ -601,6 +605,7 @@ def heading_turn(
     rows = motion.stretches(t, level, motion.reference(path))
     turn = match(rows, find_lag=False)
     angle = unknown("too little motion beside positions")
+    # a way that fits badly has no direction
     if turn.misfit < MOST_MISFIT and 0.5 < turn.gain.value < 2.0:
         angle = turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, angle.reason)
     allowed = right.calibration.heading.bias_sigma_rad
@@ -648,6 +653,7 @@ def way_m(right: Sequence, at_ns: np.ndarray) -> np.ndarray:
         return np.zeros(len(at_ns))
     steps_s = np.diff(stamps_ns) / NS_PER_S
     mean_speed = (speed[1:] + speed[:-1]) / 2
+    # nothing is known of a gap but how fast the vehicle goes elsewhere
     is_gap = steps_s > right.calibration.dvl.gap_s
     mean_speed[is_gap] = np.percentile(speed, HIGH_PERCENTILE)
     return np.interp(at_ns, stamps_ns, np.append(0.0, np.cumsum(mean_speed * steps_s)))
@@ -692,6 +698,7 @@ def position_findings(
     found = None if motion is None else POSITIONS.compare(right, motion)
     few = Match.unknown("too few fixes beside the Doppler log")
     rows = findings_of(POSITIONS, found or few, right, config)
+    # changes that the path does not explain may be jumps, which are a better name
     if rows[0].grave and "%" not in rows[0].advice:
         yield rows[0]
         return

@@ -142,12 +142,14 @@ class SharedRows:
         inside[1:] &= np.diff(t) > 0
         if not inside.any():
             return None
+        # a choice among a few axes needs no more, and costs with the length
         inside &= np.abs(t - np.median(t[inside])) <= LONGEST_S / 2
         t = t[inside]
         holes = holes_before(stamps_ns)[np.searchsorted(imu_s, t, side="right") - 1]
         runs = list(runs_of(t, holes))
         if not runs:
             return None
+        # rows of the Doppler log are among the ends of the steps, so that none is interpolated
         steps = np.maximum(np.ceil(np.diff(t) / STEP_S), 1).astype(int)
         row = np.concatenate([[0], np.cumsum(steps)])
         grid_s = np.interp(np.arange(row[-1] + 1), row, t)
@@ -178,6 +180,7 @@ class SharedRows:
         """Q, shape (10, 10), of ``(1, P)``: the sum of squares of r(G, P)."""
         turn = self.turn @ G.T
         C = running_rotations(turn)  # (n, 3, 3)
+        # the body turns during a step: its force is felt at the middle
         half = Rotation.from_rotvec(turn / 2).apply(self.impulse)
         steps = np.einsum("nij,nj->ni", C[:-1], half)
         F = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])

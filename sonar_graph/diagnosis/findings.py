@@ -172,6 +172,7 @@ def said_once(findings: list[Finding]) -> list[Finding]:
     """Findings that share one line: the first that acts has it, the others refer to it."""
     shown = list[Finding]()
     for finding in findings:
+        # a line for three axes is one line to write
         is_repeated = finding.acts and any(before.acts for before in shown)
         also = replace(finding, cause=ALSO, consequence="", line="")
         shown.append(also if is_repeated else finding)

@@ -64,6 +64,7 @@ class BodyMotion:
         path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, force))
         t = path.since_origin(dvl.stamps_ns)  # (n,)
         rows = path.covers(t) & np.isfinite(dvl.velocity).all(axis=1)
+        # stamps may repeat: of such rows the first counts
         rows[1:] &= np.diff(t) > 0
         t = t[rows]
         if len(t) < 3:
@@ -76,11 +77,13 @@ class BodyMotion:
         longest_s = max(
             calibration.dvl.gap_s, GAP_INTERVALS * float(np.median(intervals))
         )
+        # the one place where integrals break: every reference and stretch goes by these parts
         breaks = (intervals > longest_s) | (np.diff(path.parts_at(t)) > 0)
         C = path.rotations_at(t)  # (n, 3, 3)
         up_in_path = felt_up(path, t, np.einsum("nij,nj->ni", C, v), calibration)
         up = np.einsum("nji,nj->ni", C, up_in_path)
         is_held = calibration.odometry_interpolation == "hold-past"
+        # at the IMU's rate, since turns are faster than rows of the Doppler log
         yaw_at_imu = integral(
             path.seconds, yaw_rate(path, t, up_in_path), is_held=is_held
         )
@@ -106,6 +109,7 @@ class BodyMotion:
             row = np.searchsorted(self.seconds, seconds)
             after = np.clip(row, 1, len(self.seconds) - 1)
             is_between = self.parts[after] != self.parts[after - 1]
+            # the first row of a part belongs to it
             is_between &= self.seconds[after] != seconds
             is_outside = (seconds < self.seconds[0]) | (seconds > self.seconds[-1])
             found = np.interp(seconds, self.seconds, values)
@@ -179,6 +183,7 @@ def felt_up(
     begin = np.maximum(t - UP_OVER_S / 2, part_edges(path, t, "left"))
     end = np.minimum(t + UP_OVER_S / 2, part_edges(path, t, "right"))
     gained = path.linear_at(end, path.impulse) - path.linear_at(begin, path.impulse)
+    # what moves the vehicle is no gravity
     accelerated = np.gradient(smoothed(t, v), t, axis=0)
     up = gained / np.maximum(end - begin, 1e-9)[:, None] - accelerated
     return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1), 1e-9)[:, None])

@@ -60,8 +60,7 @@ from sonar_graph.diagnosis.start import (
 )
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import gravity_warning
-from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.logs.adapters.adapter import axes_matrix
+from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
@@ -125,10 +124,12 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     match = match_dvl_to_imu(imu, dvl, sequence.calibration)
     of_dvl = dvl_findings(match, sequence, config)
     lever = lever_findings(match, sequence.calibration)
+    # each following check sees the log as these lines would make it
     right = corrected_sequence(sequence, match, of_dvl)
     tilt = find_start_tilt(right)
     bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
     by_motion = motion_findings(right, config)
+    # one row on the bias that is known is enough
     if any(is_vertical_bias(f) and f.estimate.is_known for f in by_motion):
         bias = [f for f in bias if f.estimate.is_known or f.acts]
     reference = reference_findings(right, config, tilt)
@@ -241,6 +242,7 @@ def gyro_axes_finding(
 ) -> Finding:
     """Axes of the gyros that differ from those of the accelerometers: the driver has them wrong."""
     body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    # the line replaces that of the configuration
     given = config.table("imu").get("angular_velocity_axes", ("x", "y", "z"))
     driver = body_R_imu.T @ axes @ body_R_imu @ axes_matrix(given)
     names = ", ".join(f'"{name}"' for name in signed_axes(np.round(driver)))
@@ -468,6 +470,7 @@ def reference_findings(
     heading = None
     if offset.is_known and start != Start():
         heading = find_start_heading(right, reference, offset)
+    # rows on the start must not contradict each other
     is_wrong = heading is not None and heading.acts
     yaw_rad = heading.rpy_rad[2] if heading and is_wrong else start.rpy_rad[2]
     yield from tilt_findings(tilt, start, yaw_rad)

@@ -65,6 +65,7 @@ def sighting_changes(
     mounting = sequence.calibration.sonar.mounting.pose()
     R = mounting.rotation().matrix()  # body_R_sonar
     lever = mounting.translation()
+    # a sonar's image has no elevation: landmarks are taken as level with it
     azimuth = sign * seen.azimuth_rad[i]
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
     place = lever + (seen.range_m[i, None] * ahead) @ R.T  # (k, 3)

@@ -150,6 +150,7 @@ class RobustFit:
             near = usable & (size <= OUTLYING * np.maximum(robust, 1e-12)[:, None])
             fewest = (1 - MOST_OUTLYING) * usable.sum(axis=1)
             is_most = near.sum(axis=1) >= fewest
+            # where so many are far the model is wrong, not the rows
             kept = np.where(is_most[:, None], near, usable)
         return cls(A, p, inverse, residuals, usable, kept)
 
@@ -206,6 +207,7 @@ def match(
     if not rows[0, now]:
         return Match.unknown("too few rows beside its reference")
     least = mean_squares.min(axis=1)
+    # a straight way is its own mirror image, turned: the other sense must be far better
     is_mirrored = is_plane and bool(least[-1] * CLEARLY_BETTER**2 < least[0])
     of_lags = mean_squares[int(is_mirrored)]
     best = int(np.argmin(of_lags))
@@ -231,6 +233,7 @@ def refined(
         columns = [stretch.shifted(np.array([lag_s]))[0]]
         if find_lag:
             columns.append(stretch.slope(lag_s))
+        # one candidate: the grid has chosen the lag and the sense
         x = np.stack(columns, axis=1)[None]  # (1, n, 1 or 2)
         found = RobustFit.of(x.conj() if is_mirrored else x, stretch, drift_sigma)
         if not found.rows[0]:
@@ -287,6 +290,7 @@ def root_mean_square(parts: list[Values]) -> float:
 def weighted(estimates: list[tuple[float, float]]) -> Estimate1D:
     """Mean weighted by inverse variances; its sigma includes the scatter between stretches."""
     values, sigmas = np.array(estimates).T
+    # a stretch without noise must not have all of the weight
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
     mean = float(weights @ values / weights.sum())
     scatter = float(weights @ (values - mean) ** 2) / max(len(values) - 1, 1)

@@ -55,6 +55,7 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
     if not any(estimate.is_known for estimate in found.lever):
         return [Finding(ARM, found.lever[0], "m")]
     given = given_arm(calibration)
+    # the line has all three axes, of which those that fit stay as they are
     wrong = arm_error(found, calibration)
     imu = np.subtract(calibration.imu.mounting.translation_m, wrong)
     dvl = np.add(calibration.dvl.mounting.translation_m, wrong)
@@ -179,6 +180,7 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     imu, dvl = beginning(sequence, LONGEST_S)
     if found.tilt is not None or imu is None or dvl is None:
         return found
+    # attitude cannot be carried over a hole
     imu = until_hole(imu)
     try:
         tilt = align_in_motion(imu, dvl, sequence.calibration)

@@ -74,6 +74,7 @@ def velocity_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     is_far = by_dvl_m > LARGEST_RANGE_RATIO * measured_m
     if not (speed_m_s > FASTEST_M_S or is_far):
         return
+    # the largest unit in which the vehicle is no faster than usual
     slow = [unit for unit in SPEEDS if speed_m_s * SPEEDS[unit] <= USUAL_SPEED_M_S]
     unit = slow[0] if slow else "mm/s"
     scale = config.number("dvl", "scale", 1.0) * SPEEDS[unit]
@@ -156,6 +157,7 @@ def tilt_rates(imu: Imu) -> tuple[float, float] | None:
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) // NS_PER_S
     names, first, count = np.unique(seconds, return_index=True, return_counts=True)
     force = np.add.reduceat(imu.specific_force, first, axis=0)
+    # seconds without a sample are no neighbours
     is_next = np.diff(names) == 1
     is_measured = np.isfinite(force).all() and force.any(axis=1).all()
     if np.count_nonzero(is_next) < LEAST_SECONDS or not is_measured:
@@ -197,6 +199,7 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
     by_dvl = np.abs(np.einsum("ak,ka->k", moved, (u[i] + u[j]) / 2))
     measured = np.abs(seen.range_m[j] - seen.range_m[i])
     least = calibration.sonar.range_sigma_m
+    # the range of a landmark abeam hardly changes: a change below the noise is none
     return max(float(np.median(measured)), least), float(np.median(by_dvl))
 
 

@@ -108,6 +108,10 @@ CASES: dict[str, Case] = {
         [imu(force=(0, 0, -1), rate=(0, 0, 90)), dvl()],
         '[imu]\nrotation = "frd"\nangular_velocity_scale = 0.017453292519943295\nlinear_acceleration_scale = 9.80665',
         {"imu.specific_force": [[0, 0, 9.80665]] * 5, "imu.angular_velocity": [[0, 0, -np.pi / 2]] * 5}, {}),
+    "yaw of the gyros alone with the wrong sign, after the axes of both": (
+        [imu(force=(0, 0, -9.8), rate=(0.1, 0.2, 0.3)), dvl()],
+        '[imu]\nrotation = "frd"\nangular_velocity_axes = ["x", "y", "-z"]',
+        {"imu.specific_force": [[0, 0, 9.8]] * 5, "imu.angular_velocity": [[0.1, -0.2, 0.3]] * 5}, {}),
     "gravity put right by the mounting of the frame that is named": (
         [imu(force=(0, 9.8, 0)), dvl(), tree("real_link", (1, 2, 3), x=HALF, w=HALF)],
         FRD_DVL + '[imu]\nframe_id = "real_link"',
