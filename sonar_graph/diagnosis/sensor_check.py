@@ -59,7 +59,7 @@ from sonar_graph.diagnosis.start import (
     with_fitted,
 )
 from sonar_graph.diagnosis.units import force_scale, wrong_units
-from sonar_graph.logs import gravity_warning
+from sonar_graph.logs import gravity_warning, stuck_quantities
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
@@ -118,6 +118,7 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
+    sequence = without_stuck(sequence)
     forces, sequence = force_findings(sequence, config)
     axes, sequence = axes_findings(sequence, config)
     imu, dvl = middle_rows(sequence)
@@ -146,7 +147,7 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """
     if faults := wrong_units(sequence, config):
         return faults
-    forces, right = force_findings(sequence, config)
+    forces, right = force_findings(without_stuck(sequence), config)
     axes, right = axes_findings(right, config)
     found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
@@ -195,6 +196,24 @@ def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
     return inner_imu or imu, inner_dvl or dvl
 
 
+def without_stuck(sequence: Sequence) -> Sequence:
+    """Sequence without rows of IMU and Doppler log that are stuck, which its reading names: no reference for others."""
+    imu = sequence.imu
+    dvl = sequence.dvl
+    if sequence.calibration.odometry_interpolation != "linear":
+        return sequence  # wheels turn evenly
+    stuck = stuck_quantities(imu, dvl)
+    of_imu = np.flatnonzero(~(stuck["angular rate"] | stuck["specific force"]))
+    of_dvl = np.flatnonzero(~stuck["velocity"])
+    if len(of_imu) < 2 or len(of_dvl) < 2:
+        return sequence
+    if len(of_imu) < len(imu):
+        imu = imu.rows(of_imu)
+    if len(of_dvl) < len(dvl):
+        dvl = dvl.rows(of_dvl)
+    return replace(sequence, imu=imu, dvl=dvl)
+
+
 def force_findings(
     sequence: Sequence, config: LogConfig
 ) -> tuple[list[Finding], Sequence]:
@@ -222,6 +241,10 @@ def axes_findings(
     if found is None:
         return [], sequence
     findings = list[Finding]()
+    # gyros and Doppler log agree with each other: rates are reflected the other way
+    is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
+    if is_force and (found.dvl != np.eye(3)).any():
+        return force_axes(found, sequence, config)
     if (found.gyro != np.eye(3)).any():
         names = ", ".join(signed_axes(found.gyro))
         cause = (
@@ -235,6 +258,35 @@ def axes_findings(
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
+
+
+def force_axes(
+    found: AxesMatch, sequence: Sequence, config: LogConfig
+) -> tuple[list[Finding], Sequence]:
+    """Axes of the accelerometers that differ from those of gyros and Doppler log, and the sequence with them put right."""
+    R = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    turn = R.T @ found.dvl.T @ R
+    table = config.table("imu")
+    before = axes_matrix(table.get("rotation", "flu"))
+    of_rates = axes_matrix(table.get("angular_velocity_axes", ("x", "y", "z")))
+    rotation = turn @ before
+    # rates stay as they are
+    rate_axes = of_rates @ before @ rotation.T
+    lines = [
+        ", ".join(f'"{name}"' for name in signed_axes(np.round(axes)))
+        for axes in (rotation, rate_axes)
+    ]
+    finding = Finding(
+        "accelerometer axes",
+        unknown("wrong axes"),
+        cause=f"forces change as gyros and Doppler log have it, {found.ratio:.2g} times closer, about the axes "
+        f"({', '.join(signed_axes(found.dvl.T))})",
+        line=f"`rotation = [{lines[0]}]` and `angular_velocity_axes = [{lines[1]}]` under [imu] {IN_LOG_CONFIG}",
+        gravity=Gravity.GRAVE,
+    )
+    imu = sequence.imu
+    force = imu.specific_force @ turn.T
+    return [finding], replace(sequence, imu=replace(imu, specific_force=force))
 
 
 def gyro_axes_finding(

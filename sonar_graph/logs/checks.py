@@ -328,18 +328,19 @@ def _may_be_chance(differs: NDArray[np.bool_], repeated: Ints) -> NDArray[np.boo
     return np.asarray((len(differs) + 1) * share**repeated >= 1e-3)
 
 
-def stuck_doubt(
+def stuck_rows(
     stamps_ns: Ints,
     values: Floats,
-    quantity: str,
     others: Mapping[str, tuple[Ints, Floats]],
-) -> str | None:
-    """Doubt about rows, shape (n, k), that repeat to the bit while all others change; None: there are none.
+    *,
+    may_rest: bool = False,
+) -> NDArray[np.bool_]:
+    """Mask of rows, shape (n,), of values, shape (n, k), that repeat to the bit while all others change.
 
     A vehicle at rest in a simulator repeats all sensors. Noise never repeats, so that one sensor that repeats alone is
-    stuck. Zeros count as well, except for a vehicle's velocity, which is zero at rest.
+    stuck.
 
-    ``others``: stamps and values of the other sensors, by name.
+    ``others``: stamps and values of the other sensors, by name. ``may_rest``: zeros are a value at rest.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
     first = np.concatenate([[0], np.flatnonzero(differs) + 1])
@@ -348,22 +349,43 @@ def stuck_doubt(
         last - first + 1 >= SURELY_STUCK_ROWS
     )
     chosen &= ~_may_be_chance(differs, last - first)
-    if quantity == "velocity":
+    if may_rest:
         chosen &= values[first].any(axis=1)
     for stretch in np.flatnonzero(chosen).tolist():
         begin_ns, end_ns = stamps_ns[[first[stretch], last[stretch]]].tolist()
         chosen[stretch] = all(
             _changes(at_ns, rows, begin_ns, end_ns) for at_ns, rows in others.values()
         )
-    if not chosen.any():
+    return np.repeat(chosen, last - first + 1)
+
+
+def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, NDArray[np.bool_]]:
+    """Masks of rows of IMU and Doppler log that are stuck, by quantity, as of `stuck_rows`."""
+    rows = {
+        "angular rate": (imu.stamps_ns, imu.angular_velocity),
+        "specific force": (imu.stamps_ns, imu.specific_force),
+        "velocity": (dvl.stamps_ns, dvl.velocity),
+    }
+    found = {}
+    for quantity, (stamps_ns, values) in rows.items():
+        others = {name: other for name, other in rows.items() if name != quantity}
+        may_rest = quantity == "velocity"
+        found[quantity] = stuck_rows(stamps_ns, values, others, may_rest=may_rest)
+    return found
+
+
+def stuck_doubt(stamps_ns: Ints, stuck: NDArray[np.bool_], quantity: str) -> str | None:
+    """Doubt about a quantity with stuck rows, shape (n,); None: there are none."""
+    if not stuck.any():
         return None
-    begin = first[chosen]
-    end = last[chosen]
+    edges = np.diff(np.concatenate([[0], stuck.astype(int), [0]]))
+    begin = np.flatnonzero(edges > 0)
+    end = np.flatnonzero(edges < 0) - 1
     rows = end - begin + 1
     times = _longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))
     return (
-        f"{quantity} the same to the last bit in {rows.sum()} rows, {times} s after the first, while "
-        f"{' and '.join(others)} change: stuck; results are wrong from there on, and the part before is read by --end"
+        f"{quantity} the same to the last bit in {rows.sum()} rows, {times} s after the first, while the other sensors "
+        "change: stuck; results are wrong from there on, and the part before is read by --end"
     )
 
 

@@ -43,6 +43,7 @@ from sonar_graph.logs.checks import (
     spike_warning,
     stamp_faults,
     stuck_doubt,
+    stuck_quantities,
     stuck_warning,
     way_by,
 )
@@ -549,15 +550,10 @@ class Assembly:
         # wheels turn evenly, and their rates jump
         if dvl is None or self.calibration.odometry_interpolation != "linear":
             return
-        rows = {
-            "angular rate": (imu.stamps_ns, imu.angular_velocity),
-            "specific force": (imu.stamps_ns, imu.specific_force),
-            "velocity": (dvl.stamps_ns, dvl.velocity),
-        }
-        for quantity, (stamps_ns, values) in rows.items():
-            others = {name: other for name, other in rows.items() if name != quantity}
+        for quantity, stuck in stuck_quantities(imu, dvl).items():
             role = "dvl" if quantity == "velocity" else "imu"
-            if doubt := stuck_doubt(stamps_ns, values, quantity, others):
+            stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
+            if doubt := stuck_doubt(stamps_ns, stuck, quantity):
                 yield f"{role}: {doubt}"
 
     def warnings(self) -> Iterator[str]:

@@ -19,6 +19,7 @@ from sonar_graph.logs.checks import (
     spike_warning,
     stamp_faults,
     stuck_doubt,
+    stuck_rows,
     stuck_warning,
 )
 from sonar_graph.logs.reading import require_use, unsaid_noise
@@ -332,9 +333,14 @@ EVERY_TENTH_S = stamps(np.arange(300) / 10)
 def test_a_quantity_that_repeats_while_others_change_is_stuck(
     quantity: str, values: Floats, others: Floats, is_stuck: bool
 ) -> None:
-    found = stuck_doubt(
-        EVERY_TENTH_S, values, quantity, {"force": (EVERY_TENTH_S, others)}
+    others_by_name = {"force": (EVERY_TENTH_S, others)}
+    stuck = stuck_rows(
+        EVERY_TENTH_S, values, others_by_name, may_rest=quantity == "velocity"
     )
+    np.testing.assert_array_equal(
+        np.flatnonzero(stuck), np.arange(100, 200) if is_stuck else []
+    )
+    found = stuck_doubt(EVERY_TENTH_S, stuck, quantity)
     assert (found is not None) == is_stuck
     if is_stuck:
         assert (
