@@ -292,7 +292,7 @@ RANGE = Check(
     units=LENGTHS,
     scale_key="range_scale",
     # landmarks are wrong by the error of the whole range, not of its changes
-    reach=lambda sequence, _: typical_range_m(sequence),
+    reach=lambda sequence, _: typical_sighting(sequence)[0],
     sense=lambda _: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}",
@@ -311,6 +311,7 @@ AZIMUTH = Check(
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units=DEGREES,
     scale_key="azimuth_scale",
+    reach=lambda sequence, _: typical_sighting(sequence)[1],
     sense=lambda config: Advice(
         "they turn with the vehicle, mirrored",
         f'{scale_line("detections", "azimuth_scale", config, -1.0)}; of a Detection3DArray `rotation = "frd"`',
@@ -325,12 +326,16 @@ AZIMUTH = Check(
 CHECKS = (DEPTH, RANGE, AZIMUTH, HEADING, POSITIONS)
 
 
-def typical_range_m(sequence: Sequence) -> float:
-    """Median range of the sightings that can be used; 0 without any."""
+def typical_sighting(sequence: Sequence) -> tuple[float, float]:
+    """Range, m, and size of the azimuth, rad, of sightings that can be used, root mean squares; 0 without any."""
     seen = sequence.detections
     if seen is None or not (is_sound := seen.are_sound()).any():
-        return 0.0
-    return float(np.median(seen.range_m[is_sound]))
+        return 0.0, 0.0
+    mean_squares = [
+        float(np.mean(np.square(values[is_sound])))
+        for values in (seen.range_m, seen.azimuth_rad)
+    ]
+    return float(np.sqrt(mean_squares[0])), float(np.sqrt(mean_squares[1]))
 
 
 def level_sigma_m(sigma_m: tuple[float, float, float]) -> float:
