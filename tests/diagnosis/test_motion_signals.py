@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import aiding_check
 from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.logs.adapters.log_config import LogConfig
@@ -65,6 +67,30 @@ def test_a_hole_of_the_imu_breaks_the_motion_and_a_reference_is_unknown_in_it():
     assert np.isnan(yaw(motion.seconds[[0, -1]] + [-1.0, 1.0])).all()
     rows = motion.stretches(np.arange(100.0), np.arange(100.0), yaw)
     assert all(part.seconds[-1] <= 41 or part.seconds[0] >= 45 for part in rows)
+
+
+def test_a_hole_between_two_rows_of_the_doppler_log_breaks_the_motion():
+    """It is no gap of the log, whose rows are 0.2 s apart."""
+    whole = motion_of(RUN)
+    assert set(whole.parts) == {0}
+    motion = motion_of(without_imu(RUN, 40.0, 40.3))
+    assert set(motion.parts) == {0, 1}
+    assert np.diff(motion.seconds).max() < 1.0
+
+
+@pytest.mark.parametrize("angle", [-0.7, 0.5 * np.pi])
+def test_velocities_turned_on_the_body_turn_the_path(angle: float):
+    """To the left where the angle is positive; the arm to the log is taken off before."""
+    section = RUN.calibration.dvl.model_copy(update={"mounting": Mounting()})
+    run = replace(RUN, calibration=RUN.calibration.model_copy(update={"dvl": section}))
+    level = replace(RUN.imu, angular_velocity=RUN.imu.angular_velocity * [0, 0, 1])
+    run = replace(run, imu=level)
+    velocity = Rotation.from_euler("z", angle).apply(run.dvl.velocity * [1, 1, 0])
+    ahead = replace(run, dvl=replace(run.dvl, velocity=run.dvl.velocity * [1, 1, 0]))
+    turned = replace(run, dvl=replace(run.dvl, velocity=velocity))
+    length_m = np.abs(motion_of(ahead).path_m).max()
+    expected = motion_of(ahead).path_m * np.exp(1j * angle)
+    assert np.abs(motion_of(turned).path_m - expected).max() < 0.05 * length_m
 
 
 def test_a_gap_of_the_doppler_log_breaks_the_motion_too():
