@@ -1,7 +1,7 @@
 """Logs by another hand: every fault of the table of checks at three sizes, and logs without a fault.
 
     python benchmarks/validation/foreign_logs.py [--quick] [--seed 1] [--faultless 50] [--coverage 100]
-        [--only WORD ...] [--results FILE] [--write]
+        [--only WORD ...] [--results FILE] [--table docs/theory/foreign_logs.md]
 
 Worlds and files are those of `foreign_world.py`, faults those of `foreign_faults.py`. A log is judged by
 ``sonar-graph compare``, by its exit code, its printed lines and the trajectories that it writes:
@@ -27,6 +27,7 @@ import re
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from foreign_faults import Fault, Marked, MarkedSightings, roles, table
 from foreign_world import EPOCH_S, Log, calibration_of, make_log, write
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from common import make_parser, note, print_figures, print_table, write_results
+from common import make_parser, note, print_figures, print_table
 
 os.environ.setdefault("COLUMNS", "2000")  # before rich: a warning stays on its line
 from sonar_graph import report
@@ -412,33 +413,63 @@ def counts_of(done: list[Judgement]) -> dict[str, int]:
     return {name: counts[name] for name in FIGURES}
 
 
-def write_tables(done: list[Judgement], covered: list[Coverage]) -> None:
-    """Write what was found of each cell, at which size, what was not, and the coverage of intervals."""
-    counts = ", ".join(f"{name} {count}" for name, count in counts_of(done).items())
+def page(
+    arguments: argparse.Namespace, done: list[Judgement], covered: list[Coverage]
+) -> str:
+    """What was found of each cell, at which size, what was not, and the coverage of intervals, as Markdown."""
+    command_line = f"benchmarks/validation/foreign_logs.py --seed {arguments.seed}"
     cells = [
         (quantity, *(cell(done, quantity, kind) for kind in KINDS))
         for quantity in QUANTITIES
     ]
-    title = f"Faults of foreign logs by what became of them: {counts}"
-    write_results("foreign_logs.md", title, ("quantity", *KINDS), cells)
     missed = [
-        (one.fault, one.size, one.verdict, one.error_m, one.without_m, one.world)
+        (
+            one.fault,
+            f"{one.size:.3g}",
+            one.verdict,
+            f"{one.error_m:.2f}",
+            "" if one.without_m is None else f"{one.without_m:.2f}",
+            one.world,
+        )
         for one in done
         if one.verdict in FAILURES
     ]
-    headers = ("fault", "size", "verdict", "error (m)", "without it (m)", "world")
-    write_results(
-        "foreign_misses.md",
-        "Foreign logs not judged as they should be",
-        headers,
-        missed,
+    of_misses = (
+        "fault",
+        "size",
+        "verdict",
+        "error (m)",
+        "without the fault (m)",
+        "world",
     )
-    if covered:
-        headers = ("95 % interval of", "logs", "held", "rms error / sigma")
-        rows = [tuple(asdict(one).values()) for one in covered]
-        write_results(
-            "foreign_coverage.md", "Coverage of the intervals of inspect", headers, rows
-        )
+    intervals = [
+        (one.quantity, one.logs, f"{one.share:.2f}", f"{one.rms:.2f}")
+        for one in covered
+    ]
+    of_intervals = ("95 % interval of", "logs", "held", "rms error / sigma")
+    counts = counts_of(done)
+    return "\n\n".join(
+        [
+            "# Faults of foreign logs",
+            f"Written by `{command_line}`, whose docstring explains the words: dives of a minute by worlds and a writer "
+            "that share no code with the package, each with one fault, or without one. A fault is *named* where a line names its "
+            "cause, and *harmless* where no line does and the error stays below five times that without the fault. "
+            "See [sensor_check](sensor_check.md).",
+            markdown(list(counts), [list(counts.values())]),
+            "## By quantity and kind",
+            markdown(["quantity", *KINDS], cells),
+            "## Not judged as they should be",
+            markdown(of_misses, missed) if missed else "None.",
+            "## Intervals of `inspect`",
+            markdown(of_intervals, intervals) if intervals else "Not measured.",
+        ]
+    )
+
+
+def markdown(headers: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table."""
+    lines = [headers, ["---"] * len(headers), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
 def main() -> None:
@@ -460,9 +491,7 @@ def main() -> None:
         help="faults with a word in their names",
     )
     parser.add_argument("--results", type=Path, help="file of results, to go on with")
-    parser.add_argument(
-        "--write", action="store_true", help="write the tables to benchmarks/results"
-    )
+    parser.add_argument("--table", type=Path, help="page to write the tables to")
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.faultless = min(arguments.faultless, 2)
@@ -488,8 +517,9 @@ def main() -> None:
             ("quantity", "logs", "95 % held", "rms error / sigma"),
             [tuple(asdict(one).values()) for one in covered],
         )
-    if arguments.write:
-        write_tables(done, covered)
+    if arguments.table is not None:
+        text = page(arguments, done, covered)
+        arguments.table.write_text(text + "\n", encoding="utf-8")
     print_figures(counts_of(done))
 
 
