@@ -387,7 +387,8 @@ def findings_of(
             line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
             gravity=gravity_of(acts, error > GRAVE_ERROR * sigma),
         )
-    if not found.lag.is_known:
+    # wheels start to slip in turns: no delay of a sensor
+    if not found.lag.is_known or check.slips(sequence):
         return [row]
     return [row, lag_finding(check, found, sigma, config)]
 
