@@ -87,6 +87,8 @@ if TYPE_CHECKING:
     from sonar_graph.estimator import Estimator, load_estimator
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
     from sonar_graph.logs import inspect_log, read_log, write_log
+    from sonar_graph.logs.adapters import LogConfig
+    from sonar_graph.logs.mcap import TimeWindow
     from sonar_graph.images import SonarFrames
     from sonar_graph.measurements import (
         Depth,
@@ -116,12 +118,14 @@ __all__ = [
     "Imu",
     "LandmarkDetections",
     "LandmarkMap",
+    "LogConfig",
     "Measurements",
     "Odometry",
     "PositionFixes",
     "RunResult",
     "Sequence",
     "SonarFrames",
+    "TimeWindow",
     "Trajectory",
     "compare",
     "inspect_log",

@@ -20,7 +20,13 @@ from pydantic._internal._model_construction import ModelMetaclass
 from pydantic.fields import FieldInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sonar_graph.errors import MISFIT, EstimatorError, SettingError, expectation
+from sonar_graph.errors import (
+    MISFIT,
+    ArgumentError,
+    EstimatorError,
+    SettingError,
+    expectation,
+)
 
 STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS, SHORTEST_HOLE_S = 5, 0.05
@@ -328,8 +334,8 @@ class Calibration(Section):
 
 
 def require_calibration(value: object, call: str) -> None:
-    """Raise a TypeError that names the ``call`` where its first argument is no `Calibration`."""
+    """Raise an `ArgumentError` that names the ``call`` where a value is no `Calibration`."""
     if not isinstance(value, Calibration):
-        raise TypeError(
+        raise ArgumentError(
             f"{call}: expected a Calibration, not {type(value).__name__}; of a dict: Calibration.model_validate(values)"
         )

@@ -14,6 +14,10 @@ class SonarGraphError(Exception):
     """Root of every error that this package raises on purpose."""
 
 
+class ArgumentError(SonarGraphError, TypeError):
+    """A function of this package is called with a value of another kind."""
+
+
 class MeasurementError(SonarGraphError):
     """A block of measurements breaks its own rules (shape, order, finiteness)."""
 

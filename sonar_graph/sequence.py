@@ -5,12 +5,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration
-from sonar_graph.errors import MeasurementError
+from sonar_graph.calibration import Calibration, require_calibration
+from sonar_graph.errors import ArgumentError, MeasurementError
 from sonar_graph.measurements import (
     BLOCKS,
     NS_PER_S,
@@ -68,7 +69,14 @@ class Sequence:
     """Provenance by subject: data set, licence, options of a simulation, seed."""
 
     def __post_init__(self) -> None:
+        require_calibration(self.calibration, "Sequence.calibration")
         require_blocks(self)
+        for name in ("imu", "dvl"):
+            if getattr(self, name) is None:
+                raise MeasurementError(
+                    f"Sequence.{name}: expected {BLOCKS[name].__name__}, not None; every estimator needs an IMU and a "
+                    "Doppler log"
+                )
 
     def __repr__(self) -> str:
         known = self.blocks() | {
@@ -167,11 +175,12 @@ class Sequence:
         Raises
         ------
         MeasurementError
-            When the rate is not positive, the sequence is shorter than one step, or the instants are too many.
+            When the rate is no positive number, the sequence is shorter than one step, or the instants are too many.
         """
-        if not 0 < rate_hz <= NS_PER_S:
+        given: object = rate_hz
+        if not isinstance(given, Real) or not 0 < rate_hz <= NS_PER_S:
             raise MeasurementError(
-                f"{rate_hz} Hz is no rate; expected more than 0, and at most one instant a nanosecond"
+                f"{rate_hz!r} Hz is no rate; expected a number of more than 0, and at most one instant a nanosecond"
             )
         step_ns = round(NS_PER_S / rate_hz)
         count = (self.end_ns - self.start_ns) // step_ns
@@ -216,8 +225,8 @@ def longest_part(stamps_ns: Ints) -> tuple[int, int]:
 
 
 def require_sequence(value: object, call: str) -> None:
-    """Raise a TypeError that names the expected ``call`` where an argument is no `Sequence`."""
+    """Raise an `ArgumentError` that names the expected ``call`` where an argument is no `Sequence`."""
     if not isinstance(value, Sequence):
-        raise TypeError(
+        raise ArgumentError(
             f"{call}: expected a Sequence, not {type(value).__name__}; read_log gives one"
         )

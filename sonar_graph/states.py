@@ -354,9 +354,7 @@ class Refusal(StrEnum):
     UNCONFIRMED = (
         "refused: no other velocity confirms it, and none before it is near enough"
     )
-    WAITED = (
-        "not used: it came after a gap, and only the velocity that confirmed it was"
-    )
+    WAITED = "left out: after a gap a velocity waits until a later one agrees, and the later one ends the gap; nothing to do"
     IN_GAP = "not used: in a gap of the Doppler log, or before it in the same interval of keyframes"
     UNSOUND = "refused: its covariance is not positive definite, or no sensor gives its value or its noise"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"

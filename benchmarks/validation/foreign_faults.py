@@ -272,17 +272,18 @@ def of_depth() -> Iterator[Fault]:
 
 
 def of_heading() -> Iterator[Fault]:
-    row = partial(Fault, "heading", roles=roles("heading"), needs=roles("heading"))
-    degrees = r"heading.*(degrees|another|of its changes)|yaw_rad.*degrees"
+    row = partial(Fault, "heading", roles=roles("heading", "start"), needs=roles("heading"))
+    degrees = r"heading.*(degrees|another|of its changes|that of the start)|yaw_rad.*degrees"
     yield row("stuck", FROM, FROM_S, stuck("heading_s", "yaw_rad"), r"heading.*(repeat|stuck|same)")
     yield row("late", "seconds", (0.7, 1.5, 2.5), late("heading_s"), r"heading.*too late")
-    yield row(SENSE, "clockwise from north", AGAIN, clockwise, r"heading.*clockwise")
+    yield row(SENSE, "clockwise from north", AGAIN, clockwise, r"heading.*(clockwise|that of the start)")
     yield row("unit", "degrees", (DEGREE, DEGREE, DEGREE), scaled("yaw_rad"), degrees)
-    yield row("scale", "factor", (1.1, 0.9, 1.3), scaled("yaw_rad"), r"heading", roles=roles("heading", "imu"))
+    yield row("scale", "factor", (1.1, 0.9, 1.3), scaled("yaw_rad"), r"heading", roles=roles("heading", "imu", "start"))
     yield row("marked invalid", "share, sigma or none", SHARES, Marked("heading", "heading_s", "yaw_rad", True), LEFT_OUT)
     yield row("marked invalid", "share, NaN", SHARES, Marked("heading", "heading_s", "yaw_rad", False), LEFT_OUT)
-    row = partial(row, roles=roles("heading", "dvl"), needs=roles("heading", "fixes"))
-    yield row(SENSE, "turned, degrees", (25.0, 60.0, -90.0), added("yaw_rad", 1 / DEGREE), r"heading.*towards the positions")
+    row = partial(row, roles=roles("heading", "dvl", "start"), needs=roles("heading", "fixes"))
+    from_north = r"heading.*(towards the positions|that of the start)"
+    yield row(SENSE, "turned, degrees", (25.0, 60.0, -90.0), added("yaw_rad", 1 / DEGREE), from_north)
 
 
 def of_position() -> Iterator[Fault]:

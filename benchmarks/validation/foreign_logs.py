@@ -451,9 +451,10 @@ def page(
     return "\n\n".join(
         [
             "# Faults of foreign logs",
-            f"Written by `{command_line}`, whose docstring explains the words: dives of a minute by worlds and a "
-            "writer that share no code with the package, each with one fault, or without one. A fault is *named* where a line names its "
-            "cause, and *harmless* where no line does and the error stays below five times that without the fault. "
+            f"Written by `{command_line}`, whose docstring explains the words: dives of a minute by worlds "
+            "and a writer that share no code with the package, each with one fault, or without one. A fault is "
+            "*named* where a line names its cause, and *harmless* where no line does and the error stays below five "
+            "times that without the fault. "
             "See [sensor_check](sensor_check.md).",
             markdown(list(counts), [list(counts.values())]),
             "## By quantity and kind",

@@ -6,6 +6,7 @@ log with something in doubt; 130 interrupted. Only unforeseen errors end in a tr
 """
 
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -141,6 +142,8 @@ def of_all_commands(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its code; the entry point of ``sonar-graph``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    # commands print the notes of a log themselves
+    logging.getLogger("sonar_graph.logs").addHandler(logging.NullHandler())
     try:
         with terminations_as_interrupts(), noticed_interrupts() as check:
             try:

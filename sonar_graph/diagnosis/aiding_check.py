@@ -35,6 +35,7 @@ from sonar_graph.diagnosis.signals import (
 from sonar_graph.diagnosis.start import LEAST_BIAS_RAD_S, turned_mounting
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, PositionFixes
+from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
@@ -590,7 +591,39 @@ def heading_findings(
     rows = findings_of(HEADING, found, right, config)
     yield from rows
     if not rows[0].grave:
+        yield from start_heading_findings(right, motion)
         yield from heading_turn(right, config, motion)
+
+
+def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Finding]:
+    """First headings that differ from a stated start; nothing where they agree, or no start is stated."""
+    heading = right.heading
+    start = right.calibration.start
+    is_stated = start.source == "stated" and "rpy_rad" in start.model_fields_set
+    if heading is None or not is_stated:
+        return
+    first = max(int(np.searchsorted(heading.stamps_ns, right.start_ns)) - 1, 0)
+    t = motion.since_origin(heading.stamps_ns[first : first + FIRST_ROWS])
+    turned = motion.reference(motion.yaw_rad)(t) - motion.yaw_rad[0]
+    off = heading.yaw_rad[first : first + FIRST_ROWS] - turned - start.rpy_rad[2]
+    if not np.isfinite(off).any():
+        return
+    calibration = right.calibration.heading
+    sigma = np.hypot(calibration.sigma_rad, calibration.bias_sigma_rad)
+    error = Estimate1D(
+        float(np.nanmedian(wrap_angle(off))),
+        float(np.hypot(sigma, start.rpy_sigma_rad[2])),
+    )
+    if not matters(error, LARGE_TURN_RAD):
+        return
+    yield Finding(
+        "heading: turn from that of the start",
+        in_degrees(error),
+        "°",
+        cause="another north, sense or unit of the headings, or a wrong start?",
+        line=f"`world` and `yaw_offset_rad` under [heading] {IN_LOG_CONFIG}, or `start.rpy_rad` {IN_CALIBRATION}",
+        gravity=Gravity.GRAVE,
+    )
 
 
 def heading_turn(

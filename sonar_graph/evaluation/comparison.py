@@ -4,7 +4,7 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.errors import EvaluationError
+from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.free_start import with_fitted_truth
 from sonar_graph.evaluation.own_map import shared_map_instants
@@ -99,8 +99,8 @@ def compare(
         When no estimator is named, one is named twice, or settings are for one that is not named.
     UnknownEstimatorError, EstimatorError
         As in `run_estimator`, before anything runs: mistakes in names and settings. A failed run is a result instead.
-    TypeError
-        When `sequence` is no `Sequence`, or `names` is a single text.
+    ArgumentError
+        When `sequence` is no `Sequence`, `names` is a single text, or `overrides` is no mapping.
 
     Examples
     --------
@@ -116,8 +116,15 @@ def compare(
     require_sequence(sequence, "compare(sequence, names)")
     asked: object = names
     if isinstance(asked, str):
-        raise TypeError(f"compare(sequence, names): names is a list: give [{asked!r}]")
+        raise ArgumentError(
+            f"compare(sequence, names): names is a list: give [{asked!r}]"
+        )
     settings = overrides or {}
+    if not isinstance(settings, Mapping):
+        raise ArgumentError(
+            f"compare(sequence, names, overrides): expected settings by estimator, such as "
+            f"{{'isam2': {{'kernel.width': 2.0}}}}, not {type(settings).__name__}"
+        )
     if not names:
         raise EvaluationError("no estimator to compare; name at least one")
     twice = sorted({name for name in names if names.count(name) > 1})

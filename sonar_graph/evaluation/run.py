@@ -193,7 +193,7 @@ def run_estimator(
         When no estimator has that name.
     EstimatorError
         When a setting does not exist or does not fit.
-    TypeError
+    ArgumentError
         When `sequence` is no `Sequence`, such as the path of a log.
 
     Examples

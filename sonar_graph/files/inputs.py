@@ -6,16 +6,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-from sonar_graph.errors import EvaluationError
+from sonar_graph.errors import ArgumentError, EvaluationError
 
 LARGEST_TEXT = 1 << 27
 """Bytes."""
 
 
 def as_path(value: object, call: str) -> Path:
-    """An argument as a path; a TypeError that names the expected ``call`` where it is none."""
+    """An argument as a path; an `ArgumentError` that names the expected ``call`` where it is none."""
     if not isinstance(value, str | Path):
-        raise TypeError(
+        raise ArgumentError(
             f"{call}: expected a path, a str or Path, not {type(value).__name__}"
         )
     return Path(value)

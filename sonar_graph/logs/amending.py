@@ -110,7 +110,9 @@ class _AmendedCopy:
         anew: Mapping[str, str],
         added: Set[str],
     ) -> None:
-        self._source, self._anew, self._taken = source, anew, set(added - anew.keys())
+        self._source = source
+        self._anew = anew
+        self._taken = set(added - anew.keys())
         self._passages = [
             (log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs
         ]
@@ -127,9 +129,12 @@ class _AmendedCopy:
         metadata: Mapping[str, Mapping[str, str]],
         salvage: bool,
     ) -> Amended:
-        writer, amended, damage = self._writer, self._amended, Damage()
+        writer = self._writer
+        amended = self._amended
+        damage = Damage()
         with self._passages[0][0].path.open("rb") as stream:
             try:
+                # the profile tells viewers of ROS what they read
                 head = next(iter(StreamReader(stream).records), None)
             except McapError:
                 head = None
@@ -165,6 +170,7 @@ class _AmendedCopy:
             if record.opcode == Opcode.METADATA:
                 found = parse(Metadata.read, content)
                 writer.add_metadata(found.name, found.metadata)
+            # a CRC of zero means none
             elif content[-4:] in (
                 bytes(4),
                 zlib.crc32(content[:-4]).to_bytes(4, "little"),
@@ -203,11 +209,13 @@ class _AmendedCopy:
             data = pieces[0].data
             columns = zip(*(piece.found for piece in pieces), strict=True)
             at, size, time_ns = (np.concatenate(column) for column in columns)
+            # messages of all topics of a chunk, to be sorted by time
             of = np.repeat(
                 np.arange(len(pieces)), [len(piece.found.sizes) for piece in pieces]
             )
             for row in np.lexsort((at, time_ns)).tolist():
-                begin, topic = int(at[row]), pieces[of[row]].topic.name
+                begin = int(at[row])
+                topic = pieces[of[row]].topic.name
                 payload = bytes(data[begin : begin + int(size[row])])
                 # before each payload is the head of its record
                 number, published_ns = (
@@ -226,6 +234,7 @@ class _AmendedCopy:
         )
         topic = piece.topic
         wanted = self._anew.get(topic.name)
+        # two types on one topic confuse every reader
         if topic.name in self._taken or (
             wanted is not None and short_name(topic.type_name) != short_name(wanted)
         ):

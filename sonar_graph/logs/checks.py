@@ -72,7 +72,8 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     unset = (stamps_ns == 0) & (log_times_ns != 0)
     if unset.any():
         yield f"{_count(int(unset.sum()), 'message')} without a stamp: the time of recording is used"
-    stamps_ns, log_times_ns = stamps_ns[~unset], log_times_ns[~unset]
+    stamps_ns = stamps_ns[~unset]
+    log_times_ns = log_times_ns[~unset]
     if len(stamps_ns) < 2:
         return
     steps_ns = np.diff(stamps_ns)
@@ -83,6 +84,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     repeated = len(stamps_ns) - len(np.unique(stamps_ns))
     if repeated:
         yield f"{_count(repeated, 'message')} with the stamp of another"
+    # the recorder's clock is the only other one that a log has
     lag_ns = log_times_ns - stamps_ns
     typical_s = float(np.median(lag_ns)) / 1e9
     if abs(typical_s) > DAY_S:
@@ -91,6 +93,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     elif abs(typical_s) > LARGEST_LAG_S:
         side = "before" if typical_s > 0 else "after"
         yield f"stamped {abs(typical_s):.4g} s {side} recording: another clock, or a delay"
+    # medians of some messages: a single late one is no drift
     first_s, last_s = (
         float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:])
     )
@@ -117,6 +120,7 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
         yield f"{early} ends {abs(end_s):.1f} s before the {late}; not estimated from there"
     if calibration.odometry_interpolation == "hold-past":
         return
+    # estimators begin where both sensors are
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     holes = imu_holes(imu.stamps_ns)
     holes = holes[
@@ -140,11 +144,15 @@ def _dvl_gap_warnings(
 ) -> Iterator[str]:
     """Gaps of the Doppler log, grouped by how estimators bridge them."""
     partial = is_partial(dvl)
-    whole_ns, partial_ns = dvl.stamps_ns[~partial], dvl.stamps_ns[partial]
+    whole_ns = dvl.stamps_ns[~partial]
+    partial_ns = dvl.stamps_ns[partial]
     if len(whole_ns) and whole_ns[0] > start_ns:
         yield f"dvl: no whole velocity until {(whole_ns[0] - start_ns) * 1e-9:.3f} s after the start: too few beams"
-    by_beams, by_force, by_walk = [], [], []
+    by_beams = []
+    by_force = []
+    by_walk = []
     for gap in _gaps_where(np.diff(whole_ns) > longest_ns, whole_ns).tolist():
+        # rows of one or two beams inside the gap shorten it
         first, last = np.searchsorted(partial_ns, gap, side="right")
         samples = imu.between(*gap)
         if last > first:
@@ -176,13 +184,13 @@ def imu_holes(stamps_ns: Ints) -> Ints:
     An interval is a hole when it is longer than the median of the intervals before it by a factor.
     """
     intervals = np.diff(stamps_ns)
-    shorter, before = (
-        np.zeros(len(intervals)),
-        np.minimum(np.arange(len(intervals)), ROWS_BEFORE),
-    )
+    shorter = np.zeros(len(intervals))
+    before = np.minimum(np.arange(len(intervals)), ROWS_BEFORE)
+    # counting shorter intervals finds the median without sorting each window
     for lag in range(1, min(ROWS_BEFORE + 1, len(intervals))):
         shorter[lag:] += HOLE_INTERVALS * intervals[:-lag] < intervals[lag:]
     is_hole = (intervals > SHORTEST_HOLE_S * 1e9) & (2 * shorter >= before)
+    # the first interval has none before it to be compared with
     is_hole[:1] &= intervals[:1] > UNTYPICAL_S * 1e9
     return _gaps_where(is_hole, stamps_ns)
 
@@ -202,6 +210,7 @@ def _gap_times(gaps: Ints | list[list[int]], start_ns: int) -> str:
 
 def _longest(first_ns: Ints, last_ns: Ints, size: Ints, origin_ns: int) -> str:
     """Times of the `MOST_NAMED` largest spans in their order: ``1.000 to 2.500, 4.000 to 4.200``."""
+    # the largest ones, in the order of the log
     named = np.sort(np.argsort(-size, kind="stable")[:MOST_NAMED])
     return ", ".join(
         f"{(first_ns[k] - origin_ns) * 1e-9:.3f} to {(last_ns[k] - origin_ns) * 1e-9:.3f}"
@@ -224,6 +233,7 @@ def gravity_warning(
     measured = specific_force[np.isfinite(specific_force).all(axis=1)]
     if not len(measured):
         return None
+    # the median forgets manoeuvres, which the mean keeps
     typical = mounting.pose().rotation().matrix() @ np.median(measured, axis=0)
     length = float(np.linalg.norm(typical))
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:
@@ -235,10 +245,8 @@ def gravity_warning(
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None
     axis = int(np.argmax(np.abs(typical)))
-    sign, rotation = (
-        ("-" if typical[axis] < 0 else "+"),
-        _ROTATIONS.get((axis, bool(typical[axis] < 0))),
-    )
+    sign = "-" if typical[axis] < 0 else "+"
+    rotation = _ROTATIONS.get((axis, bool(typical[axis] < 0)))
     advice = 'give rotation = "frd", or linear_acceleration_scale = -1 where only the sign is wrong'
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
@@ -264,7 +272,9 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
     if len(values) < 3:
         return None
     least, unit, effect = SPIKES[quantity]
+    # a step has one neighbour on either side, a spike none
     off = np.linalg.norm(values[1:-1] - (values[:-2] + values[2:]) / 2, axis=1)
+    # a row without accelerometers is no spike
     off[np.isnan(off)] = 0.0
     agree = np.linalg.norm(values[2:] - values[:-2], axis=1) < off / 2
     spikes = (
@@ -299,6 +309,7 @@ def stuck_warning(
         last - first + 1 >= STUCK_ROWS
     )
     if is_coarse:
+        # resolution alone makes short stretches of equal rows
         is_long &= ~_may_be_chance(differs, last - first)
     is_zero = ~np.any(values[first], axis=1)
     texts = []
@@ -308,7 +319,8 @@ def stuck_warning(
     ):
         if not chosen.any():
             continue
-        begin, end = first[chosen], last[chosen]
+        begin = first[chosen]
+        end = last[chosen]
         rows = end - begin + 1
         times = f"{_longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))} s after the first"
         more = (
@@ -404,6 +416,7 @@ def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     ``values``, shape (n, k), and ``moved``, what the vehicle has moved until each row by other sensors, have one unit.
     A stretch counts where the vehicle moves in it by more than ``least`` and three steps of the sensor's resolution.
     """
+    # the smallest change of a sensor is its resolution
     changes = np.linalg.norm(np.diff(values, axis=0), axis=1)
     differs = changes > 0
     resolution = float(np.min(changes[differs], initial=np.inf))
@@ -461,6 +474,7 @@ def _repeated_while_moving(
     for begin, end in zip(
         first[is_stuck].tolist(), last[is_stuck].tolist(), strict=True
     ):
+        # the first row of a stretch was measured
         mask[begin + 1 : end + 1] = True
     return mask
 
@@ -474,6 +488,7 @@ def way_by(
     """
     if role == "heading":
         stamps_ns = imu.stamps_ns
+        # yaw rate: the world's vertical is the body's z while it is near level
         rate = (
             imu.angular_velocity
             @ calibration.imu.mounting.pose().rotation().matrix()[2]
@@ -492,6 +507,7 @@ def way_by(
         width = min(width, len(rows))
         smooth = np.column_stack(
             [
+                # without averaging, noise adds up to a distance that was not moved
                 np.convolve(column, np.ones(width) / width, "same")
                 for column in velocity.T
             ]

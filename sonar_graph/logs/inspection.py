@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError, SonarGraphError
 from sonar_graph.files import as_path
 from sonar_graph.logs.adapters import (
     LogConfig,
+    as_log_config,
     leaf_fields,
     plain_lines,
     shipped_like,
@@ -27,7 +29,7 @@ from sonar_graph.logs.cdr import (
     short_name,
 )
 from sonar_graph.logs.checks import stamp_faults
-from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topic, scan
+from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, Topic, scan
 from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import (
     ROLES,
@@ -35,8 +37,11 @@ from sonar_graph.logs.roles import (
     SONAR,
     TF,
     Choice,
+    Window,
+    as_window,
     choose_each,
     refusal,
+    require_topics,
     wanted_types,
 )
 from sonar_graph.logs.sonar_images import (
@@ -45,7 +50,9 @@ from sonar_graph.logs.sonar_images import (
     sonar_frame,
 )
 from sonar_graph.logs.vehicle_setup import (
+    GIVEN,
     PartialCalibration,
+    as_calibration,
     read_calibration,
     read_notes,
     recorded_name,
@@ -53,6 +60,7 @@ from sonar_graph.logs.vehicle_setup import (
 )
 from sonar_graph.measurements import NS_PER_S, Ints
 
+TIME = "builtin_interfaces/msg/Time"
 _MOST_FIELDS = 24
 _EXAMPLES = {
     "imu": 'angular_velocity = ["...", "...", "..."]\nlinear_acceleration = ["...", "...", "..."]',
@@ -69,14 +77,14 @@ class TopicSummary:
     type_name: str
     encoding: str
     """Such as ``cdr`` or ``protobuf``."""
-    messages: int
-    first_stamp_ns: int
-    last_stamp_ns: int
-    rate_hz: float
+    messages: int = 0
+    first_stamp_ns: int = 0
+    last_stamp_ns: int = 0
+    rate_hz: float = 0.0
     """Messages per second between the first and the last; 0 where all have one stamp."""
-    largest_gap_s: float
+    largest_gap_s: float = 0.0
     """Longest time between successive stamps."""
-    stamps_from: str
+    stamps_from: str = "log"
     """``header`` or ``log``."""
     jitter_s: float = 0.0
     """Scatter of the times between successive stamps: half of the central 68 %."""
@@ -167,7 +175,7 @@ class LogSummary:
     def duration_s(self) -> float:
         """Seconds between the first and the last stamp of the topics that play a role, or of all where none does."""
         used = {role.topic for role in self.roles}
-        # not the recorder's clock
+        # a log that was played has the recorder's clock of another day
         by_header = [topic for topic in self.topics if topic.stamps_from == "header"]
         topics = (
             [topic for topic in self.topics if topic.name in used]
@@ -183,10 +191,10 @@ class LogSummary:
 
 def inspect_log(
     path: str | Path,
-    config: LogConfig | None = None,
+    config: LogConfig | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
-    window: TimeWindow | None = None,
-    calibration: PartialCalibration | None = None,
+    window: Window | None = None,
+    calibration: Calibration | PartialCalibration | str | Path | None = None,
 ) -> LogSummary:
     """Summarise an MCAP file; faults of the log become part of the summary.
 
@@ -194,12 +202,8 @@ def inspect_log(
     ----------
     path
         The log.
-    config, topics
-        What the user says about topics, as for `read_log`.
-    window
-        Part of the recording to inspect.
-    calibration
-        What the user says about the vehicle: mountings that it states are not missed in ``/tf_static``.
+    config, topics, window, calibration
+        As of `read_log`; mountings of the calibration are not missed in ``/tf_static``.
 
     Returns
     -------
@@ -209,7 +213,10 @@ def inspect_log(
     Raises
     ------
     LogError
-        When there is no such file, it is not MCAP, or `config` names fields that the messages do not have.
+        When there is no such file, it is not MCAP, `config` names fields that the messages do not have, or `topics` one
+        that is not in the log.
+    ArgumentError
+        When an argument is of another kind.
 
     See Also
     --------
@@ -232,19 +239,22 @@ def inspect_log(
     >>> summary.warnings[0].split(":")[1]
     " gravity is felt along +y (9.81 m/s2) instead of the body's +z"
     """
-    config = config or LogConfig()
+    call = "inspect_log"
+    path = as_path(path, f"{call}(path)")
+    config = as_log_config(config, call) or LogConfig()
+    given = as_calibration(calibration, call)
+    wanted = {} if topics is None else topics
     types = wanted_types(config)
     recording = scan(
-        as_path(path, "inspect_log(path)"),
+        path,
         lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP,
-        window,
+        as_window(window, call),
     )
-    damage = [
-        *recording.corrupt,
-        *([recording.ending] if recording.ending else []),
-        *recording.damage.remarks,
-    ]
-    choices = choose_each(recording, topics or {}, config, ROLES)
+    require_topics(recording, wanted, config, call)
+    damage = [*recording.corrupt, *recording.damage.remarks]
+    if recording.ending:
+        damage.insert(len(recording.corrupt), recording.ending)
+    choices = choose_each(recording, wanted, config, ROLES)
     mounted: dict[str, str] = {}
     try:
         notes = read_notes(recording)
@@ -252,13 +262,15 @@ def inspect_log(
         notes = {}
         damage.append(str(error))
     summaries = tuple(_summarise(topic) for topic in recording.topics.values())
-    left_out, warnings, unusable = list[str](), list[str](), list[str]()
+    left_out = list[str]()
+    warnings = list[str]()
+    unusable = list[str]()
     try:
         frame = sonar_frame(recording, choices[SONAR].topic, config)
         assembly = Assembly(
             recording,
             {name: choices[name] for name in SEQUENCE_ROLES},
-            calibration,
+            given,
             frame,
         )
         mounted = assembly.mounted
@@ -267,13 +279,16 @@ def inspect_log(
         pass  # `calibration` says so
     except SonarGraphError as error:
         unusable.append(str(error))
-    sonar, sonar_fault = None, False
+    sonar = None
+    sonar_fault = False
     if (sonar_topic := choices[SONAR].topic) is not None:
         try:
+            # the first frames show the setting
             frames = next(read_sonar_frames(recording.path, sonar_topic, config), None)
             sonar = describe_frames(frames) if frames else None
         except SonarGraphError as error:
-            sonar, sonar_fault = f"cannot be read: {error}", True
+            sonar = f"cannot be read: {error}"
+            sonar_fault = True
     return LogSummary(
         path=recording.path,
         name=recorded_name(recording),
@@ -282,7 +297,7 @@ def inspect_log(
             RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
             for c in choices.values()
         ),
-        calibration=_calibration_source(recording, mounted),
+        calibration=_calibration_source(recording, mounted, given),
         notes=notes,
         damage=tuple(damage),
         unusable=tuple(unusable),
@@ -295,34 +310,25 @@ def inspect_log(
 
 
 def _summarise(topic: Topic) -> TopicSummary:
-    header_ns, log_times_ns = _header_stamps(topic), topic.log_times_ns
     if not len(topic):  # none of its messages is what its definition says
-        faults = "has " + ", ".join(
-            f"{count} messages {fault}" for fault, count in topic.unsound.items()
-        )
-        return TopicSummary(
-            topic.name,
-            topic.type_name,
-            topic.encoding,
-            0,
-            0,
-            0,
-            0.0,
-            0.0,
-            "log",
-            refusal=faults,
-        )
-    stamps_ns, lag_s = np.sort(log_times_ns), None
+        counts = (f"{count} messages {fault}" for fault, count in topic.unsound.items())
+        lost = f"has {', '.join(counts)}"
+        return TopicSummary(topic.name, topic.type_name, topic.encoding, refusal=lost)
+    log_times_ns = topic.log_times_ns
+    header_ns = _header_stamps(topic)
+    stamps_ns = np.sort(log_times_ns)
+    lag_s = None
+    faults: tuple[str, ...] = ()
     if header_ns is not None:
-        stamps_ns = np.sort(np.where(header_ns == 0, log_times_ns, header_ns))
-        stamped = (header_ns != 0) | (log_times_ns == 0)
-        lag_s = (
-            float(np.median((log_times_ns - header_ns)[stamped])) * 1e-9
-            if stamped.any()
-            else None
-        )
+        # data sets begin at 0: recorded at 0, a stamp of 0 is right
+        is_stamped = (header_ns != 0) | (log_times_ns == 0)
+        stamps_ns = np.sort(np.where(is_stamped, header_ns, log_times_ns))
+        if is_stamped.any():
+            lag_s = float(np.median((log_times_ns - header_ns)[is_stamped])) * 1e-9
+        faults = tuple(stamp_faults(header_ns, log_times_ns))
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     steps_s = np.diff(stamps_ns) * 1e-9
+    # gaps must not count as jitter
     low, high = np.quantile(steps_s, [0.16, 0.84]) if len(steps_s) else (0.0, 0.0)
     return TopicSummary(
         name=topic.name,
@@ -336,9 +342,7 @@ def _summarise(topic: Topic) -> TopicSummary:
         stamps_from="log" if header_ns is None else "header",
         jitter_s=float(high - low) / 2,
         lag_s=lag_s,
-        stamp_faults=()
-        if header_ns is None
-        else tuple(stamp_faults(header_ns, log_times_ns)),
+        stamp_faults=faults,
         refusal=refusal(topic),
     )
 
@@ -349,22 +353,16 @@ def _header_stamps(topic: Topic) -> Ints | None:
         first = topic.definition().fields[:1] if topic.is_ros2 else ()
     except SonarGraphError:
         return None
-    if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
+    kind = first[0].kind if first and not first[0].is_array else None
+    is_header = isinstance(kind, Struct) and kind.name == "std_msgs/Header"
+    if not is_header or min(topic.stacks, default=0) < STAMP_BYTES:
         return None
-    if (
-        first[0].kind.name != "std_msgs/Header"
-        or min(topic.stacks, default=0) < STAMP_BYTES
-    ):
-        return None
-    time = parse_definition(
-        "builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time")
-    )
     parts = [
         (rows, payloads[:, :STAMP_BYTES])
         for stack in topic.stacks.values()
         for rows, payloads in stack
     ]
-    decoded = decode(time, parts)
+    decoded = decode(parse_definition(TIME, definition(TIME)), parts)
     if decoded.unsound:
         return None
     stamps_ns = np.empty(len(topic), np.int64)
@@ -375,8 +373,16 @@ def _header_stamps(topic: Topic) -> Ints | None:
     return stamps_ns
 
 
-def _calibration_source(recording: Recording, mounted: Mapping[str, str]) -> str:
+def _calibration_source(
+    recording: Recording,
+    mounted: Mapping[str, str],
+    given: Calibration | PartialCalibration | None,
+) -> str:
     """Source of the calibration, given the frame of each sensor whose mounting is from ``/tf_static``."""
+    if isinstance(given, Calibration):
+        return GIVEN
+    if given is not None:
+        return given.before(_calibration_source(recording, mounted, None))
     try:
         recorded = read_calibration(recording)
         has_frames = bool(static_frames(recording))
@@ -408,7 +414,8 @@ def starting_config(
         f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."
     ]
     for choice in choices:
-        role, table = choice.role.name, config.table(choice.role.name)
+        role = choice.role.name
+        table = config.table(choice.role.name)
         named = choice.candidates or choice.could_be
         if choice.topic is not None and choice.adapter is not None:
             topic = recording.topics[choice.topic]
@@ -419,38 +426,10 @@ def starting_config(
                 "\n".join([_comment(choice.reason), f"[{role}]", *plain_lines(table)])
             )
         elif named:
-            parts.append(
-                _comment(
-                    "\n".join(
-                        [
-                            f"[{role}]  # one of",
-                            *(f'topic = "{name}"' for name in named),
-                        ]
-                    )
-                )
-            )
-        elif (
-            choice.role.is_required
-        ):  # a table to fill in, for a topic whose name contains the role
-            lines = [
-                f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
-            ]
-            likely = [
-                topic
-                for topic in recording.topics.values()
-                if role in topic.name.lower() and topic.is_ros2
-            ]
-            name, kind = (
-                (likely[0].name, likely[0].type_name)
-                if likely
-                else ("/...", "package/msg/Type")
-            )
-            lines += [f'topic = "{name}"', f'type = "{kind}"']
-            if likely and "header.stamp.sec" not in _leaves(likely[0]):
-                lines.append(
-                    'stamp = "log"  # messages without a header: when they were recorded'
-                )
-            parts.append(_comment("\n".join([*lines, _EXAMPLES[role]])))
+            topics = (f'topic = "{name}"' for name in named)
+            parts.append(_comment("\n".join([f"[{role}]  # one of", *topics])))
+        elif choice.role.is_required:
+            parts.append(_comment(_to_fill_in(role, recording)))
         else:
             parts.append(_comment(f"[{role}]  # nothing found"))
     if any(choice.topic is None and choice.role.is_required for choice in choices):
@@ -471,6 +450,26 @@ def starting_config(
             head = f"{topic.name} is a {topic.type_name} with the fields"
             parts.append(_comment("\n".join([head, *fields[:_MOST_FIELDS], *more])))
     return "\n\n".join(parts) + "\n"
+
+
+def _to_fill_in(role: str, recording: Recording) -> str:
+    """Table for a topic of an unknown type whose name contains the role, or for any."""
+    lines = [
+        f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
+    ]
+    likely = [
+        topic
+        for topic in recording.topics.values()
+        if role in topic.name.lower() and topic.is_ros2
+    ]
+    name = likely[0].name if likely else "/..."
+    kind = likely[0].type_name if likely else "package/msg/Type"
+    lines += [f'topic = "{name}"', f'type = "{kind}"']
+    if likely and "header.stamp.sec" not in _leaves(likely[0]):
+        lines.append(
+            'stamp = "log"  # messages without a header: when they were recorded'
+        )
+    return "\n".join([*lines, _EXAMPLES[role]])
 
 
 def _comment(text: str) -> str:

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 
 DROPPED_TOPIC = "/sonar_graph/dropped"
 CHUNK_BYTES = 1 << 20
-LIVE_RATE, LATENESS = "live.rate_hz", "live.lateness_s"
+LIVE_RATE = "live.rate_hz"
+LATENESS = "live.lateness_s"
 """Notes that say how often the live estimator was asked, and its lateness budget."""
 NEWEST_FRAMES = "live.newest_frames_ns"
 """Note with the log time of the newest transforms that the calibration was gathered from; later ones did not count."""
@@ -82,6 +83,7 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
             topic.leave_out(topic.log_times_ns[topic.log_times_ns > int(newest_ns)])
     for name in {name for name, _ in dropped}:
         if name in recording.topics:
+            # a message is named by topic and log time
             times_ns = [log_time_ns for topic, log_time_ns in dropped if topic == name]
             recording.topics[name].leave_out(np.array(times_ns, np.int64))
     counts = Counter((name, reason) for (name, _), reason in dropped.items())
@@ -129,6 +131,7 @@ def pinned(
             tables.setdefault(role, {})["topic"] = choice.topic
     for role in ("imu", "dvl"):
         adapter = assembly.adapters[role]
+        # single messages must be read as all of the log are
         tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))
     for role in ("positions", "truth"):
         if role in assembly.topics and assembly.adapters[role].geodetic is not None:
@@ -152,6 +155,7 @@ class LiveRecord:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
+            # a record is never overwritten: it cannot be made again
             self._stream = path.open("xb")
         except FileExistsError as error:
             raise LogError(
@@ -182,7 +186,8 @@ class LiveRecord:
             When the calibration in the record is invalid.
         """
         recording = scan(path, lambda _: Keep.NONE)
-        recorded, config = read_calibration(recording), recorded_config(recording)
+        recorded = read_calibration(recording)
+        config = recorded_config(recording)
         if recorded is None or config is None:
             return given
         values = {
@@ -252,8 +257,10 @@ class LiveRecord:
         sent_ns: int = 0,
     ) -> int:
         """Write a message as it came; its log time, by which it is named: of arrival, and unlike any other's."""
+        # two messages of one instant would share their name
         log_time_ns = max(arrival_ns, self._newest_ns.get(topic, 0) + 1)
         self._newest_ns[topic] = log_time_ns
+        # middleware without a time of sending gives 0
         sent_ns = sent_ns if 0 < sent_ns < 2**63 else log_time_ns
         self._writer.add_message(
             self._channels[topic], log_time_ns, payload, sent_ns, sequence % 2**32

@@ -68,6 +68,7 @@ class FirstPath:
     ) -> "FirstPath":
         """Integrate with the trapezoid rule, up to the first hole of the IMU."""
         t = (imu.stamps_ns - start_ns) * 1e-9
+        # a hole of the IMU ends what can be integrated
         t_hole = np.append(t[:-1][np.diff(t) > LONGEST_HOLE_S], LONGEST_S)
         rows = (t >= -1.0) & (t <= t_hole[t_hole > 0][0])
         t = t[rows]
@@ -77,6 +78,7 @@ class FirstPath:
         ) @ body_R_imu.T
         dt = np.diff(t)[:, None]
         C = running_rotations((rate[1:] + rate[:-1]) / 2 * dt)
+        # turns are counted from the start on
         C = C[np.searchsorted(t, 0.0, side="right") - 1].T @ C
         force = np.einsum("nij,nj->ni", C, imu.specific_force[rows] @ body_R_imu.T)
         F = np.vstack(
@@ -109,6 +111,7 @@ class FirstPath:
         line = (self.velocity - self.impulse)[first]
         if len(t) < FEWEST_VELOCITIES or not np.isfinite(line).all():
             return None
+        # a constant force in the world is a straight line in time
         slope, level = np.polyfit(t, line, 1)
         size = float(np.linalg.norm(slope))
         g = calibration.gravity_m_s2
@@ -117,6 +120,7 @@ class FirstPath:
         scatter = float(np.std(line - slope * t[:, None] - level))
         # as if all scatter were one slow wave
         of_line = scatter * np.sqrt(12.0) / (g * float(np.ptp(t)))
+        # a bias of the accelerometers tilts gravity by its share of g
         of_force = calibration.imu.accel_bias_sigma / g
         of_turn = calibration.imu.gyro_bias_sigma * float(np.ptp(t))
         sigma = WIDER * float(np.sqrt(of_line**2 + of_force**2 + of_turn**2))
@@ -175,6 +179,7 @@ def measured_start(
             notes.append("roll and pitch unknown, taken as 0")
         else:
             (x, y, z), sigmas[:2] = up
+            # the world's up in the body fixes roll and pitch
             roll = float(np.arctan2(y, z))
             pitch = float(np.arctan2(-x, np.hypot(y, z)))
             notes.append("level by gravity")
@@ -187,6 +192,7 @@ def measured_start(
         turned = _turned(
             blocks["imu"], calibration, (roll, pitch), heading.stamps_ns[near], start_ns
         )
+        # angles near the cut at 180 degrees have no median of their own
         at_start = np.unwrap(heading.yaw_rad[near]) - turned
         yaw = float(np.angle(np.exp(1j * np.median(at_start))))
         sigmas[2] = WIDER * np.hypot(
@@ -209,7 +215,9 @@ def measured_start(
         variances = np.where(
             np.isnan(variances), np.square(calibration.positions.sigma_m), variances
         )
+        # fixes near the start were not taken at it
         way = path.moved((fixes.stamps_ns[near] - start_ns) * 1e-9) @ R.T  # (k, 3)
+        # fixes are of the antenna
         antenna = R @ np.array(calibration.positions.antenna_m)
         position = np.median(fixes.position_m[near] - way, axis=0) - antenna
         # an error of the heading turns the way to the fixes
@@ -260,6 +268,7 @@ def height_by_depth(
     ``up`` is the world's up in the body, shape (3,).
     """
     near = _nearest(depth.stamps_ns, start_ns)
+    # the first depths may come after the start
     late_s = np.asarray((depth.stamps_ns[near] - start_ns) * 1e-9, np.float64)
     climb_m = path.moved(late_s) @ up
     port_m = float(up @ calibration.depth.port_m)
@@ -287,6 +296,7 @@ def yaw_by_fixes(
         return 0.0, UNKNOWN_YAW_SIGMA_RAD
     reckoned = np.interp(t[is_inside], path.seconds, p)
     seen = places[is_inside] @ [1.0, 1j, 0.0]
+    # turn about the centre: the place of the start is another unknown
     reckoned = reckoned - reckoned.mean()
     seen = seen - seen.mean()
     c = np.vdot(reckoned, seen)
@@ -299,6 +309,7 @@ def yaw_by_fixes(
         * float(np.sqrt(np.mean(np.abs(left) ** 2) / 2))
         / max(moved_m, 1e-9)
     )
+    # the path is too short for a direction
     if sigma > UNKNOWN_YAW_SIGMA_RAD / 2:
         return 0.0, UNKNOWN_YAW_SIGMA_RAD
     return float(np.angle(c)), max(sigma, LEAST_TILT_SIGMA_RAD)

@@ -5,6 +5,7 @@ and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of
 was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md).
 """
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,10 @@ from sonar_graph.logs.adapters import (
     DvlAdapter,
     FieldTable,
     GeodeticFields,
-    HeadingAdapter,
     LogConfig,
     MessageTable,
     Origin,
-    PositionAdapter,
-    TruthAdapter,
+    as_log_config,
     changes_text,
     detection_warnings,
     shipped_like,
@@ -48,18 +47,30 @@ from sonar_graph.logs.checks import (
     way_by,
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
-from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan
+from sonar_graph.logs.mcap import (
+    Keep,
+    Progress,
+    Recording,
+    TimeWindow,
+    Topic,
+    scan,
+)
 from sonar_graph.logs.roles import (
     ROLES,
     SEQUENCE_ROLES,
     SONAR,
     Choice,
+    Window,
+    as_window,
     choose_topics,
+    require_topics,
     wanted_types,
 )
 from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
+    GIVEN,
     PartialCalibration,
+    as_calibration,
     gathered,
     is_described,
     mounted_by,
@@ -73,6 +84,18 @@ from sonar_graph.logs.vehicle_setup import (
 from sonar_graph.measurements import Block, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 
+LOG = logging.getLogger("sonar_graph.logs")
+WARNED = (
+    "log.ending",
+    "log.damage",
+    "log.start_pose",
+    "log.stamps",
+    "log.dropped",
+    "log.doubtful",
+    "log.warnings",
+    "log.gaps",
+)
+"""Notes that `read_log` also logs: the user may have to act on them."""
 FOUND_ANEW = frozenset(
     {"log.warnings", "log.gaps", "log.noise", "log.sensors", "log.doubtful"}
 )
@@ -92,17 +115,17 @@ def read_log(
     path: str | Path,
     *,
     calibration: Calibration | PartialCalibration | str | Path | None = None,
-    name: str | None = None,
     topics: Mapping[str, str] | None = None,
-    config: LogConfig | None = None,
-    window: TimeWindow | None = None,
+    config: LogConfig | str | Path | None = None,
+    window: Window | None = None,
     salvage: bool = False,
     progress: Progress | None = None,
 ) -> Sequence:
     """Read a log of ROS 2 messages as a `Sequence`.
 
-    Stamps are those of the sensors' headers. The notes of the sequence, under ``log.*``, say which topic was used for
-    what, where the calibration comes from, what was left out and what looks wrong.
+    Stamps are those of the sensors' headers. The notes of the sequence, under ``log.*``, list the topics in use, the
+    source of the calibration, the rows left out and the numbers in doubt. Those of `WARNED` are also logged as warnings
+    of the logger ``sonar_graph.logs``, which Python prints where the program has set up no logging.
 
     Parameters
     ----------
@@ -112,15 +135,14 @@ def read_log(
         A `Calibration` replaces everything that the file says. A `PartialCalibration`, or the path of a TOML or JSON
         file of one, goes before it, field by field.
         Without either the file's record holds; without a record, defaults with the mountings of ``/tf_static``.
-    name
-        Name of the sequence, instead of the one in the file; without either, the file's name.
     topics
         Topics by role (``imu``, ``dvl``, ``depth``, ``heading``, ``positions``, ``detections``, ``truth``,
         ``true_landmarks``), where several fit or none is found by type and name; they go before those of `config`.
     config
-        Description of the topics of a foreign log; `read_log_config` reads one from a TOML file.
+        Description of the topics of a foreign log, or the path of a TOML file with one.
     window
-        Part of the recording to read; ``/tf_static`` and other latched topics are read whenever recorded.
+        Part of the recording to read: a `TimeWindow`, or start and end in seconds from its beginning, ``(0, 10)``.
+        ``/tf_static`` and other latched topics are read whenever recorded.
     salvage
         Read what is whole of a file that is damaged in its middle; the note ``log.damage`` says what is lost.
     progress
@@ -134,14 +156,14 @@ def read_log(
     Raises
     ------
     MissingTopicError
-        When the log has no IMU or no DVL; listing the topics that it has.
+        When the log has no IMU or no DVL, or no topic of a name in `topics`; listing the topics that it has.
     LogError
         When the file is not MCAP, is damaged in its middle without `salvage`, has nothing in the window, or a message
         breaks its own rules.
     CalibrationError
         When the calibration in the file is invalid, or becomes so by `calibration`, or that file cannot be read.
-    TypeError
-        When `path` or `calibration` is something else.
+    ArgumentError
+        When an argument is of another kind, such as a list of topics.
 
     See Also
     --------
@@ -162,44 +184,45 @@ def read_log(
     >>> sequence.notes["log.topics"]
     'imu: /imu/data; dvl: /dvl/data; ...'
     """
-    path = as_path(path, "read_log(path)")
-    if not isinstance(calibration, Calibration | PartialCalibration | None):
-        calibration = PartialCalibration.read(
-            as_path(calibration, "read_log(path, calibration=FILE or Calibration)")
-        )
-    recording, config = _scanned(path, config, window, progress)
+    call = "read_log"
+    path = as_path(path, f"{call}(path)")
+    given = as_calibration(calibration, call)
+    part = as_window(window, call)
+    recording, config = _scanned(path, as_log_config(config, call), part, progress)
     if not salvage:
         recording.require_sound()
+    wanted = {} if topics is None else topics
+    require_topics(recording, wanted, config, call)
     left_out = leave_out_dropped(recording)
-    choices = choose_topics(recording, topics or {}, config)
-    frame = sonar_frame(recording, (topics or {}).get(SONAR), config)
-    sequence = Assembly(recording, choices, calibration, frame).sequence(name)
-    sequence.notes.update(left_out)
-    if (
-        window is not None
-        and window.start is not None
-        and recording.beginning_ns is not None
-    ):
-        late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
-        given = (
-            calibration.values if isinstance(calibration, PartialCalibration) else {}
-        )
-        recorded = (
-            None
-            if isinstance(calibration, Calibration)
-            else read_calibration(recording)
-        )
-        if (
-            late_ns > 0
-            and "start" not in given
-            and recorded is not None
-            and "start" in recorded.model_fields_set
-        ):
-            sequence.notes["log.start_pose"] = (
-                f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was "
-                "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
-            )
+    choices = choose_topics(recording, wanted, config)
+    frame = sonar_frame(recording, wanted.get(SONAR), config)
+    sequence = Assembly(recording, choices, given, frame).sequence()
+    sequence.notes.update(left_out | _start_note(recording, part, given))
+    for subject in WARNED:
+        if subject in sequence.notes:
+            LOG.warning("%s: %s: %s", path.name, subject, sequence.notes[subject])
     return sequence
+
+
+def _start_note(
+    recording: Recording,
+    window: TimeWindow | None,
+    given: Calibration | PartialCalibration | None,
+) -> dict[str, str]:
+    """Note about a stated start pose that is of an earlier instant than the part that was read; empty without."""
+    begin = None if window is None else window.start
+    beginning_ns = recording.beginning_ns
+    if begin is None or beginning_ns is None or isinstance(given, Calibration):
+        return {}
+    late_s = (begin.resolve(beginning_ns) - beginning_ns) * 1e-9
+    recorded = read_calibration(recording)
+    is_stated = recorded is not None and "start" in recorded.model_fields_set
+    if late_s <= 0 or not is_stated or (given and "start" in given.values):
+        return {}
+    return {
+        "log.start_pose": f"the start pose that it states is of its beginning, {late_s:.3f} s before the part that was "
+        "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
+    }
 
 
 def _scanned(
@@ -209,23 +232,21 @@ def _scanned(
     progress: Progress | None,
 ) -> tuple[Recording, LogConfig]:
     """The messages of a log that may be needed, and the description of its topics: the given one, or its own."""
+
+    def scanned(types: frozenset[str]) -> Recording:
+        def keep(kind: str) -> Keep:
+            return Keep.ALL if short_name(kind) in types else Keep.NONE
+
+        return scan(path, keep, window, progress)
+
     types = wanted_types(config or LogConfig())
-    recording = scan(
-        path,
-        lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE,
-        window,
-        progress,
-    )
-    own = recorded_config(recording) if config is None else None
-    if own is None or wanted_types(own) <= types:
-        return recording, config or own or LogConfig()
-    types = wanted_types(own)
-    return scan(
-        path,
-        lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE,
-        window,
-        progress,
-    ), own
+    recording = scanned(types)
+    if config is not None:
+        return recording, config
+    own = recorded_config(recording) or LogConfig()
+    # the types of its own topics are known only now
+    is_enough = wanted_types(own) <= types
+    return recording if is_enough else scanned(wanted_types(own)), own
 
 
 class Assembly:
@@ -244,81 +265,64 @@ class Assembly:
         calibration: Calibration | PartialCalibration | None = None,
         sonar: str | None = None,
     ) -> None:
-        self._recording, self._sonar = recording, sonar
-        self.topics = {
-            role: recording.topics[c.topic]
-            for role, c in choices.items()
-            if c.topic is not None
-        }
-        self.adapters: dict[str, Any] = {
-            role: c.adapter for role, c in choices.items() if c.adapter is not None
-        }
+        self._recording = recording
+        self._sonar = sonar
+        self.topics: dict[str, Topic] = {}
+        self.adapters: dict[str, Any] = {}
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
         self._stuck: dict[str, str] = {}
         self._tables: dict[str, MessageTable] = {}
-        for role, topic in self.topics.items():
-            if self.adapters[role].reads_table:
-                try:
-                    self._tables[role] = self.adapters[role].table(topic)
-                except LogError:
-                    if len(topic) or ROLES[role].is_required:
-                        raise
-                    self._dropped[role] = topic.unsound
-        self._notes = {
-            key: note
-            for key, note in read_notes(recording).items()
-            if key not in FOUND_ANEW
-        }
-        # the record is of what the live run used
+        changes = []
+        for role, choice in choices.items():
+            if choice.topic is None or choice.adapter is None:
+                continue
+            topic = self.topics[role] = recording.topics[choice.topic]
+            adapter = self.adapters[role] = choice.adapter
+            self._read_table(role)
+            shipped = shipped_like(role, topic.type_name, topic.definition())
+            if change := changes_text(adapter, shipped):
+                changes.append(f"{role}: {change}")
+        recorded = read_notes(recording)
+        self._notes = {k: note for k, note in recorded.items() if k not in FOUND_ANEW}
+        # the record of a live run has the rows that counted then, also stuck ones
         self._is_live = LIVE_RATE in self._notes
-        self._notes["log.topics"] = "; ".join(
-            f"{role}: {topic.name}" for role, topic in self.topics.items()
-        )
-        changes = {
-            role: changes_text(
-                self.adapters[role],
-                shipped_like(role, topic.type_name, topic.definition()),
-            )
-            for role, topic in self.topics.items()
-        }
-        if text := "; ".join(
-            f"{role}: {change}" for role, change in changes.items() if change
-        ):
-            self._notes["log.adapters"] = text
+        used = (f"{role}: {topic.name}" for role, topic in self.topics.items())
+        self._notes["log.topics"] = "; ".join(used)
+        if changes:
+            self._notes["log.adapters"] = "; ".join(changes)
         if "truth" in choices and choices["truth"].topic is None:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()
-        self._is_mounting_known = self._is_start_stated = True
-        self._unplaced: dict[str, str] = {}
-        self._has_tree = False
+        self._is_mounting_known = True
+        self._is_start_stated = True
+        self._unplaced: list[str] = []
         self.mounted: dict[str, str] = {}
         """Frame in ``/tf_static`` of each sensor whose mounting is from there."""
-        self.calibration = (
-            calibration
-            if isinstance(calibration, Calibration)
-            else self._gathered(calibration)
-        )
         if isinstance(calibration, Calibration):
-            self._notes["log.calibration"] = "given by the caller"
+            self.calibration = calibration
+            self._notes["log.calibration"] = GIVEN
+        else:
+            self.calibration = self._gathered(calibration)
         dvl = self.adapters.get("dvl")
-        # wheels stop, and turn evenly
+        # wheels stop and turn evenly, which would look like a Doppler log without lock
         is_held = self.calibration.odometry_interpolation == "hold-past"
         if isinstance(dvl, DvlAdapter) and (is_held or is_described(recording)):
             self.adapters["dvl"] = dvl.with_marks_alone()
 
-    def _gathered(self, given: PartialCalibration | None) -> Calibration:
-        """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
-        recorded = read_calibration(self._recording)
-        said = set() if recorded is None else recorded.model_fields_set
-        is_recorded = is_described(self._recording)
-        self._is_start_stated = is_recorded and not (
-            given and given.values.get("start")
-        )
-        in_record = (
-            mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
-        )
-        stated = in_record | (mounted_by(given.values) if given else set())
+    def _read_table(self, role: str) -> None:
+        topic = self.topics[role]
+        if not self.adapters[role].reads_table:
+            return
+        try:
+            self._tables[role] = self.adapters[role].table(topic)
+        except LogError:
+            if len(topic) or ROLES[role].is_required:
+                raise
+            self._dropped[role] = topic.unsound
+
+    def _frames(self) -> dict[str, str]:
+        """Frame of each sensor that has a place on the vehicle."""
         frames = {
             role: self.adapters[role].frame_in(table.groups)
             for role, table in self._tables.items()
@@ -327,57 +331,55 @@ class Assembly:
         for role in ("depth", "positions"):
             if not frames.get(role, role):
                 del frames[role]  # in the world: there is no port or antenna to mount
-        if "detections" in self.topics and (
-            messages := self.topics["detections"].messages()
-        ):
-            frames["sonar"] = self.adapters["detections"].frame_in(messages)
+        detections = self.topics.get("detections")
+        if detections is not None and (messages := detections.messages()):
+            frames[SONAR] = self.adapters["detections"].frame_in(messages)
         elif self._sonar is not None:
-            frames["sonar"] = self._sonar
+            frames[SONAR] = self._sonar
+        return frames
+
+    def _gathered(self, given: PartialCalibration | None) -> Calibration:
+        """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
+        recorded = read_calibration(self._recording)
+        is_recorded = is_described(self._recording)
+        values = {} if given is None else given.values
+        stated = {} if recorded is None else recorded.model_dump(exclude_unset=True)
+        self._is_start_stated = is_recorded and not values.get("start")
+        in_record = mounted_by(stated)
+        by_hand = in_record | mounted_by(values)
+        frames = self._frames()
         tree = static_frames(self._recording)
         mountings = {}
         for name, frame in frames.items():
             try:
-                found = mounting_of(frame, tree)
+                mounting = mounting_of(frame, tree)
             except LogError as error:
-                if name not in stated:
-                    raise LogError(
-                        f"{self._recording.path}: {name}: {error}"
-                    ) from error
-                found = None
-            if found is not None:
-                mountings[name] = found
-        self.mounted = {
-            name: frames[name] for name in mountings if name not in in_record
-        }
-        mounted = mountings.keys() | stated
+                # a fault in the tree does no harm where the mounting is stated
+                if name in by_hand:
+                    continue
+                raise LogError(f"{self._recording.path}: {name}: {error}") from error
+            if mounting is not None:
+                mountings[name] = mounting
+        self.mounted = {k: frames[k] for k in mountings if k not in in_record}
+        mounted = mountings.keys() | by_hand
         self._is_mounting_known = "dvl" in mounted
+        missing = {name: frame for name, frame in frames.items() if name not in mounted}
         if recorded is None:  # a record of this package states what is not zero
-            self._unplaced = {
-                name: frame for name, frame in frames.items() if name not in mounted
-            }
-            self._has_tree = bool(tree)
+            self._unplaced = [
+                unplaced(name, frame, has_tree=bool(tree))
+                for name, frame in missing.items()
+            ]
         source = "from the log"
         if not is_recorded:
-            source = (
-                f"{', '.join(sorted(said))} from the log; else defaults"
-                if said
-                else "defaults"
-            )
-            source += (
-                f"; mountings from /tf_static: {', '.join(self.mounted) or 'none'}"
-            )
-            missing = [
-                f"{name} ({frame or 'unnamed'})"
-                for name, frame in frames.items()
-                if name not in mounted
-            ]
-            source += (
-                f"; not in the tree, taken as base_link: {', '.join(missing)}"
-                if missing
-                else ""
-            )
+            said = ", ".join(sorted(stated))
+            source = f"{said} from the log; else defaults" if said else "defaults"
+            placed = ", ".join(self.mounted) or "none"
+            source += f"; mountings from /tf_static: {placed}"
+            if missing:
+                names = (f"{name} ({missing[name] or 'unnamed'})" for name in missing)
+                source += f"; not in the tree, taken as base_link: {', '.join(names)}"
         if given:
-            source = f"from {given.source}: {', '.join(given.fields()) or 'nothing'}; else {source}"
+            source = given.before(source)
         self._notes["log.calibration"] = source
         return gathered(given, recorded, mountings)
 
@@ -385,29 +387,31 @@ class Assembly:
         """The measurements of a role; None where it has no topic, or none of its rows is fit."""
         if role in self._blocks or role not in self.topics:
             return self._blocks.get(role)
-        topic, adapter = self.topics[role], self.adapters[role]
+        topic = self.topics[role]
+        adapter = self.adapters[role]
         source: Any = self._tables.get(role) if adapter.reads_table else topic
+        rows = None
         dropped: Dropped = {}
-        if source is None:
-            self._blocks[role] = None
-        else:
+        if source is not None:
             if isinstance(adapter, DepthAdapter) and (
                 said := adapter.assumption(self.calibration.gravity_m_s2)
             ):
                 self._notes["log.depth"] = said
-            self._blocks[role], dropped = rows_of(
+            rows, dropped = rows_of(
                 adapter, source, self.calibration, *self.axes_and_origin(role)
             )
-        if self._blocks[role] is not None and role in LEAST_MOVED and not self._is_live:
-            self._blocks[role], stuck = self._without_repeats(role, self._blocks[role])
+        if rows is not None and role in LEAST_MOVED and not self._is_live:
+            rows, stuck = self._without_repeats(role, rows)
             dropped = dropped | stuck
+        self._blocks[role] = rows
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
-        return self._blocks[role]
+        return rows
 
     def _without_repeats(self, role: str, rows: Any) -> tuple[Any, Dropped]:
         """Rows without those of a sensor that is stuck while the vehicle moves, and their number."""
-        imu, dvl = self.block("imu"), self.block("dvl")
+        imu = self.block("imu")
+        dvl = self.block("dvl")
         if imu is None or dvl is None or len(rows) < 2:
             return rows, {}
         moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
@@ -416,32 +420,30 @@ class Assembly:
             seen = np.column_stack((rows.range_m, rows.azimuth_rad))
             stuck = repeated_sightings(rows.stamps_ns, seen, moved, least)
         else:
-            values = {
-                "positions": "position_m",
-                "heading": "yaw_rad",
-                "depth": "z_m",
-            }[role]
-            stuck = repeats(getattr(rows, values).reshape(len(rows), -1), moved, least)
-        if not stuck.any():
+            names = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}
+            values = getattr(rows, names[role]).reshape(len(rows), -1)
+            stuck = repeats(values, moved, least)
+        count = int(np.count_nonzero(stuck))
+        if not count:
             return rows, {}
-        first = int(np.argmax(stuck))
-        late_s = (
-            rows.stamps_ns[first] - max(imu.stamps_ns[0], dvl.stamps_ns[0])
-        ) * 1e-9
-        text = f"that repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
-        self._stuck[role] = (
-            f"{np.count_nonzero(stuck)} of {len(rows)} rows {text.removeprefix('that ')}: left out"
-        )
-        return rows.rows(np.flatnonzero(~stuck)), {text: int(np.count_nonzero(stuck))}
+        # times are counted from where estimators begin
+        start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
+        late_s = (rows.stamps_ns[np.argmax(stuck)] - start_ns) * 1e-9
+        text = f"repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
+        self._stuck[role] = f"{count} of {len(rows)} rows {text}: left out"
+        return rows.rows(np.flatnonzero(~stuck)), {f"that {text}": count}
 
     def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
         """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
-        R = (
-            self._heading_mounting().pose().rotation().matrix()
-            if role == "heading"
-            else np.eye(3)
-        )
-        return R, self._origin() if role in ("positions", "truth") else None
+        R = np.eye(3)
+        if role == "heading":
+            R = self._heading_mounting().pose().rotation().matrix()
+        if role not in ("positions", "truth"):
+            return R, None
+        origin, said = common_origin(self.adapters, self._tables)
+        if said:
+            self._notes["log.origin"] = said
+        return R, origin
 
     def _heading_mounting(self) -> Mounting:
         """Mounting of the sensor of an orientation: the IMU's where it is its topic, else that of its frame."""
@@ -450,45 +452,18 @@ class Assembly:
         frame = self.adapters["heading"].frame_in(self._tables["heading"].groups)
         return mounting_of(frame, static_frames(self._recording)) or Mounting()
 
-    def _origin(self) -> Origin | None:
-        """Origin of the world in degrees and metres: the configured one, or the first fix; None without any.
-
-        The note ``log.origin`` has it.
-        """
-        origin, said = common_origin(self.adapters, self._tables)
-        if said:
-            self._notes["log.origin"] = said
-        return origin
-
     def sequence(self, name: str | None = None) -> Sequence:
         """Everything that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
 
         Raises LogError when IMU and DVL are not enough for any estimator, or a message breaks its own rules.
         """
-        for role in ("imu", "dvl"):
-            if self.block(role) is None:
-                topic = self.topics[role]
-                faults = self._dropped.get(role, {})
-                keys = [
-                    key
-                    for fault in faults
-                    if (key := self.adapters[role].accepts(fault)) is not None
-                ]
-                way_out = (
-                    f"; `{', '.join(keys)}` under [{role}] in a log configuration uses them"
-                    if keys
-                    else ""
-                )
-                raise topic.error(
-                    f"none of its {len(topic)} messages can be used: {_counts(faults)}{way_out}"
-                )
-        require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
-        stamps = [
-            f"{role}: {text}"
-            for role, table in self._tables.items()
-            for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
-        ]
+        for role in ("imu", "dvl"):
+            if blocks[role] is None:
+                raise self._useless(role)
+        imu = blocks["imu"]
+        dvl = blocks["dvl"]
+        require_use(str(self._recording.path), imu, dvl)
         from sonar_graph.logs.measured_start import (  # compiles
             is_whole,
             with_measured_start,
@@ -498,35 +473,51 @@ class Assembly:
             self.calibration, self._notes["log.start"] = with_measured_start(
                 self.calibration, blocks
             )
+        stamps = [
+            f"{role}: {text}"
+            for role, table in self._tables.items()
+            for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
+        ]
         findings = {
             "log.dropped": self.left_out(),
             "log.stamps": stamps,
-            "log.doubtful": list(self.doubts()),
-            "log.warnings": list(self.warnings()),
-            "log.gaps": list(
-                gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)
-            ),
-            "log.noise": list(unsaid_noise(blocks)),
+            "log.doubtful": self.doubts(),
+            "log.warnings": self.warnings(),
+            "log.gaps": gap_warnings(imu, dvl, self.calibration),
+            "log.noise": unsaid_noise(blocks),
         }
-        self._notes |= {
-            subject: "; ".join(texts) for subject, texts in findings.items() if texts
-        }
-        name = (
-            name or recorded_name(self._recording) or spelt(self._recording.path.stem)
-        )
+        for subject, texts in findings.items():
+            if text := "; ".join(texts):
+                self._notes[subject] = text
+        own = recorded_name(self._recording)
         return Sequence(
-            name=name, calibration=self.calibration, notes=self._notes, **blocks
+            name=name or own or spelt(self._recording.path.stem),
+            calibration=self.calibration,
+            notes=self._notes,
+            **blocks,
+        )
+
+    def _useless(self, role: str) -> LogError:
+        """Refusal of a topic of which no message can be used."""
+        topic = self.topics[role]
+        faults = self._dropped.get(role, {})
+        keys = [key for fault in faults if (key := self.adapters[role].accepts(fault))]
+        way_out = ""
+        if keys:
+            way_out = (
+                f"; `{', '.join(keys)}` under [{role}] in a log configuration uses them"
+            )
+        return topic.error(
+            f"none of its {len(topic)} messages can be used: {_counts(faults)}{way_out}"
         )
 
     def survey(self) -> tuple[list[str], list[str]]:
         """Rows left out and warnings of everything that was chosen, whether or not it is enough for a sequence."""
-        imu, dvl, *_ = (self.block(role) for role in SEQUENCE_ROLES)
-        gaps = (
-            gap_warnings(imu, dvl, self.calibration)
-            if imu is not None and dvl is not None
-            else ()
-        )
-        return self.left_out(), [*self.doubts(), *self.warnings(), *gaps]
+        blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
+        warnings = [*self.doubts(), *self.warnings()]
+        if blocks["imu"] is not None and blocks["dvl"] is not None:
+            warnings += gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)
+        return self.left_out(), warnings
 
     def left_out(self) -> list[str]:
         """Numbers of rows that were left out of the blocks read so far, by role and reason."""
@@ -558,66 +549,54 @@ class Assembly:
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
-        yield from (
-            unplaced(name, frame, has_tree=self._has_tree)
-            for name, frame in self._unplaced.items()
-        )
+        yield from self._unplaced
         for role, table in self._tables.items():
-            yield from (
-                f"{role}: {text}" for text in self.adapters[role].warnings(table)
+            for text in self.adapters[role].warnings(table):
+                yield f"{role}: {text}"
+        yield from (f"{role}: {text}" for role, text in self._oddities() if text)
+        blocks = {role: self.block(role) for role in NOISE_FIELDS}
+        yield from unsaid_noise(blocks, only_partly=True)
+        dvl = blocks["dvl"]
+        sigmas = self.calibration.dvl.velocity_sigma_m_s
+        if dvl is not None and np.isnan(dvl.velocity_cov).any() and 0 in sigmas:
+            yield (
+                "dvl: velocity_sigma_m_s of the calibration is 0 on an axis, and rows have no covariance of their own: "
+                "smoothers cannot use them; give [dvl] velocity_sigma_m_s above 0 in a file for --calibration"
             )
-        imu, dvl, depth, detections = (
-            self.block(role) for role in ("imu", "dvl", "depth", "detections")
-        )
-        # otherwise rates jump, and wheels turn evenly
+        detections = blocks["detections"]
+        if detections is not None and {"imu", "dvl"} <= self._tables.keys():
+            stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl")]
+            first_ns = max(int(ns.min()) for ns in stamps)
+            last_ns = min(int(ns.max()) for ns in stamps)
+            for text in detection_warnings(detections, first_ns, last_ns):
+                yield f"detections: {text}"
+
+    def _oddities(self) -> Iterator[tuple[str, str | None]]:
+        """Results of the checks of numbers by role; None: nothing is wrong."""
+        imu = self.block("imu")
+        dvl = self.block("dvl")
+        depth = self.block("depth")
+        # of wheels rates jump, and values stay the same
         is_linear = self.calibration.odometry_interpolation == "linear"
-        found: list[tuple[str, str | None]] = []
-        if imu is not None and is_linear:
-            columns = (
-                ("angular rate", imu.angular_velocity),
-                ("specific force", imu.specific_force),
-            )
-            found += [
-                ("imu", spike_warning(imu.stamps_ns, values, quantity))
-                for quantity, values in columns
-            ]
-            found += [
-                ("imu", stuck_warning(imu.stamps_ns, values, quantity))
-                for quantity, values in columns
-            ]
+        if imu is not None:
+            quantities = {
+                "angular rate": imu.angular_velocity,
+                "specific force": imu.specific_force,
+            }
+            for check in (spike_warning, stuck_warning) if is_linear else ():
+                for quantity, values in quantities.items():
+                    yield "imu", check(imu.stamps_ns, values, quantity)
         if dvl is not None and is_linear:
-            found.append(
-                ("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity"))
-            )
+            yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
         if depth is not None:
-            found.append(
-                (
-                    "depth",
-                    stuck_warning(
-                        depth.stamps_ns, depth.z_m[:, None], "height", is_coarse=True
-                    ),
-                )
+            heights = depth.z_m[:, None]
+            yield (
+                "depth",
+                stuck_warning(depth.stamps_ns, heights, "height", is_coarse=True),
             )
         if "dvl" in self._tables and not self._is_mounting_known:
-            found.append(("dvl", axes_warning(self.adapters["dvl"])))
-        yield from (
-            f"{role}: {text}" for role, text in [*found, *self._stuck.items()] if text
-        )
-        yield from unsaid_noise(
-            {role: self.block(role) for role in NOISE_FIELDS}, only_partly=True
-        )
-        stamps = [
-            self._tables[role].stamps_ns
-            for role in ("imu", "dvl")
-            if role in self._tables
-        ]
-        if detections is not None and len(stamps) == 2:
-            first_ns, last_ns = (
-                max(ns.min() for ns in stamps),
-                min(ns.max() for ns in stamps),
-            )
-            texts = detection_warnings(detections, int(first_ns), int(last_ns))
-            yield from (f"detections: {text}" for text in texts)
+            yield "dvl", axes_warning(self.adapters["dvl"])
+        yield from self._stuck.items()
 
 
 def common_origin(
@@ -629,26 +608,15 @@ def common_origin(
     """
     of_earth: dict[str, GeodeticFields] = {}
     for role in ("positions", "truth"):
-        adapter = adapters.get(role)
-        if (
-            role in tables
-            and isinstance(adapter, PositionAdapter | TruthAdapter)
-            and adapter.geodetic is not None
-        ):
-            of_earth[role] = adapter.geodetic
-    said = [
-        fields.origin_deg_m
-        for fields in of_earth.values()
-        if fields.origin_deg_m is not None
-    ]
-    found = [
-        fix
-        for role, fields in of_earth.items()
-        if (fix := fields.first_fix(tables[role])) is not None
-    ]
-    if not said and not found:
+        fields = getattr(adapters.get(role), "geodetic", None)
+        if role in tables and fields is not None:
+            of_earth[role] = fields
+    said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m]
+    fixes = (fields.first_fix(tables[role]) for role, fields in of_earth.items())
+    origin = next((one for one in (*said, *fixes) if one is not None), None)
+    if origin is None:
         return None, None
-    latitude_deg, longitude_deg, height_m = origin = (said or found)[0]
+    latitude_deg, longitude_deg, height_m = origin
     return origin, (
         f"of the world, x east, y north: latitude {latitude_deg:.8f}°, longitude {longitude_deg:.8f}°, height "
         f"{height_m:.3f} m, {'as configured' if said else 'the first fix'}"
@@ -666,15 +634,14 @@ def rows_of(
 
     ``body_R_sensor`` is of the sensor of an orientation; ``origin`` of the world, in degrees and metres.
     """
-    if isinstance(adapter, DepthAdapter):
-        return adapter.read(source, calibration.gravity_m_s2)
-    if isinstance(adapter, HeadingAdapter):
-        return adapter.read(source, body_R_sensor)
-    if isinstance(adapter, PositionAdapter):
-        return adapter.read(source, origin, calibration.positions.sigma_m)
-    if isinstance(adapter, TruthAdapter):
-        return adapter.read(source, origin)
-    found: tuple[Any, Dropped] = adapter.read(source)
+    known = {
+        "gravity_m_s2": calibration.gravity_m_s2,
+        "sigma_m": calibration.positions.sigma_m,
+        "body_R_sensor": body_R_sensor,
+        "origin": origin,
+    }
+    needed = {name: known[name] for name in adapter.NEEDS}
+    found: tuple[Any, Dropped] = adapter.read(source, **needed)
     return found
 
 
@@ -710,10 +677,11 @@ def unsaid_noise(
     With ``only_partly`` those of which other rows say one: a sensor that mostly knows its noise and here does not.
     """
     for role, (column, fields) in NOISE_FIELDS.items():
-        if (block := blocks.get(role)) is not None:
-            covariances = getattr(block, column)
-            count = np.count_nonzero(
-                np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1)
-            )
-            if count and not (only_partly and count == len(covariances)):
-                yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"
+        if blocks.get(role) is None:
+            continue
+        covariances = getattr(blocks[role], column)
+        n = len(covariances)
+        is_unknown = np.isnan(covariances.reshape(n, -1)).any(axis=1)
+        count = np.count_nonzero(is_unknown)
+        if count and not (only_partly and count == n):
+            yield f"{role}: {count} of {n} rows say no covariance, {fields} of the calibration count"

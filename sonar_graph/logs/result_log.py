@@ -38,9 +38,9 @@ from sonar_graph.logs.writing import (
     header,
     odometry_messages,
     outgoing,
-    point_messages,
     pose_messages,
     static_message,
+    truth_messages,
 )
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
@@ -94,25 +94,18 @@ def write_result(
         When a file cannot be written, or a stamp does not fit into a ROS 2 message.
     """
     sources = dict(zip(source_names(estimates), estimates.values(), strict=True))
-    truth, landmarks = sequence.truth, sequence.true_landmarks
+    truth = sequence.truth
+    landmarks = sequence.true_landmarks
     drawn = [block.positions for estimate in estimates.values() for block in estimate]
     drawn += [block.positions for block in (truth, landmarks) if block is not None]
     scene = viewer.Scene.around(drawn)
     colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {
         TRUTH: viewer.GREY
     }
-    messages = [
-        static_message(
-            "/tf_static", TF, sequence.start_ns, encode_mountings(sequence.calibration)
-        )
-    ]
+    mountings = encode_mountings(sequence.calibration)
+    messages = [static_message("/tf_static", TF, sequence.start_ns, mountings)]
     if truth is not None and len(truth):
-        if truth.has_orientation:
-            messages.append(
-                odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/{BODY_FRAME}")
-            )
-        else:
-            messages.append(point_messages(f"/{TRUTH}/point", truth))
+        messages.append(truth_messages(truth, f"{TRUTH}/{BODY_FRAME}"))
         messages.append(_path(f"/{TRUTH}/path", _drawable(truth), sequence.start_ns))
     if landmarks is not None:
         messages += _landmarks(TRUTH, landmarks, sequence.start_ns, viewer.GREY, scene)
@@ -126,18 +119,12 @@ def write_result(
         "estimators": ",".join(estimates),
         "topics": ",".join(sources),
     }
-    write_recording(
-        Path(path), messages, {RESULT_RECORD: record | dict(about or {})}, attachments
-    )
-    layers = [
-        viewer.Layer(
-            topic,
-            entry.type_name,
-            colours.get(topic.split("/")[1], viewer.GREY),
-            is_latched=entry.is_latched,
-        )
-        for topic, entry in {entry.topic: entry for entry in messages}.items()
-    ]
+    records = {RESULT_RECORD: record | dict(about or {})}
+    write_recording(Path(path), messages, records, attachments)
+    layers = []
+    for topic, entry in {entry.topic: entry for entry in messages}.items():
+        colour = colours.get(topic.split("/")[1], viewer.GREY)
+        layers.append(viewer.Layer(topic, entry.type_name, colour, entry.is_latched))
     viewer.write_layouts(Path(path), layers, scene)
 
 
@@ -149,6 +136,7 @@ def source_names(estimators: Iterable[str]) -> list[str]:
     taken = {TRUTH, "tf", "tf_static"}
     names = []
     for estimator in estimators:
+        # names of topics in ROS allow no other characters
         plain = re.sub(r"[^0-9A-Za-z]+", "_", estimator).strip("_")
         plain = plain if plain[:1].isalpha() else f"estimator_{plain}".rstrip("_")
         candidates = (
@@ -173,13 +161,15 @@ def _estimator(
         messages.append(
             viewer.position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour)
         )
-        first_ns, last_ns = int(causal.stamps_ns[0]), int(causal.stamps_ns[-1])
+        first_ns = int(causal.stamps_ns[0])
+        last_ns = int(causal.stamps_ns[-1])
         # the path so far, now and then, and thinned: all of them together would grow with the square of time
         period_ns = max(_PATH_PERIOD_NS, (last_ns - first_ns) // _MOST_CAUSAL_PATHS)
         thinned = _thinned(
             causal,
             max(_CAUSAL_PATH_STEP_NS, (last_ns - first_ns) // _MOST_CAUSAL_POSES),
         )
+        # each path holds all poses before it: few of them keep the file small
         ends_ns = np.arange(first_ns + period_ns, last_ns, period_ns)
         counts = np.searchsorted(thinned.stamps_ns, ends_ns, side="right")
         for count, end_ns in zip(counts.tolist(), ends_ns.tolist(), strict=True):
@@ -226,22 +216,15 @@ def _thinned(trajectory: Trajectory, step_ns: int) -> Trajectory:
 def _path(topic: str, trajectory: Trajectory, stamp_ns: int) -> Outgoing:
     """One ``nav_msgs/Path`` published at an instant."""
     at_ns = np.array([stamp_ns])
-    poses = header(trajectory.stamps_ns, WORLD_FRAME, "poses.header")
-    poses |= fields("poses.pose.position", "xyz", trajectory.positions)
-    quaternions = (
-        trajectory.quaternions_xyzw
-        if trajectory.has_orientation
-        else np.array([[0.0, 0.0, 0.0, 1.0]])
-    )
-    poses |= fields(
-        "poses.pose.orientation",
-        "xyzw",
-        np.broadcast_to(quaternions, (len(trajectory), 4)),
-    )
-    values = header(at_ns, WORLD_FRAME) | poses
-    return outgoing(
-        topic, viewer.PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True
-    )
+    quaternions = np.tile([0.0, 0.0, 0.0, 1.0], (len(trajectory), 1))
+    if trajectory.has_orientation:
+        quaternions = trajectory.quaternions_xyzw
+    values = header(at_ns, WORLD_FRAME)
+    values |= header(trajectory.stamps_ns, WORLD_FRAME, "poses.header")
+    values |= fields("poses.pose.position", "xyz", trajectory.positions)
+    values |= fields("poses.pose.orientation", "xyzw", quaternions)
+    lengths = {"poses": len(trajectory)}
+    return outgoing(topic, viewer.PATH, at_ns, values, lengths, is_latched=True)
 
 
 def _bodies(
@@ -256,17 +239,12 @@ def _bodies(
     truth = sequence.true_poses
     owner = next(iter(bodies.values()), truth)
     if truth is not None and len(truth):
-        instants_ns = np.unique(
-            np.concatenate(
-                [b.stamps_ns for b in bodies.values()] or [_drawable(truth).stamps_ns]
-            )
-        )
-        within = (instants_ns >= truth.stamps_ns[0]) & (
-            instants_ns <= truth.stamps_ns[-1]
-        )
-        bodies[f"{TRUTH}/{BODY_FRAME}"] = (
-            truth.at(instants_ns[within]) if len(truth) > 1 else truth
-        )
+        # viewers interpolate no frames: the truth needs the instants of the estimates
+        drawn = list(bodies.values()) or [_drawable(truth)]
+        at_ns = np.unique(np.concatenate([body.stamps_ns for body in drawn]))
+        first_ns, last_ns = truth.stamps_ns[[0, -1]]
+        at_ns = at_ns[(at_ns >= first_ns) & (at_ns <= last_ns)]
+        bodies[f"{TRUTH}/{BODY_FRAME}"] = truth.at(at_ns) if len(truth) > 1 else truth
     return {BODY_FRAME: owner, **bodies} if owner is not None and len(owner) else bodies
 
 
@@ -279,32 +257,22 @@ def body_transforms(topic: str, bodies: Mapping[str, Trajectory]) -> list[Outgoi
         [np.isin(stamps_ns, body.stamps_ns) for body in bodies.values()]
     )
     entries = []
-    for pattern in np.unique(
-        present, axis=0
-    ):  # one layout of messages for each set of bodies
+    # one layout of messages for each set of bodies
+    for pattern in np.unique(present, axis=0):
         at_ns = stamps_ns[(present == pattern).all(axis=1)]
-        chosen = {
-            name: body
-            for (name, body), is_there in zip(bodies.items(), pattern, strict=True)
-            if is_there
-        }
-        rows = [
-            body.rows(np.searchsorted(body.stamps_ns, at_ns))
-            for body in chosen.values()
+        chosen = [
+            name for name, is_there in zip(bodies, pattern, strict=True) if is_there
         ]
-        values = header(
-            np.tile(at_ns[:, None], len(rows)), WORLD_FRAME, "transforms.header"
-        )
-        values |= fields(
-            "transforms.transform.translation",
-            "xyz",
-            np.stack([r.positions for r in rows], 1),
-        )
-        values |= fields(
-            "transforms.transform.rotation",
-            "xyzw",
-            np.stack([r.quaternions_xyzw for r in rows], 1),
-        )
-        values["transforms.child_frame_id"] = list(chosen)
+        rows = [
+            bodies[name].rows(np.searchsorted(bodies[name].stamps_ns, at_ns))
+            for name in chosen
+        ]
+        instants_ns = np.tile(at_ns[:, None], len(rows))
+        places = np.stack([row.positions for row in rows], axis=1)
+        turns = np.stack([row.quaternions_xyzw for row in rows], axis=1)
+        values = header(instants_ns, WORLD_FRAME, "transforms.header")
+        values |= fields("transforms.transform.translation", "xyz", places)
+        values |= fields("transforms.transform.rotation", "xyzw", turns)
+        values["transforms.child_frame_id"] = chosen
         entries.append(outgoing(topic, TF, at_ns, values, {"transforms": len(rows)}))
     return entries

@@ -7,7 +7,7 @@ choice comes with its reason, for notes, error messages and `inspect_log` (docs/
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.errors import ArgumentError, LogError, MissingTopicError
 from sonar_graph.logs.adapters import (
     SHIPPED,
     TRUTH_WORDS,
@@ -17,7 +17,7 @@ from sonar_graph.logs.adapters import (
     shipped_for,
 )
 from sonar_graph.logs.cdr import parse_definition, short_name
-from sonar_graph.logs.mcap import Recording, Topic
+from sonar_graph.logs.mcap import Recording, TimeWindow, Topic
 
 IMU = "sensor_msgs/msg/Imu"
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -114,7 +114,8 @@ class Choice:
 
     def advice(self) -> str:
         """Advice to choose one of several topics, on the command line, in Python and in a log configuration."""
-        role, topic = self.role.name, self.candidates[0]
+        role = self.role.name
+        topic = self.candidates[0]
         return f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
 
 
@@ -151,6 +152,7 @@ def refusal(topic: Topic) -> str | None:
 
 def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
     """Adapter for a topic in a role, or the reason why there is none."""
+    # first what no role can read
     if (reason := refusal(topic)) is not None:
         return reason
     table = config.table(role.name)
@@ -180,54 +182,36 @@ def choose_topic(
     A topic that the user ``wanted`` goes before that of the configuration, and this before a search by type. A
     configuration that names fields which the messages do not have is refused.
     """
-    table, topics = config.table(role.name), recording.topics
+    table = config.table(role.name)
+    topics = recording.topics
     if table.get("use") is False and wanted is None:
         return Choice(role, None, f"switched off in {config.source}", is_off=True)
-    named, asked = wanted or table.get("topic"), table.get("type")
+    named = wanted or table.get("topic")
+    asked = table.get("type")
     if named:
         meant = [topics[named]] if named in topics else []
         adapter = adapter_for(role, meant[0], config) if meant else "is not in the log"
         if isinstance(adapter, str):
             choice = Choice(role, None, f"{named} was chosen but {adapter}")
         else:
-            choice = Choice(
-                role,
-                named,
-                f"chosen {'by name' if wanted else f'in {config.source}'}",
-                adapter,
-            )
+            by = "by name" if wanted else f"in {config.source}"
+            choice = Choice(role, named, f"chosen {by}", adapter)
     elif asked:
-        meant = [
-            topic
-            for topic in topics.values()
-            if short_name(topic.type_name) == short_name(asked)
-        ]
+        type_name = short_name(asked)
+        meant = [t for t in topics.values() if short_name(t.type_name) == type_name]
         choice = _only(role, recording, config, meant) or Choice(
             role, None, f"no {asked}, which {config.source} asks for"
         )
     else:
-        telling, general = (
-            [t for t in topics.values() if role.fits(t, general=of)]
-            for of in (False, True)
+        special = [t for t in topics.values() if role.fits(t, general=False)]
+        general = [t for t in topics.values() if role.fits(t, general=True)]
+        meant = special + general
+        # a type that any sensor may send counts only where no other fits
+        choice = (
+            _only(role, recording, config, special)
+            or _only(role, recording, config, general)
+            or _none_fits(role, recording, config)
         )
-        meant = telling + general
-        found = _only(role, recording, config, telling) or _only(
-            role, recording, config, general
-        )
-        if found is None:
-            allowed = [topic for topic in topics.values() if role.may_play(topic)]
-            others = tuple(
-                t.name
-                for t in allowed
-                if not isinstance(adapter_for(role, t, config), str)
-            )
-            hint = (
-                f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}"
-                if others
-                else ""
-            )
-            found = Choice(role, None, f"no {role.describe()}{hint}", could_be=others)
-        choice = found
     if table and not choice.candidates:
         for topic in [topics[choice.topic]] if choice.topic else meant:
             if refusal(topic) is None:
@@ -235,33 +219,81 @@ def choose_topic(
     return choice
 
 
+def _none_fits(role: Role, recording: Recording, config: LogConfig) -> Choice:
+    """Choice of no topic, with those that the user may choose by name."""
+    others = tuple(
+        topic.name
+        for topic in recording.topics.values()
+        if role.may_play(topic)
+        and not isinstance(adapter_for(role, topic, config), str)
+    )
+    reason = f"no {role.describe()}"
+    if others:
+        reason += (
+            f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}"
+        )
+    return Choice(role, None, reason, could_be=others)
+
+
 def _only(
     role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]
 ) -> Choice | None:
     """Choose the only usable topic of those that fit; None where none fits."""
     adapters = {topic.name: adapter_for(role, topic, config) for topic in fitting}
-    usable = {
-        name: adapter
-        for name, adapter in adapters.items()
-        if not isinstance(adapter, str)
-    }
+    usable = {k: one for k, one in adapters.items() if not isinstance(one, str)}
     if len(usable) > 1:
-        return Choice(
-            role,
-            None,
-            f"{len(usable)} topics fit: {', '.join(usable)}",
-            candidates=tuple(usable),
-        )
+        reason = f"{len(usable)} topics fit: {', '.join(usable)}"
+        return Choice(role, None, reason, candidates=tuple(usable))
     for name, adapter in usable.items():
         as_told = f", read as {config.source} says" if config.table(role.name) else ""
-        return Choice(
-            role,
-            name,
-            f"the only {recording.topics[name].type_name} that fits{as_told}",
-            adapter,
-        )
+        reason = f"the only {recording.topics[name].type_name} that fits{as_told}"
+        return Choice(role, name, reason, adapter)
     reasons = [f"{name} {reason}" for name, reason in adapters.items()]
     return Choice(role, None, "; ".join(reasons)) if reasons else None
+
+
+Window = TimeWindow | tuple[float | str | None, float | str | None]
+"""Part of a log: also start and end alone, in seconds from its beginning or as dates; None: no limit."""
+
+
+def as_window(value: Window | None, call: str) -> TimeWindow | None:
+    """A time window; an `ArgumentError` that names the ``call`` where a value is none."""
+    if isinstance(value, TimeWindow | None):
+        return value
+    if isinstance(value, tuple | list) and len(value) == 2:
+        limits = (None if limit is None else str(limit) for limit in value)
+        return TimeWindow.parse(*limits)
+    raise ArgumentError(
+        f"{call}(path, window=(START, END)): expected two times, in seconds from the log's beginning such as (0, 10), "
+        f"not {value!r:.60}"
+    )
+
+
+def require_roles(wanted: Mapping[str, str]) -> None:
+    """Refuse topics that are chosen for roles that do not exist."""
+    if unknown := wanted.keys() - ROLES.keys():
+        raise LogError(
+            f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}"
+        )
+
+
+def require_topics(
+    recording: Recording, wanted: Mapping[str, str], config: LogConfig, call: str
+) -> None:
+    """Refuse roles that do not exist, and topics that are not in a log, by an error that lists those that are."""
+    given: object = wanted
+    if not isinstance(given, Mapping):
+        raise ArgumentError(
+            f"{call}(path, topics={{'imu': '/imu/data'}}): expected topics by role, not {type(given).__name__}"
+        )
+    require_roles(wanted)
+    for role, topic in wanted.items():
+        if topic not in recording.topics:
+            reason = f"{topic} was chosen but is not in the log"
+            images = images_alone(recording, config)
+            raise MissingTopicError(
+                _missing(recording, role, reason, images, is_needed=False)
+            )
 
 
 _OF_THE_DRIVER = (
@@ -289,19 +321,17 @@ def choose_each(
         name: choose_topic(ROLES[name], recording, config, wanted.get(name))
         for name in roles
     }
-    imu, heading = choices.get("imu"), choices.get("heading")
+    imu = choices.get("imu")
+    heading = choices.get("heading")
     if imu is None or imu.topic is None or heading is None:
         return choices
     if imu.topic in heading.candidates:
         adapter = adapter_for(heading.role, recording.topics[imu.topic], config)
         if not isinstance(adapter, str):
-            heading = Choice(
-                heading.role,
-                imu.topic,
-                "the orientation of the topic in use as IMU",
-                adapter,
-            )
+            reason = "the orientation of the topic in use as IMU"
+            heading = Choice(heading.role, imu.topic, reason, adapter)
     if heading.topic == imu.topic and heading.adapter is not None:
+        # one message brings both, so stamps and axes hold for both
         unsaid = [key for key in _OF_THE_DRIVER if key not in config.table("heading")]
         adapter = heading.adapter.model_copy(
             update={key: getattr(imu.adapter, key) for key in unsaid}
@@ -321,11 +351,8 @@ def choose_topics(
     A needed role without a topic, and a topic that is named but not there, are a MissingTopicError, which lists the
     topics that are.
     """
-    path, unknown = recording.path, wanted.keys() - ROLES.keys()
-    if unknown:
-        raise LogError(
-            f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}"
-        )
+    path = recording.path
+    require_roles(wanted)
     choices = choose_each(recording, wanted, config, roles)
     for name, choice in choices.items():
         is_required = choice.role.is_required
@@ -366,6 +393,7 @@ def _missing(
     if any(fault and "`" in fault and fault in reason for fault in faults.values()):
         way_out = images  # the reason has its own
     counts = range(len(topics), 0, -1)
+    # name as many topics as fit into one line
     for both, count in [
         (needed, count) for needed in (BOTH * is_needed, "") for count in counts
     ]:

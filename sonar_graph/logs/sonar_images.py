@@ -8,10 +8,22 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
+from sonar_graph.files import as_path
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters import LogConfig, Refused, SonarAdapter
+from sonar_graph.logs.adapters import (
+    LogConfig,
+    Refused,
+    SonarAdapter,
+    as_log_config,
+)
 from sonar_graph.logs.mcap import Keep, Recording, TimeWindow, scan, stream
-from sonar_graph.logs.roles import SONAR, choose_each, choose_topics
+from sonar_graph.logs.roles import (
+    SONAR,
+    Window,
+    as_window,
+    choose_each,
+    choose_topics,
+)
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
@@ -158,10 +170,13 @@ def joined_calibration(
     What the user gives goes before both. The sonar's mounting is that of the navigation's record or ``/tf_static``, or
     else that of the images'; where nothing states one, none is stated. ``topic`` is that of the images.
     """
-    known, own = recorded_fields(navigation), recorded_fields(images).get(SONAR, {})
+    known = recorded_fields(navigation)
+    own = recorded_fields(images).get(SONAR, {})
+    # the sonar's own recording has its lens and scale
     better = {name: own[name] for name in OF_THE_IMAGES if name in own}
     frame = sonar_frame(scan(images, lambda _: Keep.NONE), topic)
     found = None if frame is None else static_mounting(navigation, frame)
+    # the vehicle's tree goes before that of the sonar's own log
     if found is None and frame is not None and "mounting" not in own:
         found = static_mounting(images, frame)
     mounting = {} if found is None else {"mounting": found.model_dump(mode="json")}
@@ -187,9 +202,9 @@ def no_images(log: Path | str, window: TimeWindow | None = None) -> str:
 def read_sonar_frames(
     path: Path,
     topic: str | None = None,
-    config: LogConfig | None = None,
+    config: LogConfig | str | Path | None = None,
     *,
-    window: TimeWindow | None = None,
+    window: Window | None = None,
     salvage: bool = False,
     refused: Refused | None = None,
 ) -> Iterator[SonarFrames]:
@@ -218,7 +233,10 @@ def read_sonar_frames(
         When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
         image is not what its message says (without ``refused``). A log without sonar images gives no block.
     """
-    config, path = config or LogConfig(), Path(path)
+    call = "read_sonar_frames"
+    path = as_path(path, f"{call}(path)")
+    config = as_log_config(config, call) or LogConfig()
+    part = as_window(window, call)
     recording = scan(path, lambda _: Keep.NONE)
     choice = choose_topics(
         recording, {SONAR: topic} if topic else {}, config, (SONAR,)
@@ -228,7 +246,7 @@ def read_sonar_frames(
     for piece in stream(
         path,
         _keeping(recording.topics[choice.topic].type_name),
-        window,
+        part,
         salvage=salvage,
     ):
         if piece.name == choice.topic:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.files import text_of
+from sonar_graph.files import as_path, text_of
 from sonar_graph.logs.cdr import (
     Bytes,
     Value,
@@ -47,6 +47,8 @@ LARGEST_LEVER_M = 1000.0
 Values = Mapping[str, Any]
 OPTIONAL = {name for name, value in Calibration().model_dump().items() if value is None}
 """Fields of a calibration that may be absent."""
+GIVEN = "given by the caller"
+"""Source of a calibration that replaces that of the log."""
 MOUNTING_FIELDS = {
     "imu": "mounting",
     "dvl": "mounting",
@@ -82,25 +84,17 @@ def _frames_in(recording: Recording) -> FrameTree:
         ):
             continue
         for group in topic.messages():
-            translations = np.stack(
-                [group[f"transforms.transform.translation.{axis}"] for axis in "xyz"],
-                axis=-1,
-            )
-            rotations = np.stack(
-                [group[f"transforms.transform.rotation.{axis}"] for axis in "wxyz"],
-                axis=-1,
-            )
-            names = zip(
-                group.strings("transforms.child_frame_id"),
-                group.strings("transforms.header.frame_id"),
-                strict=True,
-            )
-            for message, (children, parents) in enumerate(names):
-                for i, (child, parent) in enumerate(
-                    zip(children, parents, strict=True)
-                ):
-                    pose = _pose(translations[message, i], rotations[message, i])
-                    frames[child.lstrip("/")] = parent.lstrip("/"), pose
+            part = "transforms.transform"
+            translations = [group[f"{part}.translation.{axis}"] for axis in "xyz"]
+            rotations = [group[f"{part}.rotation.{axis}"] for axis in "wxyz"]
+            t = np.stack(translations, axis=-1)  # (messages, transforms, 3)
+            q = np.stack(rotations, axis=-1)  # (messages, transforms, 4)
+            children = group.strings("transforms.child_frame_id")
+            parents = group.strings("transforms.header.frame_id")
+            for message, names in enumerate(zip(children, parents, strict=True)):
+                for i, (child, parent) in enumerate(zip(*names, strict=True)):
+                    pose = _pose(t[message, i], q[message, i])
+                    frames[child.lstrip("/")] = (parent.lstrip("/"), pose)
     return frames
 
 
@@ -122,21 +116,17 @@ def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
     The body is ``base_link``, else ``base_footprint``, with or without a namespace before it; a sensor's frame is found
     without its namespace too, where one frame alone fits. A LogError names the transform that cannot be one.
     """
-    above = _above(_as_in_tree(frame.lstrip("/"), frames), frames)
-    body_T_sensor = next(
-        (
-            pose
-            for root in BODY_FRAMES
-            if (pose := _from(root, above, frames)) is not None
-        ),
-        None,
-    )
-    if isinstance(body_T_sensor, str):
-        raise _unusable(frame, body_T_sensor)
-    if body_T_sensor is None:
-        return None
-    if not (lever_m := math.hypot(*body_T_sensor.translation())) < LARGEST_LEVER_M:
-        raise _unusable(frame, f"is {lever_m:g} m from {BODY_FRAME}")
+    try:
+        body_T_sensor = _body_T(_as_in_tree(frame.lstrip("/"), frames), frames)
+        if body_T_sensor is None:
+            return None
+        lever_m = math.hypot(*body_T_sensor.translation())
+        # also where it is NaN
+        if not lever_m < LARGEST_LEVER_M:
+            raise LogError(f"is {lever_m:g} m from {BODY_FRAME}")
+    except LogError as error:
+        advice = "state the sensor's mounting in a file for --calibration"
+        raise LogError(f"/tf_static: {frame}: {error}; {advice}") from None
     x_m, y_m, z_m = body_T_sensor.translation().tolist()
     roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
     return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))
@@ -150,6 +140,7 @@ def _as_in_tree(frame: str, frames: FrameTree) -> str:
     """Name of a frame in the tree: the same, or the only one that differs by a namespace in front."""
     if frame in frames or not frame or _last(frame) in BODY_FRAMES:
         return frame
+    # drivers and robot descriptions disagree about namespaces
     alike = [
         name
         for name in frames
@@ -158,50 +149,43 @@ def _as_in_tree(frame: str, frames: FrameTree) -> str:
     return alike[0] if len(alike) == 1 else frame
 
 
-def _above(frame: str, frames: FrameTree) -> dict[str, gtsam.Pose3 | str]:
-    """``ancestor_T_frame`` of a frame and all its ancestors, or the fault of a transform on the way to one."""
-    above: dict[str, gtsam.Pose3 | str] = {frame: gtsam.Pose3()}
-    name = frame
-    while name in frames and frames[name][0] not in above:
-        parent, parent_T_name = frames[name]
-        name_T_frame = above[name]
-        if isinstance(name_T_frame, str):
-            above[parent] = name_T_frame
-        elif isinstance(parent_T_name, str):
-            above[parent] = f"the transform from {parent} to {name} {parent_T_name}"
-        else:
-            above[parent] = parent_T_name * name_T_frame
-        name = parent
-    return above
-
-
-def _from(
-    root: str, above: dict[str, gtsam.Pose3 | str], frames: FrameTree
-) -> gtsam.Pose3 | str | None:
-    """``body_T_frame`` of a body with a root's name above the frame, or beside it below a common ancestor.
-
-    A fault of a transform in between is given in its place; None where no such body is in the tree.
-    """
-    body = next((name for name in above if _last(name) == root), None)
-    if body is not None:
-        return above[body]
-    for beside in (name for name in frames if _last(name) == root):
-        body_above = _above(beside, frames)
-        shared = next((name for name in above if name in body_above), None)
-        if shared is None:
-            continue
-        shared_T_frame = above[shared]
-        shared_T_body = body_above[shared]
-        if isinstance(shared_T_frame, str) or isinstance(shared_T_body, str):
-            return shared_T_frame if isinstance(shared_T_frame, str) else shared_T_body
-        return shared_T_body.inverse() * shared_T_frame
+def _body_T(frame: str, frames: FrameTree) -> gtsam.Pose3 | None:
+    """``body_T_frame`` of the first body above the frame, or beside it below a common ancestor; None without one."""
+    above = _ancestors(frame, frames)
+    for root in BODY_FRAMES:
+        for name in above:
+            if _last(name) == root:
+                return _pose_in(name, above, frames)
+        for name in frames:
+            if _last(name) != root:
+                continue
+            above_body = _ancestors(name, frames)
+            shared = next((one for one in above if one in above_body), None)
+            if shared is not None:
+                shared_T_frame = _pose_in(shared, above, frames)
+                shared_T_body = _pose_in(shared, above_body, frames)
+                return shared_T_body.inverse() * shared_T_frame
     return None
 
 
-def _unusable(frame: str, fault: str) -> LogError:
-    return LogError(
-        f"/tf_static: {frame}: {fault}; state the sensor's mounting in a file for --calibration"
-    )
+def _ancestors(frame: str, frames: FrameTree) -> list[str]:
+    """A frame and all frames above it, up to the first that comes again in a circle."""
+    names = [frame]
+    while names[-1] in frames and frames[names[-1]][0] not in names:
+        names.append(frames[names[-1]][0])
+    return names
+
+
+def _pose_in(ancestor: str, names: list[str], frames: FrameTree) -> gtsam.Pose3:
+    """``ancestor_T_frame`` of the first of the names, each of which hangs on the next."""
+    pose = gtsam.Pose3()
+    for name in names[: names.index(ancestor)]:
+        parent, parent_T_name = frames[name]
+        # only a fault on the way between sensor and body does harm
+        if isinstance(parent_T_name, str):
+            raise LogError(f"the transform from {parent} to {name} {parent_T_name}")
+        pose = parent_T_name * pose
+    return pose
 
 
 def encode_mountings(calibration: Calibration) -> Bytes:
@@ -213,25 +197,21 @@ def encode_mountings(calibration: Calibration) -> Bytes:
         "sonar": calibration.sonar.mounting,
         "positions": Mounting(translation_m=calibration.positions.antenna_m),
     }
-    quaternions = Rotation.from_matrix(
-        [m.pose().rotation().matrix() for m in mountings.values()]
-    ).as_quat()
-    translations = np.array([m.translation_m for m in mountings.values()])
+    rotations = [mounting.pose().rotation().matrix() for mounting in mountings.values()]
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    translations = np.array([mounting.translation_m for mounting in mountings.values()])
     values: dict[str, Value] = {
         "transforms.header.frame_id": BODY_FRAME,
         "transforms.child_frame_id": list(mountings),
     }
-    values |= {
-        f"transforms.transform.translation.{axis}": translations[None, :, i]
-        for i, axis in enumerate("xyz")
-    }
-    values |= {
-        f"transforms.transform.rotation.{axis}": quaternions[None, :, i]
-        for i, axis in enumerate("xyzw")
-    }
-    return encode(
-        parse_definition(TF, definition(TF)), 1, values, {"transforms": len(mountings)}
-    )
+    for part, names, columns in (
+        ("translation", "xyz", translations),
+        ("rotation", "xyzw", quaternions),
+    ):
+        for i, axis in enumerate(names):
+            values[f"transforms.transform.{part}.{axis}"] = columns[None, :, i]
+    definition_of_tf = parse_definition(TF, definition(TF))
+    return encode(definition_of_tf, 1, values, {"transforms": len(mountings)})
 
 
 OTHER_FILES = (
@@ -259,19 +239,16 @@ class PartialCalibration:
         try:
             Calibration.model_validate(_over(Calibration().model_dump(), values))
         except ValidationError as error:
-            absent = [
+            faults = error.errors()
+            # a needed field, unlike a kind of section, may still come from the log
+            if not all(
                 fault["type"] == "missing" and isinstance(fault["loc"][-1], str)
-                for fault in error.errors()
-            ]
-            if not all(absent):
-                unused = [
-                    role
+                for fault in faults
+            ):
+                advice = "".join(
+                    f"; to leave {role} unused: use = false under [{role}] in the log configuration"
                     for role in ("depth", "heading", "positions")
                     if values.get(role) is False
-                ]
-                advice = "".join(
-                    f"; to leave {r} unused: use = false under [{r}] in the log configuration"
-                    for r in unused
                 )
                 raise CalibrationError(
                     f"{source}: {faults_in(error, Calibration)}{advice}"
@@ -324,6 +301,21 @@ class PartialCalibration:
         """Paths of the fields that are given, such as ``dvl.mounting.translation_m``."""
         return list(_paths(self.values))
 
+    def before(self, source: str) -> str:
+        """Source of a calibration of which these fields go before those of another source."""
+        return f"from {self.source}: {', '.join(self.fields()) or 'nothing'}; else {source}"
+
+
+def as_calibration(
+    value: Calibration | PartialCalibration | str | Path | None, call: str
+) -> Calibration | PartialCalibration | None:
+    """The given fields of a calibration, also those in a file; an `ArgumentError` that names the ``call`` for others."""
+    if isinstance(value, Calibration | PartialCalibration | None):
+        return value
+    return PartialCalibration.read(
+        as_path(value, f"{call}(path, calibration=FILE or Calibration)")
+    )
+
 
 def gathered(
     given: PartialCalibration | None,
@@ -338,6 +330,7 @@ def gathered(
     # a start that nobody states is not set
     values = Calibration().model_dump(exclude={"start"})
     for sensor, mounting in mountings.items():
+        # a pressure port and an antenna have no axes
         is_place = MOUNTING_FIELDS[sensor] != "mounting"
         values[sensor][MOUNTING_FIELDS[sensor]] = (
             mounting.translation_m if is_place else mounting.model_dump()
@@ -382,32 +375,24 @@ def with_fields(recorded: Values, *changes: Values) -> str:
 
 def unplaced(sensor: str, frame: str, *, has_tree: bool) -> str:
     """Warning about a sensor whose place is not known, with what states it."""
-    key = f"[{sensor}] {MOUNTING_FIELDS[sensor]}"
-    where = f"{key} in a file for --calibration"
+    where = f"[{sensor}] {MOUNTING_FIELDS[sensor]} in a file for --calibration"
+    taken = "mounting taken as zero; give"
     if not frame:
-        return (
-            f"{sensor}: no frame in its messages: mounting taken as zero; give {where}"
-        )
-    tree = "" if has_tree else " (the log has no /tf_static)"
-    other = (
-        f", or frame_id under [{sensor}] in a log configuration"
-        if has_tree and sensor != "sonar"
-        else ""
-    )
-    return f"{sensor}: no transform from {frame} to {BODY_FRAME}{tree}: mounting taken as zero; give {where}{other}"
+        return f"{sensor}: no frame in its messages: {taken} {where}"
+    missing = f"{sensor}: no transform from {frame} to {BODY_FRAME}"
+    if not has_tree:
+        return f"{missing} (the log has no /tf_static): {taken} {where}"
+    if sensor != "sonar":
+        where += f", or frame_id under [{sensor}] in a log configuration"
+    return f"{missing}: {taken} {where}"
 
 
 def mounted_by(values: Values) -> set[str]:
     """Sensors whose mounting is given."""
-    sections = {
-        sensor: values[sensor]
-        for sensor in MOUNTING_FIELDS
-        if isinstance(values.get(sensor), Mapping)
-    }
     return {
         sensor
-        for sensor, section in sections.items()
-        if MOUNTING_FIELDS[sensor] in section
+        for sensor, field in MOUNTING_FIELDS.items()
+        if isinstance(values.get(sensor), Mapping) and field in values[sensor]
     }
 
 
@@ -418,6 +403,7 @@ def _over(values: Values, changes: Values) -> dict[str, Any]:
         old = merged.get(name)
         if isinstance(old, Mapping) and isinstance(change, Mapping):
             merged[name] = _over(old, change)
+        # TOML has no null
         elif change is False and name in OPTIONAL:
             merged[name] = None
         else:
@@ -440,14 +426,10 @@ def recorded_name(recording: Recording) -> str | None:
 
 def read_calibration(recording: Recording) -> Calibration | None:
     """Calibration in the log's record, or None; an invalid one is a `CalibrationError`."""
-    text = recording.metadata.get(METADATA, {}).get("calibration")
-    if text is None:
+    values = _recorded(recording, "calibration", None)
+    if values is None:
         return None
-    return parse(
-        Calibration,
-        _json(recording, "calibration", text),
-        f"{recording.path}: metadata record {METADATA!r}",
-    )
+    return parse(Calibration, values, f"{recording.path}: metadata record {METADATA!r}")
 
 
 def is_described(recording: Recording) -> bool:
@@ -456,17 +438,13 @@ def is_described(recording: Recording) -> bool:
         recorded = read_calibration(recording)
     except CalibrationError:
         return False
-    return (
-        recorded is not None
-        and recorded.model_fields_set | {"start"} == Calibration.model_fields.keys()
-    )
+    stated = set() if recorded is None else recorded.model_fields_set
+    return stated | {"start"} == Calibration.model_fields.keys()
 
 
 def read_notes(recording: Recording) -> dict[str, str]:
     """Notes in the log's record, which must be a JSON object."""
-    notes = _json(
-        recording, "notes", recording.metadata.get(METADATA, {}).get("notes", "{}")
-    )
+    notes = _recorded(recording, "notes", {})
     if not isinstance(notes, dict):
         raise LogError(
             f"{recording.path}: metadata record {METADATA!r}: notes must be a JSON object"
@@ -485,7 +463,11 @@ def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
     }
 
 
-def _json(recording: Recording, key: str, text: str) -> object:
+def _recorded(recording: Recording, key: str, default: object) -> object:
+    """Content of the log's record under a key."""
+    text = recording.metadata.get(METADATA, {}).get(key)
+    if text is None:
+        return default
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

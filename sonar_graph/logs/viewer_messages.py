@@ -31,17 +31,20 @@ from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
 from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS
-from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing
-from sonar_graph.measurements import Floats
+from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing, stamped
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.states import LandmarkMap, Trajectory
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
-SPHERE, TEXT_VIEW_FACING = 2, 9
+SPHERE = 2
+TEXT_VIEW_FACING = 9
 UNKNOWN_DIAMETER_M = 0.2
 """Diameter of the sphere that is drawn for an unknown covariance."""
 _SMALLEST_DIAMETER_M = 1e-3
-ELLIPSOID, UNKNOWN, IDENTITY = "ellipsoid_95_percent", "covariance_unknown", "identity"
+ELLIPSOID = "ellipsoid_95_percent"
+UNKNOWN = "covariance_unknown"
+IDENTITY = "identity"
 _FAINT = 0.35
 _SIGMAS = math.sqrt(chi_square_quantile(0.95, 3))
 Colour = tuple[float, float, float, float]
@@ -64,6 +67,7 @@ def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
     )
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
+    # rounding may leave a variance below zero
     diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
     return np.maximum(diameters, _SMALLEST_DIAMETER_M), Rotation.from_matrix(
         axes
@@ -83,62 +87,47 @@ def landmark_markers(
 ) -> Outgoing:
     """``visualization_msgs/MarkerArray``: for each landmark an ellipsoid, with its identity as text above it."""
     count = len(landmarks)
+    is_unknown = _unknown(landmarks.covariances)
     diameters, quaternions = ellipsoids(landmarks.covariances)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
     above = landmarks.positions + np.array([0, 0, text_height_m])
-    stamps_ns = np.full(2 * count, stamp_ns)
-    values = header(stamps_ns, WORLD_FRAME, "markers.header")
-    values |= fields(
-        "markers.pose.position", "xyz", np.vstack([landmarks.positions, above])
+    letters = np.full((count, 3), text_height_m)
+    values = _marker_columns(
+        np.full(2 * count, stamp_ns),
+        np.vstack([landmarks.positions, above]),
+        np.vstack([quaternions, upright]),
+        np.vstack([diameters, letters]),
+        colour,
     )
-    values |= fields(
-        "markers.pose.orientation", "xyzw", np.vstack([quaternions, upright])
-    )
-    values |= fields(
-        "markers.scale",
-        "xyz",
-        np.vstack([diameters, np.full((count, 3), text_height_m)]),
-    )
-    values |= fields("markers.color", "rgba", np.tile(colour, (2 * count, 1)))
+    names = [UNKNOWN if unknown else ELLIPSOID for unknown in is_unknown]
+    texts = [str(identity) for identity in landmarks.ids.tolist()]
     values |= {
-        "markers.ns": [
-            UNKNOWN if unknown else ELLIPSOID
-            for unknown in _unknown(landmarks.covariances)
-        ]
-        + [IDENTITY] * count,
+        "markers.ns": names + [IDENTITY] * count,
         "markers.id": np.tile(np.arange(count), 2),
         "markers.type": np.repeat([SPHERE, TEXT_VIEW_FACING], count),
-        "markers.text": [""] * count
-        + [str(identity) for identity in landmarks.ids.tolist()],
+        "markers.text": [""] * count + texts,
     }
-    return outgoing(
-        topic,
-        MARKER_ARRAY,
-        np.array([stamp_ns]),
-        values,
-        {"markers": 2 * count},
-        is_latched=True,
-    )
+    lengths = {"markers": 2 * count}
+    at_ns = np.array([stamp_ns])
+    return outgoing(topic, MARKER_ARRAY, at_ns, values, lengths, is_latched=True)
 
 
 def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
     """``visualization_msgs/MarkerArray`` for each pose with a known covariance: the ellipsoid of its position."""
-    known = trajectory.rows(
-        np.flatnonzero(~_unknown(trajectory.covariances[:, 3:, 3:]))
-    )
-    world_axes = (
-        body_to_ros(known.covariances, known.matrices)
-        if len(known)
-        else known.covariances
-    )
+    is_known = ~_unknown(trajectory.covariances[:, 3:, 3:])
+    known = trajectory.rows(np.flatnonzero(is_known))
+    world_axes = known.covariances
+    if len(known):
+        world_axes = body_to_ros(known.covariances, known.matrices)
     diameters, quaternions = ellipsoids(world_axes[:, :3, :3])
-    columns = header(known.stamps_ns, WORLD_FRAME, "markers.header")
-    columns |= fields("markers.pose.position", "xyz", known.positions)
-    columns |= fields("markers.pose.orientation", "xyzw", quaternions)
-    columns |= fields("markers.scale", "xyz", diameters)
-    columns |= fields(
-        "markers.color", "rgba", np.tile((*colour[:3], _FAINT), (len(known), 1))
+    columns = _marker_columns(
+        known.stamps_ns,
+        known.positions,
+        quaternions,
+        diameters,
+        (*colour[:3], _FAINT),
     )
+    # one marker in each message
     values: dict[str, Value] = {
         path: value[:, None] if isinstance(value, np.ndarray) else value
         for path, value in columns.items()
@@ -147,8 +136,25 @@ def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> O
     return outgoing(topic, MARKER_ARRAY, known.stamps_ns, values, {"markers": 1})
 
 
+def _marker_columns(
+    stamps_ns: Ints,
+    positions: Floats,
+    quaternions: Floats,
+    sizes_m: Floats,
+    colour: Colour,
+) -> dict[str, Value]:
+    """Fields of markers, a row each, in the world."""
+    values = header(stamps_ns, WORLD_FRAME, "markers.header")
+    values |= fields("markers.pose.position", "xyz", positions)
+    values |= fields("markers.pose.orientation", "xyzw", quaternions)
+    values |= fields("markers.scale", "xyz", sizes_m)
+    parts = zip("rgba", colour, strict=True)
+    return values | {f"markers.color.{name}": part for name, part in parts}
+
+
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_FLOAT32, _FLOAT64 = 7, 8
+_FLOAT32 = 7
+_FLOAT64 = 8
 """Types of a ``sensor_msgs/PointField``."""
 _NUMBERS = ("id", *LANDMARK_COLUMNS[4:])
 POINT = np.dtype([("xyz", "<f4", 3), ("", "<f4"), ("numbers", "<f8", len(_NUMBERS))])
@@ -165,8 +171,8 @@ def landmark_cloud(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoin
     points["xyz"] = landmarks.positions
     points["numbers"][:, 0] = landmarks.ids
     points["numbers"][:, 1:] = landmarks.covariances[:, *np.triu_indices(3)]
-    stamps_ns = np.array([stamp_ns])
-    values = header(stamps_ns, WORLD_FRAME) | {
+    at_ns = np.array([stamp_ns])
+    values = header(at_ns, WORLD_FRAME) | {
         "height": 1,
         "width": len(points),
         "fields.name": ["x", "y", "z", *_NUMBERS],
@@ -178,14 +184,8 @@ def landmark_cloud(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoin
         "data": np.frombuffer(points.tobytes(), np.uint8)[None, :],
         "is_dense": 1,
     }
-    return outgoing(
-        topic,
-        POINT_CLOUD,
-        stamps_ns,
-        values,
-        {"fields": 3 + len(_NUMBERS)},
-        is_latched=True,
-    )
+    lengths = {"fields": 3 + len(_NUMBERS)}
+    return outgoing(topic, POINT_CLOUD, at_ns, values, lengths, is_latched=True)
 
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -206,17 +206,17 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
     for picture in pictures:
         stamps_ns = np.array([picture.stamp_ns])
         content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
-        values = header(stamps_ns, "sonar") | {"format": "jpeg", "data": content}
+        values: dict[str, Value] = {"format": "jpeg", "data": content}
+        lengths = {"data": content.shape[1]}
         messages.append(
-            outgoing(
-                topic, COMPRESSED_IMAGE, stamps_ns, values, {"data": content.shape[1]}
-            )
+            stamped(topic, COMPRESSED_IMAGE, stamps_ns, "sonar", values, lengths)
         )
     return messages
 
 
 PATH = "nav_msgs/msg/Path"
-FOXGLOVE_SUFFIX, RVIZ_SUFFIX = ".foxglove.json", ".rviz"
+FOXGLOVE_SUFFIX = ".foxglove.json"
+RVIZ_SUFFIX = ".rviz"
 _PLOTS = {
     "Plot!height": ("pose.pose.position.z", ("/pose", "/ground_truth/odometry")),
     "Plot!variance": ("pose.covariance[0]", ("/pose",)),
@@ -236,10 +236,12 @@ class Scene:
     def around(cls, positions: Iterable[Floats]) -> Scene:
         """The scene around all positions, each of shape (n, 3), without those that are not finite."""
         points = np.concatenate([np.zeros((0, 3)), *positions])
+        # an estimate that diverged must not move the camera away
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return cls((0.0, 0.0, 0.0), 1.0)
-        low, high = points.min(axis=0), points.max(axis=0)
+        low = points.min(axis=0)
+        high = points.max(axis=0)
         x, y, z = np.round((low + high) / 2, 3).tolist()
         return cls((x, y, z), max(float((high - low).max()), 1.0))
 
@@ -377,7 +379,8 @@ def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     if pictures := [
         layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE
     ]:
-        panel, beside = "Image!pictures", layout["layout"]
+        panel = "Image!pictures"
+        beside = layout["layout"]
         panels[panel] = {"imageMode": {"imageTopic": pictures[0]}}
         plots = beside["second"]
         beside["second"] = {

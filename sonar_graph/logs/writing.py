@@ -59,8 +59,8 @@ from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
 WORLD_FRAME = "map"
-_Z_VARIANCE = 14
-"""Place of the variance of z in the 6 x 6 covariance of a pose."""
+NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
+"""Covariance by which ROS marks values that are none."""
 _SECONDS = np.iinfo(np.int32)
 
 
@@ -105,16 +105,12 @@ def write_log(
     path = as_path(path, "write_log(path, sequence)")
     require_sequence(sequence, "write_log(path, sequence)")
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
-    messages = [
-        static_message(
-            "/tf_static", TF, first_ns, encode_mountings(sequence.calibration)
-        )
-    ]
+    mountings = encode_mountings(sequence.calibration)
+    messages = [static_message("/tf_static", TF, first_ns, mountings)]
     if sequence.true_landmarks is not None:
+        landmarks = sequence.true_landmarks
         messages.append(
-            landmark_map_message(
-                "/ground_truth/landmarks", sequence.true_landmarks, first_ns
-            )
+            landmark_map_message("/ground_truth/landmarks", landmarks, first_ns)
         )
     messages.append(imu_messages("/imu/data", sequence.imu))
     messages.append(dvl_messages("/dvl/data", sequence.dvl))
@@ -127,12 +123,7 @@ def write_log(
     if sequence.detections is not None:
         messages += detection_messages("/sonar/landmarks", sequence.detections)
     if sequence.truth is not None:
-        of_truth = (
-            ("odometry", odometry_messages)
-            if sequence.truth.has_orientation
-            else ("point", point_messages)
-        )
-        messages.append(of_truth[1](f"/ground_truth/{of_truth[0]}", sequence.truth))
+        messages.append(truth_messages(sequence.truth))
     record = {
         "name": sequence.name,
         "calibration": recorded_calibration(sequence.calibration),
@@ -148,12 +139,10 @@ def write_log(
             ]
             out.write([*map(_rows, messages, begins, ends), entry])
             begins = ends
-        out.write(
-            list(map(_rows, messages, begins, [len(m.log_times_ns) for m in messages]))
-        )
+        out.write([_rows(m, first) for m, first in zip(messages, begins, strict=True)])
 
 
-def _rows(entry: Outgoing, first: int, end: int) -> Outgoing:
+def _rows(entry: Outgoing, first: int, end: int | None = None) -> Outgoing:
     return replace(
         entry,
         log_times_ns=entry.log_times_ns[first:end],
@@ -163,70 +152,68 @@ def _rows(entry: Outgoing, first: int, end: int) -> Outgoing:
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:
     """``sensor_msgs/Imu`` without orientation."""
+    # ROS marks an acceleration that was not measured by -1 in its covariance
     unmeasured = np.isnan(imu.specific_force).all(axis=1)
-    no_orientation = np.array([-1.0] + [0.0] * 8)
-    values = header(imu.stamps_ns, "imu")
-    values |= {"orientation.w": 1.0, "orientation_covariance": no_orientation[None, :]}
+    values: dict[str, Value] = {
+        "orientation.w": 1.0,
+        "orientation_covariance": NOT_MEASURED[None, :],
+        "linear_acceleration_covariance": np.outer(unmeasured, NOT_MEASURED),
+    }
     values |= fields("angular_velocity", "xyz", imu.angular_velocity)
     values |= fields("linear_acceleration", "xyz", imu.specific_force)
-    values["linear_acceleration_covariance"] = np.outer(unmeasured, no_orientation)
-    return outgoing(topic, IMU, imu.stamps_ns, values)
+    return stamped(topic, IMU, imu.stamps_ns, "imu", values)
 
 
 def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
     """``marine_acoustic_msgs/Dvl`` over the bottom, without single beams."""
     covariances = dvl.velocity_cov.reshape(-1, 9).copy()
-    covariances[np.isnan(covariances).any(axis=1)] = [-1.0] + [0.0] * 8
-    values = header(dvl.stamps_ns, "dvl") | fields("velocity", "xyz", dvl.velocity)
+    covariances[np.isnan(covariances).any(axis=1)] = NOT_MEASURED
+    values = fields("velocity", "xyz", dvl.velocity)
     values |= {"velocity_mode": 1, "velocity_covar": covariances, "num_good_beams": 4}
     # not known; 0 is what drivers leave that do not fill it
-    values |= {"sound_speed": np.nan}
-    return outgoing(topic, DVL, dvl.stamps_ns, values)
+    values["sound_speed"] = np.nan
+    return stamped(topic, DVL, dvl.stamps_ns, "dvl", values)
 
 
 def depth_messages(topic: str, depth: Depth) -> Outgoing:
     """``PoseWithCovarianceStamped`` of which only z counts; it keeps every bit of a height, a pressure does not."""
-    covariances = np.zeros((len(depth), 36))
-    covariances[:, _Z_VARIANCE] = np.where(
-        np.isnan(depth.variance_m2), 0.0, depth.variance_m2
-    )
-    values = header(depth.stamps_ns, WORLD_FRAME)
-    values |= {
-        "pose.pose.position.z": depth.z_m,
-        "pose.pose.orientation.w": 1.0,
-        "pose.covariance": covariances,
-    }
-    return outgoing(topic, POSE_WITH_COVARIANCE, depth.stamps_ns, values)
+    covariances = np.zeros((len(depth), 6, 6))
+    covariances[:, 2, 2] = np.nan_to_num(depth.variance_m2, posinf=np.inf)
+    values = {"pose.pose.position.z": depth.z_m}
+    return _upright_poses(topic, depth.stamps_ns, values, covariances)
 
 
 def heading_messages(topic: str, heading: Heading) -> Outgoing:
     """``sonar_graph_msgs/Heading``; it keeps every bit of an angle, a quaternion does not."""
-    values = header(heading.stamps_ns, WORLD_FRAME) | {
-        "yaw_rad": heading.yaw_rad,
-        "sigma_rad": heading.sigma_rad,
-    }
-    return outgoing(topic, HEADING, heading.stamps_ns, values)
+    values = {"yaw_rad": heading.yaw_rad, "sigma_rad": heading.sigma_rad}
+    return stamped(topic, HEADING, heading.stamps_ns, WORLD_FRAME, values)
 
 
 def fix_messages(topic: str, fixes: PositionFixes) -> Outgoing:
     """``PoseWithCovarianceStamped`` of which the position counts, and the upper left of the covariance."""
-    is_unknown = np.asarray(np.isnan(fixes.covariance_m2).any(axis=(1, 2)))
+    is_known = ~np.isnan(fixes.covariance_m2).any(axis=(1, 2))
     covariances = np.zeros((len(fixes), 6, 6))
-    covariances[:, :3, :3] = np.where(
-        is_unknown[:, None, None], 0.0, fixes.covariance_m2
-    )
-    values = header(fixes.stamps_ns, WORLD_FRAME) | fields(
-        "pose.pose.position", "xyz", fixes.position_m
-    )
-    values |= {
+    covariances[is_known, :3, :3] = fixes.covariance_m2[is_known]
+    values = fields("pose.pose.position", "xyz", fixes.position_m)
+    return _upright_poses(topic, fixes.stamps_ns, values, covariances)
+
+
+def _upright_poses(
+    topic: str, stamps_ns: Ints, values: Mapping[str, Value], covariances: Floats
+) -> Outgoing:
+    """Poses without a turn, of which a part is measured; covariances of shape (n, 6, 6)."""
+    pose: dict[str, Value] = {
         "pose.pose.orientation.w": 1.0,
         "pose.covariance": covariances.reshape(-1, 36),
     }
-    return outgoing(topic, POSE_WITH_COVARIANCE, fixes.stamps_ns, values)
+    return stamped(
+        topic, POSE_WITH_COVARIANCE, stamps_ns, WORLD_FRAME, {**values, **pose}
+    )
 
 
 def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
     """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
+    # rows of one stamp are one sonar frame
     stamps_ns, first, counts = np.unique(
         detections.stamps_ns, return_index=True, return_counts=True
     )
@@ -245,12 +232,11 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
     for count in np.unique(counts).tolist():
         frames = counts == count
         rows = first[frames][:, None] + np.arange(count)
-        values = header(stamps_ns[frames], "sonar")
-        values |= {
-            name: column[rows].reshape(len(rows), -1)
-            for name, column in columns.items()
+        values = {
+            k: column[rows].reshape(len(rows), -1) for k, column in columns.items()
         }
-        entries.append(outgoing(topic, DETECTIONS, stamps_ns[frames], values))
+        at_ns = stamps_ns[frames]
+        entries.append(stamped(topic, DETECTIONS, at_ns, "sonar", values))
     return entries
 
 
@@ -266,37 +252,39 @@ def odometry_messages(
     topic: str, trajectory: Trajectory, body_frame: str = BODY_FRAME
 ) -> Outgoing:
     """``nav_msgs/Odometry`` without a twist."""
-    values = (
-        header(trajectory.stamps_ns, WORLD_FRAME)
-        | pose_columns(trajectory)
-        | {"child_frame_id": body_frame}
-    )
-    return outgoing(topic, ODOMETRY, trajectory.stamps_ns, values)
+    values = pose_columns(trajectory) | {"child_frame_id": body_frame}
+    return stamped(topic, ODOMETRY, trajectory.stamps_ns, WORLD_FRAME, values)
 
 
 def point_messages(topic: str, trajectory: Trajectory) -> Outgoing:
     """``geometry_msgs/PointStamped``, of a trajectory whose orientations are not known."""
-    values = header(trajectory.stamps_ns, WORLD_FRAME) | fields(
-        "point", "xyz", trajectory.positions
-    )
-    return outgoing(topic, POINT, trajectory.stamps_ns, values)
+    values = fields("point", "xyz", trajectory.positions)
+    return stamped(topic, POINT, trajectory.stamps_ns, WORLD_FRAME, values)
+
+
+def truth_messages(truth: Trajectory, body_frame: str = BODY_FRAME) -> Outgoing:
+    """The true poses, or the points of a truth without orientations."""
+    if truth.has_orientation:
+        return odometry_messages("/ground_truth/odometry", truth, body_frame)
+    return point_messages("/ground_truth/point", truth)
 
 
 def pose_messages(topic: str, trajectory: Trajectory) -> Outgoing:
     """``geometry_msgs/PoseWithCovarianceStamped``."""
-    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory)
-    return outgoing(topic, POSE_WITH_COVARIANCE, trajectory.stamps_ns, values)
+    values = pose_columns(trajectory)
+    return stamped(
+        topic, POSE_WITH_COVARIANCE, trajectory.stamps_ns, WORLD_FRAME, values
+    )
 
 
 def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
     """One ``sonar_graph_msgs/LandmarkMap``."""
-    stamps_ns = np.array([stamp_ns])
-    values = header(stamps_ns, WORLD_FRAME) | {
+    values = {
         "ids": landmarks.ids[None, :],
         "position": landmarks.positions.reshape(1, -1),
         "covariance": landmarks.covariances.reshape(1, -1),
     }
-    return outgoing(topic, LANDMARK_MAP, stamps_ns, values)
+    return stamped(topic, LANDMARK_MAP, np.array([stamp_ns]), WORLD_FRAME, values)
 
 
 def static_message(
@@ -338,10 +326,11 @@ def sonar_image_messages(
         raise LogError(
             f"{topic}: samples of type {frames.intensity.dtype} cannot be written; give {SAMPLE_TYPES}"
         )
+    # drivers send all beams of a range side by side
     samples = np.ascontiguousarray(
         frames.intensity.transpose(0, 2, 1), dtype=f"<{kind}"
     )
-    values = header(frames.stamps_ns, "sonar") | {
+    values = {
         "ping_info.frequency": frequency_hz,
         "ping_info.sound_speed": sound_speed_m_s,
         "beam_directions.y": -np.sin(frames.azimuths_rad)[None, :],
@@ -351,9 +340,8 @@ def sonar_image_messages(
         "image.beam_count": beams,
         "image.data": samples.reshape(count, -1).view(np.uint8),
     }
-    return outgoing(
-        topic, SONAR_IMAGE, frames.stamps_ns, values, {"beam_directions": beams}
-    )
+    lengths = {"beam_directions": beams}
+    return stamped(topic, SONAR_IMAGE, frames.stamps_ns, "sonar", values, lengths)
 
 
 @lru_cache
@@ -367,6 +355,7 @@ def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, 
 
     Raises `LogError` when a stamp lies outside what ROS 2 can express (years 1901 to 2038).
     """
+    # also before 1970 nanoseconds are positive
     seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
     if len(seconds) and not (
         _SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max
@@ -398,3 +387,16 @@ def outgoing(
     """Messages recorded at their stamps; values and lengths as for `encode`."""
     payloads = encode(own_definition(type_name), len(stamps_ns), values, lengths)
     return Outgoing(topic, type_name, stamps_ns, payloads, is_latched)
+
+
+def stamped(
+    topic: str,
+    type_name: str,
+    stamps_ns: Ints,
+    frame_id: str,
+    values: Mapping[str, Value],
+    lengths: Mapping[str, int] | None = None,
+) -> Outgoing:
+    """Messages with a header each, recorded at their stamps."""
+    columns = header(stamps_ns, frame_id) | dict(values)
+    return outgoing(topic, type_name, stamps_ns, columns, lengths)

@@ -22,12 +22,12 @@ from sonar_graph.images import NO_DEPTH, NO_HEIGHT, NO_TILT, SonarFrames, decibe
 from sonar_graph.logs import (
     ImagesAlone,
     PartialCalibration,
+    Window,
     read_log,
     read_sonar_frames,
 )
 from sonar_graph.logs import no_images as no_images
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.logs.mcap import TimeWindow
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
 from sonar_graph.recognition.recognition_record import (
@@ -90,8 +90,8 @@ def recognise(
     recogniser: LandmarkRecogniser | None = None,
     calibration: Calibration | PartialCalibration | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
-    config: LogConfig | None = None,
-    window: TimeWindow | None = None,
+    config: LogConfig | str | Path | None = None,
+    window: Window | None = None,
     salvage: bool = False,
 ) -> Run:
     """Recognise landmarks in sonar images; give the sequence with the detections in it.
@@ -182,11 +182,11 @@ def recognise_images(
     *,
     motion: MotionFrom = "navigation",
     topic: str | None = None,
-    config: LogConfig | None = None,
+    config: LogConfig | str | Path | None = None,
     designs: Sequence[LandmarkDesign] | None = None,
     params: RecogniserParams | None = None,
     recogniser: LandmarkRecogniser | None = None,
-    window: TimeWindow | None = None,
+    window: Window | None = None,
     salvage: bool = False,
     progress: Callable[[int], None] | None = None,
     seen: Callable[[SonarFrames], None] | None = None,

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.errors import EvaluationError
+from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.evaluation import (
     NONE,
     UNJUDGED,
@@ -30,7 +30,7 @@ from sonar_graph.evaluation import (
     write_comparison,
     write_viewer_files,
 )
-from sonar_graph.files import COMPARISON, replacing, result_written
+from sonar_graph.files import COMPARISON, as_path, replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
 from sonar_graph.report.ensemble_section import (
@@ -83,6 +83,8 @@ def write_report(
     EvaluationError
         When the folder cannot be written to, another command writes there, it holds others' files under these names, or
         the name of an estimator cannot be the name of a folder.
+    ArgumentError
+        When `comparison` is something else, such as a list of runs.
     LogError
         When ``result.mcap`` cannot be written, or a stamp does not fit into a ROS 2 message.
 
@@ -97,7 +99,13 @@ def write_report(
     ...     write_report(comparison, folder).name
     'report.html'
     """
-    folder = Path(folder)
+    given: object = comparison
+    if not isinstance(given, Comparison):
+        raise ArgumentError(
+            f"write_report(comparison, folder): expected a Comparison, not {type(given).__name__}; "
+            "compare(sequence, names) gives one"
+        )
+    folder = as_path(folder, "write_report(comparison, folder)")
     try:
         with result_written(folder, COMPARISON, overwrite=overwrite):
             write_comparison(comparison, folder)

@@ -1,6 +1,7 @@
 """A log as a sequence: topics, stamps, rows left out, detections, damage, and the account of all that in the notes."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sonar_graph as sg
 from sonar_graph.calibration import Calibration, Start
-from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
+from sonar_graph.errors import (
+    CalibrationError,
+    LogError,
+    MissingTopicError,
+    SonarGraphError,
+)
 from sonar_graph.logs.adapters.landmark_messages import (
     LandmarkMapAdapter,
     detection_warnings,
@@ -110,6 +117,87 @@ def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(
     ):
         with pytest.raises(TypeError, match=message):
             call()
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda log: sg.read_log(log, config=3), r"read_log\(path, config=FILE or LogConfig\): expected a path"),
+        (lambda log: sg.read_log(log, window=3), r"window=\(START, END\)\): expected two times.*\(0, 10\), not 3"),
+        (lambda log: sg.read_log(log, window=(0, "noon")), "'noon' is no time in a log"),
+        (lambda log: sg.read_log(log, topics=["/imu"]), r"topics=\{'imu': .*\}\): expected topics by role, not list"),
+        (lambda log: sg.read_log(log, topics={"smell": "/imu"}), "there is no role smell; topics are chosen for imu"),
+        (lambda log: sg.read_log(log, topics={"sonar": "/x"}), "/x was chosen but is not in the log; the log has /dvl"),
+        (lambda log: sg.inspect_log(log, topics={"sonar": "/x"}), "/x was chosen but is not in the log; the log has /dvl"),
+        (lambda log: sg.inspect_log(log, calibration={}), r"inspect_log\(path, calibration=FILE or Calibration\)"),
+        (lambda log: replace(sg.read_log(log), imu=None), r"Sequence\.imu: expected Imu, not None; every estimator"),
+        (lambda log: replace(sg.read_log(log), calibration={}), r"Sequence\.calibration: expected a Calibration"),
+        (lambda log: sg.read_log(log).instants("2"), "'2' Hz is no rate; expected a number"),
+        (lambda log: sg.write_report([], log.parent), r"expected a Comparison, not list; compare\(sequence, names\)"),
+        (
+            lambda log: sg.compare(sg.read_log(log), ["isam2"], "isam2.kernel.width=2"),
+            r"expected settings by estimator, such as \{'isam2': \{'kernel.width': 2.0\}\}, not str",
+        ),
+    ],
+)  # fmt: skip
+def test_a_wrong_argument_is_an_error_of_this_package_with_what_mends_it(
+    bench: Bench, call: Callable[[Path], object], said: str
+) -> None:
+    with pytest.raises(SonarGraphError, match=said):
+        call(bench.write(*bench.basics()))
+
+
+def test_a_configuration_may_be_a_path_and_a_window_two_times(
+    bench: Bench, tmp_path: Path
+) -> None:
+    path = bench.write(*bench.basics())
+    (tmp_path / "mine.toml").write_text('[dvl]\nrotation = "frd"')
+    for config in (tmp_path / "mine.toml", str(tmp_path / "mine.toml")):
+        sequence = read_log(path, config=config, window=(0, None))
+        assert sequence.notes["log.adapters"] == 'dvl: rotation = "frd"'
+        summary = inspect_log(path, config, window=(0, None))
+        assert '\nrotation = "frd"' in summary.toml
+    part = TimeWindow(Instant(seconds=0.1), Instant(seconds=0.3))
+    one = read_log(path, window=(0.1, "0.3"))
+    assert (
+        one.imu.stamps_ns.tolist() == read_log(path, window=part).imu.stamps_ns.tolist()
+    )
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ({"velocity_covar": [0.1, 0, 0, 0, 0, 0, 0, 0, 0.1]}, "dvl: velocity_covar: no covariance in 5 of 5 messages"),
+        ({"velocity_covar": [0.1, 0, 0, 0, -0.1, 0, 0, 0, 0.1]}, "dvl: velocity_covar: no covariance in 5 of 5 messages"),
+        ({"velocity_covar": [0.1, 0, 0, 0, 0.1, 0, 0, 0, 0.1]}, ""),
+    ],
+)  # fmt: skip
+def test_what_is_in_doubt_is_logged_and_noise_that_is_none_is_replaced(
+    bench: Bench, caplog: pytest.LogCaptureFixture, fault: dict[str, Any], said: str
+) -> None:
+    imu, dvl = bench.basics()
+    rows = [row | fault for row in dvl[2]]
+    sequence = read_log(bench.write(imu, (*dvl[:2], rows)))
+    logged = [record.message for record in caplog.records]
+    assert any(said in line for line in logged)
+    assert said in sequence.notes["log.warnings"]
+    assert np.isnan(sequence.dvl.velocity_cov).all() == bool(said)
+
+
+def test_noise_of_zero_in_the_calibration_is_in_doubt_where_the_log_states_none(
+    make_sequence: Any, tmp_path: Path
+) -> None:
+    write_log(tmp_path / "a.mcap", make_sequence())
+    (tmp_path / "a.toml").write_text("[dvl]\nvelocity_sigma_m_s = [0.0, 0.1, 0.1]")
+    given = tmp_path / "a.toml"
+    is_unknown = np.isnan(read_log(tmp_path / "a.mcap").dvl.velocity_cov).any()
+    notes = read_log(tmp_path / "a.mcap", calibration=given).notes
+    assert is_unknown == (
+        "velocity_sigma_m_s of the calibration is 0" in notes.get("log.warnings", "")
+    )
+    # of a file that is given, the summary names the fields
+    source = inspect_log(tmp_path / "a.mcap", calibration=given).calibration
+    assert source == f"from {given}: dvl.velocity_sigma_m_s; else in the log"
 
 
 # --- rows -----------------------------------------------------------------------------------------------------------

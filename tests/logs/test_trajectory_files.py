@@ -1,6 +1,4 @@
 import decimal
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +6,8 @@ from evo.tools import file_interface
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.errors import LogError
 from sonar_graph.logs.trajectory_files import (
     decimal_ns,
-    read_landmarks_csv,
-    read_tum,
     write_landmarks_csv,
     write_tum,
 )
@@ -32,27 +27,19 @@ def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory, stamps, seed):
     )
     path = tmp_path_factory.mktemp("tum") / "t.tum"
     write_tum(path, written)
-    found = read_tum(path)
-    assert found.stamps_ns.tolist() == stamps
-    np.testing.assert_array_equal(found.positions, written.positions)
-    np.testing.assert_array_equal(found.quaternions_xyzw, written.quaternions_xyzw)
+    rows = [line.split() for line in path.read_text().splitlines()]
+    assert [decimal_ns(row[0]) for row in rows] == stamps
+    numbers = np.array([row[1:] for row in rows], float)
+    np.testing.assert_array_equal(numbers[:, :3], written.positions)
+    np.testing.assert_array_equal(numbers[:, 3:], written.quaternions_xyzw)
 
 
-def test_lines_are_those_that_tum_describes_with_comments_blank_lines_and_exponents(
-    tmp_path,
-):
+def test_lines_are_those_that_tum_describes(tmp_path):
     pose = Trajectory.without_covariances(
         np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:]
     )
     write_tum(tmp_path / "t.tum", pose)
     assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1 2 3.5 0 0 0 1\n"
-    (tmp_path / "t.tum").write_text(
-        "# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n"
-    )
-    assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [
-        1_500_000_000,
-        2_000_000_000,
-    ]
 
 
 def test_decimal_seconds_keep_their_nanoseconds_whatever_the_precision_of_the_caller():
@@ -80,28 +67,6 @@ def test_evo_reads_the_same_poses(make_sequence, tmp_path):
     )
 
 
-MISTAKES: list[tuple[Callable[[Path], object], str | None, str]] = [
-    (read_tum, None, "cannot be read"),
-    (read_tum, "1 0 0 0 0 0 0\n", "line 1: 7 values"),
-    (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 x 0 0 0 1\n", "line 2: .* no number"),
-    (read_tum, "t 0 0 0 0 0 0 1\n", "line 1: .* no number"),
-    (read_tum, "nan 0 0 0 0 0 0 1\n", "line 1: .* no number"),
-    (read_tum, "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "pose 2 is not later"),
-    (read_landmarks_csv, "id,x\n1,2\n", "is not a landmark table"),
-]
-
-
-@pytest.mark.parametrize(("read", "text", "message"), MISTAKES)
-def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(
-    tmp_path, read, text, message
-):
-    path = tmp_path / "table.txt"
-    if text is not None:
-        path.write_text(text)
-    with pytest.raises(LogError, match=rf"table\.txt.* {message}"):
-        read(path)
-
-
 def test_landmarks_come_back_from_their_table_and_an_empty_map_is_a_header(tmp_path):
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3, 3))
@@ -116,7 +81,9 @@ def test_landmarks_come_back_from_their_table_and_an_empty_map_is_a_header(tmp_p
         assert [float(line.split(",")[8]) for line in lines[:1]] == covariances[
             : min(count, 1), 1, 2
         ].tolist()
-        found = read_landmarks_csv(tmp_path / "l.csv")
-        assert found.ids.tolist() == landmarks.ids.tolist()
-        np.testing.assert_array_equal(found.positions, landmarks.positions)
-        np.testing.assert_array_equal(found.covariances, landmarks.covariances)
+        rows = [line.split(",") for line in lines]
+        assert [int(row[0]) for row in rows] == landmarks.ids.tolist()
+        numbers = np.array([row[1:] for row in rows], float).reshape(-1, 9)
+        np.testing.assert_array_equal(numbers[:, :3], landmarks.positions)
+        upper = landmarks.covariances[:, *np.triu_indices(3)]
+        np.testing.assert_array_equal(numbers[:, 3:], upper)

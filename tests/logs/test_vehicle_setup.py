@@ -374,8 +374,8 @@ def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything
         "from vehicle.toml: imu.gyro_noise_density, gravity_m_s2; else from the log"
     )
     assert found.notes["log.calibration"] == expected
-    given = read_log(tmp_path / "a.mcap", calibration=Calibration(), name="mine")
-    assert (given.calibration, given.name) == (Calibration(), "mine")
+    given = read_log(tmp_path / "a.mcap", calibration=Calibration())
+    assert (given.calibration, given.name) == (Calibration(), sequence.name)
     assert given.notes["log.calibration"] == "given by the caller"
     mounting = Mounting(translation_m=TREE_M)
     tree = Calibration(

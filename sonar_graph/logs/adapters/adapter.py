@@ -134,10 +134,14 @@ TimeUnit = Annotated[float, Field(gt=0, allow_inf_nan=False), _from_units(TIMES)
 class Adapter(Section):
     """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
 
-    A subclass adds the attributes of its role, names the paths that a message must have in `fields`, and gives the
-    measurements, with the number of rows left out by reason, in ``read``.
+    A subclass adds the attributes of its role, names those that hold paths in `PATHS`, and gives the measurements, with
+    the number of rows left out by reason, in ``read``.
     """
 
+    PATHS: ClassVar[tuple[str, ...]] = ()
+    """Attributes with paths that a message must have."""
+    NEEDS: ClassVar[tuple[str, ...]] = ()
+    """Arguments of ``read`` beside the messages (`rows_of`)."""
     reads_table: ClassVar[bool] = True
     """False where ``read`` takes the topic, because its messages have lists of different lengths."""
     type: str
@@ -163,7 +167,7 @@ class Adapter(Section):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have, except for the stamp's."""
-        return field_paths()
+        return field_paths(*(getattr(self, name) for name in self.PATHS))
 
     def missing_in(self, definition: Struct) -> list[str]:
         """Paths of `fields` that a message type does not have."""
@@ -200,10 +204,24 @@ class Adapter(Section):
         yield from ()
 
 
-def field_paths(*values: str | Iterable[str] | None) -> Iterator[str]:
+class PathSection(Section):
+    """Section of an adapter with paths of its own."""
+
+    PATHS: ClassVar[tuple[str, ...]]
+    """Attributes with paths that a message must have."""
+
+    def paths(self) -> Iterator[str]:
+        """Paths that a message must have."""
+        return field_paths(*(getattr(self, name) for name in self.PATHS))
+
+
+def field_paths(*values: str | Iterable[str] | PathSection | None) -> Iterator[str]:
     """Paths in attributes of an adapter, each one path, several, or none."""
     for value in values:
-        yield from (value,) if isinstance(value, str) else value or ()
+        if isinstance(value, PathSection):
+            yield from value.paths()
+        else:
+            yield from (value,) if isinstance(value, str) else value or ()
 
 
 def leaf_fields(
@@ -223,8 +241,10 @@ ROUNDING = 1e-6
 """Part of the largest eigenvalue by which single precision may leave the smallest below zero."""
 
 
-class CovarianceFields(Section):
+class CovarianceFields(PathSection):
     """Fields of a covariance, and the meaning of their numbers."""
+
+    PATHS = ("fields",)
 
     fields: tuple[str, ...] = Field(min_length=1, max_length=3)
     """One field: a row-major matrix (3x3, or 6x6 of which the first three rows count), or one number for all axes.
@@ -239,34 +259,26 @@ class CovarianceFields(Section):
     def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
         """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
-        negative = matrices[:, 0, 0] < 0
-        zero = ~matrices.any(axis=(1, 2))
-        invalid = (negative & (self.negative == "invalid")) | (
-            zero & (self.zero == "invalid")
-        )
+        is_negative = matrices[:, 0, 0] < 0
+        is_zero = ~matrices.any(axis=(1, 2))
+        is_invalid = is_negative & (self.negative == "invalid")
+        is_invalid |= is_zero & (self.zero == "invalid")
+        is_finite = np.isfinite(matrices).all(axis=(1, 2))
+        is_unknown = is_negative | is_zero | ~is_finite | _is_impossible(matrices)
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
-        unknown = (
-            negative
-            | zero
-            | ~np.isfinite(matrices).all(axis=(1, 2))
-            | _is_indefinite(matrices)
-        )
-        return np.where(unknown[:, None, None], np.nan, matrices), invalid
+        return np.where(is_unknown[:, None, None], np.nan, matrices), is_invalid
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Number of messages whose matrix is no covariance."""
-        if self.meaning == "standard deviation":
-            return
         matrices = self._matrices(table)
-        indefinite: NDArray[np.bool_] = _is_indefinite(matrices) & (
-            matrices[:, 0, 0] >= 0
-        )
-        count = np.count_nonzero(indefinite)
+        # a negative first element and zeros alone are a driver's ways to send no covariance
+        is_stated = (matrices[:, 0, 0] >= 0) & matrices.any(axis=(1, 2))
+        count = np.count_nonzero(_is_impossible(matrices) & is_stated)
         if count:
             yield (
                 f"{', '.join(self.fields)}: no covariance in {count} of {len(table)} messages, since some direction's "
-                f"variance is negative: the calibration's noise is taken there"
+                f"variance is negative or an axis' is zero: the calibration's noise is taken there"
             )
 
     def read_variance(self, table: FieldTable) -> Floats:
@@ -296,18 +308,19 @@ class CovarianceFields(Section):
                 self.fields[0],
                 f"has {column.shape[1]} numbers; a covariance has 1, 9 or 36",
             )
+        # of a pose the translation comes first
         side = 3 if column.shape[1] == 9 else 6
         return column.reshape(-1, side, side)[:, :3, :3]
 
 
-def _is_indefinite(matrices: Floats) -> NDArray[np.bool_]:
-    """Matrices with a negative eigenvalue beyond rounding, shape (n,); none where a number is not finite."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
-    symmetric = np.where(
-        np.asarray(finite)[:, None, None], matrices + np.swapaxes(matrices, 1, 2), 0.0
-    )
-    variances: Floats = np.linalg.eigvalsh(symmetric)
-    return np.asarray(variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1))
+def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:
+    """Matrices with a zero on the diagonal or a negative eigenvalue beyond rounding, shape (n,); False for NaN."""
+    is_finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    finite = np.where(is_finite[:, None, None], matrices, np.eye(3))
+    variances: Floats = np.linalg.eigvalsh(finite + np.swapaxes(finite, 1, 2))
+    is_negative = variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1)
+    is_zero = (np.einsum("nii->ni", finite) == 0).any(axis=1)
+    return np.asarray(is_negative | is_zero)
 
 
 def _diagonal(values: Floats) -> Floats:

@@ -8,28 +8,27 @@ origin (`sonar_graph.logs.adapters.geodesy`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from sonar_graph.calibration import Section
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
     CovarianceFields,
     LengthScale,
+    PathSection,
     axes_matrix,
-    field_paths,
 )
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
-    fit_rows,
+    fit_block,
     not_finite,
 )
 from sonar_graph.logs.mcap import Keep, Topic
@@ -51,6 +50,9 @@ _WHOLE_CIRCLE = 2 * np.pi + 0.1
 
 class HeadingAdapter(Adapter):
     """Yaw of the body, from an orientation or from one angle."""
+
+    PATHS = ("orientation", "yaw", "variance", "status")
+    NEEDS = ("body_R_sensor",)
 
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w: the sensor in the world."""
@@ -74,11 +76,6 @@ class HeadingAdapter(Adapter):
         if (self.orientation is None) == (self.yaw is None):
             raise ValueError("give either orientation = [x, y, z, w] or yaw")
         return self
-
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        variance = self.variance.fields if self.variance else None
-        return field_paths(self.orientation, self.yaw, variance, self.status)
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
@@ -123,6 +120,7 @@ class HeadingAdapter(Adapter):
         """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
         faults = {NO_MEASUREMENT: ~self.is_measured(table)}
         if self.orientation is not None:
+            # drivers without an attitude send zeros
             quaternions = table.beside(self.orientation).astype(float)
             lengths = np.linalg.norm(quaternions, axis=1)
             is_rotation = np.isfinite(lengths) & (lengths > 0.5)
@@ -143,6 +141,7 @@ class HeadingAdapter(Adapter):
             }
         else:
             yaw_rad = table.column(str(self.yaw)) * self.scale
+            # a bearing turns clockwise from north
             yaw_rad = np.pi / 2 - yaw_rad if self.world == "ned" else yaw_rad
             faults[NOT_FINITE] = not_finite(yaw_rad)
         variance = (
@@ -150,19 +149,13 @@ class HeadingAdapter(Adapter):
             if self.variance
             else np.full(len(table), np.nan)
         )
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        if not rows.size:
-            return None, dropped
-        yaw_rad = (
-            yaw_rad[rows] + self.yaw_offset_rad
-            if self.yaw_offset_rad
-            else yaw_rad[rows]
-        )
-        return Heading(table.stamps_ns[rows], yaw_rad, np.sqrt(variance[rows])), dropped
+        yaw_rad = yaw_rad + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad
+        return fit_block(Heading, table.stamps_ns, faults, yaw_rad, np.sqrt(variance))
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
         if self.variance is not None:
+            # a sigma of a full turn is another unit, or means unknown
             is_beyond = self.is_measured(table) & (
                 self.variance.read_variance(table) > FULL_TURN_RAD**2
             )
@@ -181,8 +174,10 @@ class HeadingAdapter(Adapter):
                 )
 
 
-class GeodeticFields(Section):
+class GeodeticFields(PathSection):
     """Fields of a position on the Earth, and the origin of the world."""
+
+    PATHS = ("latitude", "longitude", "height", "status")
 
     latitude: str
     """Degrees, north."""
@@ -197,10 +192,6 @@ class GeodeticFields(Section):
     origin_deg_m: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
 
-    def paths(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        return field_paths(self.latitude, self.longitude, self.height, self.status)
-
     def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
         """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
 
@@ -210,6 +201,7 @@ class GeodeticFields(Section):
             [table.column(self.latitude), table.column(self.longitude)]
         ).astype(float)
         if self.unit == "ddmm.mmmm":
+            # 4807.038 is 48 degrees and 7.038 minutes
             degrees = np.trunc(place / 100)
             place = degrees + (place - 100 * degrees) / 60
         elif self.unit == "rad":
@@ -286,37 +278,70 @@ class GeodeticFields(Section):
         )
 
 
-class PositionAdapter(Adapter):
-    """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
+class Places(NamedTuple):
+    """Positions in the world, a row each."""
 
+    position_m: Floats
+    """Shape (n, 3), z up; a height that was not measured is 0."""
+    faults: dict[str, NDArray[np.bool_]]
+    """Masks of rows without a position, by reason."""
+    has_height: NDArray[np.bool_]
+
+
+class PlaceAdapter(Adapter):
+    """Positions, in latitude and longitude or in metres of the world."""
+
+    PATHS: ClassVar[tuple[str, ...]] = ("position", "geodetic")
+    NEEDS: ClassVar[tuple[str, ...]] = ("origin",)
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
     """Fields of x, y, z in the world instead, metres."""
     scale: LengthScale = 1.0
     """Turns `position` into metres, and its covariance by the square; 0.001 or "mm" from millimetres."""
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
     world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned"; of `position`."""
-    covariance: CovarianceFields | None = None
-    """Along the world's axes; without it the calibration's noise holds."""
-    covariance_type: str | None = None
-    """Field that is 0 where the covariance is unknown."""
 
     @model_validator(mode="after")
-    def _has_one_source(self) -> PositionAdapter:
+    def _has_one_place(self) -> PlaceAdapter:
         if (self.geodetic is None) == (self.position is None):
             raise ValueError(
                 "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
             )
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        geodetic = self.geodetic.paths() if self.geodetic else None
-        covariance = self.covariance.fields if self.covariance else None
-        return field_paths(geodetic, self.position, covariance, self.covariance_type)
+    def scaled(self, table: FieldTable) -> Floats:
+        """Values of `position` in metres, along the driver's axes, shape (n, 3)."""
+        return table.beside(self.position or ()).astype(float) * self.scale
+
+    def places(self, table: FieldTable, origin: Origin | None) -> Places:
+        """Positions of all rows; ``origin`` in degrees and metres is for positions on the Earth."""
+        if self.geodetic is not None:
+            position_m, is_fix, has_height = self.geodetic.positions(table, origin)
+            fault = f"without a fix{self.geodetic.beyond(table)}"
+            return Places(position_m, {fault: ~is_fix}, has_height)
+        position_m = self.scaled(table)
+        faults = {NOT_FINITE: not_finite(position_m)}
+        if self.world == "ned":
+            position_m = position_m @ ENU_R_NED.T
+        return Places(position_m, faults, np.ones(len(table), bool))
+
+
+class PositionAdapter(PlaceAdapter):
+    """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
+
+    PATHS = ("geodetic", "position", "covariance", "covariance_type")
+    NEEDS = ("origin", "sigma_m")
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
+    covariance: CovarianceFields | None = None
+    """Along the world's axes; without it the calibration's noise holds."""
+    covariance_type: str | None = None
+    """Field that is 0 where the covariance is unknown."""
+
+    def scaled(self, table: FieldTable) -> Floats:
+        """Values of `position` in metres from the origin, along the driver's axes, shape (n, 3)."""
+        return super().scaled(table) - self.origin_m
 
     def read(
         self,
@@ -329,54 +354,33 @@ class PositionAdapter(Adapter):
         ``origin``, in degrees and metres, is for positions on the Earth, the calibration's ``sigma_m`` for fixes
         without height and covariance.
         """
-        faults: dict[str, NDArray[np.bool_]] = {}
-        has_height = np.ones(len(table), bool)
-        if self.geodetic is not None:
-            positions, is_fix, has_height = self.geodetic.positions(table, origin)
-            faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
-        else:
-            positions = (
-                table.beside(self.position or ()).astype(float) * self.scale
-                - self.origin_m
-            )
-            faults[NOT_FINITE] = not_finite(positions)
-        covariances = np.full((len(table), 3, 3), np.nan)
+        positions, faults, has_height = self.places(table, origin)
+        C = np.full((len(table), 3, 3), np.nan)
         if self.covariance is not None:
-            covariances, faults["with a covariance that says invalid"] = (
-                self.covariance.read(table)
+            C, faults["with a covariance that says invalid"] = self.covariance.read(
+                table
             )
         if self.covariance_type is not None:
-            covariances = np.where(
-                (table.column(self.covariance_type) == 0)[:, None, None],
-                np.nan,
-                covariances,
-            )
+            C[table.column(self.covariance_type) == 0] = np.nan
         if self.position is not None:
-            covariances = covariances * self.scale**2
-        if self.position is not None and self.world == "ned":
-            positions, covariances = (
-                positions @ ENU_R_NED.T,
-                ENU_R_NED @ covariances @ ENU_R_NED.T,
-            )
-        flat = np.where(np.isnan(covariances), np.diag(np.square(sigma_m)), covariances)
-        flat[:, 2, :], flat[:, :, 2], flat[:, 2, 2] = 0.0, 0.0, UNMEASURED_M2
-        covariances = np.where(has_height[:, None, None], covariances, flat)
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        fixes = (
-            PositionFixes(table.stamps_ns[rows], positions[rows], covariances[rows])
-            if rows.size
-            else None
-        )
-        return fixes, dropped
+            C = C * self.scale**2
+            if self.world == "ned":
+                C = ENU_R_NED @ C @ ENU_R_NED.T
+        # without a height, x and y keep their noise and z gets none that counts
+        is_flat = ~has_height
+        flat = np.where(np.isnan(C), np.diag(np.square(sigma_m)), C)[is_flat]
+        flat[:, 2, :] = 0.0
+        flat[:, :, 2] = 0.0
+        flat[:, 2, 2] = UNMEASURED_M2
+        C[is_flat] = flat
+        return fit_block(PositionFixes, table.stamps_ns, faults, positions, C)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about matrices that are no covariances, and places that are not on the Earth."""
         if self.covariance is not None:
             yield from self.covariance.warnings(table)
         if self.position is not None:
-            positions = (
-                table.beside(self.position).astype(float) * self.scale - self.origin_m
-            )
+            positions = self.scaled(table)
             is_far = (np.abs(positions) > FARTHEST_FIX_M).any(axis=1)
             if is_far.any():
                 yield (

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from sonar_graph.calibration import Section
 from sonar_graph.devices import velocity_of_beams
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     CovarianceFields,
+    PathSection,
     SpeedScale,
-    field_paths,
     turn,
     turn_covariances,
 )
@@ -31,7 +30,7 @@ from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
-    fit_rows,
+    fit_block,
     not_finite,
 )
 from sonar_graph.measurements import Dvl, Floats, Ints
@@ -40,8 +39,10 @@ FEWEST_BEAMS = 3
 """Beams needed for a velocity."""
 
 
-class BeamGeometry(Section):
+class BeamGeometry(PathSection):
     """Directions of the beams, and their fields where the velocity is to be computed from them."""
+
+    PATHS = ("velocity", "valid")
 
     tilt_deg: float = Field(gt=0, lt=90)
     """Angle between beams and the instrument's vertical: 30 (RDI), 25 (Nortek), 22.5 (Water Linked)."""
@@ -58,8 +59,10 @@ class BeamGeometry(Section):
 
     def directions(self) -> Floats:
         """Unit vectors, shape (beams, 3), z down."""
-        tilt, azimuth = np.radians(self.tilt_deg), np.radians(self.azimuth_deg)
-        across, down = np.sin(tilt), np.full(azimuth.shape, np.cos(tilt))
+        tilt = np.radians(self.tilt_deg)
+        azimuth = np.radians(self.azimuth_deg)
+        across = np.sin(tilt)
+        down = np.full(azimuth.shape, np.cos(tilt))
         return np.column_stack(
             [across * np.cos(azimuth), across * np.sin(azimuth), down]
         )
@@ -91,6 +94,7 @@ class BeamGeometry(Section):
             self.directions(), along * scale, valid, self.sigma_m_s or 1.0
         )
         count = valid.sum(axis=1)
+        # fewer beams leave a direction unmeasured, and its variance is unknown
         velocity[count < self.fewest] = np.nan
         return (
             velocity,
@@ -135,6 +139,15 @@ Number = bool | int | float
 class DvlAdapter(Adapter):
     """Velocity over the bottom in the instrument's frame."""
 
+    PATHS = (
+        "velocity",
+        "covariance",
+        "valid_where",
+        "good_beams",
+        "altitude",
+        "beams",
+    )
+
     velocity: tuple[str, str, str] | None = None
     """Fields of the velocity along x, y, z; not used where `beams` have a velocity."""
     scale: SpeedScale = 1.0
@@ -169,13 +182,6 @@ class DvlAdapter(Adapter):
             )
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
-        covariance = self.covariance.fields if self.covariance else None
-        marks = (self.valid_where, self.good_beams, self.altitude)
-        return field_paths(self.velocity, covariance, *marks, *beams)
-
     def read(self, table: FieldTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
         faults: dict[str, NDArray[np.bool_]] = {}
@@ -198,18 +204,14 @@ class DvlAdapter(Adapter):
         faults |= self._marked_invalid(table)
         faults[NOT_FINITE] = not_finite(velocity)
         faults |= self._signs_of_no_lock(table, velocity)
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        velocity, covariance = (
-            turn(self.rotation, velocity[rows]),
-            turn_covariances(self.rotation, covariance[rows]),
-        )
-        return (
-            Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None
-        ), dropped
+        velocity = turn(self.rotation, velocity)
+        covariance = turn_covariances(self.rotation, covariance)
+        return fit_block(Dvl, table.stamps_ns, faults, velocity, covariance)
 
     def _filled(self, table: FieldTable) -> dict[str, NDArray[np.bool_]]:
         """Masks of valid messages by the fields of `valid_where` that the driver fills."""
         columns = {path: table.column(path) for path in self.valid_where}
+        # a field that is 0 in every message carries no mark
         is_unfilled = {
             path: path in self.may_be_unfilled and not column.any()
             for path, column in columns.items()
@@ -233,6 +235,7 @@ class DvlAdapter(Adapter):
             for path, valid in self._filled(table).items()
         }
         if self.good_beams is not None:
+            # 0 beams in all messages: the driver does not count
             beams = table.column(self.good_beams)
             faults[NO_BEAM] = (beams == 0) & (self.are_beams_counted or beams.any())
         return faults
@@ -255,6 +258,7 @@ class DvlAdapter(Adapter):
                 faults[f"with {self.altitude} below 0"] = (
                     altitude_m < 0
                 ) & self._may_count(altitude_m > 0)
+            # sentinels fill all axes alike
             is_same = (velocity == velocity[:, :1]).all(axis=1)
             faults[SENTINEL] = is_same & (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S)
             if self.lock == "found" and not self.are_zeros_measured:
@@ -351,10 +355,12 @@ def zeros_in_one_step(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
     A vehicle slows down over several rows. A driver without bottom lock sends zeros from one row to the next, and the
     step is `STEP_RATIO` times the 99 % quantile of the steps between rows with a velocity.
     """
+    # messages may be recorded out of order
     order = np.argsort(stamps_ns, kind="stable")
     v = velocity[order]
     is_zero: NDArray[np.bool_] = np.asarray(~v.any(axis=1))
     step_m_s = np.linalg.norm(np.diff(v, axis=0), axis=1)
+    # steps to and from zeros would raise the limit that is to find them
     is_usual = ~is_zero[1:] & ~is_zero[:-1] & np.isfinite(step_m_s)
     found = np.zeros(len(v), bool)
     if not is_zero.any() or np.count_nonzero(is_usual) < FEWEST_STEPS:
@@ -386,6 +392,7 @@ def repeats(velocity: Floats, stamps_ns: Ints) -> NDArray[np.bool_]:
         [[False], (v[1:] == v[:-1]).all(axis=1) & v[1:].any(axis=1)]
     )
     in_file = np.zeros(len(v), bool)
+    # runs of equal rows, which a habit makes often and a fault once
     lengths = np.diff([*np.flatnonzero(~is_same), len(v)])
     if (
         np.mean(is_same) < LEAST_REPEATED

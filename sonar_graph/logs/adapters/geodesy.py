@@ -21,7 +21,8 @@ def earth_centred(
     latitude_rad: Floats, longitude_rad: Floats, height_m: Floats
 ) -> Floats:
     """Earth-centred, Earth-fixed coordinates, shape (n, 3), metres."""
-    sin, cos = np.sin(latitude_rad), np.cos(latitude_rad)
+    sin = np.sin(latitude_rad)
+    cos = np.cos(latitude_rad)
     N = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin**2)
     across = (N + height_m) * cos
     along = (N * (1.0 - ECCENTRICITY_SQUARED) + height_m) * sin
@@ -35,13 +36,13 @@ def east_north_up(
 ) -> Floats:
     """Metres east, north and up of an origin, shape (n, 3)."""
     origin_latitude_rad, origin_longitude_rad, _ = origin
-    sin_lat, cos_lat = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
-    sin_lon, cos_lon = np.sin(origin_longitude_rad), np.cos(origin_longitude_rad)
+    sin_lat = np.sin(origin_latitude_rad)
+    cos_lat = np.cos(origin_latitude_rad)
+    sin_lon = np.sin(origin_longitude_rad)
+    cos_lon = np.cos(origin_longitude_rad)
     centre = earth_centred(*(np.array([value]) for value in origin))
-    east, north = (
-        [-sin_lon, cos_lon, 0.0],
-        [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-    )
+    east = [-sin_lon, cos_lon, 0.0]
+    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
     enu_R_earth = np.array(
         [east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]]
     )

@@ -17,14 +17,13 @@ from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
     LengthScale,
-    field_paths,
     turn,
     turn_covariances,
 )
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
-    fit_rows,
+    fit_block,
     header_stamps_ns,
     not_finite,
 )
@@ -48,63 +47,44 @@ NO_POSTERIOR = "with probabilities that are not between 0 and 1 or more than 1 i
 
 
 class _Rows(NamedTuple):
-    """Detections of messages that share a layout, one row each."""
+    """Detections, one row each."""
 
     message: Ints
     """Number of the message in its topic."""
     stamps_ns: Ints
-    values: tuple[Floats, ...]
-    """Columns that do not depend on the candidates."""
     ids: Ints
     """Shape (n, k)."""
     probabilities: Floats
     """Shape (n, k)."""
+    values: tuple[Floats, ...]
+    """Columns that do not depend on the candidates."""
 
 
-class _Joined:
-    """Rows of all layouts, padded to the most candidates with -1 and probability 0; detections in order of messages."""
-
-    def __init__(self, topic: Topic, parts: list[_Rows]) -> None:
-        most = max(1, *(part.ids.shape[1] for part in parts))
-        self.message = np.concatenate([part.message for part in parts])
-        self.stamps_ns = np.concatenate([part.stamps_ns for part in parts])
-        self.values = [
-            np.concatenate(columns)
-            for columns in zip(*(part.values for part in parts), strict=True)
-        ]
-        self.ids = np.concatenate([_padded(part.ids, most, -1) for part in parts])
-        self.probabilities = np.concatenate(
-            [_padded(part.probabilities, most, 0) for part in parts]
+def _joined(topic: Topic, parts: list[_Rows]) -> _Rows:
+    """Rows of all layouts in the order of messages, padded to the most candidates with -1 and probability 0."""
+    most = max(1, *(part.ids.shape[1] for part in parts))
+    ids = np.concatenate([_padded(part.ids, most, -1) for part in parts])
+    probabilities = np.concatenate(
+        [_padded(part.probabilities, most, 0) for part in parts]
+    )
+    message = np.concatenate([part.message for part in parts])
+    stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+    values = zip(*(part.values for part in parts), strict=True)
+    is_large = (ids >= FIRST_TOO_LARGE_ID).any(axis=1)
+    if is_large.any():
+        where = f"message {message[int(np.argmax(is_large))]} has an identity of 2^56 or more"
+        raise topic.error(
+            f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false"
         )
-        if (large := (self.ids >= FIRST_TOO_LARGE_ID).any(axis=1)).any():
-            where = f"message {self.message[int(np.argmax(large))]} has an identity of 2^56 or more"
-            raise topic.error(
-                f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false"
-            )
-
-    def fit(self, faults: Mapping[str, np.ndarray]) -> tuple[Ints, Dropped]:
-        """Rows without a fault, in the order of their stamps, and the number of the others by fault."""
-        order = np.argsort(self.message, kind="stable")
-        in_order = {fault: has_it[order] for fault, has_it in faults.items()}
-        rows, dropped = fit_rows(self.stamps_ns[order], in_order, unique=False)
-        return order[rows], dropped
-
-    def detections(
-        self,
-        rows: Ints,
-        ranges_m: Floats,
-        azimuths_rad: Floats,
-        covariances: Floats,
-        tracks: Ints,
-    ) -> LandmarkDetections | None:
-        """The chosen rows as measurements; None where there are none."""
-        measured = (ranges_m[rows], azimuths_rad[rows], covariances[rows])
-        identities = (self.ids[rows], self.probabilities[rows], tracks[rows])
-        return (
-            LandmarkDetections(self.stamps_ns[rows], *measured, *identities)
-            if rows.size
-            else None
-        )
+    # rows of one stamp keep the order in which they were sent
+    order = np.argsort(message, kind="stable")
+    return _Rows(
+        message[order],
+        stamps_ns[order],
+        ids[order],
+        probabilities[order],
+        tuple(np.concatenate(columns)[order] for columns in values),
+    )
 
 
 def _padded(columns: np.ndarray, count: int, filling: int) -> np.ndarray:
@@ -128,9 +108,8 @@ class DetectionListsAdapter(Adapter):
         log_times_ns = topic.log_times_ns  # of sound messages, which are known now
         if not groups:
             return None, {}
-        rows = _Joined(
-            topic, [self._rows(topic, group, log_times_ns) for group in groups]
-        )
+        parts = [self._rows(topic, group, log_times_ns) for group in groups]
+        rows = _joined(topic, parts)
         ranges, azimuths, covariances, tracks = rows.values
         if self.range_scale != 1 or self.azimuth_scale != 1:
             scales = np.array([self.range_scale, self.azimuth_scale])
@@ -141,21 +120,23 @@ class DetectionListsAdapter(Adapter):
             NOT_FINITE: not_finite(ranges, azimuths, rows.probabilities),
             NO_POSTERIOR: no_posterior(rows.probabilities),
         }
-        fit, dropped = rows.fit(faults)
-        return rows.detections(fit, ranges, azimuths, covariances, tracks), dropped
+        measured = (ranges, azimuths, covariances)
+        named = (rows.ids, rows.probabilities, tracks)
+        return fit_block(
+            LandmarkDetections, rows.stamps_ns, faults, *measured, *named, unique=False
+        )
 
     def _rows(self, topic: Topic, group: Messages, log_times_ns: Ints) -> _Rows:
         frames, count = group["range_m"].shape
-        ids, probabilities = group["candidate_ids"], group["id_probability"]
+        ids = group["candidate_ids"]
+        probabilities = group["id_probability"]
         # not in old logs
         tracks = (
             group["track"] if "track" in group.layout.columns else np.empty((frames, 0))
         )
         where = f"message {group.rows[0]} has {count} ranges"
-        azimuths, covariances = (
-            group["azimuth_rad"].shape[1],
-            group["covariance"].shape[1],
-        )
+        azimuths = group["azimuth_rad"].shape[1]
+        covariances = group["covariance"].shape[1]
         if (azimuths, covariances, ids.shape[1] % count) != (
             count,
             4 * count,
@@ -169,20 +150,23 @@ class DetectionListsAdapter(Adapter):
             raise topic.error(
                 f"{where} and {tracks.shape[1]} tracks; expected as many, or none"
             )
-        total, candidates = frames * count, ids.shape[1] // count
+        total = frames * count
+        candidates = ids.shape[1] // count
+        track = np.full(total, NO_TRACK, np.int64)
+        if tracks.size:
+            track = tracks.astype(np.int64).reshape(total)
+        values = (
+            group["range_m"].reshape(total),
+            group["azimuth_rad"].reshape(total),
+            group["covariance"].reshape(total, 2, 2),
+            track,
+        )
         return _Rows(
             np.repeat(group.rows, count),
             np.repeat(header_stamps_ns(group, log_times_ns), count),
-            (
-                group["range_m"].reshape(total),
-                group["azimuth_rad"].reshape(total),
-                group["covariance"].reshape(total, 2, 2),
-                tracks.astype(np.int64).reshape(total)
-                if tracks.size
-                else np.full(total, NO_TRACK, np.int64),
-            ),
             ids.reshape(total, candidates),
             probabilities.reshape(total, candidates),
+            values,
         )
 
 
@@ -204,16 +188,6 @@ class DetectionArrayAdapter(Adapter):
     ids: Mapping[str, int] = {}
     """Integer identity of each class that is no number: {"buoy" = 1, "ladder" = 2}."""
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        return field_paths(
-            f"{_CENTRE}.x",
-            _SCORE,
-            _CLASS,
-            f"{_RESULT}.pose.position.x",
-            f"{_RESULT}.covariance",
-        )
-
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection that has a result; the scores are the posterior, in the order of the results."""
         groups = [
@@ -221,8 +195,9 @@ class DetectionArrayAdapter(Adapter):
         ]
         if not groups:
             return None, {}
-        rows = _Joined(topic, [self._rows(topic, group) for group in groups])
+        rows = _joined(topic, [self._rows(topic, group) for group in groups])
         scores = rows.probabilities
+        # scores that are no probabilities would be taken for certainty
         worst = float(np.nanmax(scores.sum(axis=1), initial=0.0))
         if worst > 1 + ROUNDING or (scores < 0).any():
             raise topic.error(
@@ -238,28 +213,30 @@ class DetectionArrayAdapter(Adapter):
             NOT_FINITE: not_finite(ranges, azimuths, scores),
             "at the sonar itself": ranges == 0,
         }
-        fit, dropped = rows.fit(faults)
         tracks = np.full(len(ranges), NO_TRACK, np.int64)
-        return rows.detections(fit, ranges, azimuths, spread, tracks), dropped
+        measured = (ranges, azimuths, spread)
+        named = (rows.ids, scores, tracks)
+        return fit_block(
+            LandmarkDetections, rows.stamps_ns, faults, *measured, *named, unique=False
+        )
 
     def _rows(self, topic: Topic, group: Messages) -> _Rows:
         """Every detection, with the results of each at its own places; NaN: unknown."""
         counts = np.array(group.lengths("detections.results"), np.int64)
-        n, m, k = len(group), len(counts), max(1, int(counts.max()))
-        detection, result = (
-            np.repeat(np.arange(m), counts),
-            np.concatenate([np.arange(c) for c in counts]).astype(int),
-        )
-        scores, ids = np.zeros((n, m, k)), np.full((n, m, k), -1, np.int64)
+        n = len(group)
+        m = len(counts)
+        k = max(1, int(counts.max()))
+        detection = np.repeat(np.arange(m), counts)
+        result = np.concatenate([np.arange(c) for c in counts]).astype(int)
+        scores = np.zeros((n, m, k))
+        ids = np.full((n, m, k), -1, np.int64)
         scores[:, detection, result] = group[_SCORE]
         names = group.strings(_CLASS)
         ids[:, detection, result] = [
             [self._identity(topic, name) for name in message] for message in names
         ]
-        positions, covariances = (
-            np.full((n, m, 3), np.nan),
-            np.full((n, m, 3, 3), np.nan),
-        )
+        positions = np.full((n, m, 3), np.nan)
+        covariances = np.full((n, m, 3, 3), np.nan)
         if self.position == "bbox":
             positions[:] = np.stack(
                 [group[f"{_CENTRE}.{axis}"] for axis in "xyz"], axis=-1
@@ -272,15 +249,21 @@ class DetectionArrayAdapter(Adapter):
             )
             positions[:, some] = found[:, first]
             pose = group[f"{_RESULT}.covariance"].reshape(n, -1, 6, 6)[:, first, :3, :3]
+            # zeros and a negative variance are unknown
             known = pose.any(axis=(2, 3)) & (pose[..., 0, 0] >= 0)
             covariances[:, some] = np.where(known[..., None, None], pose, np.nan)
         return _Rows(
             np.repeat(group.rows, m),
             np.repeat(header_stamps_ns(group, topic.log_times_ns), m),
-            (positions.reshape(-1, 3), covariances.reshape(-1, 3, 3)),
             ids.reshape(-1, k),
             scores.reshape(-1, k),
+            (positions.reshape(-1, 3), covariances.reshape(-1, 3, 3)),
         )
+
+    def fields(self) -> Iterator[str]:
+        """Paths that a message must have."""
+        pose = (f"{_RESULT}.pose.position.x", f"{_RESULT}.covariance")
+        return iter((f"{_CENTRE}.x", _SCORE, _CLASS, *pose))
 
     def _identity(self, topic: Topic, name: str) -> int:
         try:
@@ -299,7 +282,8 @@ def range_and_azimuth(
 ) -> tuple[Floats, Floats, Floats]:
     """Range, azimuth and their covariance, shapes (n,), (n,) and (n, 2, 2), from positions and theirs."""
     x, y, _ = positions.T
-    ranges, across_squared = np.linalg.norm(positions, axis=1), x**2 + y**2
+    ranges = np.linalg.norm(positions, axis=1)
+    across_squared = x**2 + y**2
     jacobians = np.zeros((len(positions), 2, 3))
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobians[:, 0] = positions / ranges[:, None]
@@ -319,21 +303,21 @@ class LandmarkMapAdapter(Adapter):
         groups = topic.messages()
         if not groups:
             return None, {}
+        # a map is latched: the newest counts
         last = max(groups, key=lambda group: int(group.rows[-1]))
         ids, position, covariance = (
             last[name][-1] for name in ("ids", "position", "covariance")
         )
-        count, different = len(ids), len(np.unique(ids))
+        count = len(ids)
+        different = len(np.unique(ids))
         if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
             raise topic.error(
                 f"{count} ids ({different} different), {len(position)} position and {len(covariance)} covariance "
                 f"elements; expected n different, 3n and 9n"
             )
         order = np.argsort(ids)
-        positions, covariances = (
-            position.reshape(-1, 3)[order],
-            covariance.reshape(-1, 3, 3)[order],
-        )
+        positions = position.reshape(-1, 3)[order]
+        covariances = covariance.reshape(-1, 3, 3)[order]
         return LandmarkMap(ids[order].astype(np.int64), positions, covariances), {}
 
 
@@ -344,10 +328,8 @@ def detection_warnings(
 
     The odometry lasts from ``first_ns`` to ``last_ns``.
     """
-    is_range, is_azimuth = (
-        possible_ranges(detections.range_m),
-        np.abs(detections.azimuth_rad) <= FULL_TURN_RAD,
-    )
+    is_range = possible_ranges(detections.range_m)
+    is_azimuth = np.abs(detections.azimuth_rad) <= FULL_TURN_RAD
     faults = {
         "a range that is not above 0 and at most 100 km": ~is_range,
         "a covariance that is not positive definite": is_range
@@ -366,6 +348,7 @@ def detection_warnings(
             f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? Beyond a full turn they are not used"
         )
     tracked = detections.track != NO_TRACK
+    # one frame sees an object once
     pairs = np.column_stack((detections.stamps_ns[tracked], detections.track[tracked]))
     different, counts = np.unique(pairs, axis=0, return_counts=True)
     if repeated := int((counts - 1).sum()):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -12,7 +11,6 @@ from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
     LengthScale,
-    field_paths,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED
 from sonar_graph.logs.adapters.landmark_messages import NO_POSTERIOR
@@ -20,7 +18,7 @@ from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
-    fit_rows,
+    fit_block,
     not_finite,
 )
 from sonar_graph.measurements import (
@@ -37,6 +35,16 @@ from sonar_graph.states import LandmarkMap
 
 class DetectionRowsAdapter(Adapter):
     """Range, azimuth and identity of one detection a row; rows of one sonar frame share a stamp."""
+
+    PATHS = (
+        "range",
+        "azimuth",
+        "ids",
+        "probabilities",
+        "range_sigma",
+        "azimuth_sigma",
+        "track",
+    )
 
     range: str
     """Field with the slant range."""
@@ -73,13 +81,6 @@ class DetectionRowsAdapter(Adapter):
             )
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a row must have."""
-        more = (self.range_sigma, self.azimuth_sigma, self.track)
-        return field_paths(
-            self.range, self.azimuth, self.ids, self.probabilities, *more
-        )
-
     def read(self, table: FieldTable) -> tuple[LandmarkDetections | None, Dropped]:
         """Detections in the order of their stamps."""
         range_m = table.column(self.range) * self.range_scale
@@ -96,6 +97,7 @@ class DetectionRowsAdapter(Adapter):
                 f"has an identity of 2^56 or more; {ID_ADVICE}",
             )
         probability = np.zeros(ids.shape)
+        # without probabilities the recogniser is sure
         probability[:, 0] = 1.0
         if self.probabilities:
             given = table.beside(self.probabilities)
@@ -122,18 +124,16 @@ class DetectionRowsAdapter(Adapter):
             NOT_FINITE: not_finite(range_m, azimuth_rad),
             NO_POSTERIOR: no_posterior(probability),
         }
-        rows, dropped = fit_rows(table.stamps_ns, faults, unique=False)
-        measured = (range_m[rows], azimuth_rad[rows], covariance[rows])
-        identities = (ids[rows], probability[rows], track[rows])
-        return (
-            LandmarkDetections(table.stamps_ns[rows], *measured, *identities)
-            if rows.size
-            else None
-        ), dropped
+        measured = (range_m, azimuth_rad, covariance, ids, probability, track)
+        return fit_block(
+            LandmarkDetections, table.stamps_ns, faults, *measured, unique=False
+        )
 
 
 class LandmarkRowsAdapter(Adapter):
     """Identity and true position of one landmark a row; without stamps."""
+
+    PATHS = ("id", "position")
 
     id: str
     """Field with the identity, an integer."""
@@ -144,16 +144,10 @@ class LandmarkRowsAdapter(Adapter):
     world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned"."""
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a row must have."""
-        return field_paths(self.id, self.position)
-
     def read(self, table: FieldTable) -> tuple[LandmarkMap | None, Dropped]:
         """Map of the rows, of which each has another identity."""
-        ids, positions = (
-            _whole(table, self.id, -1),
-            table.beside(self.position) * self.scale,
-        )
+        ids = _whole(table, self.id, -1)
+        positions = table.beside(self.position) * self.scale
         positions = positions @ ENU_R_NED.T if self.world == "ned" else positions
         fit = (ids >= 0) & ~not_finite(positions)
         dropped: Dropped = (

@@ -21,7 +21,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from sonar_graph.errors import LogError
-from sonar_graph.files import text_of
+from sonar_graph.files import as_path, text_of
 from sonar_graph.logs.adapters.adapter import UNITS, Adapter, leaf_fields
 from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
 from sonar_graph.logs.adapters.drivers import SHIPPED
@@ -57,7 +57,14 @@ Table = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class LogConfig:
-    """Validated tables by role; keys that a table leaves out are those of the shipped adapter."""
+    """Validated tables by role; keys that a table leaves out are those of the shipped adapter.
+
+    Examples
+    --------
+    >>> from sonar_graph import LogConfig
+    >>> LogConfig.parse({"dvl": {"rotation": "frd"}}, "by hand").table("dvl")
+    {'rotation': 'frd'}
+    """
 
     tables: Mapping[str, Table] = field(default_factory=dict)
     source: str = "log configuration"
@@ -137,6 +144,7 @@ class LogConfig:
             values = base.model_dump()
             for key, value in {**table, "type": type_name}.items():
                 old = getattr(base, key, None)
+                # false takes away a field, and is a value where a switch is meant
                 if value is False and not isinstance(old, bool):
                     values[key] = None
                 elif isinstance(old, BaseModel) and isinstance(value, Mapping):
@@ -146,6 +154,7 @@ class LogConfig:
             try:
                 found.append(type(base).model_validate(values))
             except ValidationError as error:
+                # a type that is not shipped needs all of its fields
                 is_incomplete = any(
                     fault["type"] == "missing" for fault in error.errors()
                 )
@@ -177,6 +186,7 @@ class LogConfig:
                         key == "frame_id_field" and path not in known
                     )
                 if is_absent:
+                    # a misspelt field is the usual fault
                     similar = get_close_matches(path, known, 1)
                     suggestion = f"did you mean {similar[0]}? " if similar else ""
                     names = ", ".join(name + size for name, size in known.items())
@@ -237,6 +247,13 @@ def read_log_config(path: Path) -> LogConfig:
     except (ValueError, RecursionError) as error:
         raise LogError(f"{path}: not TOML: {error}") from error
     return LogConfig.parse(values, str(path))
+
+
+def as_log_config(value: LogConfig | str | Path | None, call: str) -> LogConfig | None:
+    """A log configuration, or that in a TOML file; an `ArgumentError` that names the ``call`` where it is neither."""
+    if isinstance(value, LogConfig | None):
+        return value
+    return read_log_config(as_path(value, f"{call}(path, config=FILE or LogConfig)"))
 
 
 _WIDTH = 120

@@ -2,15 +2,16 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
-from sonar_graph.measurements import NS_PER_S, Ints
+from sonar_graph.measurements import NS_PER_S, Block, Ints
 
+Rows = TypeVar("Rows", bound=Block)
 Dropped = dict[str, int]
 """Number of rows left out, by reason."""
 NOT_FINITE = "with values that are not finite or beyond 1e15"
@@ -75,7 +76,8 @@ class MessageTable(FieldTable):
         stamp_unit_s: float = 1.0,
         stamp_offset_s: float = 0.0,
     ) -> None:
-        self.topic, self.source = topic, f"topic {topic.name}"
+        self.topic = topic
+        self.source = f"topic {topic.name}"
         self.groups = topic.messages()
         if not self.groups:
             faults = ", ".join(
@@ -149,6 +151,7 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
     finite = np.where(np.isfinite(values), values, 0)
     if unit_ns < 1 or abs(unit_ns - round(unit_ns)) > 1e-9 * unit_ns:
         return np.rint(finite * unit_ns).astype(np.int64)
+    # seconds since 1970 as a double lose nanoseconds when they are multiplied
     whole = np.floor(finite)
     return whole.astype(np.int64) * round(unit_ns) + np.rint(
         (finite - whole) * unit_ns
@@ -178,7 +181,22 @@ def fit_rows(
     rows: Ints = np.flatnonzero(fit).astype(np.int64)
     rows = rows[np.argsort(stamps_ns[rows], kind="stable")]
     if unique and rows.size:
+        # estimators need increasing stamps
         again = np.diff(stamps_ns[rows], prepend=stamps_ns[rows[0]] - 1) == 0
         counts[SAME_STAMP] = int(np.count_nonzero(again))
         rows = rows[~again]
     return rows, {fault: count for fault, count in counts.items() if count}
+
+
+def fit_block(
+    kind: type[Rows],
+    stamps_ns: Ints,
+    faults: Mapping[str, NDArray[np.bool_]],
+    *columns: NDArray[Any],
+    unique: bool = True,
+) -> tuple[Rows | None, Dropped]:
+    """Block of the rows that `fit_rows` chooses, None without any, and the number of the others by fault."""
+    rows, dropped = fit_rows(stamps_ns, faults, unique=unique)
+    if not rows.size:
+        return None, dropped
+    return kind(stamps_ns[rows], *(column[rows] for column in columns)), dropped

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters.adapter import Adapter, field_paths
+from sonar_graph.logs.adapters.adapter import Adapter
 from sonar_graph.logs.adapters.message_table import MessageTable
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
@@ -41,6 +41,18 @@ class _Images(NamedTuple):
 class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
+    PATHS = (
+        "data",
+        "ranges",
+        "range_resolution",
+        "bearings",
+        "sample_type",
+        "sample_bytes",
+        "big_endian",
+        "row_gains",
+        "row_bytes",
+        "directions",
+    )
     reads_table = False
     data: str
     """Field with the image's bytes."""
@@ -78,20 +90,6 @@ class SonarAdapter(Adapter):
             raise ValueError("give either bearings or directions")
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        single = (
-            self.data,
-            self.ranges,
-            self.range_resolution,
-            self.bearings,
-            self.sample_type,
-            self.sample_bytes,
-        )
-        return field_paths(
-            *single, self.big_endian, self.row_gains, self.row_bytes, self.directions
-        )
-
     def read(
         self, topic: Topic, refused: Refused | None = None
     ) -> Iterator[SonarFrames]:
@@ -105,6 +103,7 @@ class SonarAdapter(Adapter):
         is_any_sound = bool(topic.messages())
         if refused is not None:
             instants, counts = np.unique(recorded_ns, return_counts=True)
+            # unsound messages are known by their times alone
             sound_ns = np.sort(topic.log_times_ns)
             sound = np.searchsorted(sound_ns, instants, "right") - np.searchsorted(
                 sound_ns, instants
@@ -127,7 +126,9 @@ class SonarAdapter(Adapter):
         )
         within = np.concatenate([np.arange(len(images.rows)) for images in blocks])
         order = np.argsort(rows)
-        rows, block, within = rows[order], block[order], within[order]
+        rows = rows[order]
+        block = block[order]
+        within = within[order]
         begins = (
             np.flatnonzero((np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0))
             + 1
@@ -172,6 +173,7 @@ class SonarAdapter(Adapter):
             azimuths_rad = sign * np.radians(
                 group[str(self.bearings)].astype(float) * self.bearing_unit_deg
             )
+        # a sonar changes range or gain between pings: each setting is a block
         same = np.column_stack([kinds, bins_m, azimuths_rad])
         _, first, block = np.unique(
             same, axis=0, return_index=True, return_inverse=True
@@ -216,9 +218,11 @@ class SonarAdapter(Adapter):
                 )
         dtype = np.dtype((">" if big_endian > 0 else "<") + name)
         data = np.ascontiguousarray(data).view(np.uint8)
-        size, head = data.shape[1], _GAIN_BYTES if row_gains > 0 else 0
+        size = data.shape[1]
+        head = _GAIN_BYTES if row_gains > 0 else 0
         if self.image_order == "range-major":
             used = head + beams * dtype.itemsize
+            # rows may be padded
             row_bytes = row_bytes if row_bytes > 0 else used
             row_count = size // max(row_bytes, 1)
         else:
@@ -242,6 +246,7 @@ class SonarAdapter(Adapter):
                 .view("<u4")
                 .astype(np.float32)
             )
+            # the gain of a row is of power, and samples are amplitudes
             values = (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32)
         return (
             values.transpose(0, 2, 1) if self.image_order == "range-major" else values

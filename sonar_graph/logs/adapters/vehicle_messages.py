@@ -11,6 +11,7 @@ of translation, then rotation, along the fixed axes of the header's frame. With 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,20 +24,19 @@ from sonar_graph.logs.adapters.adapter import (
     CovarianceFields,
     DepthScale,
     ForceScale,
-    LengthScale,
     RateScale,
     SignedAxes,
     axes_matrix,
-    field_paths,
     turn,
 )
-from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
+from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, PlaceAdapter
 from sonar_graph.logs.adapters.geodesy import Origin
 from sonar_graph.logs.adapters.message_table import (
     LARGEST,
     NOT_FINITE,
     Dropped,
     FieldTable,
+    fit_block,
     fit_rows,
     not_finite,
 )
@@ -51,6 +51,13 @@ LEAST_MOVE_M = 1.0
 
 class ImuAdapter(Adapter):
     """Angular rate and specific force."""
+
+    PATHS = (
+        "angular_velocity",
+        "linear_acceleration",
+        "angular_velocity_status",
+        "linear_acceleration_status",
+    )
 
     angular_velocity: Paths
     """Fields of the rates about x, y, z."""
@@ -71,15 +78,11 @@ class ImuAdapter(Adapter):
     unfilled: Literal["all", "each"] = "all"
     """"all": zeros are not measured where all messages have them; "each": wherever a message has them."""
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        status = (self.angular_velocity_status, self.linear_acceleration_status)
-        return field_paths(self.angular_velocity, self.linear_acceleration, *status)
-
     def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
         force = self._force(table)
+        # NaN is what estimators take as not measured
         unmeasured = _is_marked(
             table, self.linear_acceleration_status, force
         ) | self._is_force_unfilled(table, force)
@@ -89,16 +92,12 @@ class ImuAdapter(Adapter):
             unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force
         )
         is_unmeasured = _is_marked(table, self.angular_velocity_status, rate)
-        rows, dropped = fit_rows(
-            table.stamps_ns,
-            {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)},
-            unique=True,
-        )
-        rate = turn(self.rotation, rate[rows])
+        faults = {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)}
+        rate = turn(self.rotation, rate)
         if self.angular_velocity_axes is not None:
             rate = turn(self.angular_velocity_axes, rate)
-        force = turn(self.rotation, force[rows])
-        return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
+        force = turn(self.rotation, force)
+        return fit_block(Imu, table.stamps_ns, faults, rate, force)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about values that the driver does not fill, or fills with what is no number."""
@@ -184,6 +183,7 @@ def _is_denied(status: np.ndarray, values: Floats) -> bool:
     """Tell whether a driver calls all rows not measured, although the values change as measured ones do."""
     if not (status == -1).all():
         return False
+    # a driver that fills in -1 everywhere would lose its whole log
     finite = values[np.isfinite(values).all(axis=1)]
     return len(finite) > 1 and bool(
         np.any(finite[1:] != finite[:-1], axis=1).mean() > 0.5
@@ -192,6 +192,9 @@ def _is_denied(status: np.ndarray, values: Floats) -> bool:
 
 class DepthAdapter(Adapter):
     """Height of the pressure port, from a pressure or from a field in metres."""
+
+    PATHS = ("pressure", "height", "variance")
+    NEEDS = ("gravity_m_s2",)
 
     pressure: str | None = None
     """Field with a pressure."""
@@ -212,12 +215,6 @@ class DepthAdapter(Adapter):
             raise ValueError("give either pressure or height")
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        return field_paths(
-            self.pressure, self.height, self.variance.fields if self.variance else None
-        )
-
     def read(
         self, table: FieldTable, gravity_m_s2: float
     ) -> tuple[Depth | None, Dropped]:
@@ -237,14 +234,8 @@ class DepthAdapter(Adapter):
             variance_m2 = variance_m2 / pascals_per_metre**2
         else:
             z_m = table.column(str(self.height)) * self.scale
-        rows, dropped = fit_rows(
-            table.stamps_ns, {NOT_FINITE: not_finite(z_m)}, unique=True
-        )
-        return (
-            Depth(table.stamps_ns[rows], z_m[rows], variance_m2[rows])
-            if rows.size
-            else None
-        ), dropped
+        faults = {NOT_FINITE: not_finite(z_m)}
+        return fit_block(Depth, table.stamps_ns, faults, z_m, variance_m2)
 
     def assumption(self, gravity_m_s2: float) -> str | None:
         """Formula from pressure to height for the notes; None where the message gives a height."""
@@ -258,6 +249,7 @@ class DepthAdapter(Adapter):
         """Warning about a pressure below the atmosphere's."""
         if self.pressure is None:
             return
+        # the first and last rows of a dive are at the surface
         typical_pa = float(np.nanmedian(table.column(self.pressure))) * self.scale
         if typical_pa < 0.5 * self.atmosphere_pa:
             yield (
@@ -266,19 +258,15 @@ class DepthAdapter(Adapter):
             )
 
 
-class TruthAdapter(Adapter):
+class TruthAdapter(PlaceAdapter):
     """Poses of the body; a twist is not used.
 
     From world and body axes of the driver (``w``, ``b``) to those of this package: ``R = enu_R_w w_R_b ours_R_b^T``.
     """
 
+    PATHS = ("position", "geodetic", "orientation", "rpy", "covariance")
+
     frame_id_field: str | None = None
-    position: Paths | None = None
-    """Fields of x, y, z in the world."""
-    scale: LengthScale = 1.0
-    """Turns them into metres; 0.001 or "mm" from millimetres."""
-    geodetic: GeodeticFields | None = None
-    """Fields of a position on the Earth instead."""
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w; false: only positions are true, and no heading is scored."""
     rpy: Paths | None = None
@@ -289,49 +277,26 @@ class TruthAdapter(Adapter):
     """Array field of 36: position, then rotation, along the world's axes, as ROS has it."""
     covariance_meaning: Literal["variance", "standard deviation"] = "variance"
     """"variance", or "standard deviation" where the driver puts those on the diagonal."""
-    world: Literal["enu", "ned"] = "enu"
-    """"enu" (any world with z up), or "ned"."""
 
     @model_validator(mode="after")
-    def _has_one_source(self) -> TruthAdapter:
-        if (self.geodetic is None) == (self.position is None):
-            raise ValueError(
-                "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
-            )
+    def _has_one_turn(self) -> TruthAdapter:
         if self.orientation is not None and self.rpy is not None:
             raise ValueError(
                 "give either orientation = [x, y, z, w] or rpy = [roll, pitch, yaw]"
             )
         return self
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        geodetic = self.geodetic.paths() if self.geodetic else None
-        return field_paths(
-            self.position, geodetic, self.orientation, self.rpy, self.covariance
-        )
-
     def read(
         self, table: FieldTable, origin: Origin | None = None
     ) -> tuple[Trajectory | None, Dropped]:
         """Poses with covariances, NaN: unknown; ``origin`` in degrees and metres, of positions on the Earth."""
-        faults: dict[str, np.ndarray] = {}
-        if self.geodetic is not None:
-            positions, is_fix, _ = self.geodetic.positions(table, origin)
-            faults[f"without a fix{self.geodetic.beyond(table)}"] = ~is_fix
-        else:
-            positions = _scaled(table.beside(self.position or ()), self.scale)
-            faults[NOT_FINITE] = not_finite(positions)
+        positions, faults, _ = self.places(table, origin)
         if self.orientation is None and self.rpy is None:
             rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-            positions = (
-                positions[rows] @ ENU_R_NED.T
-                if self.world == "ned" and self.position
-                else positions[rows]
-            )
-            return Trajectory.of_positions(
-                table.stamps_ns[rows], positions
-            ) if rows.size else None, dropped
+            if not rows.size:
+                return None, dropped
+            stamps_ns = table.stamps_ns[rows]
+            return Trajectory.of_positions(stamps_ns, positions[rows]), dropped
         quaternions = self._quaternions(table)
         lengths = np.linalg.norm(quaternions, axis=1)
         faults[NOT_FINITE] = not_finite(positions, quaternions)
@@ -341,34 +306,29 @@ class TruthAdapter(Adapter):
             return None, dropped
         # unit quaternions keep every bit
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
-        positions, quaternions = positions[rows], (quaternions / scale[:, None])[rows]
+        quaternions = (quaternions / scale[:, None])[rows]
         enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
         if self.world != "enu" or self.rotation != "flu":
-            matrices = SpatialRotation.from_quat(quaternions).as_matrix()
-            turned = SpatialRotation.from_matrix(
-                enu_R_world @ matrices @ axes_matrix(self.rotation).T
-            )
-            positions, quaternions = positions @ enu_R_world.T, turned.as_quat()
+            world_R_driver = SpatialRotation.from_quat(quaternions).as_matrix()
+            driver_R_body = axes_matrix(self.rotation).T
+            quaternions = SpatialRotation.from_matrix(
+                enu_R_world @ world_R_driver @ driver_R_body
+            ).as_quat()
         truth = Trajectory.without_covariances(
-            table.stamps_ns[rows], positions, quaternions
+            table.stamps_ns[rows], positions[rows], quaternions
         )
         if self.covariance is None:
             return truth, dropped
-        covariances = table.column(self.covariance)
-        if covariances.shape[1:] != (36,):
+        C = table.column(self.covariance)
+        if C.shape[1:] != (36,):
             table.refuse(self.covariance, "is no array of 36 numbers")
-        covariances = covariances.reshape(-1, 6, 6)[rows]
+        C = C.reshape(-1, 6, 6)[rows]
         if self.covariance_meaning == "standard deviation":
-            covariances = np.where(
-                covariances < 0, covariances, covariances**2
-            ) * np.eye(6)
+            C = np.where(C < 0, C, C**2) * np.eye(6)
         if self.world != "enu":
             W = np.kron(np.eye(2), enu_R_world)
-            covariances = W @ covariances @ W.T
-        covariances = ros_to_body(covariances, truth.matrices)
-        return Trajectory(
-            truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances
-        ), dropped
+            C = W @ C @ W.T
+        return replace(truth, covariances=ros_to_body(C, truth.matrices)), dropped
 
     def _quaternions(self, table: FieldTable) -> np.ndarray:
         """Orientations x, y, z, w, shape (n, 4); zeros where an angle is not finite."""
@@ -383,22 +343,15 @@ class TruthAdapter(Adapter):
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about an orientation that never changes while the vehicle moves."""
-        if (
-            (self.orientation is None and self.rpy is None)
-            or self.position is None
-            or len(table) < 2
-        ):
+        has_turns = self.orientation is not None or self.rpy is not None
+        if not has_turns or self.position is None or len(table) < 2:
             return
-        quaternions, positions = (
-            self._quaternions(table),
-            _scaled(table.beside(self.position), self.scale),
-        )
+        quaternions = self._quaternions(table)
+        positions = self.scaled(table)
         moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
-        if (
-            np.isfinite(moved_m)
-            and moved_m > LEAST_MOVE_M
-            and not (quaternions != quaternions[0]).any()
-        ):
+        is_turning = (quaternions != quaternions[0]).any()
+        # False for a NaN
+        if LEAST_MOVE_M < moved_m < np.inf and not is_turning:
             yield (
                 f"its orientation is the same in all {len(table)} messages, although it moves by {moved_m:.3g} m: if "
                 "that is none, `orientation = false` under [truth] in the log configuration; no heading is then scored"
@@ -417,6 +370,7 @@ def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
 def ros_to_body(covariances: Floats, rotations: Floats) -> Floats:
     """Inverse of `body_to_ros`; all zeros, or a negative variance, mean unknown and become NaN."""
     swap = _swap(rotations).transpose(0, 2, 1)
+    # ROS has no other mark for unknown
     known = np.any(covariances != 0, axis=(1, 2)) & (
         np.diagonal(covariances, axis1=1, axis2=2) >= 0
     ).all(axis=1)

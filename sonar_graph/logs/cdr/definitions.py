@@ -320,6 +320,7 @@ class _Parser:
             self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1
             for entry in struct.fields
         )
+        # nested definitions grow exponentially
         if self._sizes[name] > _MOST_FIELDS:
             raise LogError(
                 f"the definition of {name} has more than {_MOST_FIELDS} fields; no real one has"
@@ -332,6 +333,7 @@ class _Parser:
             return type_name
         package = owner.split("/", 1)[0]
         wanted = short_name(type_name)
+        # old definitions write Header without its package
         wanted = {"Header": "std_msgs/Header"}.get(
             wanted, wanted if "/" in wanted else f"{package}/{wanted}"
         )

@@ -228,7 +228,8 @@ class Plan:
         if not definition.fields:
             values.append(Value(prefix, "u1", 1, is_single))
         for entry in definition.fields:
-            path, single = prefix + entry.name, is_single and not entry.is_array
+            path = prefix + entry.name
+            single = is_single and not entry.is_array
             if isinstance(entry.kind, Struct) and not entry.is_array:
                 self._add(entry.kind, path + ".", single, steps, values)
             elif (
@@ -395,7 +396,8 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
         raise UnsoundMessageError(
             f"encoded as {kind or payload[:HEADER_BYTES].hex()} instead of plain CDR"
         )
-    unpack, size = _UNPACK_LENGTH[order], len(payload)
+    unpack = _UNPACK_LENGTH[order]
+    size = len(payload)
 
     def read_length(step: DecodingStep, at: int) -> int:
         if at + LENGTH_BYTES > size:
@@ -423,7 +425,8 @@ def unsound_contents(
             has_it = np.asarray((payloads[:, start : start + count] > 1).any(axis=1))
             if has_it.any():
                 yield f"with a boolean {path} that is neither 0 nor 1", has_it
-    many, first = len(payloads) > 1, payloads[0].data
+    many = len(payloads) > 1
+    first = payloads[0].data
     for path in layout.plan.texts:
         column = layout.column(path)
         for start, length in zip(column.starts, column.counts, strict=True):

@@ -124,7 +124,8 @@ class Decoder:
         groups = []
         for rows, stack in payloads:
             for layout, members in self._by_layout(rows, stack):
-                first, last = int(members[0]), int(members[-1])
+                first = int(members[0])
+                last = int(members[-1])
                 # a view where they lie side by side
                 found = (
                     stack[first : last + 1]
@@ -150,6 +151,7 @@ class Decoder:
     def _by_layout(self, rows: Ints, stack: Bytes) -> Iterator[tuple[Layout, Ints]]:
         """Layouts of payloads of one length, each with the places of its payloads in the stack."""
         known = self._known[stack.shape[1]]
+        # most messages of a topic share one layout: compare before walking
         left = np.arange(len(stack))
         for layout in known:
             same = layout.same(stack, left)
@@ -163,6 +165,7 @@ class Decoder:
                 continue
             same = found.same(stack, left) if left.size > 1 else np.ones(1, bool)
             yield found, left[same]
+            # texts that change in length give nearly every message a layout of its own
             if np.count_nonzero(same) * _ROWS_COMPARED_PER_WALK < left.size:
                 yield from self._one_by_one(rows, stack, left[~same])
                 return
@@ -235,6 +238,7 @@ def encode(
             continue
         given = np.asarray(value)
         with np.errstate(invalid="ignore"):  # checked in the next line
+            # casting silently wraps integers
             numbers = given.astype(column.dtype)
         if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
             raise ValueError(f"{path}: a number does not fit into {column.dtype}")
@@ -288,7 +292,8 @@ def _given_lengths(
 
 def _view(payloads: Bytes, column: PayloadColumn) -> NDArray[Any] | None:
     """Column without copying, shape (n, m); None where its parts are not evenly spaced single values."""
-    starts, size = column.starts, column.dtype.itemsize
+    starts = column.starts
+    size = column.dtype.itemsize
     if not starts:
         return np.empty((len(payloads), 0), column.dtype)
     values = payloads[:, starts[0] : starts[0] + column.counts[0] * size].view(
@@ -296,6 +301,7 @@ def _view(payloads: Bytes, column: PayloadColumn) -> NDArray[Any] | None:
     )
     if len(starts) == 1:
         return values
+    # one strided view replaces a copy
     spacing = starts[1] - starts[0]
     if any(count != 1 for count in column.counts) or starts != list(
         range(starts[0], starts[-1] + 1, spacing)

@@ -208,6 +208,12 @@ class TimeWindow:
     """Part of a log from ``start`` up to but not including ``end``; None: from the beginning, to the end.
 
     The times of recording count, not the sensors' stamps, because only the former are in a file's index.
+
+    Examples
+    --------
+    >>> from sonar_graph import TimeWindow
+    >>> TimeWindow.parse("10", None).start
+    Instant(seconds=10.0, absolute_ns=None)
     """
 
     start: Instant | None = None

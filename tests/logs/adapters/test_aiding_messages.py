@@ -81,6 +81,14 @@ NED_NORTH_WEST = Rotation.from_euler("ZYX", [np.radians(-45), 0.1, 0.2])
 OFFSET = "[heading]\nyaw_offset_rad = 0.25"
 COMPASS = 'type = "std_msgs/msg/Float64"\nyaw = "data"\nstamp = "log"\nframe_id_field = false\nworld = "ned"\n'
 BY_EAST = f"{FRD_DVL}[positions.geodetic]\norigin_deg_m = [1e-3, 7.0, 15.0]"
+# the numbers of the covariance stand in for angles
+NED_ON_EARTH = f"""{FRD_DVL}[truth]
+type = "sensor_msgs/msg/NavSatFix"
+topic = "/truth/fix"
+world = "ned"
+geodetic = {{latitude = "latitude", longitude = "longitude", height = "altitude"}}
+rpy = ["position_covariance[1]", "position_covariance[2]", "position_covariance[3]"]
+"""
 # fmt: off
 CASES: dict[str, Case] = {
     "orientation that says its variance": (
@@ -152,6 +160,9 @@ EARTH: dict[str, Case] = {
     "true positions from satellites, with the origin of the fixes": (
         [fixes(fix()), fixes(fix(2.0), fix(3.0), topic="/truth/fix")], "",
         {"truth.positions": [[0, 2, 0], [0, 3, 0]], "positions.position_m": [[0, 0, 0]]}, {}),
+    "true places on the Earth have no axes of their own": (
+        [fixes(fix()), fixes(fix(2.0), fix(3.0), topic="/truth/fix")], NED_ON_EARTH,
+        {"truth.positions": [[0, 2, 0], [0, 3, 0]]}, {}),
 }
 # fmt: on
 
