@@ -591,7 +591,6 @@ def heading_findings(
     rows = findings_of(HEADING, found, right, config)
     yield from rows
     if not rows[0].grave:
-        yield from start_heading_findings(right, motion)
         yield from heading_turn(right, config, motion)
 
 

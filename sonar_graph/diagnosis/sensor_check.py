@@ -28,6 +28,7 @@ from sonar_graph.diagnosis.aiding_check import (
     heading_findings,
     position_findings,
     start_depth_findings,
+    start_heading_findings,
     vertical_bias,
 )
 from sonar_graph.diagnosis.axes import AxesMatch, match_axes
@@ -407,6 +408,9 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
     if vertical is not None and not is_heading_wrong:
         found.append(vertical)
     found += of_heading
+    # positions, where there are any, give the angle itself
+    if not any(f.acts for f in of_heading):
+        found += start_heading_findings(right, motion)
     found += position_findings(right, config, motion)
     # a wrong unit of either makes another height too
     if not any(f.grave for f in found):

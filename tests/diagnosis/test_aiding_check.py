@@ -416,3 +416,22 @@ def test_a_delay_of_the_sonar_is_found_by_the_turns_between_sightings(late_s: fl
     assert delay.acts == (late_s > 0)
     if late_s:
         assert line_of(delay)["stamp_offset_s"] == pytest.approx(-late_s, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("off_rad", "is_stated", "is_named"),
+    [(1.0, True, True), (0.1, True, False), (1.0, False, False)],
+)
+def test_first_headings_far_from_a_stated_start_are_grave(
+    off_rad: float, is_stated: bool, is_named: bool
+):
+    run = compass(RIGHT, lambda yaw_rad: yaw_rad + off_rad)
+    yaw_rad = RIGHT.truth.rotations().as_euler("ZYX")[0, 0]
+    start = Start(rpy_rad=(0.0, 0.0, yaw_rad)) if is_stated else Start()
+    run = replace(run, calibration=run.calibration.model_copy(update={"start": start}))
+    motion = BodyMotion.of(run)
+    assert motion is not None
+    found = list(aiding_check.start_heading_findings(run, motion))
+    assert [finding.grave for finding in found] == [True] * is_named
+    if is_named:
+        assert found[0].estimate.value == pytest.approx(np.degrees(off_rad), abs=3.0)
