@@ -244,6 +244,8 @@ def axes_findings(
     findings = list[Finding]()
     # gyros and Doppler log agree with each other: rates are reflected the other way
     is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
+    # gravity is felt upwards: of the accelerometers only level axes can be wrong
+    is_force &= found.dvl[2, 2] == 1.0
     if is_force and (found.dvl != np.eye(3)).any():
         return force_axes(found, sequence, config)
     if (found.gyro != np.eye(3)).any():
