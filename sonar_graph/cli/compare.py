@@ -329,6 +329,11 @@ def compare_log(
         found_in_sensors = notes_of(
             check_sensors(sequence, reading.config or LogConfig())
         )
+    if of_reading := sequence.notes.get("log.doubtful"):
+        of_sensors = found_in_sensors.get("log.doubtful", "")
+        found_in_sensors["log.doubtful"] = "; ".join(
+            text for text in (of_reading, of_sensors) if text
+        )
     sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
     found = None
     # what was recognised is in it: estimates are those of the live run

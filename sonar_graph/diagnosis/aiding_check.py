@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.diagnosis.findings import (
+    ACTING_SIGMAS,
     IN_CALIBRATION,
     IN_LOG_CONFIG,
     NO_NEED,
@@ -29,10 +30,12 @@ from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     Match,
     match,
+    root_mean_square,
 )
 from sonar_graph.diagnosis.start import LEAST_BIAS_RAD_S, turned_mounting
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, PositionFixes
+from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
@@ -106,8 +109,12 @@ class Check:
     scale_key: str = "scale"
     systematic: float = 0.0
     """Sigma of the gain by what the comparison leaves out."""
+    slow_sigma: Callable[[Sequence], float] = lambda _: 0.0
+    """Error of sensor and reference that changes as slowly as the motion, in the sensor's unit: blocks of rows hide it."""
     least_scale: float = 0.03
     least_lag_s: float = 0.1
+    reach: Callable[[Sequence, Match], float] = lambda _, found: found.moved
+    """What the error of a gain is multiplied by, in the sensor's unit."""
     quantity: str = ""
     """Name of the gain where it is not made from the others."""
     is_angle: bool = False
@@ -151,7 +158,19 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
     rows = motion.stretches(t, depth.z_m, motion.reference(height), longest_s)
-    return match(rows, drift_sigma=0.03)
+    found = match(rows, drift_sigma=0.03)
+    return found.less_certain(motion.sampling_error(motion.height_m))
+
+
+def climb_sigma(sequence: Sequence) -> float:
+    """Error of a height reckoned by the Doppler log over `CLIMB_S`, about a line, m.
+
+    The integral of white noise is a random walk, and about a line an eighth of its end's error is left in a gain.
+    """
+    interval_s = float(np.median(np.diff(sequence.dvl.stamps_ns))) / NS_PER_S
+    duration_s = min(sequence.duration_s, CLIMB_S)
+    velocity_m_s = max(sequence.calibration.dvl.velocity_sigma_m_s)
+    return velocity_m_s * float(np.sqrt(interval_s * duration_s)) / 8.0
 
 
 def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -175,7 +194,8 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    return match(motion.stretches(t, level, motion.reference(path)))
+    found = match(motion.stretches(t, level, motion.reference(path)))
+    return found.less_certain(motion.sampling_error(motion.path_m))
 
 
 def is_level_fix(fixes: PositionFixes) -> NDArray[np.bool_]:
@@ -194,13 +214,16 @@ def sighting_match(
         changes = sighting_changes(sequence, motion, sign)
         if changes is None:
             return None
-        found[sign] = (changes, match([changes.azimuth], find_lag=False))
+        # only turns show a delay: ranges change evenly
+        found[sign] = (changes, match([changes.azimuth], find_lag=not of_range))
     # a landmark's place depends on its azimuth: a mirrored one is more than a gain of -1
     is_mirrored = found[-1.0][1].scatter < found[1.0][1].scatter / CLEARLY_BETTER
     changes, by_azimuth = found[-1.0 if is_mirrored else 1.0]
     if of_range:
         return match([changes.range], find_lag=False)
-    return replace(by_azimuth, is_mirrored=is_mirrored)
+    # a delay turns landmarks about the vehicle as fast as it turns, not as changes of the azimuth change
+    turn_rate = root_mean_square([np.diff(motion.yaw_rad) / np.diff(motion.seconds)])
+    return replace(by_azimuth, is_mirrored=is_mirrored, rate=turn_rate)
 
 
 DEPTH = Check(
@@ -209,6 +232,7 @@ DEPTH = Check(
     against="the Doppler log's vertical velocity",
     compare=depth_match,
     sigma=lambda sequence: max(sequence.calibration.depth.sigma_m, 0.02),
+    slow_sigma=climb_sigma,
     units=LENGTHS | PRESSURES,
     sense=lambda config: Advice(
         "it rises where the vehicle sinks by the Doppler log: depths downwards, or an altimeter?",
@@ -225,6 +249,7 @@ HEADING = Check(
     against="the gyros",
     compare=heading_match,
     sigma=lambda sequence: sequence.calibration.heading.sigma_rad,
+    slow_sigma=lambda sequence: 0.1 * sequence.calibration.heading.bias_sigma_rad,
     units=DEGREES,
     sense=lambda config: Advice(
         "it turns against the gyros, clockwise", other_world(config, "heading")
@@ -244,6 +269,9 @@ POSITIONS = Check(
     against="the path by gyros and Doppler log",
     compare=fix_match,
     sigma=lambda sequence: level_sigma_m(sequence.calibration.positions.sigma_m),
+    slow_sigma=lambda sequence: (
+        0.1 * level_sigma_m(sequence.calibration.positions.sigma_m)
+    ),
     units=LENGTHS | {"degrees": 1.1e5},
     sense=lambda config: Advice(
         "north and east are exchanged",
@@ -264,6 +292,8 @@ RANGE = Check(
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
     units=LENGTHS,
     scale_key="range_scale",
+    # landmarks are wrong by the error of the whole range, not of its changes
+    reach=lambda sequence, _: typical_sighting(sequence)[0],
     sense=lambda _: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}",
@@ -282,6 +312,7 @@ AZIMUTH = Check(
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units=DEGREES,
     scale_key="azimuth_scale",
+    reach=lambda sequence, _: typical_sighting(sequence)[1],
     sense=lambda config: Advice(
         "they turn with the vehicle, mirrored",
         f'{scale_line("detections", "azimuth_scale", config, -1.0)}; of a Detection3DArray `rotation = "frd"`',
@@ -294,6 +325,18 @@ AZIMUTH = Check(
     is_angle=True,
 )
 CHECKS = (DEPTH, RANGE, AZIMUTH, HEADING, POSITIONS)
+
+
+def typical_sighting(sequence: Sequence) -> tuple[float, float]:
+    """Range, m, and size of the azimuth, rad, of sightings that can be used, root mean squares; 0 without any."""
+    seen = sequence.detections
+    if seen is None or not (is_sound := seen.are_sound()).any():
+        return 0.0, 0.0
+    mean_squares = [
+        float(np.mean(np.square(values[is_sound])))
+        for values in (seen.range_m, seen.azimuth_rad)
+    ]
+    return float(np.sqrt(mean_squares[0])), float(np.sqrt(mean_squares[1]))
 
 
 def level_sigma_m(sigma_m: tuple[float, float, float]) -> float:
@@ -313,6 +356,8 @@ def findings_of(
     size = abs(found.gain.value)
     if not found.gain.is_known:
         return [Finding(quantity, found.gain)]
+    by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
+    found = found.less_certain(float(np.hypot(by_slow, check.systematic)))
     if not found.moved * max(1.0, size) > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
     gain = found.gain.limited(LARGEST_GAIN_SIGMA * max(1.0, size), still)
@@ -329,12 +374,11 @@ def findings_of(
         ]
     if not gain.is_known:
         return [Finding(quantity, gain)]
-    error = abs(size - 1.0) * found.moved
+    error = abs(size - 1.0) * check.reach(sequence, found)
     # a scale matters only where its error shows beside the noise of a row
     is_off = matters(replace(gain, value=size - 1.0), check.least_scale)
     acts = is_off and error > sigma and not check.slips(sequence)
-    known = replace(gain, sigma=float(np.hypot(gain.sigma, check.systematic)))
-    row = Finding(quantity, known, cause=NO_NEED)
+    row = Finding(quantity, gain, cause=NO_NEED)
     if acts:
         advice = check.scaled(config, size)
         row = replace(
@@ -344,7 +388,8 @@ def findings_of(
             line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
             gravity=gravity_of(acts, error > GRAVE_ERROR * sigma),
         )
-    if not found.lag.is_known:
+    # wheels start to slip in turns: no delay of a sensor
+    if not found.lag.is_known or check.slips(sequence):
         return [row]
     return [row, lag_finding(check, found, sigma, config)]
 
@@ -365,7 +410,8 @@ def grave_fault(
     if found.is_mirrored or (gain.is_known and gain.value < 0):
         return check.sense(config)
     other_unit = SLIPPING_UNIT if check.slips(sequence) else OTHER_UNIT
-    if gain.is_known and not 1 / other_unit < size < other_unit:
+    is_sure = matters(replace(gain, value=size - 1.0), 0.0)
+    if is_sure and not 1 / other_unit < size < other_unit:
         return unit_advice(check, size, config)
     # sightings that contradict the motion are wrong identities as a rule, which the estimators name
     is_scattered = found.scatter > LARGEST_SCATTER * sigma and not check.is_sighting
@@ -471,9 +517,36 @@ def vertical_bias(
     )
 
 
-FARTHEST_FROM_START_M = 2.0
-"""Height that a vehicle gains about the start, with its depth sensor's error."""
+FARTHEST_FROM_START_M = 0.5
+"""Difference between the height of a start and that of the first depths that waves and a rough start make."""
 FIRST_ROWS = 5
+
+
+def fix_height_findings(sequence: Sequence) -> Iterator[Finding]:
+    """Depths at another height than the position fixes, where no start decides which of them is wrong."""
+    depth = sequence.depth
+    fixes = sequence.positions
+    if depth is None or fixes is None or sequence.calibration.start.source == "stated":
+        return
+    heights_m2 = fixes.covariance_m2[:, 2, 2]
+    inside = fixes.are_sound() & ~(heights_m2 >= 0.5 * UNMEASURED_M2)
+    inside &= fixes.stamps_ns >= depth.stamps_ns[0]
+    inside &= fixes.stamps_ns <= depth.stamps_ns[-1]
+    if np.count_nonzero(inside) < NEAR_START:
+        return
+    by_depth = np.interp(fixes.stamps_ns[inside], depth.stamps_ns, depth.z_m)
+    off_m = float(np.median(fixes.position_m[inside, 2] - by_depth))
+    sigma_m = sequence.calibration.positions.sigma_m[2]
+    if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
+        return
+    yield Finding(
+        "depth: height of the position fixes over it",
+        Estimate1D(off_m, sigma_m),
+        "m",
+        cause="another origin, sign or unit of the depths, or another height of the fixes?",
+        line=f"{unused('depth')} leaves the depths out",
+        gravity=Gravity.GRAVE,
+    )
 
 
 def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
@@ -484,10 +557,15 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     if depth is None or not is_stated:
         return
     first = max(int(np.searchsorted(depth.stamps_ns, sequence.start_ns)) - 1, 0)
-    height_m = float(np.median(depth.z_m[first : first + FIRST_ROWS]))
+    rows_m = depth.z_m[first : first + FIRST_ROWS]
+    height_m = float(np.median(rows_m))
     port = np.array(sequence.calibration.depth.port_m)
     off_m = height_m - float(start.pose().transformFrom(port)[2])
-    if abs(off_m) <= FARTHEST_FROM_START_M + 3.0 * start.position_sigma_m[2]:
+    sigma_m = float(
+        np.hypot(start.position_sigma_m[2], sequence.calibration.depth.sigma_m)
+    )
+    climbed_m = float(np.ptp(rows_m))
+    if abs(off_m) <= FARTHEST_FROM_START_M + climbed_m + ACTING_SIGMAS * sigma_m:
         return
     x, y, z = start.position_m
     yield Finding(
@@ -514,6 +592,37 @@ def heading_findings(
     yield from rows
     if not rows[0].grave:
         yield from heading_turn(right, config, motion)
+
+
+def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Finding]:
+    """First headings that differ from a stated start; nothing where they agree, or no start is stated."""
+    heading = right.heading
+    start = right.calibration.start
+    is_stated = start.source == "stated" and "rpy_rad" in start.model_fields_set
+    if heading is None or not is_stated:
+        return
+    first = max(int(np.searchsorted(heading.stamps_ns, right.start_ns)) - 1, 0)
+    t = motion.since_origin(heading.stamps_ns[first : first + FIRST_ROWS])
+    turned = motion.reference(motion.yaw_rad)(t) - motion.yaw_rad[0]
+    off = heading.yaw_rad[first : first + FIRST_ROWS] - turned - start.rpy_rad[2]
+    if not np.isfinite(off).any():
+        return
+    calibration = right.calibration.heading
+    sigma = np.hypot(calibration.sigma_rad, calibration.bias_sigma_rad)
+    error = Estimate1D(
+        float(np.nanmedian(wrap_angle(off))),
+        float(np.hypot(sigma, start.rpy_sigma_rad[2])),
+    )
+    if not matters(error, LARGE_TURN_RAD):
+        return
+    yield Finding(
+        "heading: turn from that of the start",
+        in_degrees(error),
+        "°",
+        cause="another north, sense or unit of the headings, or a wrong start?",
+        line=f"`world` and `yaw_offset_rad` under [heading] {IN_LOG_CONFIG}, or `start.rpy_rad` {IN_CALIBRATION}",
+        gravity=Gravity.GRAVE,
+    )
 
 
 def heading_turn(
@@ -654,12 +763,13 @@ def distance_finding(
 ) -> Finding:
     """Distance of the first fixes from the start, and whether they begin far from it or from the world's origin."""
     calibration = right.calibration
-    order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))
-    near = np.median(fixes.position_m[order[:NEAR_START]], axis=0)
+    order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
+    near = np.median(fixes.position_m[order], axis=0)
     from_start_m = float(np.hypot(*(near - calibration.start.position_m)[:2]))
     from_origin_m = float(np.hypot(*near[:2]))
     noise_m = level_sigma_m(calibration.positions.sigma_m)
-    path_m = float(way_m(right, right.dvl.stamps_ns[-1:])[0])
+    # how far the vehicle can be from the start by then
+    path_m = float(way_m(right, fixes.stamps_ns[order]).max())
     start_m = level_sigma_m(calibration.start.position_sigma_m)
     allowed_m = 5.0 * float(np.hypot(noise_m, start_m)) + path_m
     quantity = "position fixes: distance from the start"
@@ -676,7 +786,8 @@ def distance_finding(
     origin = numbers(before + np.round(near), 0)
     return replace(
         row,
-        cause=f"they begin {distance_m:.3g} m from {place}, the whole way is {path_m:.3g} m: a map grid (UTM)?",
+        cause=f"they begin {distance_m:.3g} m from {place}, the way to them is {path_m:.3g} m: a map grid (UTM), or another "
+        "scale or place?",
         line=f"`origin_m = {origin}` under [positions] {IN_LOG_CONFIG} moves the origin to the first; or state the "
         "start there",
         gravity=Gravity.GRAVE,

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.diagnosis.signals import SignalStretch, Values
+from sonar_graph.diagnosis.signals import SignalStretch, Values, root_mean_square
 from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
 from sonar_graph.navigation.alignment import InertialPath
 from sonar_graph.sequence import Sequence
@@ -116,6 +116,20 @@ class BodyMotion:
             return np.where(is_between | is_outside, np.nan, found)
 
         return at
+
+    def sampling_error(self, values: Values) -> float:
+        """Relative error of an integral of the Doppler log that its interval T makes, for `height_m` or `path_m`.
+
+        Between rows the velocity counts as linear. The integral of a sine of frequency w is too small by ``(w T)^2 / 12``;
+        ``(w T)^2`` is the ratio of second differences of the velocity and the velocity.
+        """
+        step = np.asarray(np.diff(values) / np.diff(self.seconds), values.dtype)
+        bent = step[2:] - 2.0 * step[1:-1] + step[:-2]
+        inside = self.parts[3:] == self.parts[:-3]
+        if not inside.any():
+            return 0.0
+        moved = root_mean_square([step])
+        return root_mean_square([bent[inside]]) / (12.0 * max(moved, 1e-9))
 
     def part_at(self, seconds: Floats) -> Ints:
         """Part of the last row before each instant, shape (n,)."""

@@ -24,9 +24,11 @@ from sonar_graph.diagnosis.aiding_check import (
     POSITIONS,
     RANGE,
     findings_of,
+    fix_height_findings,
     heading_findings,
     position_findings,
     start_depth_findings,
+    start_heading_findings,
     vertical_bias,
 )
 from sonar_graph.diagnosis.axes import AxesMatch, match_axes
@@ -57,8 +59,8 @@ from sonar_graph.diagnosis.start import (
     turned_mounting,
     with_fitted,
 )
-from sonar_graph.diagnosis.units import wrong_units
-from sonar_graph.logs import gravity_warning
+from sonar_graph.diagnosis.units import force_scale, wrong_units
+from sonar_graph.logs import gravity_warning, stuck_quantities
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
@@ -86,6 +88,8 @@ LARGEST_DENSITY_RATIO = 1.5
 LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
 CERTAIN_SIGMAS = 4.0
+LEAST_TOGETHER_S = 0.1
+"""Difference between two delays that counts as none."""
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 
 
@@ -115,6 +119,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
+    sequence = without_stuck(sequence)
+    forces, sequence = force_findings(sequence, config)
     axes, sequence = axes_findings(sequence, config)
     imu, dvl = middle_rows(sequence)
     match = match_dvl_to_imu(imu, dvl, sequence.calibration)
@@ -130,7 +136,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         bias = [f for f in bias if f.estimate.is_known or f.acts]
     reference = reference_findings(right, config, tilt)
     noise = noise_findings(sequence)
-    return [*axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise]
+    of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
+    return [*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise]
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -141,9 +148,34 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """
     if faults := wrong_units(sequence, config):
         return faults
-    axes, right = axes_findings(sequence, config)
-    found = worst_first([*axes, *motion_findings(right, config)])
+    forces, right = force_findings(without_stuck(sequence), config)
+    axes, right = axes_findings(right, config)
+    found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
+
+
+def by_late_imu(
+    of_dvl: list[Finding], by_motion: list[Finding], config: LogConfig
+) -> tuple[list[Finding], list[Finding]]:
+    """Findings of the Doppler log and of others, where all are early against a late IMU with one line for the IMU."""
+    late, *others = of_dvl
+    delays = [f for f in by_motion if f.quantity.endswith(": delay") and f.acts]
+    if not (late.acts and delays):
+        return of_dvl, by_motion
+    for delay in delays:
+        together = replace(
+            delay.estimate, value=delay.estimate.value + late.estimate.value
+        )
+        if matters(together, LEAST_TOGETHER_S, late.estimate.sigma):
+            return of_dvl, by_motion
+    total_s = config.number("imu", "stamp_offset_s", 0.0) - late.estimate.value
+    names = " and ".join(delay.quantity.partition(" against")[0] for delay in delays)
+    of_imu = replace(
+        late,
+        cause=f"{names} differ from the IMU by as much: the IMU's own stamps are wrong",
+        line=f"`stamp_offset_s = {total_s:.3f}` under [imu] {IN_LOG_CONFIG}",
+    )
+    return [of_imu, *others], [f for f in by_motion if f not in delays]
 
 
 def is_vertical_bias(finding: Finding) -> bool:
@@ -165,6 +197,38 @@ def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
     return inner_imu or imu, inner_dvl or dvl
 
 
+def without_stuck(sequence: Sequence) -> Sequence:
+    """Sequence without rows of IMU and Doppler log that are stuck, which its reading names: no reference for others."""
+    imu = sequence.imu
+    dvl = sequence.dvl
+    if sequence.calibration.odometry_interpolation != "linear":
+        return sequence  # wheels turn evenly
+    stuck = stuck_quantities(imu, dvl)
+    of_imu = np.flatnonzero(~(stuck["angular rate"] | stuck["specific force"]))
+    of_dvl = np.flatnonzero(~stuck["velocity"])
+    if len(of_imu) < 2 or len(of_dvl) < 2:
+        return sequence
+    if len(of_imu) < len(imu):
+        imu = imu.rows(of_imu)
+    if len(of_dvl) < len(dvl):
+        dvl = dvl.rows(of_dvl)
+    return replace(sequence, imu=imu, dvl=dvl)
+
+
+def force_findings(
+    sequence: Sequence, config: LogConfig
+) -> tuple[list[Finding], Sequence]:
+    """Scale of the accelerometers by gravity, and the sequence with the scale put right."""
+    found = force_scale(sequence, config)
+    if found is None:
+        return [], sequence
+    if found.acts:
+        imu = sequence.imu
+        force = imu.specific_force / found.estimate.value
+        sequence = replace(sequence, imu=replace(imu, specific_force=force))
+    return [found], sequence
+
+
 def axes_findings(
     sequence: Sequence, config: LogConfig
 ) -> tuple[list[Finding], Sequence]:
@@ -178,6 +242,12 @@ def axes_findings(
     if found is None:
         return [], sequence
     findings = list[Finding]()
+    # gyros and Doppler log agree with each other: rates are reflected the other way
+    is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
+    # gravity is felt upwards: of the accelerometers only level axes can be wrong
+    is_force &= found.dvl[2, 2] == 1.0
+    if is_force and (found.dvl != np.eye(3)).any():
+        return force_axes(found, sequence, config)
     if (found.gyro != np.eye(3)).any():
         names = ", ".join(signed_axes(found.gyro))
         cause = (
@@ -191,6 +261,35 @@ def axes_findings(
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
+
+
+def force_axes(
+    found: AxesMatch, sequence: Sequence, config: LogConfig
+) -> tuple[list[Finding], Sequence]:
+    """Axes of the accelerometers that differ from those of gyros and Doppler log, and the sequence with them put right."""
+    R = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    turn = R.T @ found.dvl.T @ R
+    table = config.table("imu")
+    before = axes_matrix(table.get("rotation", "flu"))
+    of_rates = axes_matrix(table.get("angular_velocity_axes", ("x", "y", "z")))
+    rotation = turn @ before
+    # rates stay as they are
+    rate_axes = of_rates @ before @ rotation.T
+    lines = [
+        ", ".join(f'"{name}"' for name in signed_axes(np.round(axes)))
+        for axes in (rotation, rate_axes)
+    ]
+    finding = Finding(
+        "accelerometer axes",
+        unknown("wrong axes"),
+        cause=f"forces change as gyros and Doppler log have it, {found.ratio:.2g} times closer, about the axes "
+        f"({', '.join(signed_axes(found.dvl.T))})",
+        line=f"`rotation = [{lines[0]}]` and `angular_velocity_axes = [{lines[1]}]` under [imu] {IN_LOG_CONFIG}",
+        gravity=Gravity.GRAVE,
+    )
+    imu = sequence.imu
+    force = imu.specific_force @ turn.T
+    return [finding], replace(sequence, imu=replace(imu, specific_force=force))
 
 
 def gyro_axes_finding(
@@ -311,7 +410,13 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
     if vertical is not None and not is_heading_wrong:
         found.append(vertical)
     found += of_heading
+    # positions, where there are any, give the angle itself
+    if not any(f.acts for f in of_heading):
+        found += start_heading_findings(right, motion)
     found += position_findings(right, config, motion)
+    # a wrong unit of either makes another height too
+    if not any(f.grave for f in found):
+        found += fix_height_findings(right)
     return found
 
 

@@ -72,20 +72,32 @@ def sighting_changes(
     path = motion.reference(motion.path_m)
     yaw = motion.reference(motion.yaw_rad)
     height = motion.reference(motion.height_m)
-    # level, in axes of the body at the first sighting
-    moved = (path(t[j]) - path(t[i])) * np.exp(-1j * yaw(t[i]))
-    turned = np.exp(-1j * (yaw(t[j]) - yaw(t[i])))
-    level = (place[:, 0] + 1j * place[:, 1] - moved) * turned
-    z = place[:, 2] - (height(t[j]) - height(t[i]))
-    # a hole between the two sightings makes the motion unknown
-    is_known = motion.part_at(t[i]) == motion.part_at(t[j])
-    after = (np.column_stack([level.real, level.imag, z]) - lever) @ R
-    after[~is_known] = np.nan
-    by_range = np.linalg.norm(after, axis=1) - seen.range_m[i]
-    by_azimuth = wrap_angle(np.arctan2(after[:, 1], after[:, 0]) - azimuth)
+
+    def after(at: Floats) -> Floats:
+        """Landmarks in the sonar at the second sighting, at times of any shape (..., k); NaN: unknown."""
+        t_j = np.asarray(at)
+        t_i = t_j - (t[j] - t[i])
+        # level, in axes of the body at the first sighting
+        moved = (path(t_j) - path(t_i)) * np.exp(-1j * yaw(t_i))
+        turned = np.exp(-1j * (yaw(t_j) - yaw(t_i)))
+        level = (place[:, 0] + 1j * place[:, 1] - moved) * turned
+        z = place[:, 2] - (height(t_j) - height(t_i))
+        found = (np.stack([level.real, level.imag, z], axis=-1) - lever) @ R
+        # a hole between the two sightings makes the motion unknown
+        found[motion.part_at(t_i) != motion.part_at(t_j)] = np.nan
+        return np.asarray(found)
+
+    def by_range(at: Floats) -> Floats:
+        return np.asarray(np.linalg.norm(after(at), axis=-1) - seen.range_m[i])
+
+    def by_azimuth(at: Floats) -> Floats:
+        found = after(at)
+        turned = np.arctan2(found[..., 1], found[..., 0]) - azimuth
+        return np.asarray(wrap_angle(turned))
+
     changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     longer = seen.range_m[j] - seen.range_m[i]
     return SightingChanges(
-        SignalStretch(t[j], longer, lambda _: by_range, has_offset=False),
-        SignalStretch(t[j], changed, lambda _: by_azimuth, has_offset=False),
+        SignalStretch(t[j], longer, by_range, has_offset=False),
+        SignalStretch(t[j], changed, by_azimuth, has_offset=False),
     )

@@ -15,7 +15,7 @@ docs/theory/sensor_check.md.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,13 +77,18 @@ class Match:
     scatter: float = np.nan
     """Root mean square of e, of the rows that fit."""
     moved: float = np.nan
-    """Root mean square of the reference about its mean."""
+    """Root mean square of the reference about what the fit leaves open: its mean, and its slope where it drifts."""
     misfit: float = 0.0
     """Share of y's squares that the reference does not explain."""
     rate: float = 0.0
     """Root mean square of the sensor's change a second."""
     is_mirrored: bool = False
     """True where the conjugate of the reference fits."""
+
+    def less_certain(self, sigma: float) -> "Match":
+        """The same with an error of the gain by what the comparison leaves out."""
+        whole = float(np.hypot(self.gain.sigma, sigma))
+        return replace(self, gain=replace(self.gain, sigma=whole))
 
     @classmethod
     def unknown(cls, reason: str) -> "Match":
@@ -252,7 +257,7 @@ def refined(
         weighted(angles),
         weighted(lags) if find_lag else unknown("not estimated"),
         scatter,
-        root_mean_square([centred(s.shifted(np.zeros(1))[0], s) for s in stretches]),
+        root_mean_square([moved_in(s, has_drift=drift_sigma > 0) for s in stretches]),
         scatter**2 / max(signal**2, 1e-24),
         root_mean_square([s.slope(0.0) for s in stretches]),
         is_mirrored,
@@ -262,6 +267,19 @@ def refined(
 def centred(values: Values, stretch: SignalStretch) -> Values:
     """Values about their mean, but for changes."""
     return np.asarray(values - np.nanmean(values) * stretch.has_offset)
+
+
+def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
+    """Reference at the rows about its mean, or about a line, shape (n,)."""
+    x = stretch.shifted(np.zeros(1))[0]
+    if not has_drift:
+        return centred(x, stretch)
+    known = np.isfinite(x)
+    if np.count_nonzero(known) < FEWEST_ROWS:
+        return x * np.nan
+    t = stretch.seconds - stretch.seconds.mean()
+    line = np.polynomial.Polynomial.fit(t[known], x[known], 1)
+    return np.asarray(x - line(t))
 
 
 def root_mean_square(parts: list[Values]) -> float:

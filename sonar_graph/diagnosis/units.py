@@ -5,14 +5,24 @@ no proof. docs/theory/sensor_check.md.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import median_filter
 
-from sonar_graph.diagnosis.findings import IN_LOG_CONFIG, Finding, Gravity, unknown
+from sonar_graph.diagnosis.findings import (
+    IN_LOG_CONFIG,
+    NO_NEED,
+    Finding,
+    Gravity,
+    gravity_of,
+    matters,
+    unknown,
+)
 from sonar_graph.diagnosis.sightings import sighting_pairs
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats, Imu
+from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 
 FASTEST_M_S = 20.0
@@ -25,6 +35,10 @@ FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
 """Factor to m/s²; mg and cm/s² differ by a fiftieth, so that the nearest counts."""
 SHARE_OF_GRAVITY = 0.2
 """Relative difference allowed between a typical specific force and gravity."""
+LEAST_FORCE_SCALE = 0.015
+"""Gravity differs by 0.5 % over the Earth, and what accelerates a vehicle adds little."""
+LARGE_FORCE_SCALE = 0.1
+"""From here on gaps of the Doppler log are bridged with an error of a metre after two seconds."""
 USUAL_SPEED_M_S = 3.0
 MEDIAN_ROWS = 9
 LARGEST_RANGE_RATIO = 10.0
@@ -109,6 +123,28 @@ def force_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
         "accelerometer",
         f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}?",
         f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}",
+    )
+
+
+def force_scale(sequence: Sequence, config: LogConfig) -> Finding | None:
+    """Typical specific force over gravity; None where the accelerometers do not measure gravity."""
+    forces = lengths(sequence.imu.specific_force)
+    gravity = sequence.calibration.gravity_m_s2
+    typical = float(np.median(forces)) if len(forces) else 0.0
+    if abs(typical / gravity - 1) > SHARE_OF_GRAVITY:
+        return None
+    imu = sequence.calibration.imu
+    scale = Estimate1D(typical / gravity, imu.accel_bias_sigma / gravity)
+    row = Finding("accelerometer scale", scale, cause=NO_NEED)
+    error = replace(scale, value=scale.value - 1)
+    if not matters(error, LEAST_FORCE_SCALE):
+        return row
+    key = config.number("imu", "linear_acceleration_scale", 1.0) / scale.value
+    return replace(
+        row,
+        cause=f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²",
+        line=f"`linear_acceleration_scale = {key:.4g}` under [imu] {IN_LOG_CONFIG}",
+        gravity=gravity_of(True, abs(error.value) > LARGE_FORCE_SCALE),
     )
 
 

@@ -335,11 +335,11 @@ class LiveRun:
                         LINE_WIDTH,
                     )
                 )
-        for warning in self.engine.notes.get("log.warnings", "").split("; "):
-            if warning and not warning.startswith(
-                "detections:"
-            ):  # the odometry after the newest has not come yet
-                self._said(f"warning: {warning}")
+        for subject in ("log.doubtful", "log.warnings"):
+            for warning in self.engine.notes.get(subject, "").split("; "):
+                # the odometry after the newest has not come yet
+                if warning and not warning.startswith("detections:"):
+                    self._said(f"warning: {warning}")
         self._worker.begin(calibration)
         self._predictor = Predictor(calibration)
         self._newest_ns = self._next_frame_ns = 0

@@ -4,7 +4,8 @@ Nothing is corrected here. Each check returns sentences for the notes of a seque
 (docs/design/0004-logs.md).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +45,17 @@ LARGEST_LAG_S = 1.0
 LONG_GAP_S = 1.5
 """Time without a Doppler sample, or between the first or last samples of both sensors, that a user should know of."""
 LARGEST_LAG_CHANGE_S = 0.5
-"""Ratio of medians of 60 distances that chance does not make of equally good ones."""
-LEAST_MOVED = {"positions": 1.0, "heading": 0.2, "depth": 0.5}
+LEAST_MOVED = {"positions": 1.0, "heading": 0.2, "depth": 0.5, "detections": 0.5}
 """Motion, m or rad, from which on a sensor that repeats its value is stuck, by role."""
 RESOLUTIONS = 3.0
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
+SURELY_STUCK_S = 3.0
+SURELY_STUCK_ROWS = 10
+"""The same of a sensor that is called stuck because others change meanwhile."""
+LEAST_CHANGING = 0.9
+"""Share of rows that differ from the row before, from which on a sensor changes."""
 _ROTATIONS = {
     (0, False): "[0, -90, 0]",
     (0, True): "[0, 90, 0]",
@@ -305,9 +310,9 @@ def stuck_warning(
     is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
         last - first + 1 >= STUCK_ROWS
     )
-    if is_coarse and differs.any():
+    if is_coarse:
         # resolution alone makes short stretches of equal rows
-        is_long &= len(values) * (1.0 - differs.mean()) ** (last - first) < 1e-3
+        is_long &= ~_may_be_chance(differs, last - first)
     is_zero = ~np.any(values[first], axis=1)
     texts = []
     for chosen, what in (
@@ -329,6 +334,84 @@ def stuck_warning(
     return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be sending without lock"
 
 
+def _may_be_chance(differs: NDArray[np.bool_], repeated: Ints) -> NDArray[np.bool_]:
+    """Stretches whose number of repeated rows comes by chance once in a thousand logs of a coarse sensor, shape (k,)."""
+    if not differs.any():
+        return np.zeros(len(repeated), bool)
+    share = 1.0 - float(differs.mean())
+    return np.asarray((len(differs) + 1) * share**repeated >= 1e-3)
+
+
+def stuck_rows(
+    stamps_ns: Ints,
+    values: Floats,
+    others: Mapping[str, tuple[Ints, Floats]],
+    *,
+    may_rest: bool = False,
+) -> NDArray[np.bool_]:
+    """Mask of rows, shape (n,), of values, shape (n, k), that repeat to the bit while all others change.
+
+    A vehicle at rest in a simulator repeats all sensors. Noise never repeats, so that one sensor that repeats alone is
+    stuck.
+
+    ``others``: stamps and values of the other sensors, by name. ``may_rest``: zeros are a value at rest.
+    """
+    differs = np.any(values[1:] != values[:-1], axis=1)
+    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
+    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    chosen = (stamps_ns[last] - stamps_ns[first] > SURELY_STUCK_S * 1e9) & (
+        last - first + 1 >= SURELY_STUCK_ROWS
+    )
+    chosen &= ~_may_be_chance(differs, last - first)
+    if may_rest:
+        chosen &= values[first].any(axis=1)
+    for stretch in np.flatnonzero(chosen).tolist():
+        begin_ns, end_ns = stamps_ns[[first[stretch], last[stretch]]].tolist()
+        chosen[stretch] = all(
+            _changes(at_ns, rows, begin_ns, end_ns) for at_ns, rows in others.values()
+        )
+    return np.repeat(chosen, last - first + 1)
+
+
+def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, NDArray[np.bool_]]:
+    """Masks of rows of IMU and Doppler log that are stuck, by quantity, as of `stuck_rows`."""
+    rows = {
+        "angular rate": (imu.stamps_ns, imu.angular_velocity),
+        "specific force": (imu.stamps_ns, imu.specific_force),
+        "velocity": (dvl.stamps_ns, dvl.velocity),
+    }
+    found = {}
+    for quantity, (stamps_ns, values) in rows.items():
+        others = {name: other for name, other in rows.items() if name != quantity}
+        may_rest = quantity == "velocity"
+        found[quantity] = stuck_rows(stamps_ns, values, others, may_rest=may_rest)
+    return found
+
+
+def stuck_doubt(stamps_ns: Ints, stuck: NDArray[np.bool_], quantity: str) -> str | None:
+    """Doubt about a quantity with stuck rows, shape (n,); None: there are none."""
+    if not stuck.any():
+        return None
+    edges = np.diff(np.concatenate([[0], stuck.astype(int), [0]]))
+    begin = np.flatnonzero(edges > 0)
+    end = np.flatnonzero(edges < 0) - 1
+    rows = end - begin + 1
+    times = _longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))
+    return (
+        f"{quantity} the same to the last bit in {rows.sum()} rows, {times} s after the first, while the other sensors "
+        "change: stuck; results are wrong from there on, and the part before is read by --end"
+    )
+
+
+def _changes(stamps_ns: Ints, values: Floats, begin_ns: int, end_ns: int) -> bool:
+    """True where most rows between two instants differ from the row before."""
+    inside = values[(stamps_ns >= begin_ns) & (stamps_ns <= end_ns)]
+    if len(inside) < 2:
+        return False
+    differs = np.any(inside[1:] != inside[:-1], axis=1)
+    return bool(differs.mean() >= LEAST_CHANGING)
+
+
 def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     """Mask of rows, shape (n,), that repeat the row before to the bit while the vehicle moves: a stuck sensor.
 
@@ -339,12 +422,57 @@ def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     changes = np.linalg.norm(np.diff(values, axis=0), axis=1)
     differs = changes > 0
     resolution = float(np.min(changes[differs], initial=np.inf))
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
-    is_stuck = np.abs(moved[last] - moved[first]) > max(
-        least, RESOLUTIONS * resolution if np.isfinite(resolution) else 0
+    if np.isfinite(resolution):
+        least = max(least, RESOLUTIONS * resolution)
+    return _repeated_while_moving(differs, moved, least)
+
+
+def repeated_sightings(
+    frame: Ints, sightings: Floats, moved: Floats, least: float
+) -> NDArray[np.bool_]:
+    """Mask of sightings, shape (n,), that repeat what came before to the bit while the vehicle moves.
+
+    Either a whole frame repeats the frame before, or one coordinate has one value for all landmarks of several frames.
+
+    ``frame``: number of each sighting's frame, in order, shape (n,). ``sightings``: range and azimuth, shape (n, 2).
+    ``moved``: the way until each sighting, m.
+    """
+    mask = repeated_frames(frame, sightings, moved, least)
+    has_company = np.zeros(len(frame), bool)
+    has_company[1:] = frame[1:] == frame[:-1]
+    for column in sightings.T:
+        differs = column[1:] != column[:-1]
+        is_held = _repeated_while_moving(differs, moved, least)
+        # a single landmark straight ahead keeps the azimuth of a beam; two landmarks do not share it
+        run = np.concatenate([[0], np.cumsum(differs)])
+        shares = np.bincount(run, weights=is_held & has_company)
+        mask |= is_held & (shares[run] > 0)
+    return mask
+
+
+def repeated_frames(
+    frame: Ints, sightings: Floats, moved: Floats, least: float
+) -> NDArray[np.bool_]:
+    """Mask of sightings, shape (n,), whose whole frame repeats the frame before, as of `repeated_sightings`."""
+    begins = np.flatnonzero(np.diff(frame, prepend=frame[0] - 1))
+    parts = np.split(sightings, begins[1:])
+    differs = np.array(
+        [not np.array_equal(a, b) for a, b in pairwise(parts)], dtype=bool
     )
-    mask = np.zeros(len(values), bool)
+    if not differs.any():  # one picture all the time, as in a demonstration
+        return np.zeros(len(frame), bool)
+    is_stuck = _repeated_while_moving(differs, moved[begins], least)
+    return np.repeat(is_stuck, [len(part) for part in parts])
+
+
+def _repeated_while_moving(
+    differs: NDArray[np.bool_], moved: Floats, least: float
+) -> NDArray[np.bool_]:
+    """Rows, shape (n,), that do not differ from the row before in a stretch over which the vehicle moves by a length."""
+    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
+    last = np.concatenate([first[1:] - 1, [len(differs)]])
+    is_stuck = np.abs(moved[last] - moved[first]) > least
+    mask = np.zeros(len(differs) + 1, bool)
     for begin, end in zip(
         first[is_stuck].tolist(), last[is_stuck].tolist(), strict=True
     ):
@@ -358,7 +486,7 @@ def way_by(
 ) -> Floats:
     """What the vehicle has moved until each instant, for `repeats`: metres, or rad for a heading, shape (n,).
 
-    For depth the way up and down, for fixes the way, both by velocities averaged over a second.
+    For depth the way up and down, for fixes and sightings the way, both by velocities averaged over a second.
     """
     if role == "heading":
         stamps_ns = imu.stamps_ns

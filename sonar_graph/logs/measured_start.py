@@ -2,7 +2,7 @@
 
 Height comes from the first depths, roll and pitch from the first seconds of accelerometers and Doppler log, yaw from
 the first headings, x and y from the first fixes. With C the turn by the gyros since the start, F = int C f dt, v the
-velocity in the body and p = int C v dt::
+velocity in the body and p = int C v dt, which also leads back from the first headings and fixes to the start::
 
     C v - F = v_0 - g t u            the slope of this line is the world's up u, in the body's axes at the start
     fix(t) = p_0 + exp(i yaw) p(t)   complex numbers, level: yaw where there are fixes and no headings
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.logs.adapters import plain_lines
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.numerics import running_rotations
 
 NEAREST_ROWS = 5
@@ -40,7 +40,8 @@ LEAST_TILT_SIGMA_RAD = 0.01
 LEVEL_SIGMA_RAD = 0.1
 """Of roll and pitch taken as zero."""
 LEAST_HEIGHT_SIGMA_M = 0.05
-"""Waves, resolution, and the time between the first depths and the start."""
+"""Waves and resolution."""
+CLIMB_SHARE = 0.1
 UNKNOWN_YAW_SIGMA_RAD = 1.0
 SOURCES = {
     "stated": "as stated",
@@ -93,6 +94,15 @@ class FirstPath:
         velocity = np.einsum("nij,nj->ni", at, dvl.velocity[is_inside] @ body_R_dvl.T)
         impulse = np.column_stack([np.interp(seconds, t, column) for column in F.T])
         return cls(seconds, velocity, impulse)
+
+    def moved(self, seconds: Floats) -> Floats:
+        """C v integrated from the start to some instants, shape (n, 3), m."""
+        if len(self.seconds) < 2:
+            return np.zeros((len(seconds), 3))
+        steps = np.diff(self.seconds)[:, None]
+        means = (self.velocity[1:] + self.velocity[:-1]) / 2
+        p = np.vstack([np.zeros(3), np.cumsum(means * steps, axis=0)])
+        return np.column_stack([np.interp(seconds, self.seconds, x) for x in p.T])
 
     def up(self, calibration: Calibration) -> tuple[Floats, float] | None:
         """The world's up at the start, shape (3,), and its sigma in rad; None without gravity in the accelerometers."""
@@ -179,8 +189,12 @@ def measured_start(
     if (heading := blocks.get("heading")) is not None:
         source = "heading"
         near = _nearest(heading.stamps_ns, start_ns)
+        turned = _turned(
+            blocks["imu"], calibration, (roll, pitch), heading.stamps_ns[near], start_ns
+        )
         # angles near the cut at 180 degrees have no median of their own
-        yaw = float(np.angle(np.exp(1j * np.median(np.unwrap(heading.yaw_rad[near])))))
+        at_start = np.unwrap(heading.yaw_rad[near]) - turned
+        yaw = float(np.angle(np.exp(1j * np.median(at_start))))
         sigmas[2] = WIDER * np.hypot(
             calibration.heading.bias_sigma_rad, calibration.heading.sigma_rad
         )
@@ -202,16 +216,16 @@ def measured_start(
             np.isnan(variances), np.square(calibration.positions.sigma_m), variances
         )
         # fixes near the start were not taken at it
-        speed = float(np.median(np.linalg.norm(blocks["dvl"].velocity, axis=1)))
-        moved_m = speed * float(np.ptp([*fixes.stamps_ns[near], start_ns])) * 1e-9
+        way = path.moved((fixes.stamps_ns[near] - start_ns) * 1e-9) @ R.T  # (k, 3)
         # fixes are of the antenna
-        position = np.median(fixes.position_m[near], axis=0) - R @ np.array(
-            calibration.positions.antenna_m
-        )
-        position_sigma = WIDER * np.sqrt(variances + moved_m**2)
+        antenna = R @ np.array(calibration.positions.antenna_m)
+        position = np.median(fixes.position_m[near] - way, axis=0) - antenna
+        # an error of the heading turns the way to the fixes
+        turned_m = sigmas[2] * float(np.median(np.linalg.norm(way, axis=1)))
+        position_sigma = np.sqrt(WIDER**2 * variances + turned_m**2)
     if blocks.get("depth") is not None:
         position[2], position_sigma[2] = height_by_depth(
-            calibration, start_ns, blocks, R[2]
+            calibration, start_ns, blocks["depth"], path, R[2]
         )
     elif fixes is None and calibration.planar is None:
         notes.append("no depth")
@@ -224,31 +238,49 @@ def measured_start(
     return start.model_copy(update={**rounded, "source": source}), notes
 
 
+def _turned(
+    imu: Imu,
+    calibration: Calibration,
+    tilt_rad: tuple[float, float],
+    at_ns: Ints,
+    start_ns: int,
+) -> Floats:
+    """Turn by the gyros about the vertical at the start until some instants, shape (n,), rad."""
+    level_R_body = Rotation.from_euler("ZYX", [0.0, tilt_rad[1], tilt_rad[0]])
+    body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+    rate = (imu.angular_velocity - calibration.imu.gyro_bias_rad_s) @ body_R_imu.T
+    about_up = rate @ level_R_body.as_matrix()[2]
+    steps = (about_up[1:] + about_up[:-1]) / 2 * np.diff(imu.stamps_ns) * 1e-9
+    turn = np.append(0.0, np.cumsum(steps))
+    at = np.interp(at_ns, imu.stamps_ns, turn)
+    return np.asarray(at - np.interp(start_ns, imu.stamps_ns, turn))
+
+
 def height_by_depth(
-    calibration: Calibration, start_ns: int, blocks: Mapping[str, Any], up: Floats
+    calibration: Calibration,
+    start_ns: int,
+    depth: Depth,
+    path: FirstPath,
+    up: Floats,
 ) -> tuple[float, float]:
-    """Height of the body at the start and its sigma, m: the first depths, less what the vehicle sank meanwhile.
+    """Height of the body at the start and its sigma, m: the first depths, less what the vehicle climbed meanwhile.
 
     ``up`` is the world's up in the body, shape (3,).
     """
-    depth = blocks["depth"]
-    dvl = blocks["dvl"]
     near = _nearest(depth.stamps_ns, start_ns)
-    first = _nearest(dvl.stamps_ns, start_ns)
-    body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     # the first depths may come after the start
-    climb_m_s = float(np.median(dvl.velocity[first] @ body_R_dvl.T @ up))
-    late_s = (depth.stamps_ns[near] - start_ns) * 1e-9
-    z_m = float(np.median(depth.z_m[near] - climb_m_s * late_s)) - float(
-        up @ calibration.depth.port_m
-    )
+    late_s = np.asarray((depth.stamps_ns[near] - start_ns) * 1e-9, np.float64)
+    climb_m = path.moved(late_s) @ up
+    port_m = float(up @ calibration.depth.port_m)
+    z_m = float(np.median(depth.z_m[near] - climb_m)) - port_m
     variance = float(np.median(depth.variance_m2[near]))
     sigma_m = (
         calibration.depth.sigma_m if np.isnan(variance) else float(np.sqrt(variance))
     )
-    climbed_m = abs(climb_m_s) * float(np.median(np.abs(late_s)))
+    # a tenth of the climb for the error of the velocities and of up
+    of_climb = CLIMB_SHARE * float(np.median(np.abs(climb_m)))
     return z_m, float(
-        np.sqrt((WIDER * sigma_m) ** 2 + LEAST_HEIGHT_SIGMA_M**2 + climbed_m**2)
+        np.sqrt((WIDER * sigma_m) ** 2 + LEAST_HEIGHT_SIGMA_M**2 + of_climb**2)
     )
 
 

@@ -37,9 +37,12 @@ from sonar_graph.logs.checks import (
     gap_warnings,
     gravity_warning,
     is_partial,
+    repeated_sightings,
     repeats,
     spike_warning,
     stamp_faults,
+    stuck_doubt,
+    stuck_quantities,
     stuck_warning,
     way_by,
 )
@@ -78,7 +81,7 @@ from sonar_graph.logs.vehicle_setup import (
     static_frames,
     unplaced,
 )
-from sonar_graph.measurements import Block, Dvl, Floats, Imu
+from sonar_graph.measurements import Block, Dvl, Floats, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 
 LOG = logging.getLogger("sonar_graph.logs")
@@ -88,6 +91,7 @@ WARNED = (
     "log.start_pose",
     "log.stamps",
     "log.dropped",
+    "log.doubtful",
     "log.warnings",
     "log.gaps",
 )
@@ -411,9 +415,14 @@ class Assembly:
         if imu is None or dvl is None or len(rows) < 2:
             return rows, {}
         moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
-        name = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}[role]
-        values = getattr(rows, name).reshape(len(rows), -1)
-        stuck = repeats(values, moved, LEAST_MOVED[role])
+        least = LEAST_MOVED[role]
+        if isinstance(rows, LandmarkDetections):
+            seen = np.column_stack((rows.range_m, rows.azimuth_rad))
+            stuck = repeated_sightings(rows.stamps_ns, seen, moved, least)
+        else:
+            names = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}
+            values = getattr(rows, names[role]).reshape(len(rows), -1)
+            stuck = repeats(values, moved, least)
         count = int(np.count_nonzero(stuck))
         if not count:
             return rows, {}
@@ -472,6 +481,7 @@ class Assembly:
         findings = {
             "log.dropped": self.left_out(),
             "log.stamps": stamps,
+            "log.doubtful": self.doubts(),
             "log.warnings": self.warnings(),
             "log.gaps": gap_warnings(imu, dvl, self.calibration),
             "log.noise": unsaid_noise(blocks),
@@ -504,7 +514,7 @@ class Assembly:
     def survey(self) -> tuple[list[str], list[str]]:
         """Rows left out and warnings of everything that was chosen, whether or not it is enough for a sequence."""
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
-        warnings = list(self.warnings())
+        warnings = [*self.doubts(), *self.warnings()]
         if blocks["imu"] is not None and blocks["dvl"] is not None:
             warnings += gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)
         return self.left_out(), warnings
@@ -515,13 +525,35 @@ class Assembly:
             f"{role}: {_counts(dropped)}" for role, dropped in self._dropped.items()
         ]
 
+    def doubts(self) -> Iterator[str]:
+        """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
+
+        Axes of the accelerometers that gravity contradicts, and quantities that are stuck.
+        """
+        imu = self.block("imu")
+        dvl = self.block("dvl")
+        if imu is None:
+            return
+        mounting = self.calibration.imu.mounting
+        g = self.calibration.gravity_m_s2
+        if gravity := gravity_warning(imu.specific_force, mounting, g):
+            yield f"imu: {gravity}"
+        # wheels turn evenly, and their rates jump
+        if dvl is None or self.calibration.odometry_interpolation != "linear":
+            return
+        for quantity, stuck in stuck_quantities(imu, dvl).items():
+            role = "dvl" if quantity == "velocity" else "imu"
+            stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
+            if doubt := stuck_doubt(stamps_ns, stuck, quantity):
+                yield f"{role}: {doubt}"
+
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
         yield from self._unplaced
         for role, table in self._tables.items():
             for text in self.adapters[role].warnings(table):
                 yield f"{role}: {text}"
-        yield from (f"{role}: {text}" for role, text in self._doubts() if text)
+        yield from (f"{role}: {text}" for role, text in self._oddities() if text)
         blocks = {role: self.block(role) for role in NOISE_FIELDS}
         yield from unsaid_noise(blocks, only_partly=True)
         dvl = blocks["dvl"]
@@ -539,19 +571,14 @@ class Assembly:
             for text in detection_warnings(detections, first_ns, last_ns):
                 yield f"detections: {text}"
 
-    def _doubts(self) -> Iterator[tuple[str, str | None]]:
+    def _oddities(self) -> Iterator[tuple[str, str | None]]:
         """Results of the checks of numbers by role; None: nothing is wrong."""
         imu = self.block("imu")
         dvl = self.block("dvl")
         depth = self.block("depth")
-        calibration = self.calibration
         # of wheels rates jump, and values stay the same
-        is_linear = calibration.odometry_interpolation == "linear"
+        is_linear = self.calibration.odometry_interpolation == "linear"
         if imu is not None:
-            gravity = gravity_warning(
-                imu.specific_force, calibration.imu.mounting, calibration.gravity_m_s2
-            )
-            yield "imu", gravity
             quantities = {
                 "angular rate": imu.angular_velocity,
                 "specific force": imu.specific_force,

@@ -348,7 +348,7 @@ class Keyframes:
             self._set(int(epochs_ns[-1]), stamp_ns)
             self._linearise()
             motion = self.motion_since_newest(stamp_ns)
-        return self._shared_over_gap(stamp_ns, motion)
+        return self._shared_over_gap(self.stamps_ns[-1], stamp_ns, motion)
 
     def _is_blurred(self, motion: PreintegratedMotion) -> bool:
         """True when the variance of a motion exceeds ``motion_noise_share`` of the sonar's variance."""
@@ -364,18 +364,19 @@ class Keyframes:
         return np.asarray(np.square(D) @ np.square(self._bias_sigmas))
 
     def _shared_over_gap(
-        self, stamp_ns: int, motion: PreintegratedMotion
+        self, since_ns: int, stamp_ns: int, motion: PreintegratedMotion
     ) -> PreintegratedMotion:
-        """The motion to a frame or fix, with a covariance that measurements over the same gap may share.
+        """The motion from a keyframe to a frame or fix, with a covariance that measurements over the same gap may share.
 
         Measurements tied to one keyframe over the same gap share the error of its motion. With k (k + 1) times the
         covariance for the k-th of them, their information stays below that of one exact measurement:
         ``sum 1 / (k (k + 1)) = 1``.
         """
-        epochs_ns = self.odometry.epochs(self.stamps_ns[-1], stamp_ns)
-        known_ns = int(epochs_ns[-1]) if len(epochs_ns) else self.stamps_ns[-1]
+        epochs_ns = self.odometry.epochs(since_ns, stamp_ns)
+        known_ns = int(epochs_ns[-1]) if len(epochs_ns) else since_ns
         if not self.odometry.is_gap(known_ns, stamp_ns):
-            self._tied_in_gap = 0
+            if stamp_ns >= self.advanced_ns:  # a late one ends no gap
+                self._tied_in_gap = 0
             return motion
         self._tied_in_gap += 1
         k = self._tied_in_gap
@@ -630,21 +631,26 @@ class Keyframes:
             return
         world_R_i = self.smoother.estimates.atPose3(X(i)).rotation().matrix()
         if stamp_ns >= self.advanced_ns:
-            motion = self._shared_over_gap(stamp_ns, self.motion_since_newest(stamp_ns))
+            motion = self.motion_since_newest(stamp_ns)
         else:  # late: from an earlier keyframe, by rows that are known by now
             linearisation = Linearisation(self.bias(i), world_R_i)
             motion = self._motion(
                 self.stamps_ns[i], stamp_ns, linearisation, self.advanced_ns
             )
+        motion = self._shared_over_gap(self.stamps_ns[i], stamp_ns, motion)
         antenna = np.array(self.calibration.positions.antenna_m)
         arm = motion.i_T_j.transformFrom(antenna)
         world_R_fix = world_R_i @ motion.i_T_j.rotation().matrix()
         by_motion = body_point_jacobian(world_R_fix, antenna)  # (3, 6)
         # the fix hangs on the keyframe: the error of the motion between them is noise
         noise_m2 = cov_m2 + by_motion @ motion.covariance @ by_motion.T  # (3, 3)
+        D = by_motion @ motion.D_bias  # (3, 11)
+        by_biases_m2 = D * np.square(self._bias_sigmas) @ D.T  # (3, 3)
+        # beside the estimate at the keyframe the biases of the motion to the fix are an error too
+        spread_m2 = noise_m2 + by_biases_m2
         factor: gtsam.NonlinearFactor
-        by_biases_m2 = self._by_biases(by_motion @ motion.D_bias)  # (3,)
-        if (by_biases_m2 > LEAST_BIAS_SHARE * noise_m2.diagonal()).any():
+        share = by_biases_m2.diagonal() / noise_m2.diagonal()
+        if (share > LEAST_BIAS_SHARE).any():
             keys = (X(i), self.bias_keys[i])
             factor = factors.position_with_biases(
                 keys, position_m, motion, antenna, noise_m2
@@ -657,12 +663,12 @@ class Keyframes:
             P = self.smoother.joint_covariance([X(i)]).at(X(i), X(i))
             predicted_m2 = by_pose @ P @ by_pose.T  # (3, 3)
             gain = FIX_GAIN * float(
-                (predicted_m2.diagonal() / noise_m2.diagonal()).max()
+                (predicted_m2.diagonal() / spread_m2.diagonal()).max()
             )
         self.smoother.add({"position": factor}, gain=gain)
 
         def distance(values: Known) -> Floats:
             e = values.atPose3(X(i)).transformFrom(arm) - position_m
-            return np.sqrt(e @ np.linalg.solve(noise_m2, e))
+            return np.sqrt(e @ np.linalg.solve(spread_m2, e))
 
         self._unjudged.append(("positions", distance))

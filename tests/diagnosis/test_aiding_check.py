@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
 from sonar_graph.diagnosis import aiding_check, doubts
+from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.units import force_scale
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Heading, PositionFixes
 from sonar_graph.sequence import Sequence
@@ -146,7 +148,7 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
     config = LogConfig.parse({"positions": {"origin_m": [1.0, 2.0, 3.0]}}, "x")
     *_, finding = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
     assert finding.acts
-    assert "from the start, the whole way is" in finding.advice
+    assert "from the start, the way to them is" in finding.advice
     assert line_of(finding)["origin_m"] == pytest.approx(
         grid + RIGHT.truth.positions[0] + [1, 2, 3], abs=2.0
     )
@@ -155,7 +157,7 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
         RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": started})
     )
     *_, finding = aiding_check.position_findings(fixed(begun, origin=grid), config)
-    assert "from the origin of the world, the whole way is" in finding.advice
+    assert "from the origin of the world, the way to them is" in finding.advice
     few = fixed(RIGHT, every_s=1000.0)
     assert [one.text() for one in aiding_check.position_findings(few, config)] == [
         "cannot be told: too few rows beside its reference"
@@ -316,7 +318,8 @@ def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(
     ("z_m", "stated", "is_told"),
     [
         (-3.0, -3.0, False),
-        (-4.5, -3.0, False),
+        (-3.4, -3.0, False),
+        (-4.5, -3.0, True),
         (3.0, -3.0, True),
         (-3000.0, -3.0, True),
         (-50.0, None, False),
@@ -338,3 +341,97 @@ def test_heights_that_do_not_begin_at_the_stated_start_are_grave(
     assert all(
         f"the height begins at {z_m:.2f} m" in finding.advice for finding in found
     )
+
+
+def at_no_stated_start(run: Sequence, source: str) -> Sequence:
+    start = run.calibration.start.model_copy(update={"source": source})
+    return replace(run, calibration=run.calibration.model_copy(update={"start": start}))
+
+
+@pytest.mark.parametrize(
+    ("off_m", "source", "is_named"),
+    [(40.0, "fixes", True), (0.1, "fixes", False), (40.0, "stated", False)],
+)
+def test_depths_at_another_height_than_the_fixes_are_named_where_no_start_decides(
+    off_m: float, source: str, is_named: bool
+):
+    run = at_no_stated_start(fixed(RIGHT, sigma_m=0.3), source)
+    assert run.depth is not None
+    run = replace(run, depth=replace(run.depth, z_m=run.depth.z_m - off_m))
+    found = list(aiding_check.fix_height_findings(run))
+    assert [finding.grave for finding in found] == [True] * is_named
+    if is_named:
+        assert found[0].estimate.value == pytest.approx(off_m, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("factor", "line"), [(1.05, 1 / 1.05), (0.9, 1 / 0.9), (1.005, None), (3.0, None)]
+)
+def test_the_scale_of_the_accelerometers_is_that_of_gravity(factor, line):
+    """Within half a per cent gravity itself may differ; three times as much is another unit."""
+    imu = replace(RIGHT.imu, specific_force=factor * RIGHT.imu.specific_force)
+    finding = force_scale(replace(RIGHT, imu=imu), NO_CONFIG)
+    assert (finding is None) == (factor == 3.0)
+    if line is not None:
+        assert finding.acts
+        key = line_of(finding)["linear_acceleration_scale"]
+        assert key == pytest.approx(line, rel=2e-3)
+    elif finding is not None:
+        assert not finding.acts
+
+
+@pytest.mark.parametrize("period_s", [4.0, 8.0])
+def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: float):
+    """By hand: the integral of a sine over rows a second apart is too small by ``(w T)^2 / 12``."""
+    t = np.arange(600.0)
+    w = 2 * np.pi / period_s
+    height_m = np.append(0.0, np.cumsum((np.sin(w * t[1:]) + np.sin(w * t[:-1])) / 2))
+    motion = BodyMotion(
+        0,
+        t,
+        np.zeros(600, int),
+        np.tile([0.0, 0, 1], (600, 1)),
+        0 * t,
+        height_m,
+        0j * t,
+    )
+    expected = (2 * np.sin(w / 2)) ** 2 / 12
+    assert motion.sampling_error(height_m) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1.0])
+def test_a_delay_of_the_sonar_is_found_by_the_turns_between_sightings(late_s: float):
+    run = simulate_mission(MissionOptions(seed=5, duration_s=120.0))
+    seen = run.detections
+    assert seen is not None
+    late = replace(seen, stamps_ns=seen.stamps_ns + round(late_s * 1e9))
+    run = replace(run, detections=late)
+    motion = BodyMotion.of(run)
+    assert motion is not None
+    match = aiding_check.AZIMUTH.compare(run, motion)
+    assert match is not None
+    assert match.lag.sigma < 0.1
+    assert abs(match.lag.value - late_s) < 4 * match.lag.sigma
+    *_, delay = aiding_check.findings_of(aiding_check.AZIMUTH, match, run, NO_CONFIG)
+    assert delay.acts == (late_s > 0)
+    if late_s:
+        assert line_of(delay)["stamp_offset_s"] == pytest.approx(-late_s, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("off_rad", "is_stated", "is_named"),
+    [(1.0, True, True), (0.1, True, False), (1.0, False, False)],
+)
+def test_first_headings_far_from_a_stated_start_are_grave(
+    off_rad: float, is_stated: bool, is_named: bool
+):
+    run = compass(RIGHT, lambda yaw_rad: yaw_rad + off_rad)
+    yaw_rad = RIGHT.truth.rotations().as_euler("ZYX")[0, 0]
+    start = Start(rpy_rad=(0.0, 0.0, yaw_rad)) if is_stated else Start()
+    run = replace(run, calibration=run.calibration.model_copy(update={"start": start}))
+    motion = BodyMotion.of(run)
+    assert motion is not None
+    found = list(aiding_check.start_heading_findings(run, motion))
+    assert [finding.grave for finding in found] == [True] * is_named
+    if is_named:
+        assert found[0].estimate.value == pytest.approx(np.degrees(off_rad), abs=3.0)

@@ -14,9 +14,12 @@ from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
 from sonar_graph.logs.checks import (
     gap_warnings,
+    repeated_sightings,
     repeats,
     spike_warning,
     stamp_faults,
+    stuck_doubt,
+    stuck_rows,
     stuck_warning,
 )
 from sonar_graph.logs.reading import require_use, unsaid_noise
@@ -310,6 +313,67 @@ def test_equal_rows_of_more_than_a_second_and_five_rows_are_named(
     found = stuck_warning(stamps(np.arange(len(values)) / rate_hz), values, "velocity")
     assert (found is not None) == bool(expected)
     assert all(part in str(found) for part in expected)
+
+
+EVERY_TENTH_S = stamps(np.arange(300) / 10)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "values", "others", "is_stuck"),
+    [
+        ("angular rate", moving((slice(100, 200), 0.3)), moving(), True),
+        ("angular rate", moving((slice(100, 200), 0.0)), moving(), True),
+        ("velocity", moving((slice(100, 200), 0.3)), moving(), True),
+        ("velocity", moving((slice(100, 200), 0.0)), moving(), False),  # at rest
+        ("velocity", moving((slice(100, 200), 0.3)), moving((slice(120, 160), 0.1)), False),  # a simulator at rest
+        ("velocity", moving((slice(100, 120), 0.3)), moving(), False),  # 2 s
+        ("velocity", moving(), moving(), False),
+    ],
+)  # fmt: skip
+def test_a_quantity_that_repeats_while_others_change_is_stuck(
+    quantity: str, values: Floats, others: Floats, is_stuck: bool
+) -> None:
+    others_by_name = {"force": (EVERY_TENTH_S, others)}
+    stuck = stuck_rows(
+        EVERY_TENTH_S, values, others_by_name, may_rest=quantity == "velocity"
+    )
+    np.testing.assert_array_equal(
+        np.flatnonzero(stuck), np.arange(100, 200) if is_stuck else []
+    )
+    found = stuck_doubt(EVERY_TENTH_S, stuck, quantity)
+    assert (found is not None) == is_stuck
+    if is_stuck:
+        assert (
+            f"{quantity} the same to the last bit in 100 rows, 10.000 to 19.900 s"
+            in str(found)
+        )
+
+
+def test_frames_that_repeat_while_the_vehicle_moves_are_stuck() -> None:
+    """Three sightings a frame; the frames from the tenth on repeat it, or only its azimuth."""
+    frame = np.repeat(np.arange(40), 3)
+    seen = np.random.default_rng(1).uniform(1.0, 9.0, (120, 2))
+    way_m = 0.1 * frame
+    repeated = seen.copy()
+    repeated[30:] = np.tile(seen[27:30], (30, 1))
+    held = seen.copy()
+    held[30:, 1] = 0.4
+    later = frame > 9
+    assert not repeated_sightings(frame, seen, way_m, 0.5).any()
+    np.testing.assert_array_equal(
+        repeated_sightings(frame, repeated, way_m, 0.5), later
+    )
+    # the first of the equal ones may be measured
+    np.testing.assert_array_equal(
+        repeated_sightings(frame, held, way_m, 0.5), later & (np.arange(120) > 30)
+    )
+    assert not repeated_sightings(frame, repeated, 0.01 * way_m, 0.5).any()
+
+
+def test_one_landmark_straight_ahead_may_keep_its_azimuth() -> None:
+    frame = np.arange(40)
+    seen = np.column_stack([10.0 - 0.1 * frame, np.zeros(40)])
+    assert not repeated_sightings(frame, seen, 0.1 * frame, 0.5).any()
 
 
 # --- enough for an estimator ----------------------------------------------------------------------------------------

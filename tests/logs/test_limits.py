@@ -20,9 +20,9 @@ from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
 from sonar_graph.logs.cdr import parse_definition
-from sonar_graph.logs.foreign_files import MCAP_MAGIC
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap import Keep, chunks, scanning
+from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
 from sonar_graph.logs.mcap.log_file import LogFile
 from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_log

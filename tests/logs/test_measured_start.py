@@ -9,7 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.logs.measured_start import is_whole, with_measured_start
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, PositionFixes
+from sonar_graph.measurements import (
+    Depth,
+    Dvl,
+    Floats,
+    Heading,
+    Imu,
+    PositionFixes,
+)
 
 RPY = (0.1, -0.05, 0.7)
 N = 3000
@@ -114,3 +121,16 @@ def test_without_gravity_in_the_accelerometers_level_is_taken_with_a_wide_sigma(
     start = with_measured_start(Calibration(), blocks)[0].start
     assert start.rpy_rad[:2] == (0.0, 0.0)
     assert start.rpy_sigma_rad[:2] == (0.1, 0.1)
+
+
+def test_first_headings_and_fixes_count_less_the_way_since_the_start() -> None:
+    """Headings two seconds apart of a vehicle that turns by 0.1 rad/s; fixes of one that moves 0.8 m in a second."""
+    blocks = moving()
+    seconds = np.arange(0.0, 60.0, 2.0)
+    yaw_rad = RPY[2] + 0.1 * seconds
+    blocks["heading"] = Heading(
+        np.asarray(seconds * 1e9, np.int64), yaw_rad, np.full(30, 0.01)
+    )
+    start = with_measured_start(Calibration(), blocks)[0].start
+    assert start.rpy_rad[2] == pytest.approx(RPY[2], abs=0.01)
+    np.testing.assert_allclose(start.position_m, (100.0, 50.0, -14.0), atol=0.6)

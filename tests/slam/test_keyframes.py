@@ -574,6 +574,21 @@ def test_a_depth_in_a_gap_is_tied_to_the_keyframe_with_the_walk_of_the_velocity(
     )
 
 
+def test_late_fixes_in_a_gap_share_the_error_of_its_motion():
+    """The second of two that are equal has three times the noise of the motion that the first has."""
+    keyframes = keyframes_over_gaps()
+    keyframes.advance(int(at(4.0)[0]))
+    (fix_ns,) = at(3.5).tolist()
+    for _ in range(2):
+        keyframes.add_fix(fix_ns, np.zeros(3), 1e-12 * np.eye(3))
+        keyframes.update_if_due()
+    first, second = (
+        factor.noiseModel().noise().covariance()
+        for factor in factors_on(keyframes, gtsam.GPSFactorArm, X(0))
+    )
+    assert second == pytest.approx(3 * first, rel=1e-4, abs=1e-9)
+
+
 @pytest.mark.parametrize("headings_s", [[1.5], [1.5, 3.0, 5.0]])
 def test_a_heading_in_a_gap_is_tied_to_the_keyframe_by_the_gyros(headings_s):
     """No velocity is needed for that; what a gyro bias may have turned since then counts as noise."""

@@ -21,7 +21,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.errors import LogError
 from sonar_graph.files import regular
 from sonar_graph.logs.adapters import FieldTable
-from sonar_graph.logs.foreign_files import START_BYTES, foreign_kind
+from sonar_graph.logs.mcap import START_BYTES, foreign_kind
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 
 _DELIMITERS = {"tab": "\t", "space": " "}

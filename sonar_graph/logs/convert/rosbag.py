@@ -26,14 +26,16 @@ from mcap.writer import Writer
 from sonar_graph.errors import LogError, SonarGraphError
 from sonar_graph.files import regular, written_whole
 from sonar_graph.logs.cdr import DRIVER_DEFINITIONS
-from sonar_graph.logs.foreign_files import ALREADY_MCAP, START_BYTES, why_no_bag
 from sonar_graph.logs.mcap import (
+    ALREADY_MCAP,
     LARGEST_BYTES,
     LARGEST_RATIO,
     LIBRARY,
     ROSBAG2_METADATA,
+    START_BYTES,
     TRANSIENT_LOCAL,
     Progress,
+    why_no_bag,
 )
 
 if TYPE_CHECKING:

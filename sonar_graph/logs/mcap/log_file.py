@@ -21,7 +21,7 @@ from mcap.summary import Summary
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import regular
-from sonar_graph.logs.foreign_files import MCAP_MAGIC, START_BYTES, kind_and_advice
+from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC, START_BYTES, kind_and_advice
 
 HEAD = struct.Struct("<BQ")
 """Opcode of a record, and number of bytes of its content."""

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.foreign_files import MCAP_MAGIC
+from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
 from sonar_graph.logs.mcap.log_file import (
     DATA_END_BYTES,
     HEAD,
