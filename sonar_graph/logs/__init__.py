@@ -26,6 +26,5 @@ __all__ = [
     "Window", "choose_each", "choose_topics", "detection_messages", "dropped_in", "gravity_warning", "inspect_log",
     "joined_calibration", "lacking_navigation", "landmark_map_message", "landmark_markers", "no_images", "pinned",
     "read_images_alone", "read_log", "read_sonar_frames", "rows_of", "sonar_frame", "sonar_image_messages",
-    "stuck_quantities",
-    "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result", "write_tum",
-]
+    "stuck_quantities", "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result",
+    "write_tum"]
