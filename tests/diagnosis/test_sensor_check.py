@@ -207,7 +207,7 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
         # a second of gravity is enough for this one
         if finding.quantity != "accelerometer scale":
             assert finding.text().startswith("cannot be told: ")
-        assert finding.plain()["value"] is None
+            assert finding.plain()["value"] is None
 
 
 @pytest.mark.slow
