@@ -251,8 +251,9 @@ class CovarianceFields(PathSection):
     Three fields: one an axis, each a number or a row."""
     meaning: Literal["variance", "standard deviation"] = "variance"
     """Of standard deviations only the diagonal is used, squared."""
-    negative: Reading = "unknown"
-    """Meaning of a negative first element: the covariance is unknown, or the whole message is invalid."""
+    negative: Reading | Literal["found"] = "unknown"
+    """Meaning of a negative first element: the covariance is unknown, or the whole message is invalid; "found": invalid
+    where other messages have a covariance, unknown where none has."""
     zero: Reading = "unknown"
     """Meaning of a covariance of zeros."""
 
@@ -261,13 +262,25 @@ class CovarianceFields(PathSection):
         matrices = self._matrices(table)
         is_negative = matrices[:, 0, 0] < 0
         is_zero = ~matrices.any(axis=(1, 2))
-        is_invalid = is_negative & (self.negative == "invalid")
+        is_invalid = is_negative & (self.of_negative(is_negative) == "invalid")
         is_invalid |= is_zero & (self.zero == "invalid")
         is_finite = np.isfinite(matrices).all(axis=(1, 2))
         is_unknown = is_negative | is_zero | ~is_finite | _is_impossible(matrices)
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
         return np.where(is_unknown[:, None, None], np.nan, matrices), is_invalid
+
+    def of_negative(self, is_negative: NDArray[np.bool_]) -> Reading:
+        """Meaning of negative first elements, given which messages have one."""
+        if self.negative != "found":
+            return self.negative
+        # ROS writes -1 for "not measured"; a driver that knows no covariance writes it always
+        return "unknown" if is_negative.all() else "invalid"
+
+    def pinned(self, table: FieldTable) -> "CovarianceFields":
+        """Fields by which single messages are read as all messages of a table are together."""
+        is_negative = self._matrices(table)[:, 0, 0] < 0
+        return self.model_copy(update={"negative": self.of_negative(is_negative)})
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Number of messages whose matrix is no covariance."""

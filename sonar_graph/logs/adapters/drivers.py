@@ -120,7 +120,7 @@ FIX_POINT = PositionAdapter(
 MARINE_DVL = DvlAdapter(
     type="marine_acoustic_msgs/msg/Dvl",
     velocity=_xyz("velocity"),
-    covariance=CovarianceFields(fields=("velocity_covar",)),
+    covariance=CovarianceFields(fields=("velocity_covar",), negative="found"),
     valid_where={"velocity_mode": 1, "beam_velocities_valid": True},
     may_be_unfilled=("velocity_mode", "beam_velocities_valid"),
     good_beams="num_good_beams",
@@ -145,7 +145,7 @@ UUV_SIMULATOR_DVLS = [
 TWIST = DvlAdapter(
     type="geometry_msgs/msg/TwistWithCovarianceStamped",
     velocity=_xyz("twist.twist.linear"),
-    covariance=CovarianceFields(fields=("twist.covariance",)),
+    covariance=CovarianceFields(fields=("twist.covariance",), negative="found"),
 )
 ODOMETRY_TWIST = TWIST.model_copy(
     update={

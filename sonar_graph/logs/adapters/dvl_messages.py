@@ -312,6 +312,8 @@ class DvlAdapter(Adapter):
             can_count = not beams.any() or bool((beams >= FEWEST_BEAMS).any())
         if self.altitude is not None and not (table.column(self.altitude) > 0).any():
             settings["altitude"] = False
+        if self.covariance is not None and not self._is_noise_of_beams:
+            settings["covariance"] = self.covariance.pinned(table).model_dump()
         settings["lock"] = (
             "signs" if can_count and not self._is_marked(table) else "marked"
         )

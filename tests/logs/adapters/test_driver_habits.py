@@ -97,6 +97,11 @@ WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
                lost={"altitude": -1.0}),
         "20 with altitude below 0",
     ),
+    "a covariance, and -1 where nothing was measured": (
+        report(sent={"velocity_covar": [1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4]},
+               lost={"velocity_covar": [-1.0] * 9}),
+        "20 with a covariance that says invalid",
+    ),
     "Stonefish, covariance of -1": (
         report(kind="stonefish_ros2/msg/DVL", sent={"altitude": 3.0, "velocity_covariance": [1e-4] + [0.0] * 8},
                lost={"velocity_covariance": [-1.0] + [0.0] * 8}),
