@@ -590,18 +590,22 @@ class FilterShell(ABC):
             raise EstimatorError(
                 f"{self.name}: the motion to {end_ns} ns over a gap is not finite"
             )
+        more = len(in_frame(views, int(order.row[k]))) if kind == FRAME else 1
+        if kind != END:  # an estimate alone changes nothing
+            self._may_be_far = self.params.far_views
+        return self._shared(motion, kind, more)
+
+    def _shared(self, motion: Motion, kind: int, more: int = 1) -> Motion:
+        """Motion into the gap after the newest epoch with the share of its error that some more measurements have."""
         C = motion.C.copy()
         if not self.has_bias:
             C[3:, 3:] += (
                 self.calibration.imu.gyro_bias_sigma**2 * motion.D[3:] @ motion.D[3:].T
             )
         if kind in (DEPTH, HEADING, FIX, FRAME):
-            more = len(in_frame(views, int(order.row[k]))) if kind == FRAME else 1
             count = self._used_in_gap.get((self.node_ns, kind), 0) + more
             self._used_in_gap[self.node_ns, kind] = count
             C *= count * (count + 1)
-        if kind != END:  # an estimate alone changes nothing
-            self._may_be_far = self.params.far_views
         return motion._replace(C=C)
 
     def _use_late(
@@ -619,6 +623,8 @@ class FilterShell(ABC):
             first_ns, last_ns, self.gyro_bias(), attitude, since_ns
         )
         motion = motion_of(between)
+        if self.odometry.is_gap(self.node_ns, stamp_ns):
+            motion = self._shared(motion, FIX)
         if stamp_ns < self.node_ns:
             # the attitude is that at the end of the motion: take it back to the start
             attitude = attitude @ motion.dR.T

@@ -141,6 +141,8 @@ FEWEST_HEADINGS = 5
 RESTS_S = (10, 20, 40, 80, 160)
 """Tried lengths of a rest at the start; the longest that holds counts."""
 LEAST_TILT_RAD = np.radians(0.25)
+LARGE_TILT_RAD = np.radians(10.0)
+"""Of the stated start against gravity: beyond, gravity is taken for motion, and results are doubtful."""
 LEAST_HEADING_RAD = np.radians(1.0)
 """Smaller errors are hidden by others."""
 TURN_OVER_NS = NS_PER_S
@@ -272,7 +274,8 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
         )
         if matters(error, LEAST_TILT_RAD, start.rpy_sigma_rad[axis]):
             cause = f"{found.said}, not {stated}"
-            row = replace(row, cause=cause, line=line, gravity=gravity_of(True, False))
+            gravity = gravity_of(True, abs(error.value) > LARGE_TILT_RAD)
+            row = replace(row, cause=cause, line=line, gravity=gravity)
         rows.append(row)
     return said_once(rows)
 

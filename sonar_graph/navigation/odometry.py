@@ -234,7 +234,7 @@ class Odometry:
             else world_R_i.T @ self._earth
         )
         removed = Removed(bias, earth)
-        lost_ns = self._newest_epoch(min(end_ns, known_ns))
+        lost_ns = self._newest_epoch(end_ns, known_ns)
         if (
             lost_ns is not None
             and lost_ns < start_ns < end_ns
@@ -340,10 +340,12 @@ class Odometry:
             self._dvl.values[2],
         )
 
-    def _newest_epoch(self, until_ns: int) -> int | None:
-        """The newest epoch that is reached at an instant; None before the first."""
-        _, last = self._epochs_between(EARLIEST_NS, until_ns)
-        return int(self._dvl.stamps_ns[last - 1]) if last > 0 else None
+    def _newest_epoch(self, until_ns: int, known_ns: int) -> int | None:
+        """The newest epoch up to an instant that is reached at another; None before the first."""
+        # the IMU row that covers an epoch may come after the epoch's own stamp
+        epochs_ns = self.epochs(EARLIEST_NS, known_ns)
+        last = int(epochs_ns.searchsorted(until_ns, side="right"))
+        return int(epochs_ns[last - 1]) if last > 0 else None
 
     def _lies_in_gap(self, instant_ns: int) -> bool:
         """True where an instant lies between the two epochs of a closed gap."""

@@ -50,16 +50,19 @@ def test_aiding_of_huge_noise_tells_nothing_and_less_of_it_more(mission, kind, s
 
 
 @slam_filters
-def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind):
+@pytest.mark.parametrize("is_late", [False, True], ids=["in time", "late"])
+def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind, is_late):
     """Ten fixes at 9 s of a gap tell of the start rather less than an exact one; a heading is as good as elsewhere."""
     fixes_ns, unknown = later(*np.linspace(9.0, 9.9, 10)), np.full((10, 3, 3), math.nan)
     fixes = PositionFixes(
         fixes_ns, np.zeros((10, 3)), np.where(np.isnan(unknown), 1e-8 * np.eye(3), 0.0)
     )
-    sequence = replace(in_a_gap(), positions=fixes)
+    sequence = replace(in_a_gap(), positions=None if is_late else fixes)
     slam = begun(kind, sequence.calibration)
     for window in sequence.replay(later(8.0, 9.95)):
         slam.process(window)
+    if is_late:
+        slam.process(Measurements(later(9.96), positions=fixes))
     walked = sequence.calibration.dvl.velocity_walk_density**2 * 7.0**3 / 3
     assert 1 / (1 + 1 / walked) < height_and_tilt(slam)[1] < 0.9
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import sensor_check
-from sonar_graph.diagnosis.findings import Finding
+from sonar_graph.diagnosis.findings import Finding, Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import range_changes, wrong_units
 from sonar_graph.logs.adapters.log_config import LogConfig
@@ -528,3 +528,17 @@ def test_a_delay_that_all_others_share_is_that_of_the_imu(sensor: str) -> None:
     assert not any(
         finding.acts for name, finding in found.items() if name.endswith(": delay")
     )
+
+
+@pytest.mark.parametrize(("off_rad", "is_grave"), [(0.1, False), (3.0, True)])
+def test_a_start_on_its_back_makes_results_doubtful(off_rad, is_grave):
+    roll, pitch, yaw = SHORT.calibration.start.rpy_rad
+    found = {
+        finding.quantity: finding
+        for finding in sensor_check.check_sensors(
+            started_at(SHORT, roll + off_rad, pitch, yaw)
+        )
+    }
+    row = found["start roll: value"]
+    assert row.acts
+    assert (row.gravity is Gravity.GRAVE) == is_grave

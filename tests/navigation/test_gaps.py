@@ -527,6 +527,28 @@ def test_a_turn_with_a_constant_force_needs_no_fast_imu(gap_s):
     assert np.abs(off[:3, 3:]).max() < 3e-4
 
 
+@pytest.mark.parametrize("shift_ms", [0, 1], ids=["with the IMU", "between its rows"])
+@pytest.mark.parametrize("gap_s", [5.0, 60.0])
+def test_the_rest_of_a_closed_gap_is_known_wherever_the_imu_cuts(shift_ms, gap_s):
+    """The last 2 s of a gap in which a vehicle gets faster; the epoch that ends it is reached with the next IMU row."""
+    imu_ns = stamps(100.0, 12.0 + gap_s)
+    dvl_ns = stamps(5.0, 11.0 + gap_s) + shift_ms * NS // 1000
+    s = (dvl_ns - T0_NS) * 1e-9
+    kept = (s < 10.1) | (s > 9.9 + gap_s)
+    faster_m_s = 0.02 * np.clip(s - 10.0, 0.0, None)
+    velocity = np.column_stack([0.5 + faster_m_s, 0.0 * s, 0.0 * s])
+    t = (imu_ns - T0_NS) * 1e-9
+    force = np.column_stack([np.where(t > 10.0, 0.02, 0.0), 0.0 * t, 9.80665 + 0.0 * t])
+    odometry = Odometry(Calibration())
+    odometry.add(imu(imu_ns, 0.0, force), dvl(dvl_ns[kept], velocity[kept]))
+    end_ns = int(odometry.epochs(at(11.0), int(imu_ns[-1]))[0])
+    start_ns = end_ns - 2 * NS
+    found = odometry.motion(start_ns, end_ns, np.zeros(3), None, int(imu_ns[-1]))
+    end_s = (end_ns - T0_NS) * 1e-9
+    assert found.i_T_j.x() == pytest.approx(1.0 + 0.04 * (end_s - 11.0), abs=0.02)
+    assert found.covariance[3, 3] > 0.05**2
+
+
 KNOWN_START = Start(position_sigma_m=(0.0,) * 3, rpy_sigma_rad=(0.0,) * 3)
 UNSURE = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
 ESTIMATORS = ("dead-reckoning", "ekf-slam", "invariant-ekf", "isam2")
