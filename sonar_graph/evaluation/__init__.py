@@ -1,6 +1,7 @@
 """Running estimators on a sequence and scoring them; estimators are known only through their contract."""
 
 # fmt: off
+from sonar_graph.evaluation.aligned import aligned_to_truth
 from sonar_graph.evaluation.comparison import LIBRARIES, compare, describe_environment, expense, judge
 from sonar_graph.evaluation.consistency import (GATED_SHARE, NONE, UNJUDGED, Reliability, anees_interval, confidences,
     nis, normalised_squares, reliability_of, true_identities)
@@ -15,12 +16,12 @@ from sonar_graph.evaluation.scored_instants import (DURATION_S, MAP_TIMES_S, RET
     repeats_published)
 from sonar_graph.evaluation.scores import ESTIMATES
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files, result_names
-from sonar_graph.evaluation.tables import (FITTED, HEADLINES, HEIGHTS, LABELS, SCORES, compact_table, headline_metric,
+from sonar_graph.evaluation.tables import (FITTED, HEADLINES, HEIGHTS, LABELS, RAW, SCORES, compact_table, headline_metric,
     label, run_columns, score_keys, score_table, unaligned)
 __all__ = [
     "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES", "HEIGHTS",
-    "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability",
-    "RunResult", "SCORES", "Score", "UNJUDGED", "anees_interval", "between", "check_request", "compact_table",
+    "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RAW", "RETURN_M", "RefusedRows", "Reliability",
+    "RunResult", "SCORES", "Score", "UNJUDGED", "aligned_to_truth", "anees_interval", "between", "check_request", "compact_table",
     "compare", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
     "headline_metric", "judge", "label", "landmark_errors", "map_instants", "nis", "normalised_squares", "one_line",
     "own_map_errors", "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published",

@@ -15,6 +15,7 @@ from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
+from sonar_graph.settings import flattened
 from sonar_graph.states import (
     DetectionLog,
     LandmarkMap,
@@ -81,6 +82,12 @@ class RunResult:
     """Duration of asking for the trajectory and the map at the end."""
     peak_memory_mb: float = float("nan")
     """Highest resident memory of the process while it ran, less what it was before."""
+
+    @property
+    def is_as_published(self) -> bool:
+        """True for a filter without gate and robust kernel, as the papers of 2014 and before have it."""
+        params = flattened(self.params)
+        return params.get("gate_probability") == 1.0 and params.get("kernel_width") == 0
 
     def __repr__(self) -> str:
         end = (
@@ -242,6 +249,8 @@ class Comparison:
     """The recognition of landmarks in sonar images; None where the log had detections or no images."""
     ensembles: list[Ensemble] = field(default_factory=list)
     """Many runs of the same experiment; empty where there is only this one."""
+    is_aligned: bool = False
+    """Paths, maps and errors are those of `aligned_to_truth`."""
 
     def __repr__(self) -> str:
         runs = ", ".join(f"{run.estimator} {run.status}" for run in self.runs)

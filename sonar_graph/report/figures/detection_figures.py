@@ -164,7 +164,6 @@ def reliability_figure(judged: Reliability) -> Figure:
         bars,
         [str(n) if n else "" for n in judged.count],
         color=style.MUTED,
-        fontsize="small",
         padding=1.5,
     )
     counts.set_ylim(0, 1.25 * max(int(judged.count.max()), 1))

@@ -15,7 +15,7 @@ from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_m
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import LandmarkMap, Trajectory, landmark_name
 
 ELLIPSE_PROBABILITY = 0.95
 MARGIN = 0.3
@@ -23,6 +23,8 @@ MARGIN = 0.3
 SAME_M = 1e-3
 """A smoothed path nowhere farther than this from the causal one is not drawn a second time."""
 PATH_POINTS = 2500
+HIGHEST = 0.72
+"""Height of the view of the map over its width, at most."""
 ENLARGED = (1, 2, 5, 10, 20, 50)
 """Factors by which ellipses may be enlarged."""
 LARGEST_ELLIPSE = 0.09
@@ -95,12 +97,21 @@ def map_figure(comparison: Comparison) -> Figure | None:
             )
             for ellipse in ellipses(run.landmarks, own, factor):
                 panel.add_patch(ellipse)
-    label_landmarks(panel, comparison, view)
+    view = landscape(view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
     style.name_axes(panel, "world x (m)", "world y (m)")
     style.legend_above(figure, panel)
+    style.arrange(figure)
+    label_landmarks(panel, comparison)
     return figure
+
+
+def landscape(view: Floats) -> Floats:
+    """The view, widened until its height is at most `HIGHEST` of its width, so that a map fits a screen."""
+    width, height = view[1] - view[0]
+    missing = max(height / HIGHEST - width, 0.0)
+    return np.asarray(view + np.array([[-missing / 2, 0.0], [missing / 2, 0.0]]))
 
 
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
@@ -213,32 +224,20 @@ def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[E
     return ellipses
 
 
-def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
-    """Write identities beside landmarks that are in view: the true ones, or those of the first run that has any."""
-    candidates = [
-        true_landmarks_drawn(comparison),
-        *(run.landmarks for run in comparison.runs),
-    ]
+def label_landmarks(panel: Axes, comparison: Comparison) -> None:
+    """Write names beside landmarks that are in view: the true ones, then those of the first run that has a map."""
+    first = (run.landmarks for run in comparison.runs)
+    candidates = [true_landmarks_drawn(comparison), *first]
     landmarks = next(
         (known for known in candidates if known is not None and len(known)), None
     )
     if landmarks is None:
         return
-    size = "medium" if len(landmarks) <= 40 else "x-small"
-    for identity, position in zip(
-        landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True
-    ):
-        if np.all((position >= view[0]) & (position <= view[1])):
-            panel.annotate(
-                str(identity),
-                (position[0], position[1]),
-                xytext=(7, 6),
-                textcoords="offset points",
-                color=style.INK,
-                fontsize=size,
-                fontweight="bold",
-                zorder=6,
-            )
+    points = landmarks.positions[:, :2]
+    low, high = np.array([panel.get_xlim(), panel.get_ylim()]).T
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    names = [landmark_name(identity) for identity in landmarks.ids[rows].tolist()]
+    style.label_points(panel, names, points[rows])
 
 
 def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
@@ -300,7 +299,6 @@ def growth_figure(comparison: Comparison) -> Figure | None:
                 )
                 for ellipse in ellipses(known, own, enlarged):
                     panel.add_patch(ellipse)
-            label_landmarks(panel, comparison, view)
             panel.set(xlim=view[:, 0], ylim=view[:, 1])
             panel.set_aspect("equal", adjustable="box")
             label = "" if column else f"{run.estimator}\nworld y (m)"
@@ -308,6 +306,9 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     for column, seconds in enumerate(style.seconds_since_start(comparison, stamps_ns)):
         style.head_panel(axes[0, column], f"T = {seconds:.1f} s")
     style.legend_above(figure, axes[0, 0])
+    style.arrange(figure)
+    for panel in axes.flat:
+        label_landmarks(panel, comparison)
     return figure
 
 
