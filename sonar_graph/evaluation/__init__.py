@@ -21,8 +21,8 @@ from sonar_graph.evaluation.tables import (FITTED, HEADLINES, HEIGHTS, LABELS, R
 __all__ = [
     "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES", "HEIGHTS",
     "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RAW", "RETURN_M", "RefusedRows", "Reliability",
-    "RunResult", "SCORES", "Score", "UNJUDGED", "aligned_to_truth", "anees_interval", "between", "check_request", "compact_table",
-    "compare", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
+    "RunResult", "SCORES", "Score", "UNJUDGED", "aligned_to_truth", "anees_interval", "between", "check_request",
+    "compact_table", "compare", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
     "headline_metric", "judge", "label", "landmark_errors", "map_instants", "nis", "normalised_squares", "one_line",
     "own_map_errors", "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published",
     "result_names", "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table",

@@ -56,9 +56,7 @@ def _aligned_run(
     assert run.causal is not None, "a run with errors has a path"
     assert run.smoothed is not None, "a run with errors has a smoothed path"
     paths: dict[Kind, Trajectory] = {"causal": run.causal, "smoothed": run.smoothed}
-    alignments = {
-        kind: _of_path(path, series[kind]) for kind, path in paths.items()
-    }
+    alignments = {kind: _of_path(path, series[kind]) for kind, path in paths.items()}
     errors = {
         kind: _aligned_errors(path, series[kind], alignments[kind])
         for kind, path in paths.items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from html import escape
 from itertools import groupby
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
@@ -26,6 +27,9 @@ from sonar_graph.states import (
 from sonar_graph.table import as_html
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from sonar_graph.recognition import Recognition
 
 Kind = Literal["causal", "smoothed"]
@@ -266,6 +270,81 @@ class Comparison:
     def failed_runs(self) -> list[RunResult]:
         """Runs that did not come to an end."""
         return [run for run in self.runs if run.status == "failed"]
+
+    def plot_map(self, *, aligned: bool = False) -> Axes:
+        """Draw truth, paths and landmarks with their 95 % ellipses, for a notebook or a paper.
+
+        Parameters
+        ----------
+        aligned
+            Align each path and map to the truth, by `aligned_to_truth`.
+
+        Returns
+        -------
+        matplotlib axes in world metres. Its ``figure`` has a ``savefig``; its size follows matplotlib's settings.
+
+        Raises
+        ------
+        EvaluationError
+            When no run has a path, or `aligned` is asked for and no run has errors against a truth.
+
+        Examples
+        --------
+        >>> from sonar_graph import compare
+        >>> from sonar_graph.testing import small_world
+        >>> compare(small_world(), ["dead-reckoning"]).plot_map(aligned=True).get_xlabel()
+        'world x (m)'
+        """
+        # report lies above evaluation: loaded only where a figure is drawn
+        from sonar_graph.report.figures import map_figure
+
+        axes = self._panels(map_figure, "path", aligned=aligned)
+        return axes[0]
+
+    def plot_errors(self, *, aligned: bool = False) -> list[Axes]:
+        """Draw the causal errors of position and heading over time and over the distance travelled.
+
+        Parameters
+        ----------
+        aligned
+            Errors after alignment of each path to the truth, by `aligned_to_truth`.
+
+        Returns
+        -------
+        matplotlib axes: position error in metres over time and over distance, then the same of yaw in degrees.
+
+        Raises
+        ------
+        EvaluationError
+            When no run has errors against a truth.
+
+        Examples
+        --------
+        >>> from sonar_graph import compare
+        >>> from sonar_graph.testing import small_world
+        >>> axes = compare(small_world(), ["dead-reckoning"]).plot_errors(aligned=True)
+        >>> [panel.get_ylabel() for panel in axes]
+        ['position error (m)', '', 'yaw error (°)', '']
+        """
+        from sonar_graph.report.figures import error_figure
+
+        return self._panels(error_figure, "error against a truth", aligned=aligned)
+
+    def _panels(
+        self, draw: Callable[[Comparison], Figure | None], what: str, *, aligned: bool
+    ) -> list[Axes]:
+        """The panels of a figure, arranged; an `EvaluationError` where there is nothing to draw."""
+        from sonar_graph.evaluation.aligned import aligned_to_truth
+        from sonar_graph.report.figure_style import arrange
+
+        shown = aligned_to_truth(self) if aligned else self
+        if shown is None:
+            raise EvaluationError("aligned=True: no run has errors against a truth")
+        figure = draw(shown)
+        if figure is None:
+            raise EvaluationError(f"nothing to draw: no run has a {what}")
+        arrange(figure)
+        return figure.axes
 
     def _repr_html_(self) -> str:
         """The scores that are read first, for a notebook; folded below them all others, and why runs failed."""

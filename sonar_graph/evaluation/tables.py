@@ -163,7 +163,7 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
     world = "aligned" if aligned and metric != RAW else unaligned(comparison.sequence)
     headings = {
         f"causal.{metric}": f"Position error, {world}",
-        f"smoothed.{metric}": f"Smoothed error, {world}",
+        f"smoothed.{metric}": f"Smoothed, {world}",
     }
     map_metric = "se2_m" if aligned else "raw_m"
     for key, heading in COMPACT.items():
@@ -191,7 +191,7 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
             cells.append(number(score.value, score.text(), note=verdict))
         rows.append(cells)
     caption = (
-        f"Position error: {label(metric, comparison)}, causal. NEES 1: errors fit their covariances."
+        f"Position error: {label(metric, comparison, HEADLINES)}, causal. NEES 1: covariances fit."
         if metric
         else ""
     )

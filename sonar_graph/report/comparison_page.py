@@ -168,7 +168,9 @@ def render_report(comparison: Comparison) -> str:
         ],
         "headlines": {
             "aligned": sentences.headline(comparison) or told[0],
-            "raw": "" if aligned is None else sentences.headline(comparison, aligned=False),
+            "raw": ""
+            if aligned is None
+            else sentences.headline(comparison, aligned=False),
         },
         "published": sentences.published_filters(comparison),
         "finding": told,
@@ -180,11 +182,19 @@ def render_report(comparison: Comparison) -> str:
             [[run.estimator, run.reason] for run in comparison.failed_runs],
             numbers=False,
         ),
-        "compact": _views("compact", compact_table(comparison), compact_table(comparison, aligned=aligned is None)),
+        "compact": _views(
+            "compact",
+            compact_table(comparison),
+            compact_table(comparison, aligned=aligned is None),
+        ),
         "scores": score_table(comparison),
         "protocols": protocols(comparison),
         "figures": illustrations(comparison),
-        "landmarks": _views("landmarks", landmark_table(aligned or comparison), landmark_table(comparison)),
+        "landmarks": _views(
+            "landmarks",
+            landmark_table(aligned or comparison),
+            landmark_table(comparison),
+        ),
         "left_out": landmarks_left_out(comparison),
         "has_true_landmarks": sequence.true_landmarks is not None,
         "nameless": sentences.nameless_landmarks(comparison),
@@ -295,12 +305,7 @@ def outcome_table(comparison: Comparison) -> Table:
     rows = []
     for outcome in Outcome:
         if any(count and count[outcome] for count in counts):
-            shares = [
-                ABSENT
-                if count is None
-                else f"{count[outcome]} ({100 * count[outcome] / max(count.total(), 1):.1f} %)"
-                for count in counts
-            ]
+            shares = [_share(count, outcome) for count in counts]
             rows.append([outcome.value.capitalize(), *shares])
     if rows:
         rows.append(
@@ -312,6 +317,14 @@ def outcome_table(comparison: Comparison) -> Table:
     columns = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
     cells = [[words(text) for text in row] for row in rows]
     return Table("outcomes", "What became of each detection", "", columns, cells)
+
+
+def _share(count: Counter[Outcome] | None, outcome: Outcome) -> str:
+    """Detections with an outcome, with their share of all."""
+    if count is None:
+        return ABSENT
+    number = count[outcome]
+    return f"{number} ({100 * number / count.total():.1f} %)" if number else "0"
 
 
 def refused_table(comparison: Comparison) -> Table:

@@ -41,6 +41,8 @@ LINE_STYLES: tuple[Any, ...] = (
 )
 TIME_LABEL = "time since start (s)"
 PAGE_WIDTH_IN = 7.4
+HALF_WIDTH_IN = 6.35
+"""610 px: two figures stand beside each other on a screen of 1280 px."""
 PHONE_WIDTH_IN = 3.72
 """Width of the content of a page on a phone, 357 of 390 px."""
 PAGE_TEXT_PT = 9.2
@@ -132,7 +134,7 @@ def text_pt() -> float:
 
 def size_in(rows: int, row_in: float = 1.75) -> tuple[float, float]:
     """Width and height of a figure of rows, inches; on a narrow one they are lower."""
-    narrow = min(1.0, 0.4 + 0.6 * width_in() / PAGE_WIDTH_IN)
+    narrow = min(1.0, 0.55 + 0.45 * width_in() / PAGE_WIDTH_IN)
     return width_in(), ((row_in if rows > 1 else 2.3) * rows + 0.8) * narrow
 
 
@@ -280,6 +282,7 @@ class SeveralTicks(LogLocator):
     """Ticks at powers of ten, and between them where a logarithmic axis would have fewer than `LEAST_TICKS`."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Places of the ticks for an axis between two values."""
         low = min(vmin, vmax)
         high = max(vmin, vmax)
         for between in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0)):
@@ -295,7 +298,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
 
     The figure must have its final size (`arrange`), because the room is measured in inches.
     """
-    scale = 1.0 / panel.figure.dpi  # type: ignore[union-attr]
+    scale = 1.0 / panel.figure.dpi
     places_in = panel.transData.transform(points) * scale  # (n, 2)
     edges = panel.get_window_extent()
     frame = np.array([[edges.x0, edges.y0], [edges.x1, edges.y1]]) * scale
@@ -401,9 +404,7 @@ def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
     )
 
 
-def inline_svg(
-    figure: Figure, name: str, description: str, width: str = ""
-) -> str:
+def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> str:
     """The figure as an ``<svg>`` element for an HTML page.
 
     Text stays text, colours become the page's custom properties, and nothing refers outside. Identifiers begin with

@@ -9,6 +9,6 @@ from sonar_graph.report.figures.illustrations import RAW_VIEW, drawings, illustr
 from sonar_graph.report.figures.maps import growth_figure, map_figure
 
 __all__ = [
-    "RAW_VIEW", "bounds_figure", "drawings", "error_figure", "growth_figure", "illustrations", "innovation_figure", "map_figure",
-    "nees_figure", "nis_figure", "own_map_figure", "reliability_figure", "timing_figure", "yaw_figure",
+    "RAW_VIEW", "bounds_figure", "drawings", "error_figure", "growth_figure", "illustrations", "innovation_figure",
+    "map_figure", "nees_figure", "nis_figure", "own_map_figure", "reliability_figure", "timing_figure", "yaw_figure",
 ]

@@ -216,7 +216,7 @@ def own_map_figure(comparison: Comparison) -> Figure | None:
             **look,
         )
     panel.set_ylim(bottom=0.0)
-    style.name_axes(panel, style.TIME_LABEL, "error on its own map (m)")
+    style.name_axes(panel, style.TIME_LABEL, "own-map error (m)")
     style.legend_above(figure, panel)
     return figure
 
@@ -287,12 +287,11 @@ def nees_figure(comparison: Comparison) -> Figure | None:
             known = per_dof[np.isfinite(per_dof)]
             if known.size:
                 share = float(np.mean((known >= low) & (known <= high)))
-                inside.append(f"{run.estimator} {100 * share:.0f} %")
-        told = f"in the band: {', '.join(inside)}"
+                inside.append(f"{run.estimator}: {100 * share:.0f} % in the band")
         panel.text(
             0.02,
             0.04,
-            told,
+            "\n".join(inside),
             transform=panel.transAxes,
             color=style.INK,
         )

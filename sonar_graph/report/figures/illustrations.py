@@ -15,7 +15,7 @@ from sonar_graph.evaluation import (
 )
 from sonar_graph.report import sentences
 from sonar_graph.report.figure_style import (
-    PAGE_WIDTH_IN,
+    HALF_WIDTH_IN,
     PHONE_WIDTH_IN,
     Illustration,
     inline_svg,
@@ -29,9 +29,7 @@ from sonar_graph.report.figures.maps import (
     paths_cut_off,
 )
 
-
-
-ALIGNED = "each path and map aligned to the truth"
+ALIGNED = "aligned to the truth"
 
 
 @dataclass(frozen=True)
@@ -160,10 +158,10 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
 
 def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
     """One figure of the page; a map is drawn in two widths, of which the page shows the one that fits."""
-    widths_in = {"": PAGE_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
+    widths_in = {"": HALF_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
     numbers = _read_out(comparison, drawing)
     if drawing.draw is map_figure:
-        widths_in = {"": PAGE_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
+        widths_in = {"": HALF_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
         numbers = " ".join(sentences.finding(comparison))
     described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
     svg = ""

@@ -69,7 +69,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
             panel.plot(
                 *horizontal(run.causal),
                 color=own,
-                label=f"{run.estimator}, causal",
+                label=run.estimator,
                 zorder=3,
                 **look,
             )
@@ -83,11 +83,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
                 **look,
             )
         if run.landmarks is not None and len(run.landmarks):
-            look = {
-                "markersize": 3.5,
-                "markerfacecolor": "none",
-                "label": f"{run.estimator}, landmarks",
-            }
+            look = {"markersize": 3.5, "markerfacecolor": "none"}
             panel.plot(
                 *run.landmarks.positions.T[:2],
                 "os^Dv<"[index % 6],
