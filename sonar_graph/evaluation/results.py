@@ -298,7 +298,7 @@ class Comparison:
         # report lies above evaluation: loaded only where a figure is drawn
         from sonar_graph.report.figures import map_figure
 
-        axes = self._panels(map_figure, "path", aligned=aligned)
+        axes = self._panels(map_figure, "a path", aligned=aligned)
         return axes[0]
 
     def plot_errors(self, *, aligned: bool = False) -> list[Axes]:
@@ -328,7 +328,7 @@ class Comparison:
         """
         from sonar_graph.report.figures import error_figure
 
-        return self._panels(error_figure, "error against a truth", aligned=aligned)
+        return self._panels(error_figure, "errors against a truth", aligned=aligned)
 
     def _panels(
         self, draw: Callable[[Comparison], Figure | None], what: str, *, aligned: bool
@@ -342,7 +342,7 @@ class Comparison:
             raise EvaluationError("aligned=True: no run has errors against a truth")
         figure = draw(shown)
         if figure is None:
-            raise EvaluationError(f"nothing to draw: no run has a {what}")
+            raise EvaluationError(f"nothing to draw: no run has {what}")
         arrange(figure)
         return figure.axes
 
