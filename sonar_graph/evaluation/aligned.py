@@ -53,21 +53,22 @@ def _aligned_run(
     run: RunResult, series: dict[Kind, ErrorSeries], sequence: Sequence
 ) -> tuple[RunResult, dict[Kind, ErrorSeries]]:
     """A run with its errors, after the alignments of its paths and of its map."""
-    assert run.causal is not None, "a run with errors has a path"
-    assert run.smoothed is not None, "a run with errors has a smoothed path"
-    paths: dict[Kind, Trajectory] = {"causal": run.causal, "smoothed": run.smoothed}
-    alignments = {kind: _of_path(path, series[kind]) for kind, path in paths.items()}
-    errors = {
-        kind: _aligned_errors(path, series[kind], alignments[kind])
-        for kind, path in paths.items()
-    }
+    paths: dict[Kind, Trajectory] = {}
+    alignments: dict[Kind, Alignment] = {}
+    errors: dict[Kind, ErrorSeries] = {}
+    for kind, own in series.items():
+        path = run.causal if kind == "causal" else run.smoothed
+        assert path is not None, "a run with errors has a path"
+        alignments[kind] = _of_path(path, own)
+        paths[kind] = _moved(path, alignments[kind])
+        errors[kind] = _aligned_errors(path, own, alignments[kind])
     of_map = alignments["causal"]
     if run.landmarks is not None:
         of_map = _of_map(run.landmarks, sequence) or of_map
     moved = replace(
         run,
-        causal=_moved(run.causal, alignments["causal"]),
-        smoothed=_moved(run.smoothed, alignments["smoothed"]),
+        causal=paths.get("causal", run.causal),
+        smoothed=paths.get("smoothed", run.smoothed),
         landmarks=None if run.landmarks is None else of_map.map(run.landmarks),
         maps=[
             replace(known, landmarks=of_map.map(known.landmarks)) for known in run.maps

@@ -156,7 +156,7 @@ def render_report(comparison: Comparison) -> str:
         "summary": (
             f"{', '.join(run.estimator for run in runs)} on {format_value(round(sequence.duration_s, 1))} s of "
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
-            f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants."
+            f"{_counted(detections, 'landmark detection')}."
         ),
         "ensemble": ensemble_sentences(comparison.ensembles),
         "ensembles": [

@@ -63,8 +63,10 @@ PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"
 POINTS_PER_INCH = 72
 CSS_PIXELS_PER_INCH = 96
 LEAST_TICKS = 3
-BOLD_LETTER = 0.7
+BOLD_LETTER = 0.72
 """Width of a bold letter or digit, in sizes of the text."""
+NAME_HEIGHT = 1.25
+"""Height of a name with what hangs below its line, in sizes of the text."""
 MARK_IN = 0.07
 """Half the size of the mark of a landmark, inches."""
 NAME_PLACES = ((1, 1), (-1, 1), (1, -1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
@@ -303,15 +305,16 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
     edges = panel.get_window_extent()
     frame = np.array([[edges.x0, edges.y0], [edges.x1, edges.y1]]) * scale
     size_in = text_pt() / POINTS_PER_INCH
+    height = NAME_HEIGHT * size_in
     taken = [(at - MARK_IN, at + MARK_IN) for at in places_in]
     for name, at, point in zip(names, places_in, points, strict=True):
         width = size_in * BOLD_LETTER * len(name)
         for x, y in NAME_PLACES:
             low = at + np.array([x * MARK_IN, y * MARK_IN])
-            low += np.array([min(x, 0) * width, (y - 1) / 2 * size_in])
+            low += np.array([min(x, 0) * width, (y - 1) / 2 * height])
             if x == 0:
                 low[0] -= width / 2
-            high = low + np.array([width, size_in])
+            high = low + np.array([width, height])
             is_free = all(
                 np.any((high <= other_low) | (low >= other_high))
                 for other_low, other_high in taken
@@ -327,6 +330,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
                 textcoords="offset points",
                 color=INK,
                 fontweight="bold",
+                verticalalignment="bottom",
                 zorder=6,
             )
             break

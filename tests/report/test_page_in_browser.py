@@ -33,7 +33,7 @@ AXE = Path(
 )
 PHONE, DESKTOP = 390, 1280
 SMALLEST_TEXT_PX = """Math.min(...[...document.querySelectorAll("svg text")].filter(one => one.checkVisibility())
-  .map(one => parseFloat(getComputedStyle(one).fontSize) * one.getScreenCTM().a))"""
+  .map(one => parseFloat(getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().a, one.getScreenCTM().b)))"""
 VISIBLE_WORDS = "document.body.innerText.split(/\\s+/).filter(Boolean).length"
 pytestmark = [
     pytest.mark.slow,

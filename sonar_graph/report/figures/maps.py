@@ -15,7 +15,12 @@ from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_m
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
-from sonar_graph.states import LandmarkMap, Trajectory, landmark_name
+from sonar_graph.states import (
+    FIRST_ANONYMOUS_ID,
+    LandmarkMap,
+    Trajectory,
+    landmark_name,
+)
 
 ELLIPSE_PROBABILITY = 0.95
 MARGIN = 0.3
@@ -221,18 +226,20 @@ def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[E
 
 
 def label_landmarks(panel: Axes, comparison: Comparison) -> None:
-    """Write names beside landmarks that are in view: the true ones, then those of the first run that has a map."""
-    first = (run.landmarks for run in comparison.runs)
-    candidates = [true_landmarks_drawn(comparison), *first]
-    landmarks = next(
-        (known for known in candidates if known is not None and len(known)), None
-    )
-    if landmarks is None:
+    """Write names beside landmarks in view: true ones, and of the first map those without an identity, or all."""
+    true = true_landmarks_drawn(comparison)
+    maps = [run.landmarks for run in comparison.runs if run.landmarks]
+    shown = [] if true is None else [(true.ids, true.positions)]
+    if maps:
+        is_shown = maps[0].ids >= (0 if true is None else FIRST_ANONYMOUS_ID)
+        shown.append((maps[0].ids[is_shown], maps[0].positions[is_shown]))
+    if not shown:
         return
-    points = landmarks.positions[:, :2]
+    ids = np.concatenate([own for own, _ in shown])
+    points = np.concatenate([positions[:, :2] for _, positions in shown])
     low, high = np.array([panel.get_xlim(), panel.get_ylim()]).T
     rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-    names = [landmark_name(identity) for identity in landmarks.ids[rows].tolist()]
+    names = [landmark_name(identity) for identity in ids[rows].tolist()]
     style.label_points(panel, names, points[rows])
 
 
