@@ -3,22 +3,37 @@
 Positions are moved by the rotation about the vertical and the translation that fit best: ``p' = R p + t``. A path is
 fitted to the true path at the scored instants, a map to the true landmarks. These are the alignments of the scores
 ``causal.ate_se2_m``, ``smoothed.ate_se2_m`` and ``landmarks.se2_m``. NEES stay those of the estimates as reported.
+
+A position on the estimator's own map is aligned by the map: the place where a vehicle finds itself among its landmarks.
+
+    e_j = | T_j p(t_j) - p_true(t_j) |,    T_j: the best alignment of the map known at t_j to the true landmarks
+
+A smoother moves its whole map when it learns, and the path that it gave before does not move with it. Raw and aligned
+errors of the path count that; this one does not. Derivation: docs/theory/metrics.md.
 """
 
+from collections.abc import Sequence as Many
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.evaluation.consistency import world_position_covs
-from sonar_graph.evaluation.metrics import Alignment, align_yaw, scored_map, yaw_rad
+from sonar_graph.evaluation.metrics import (
+    Alignment,
+    align_map,
+    align_yaw,
+    scored_map,
+    yaw_rad,
+)
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult
 from sonar_graph.evaluation.scored_instants import rows_at
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
-LEAST_LANDMARKS = 2
+LEAST_MATCHED = 2
 """Fewer landmarks leave the rotation of a map open; the map then moves with the causal path."""
 
 
@@ -92,7 +107,7 @@ def _of_map(landmarks: LandmarkMap, sequence: Sequence) -> Alignment | None:
     _, rows, true_rows = np.intersect1d(
         scored.landmarks.ids, true.ids, return_indices=True
     )
-    if len(rows) < LEAST_LANDMARKS:
+    if len(rows) < LEAST_MATCHED:
         return None
     return align_yaw(scored.landmarks.positions[rows], true.positions[true_rows])
 
@@ -122,3 +137,48 @@ def _aligned_errors(
         position_sigma_m=np.sqrt(np.maximum(variances, 0.0)),
         yaw_rad=wrap_angle(errors.yaw_rad + yaw_rad(R[None])),
     )
+
+
+LEAST_LANDMARKS = 3
+"""True landmarks that a map must name: of two, the errors alone would turn it."""
+
+
+def own_map_errors(
+    run: RunResult, sequence: Sequence, scored_ns: Ints
+) -> tuple[Ints, Floats]:
+    """Stamps and horizontal errors, shapes (k,), at those scored instants at which the run's map was kept.
+
+    Instants at which the map names fewer than `LEAST_LANDMARKS` true landmarks are left out.
+    """
+    truth, true, path = sequence.truth, sequence.true_landmarks, run.causal
+    stamps: list[int] = []
+    errors: list[float] = []
+    if truth is None or true is None or path is None:
+        return np.array(stamps, dtype=np.int64), np.array(errors)
+    is_level = (
+        sequence.calibration.planar is not None or sequence.calibration.use_gravity
+    )
+    for known in run.maps:
+        if (
+            known.stamp_ns not in scored_ns
+            or np.isin(known.landmarks.ids, true.ids).sum() < LEAST_LANDMARKS
+        ):
+            continue
+        alignment = align_map(known.landmarks, true, is_level=is_level)
+        assert alignment is not None
+        position = path.positions[path.stamps_ns == known.stamp_ns]
+        off = alignment.apply(position) - truth.at(np.array([known.stamp_ns])).positions
+        stamps.append(known.stamp_ns)
+        errors.append(float(np.linalg.norm(off[0, :2])))
+    return np.array(stamps, dtype=np.int64), np.array(errors)
+
+
+def shared_map_instants(
+    runs: Many[RunResult], sequence: Sequence, scored_ns: Ints
+) -> Ints:
+    """Stamps at which every run that can be scored on its map at all can be, shape (k,)."""
+    shared = scored_ns
+    for stamps_ns in (own_map_errors(run, sequence, scored_ns)[0] for run in runs):
+        if len(stamps_ns):
+            shared = np.intersect1d(shared, stamps_ns)
+    return shared

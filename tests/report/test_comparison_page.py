@@ -300,7 +300,7 @@ def test_without_truth_there_is_no_aligned_view_and_the_plots_name_the_reason():
     assert blind.plot_map().get_xlabel() == "world x (m)"
     with pytest.raises(EvaluationError, match="no run has errors against a truth"):
         blind.plot_map(aligned=True)
-    with pytest.raises(EvaluationError, match="nothing to draw: no run has errors"):
+    with pytest.raises(EvaluationError, match="The log has no ground truth"):
         blind.plot_errors()
 
 

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
     DURATION_S,
     MAP_TIMES_S,
@@ -18,6 +20,7 @@ from sonar_graph.report.figure_style import (
     HALF_WIDTH_IN,
     PHONE_WIDTH_IN,
     Illustration,
+    arrange,
     inline_svg,
     sized,
 )
@@ -91,7 +94,7 @@ DRAWINGS = {
     "nees": Drawing(
         "Consistency over time",
         error_figures.nees_figure,
-        "NEES of the causal estimates per degree of freedom, not aligned. Dots are instants, lines are means over a "
+        "NEES of the causal estimates per degree of freedom, {world}. Dots are instants, lines are means over a "
         "fortieth of the run. The band holds 95 % of a consistent estimator's values.",
         "{no_errors} NEES needs them.",
         ("causal.nees_position", "causal.nees_yaw"),
@@ -154,6 +157,18 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
         name: _illustration(shown, name, drawing)
         for name, (shown, drawing) in drawings(comparison).items()
     }
+
+
+def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]:
+    """The panels of one figure, in reading order; an `EvaluationError` where there is nothing to draw."""
+    shown = aligned_to_truth(comparison) if aligned else comparison
+    if shown is None:
+        raise EvaluationError("aligned=True: no run has errors against a truth")
+    figure = DRAWINGS[name].draw(shown)
+    if figure is None:
+        raise EvaluationError(f"nothing to draw. {_instead(shown, DRAWINGS[name])}")
+    arrange(figure)
+    return figure.axes
 
 
 def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
@@ -231,6 +246,7 @@ def _captions(comparison: Comparison) -> dict[str, str]:
             cut=_leaving(far),
         ),
         "bounds": DRAWINGS["bounds"].caption.format(world=world),
+        "nees": DRAWINGS["nees"].caption.format(world=world),
         "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
     }
 
