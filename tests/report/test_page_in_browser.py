@@ -170,7 +170,9 @@ def test_one_switch_chooses_between_aligned_and_not_for_figures_tables_and_headl
 
 
 def test_folded_chapters_of_a_comparison_stand_on_paper(browser, comparison_file):
-    folded = "[...document.querySelectorAll('details.chapter:not([open]) > :not(summary)')]"
+    folded = (
+        "[...document.querySelectorAll('details.chapter:not([open]) > :not(summary)')]"
+    )
     with opened(browser, comparison_file, DESKTOP) as (page, _):
         assert page.evaluate(f"{folded}.length") > 5
         assert not page.evaluate(f"{folded}.some(one => one.checkVisibility())")
