@@ -24,6 +24,19 @@ FIRST_ANONYMOUS_ID = 3_000_000_000
 """First identity given to landmarks that the recogniser has not named; identities of designs end at 2^31 - 1."""
 
 
+def landmark_name(identity: int) -> str:
+    """Short name of a landmark: its identity, or ``u`` and a number where the recogniser has not named it.
+
+    Examples
+    --------
+    >>> from sonar_graph.states import FIRST_ANONYMOUS_ID, landmark_name
+    >>> landmark_name(4), landmark_name(FIRST_ANONYMOUS_ID + 3)
+    ('4', 'u3')
+    """
+    number = identity - FIRST_ANONYMOUS_ID
+    return str(identity) if number < 0 else f"u{number}"
+
+
 MOST_ROWS = 30
 """Most landmarks that a notebook shows."""
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.errors import ArgumentError, EvaluationError
+from sonar_graph.evaluation.aligned import shared_map_instants
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.free_start import with_fitted_truth
-from sonar_graph.evaluation.own_map import shared_map_instants
 from sonar_graph.evaluation.results import (
     Comparison,
     ErrorSeries,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from html import escape
+from importlib import import_module
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,6 +16,7 @@ from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
+from sonar_graph.settings import flattened
 from sonar_graph.states import (
     DetectionLog,
     LandmarkMap,
@@ -25,6 +27,8 @@ from sonar_graph.states import (
 from sonar_graph.table import as_html
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from sonar_graph.recognition import Recognition
 
 Kind = Literal["causal", "smoothed"]
@@ -81,6 +85,12 @@ class RunResult:
     """Duration of asking for the trajectory and the map at the end."""
     peak_memory_mb: float = float("nan")
     """Highest resident memory of the process while it ran, less what it was before."""
+
+    @property
+    def is_as_published(self) -> bool:
+        """True for a filter without gate and robust kernel, as the papers of 2014 and before have it."""
+        params = flattened(self.params)
+        return params.get("gate_probability") == 1.0 and params.get("kernel_width") == 0
 
     def __repr__(self) -> str:
         end = (
@@ -242,6 +252,8 @@ class Comparison:
     """The recognition of landmarks in sonar images; None where the log had detections or no images."""
     ensembles: list[Ensemble] = field(default_factory=list)
     """Many runs of the same experiment; empty where there is only this one."""
+    is_aligned: bool = False
+    """Paths, maps and errors are those of `aligned_to_truth`."""
 
     def __repr__(self) -> str:
         runs = ", ".join(f"{run.estimator} {run.status}" for run in self.runs)
@@ -258,6 +270,61 @@ class Comparison:
         """Runs that did not come to an end."""
         return [run for run in self.runs if run.status == "failed"]
 
+    def plot_map(self, *, aligned: bool = False) -> Axes:
+        """Draw truth, paths and landmarks with their 95 % ellipses, for a notebook or a paper.
+
+        Parameters
+        ----------
+        aligned
+            Align each path and map to the truth, by `aligned_to_truth`.
+
+        Returns
+        -------
+        matplotlib axes in world metres. Its ``figure`` has a ``savefig``; its size follows matplotlib's settings.
+
+        Raises
+        ------
+        EvaluationError
+            When no run has a path, or `aligned` is asked for and no run has errors against a truth.
+
+        Examples
+        --------
+        >>> from sonar_graph import compare
+        >>> from sonar_graph.testing import small_world
+        >>> compare(small_world(), ["dead-reckoning"]).plot_map(aligned=True).get_xlabel()
+        'world x (m)'
+        """
+        panels: list[Axes] = _figures().panels_of(self, "map", aligned=aligned)
+        return panels[0]
+
+    def plot_errors(self, *, aligned: bool = False) -> list[Axes]:
+        """Draw the causal errors of position and heading over time and over the distance travelled.
+
+        Parameters
+        ----------
+        aligned
+            Errors after alignment of each path to the truth, by `aligned_to_truth`.
+
+        Returns
+        -------
+        matplotlib axes: position error in metres over time and over distance, then the same of yaw in degrees.
+
+        Raises
+        ------
+        EvaluationError
+            When no run has errors against a truth.
+
+        Examples
+        --------
+        >>> from sonar_graph import compare
+        >>> from sonar_graph.testing import small_world
+        >>> axes = compare(small_world(), ["dead-reckoning"]).plot_errors(aligned=True)
+        >>> [panel.get_ylabel() for panel in axes]
+        ['position error (m)', '', 'yaw error (°)', '']
+        """
+        panels: list[Axes] = _figures().panels_of(self, "errors", aligned=aligned)
+        return panels
+
     def _repr_html_(self) -> str:
         """The scores that are read first, for a notebook; folded below them all others, and why runs failed."""
         failed = (
@@ -267,6 +334,11 @@ class Comparison:
         every = f"<details><summary>All scores</summary>\n{as_html(score_table(self))}\n</details>"
         name = f"<p><strong>{escape(self.sequence.name)}</strong></p>"
         return "\n".join([name, *failed, as_html(compact_table(self)), every])
+
+
+def _figures() -> Any:
+    """The figures of reports, loaded where one is drawn: reports are built on results, so results cannot import them."""
+    return import_module("sonar_graph.report.figures")
 
 
 @dataclass(frozen=True)

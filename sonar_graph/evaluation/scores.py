@@ -5,6 +5,7 @@ from collections import Counter
 
 import numpy as np
 
+from sonar_graph.evaluation.aligned import LEAST_LANDMARKS, own_map_errors
 from sonar_graph.evaluation.consistency import (
     GATED_SHARE,
     anees_interval,
@@ -26,7 +27,6 @@ from sonar_graph.evaluation.metrics import (
     scored_map,
     yaw_errors_rad,
 )
-from sonar_graph.evaluation.own_map import LEAST_LANDMARKS, own_map_errors
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.tables import unaligned
 from sonar_graph.measurements import Ints

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sonar_graph.table import ABSENT, Cell, Column, Table, absent, number, words
@@ -18,6 +19,8 @@ HEIGHTS, NO_HEIGHTS = (
 )
 """Note of a sequence whose truth has positions without heights."""
 NOT_ALIGNED = "not aligned"
+RAW = "ate_raw_m"
+AS_PUBLISHED = "as published"
 
 TRAJECTORY_LABELS = {
     "ate_raw_m": "Position error, not aligned (ATE, RMS)",
@@ -75,19 +78,19 @@ HEADLINES = {
     "ate_raw_m": "RMS, not aligned",
 }
 """Position errors that can stand in the headline, best suited first, with their names there."""
-PAIRED = {
-    "yaw_rmse_rad": "Yaw error",
-    "nees_position": "Position NEES",
-    "nees_yaw": "Yaw NEES",
-}
-"""Scores that the compact table has causal and smoothed, after the position error."""
-SINGLE = {
-    "causal.own_map_m": "On its own map",
-    "landmarks.se2_m": "Map error",
+COMPACT = {
+    "landmarks.{map_metric}": "Map error",
+    "causal.nees_position": "Position NEES",
+    "causal.nees_yaw": "Yaw NEES",
+    "causal.yaw_rmse_rad": "Yaw error",
+    "detections.nis": "NIS",
+    "detections.used": "Detections used",
     "time.update_median_ms": "Update, median",
     "time.update_max_ms": "Update, longest",
 }
-"""Scores that the compact table has once."""
+"""Scores of the compact table after the position errors, most important first."""
+MOST_SCORES = 5
+"""Scores that the compact table shows beside the name of the estimator."""
 DIRECTIONS = {
     "lower": "lower is better",
     "higher": "higher is better",
@@ -141,54 +144,54 @@ def headline_metric(comparison: Comparison) -> str | None:
     return best if counts[best] else None
 
 
-def compact_table(comparison: Comparison) -> Table:
-    """The scores that are read first: runs down, errors and NEES across, each causal and smoothed.
+def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
+    """The scores that are read first: runs down, errors and NEES across, at most `MOST_SCORES` of them.
 
-    Columns that no run has are left out. Beside a NEES stands what the covariance is judged to be, where it misfits.
+    Scores that no run has are left out. Beside a NEES stands what the covariance is judged to be, where it misfits;
+    beside a filter with the settings of its publication, that it is "as published".
+
+    Parameters
+    ----------
+    comparison
+        Runs with their scores.
+    aligned
+        Position and map errors after alignment to the truth, as in `aligned_to_truth`, instead of before.
     """
     metric = headline_metric(comparison)
-    paired = ({metric: "Position error"} if metric else {}) | PAIRED
-    keys = {
-        f"{kind}.{key}": (kind, label)
-        for key, label in paired.items()
-        for kind in ("causal", "smoothed")
+    if metric and not aligned:
+        metric = RAW
+    world = "aligned" if aligned and metric != RAW else unaligned(comparison.sequence)
+    headings = {
+        f"causal.{metric}": f"Position error, {world}",
+        f"smoothed.{metric}": f"Smoothed, {world}",
     }
-    keys |= {key: (label, "") for key, label in SINGLE.items()}
-    columns, shown = [Column("estimator", "Estimator", is_number=False)], []
-    for key, (heading, over) in keys.items():
-        scores = [
-            score
-            for run in comparison.runs
-            if (score := comparison.score_of(run.estimator, key))
-        ]
-        if scores:
-            unit = f" ({scores[0].shown_unit})" if scores[0].shown_unit else ""
-            columns.append(
-                Column(
-                    key,
-                    heading if over else heading + unit,
-                    over + unit if over else "",
-                )
-            )
-            shown.append(key)
+    map_metric = "se2_m" if aligned else "raw_m"
+    for key, heading in COMPACT.items():
+        is_map = key.startswith("landmarks.")
+        headings[key.format(map_metric=map_metric)] = (
+            f"{heading}, {world}" if is_map else heading
+        )
+    columns = [Column("estimator", "Estimator", is_number=False)]
+    for key, heading in headings.items():
+        found = [comparison.score_of(run.estimator, key) for run in comparison.runs]
+        known = [score for score in found if score is not None]
+        if known and len(columns) <= MOST_SCORES:
+            unit = f" ({known[0].shown_unit})" if known[0].shown_unit else ""
+            columns.append(Column(key, heading + unit))
     rows = []
     for index, run in enumerate(comparison.runs):
-        cells = [words(run.estimator, run=index)]
-        for key in shown:
-            found = comparison.score_of(run.estimator, key)
-            note = (
-                found.verdict
-                if found is not None and found.verdict != "consistent"
-                else ""
-            )
-            cells.append(
-                absent()
-                if found is None
-                else number(found.value, found.text(), note=note)
-            )
+        note = AS_PUBLISHED if run.is_as_published else ""
+        cells = [replace(words(run.estimator, run=index), note=note)]
+        for column in columns[1:]:
+            score = comparison.score_of(run.estimator, column.key)
+            if score is None:
+                cells.append(absent())
+                continue
+            verdict = "" if score.verdict == "consistent" else score.verdict
+            cells.append(number(score.value, score.text(), note=verdict))
         rows.append(cells)
     caption = (
-        f"Position error: {label(metric, comparison)}. NEES of a fitting covariance: 1."
+        f"Position error: {label(metric, comparison, HEADLINES)}, causal. NEES 1: covariances fit."
         if metric
         else ""
     )

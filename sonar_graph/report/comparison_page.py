@@ -5,6 +5,7 @@ Layout and explanations: ``templates/comparison.html``. Design: docs/design/0008
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -18,6 +19,7 @@ from sonar_graph.evaluation import (
     UNJUDGED,
     Comparison,
     Ensemble,
+    aligned_to_truth,
     compact_table,
     confidences,
     format_value,
@@ -39,7 +41,7 @@ from sonar_graph.report.ensemble_section import (
     ensemble_table,
 )
 from sonar_graph.report.figure_style import Illustration, inline_svg, sized
-from sonar_graph.report.figures import illustrations, reliability_figure
+from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.rendering import data_address, render
 from sonar_graph.sequence import Sequence
@@ -141,26 +143,20 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
 
 def render_report(comparison: Comparison) -> str:
     """The page as text."""
-    sequence, runs = comparison.sequence, comparison.runs
-    is_repeated, failed = repeats_published(sequence), comparison.failed_runs
+    sequence = comparison.sequence
+    runs = comparison.runs
     detections = len(sequence.detections) if sequence.detections else 0
-    lost = sentences.lost_runs(comparison)
-    told = [
-        sentence
-        for sentence in sentences.finding(comparison)[len(failed) :]
-        if sentence not in lost
-    ]
-    doubtful = sentences.doubtful_lines(comparison)
+    aligned = aligned_to_truth(comparison)
+    found = sentences.finding(comparison)
+    told = [line for line in found if line not in sentences.grave_lines(comparison)]
     content = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
         "beside_the_paper": sentences.beside_the_paper(comparison),
         "summary": (
-            f"{format_value(round(sequence.duration_s, 1))} s of "
-            f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion "
-            f"{_of_truth(sequence)}, "
-            f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants, "
-            f"{_counted(len(runs), 'estimator')}."
+            f"{', '.join(run.estimator for run in runs)} on {format_value(round(sequence.duration_s, 1))} s of "
+            f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
+            f"{_counted(detections, 'landmark detection')}."
         ),
         "ensemble": ensemble_sentences(comparison.ensembles),
         "ensembles": [
@@ -170,37 +166,39 @@ def render_report(comparison: Comparison) -> str:
             )
             for place, one in enumerate(comparison.ensembles, start=1)
         ],
-        "headline": sentences.headline(comparison) or told[0],
+        "headlines": {
+            "aligned": sentences.headline(comparison) or told[0],
+            "raw": ""
+            if aligned is None
+            else sentences.headline(comparison, aligned=False),
+        },
+        "published": sentences.published_filters(comparison),
         "finding": told,
-        "doubts": [
-            *sentences.finding(comparison)[: len(failed)],
-            *lost,
-            *doubtful[1:],
-            *(
-                line
-                for line in sentences.warning_lines(sequence.notes)
-                if line not in doubtful
-            ),
-            *sentences.doubt_of_identities(comparison),
-            *sentences.outliers(comparison),
-            *sentences.withheld_lines(comparison),
-        ],
+        "doubts": sentences.doubts(comparison),
         "failed": text_table(
             "failed",
             "Runs that did not come to an end",
             ["Estimator", "Reason"],
-            [[run.estimator, run.reason] for run in failed],
+            [[run.estimator, run.reason] for run in comparison.failed_runs],
             numbers=False,
         ),
-        "compact": compact_table(comparison),
+        "compact": _views(
+            "compact",
+            compact_table(comparison),
+            compact_table(comparison, aligned=aligned is None),
+        ),
         "scores": score_table(comparison),
         "protocols": protocols(comparison),
         "figures": illustrations(comparison),
-        "landmarks": landmark_table(comparison),
+        "landmarks": _views(
+            "landmarks",
+            landmark_table(aligned or comparison),
+            landmark_table(comparison),
+        ),
         "left_out": landmarks_left_out(comparison),
         "has_true_landmarks": sequence.true_landmarks is not None,
         "nameless": sentences.nameless_landmarks(comparison),
-        "paper": PAPER if is_repeated else "",
+        "paper": PAPER if repeats_published(sequence) else "",
         "has_detections": detections > 0 or bool(outcome_table(comparison).rows),
         "outcomes": outcome_table(comparison),
         "refused": refused_table(comparison),
@@ -219,6 +217,15 @@ def render_report(comparison: Comparison) -> str:
         "environment": comparison.environment,
     }
     return render(TEMPLATE, content)
+
+
+def _views(name: str, aligned: Table | None, raw: Table | None) -> dict[str, Table]:
+    """A table by name, and with `RAW_VIEW` the one before alignment where it differs; empty where there is none."""
+    if aligned is None or raw is None:
+        return {}
+    if raw == aligned:
+        return {name: aligned}
+    return {name: aligned, name + RAW_VIEW: replace(raw, name=name + RAW_VIEW)}
 
 
 def comparison_tables(comparison: Comparison) -> list[Table]:
@@ -298,12 +305,7 @@ def outcome_table(comparison: Comparison) -> Table:
     rows = []
     for outcome in Outcome:
         if any(count and count[outcome] for count in counts):
-            shares = [
-                ABSENT
-                if count is None
-                else f"{count[outcome]} ({100 * count[outcome] / max(count.total(), 1):.1f} %)"
-                for count in counts
-            ]
+            shares = [_share(count, outcome) for count in counts]
             rows.append([outcome.value.capitalize(), *shares])
     if rows:
         rows.append(
@@ -315,6 +317,14 @@ def outcome_table(comparison: Comparison) -> Table:
     columns = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
     cells = [[words(text) for text in row] for row in rows]
     return Table("outcomes", "What became of each detection", "", columns, cells)
+
+
+def _share(count: Counter[Outcome] | None, outcome: Outcome) -> str:
+    """Detections with an outcome, with their share of all."""
+    if count is None:
+        return ABSENT
+    number = count[outcome]
+    return f"{number} ({100 * number / count.total():.1f} %)" if number else "0"
 
 
 def refused_table(comparison: Comparison) -> Table:

@@ -20,7 +20,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as MarkPath
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
@@ -40,7 +40,13 @@ LINE_STYLES: tuple[Any, ...] = (
     (0, (1.2, 1.2)),
 )
 TIME_LABEL = "time since start (s)"
-PAGE_WIDTH_IN, PAGE_TEXT_PT = 7.4, 9.2
+PAGE_WIDTH_IN = 7.4
+HALF_WIDTH_IN = 6.35
+"""610 px: two figures stand beside each other on a screen of 1280 px."""
+PHONE_WIDTH_IN = 3.72
+"""Width of the content of a page on a phone, 357 of 390 px."""
+PAGE_TEXT_PT = 9.2
+"""12.3 px on a page that shows figures at their natural width or wider."""
 SERIES_POINTS = 700
 """Points that a drawn series keeps: more cannot be seen at the width of a page."""
 LETTERS = {"STIXGeneral": 0.48}
@@ -55,6 +61,16 @@ PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"
 }
 """Custom property of the page that replaces each colour, so that figures follow dark and light."""
 POINTS_PER_INCH = 72
+CSS_PIXELS_PER_INCH = 96
+LEAST_TICKS = 3
+BOLD_LETTER = 0.72
+"""Width of a bold letter or digit, in sizes of the text."""
+NAME_HEIGHT = 1.25
+"""Height of a name with what hangs below its line, in sizes of the text."""
+MARK_IN = 0.07
+"""Half the size of the mark of a landmark, inches."""
+NAME_PLACES = ((1, 1), (-1, 1), (1, -1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
+"""Directions from a point in which its name may stand, best first."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +136,7 @@ def text_pt() -> float:
 
 def size_in(rows: int, row_in: float = 1.75) -> tuple[float, float]:
     """Width and height of a figure of rows, inches; on a narrow one they are lower."""
-    narrow = min(1.0, 0.4 + 0.6 * width_in() / PAGE_WIDTH_IN)
+    narrow = min(1.0, 0.55 + 0.45 * width_in() / PAGE_WIDTH_IN)
     return width_in(), ((row_in if rows > 1 else 2.3) * rows + 0.8) * narrow
 
 
@@ -259,8 +275,65 @@ def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
     """Put an axis on a logarithmic scale with plain numbers at the powers of ten."""
     axis = panel.xaxis if direction == "x" else panel.yaxis
     panel.set(**{f"{direction}scale": "log"})
+    axis.set_major_locator(SeveralTicks())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
+
+
+class SeveralTicks(LogLocator):
+    """Ticks at powers of ten, and between them where a logarithmic axis would have fewer than `LEAST_TICKS`."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Places of the ticks for an axis between two values."""
+        low = min(vmin, vmax)
+        high = max(vmin, vmax)
+        for between in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0)):
+            self.set_params(subs=between)
+            ticks = np.asarray(super().tick_values(vmin, vmax))
+            if np.count_nonzero((ticks >= low) & (ticks <= high)) >= LEAST_TICKS:
+                return ticks
+        return MaxNLocator(LEAST_TICKS + 1).tick_values(vmin, vmax)
+
+
+def label_points(panel: Axes, names: list[str], points: Floats) -> None:
+    """Write names beside points, shape (n, 2), where neither another name nor a point is; a name without room is left out.
+
+    The figure must have its final size (`arrange`), because the room is measured in inches.
+    """
+    scale = 1.0 / panel.figure.dpi
+    places_in = panel.transData.transform(points) * scale  # (n, 2)
+    edges = panel.get_window_extent()
+    frame = np.array([[edges.x0, edges.y0], [edges.x1, edges.y1]]) * scale
+    size_in = text_pt() / POINTS_PER_INCH
+    height = NAME_HEIGHT * size_in
+    taken = [(at - MARK_IN, at + MARK_IN) for at in places_in]
+    for name, at, point in zip(names, places_in, points, strict=True):
+        width = size_in * BOLD_LETTER * len(name)
+        for x, y in NAME_PLACES:
+            low = at + np.array([x * MARK_IN, y * MARK_IN])
+            low += np.array([min(x, 0) * width, (y - 1) / 2 * height])
+            if x == 0:
+                low[0] -= width / 2
+            high = low + np.array([width, height])
+            is_free = all(
+                np.any((high <= other_low) | (low >= other_high))
+                for other_low, other_high in taken
+            )
+            if not is_free or np.any(low < frame[0]) or np.any(high > frame[1]):
+                continue
+            taken.append((low, high))
+            offset_pt = (low - at) * POINTS_PER_INCH
+            panel.annotate(
+                name,
+                (point[0], point[1]),
+                xytext=(offset_pt[0], offset_pt[1]),
+                textcoords="offset points",
+                color=INK,
+                fontweight="bold",
+                verticalalignment="bottom",
+                zorder=6,
+            )
+            break
 
 
 def legend_above(figure: Figure, panel: Axes) -> None:
@@ -335,13 +408,14 @@ def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
     )
 
 
-def inline_svg(figure: Figure, name: str, description: str) -> str:
+def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> str:
     """The figure as an ``<svg>`` element for an HTML page.
 
     Text stays text, colours become the page's custom properties, and nothing refers outside. Identifiers begin with
     ``name`` (letters, digits and hyphens, unique on the page), so that several figures can share a page.
 
-    ``description``: content of the figure in words, for those who cannot see it.
+    ``description``: content of the figure in words, for those who cannot see it. ``width``: "phone" for the narrow one
+    of two drawings of a figure.
     """
     arrange(figure)
     buffer = io.StringIO()
@@ -364,8 +438,9 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", svg)
     for own, variable in PAGE_COLOURS.items():
         svg = svg.replace(own, f"var({variable})")
-    width, height = (float(side) * POINTS_PER_INCH for side in figure.get_size_inches())
+    width_in, height_in = map(float, figure.get_size_inches())
+    purpose = f' data-for="{width}"' if width else ""
     return (
-        f'<svg role="img" aria-label="{html.escape(description)}" viewBox="0 0 {width:g} {height:g}"'
-        f' style="--natural-width: {width * 96 / POINTS_PER_INCH:.0f}px">{svg}'
+        f'<svg role="img"{purpose} aria-label="{html.escape(description)}" viewBox="0 0 {width_in * POINTS_PER_INCH:g} '
+        f'{height_in * POINTS_PER_INCH:g}" style="--natural-width: {width_in * CSS_PIXELS_PER_INCH:.0f}px">{svg}'
     )

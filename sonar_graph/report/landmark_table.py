@@ -20,7 +20,7 @@ from sonar_graph.evaluation import (
     unaligned,
 )
 from sonar_graph.measurements import Floats
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import LandmarkMap, Trajectory, landmark_name
 from sonar_graph.table import ABSENT, Column, Table, words
 
 PAPER = "2014 paper"
@@ -55,7 +55,8 @@ def landmark_table(comparison: Comparison) -> Table | None:
     """
     runs, true = comparison.runs, comparison.sequence.true_landmarks
     repeats = repeats_published(comparison.sequence)
-    mapped, is_aligned = {}, False
+    mapped = {}
+    is_aligned = comparison.is_aligned
     for run in runs:
         if run.landmarks is not None and len(run.landmarks):
             scored = scored_map(run.landmarks, comparison.sequence)
@@ -90,7 +91,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
             cells = [_with_difference(value, at, decimals) for value, decimals in found]
             rows.append(
                 [
-                    f"ID {id_}, {'xy'[axis]}",
+                    f"ID {landmark_name(id_)}, {'xy'[axis]}",
                     _with_difference(at, None, DECIMALS),
                     *cells,
                 ]
@@ -124,10 +125,14 @@ def landmark_table(comparison: Comparison) -> Table | None:
     caption = "Positions in the map at the end, metres" + (
         "" if true is None else "; in brackets estimate minus truth"
     )
-    if is_aligned:
+    if comparison.is_aligned:
+        caption += "; each map aligned to the true landmarks"
+    elif is_aligned:
         caption += (
             "; maps aligned to the true landmarks, whose world is not that of the start"
         )
+    elif true is not None:
+        caption += f"; {unaligned(comparison.sequence)}"
     return Table(
         "landmarks",
         caption,

@@ -108,9 +108,9 @@ def _of_comparison(
     comparison: Comparison,
 ) -> tuple[list[PaperFigure], list[Table], str]:
     figures = []
-    for name, drawing in drawings(comparison).items():
+    for name, (shown, drawing) in drawings(comparison).items():
         with sized(PAGE_IN if drawing.columns > 1 else COLUMN_IN, TEXT_PT, FONT):
-            figure = drawing.draw(comparison)
+            figure = drawing.draw(shown)
         if figure is not None:
             caption = f"{drawing.title}. {drawing.caption}"
             figures.append(

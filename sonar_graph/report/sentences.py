@@ -16,6 +16,7 @@ from sonar_graph.evaluation import (
     HEADLINES,
     HEIGHTS,
     MOST_ROWS_NAMED,
+    RAW,
     Comparison,
     RefusedRows,
     Score,
@@ -28,8 +29,10 @@ from sonar_graph.evaluation import (
 )
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
-from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, landmark_name
 
+FAIR = "invariant-ekf"
+"""The filter with the robust kernel and the gyro bias that filters as published lack."""
 TOO_CLOSE = 0.05
 """Relative difference below which one run says nothing about which of two errors is the smaller one."""
 CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
@@ -181,46 +184,84 @@ def _doubt(score: Score) -> tuple[int, float]:
     return rank, abs(math.log(max(score.value, math.ulp(0.0))))
 
 
-def headline(comparison: Comparison) -> str:
-    """One sentence: the estimator nearest to the truth, how far off it is, and what its covariances are worth.
+def grave_lines(comparison: Comparison) -> list[str]:
+    """Sentences on runs that failed or lost their way."""
+    failed = len(comparison.failed_runs)
+    return [*finding(comparison)[:failed], *lost_runs(comparison)]
+
+
+def doubts(comparison: Comparison) -> list[str]:
+    """Everything that puts results in doubt and is not the headline, worst first."""
+    notes = comparison.sequence.notes
+    doubtful = doubtful_lines(comparison)
+    return [
+        *grave_lines(comparison),
+        *doubtful[1:],
+        *doubt_of_identities(comparison),
+        *outliers(comparison),
+        *(line for line in warning_lines(notes) if line not in doubtful),
+        *withheld_lines(comparison),
+    ]
+
+
+def headline(comparison: Comparison, *, aligned: bool = True) -> str:
+    """The finding: the estimator nearest to the truth, how far off it is, and what its covariances are worth.
 
     Before that, where sensors contradict each other beyond doubt, that the results are doubtful.
 
     Empty where no run has a position error: then `finding` begins with what can be said.
+
+    Parameters
+    ----------
+    comparison
+        Runs with their scores.
+    aligned
+        Errors after alignment to the truth, where the runs have them, instead of before.
     """
     if doubtful := doubtful_lines(comparison):
         return doubtful[0]
     metric = headline_metric(comparison)
     if metric is None:
         return ""
-    errors = {
-        run.estimator: comparison.score_of(run.estimator, f"causal.{metric}")
-        for run in comparison.runs
-    }
-    (name, least), *others = sorted(
-        ((name, score) for name, score in errors.items() if score),
-        key=lambda item: item[1].value,
-    )
+    if not aligned:
+        metric = RAW
+    (name, least), *others = _in_order(comparison, metric)
     close = [
         other
         for other, score in others
         if score.value > 0 and 1 - least.value / score.value < TOO_CLOSE
     ]
-    equals = (
-        f", {' and '.join(close)} no farther than one run can tell" if close else ""
-    )
+    equals = f", {' and '.join(close)} equally near" if close else ""
     what = label(metric, comparison, HEADLINES)
     opening = f"{name} is nearest to the truth{equals}: {least.with_unit} off ({what}, causal)"
-    if any(
+    is_in_doubt = any(
         name in line
         for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]
-    ):
-        return f"{opening}, but not to be believed before its warning is settled."
+    )
+    if is_in_doubt:
+        return f"{opening}, but its warning must be settled first."
+    return f"{opening}. {_worth_of_covariances(comparison, name)}".strip()
+
+
+def _in_order(comparison: Comparison, metric: str) -> list[tuple[str, Score]]:
+    """Runs with their causal error, smallest first."""
+    errors = {
+        run.estimator: comparison.score_of(run.estimator, f"causal.{metric}")
+        for run in comparison.runs
+    }
+    known = [(name, score) for name, score in errors.items() if score]
+    return sorted(known, key=lambda item: item[1].value)
+
+
+def _worth_of_covariances(comparison: Comparison, name: str) -> str:
+    """One sentence on whether the covariances of a run fit its errors; empty where it has no NEES."""
     judged = {
         what: score
         for what, key in CONSISTENCY_KEYS.items()
         if (score := comparison.score_of(name, key))
     }
+    if not judged:
+        return ""
     far = {
         what: score
         for what, score in judged.items()
@@ -231,18 +272,23 @@ def headline(comparison: Comparison) -> str:
             f"of {what} {score.text()}" for what, score in far.items()
         )
         is_small = any(score.verdict == "over-confident" for score in far.values())
-        told = (
-            "smaller than its errors: do not rely on them"
-            if is_small
-            else "larger than its errors"
-        )
-        return f"{opening}; its covariances are {told} (NEES {listed}, 1 fits)."
+        fault = "too small: do not rely on them" if is_small else "too large"
+        return f"Its covariances are {fault} (NEES {listed}, 1 fits)."
     if any(score.verdict for score in judged.values()):
-        return f"{opening}; its covariances fit its errors."
+        return "Its covariances fit its errors."
+    return "One run is too short to judge its covariances."
+
+
+def published_filters(comparison: Comparison) -> str:
+    """Which filters have the settings of their publication, with their fair neighbour; empty without any."""
+    names = [run.estimator for run in comparison.runs if run.is_as_published]
+    if not names:
+        return ""
+    is_there = any(run.estimator == FAIR for run in comparison.runs)
+    where = "" if is_there else f"; add it with --estimators {','.join([*names, FAIR])}"
     return (
-        f"{opening}; whether its covariances fit, one run with so few independent samples does not tell."
-        if judged
-        else f"{opening}."
+        f"{' and '.join(names)}: as published, without gate, robust kernel or gyro bias. "
+        f"The fair neighbour is {FAIR}, which has kernel and bias{where}."
     )
 
 
@@ -274,14 +320,7 @@ def no_detections(comparison: Comparison) -> str:
 
 def _causal_sentence(comparison: Comparison, metric: str) -> str:
     """Causal errors in order of size, and the distance of the smallest from the others."""
-    errors = {
-        run.estimator: comparison.score_of(run.estimator, f"causal.{metric}")
-        for run in comparison.runs
-    }
-    scored = sorted(
-        ((name, score) for name, score in errors.items() if score),
-        key=lambda item: item[1].value,
-    )
+    scored = _in_order(comparison, metric)
     listed = ", ".join(f"{name} {score.with_unit}" for name, score in scored)
     opening = (
         f"Causal position error ({label(metric, comparison, HEADLINES)}): {listed}"
@@ -475,7 +514,7 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
         if run.landmarks is None or not count:
             continue
         if true is None:
-            which = f"identities from {FIRST_ANONYMOUS_ID} on are made up"
+            which = f"u0 stands for identity {FIRST_ANONYMOUS_ID} in the files"
         else:
             scored = scored_map(run.landmarks, comparison.sequence)
             found = (
@@ -503,11 +542,10 @@ def _landmarks(ids: Iterable[int]) -> str:
 
 def _listed(ids: list[int]) -> str:
     """The first identities, and the number of the others."""
+    names = [landmark_name(id_) for id_ in ids]
     if len(ids) > MOST_NAMED:
-        return (
-            f"{', '.join(map(str, ids[:MOST_NAMED]))} and {len(ids) - MOST_NAMED} more"
-        )
-    *first, last = map(str, ids)
+        return f"{', '.join(names[:MOST_NAMED])} and {len(ids) - MOST_NAMED} more"
+    *first, last = names
     return f"{', '.join(first)} and {last}" if first else last
 
 

@@ -156,10 +156,10 @@ def test_runs_are_kept_in_the_folder_and_stand_first_on_the_page_and_in_the_term
     )
     page = render_report(again)
     assert (
-        page.index("The basin is simulated")
-        < page.index("One run is one sample: this page")
+        page.index('id="figure-map"')
+        < page.index("One run is one sample")
         < page.index("20 runs by hand")
-        < page.index("In the one run")
+        < page.index("The basin is simulated")
     )
     assert 'id="figure-runs-1"' in page
     assert "20 runs by hand" in str(summary(again).renderables[-1])

@@ -6,9 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation import compare
+from sonar_graph.evaluation import (
+    aligned_to_truth,
+    compact_table,
+    compare,
+    judge,
+    landmark_errors,
+    rmse,
+)
 from sonar_graph.evaluation.consistency import reliability, reliability_of
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
@@ -103,13 +111,15 @@ def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the
     assert (
         rows["causal.nees_position"][2].note == "over-confident; expected 0.900 to 1.10"
     )
-    top = html[: html.index('class="summary"')]
-    assert "Warning: imu: no sample 3.000 to 9.000 s after the start" in top
+    top = html[: html.index("<nav")]
+    assert "1 finding, worst: imu: no sample 3.000 to 9.000 s after the start" in top
     assert "5 of 5 rows" not in top
     assert (
-        html.index('href="#warnings">1 warning</a>')
-        < html.index('class="headline"')
+        html.index('class="summary"')
+        < html.index('class="headline aligned"')
         < html.index('id="figure-map"')
+        < html.index('id="table-compact"')
+        < html.index('id="warnings"')
     )
 
 
@@ -117,7 +127,7 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     html = render_report(with_failure(comparison, "ekf-slam", REASON))
     page = Page(html)
     assert "<script" not in html
-    assert page.text.count(REASON) == 2, "in the finding and in the table of failures"
+    assert page.text.count(REASON) == 3, "in a line, unfolded, and among the failures"
     assert page.text.index("ekf-slam failed") < page.text.index("Causal position error")
     assert {"runs/ekf-slam/result.json"} == {
         attrs["href"]
@@ -168,15 +178,10 @@ def test_without_landmarks_no_figure_of_them_is_announced(comparison):
     unmapped = replace(blind, sequence=replace(blind.sequence, true_landmarks=None))
     for shown, is_announced in ((alone, True), (blind, False), (unmapped, False)):
         html = render_report(shown)
-        figures = re.findall(r'<figure id="figure-(\w+)"', html)
+        figures = re.findall(r'<figure id="figure-([\w-]+)"', html)
         assert figures == [
-            "map",
-            "errors",
-            "bounds",
-            "own_map",
-            "yaw",
-            "nees",
-            "timing",
+            *("map", "map-raw", "errors", "errors-raw", "bounds", "bounds-raw"),
+            *("own_map", "yaw", "nees", "timing"),
         ]
         assert (
             html.count("No run reports what became of")
@@ -207,7 +212,8 @@ def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
     assert "The log has no ground truth" in page.text
     assert "Per update, median" in page.text
     assert "Position error, not aligned" not in page.text
-    assert len(page.named("svg")) == 5
+    assert len(page.named("svg")) == 6, "the map in two widths, and no aligned view"
+    assert "show-raw" not in page.text
 
 
 @pytest.mark.slow
@@ -229,6 +235,93 @@ def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
             "Positions in the map at the end, metres; in brackets estimate minus truth"
             in text
         )
+
+
+@pytest.fixture(scope="module")
+def aligned(comparison) -> Comparison:
+    moved = aligned_to_truth(comparison)
+    assert moved is not None
+    return moved
+
+
+@pytest.mark.parametrize("kind", ["causal", "smoothed"])
+def test_aligned_errors_and_maps_are_those_of_the_aligned_scores(
+    comparison, aligned, kind
+):
+    """Figures and tables of one view agree: the series have the rms of the scores."""
+    for run in aligned.runs:
+        errors = aligned.errors[run.estimator][kind]
+        score = comparison.score_of(run.estimator, f"{kind}.ate_se2_m")
+        assert rmse(errors.position_m[:, :2]) == pytest.approx(score.value)
+        path = getattr(run, kind)
+        truth = comparison.sequence.truth.at(errors.stamps_ns).positions
+        at = np.searchsorted(path.stamps_ns, errors.stamps_ns)
+        np.testing.assert_allclose(
+            path.positions[at] - truth, errors.position_m, atol=1e-9
+        )
+        raw = comparison.errors[run.estimator][kind]
+        np.testing.assert_array_equal(errors.nees_position, raw.nees_position)
+        if run.landmarks is not None:
+            found = landmark_errors(run.landmarks, comparison.sequence.true_landmarks)
+            wanted = comparison.score_of(run.estimator, "landmarks.se2_m")
+            assert rmse(found.horizontal_m) == pytest.approx(wanted.value)
+
+
+def test_errors_are_the_same_after_alignment_wherever_the_estimates_world_lies(
+    comparison, aligned
+):
+    """Law: a rotation about the vertical and a shift of a run changes nothing of its aligned view."""
+    turn = Rotation.from_euler("z", 0.7)
+    moved = []
+    for run in comparison.runs:
+        paths = {
+            kind: replace(
+                path,
+                positions=turn.apply(path.positions) + np.array([3.0, -2.0, 0.0]),
+                quaternions_xyzw=(turn * path.rotations()).as_quat(),
+            )
+            for kind, path in (("causal", run.causal), ("smoothed", run.smoothed))
+        }
+        moved.append(replace(run, **paths))
+    judged = judge(comparison.sequence, comparison.instants_ns, moved)
+    again = aligned_to_truth(judged)
+    for name, series in aligned.errors.items():
+        for field in ("position_m", "position_sigma_m", "yaw_rad"):
+            np.testing.assert_allclose(
+                getattr(again.errors[name]["causal"], field),
+                getattr(series["causal"], field),
+                atol=1e-9,
+            )
+
+
+def test_without_truth_there_is_no_aligned_view_and_the_plots_name_the_reason():
+    blind = basin_comparison(60, truth=False)
+    assert aligned_to_truth(blind) is None
+    assert blind.plot_map().get_xlabel() == "world x (m)"
+    with pytest.raises(EvaluationError, match="no run has errors against a truth"):
+        blind.plot_map(aligned=True)
+    with pytest.raises(EvaluationError, match="The log has no ground truth"):
+        blind.plot_errors()
+
+
+def test_a_filter_as_published_is_named_so_with_its_fair_neighbour(comparison):
+    """Beside its name in the table, and in a sentence with what it lacks."""
+    plain = {"gate_probability": 1.0, "kernel_width": 0.0}
+    ekf = next(run for run in comparison.runs if run.estimator == "ekf-slam")
+    published = with_run(comparison, replace(ekf, params=plain))
+    text = Page(render_report(published)).text
+    assert "ekf-slam as published" in text
+    assert "The fair neighbour is invariant-ekf" in text
+    assert "The fair neighbour" not in Page(render_report(comparison)).text
+
+
+def test_the_first_table_has_at_most_six_columns_that_state_their_alignment(comparison):
+    for aligned, world in ((True, "aligned"), (False, "not aligned")):
+        columns = compact_table(comparison, aligned=aligned).columns
+        assert len(columns) <= 6
+        headings = [column.heading for column in columns if "(m)" in column.heading]
+        assert len(headings) == 3
+        assert all(heading.endswith(f", {world} (m)") for heading in headings)
 
 
 def texts(table: Table) -> dict[str, list[str]]:

@@ -19,9 +19,11 @@ from sonar_graph.evaluation.scored_instants import map_instants, published_maps
 from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
     arrange,
+    blank_panels,
     colour,
     evenly,
     inline_svg,
+    logarithmic,
     sized,
     thinned,
 )
@@ -35,7 +37,7 @@ from sonar_graph.report.figures.maps import (
     map_view,
     paths_cut_off,
 )
-from sonar_graph.states import LandmarkMap
+from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
 TIME, DISTANCE = "time since start (s)", "distance travelled (m)"
@@ -49,10 +51,10 @@ FIGURES = {
     figures.yaw_figure: ({TIME}, {"yaw (°)"}),
     figures.nees_figure: ({TIME}, {"position NEES / dof", "yaw NEES / dof"}),
     figures.innovation_figure: ({TIME}, {"range (m)", "azimuth (°)"}),
-    figures.nis_figure: ({"NIS"}, {"detections below (%)"}),
+    figures.nis_figure: ({"NIS"}, {"detections (%)"}),
     figures.timing_figure: (
         {"duration of an update (ms)"},
-        {"updates at most as long (%)"},
+        {"updates (%)"},
     ),
 }
 """Every figure, with the labels of its axes."""
@@ -118,6 +120,41 @@ def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its
     assert paths_cut_off(only(comparison, "isam2")) == []
 
 
+def test_names_of_crowded_landmarks_are_short_and_neither_overlap_nor_cover_a_mark():
+    """Landmarks without a name are u0, u1, ...; a name without room is left out."""
+    comparison = only(basin_comparison(60, truth=False), "isam2")
+    rng = np.random.default_rng(5)
+    for spread_m in (0.05, 1.0, 4.0):
+        points = np.column_stack([rng.normal(3.0, spread_m, (40, 2)), np.zeros(40)])
+        ids = FIRST_ANONYMOUS_ID + np.arange(40)
+        crowd = LandmarkMap(ids, points, np.tile(1e-4 * np.eye(3), (40, 1, 1)))
+        shown = with_run(comparison, replace(comparison.runs[0], landmarks=crowd))
+        with sized():
+            figure = map_figure(shown)
+        FigureCanvasAgg(figure).draw()
+        (panel,) = figure.axes
+        names = [text for text in panel.texts if text.get_text()]
+        assert names or spread_m < 1
+        assert {text.get_text() for text in names} <= {f"u{k}" for k in range(40)}
+        boxes = [text.get_window_extent() for text in names]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        marks = panel.transData.transform(points[:, :2])
+        assert not any(box.contains(*mark) for box in boxes for mark in marks)
+
+
+@pytest.mark.parametrize(
+    "limits", [(0.9, 1.1), (1.0, 9.0), (2.0, 3.0), (0.3, 40.0), (1e-3, 1e6)]
+)
+def test_a_logarithmic_axis_has_several_ticks(limits):
+    figure, axes = blank_panels(1, 1, (4.0, 3.0))
+    panel = axes[0, 0]
+    logarithmic(panel, "y")
+    panel.set_ylim(*limits)
+    ticks = panel.yaxis.get_majorticklocs()
+    assert 3 <= np.count_nonzero((ticks >= limits[0]) & (ticks <= limits[1])) <= 12
+    assert figure.axes == [panel]
+
+
 @pytest.fixture(scope="module")
 def comparison() -> Comparison:
     return basin_comparison()
@@ -133,7 +170,9 @@ def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     seconds = (errors.stamps_ns - errors.stamps_ns[0]) * 1e-9 + 0.5
     np.testing.assert_allclose(x_line.get_xdata(), seconds)
     corners = figure.axes[0].collections[0].get_datalim(figure.axes[0].transData)
-    assert corners.y1 == pytest.approx(3 * errors.position_sigma_m[:, 0].max())
+    assert corners.y1 == pytest.approx(
+        chi2.ppf(0.95, 1) ** 0.5 * errors.position_sigma_m[:, 0].max()
+    )
 
 
 def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
@@ -181,7 +220,8 @@ def test_a_run_that_is_far_worse_leaves_the_picture_and_is_named(comparison):
     assert errors_cut_off(far) == ["dead-reckoning"]
     best = np.hypot(*comparison.errors["isam2"]["causal"].position_m[:, :2].T).max()
     assert best < figures.error_figure(far).axes[0].get_ylim()[1] < 20 * best
-    assert "Leaves the picture: dead-reckoning." in illustrations(far)["errors"].caption
+    shown = illustrations(far)["errors-raw"]
+    assert "Leaves the picture: dead-reckoning." in shown.caption
 
 
 @pytest.mark.parametrize("draw", FIGURES)

@@ -32,6 +32,9 @@ AXE = Path(
     )
 )
 PHONE, DESKTOP = 390, 1280
+SMALLEST_TEXT_PX = """Math.min(...[...document.querySelectorAll("svg text")].filter(one => one.checkVisibility())
+  .map(one => parseFloat(getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().a, one.getScreenCTM().b)))"""
+VISIBLE_WORDS = "document.body.innerText.split(/\\s+/).filter(Boolean).length"
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium"),
@@ -126,18 +129,19 @@ def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(
         assert page.evaluate(
             "document.querySelector('.headline').textContent"
         ).startswith("isam2 is nearest to the truth")
-        beside = page.evaluate(box.format(".headline") + ".left") > page.evaluate(
-            box.format("#figure-map") + ".right"
-        )
-        assert beside == (width == DESKTOP)
-        bottom = page.evaluate(box.format(".headline") + ".bottom")
-        assert (
-            0
-            < bottom
-            < (900 if beside else page.evaluate(box.format("#figure-map svg") + ".top"))
-        )
-        assert page.evaluate(box.format("#figure-map svg") + ".bottom") <= 900
-        assert page.evaluate(box.format("#figure-map svg") + ".right") <= width
+        order = [".summary", ".headline", "#figure-map svg", "#table-compact"]
+        shown = f"#figure-map svg:nth-child({1 if width == DESKTOP else 2})"
+        order[2] = shown
+        tops = [page.evaluate(box.format(one) + ".top") for one in order]
+        assert tops == sorted(tops)
+        assert page.evaluate(box.format(shown) + ".bottom") <= 800
+        assert page.evaluate(box.format(shown) + ".right") <= width
+        assert page.evaluate(box.format("#table-compact") + ".right") <= width
+        if width == DESKTOP:
+            assert page.evaluate(box.format(shown) + ".width") >= 700
+            assert page.evaluate(box.format("#table-compact") + ".bottom") <= 800
+        assert page.evaluate(SMALLEST_TEXT_PX) >= 12
+        assert page.evaluate(VISIBLE_WORDS) <= 1500
         ink, paper = page.evaluate(
             "[getComputedStyle(document.querySelector('#figure-map svg text')).fill, "
             "getComputedStyle(document.body).backgroundColor]"
@@ -150,8 +154,25 @@ def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(
         assert said == []
 
 
+@pytest.mark.parametrize("width", [PHONE, DESKTOP])
+def test_one_switch_chooses_between_aligned_and_not_for_figures_tables_and_headline(
+    browser, comparison_file, width
+):
+    seen = "[...document.querySelectorAll('{}')].map(one => one.checkVisibility())"
+    with opened(browser, comparison_file, width) as (page, said):
+        for chosen, other in (("aligned", "raw"), ("raw", "aligned")):
+            page.locator(f"label[for=show-{chosen}]").click()
+            shown = page.evaluate(seen.format(f".{chosen}"))
+            assert len(shown) >= 6
+            assert all(shown)
+            assert not any(page.evaluate(seen.format(f".{other}")))
+        assert said == []
+
+
 def test_folded_chapters_of_a_comparison_stand_on_paper(browser, comparison_file):
-    folded = "[...document.querySelectorAll('details.chapter > :not(summary)')]"
+    folded = (
+        "[...document.querySelectorAll('details.chapter:not([open]) > :not(summary)')]"
+    )
     with opened(browser, comparison_file, DESKTOP) as (page, _):
         assert page.evaluate(f"{folded}.length") > 5
         assert not page.evaluate(f"{folded}.some(one => one.checkVisibility())")

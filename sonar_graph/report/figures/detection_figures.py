@@ -98,13 +98,13 @@ def nis_figure(comparison: Comparison) -> Figure | None:
         color=style.TRUTH,
         linewidth=3.2,
         alpha=0.6,
-        label="χ², 2 dof: expected",
+        label="expected: χ²",
     )
     for index, run, values in runs:
         _draw_distribution(panel, values, index, run.estimator)
     style.logarithmic(panel, "x")
     panel.set_xlim(grid[0], grid[-1])
-    style.name_axes(panel, "NIS", "detections below (%)")
+    style.name_axes(panel, "NIS", "detections (%)")
     style.legend_above(figure, panel)
     return figure
 
@@ -129,7 +129,7 @@ def timing_figure(comparison: Comparison) -> Figure | None:
             markersize=5,
         )
     style.logarithmic(panel, "x")
-    style.name_axes(panel, "duration of an update (ms)", "updates at most as long (%)")
+    style.name_axes(panel, "duration of an update (ms)", "updates (%)")
     style.legend_above(figure, panel)
     return figure
 
@@ -164,7 +164,6 @@ def reliability_figure(judged: Reliability) -> Figure:
         bars,
         [str(n) if n else "" for n in judged.count],
         color=style.MUTED,
-        fontsize="small",
         padding=1.5,
     )
     counts.set_ylim(0, 1.25 * max(int(judged.count.max()), 1))

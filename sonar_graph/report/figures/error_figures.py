@@ -5,6 +5,8 @@ figures. Angles are drawn in degrees. Runs share their axes; one whose errors ar
 a common scale would flatten the others.
 """
 
+import math
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -23,6 +25,8 @@ from sonar_graph.states import Trajectory
 
 DISTANCE_LABEL = "distance travelled (m)"
 BAND_PROBABILITY = 0.95
+BAND_SIGMAS = math.sqrt(chi_square_quantile(BAND_PROBABILITY, 1))
+"""1.96: half the width of the band of one error, in standard deviations."""
 NEES_FLOOR = 1e-3
 """Smaller values are drawn at the edge: below the band it does not matter how far."""
 NEES_MEANS = 40
@@ -118,7 +122,7 @@ def errors_cut_off(comparison: Comparison) -> list[str]:
 
 
 def bounds_figure(comparison: Comparison) -> Figure | None:
-    """Causal error in x, y, (z) and yaw over time with the reported ±3σ: a row for each quantity, a column a run."""
+    """Causal error in x, y, (z) and yaw over time with the reported 95 % band: a row for each quantity, a column a run."""
     runs = _runs_with_errors(comparison)
     if not runs:
         return None
@@ -139,7 +143,7 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
             _signed(errors, row if row < axes_count else None) for errors in series
         ]
         limit = ROOM * shared_limit(
-            [np.fmax(np.abs(error), 3 * sigma) for error, sigma in drawn]
+            [np.fmax(np.abs(error), BAND_SIGMAS * sigma) for error, sigma in drawn]
         )
         axes[row, 0].set_ylim(-limit, limit)
         for column, ((index, run), errors, (error, sigma)) in enumerate(
@@ -152,11 +156,11 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
                     style.evenly(len(sigma), points // 4),
                     style.thinned(sigma, points // 4),
                 )
-                low, high = -3 * sigma[band], 3 * sigma[band]
+                half = BAND_SIGMAS * sigma[band]
                 panel.fill_between(
                     seconds[band],
-                    low,
-                    high,
+                    -half,
+                    half,
                     color=style.colour(index),
                     alpha=0.2,
                     linewidth=0,
@@ -212,7 +216,7 @@ def own_map_figure(comparison: Comparison) -> Figure | None:
             **look,
         )
     panel.set_ylim(bottom=0.0)
-    style.name_axes(panel, style.TIME_LABEL, "error on its own map (m)")
+    style.name_axes(panel, style.TIME_LABEL, "own-map error (m)")
     style.legend_above(figure, panel)
     return figure
 
@@ -283,15 +287,13 @@ def nees_figure(comparison: Comparison) -> Figure | None:
             known = per_dof[np.isfinite(per_dof)]
             if known.size:
                 share = float(np.mean((known >= low) & (known <= high)))
-                inside.append(f"{run.estimator} {100 * share:.0f} %")
-        told = f"in the band: {', '.join(inside)}"
+                inside.append(f"{run.estimator}: {100 * share:.0f} % in the band")
         panel.text(
             0.02,
             0.04,
-            told,
+            "\n".join(inside),
             transform=panel.transAxes,
             color=style.INK,
-            fontsize="small",
         )
         style.name_axes(
             panel, style.TIME_LABEL if row == count - 1 else "", f"{label} NEES / dof"

@@ -3,19 +3,24 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
     DURATION_S,
     MAP_TIMES_S,
     Comparison,
+    aligned_to_truth,
     repeats_published,
     unaligned,
 )
 from sonar_graph.report import sentences
 from sonar_graph.report.figure_style import (
-    PAGE_WIDTH_IN,
+    HALF_WIDTH_IN,
+    PHONE_WIDTH_IN,
     Illustration,
+    arrange,
     inline_svg,
     sized,
 )
@@ -27,8 +32,7 @@ from sonar_graph.report.figures.maps import (
     paths_cut_off,
 )
 
-MAP_WIDTH_IN = 4.8
-"""Width of the map on the page: whole on a phone, where wider figures scroll."""
+ALIGNED = "aligned to the truth"
 
 
 @dataclass(frozen=True)
@@ -44,35 +48,39 @@ class Drawing:
     """Keys of scores that are read out for who does not see the figure."""
     columns: int = 2
     """Columns of a journal that it fills, of two."""
+    is_aligned_too: bool = False
+    """The figure has a second view, after alignment to the truth."""
 
 
 DRAWINGS = {
-    "map": Drawing("Map", map_figure, columns=1),
+    "map": Drawing("Map", map_figure, columns=1, is_aligned_too=True),
     "growth": Drawing(
-        "Map as it grew", growth_figure, instead="No run kept its map on the way."
+        "Map as it grew",
+        growth_figure,
+        instead="No run kept its map on the way.",
+        is_aligned_too=True,
     ),
     "errors": Drawing(
         "Error over time and distance",
         error_figures.error_figure,
-        "Horizontal distance of the causal position from the truth{and_heading}, "
-        "{unaligned}. Left: over time; right: over the distance that the truth has travelled.{cut}",
+        "Horizontal distance of the causal position from the truth{and_heading}, {world}. "
+        "Left: over time. Right: over the distance travelled.{cut}",
         "{no_errors}",
         ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
+        is_aligned_too=True,
     ),
     "bounds": Drawing(
-        "Errors and what was believed of them",
+        "Errors with their reported 95 % bands",
         error_figures.bounds_figure,
-        "Estimate minus truth of the causal estimates, {unaligned}. The shaded band is three reported standard "
-        "deviations either side: a consistent estimator leaves it almost never. Scales are shared by row.",
+        "Causal estimate minus truth, {world}. The shaded band should hold 95 % of the errors. Rows share their scale.",
         "{no_errors}",
         ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
+        is_aligned_too=True,
     ),
     "own_map": Drawing(
         "Where am I on my map?",
         error_figures.own_map_figure,
-        "Horizontal error of the causal position after the map, as the estimator had it at that instant, is aligned "
-        "to the true landmarks. A smoother that moves its map when it learns moves itself with it: the path told "
-        "before is left behind, and only the other errors count that.",
+        "Horizontal error of the causal position, aligned by the map of that instant to the true landmarks.",
         "No run has a map of three true landmarks while the truth is known.",
         ("causal.own_map_m",),
         columns=1,
@@ -86,25 +94,22 @@ DRAWINGS = {
     "nees": Drawing(
         "Consistency over time",
         error_figures.nees_figure,
-        "Normalised estimation error squared (NEES) of the causal estimates, divided by its degrees of freedom. "
-        "Dots are instants, the line is the mean over a fortieth of the run; 1 is consistent. The band holds 95 % "
-        "of a consistent estimator's values. Instants of one run depend on each other, so a share near 95 % is a "
-        "hint and not a test.",
+        "NEES of the causal estimates per degree of freedom, {world}. Dots are instants, lines are means over a "
+        "fortieth of the run. The band holds 95 % of a consistent estimator's values.",
         "{no_errors} NEES needs them.",
         ("causal.nees_position", "causal.nees_yaw"),
+        columns=1,
     ),
     "innovations": Drawing(
         "Innovations over time",
         detection_figures.innovation_figure,
-        "Measured minus predicted range and azimuth of detections that had a prediction; in long runs an even "
-        "choice of them, with the extremes.",
+        "Measured minus predicted range and azimuth. Long runs show an even choice, with the extremes.",
         "No run reports innovations.",
     ),
     "nis": Drawing(
         "Distribution of NIS",
         detection_figures.nis_figure,
-        "Normalised innovation squared (NIS) of used detections. Right of the grey curve: innovations larger than "
-        "predicted; left: smaller.",
+        "NIS of used detections. Right of the grey curve, innovations are larger than predicted.",
         "No run reports innovations with their covariances.",
         ("detections.nis",),
         columns=1,
@@ -112,7 +117,7 @@ DRAWINGS = {
     "timing": Drawing(
         "Time per update",
         detection_figures.timing_figure,
-        "Share of updates that took at most the given time; dots mark the median and the 99th percentile.",
+        "Share of updates that took at most this time. Dots: median and 99th percentile.",
         "No run reports durations.",
         ("time.update_median_ms", "time.update_p99_ms"),
         columns=1,
@@ -121,49 +126,77 @@ DRAWINGS = {
 """In reading order."""
 
 
-def illustrations(comparison: Comparison) -> dict[str, Illustration]:
-    """All figures of the page by name, in reading order: headings, captions, and descriptions that can be read out."""
+PHONE = "phone"
+"""Marks the narrow one of two drawings of a figure."""
+RAW_VIEW = "-raw"
+"""Ends the name of a figure or table before alignment, where there is one after it too."""
+
+
+def drawings(comparison: Comparison) -> dict[str, tuple[Comparison, Drawing]]:
+    """All figures by name, in reading order: what each shows, and its kind with the caption in full.
+
+    Where errors are known, a figure of paths or errors has two views: after alignment under its name, and before it
+    under its name with `RAW_VIEW`.
+    """
+    aligned = aligned_to_truth(comparison)
     found = {}
-    for name, drawing in drawings(comparison).items():
-        told = []  # the figure's numbers, run by run, for a reader who does not see it
-        for run in comparison.runs:
-            scores = [
-                score
-                for key in drawing.scores
-                if (score := comparison.score_of(run.estimator, key))
-            ]
-            if scores:
-                told.append(
-                    f"{run.estimator}: {' and '.join(score.with_unit for score in scores)}"
-                )
-        numbers = (
-            " ".join(sentences.finding(comparison))
-            if name == "map"
-            else f"{'; '.join(told)}."
-            if told
-            else ""
-        )
-        with sized(MAP_WIDTH_IN if drawing.draw is map_figure else PAGE_WIDTH_IN):
-            figure = drawing.draw(comparison)
-            described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
-            svg = "" if figure is None else inline_svg(figure, name, described)
-        found[name] = Illustration(
-            name, drawing.title, drawing.caption, svg, drawing.instead
-        )
+    for name, drawing in DRAWINGS.items():
+        views = {name: comparison}
+        if aligned is not None and drawing.is_aligned_too:
+            views = {name: aligned, name + RAW_VIEW: comparison}
+        for view, shown in views.items():
+            caption = _captions(shown).get(name, drawing.caption)
+            instead = _instead(shown, drawing)
+            found[view] = (shown, replace(drawing, caption=caption, instead=instead))
     return found
 
 
-def drawings(comparison: Comparison) -> dict[str, Drawing]:
-    """Kinds of figures by name, with their captions in full."""
-    captions = _captions(comparison)
+def illustrations(comparison: Comparison) -> dict[str, Illustration]:
+    """All figures of the page by name: headings, captions, and descriptions that can be read out."""
     return {
-        name: replace(
-            drawing,
-            caption=captions.get(name, drawing.caption),
-            instead=_instead(comparison, drawing),
-        )
-        for name, drawing in DRAWINGS.items()
+        name: _illustration(shown, name, drawing)
+        for name, (shown, drawing) in drawings(comparison).items()
     }
+
+
+def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]:
+    """The panels of one figure, in reading order; an `EvaluationError` where there is nothing to draw."""
+    shown = aligned_to_truth(comparison) if aligned else comparison
+    if shown is None:
+        raise EvaluationError("aligned=True: no run has errors against a truth")
+    figure = DRAWINGS[name].draw(shown)
+    if figure is None:
+        raise EvaluationError(f"nothing to draw. {_instead(shown, DRAWINGS[name])}")
+    arrange(figure)
+    return figure.axes
+
+
+def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
+    """One figure of the page; a map is drawn in two widths, of which the page shows the one that fits."""
+    widths_in = {"": HALF_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
+    numbers = _read_out(comparison, drawing)
+    if drawing.draw is map_figure:
+        widths_in = {"": HALF_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
+        numbers = " ".join(sentences.finding(comparison))
+    described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
+    svg = ""
+    for width, width_in in widths_in.items():
+        with sized(width_in):
+            figure = drawing.draw(comparison)
+            if figure is not None:
+                svg += inline_svg(figure, f"{name}{width}", described, width)
+    return Illustration(name, drawing.title, drawing.caption, svg, drawing.instead)
+
+
+def _read_out(comparison: Comparison, drawing: Drawing) -> str:
+    """The figure's numbers, run by run, for a reader who does not see it."""
+    parts = []
+    for run in comparison.runs:
+        found = [comparison.score_of(run.estimator, key) for key in drawing.scores]
+        scores = [score.with_unit for score in found if score]
+        if scores:
+            parts.append(f"{run.estimator}: {' and '.join(scores)}")
+    return f"{'; '.join(parts)}." if parts else ""
 
 
 def _instead(comparison: Comparison, drawing: Drawing) -> str:
@@ -177,13 +210,13 @@ def _captions(comparison: Comparison) -> dict[str, str]:
     """Captions that depend on the comparison."""
     is_repeated, world = (
         repeats_published(comparison.sequence),
-        unaligned(comparison.sequence),
+        ALIGNED if comparison.is_aligned else unaligned(comparison.sequence),
     )
     counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
     factor = enlargement(comparison)
     as_large = "" if factor == 1 else f", drawn {factor} times as large"
     growth = (
-        f"Causal paths until the time T since start, and the landmarks as each estimator knew them then, {world}. "
+        f"Causal paths until the time T since start, and landmarks as known then, {world}. "
         f"Ellipses hold 95 %{as_large}."
         f"{counterpart.format('Fig. 4')}"
     )
@@ -198,22 +231,22 @@ def _captions(comparison: Comparison) -> dict[str, str]:
     has_map = comparison.sequence.true_landmarks is not None or any(
         run.landmarks is not None and len(run.landmarks) for run in comparison.runs
     )
-    landmarks = f" Ellipses hold 95 % of where each estimator believes a landmark to be{as_large}; numbers are landmark IDs."
+    landmarks = f" Ellipses hold 95 %{as_large}."
     gone, far = paths_cut_off(comparison), error_figures.errors_cut_off(comparison)
     return {
         "map": (
-            f"Paths{' and landmarks' * has_map} in the world of the start pose, {world}.{landmarks * has_map} Smoothed "
-            f"paths are drawn where they differ.{_leaving(gone)}"
+            f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)}"
         ),
         "growth": growth,
         "errors": DRAWINGS["errors"].caption.format(
-            unaligned=world,
+            world=world,
             and_heading=", and size of the causal heading's error"
             if error_figures.has_yaw(comparison)
             else "",
             cut=_leaving(far),
         ),
-        "bounds": DRAWINGS["bounds"].caption.format(unaligned=world),
+        "bounds": DRAWINGS["bounds"].caption.format(world=world),
+        "nees": DRAWINGS["nees"].caption.format(world=world),
         "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
     }
 

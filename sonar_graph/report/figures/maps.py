@@ -15,7 +15,12 @@ from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_m
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import (
+    FIRST_ANONYMOUS_ID,
+    LandmarkMap,
+    Trajectory,
+    landmark_name,
+)
 
 ELLIPSE_PROBABILITY = 0.95
 MARGIN = 0.3
@@ -23,6 +28,8 @@ MARGIN = 0.3
 SAME_M = 1e-3
 """A smoothed path nowhere farther than this from the causal one is not drawn a second time."""
 PATH_POINTS = 2500
+HIGHEST = 0.72
+"""Height of the view of the map over its width, at most."""
 ENLARGED = (1, 2, 5, 10, 20, 50)
 """Factors by which ellipses may be enlarged."""
 LARGEST_ELLIPSE = 0.09
@@ -67,7 +74,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
             panel.plot(
                 *horizontal(run.causal),
                 color=own,
-                label=f"{run.estimator}, causal",
+                label=run.estimator,
                 zorder=3,
                 **look,
             )
@@ -81,11 +88,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
                 **look,
             )
         if run.landmarks is not None and len(run.landmarks):
-            look = {
-                "markersize": 3.5,
-                "markerfacecolor": "none",
-                "label": f"{run.estimator}, landmarks",
-            }
+            look = {"markersize": 3.5, "markerfacecolor": "none"}
             panel.plot(
                 *run.landmarks.positions.T[:2],
                 "os^Dv<"[index % 6],
@@ -95,12 +98,21 @@ def map_figure(comparison: Comparison) -> Figure | None:
             )
             for ellipse in ellipses(run.landmarks, own, factor):
                 panel.add_patch(ellipse)
-    label_landmarks(panel, comparison, view)
+    view = landscape(view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
     style.name_axes(panel, "world x (m)", "world y (m)")
     style.legend_above(figure, panel)
+    style.arrange(figure)
+    label_landmarks(panel, comparison)
     return figure
+
+
+def landscape(view: Floats) -> Floats:
+    """The view, widened until its height is at most `HIGHEST` of its width, so that a map fits a screen."""
+    width, height = view[1] - view[0]
+    missing = max(height / HIGHEST - width, 0.0)
+    return np.asarray(view + np.array([[-missing / 2, 0.0], [missing / 2, 0.0]]))
 
 
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
@@ -213,32 +225,22 @@ def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[E
     return ellipses
 
 
-def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
-    """Write identities beside landmarks that are in view: the true ones, or those of the first run that has any."""
-    candidates = [
-        true_landmarks_drawn(comparison),
-        *(run.landmarks for run in comparison.runs),
-    ]
-    landmarks = next(
-        (known for known in candidates if known is not None and len(known)), None
-    )
-    if landmarks is None:
+def label_landmarks(panel: Axes, comparison: Comparison) -> None:
+    """Write names beside landmarks in view: true ones, and of the first map those without an identity, or all."""
+    true = true_landmarks_drawn(comparison)
+    maps = [run.landmarks for run in comparison.runs if run.landmarks]
+    shown = [] if true is None else [(true.ids, true.positions)]
+    if maps:
+        is_shown = maps[0].ids >= (0 if true is None else FIRST_ANONYMOUS_ID)
+        shown.append((maps[0].ids[is_shown], maps[0].positions[is_shown]))
+    if not shown:
         return
-    size = "medium" if len(landmarks) <= 40 else "x-small"
-    for identity, position in zip(
-        landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True
-    ):
-        if np.all((position >= view[0]) & (position <= view[1])):
-            panel.annotate(
-                str(identity),
-                (position[0], position[1]),
-                xytext=(7, 6),
-                textcoords="offset points",
-                color=style.INK,
-                fontsize=size,
-                fontweight="bold",
-                zorder=6,
-            )
+    ids = np.concatenate([own for own, _ in shown])
+    points = np.concatenate([positions[:, :2] for _, positions in shown])
+    low, high = np.array([panel.get_xlim(), panel.get_ylim()]).T
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    names = [landmark_name(identity) for identity in ids[rows].tolist()]
+    style.label_points(panel, names, points[rows])
 
 
 def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
@@ -300,7 +302,6 @@ def growth_figure(comparison: Comparison) -> Figure | None:
                 )
                 for ellipse in ellipses(known, own, enlarged):
                     panel.add_patch(ellipse)
-            label_landmarks(panel, comparison, view)
             panel.set(xlim=view[:, 0], ylim=view[:, 1])
             panel.set_aspect("equal", adjustable="box")
             label = "" if column else f"{run.estimator}\nworld y (m)"
@@ -308,6 +309,9 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     for column, seconds in enumerate(style.seconds_since_start(comparison, stamps_ns)):
         style.head_panel(axes[0, column], f"T = {seconds:.1f} s")
     style.legend_above(figure, axes[0, 0])
+    style.arrange(figure)
+    for panel in axes.flat:
+        label_landmarks(panel, comparison)
     return figure
 
 

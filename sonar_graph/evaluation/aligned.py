@@ -1,0 +1,184 @@
+"""A comparison with each path and map moved onto the truth, so that figures and tables show the aligned errors.
+
+Positions are moved by the rotation about the vertical and the translation that fit best: ``p' = R p + t``. A path is
+fitted to the true path at the scored instants, a map to the true landmarks. These are the alignments of the scores
+``causal.ate_se2_m``, ``smoothed.ate_se2_m`` and ``landmarks.se2_m``. NEES stay those of the estimates as reported.
+
+A position on the estimator's own map is aligned by the map: the place where a vehicle finds itself among its landmarks.
+
+    e_j = | T_j p(t_j) - p_true(t_j) |,    T_j: the best alignment of the map known at t_j to the true landmarks
+
+A smoother moves its whole map when it learns, and the path that it gave before does not move with it. Raw and aligned
+errors of the path count that; this one does not. Derivation: docs/theory/metrics.md.
+"""
+
+from collections.abc import Sequence as Many
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.evaluation.consistency import world_position_covs
+from sonar_graph.evaluation.metrics import (
+    Alignment,
+    align_map,
+    align_yaw,
+    scored_map,
+    yaw_rad,
+)
+from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult
+from sonar_graph.evaluation.scored_instants import rows_at
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.models import wrap_angle
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import LandmarkMap, Trajectory
+
+LEAST_MATCHED = 2
+"""Fewer landmarks leave the rotation of a map open; the map then moves with the causal path."""
+
+
+def aligned_to_truth(comparison: Comparison) -> Comparison | None:
+    """The comparison with every path and map aligned to the truth; None where no run has errors.
+
+    Examples
+    --------
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.evaluation import aligned_to_truth
+    >>> from sonar_graph.testing import small_world
+    >>> comparison = compare(small_world(), ["dead-reckoning"])
+    >>> errors = aligned_to_truth(comparison).errors["dead-reckoning"]["causal"]
+    >>> bool(abs(errors.position_m[:, :2].mean()) < 1e-9)
+    True
+    """
+    if not any(comparison.errors.values()):
+        return None
+    runs = []
+    errors: dict[str, dict[Kind, ErrorSeries]] = {}
+    for run in comparison.runs:
+        series = comparison.errors.get(run.estimator, {})
+        if not series:
+            runs.append(run)
+            continue
+        moved, errors[run.estimator] = _aligned_run(run, series, comparison.sequence)
+        runs.append(moved)
+    return replace(comparison, runs=runs, errors=errors, is_aligned=True)
+
+
+def _aligned_run(
+    run: RunResult, series: dict[Kind, ErrorSeries], sequence: Sequence
+) -> tuple[RunResult, dict[Kind, ErrorSeries]]:
+    """A run with its errors, after the alignments of its paths and of its map."""
+    paths: dict[Kind, Trajectory] = {}
+    alignments: dict[Kind, Alignment] = {}
+    errors: dict[Kind, ErrorSeries] = {}
+    for kind, own in series.items():
+        path = run.causal if kind == "causal" else run.smoothed
+        assert path is not None, "a run with errors has a path"
+        alignments[kind] = _of_path(path, own)
+        paths[kind] = _moved(path, alignments[kind])
+        errors[kind] = _aligned_errors(path, own, alignments[kind])
+    of_map = alignments["causal"]
+    if run.landmarks is not None:
+        of_map = _of_map(run.landmarks, sequence) or of_map
+    moved = replace(
+        run,
+        causal=paths.get("causal", run.causal),
+        smoothed=paths.get("smoothed", run.smoothed),
+        landmarks=None if run.landmarks is None else of_map.map(run.landmarks),
+        maps=[
+            replace(known, landmarks=of_map.map(known.landmarks)) for known in run.maps
+        ],
+    )
+    return moved, errors
+
+
+def _of_path(path: Trajectory, errors: ErrorSeries) -> Alignment:
+    """The alignment of a path to the truth at the scored instants."""
+    estimate = rows_at(path, errors.stamps_ns).positions  # (n, 3)
+    return align_yaw(estimate, estimate - errors.position_m)
+
+
+def _of_map(landmarks: LandmarkMap, sequence: Sequence) -> Alignment | None:
+    """The alignment of a map to the true landmarks; None where too few of them are known."""
+    true = sequence.true_landmarks
+    scored = scored_map(landmarks, sequence)
+    if true is None or scored is None:
+        return None
+    _, rows, true_rows = np.intersect1d(
+        scored.landmarks.ids, true.ids, return_indices=True
+    )
+    if len(rows) < LEAST_MATCHED:
+        return None
+    return align_yaw(scored.landmarks.positions[rows], true.positions[true_rows])
+
+
+def _moved(path: Trajectory, alignment: Alignment) -> Trajectory:
+    """The path in the truth's world; covariances are in the body frame, so they stay."""
+    turned = Rotation.from_matrix(alignment.rotation) * path.rotations()
+    return replace(
+        path,
+        positions=alignment.apply(path.positions),
+        quaternions_xyzw=turned.as_quat(),
+    )
+
+
+def _aligned_errors(
+    path: Trajectory, errors: ErrorSeries, alignment: Alignment
+) -> ErrorSeries:
+    """Errors after the alignment, with the reported covariances turned as the path is."""
+    R = alignment.rotation
+    estimate = rows_at(path, errors.stamps_ns)
+    truth = estimate.positions - errors.position_m  # (n, 3)
+    covs = R @ world_position_covs(estimate) @ R.T  # (n, 3, 3)
+    variances = np.diagonal(covs, axis1=1, axis2=2)
+    return replace(
+        errors,
+        position_m=alignment.apply(estimate.positions) - truth,
+        position_sigma_m=np.sqrt(np.maximum(variances, 0.0)),
+        yaw_rad=wrap_angle(errors.yaw_rad + yaw_rad(R[None])),
+    )
+
+
+LEAST_LANDMARKS = 3
+"""True landmarks that a map must name: of two, the errors alone would turn it."""
+
+
+def own_map_errors(
+    run: RunResult, sequence: Sequence, scored_ns: Ints
+) -> tuple[Ints, Floats]:
+    """Stamps and horizontal errors, shapes (k,), at those scored instants at which the run's map was kept.
+
+    Instants at which the map names fewer than `LEAST_LANDMARKS` true landmarks are left out.
+    """
+    truth, true, path = sequence.truth, sequence.true_landmarks, run.causal
+    stamps: list[int] = []
+    errors: list[float] = []
+    if truth is None or true is None or path is None:
+        return np.array(stamps, dtype=np.int64), np.array(errors)
+    is_level = (
+        sequence.calibration.planar is not None or sequence.calibration.use_gravity
+    )
+    for known in run.maps:
+        if (
+            known.stamp_ns not in scored_ns
+            or np.isin(known.landmarks.ids, true.ids).sum() < LEAST_LANDMARKS
+        ):
+            continue
+        alignment = align_map(known.landmarks, true, is_level=is_level)
+        assert alignment is not None
+        position = path.positions[path.stamps_ns == known.stamp_ns]
+        off = alignment.apply(position) - truth.at(np.array([known.stamp_ns])).positions
+        stamps.append(known.stamp_ns)
+        errors.append(float(np.linalg.norm(off[0, :2])))
+    return np.array(stamps, dtype=np.int64), np.array(errors)
+
+
+def shared_map_instants(
+    runs: Many[RunResult], sequence: Sequence, scored_ns: Ints
+) -> Ints:
+    """Stamps at which every run that can be scored on its map at all can be, shape (k,)."""
+    shared = scored_ns
+    for stamps_ns in (own_map_errors(run, sequence, scored_ns)[0] for run in runs):
+        if len(stamps_ns):
+            shared = np.intersect1d(shared, stamps_ns)
+    return shared
