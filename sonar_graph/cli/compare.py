@@ -217,8 +217,14 @@ def demo(
         write_basin(log, options)
         echo("Recognising landmarks in them, then running the estimators")
         with writable_folder(output, names_written(output, names), overwrite=overwrite):
+            # the simulator has made the sensors as they are calibrated: to compare them would take as long as
+            # to recognise the landmarks
             prepared = prepared_log(
-                log, ReadingOptions(), RecogniserOptions(), DEFAULT_RATE_HZ
+                log,
+                ReadingOptions(),
+                RecogniserOptions(),
+                DEFAULT_RATE_HZ,
+                are_sensors_trusted=True,
             )
             with working("compiling the estimators for the first use"):
                 wait_until_compiled()
@@ -356,8 +362,10 @@ def prepared_log(
     reading: ReadingOptions,
     recognition: RecogniserOptions,
     rate_hz: float | None,
+    *,
+    are_sensors_trusted: bool = False,
 ) -> PreparedLog:
-    """Read a log, compare its sensors, and recognise landmarks if it needs that."""
+    """Read a log, compare its sensors unless they are trusted, and recognise landmarks if it needs that."""
     from sonar_graph.diagnosis import check_sensors, notes_of
     from sonar_graph.logs import LIVE_RATE, no_images
     from sonar_graph.logs.adapters import LogConfig
@@ -366,11 +374,12 @@ def prepared_log(
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     check_rate(rate_hz, sequence)
-    with working("comparing sensors"):
-        found_in_sensors = notes_of(
-            check_sensors(sequence, reading.config or LogConfig())
-        )
-    sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
+    if not are_sensors_trusted:
+        with working("comparing sensors"):
+            found_in_sensors = notes_of(
+                check_sensors(sequence, reading.config or LogConfig())
+            )
+        sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
     found = None
     # what was recognised is in it: estimates are those of the live run
     is_of_live_run = LIVE_RATE in sequence.notes
