@@ -2,7 +2,6 @@
 
 # fmt: off
 from sonar_graph.evaluation.comparison import LIBRARIES, compare, describe_environment, expense, judge
-from sonar_graph.evaluation.compiled_beside import compiled_beside
 from sonar_graph.evaluation.consistency import (GATED_SHARE, NONE, UNJUDGED, Reliability, anees_interval, confidences,
     nis, normalised_squares, reliability_of, true_identities)
 from sonar_graph.evaluation.digits import between, fixed, format_value, quantile_text, supported, with_error
@@ -22,10 +21,9 @@ __all__ = [
     "Comparison", "DURATION_S", "ESTIMATES", "Ensemble", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES", "HEIGHTS",
     "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability",
     "RunResult", "SCORES", "Score", "UNJUDGED", "anees_interval", "between", "check_request", "compact_table",
-    "compare", "compiled_beside", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
+    "compare", "confidences", "describe_environment", "expense", "fixed", "format_value", "gathered",
     "headline_metric", "judge", "label", "landmark_errors", "map_instants", "nis", "normalised_squares", "one_line",
     "own_map_errors", "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published",
-    "result_names", "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table",
-    "scored_map", "supported", "true_identities", "unaligned", "with_error", "write_comparison",
-    "write_viewer_files", "yaw_rad",
+    "result_names", "rmse", "run_columns", "run_ensembles", "run_estimator", "score_keys", "score_table", "scored_map",
+    "supported", "true_identities", "unaligned", "with_error", "write_comparison", "write_viewer_files", "yaw_rad",
 ]

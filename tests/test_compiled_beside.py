@@ -8,8 +8,8 @@ from pathlib import Path
 SCRIPT = """
 import sys
 from sonar_graph.estimator import load_estimator
-from sonar_graph.evaluation import compiled_beside
-from sonar_graph.numerics import needs_compiling
+from sonar_graph.evaluation import run_estimator
+from sonar_graph.numerics import compiled_beside, needs_compiling
 from sonar_graph.testing import small_world
 
 
@@ -17,13 +17,17 @@ def fail():
     raise ValueError("no sequence")
 
 
+def run():
+    run_estimator(small_world(), "ekf-slam")
+
+
 if __name__ == "__main__":
     module = sys.modules[load_estimator("ekf-slam").__module__]
     before = needs_compiling(module)
-    with compiled_beside(fail, ["ekf-slam"]) as wait_until_compiled:
+    with compiled_beside(fail, [module]) as wait_until_compiled:
         wait_until_compiled()
     failed = needs_compiling(module)
-    with compiled_beside(small_world, ["ekf-slam"]) as wait_until_compiled:
+    with compiled_beside(run, [module]) as wait_until_compiled:
         wait_until_compiled()
     print(before, failed, needs_compiling(module))
 """
@@ -35,7 +39,7 @@ def test_loops_are_in_the_cache_once_the_other_process_is_done(tmp_path):
     done = subprocess.run(
         [sys.executable, script],
         env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[1],
         capture_output=True,
         text=True,
     )
