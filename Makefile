@@ -12,7 +12,14 @@ VENV ?= .venv
 DEMO ?= demo
 BENCH ?= bench
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip install --disable-pip-version-check
+# One line on a terminal that shows what pip does, and nothing elsewhere; sh has no pipefail, so the code goes by a file.
+define install
+@echo "Installing $(1) into $(VENV)" >&2
+@code=$$(mktemp) && { $(PIP) $(2); echo $$? >$$code; } | if [ -t 2 ]; then \
+  awk '{ printf "\r\033[K%.76s", $$0 >"/dev/stderr"; fflush("/dev/stderr") } END { printf "\r\033[K" >"/dev/stderr" }'; \
+  else cat >/dev/null; fi; status=$$(cat $$code); rm -f $$code; exit $$status
+endef
 
 .PHONY: bench-page bench-speed demo docs test test-slow test-thorough check format wheel check-wheel install clean
 
@@ -50,7 +57,7 @@ format: $(VENV)/.installed-lint
 
 # All estimators, and rules of other projects, on recordings and basins: one page. Recordings: SONAR_GRAPH_DATA=folder.
 bench-page: $(VENV)/.installed
-	$(PIP) --editable '.[bench]' --editable benchmarks/published_rules
+	$(call install,sonar-graph[bench],--editable '.[bench]' --editable benchmarks/published_rules)
 	$(BIN)/sonar-graph bench benchmarks/suites/open.toml -o $(BENCH)
 
 # Ratios of times from scripts in which both sides take turns. ARGS: --quick, --rounds 3, --accept
@@ -78,19 +85,19 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml | $(BIN)/python
-	$(PIP) --editable .
+	$(call install,sonar-graph and its libraries,--editable .)
 	@touch $@
 
 $(VENV)/.installed-tests: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[tests]'
+	$(call install,sonar-graph[tests],--editable '.[tests]')
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[docs]'
+	$(call install,sonar-graph[docs],--editable '.[docs]')
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-lint: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[lint]'
+	$(call install,sonar-graph[lint],--editable '.[lint]')
 	@touch $@ $(VENV)/.installed
 
 clean:

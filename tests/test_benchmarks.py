@@ -98,6 +98,7 @@ QUICK = {
     "validation/sensor_faults.py": Quick(
         ("--workers", "1", "--only", "mission: (depth|gyro)"), ("cases", "failed", "unnamed", "passed"),
         ascending=((0, "cases"), (-1, "failed", 1))),
+    "validation/basin_runs.py": Quick(TWO_WORKERS, names=("causal_m", "passed")),
     "validation/batch_gate.py": Quick(
         ("--workers", "1"), ("told_power_median", "power_20_percent_20_seeds", "false_alarms_allowed", "passed"),
         ascending=((0, "power_50_percent_3_seeds"),)),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -42,8 +43,10 @@ from sonar_graph.errors import EstimatorError, EvaluationError, LogError
 from sonar_graph.files import BATCH, COMPARISON, result_written
 
 if TYPE_CHECKING:
-    from sonar_graph.evaluation import Comparison
+    from sonar_graph.evaluation import Comparison, Ensemble
+    from sonar_graph.recognition import Recognition
     from sonar_graph.sequence import Sequence
+    from sonar_graph.simulation import BasinOptions
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
@@ -55,9 +58,11 @@ LOG, PAGE = "basin.mcap", "report.html"
 DEMO = {
     **{"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}},
     **{"gyro_bias_scale": 10.0, "dvl_dropouts_per_hour": 30.0, "dvl_dropout_s": 5.0},
+    "frame_rate_hz": 2.0,
 }
 """The three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler log that
-loses the bottom some three times."""
+loses the bottom some three times. Images take most of the time: two a second still show each landmark several times."""
+DEMO_ESTIMATORS = ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"]
 DEMO_EXPERIMENTS = {
     "with a gyro bias, a Doppler log that loses the bottom, and a tenth of the tracks wrongly identified": {
         "tracks": True,
@@ -66,7 +71,8 @@ DEMO_EXPERIMENTS = {
     "without gyro bias and with all identities right": {"gyro_bias_scale": 0.0},
 }
 """Changes of the options by condition: what makes the difference between estimators, and runs without it."""
-DEMO_SEEDS = range(1, 21)
+SHORT = {"duration_s": 120.0, "laps": 1, "dvl_dropouts_per_hour": 120.0, "image": None}
+"""Changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log."""
 
 
 @with_options()
@@ -180,49 +186,82 @@ def report(
     echo(f"Report: {page}")
 
 
-def demo(output: OutputFolder = Path("demo"), overwrite: Overwrite = False) -> None:
+def demo(
+    output: OutputFolder = Path("demo"),
+    runs: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Also so many runs of the same basin without images, with faults and without.",
+        ),
+    ] = 0,
+    overwrite: Overwrite = False,
+) -> None:
     """Repeat the 2014 paper's basin experiment in short: simulate sonar images, recognise landmarks, compare, report.
 
-    Three laps in 390 s instead of 2039 s; the log takes about 90 MB. Then twenty more runs of the same
-    basin with faults and twenty without, from simulated detections, for what one run cannot tell.
+    Three laps in 390 s instead of 2039 s; the log takes about 40 MB. One run is not enough to compare estimators:
+    --runs 20 adds twenty runs of the same basin with faults and twenty without, from simulated detections.
     """
-    from sonar_graph.evaluation import run_ensembles
+    from sonar_graph.estimator import load_estimator
+    from sonar_graph.numerics import compiled_beside
     from sonar_graph.report import write_report
     from sonar_graph.simulation import BasinOptions
 
-    names = DEFAULT_ESTIMATORS.split(",")
-    with writable_folder(output, names_written(names), overwrite=overwrite):
+    names = DEMO_ESTIMATORS
+    with writable_folder(output, names_written(output, names), overwrite=overwrite):
         log = writable_log(output / LOG, overwrite=overwrite)
     options = BasinOptions.model_validate(DEMO)
-    echo(
-        f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}"
-    )
-    write_basin(log, options)
-    echo("Recognising landmarks in them, then running the estimators")
-    reading, recognition = ReadingOptions(), RecogniserOptions()
-    with compared(
-        log,
-        output,
-        names,
-        reading,
-        recognition,
-        DEFAULT_RATE_HZ,
-        None,
-        overwrite=overwrite,
-    ) as comparison:
-        experiments = {
-            name: options.model_copy(update=changes)
-            for name, changes in DEMO_EXPERIMENTS.items()
-        }
+    short = partial(run_basin, options.model_copy(update=SHORT), names)
+    modules = [sys.modules[load_estimator(name).__module__] for name in names]
+    with compiled_beside(short, modules) as wait_until_compiled:
         echo(
-            f"Running {len(experiments)} times {len(DEMO_SEEDS)} more of the same basin, without images"
+            f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}"
         )
-        with progress_bars() as progress:
-            ensembles = run_ensembles(experiments, DEMO_SEEDS, names, progress=progress)
-        comparison = replace(comparison, ensembles=ensembles)
-        with working("writing results"):
-            page = write_report(comparison, output)
+        write_basin(log, options)
+        echo("Recognising landmarks in them, then running the estimators")
+        with writable_folder(output, names_written(output, names), overwrite=overwrite):
+            # the simulator has made the sensors as they are calibrated: to compare them would take as long as
+            # to recognise the landmarks
+            prepared = prepared_log(
+                log,
+                ReadingOptions(),
+                RecogniserOptions(),
+                DEFAULT_RATE_HZ,
+                are_sensors_trusted=True,
+            )
+            with working("compiling the estimators for the first use"):
+                wait_until_compiled()
+            comparison = compare_prepared(prepared, names, {})
+            if runs:
+                comparison = replace(comparison, ensembles=more_basins(options, runs))
+            with working("writing results"):
+                page = write_report(comparison, output)
     print_outcome(comparison, f"Report: {page}")
+
+
+def run_basin(options: BasinOptions, names: list[str]) -> None:
+    """Run estimators on a simulated basin, for the code that is compiled on the way."""
+    from sonar_graph.evaluation import compare as compare_runs
+    from sonar_graph.simulation import simulate_basin
+
+    compare_runs(simulate_basin(options), names)
+
+
+def more_basins(options: BasinOptions, runs: int) -> list[Ensemble]:
+    """Runs of the demonstration's basin without images under each of its conditions, with a progress bar."""
+    from sonar_graph.evaluation import run_ensembles
+
+    experiments = {
+        name: options.model_copy(update=changes)
+        for name, changes in DEMO_EXPERIMENTS.items()
+    }
+    echo(
+        f"Running {len(experiments)} times {runs} more of the same basin, without images"
+    )
+    with progress_bars() as progress:
+        return run_ensembles(
+            experiments, range(1, runs + 1), DEMO_ESTIMATORS, progress=progress
+        )
 
 
 def estimators() -> None:
@@ -255,11 +294,16 @@ def estimators() -> None:
         raise typer.Exit(1)
 
 
-def names_written(estimators: list[str]) -> list[str]:
-    """Names of the files that a comparison of some estimators may write."""
+def names_written(output: Path, estimators: list[str]) -> list[str]:
+    """Names of the files that a comparison of some estimators may write into a folder or replace there."""
     from sonar_graph.evaluation import result_names
 
-    return [PAGE, *result_names(estimators)]
+    pictures = [
+        path.relative_to(output).as_posix()
+        for path in output.glob("recognised/*.jpg")
+        if path.stem.isdigit()
+    ]
+    return [PAGE, *result_names(estimators), *pictures]
 
 
 @contextmanager
@@ -287,13 +331,8 @@ def compared(
         recognition.designs,
         recognition.model,
     )
-    pictures = [
-        path.relative_to(output).as_posix()
-        for path in output.glob("recognised/*.jpg")
-        if path.stem.isdigit()
-    ]
     with writable_folder(
-        output, [*names_written(names), *pictures], sources, overwrite=overwrite
+        output, names_written(output, names), sources, overwrite=overwrite
     ):
         yield compare_log(log, names, overrides, reading, recognition, rate_hz)
 
@@ -306,6 +345,16 @@ def check_requests(names: list[str], overrides: dict[str, dict[str, Any]]) -> No
         check_request(name, overrides.get(name))
 
 
+class PreparedLog(NamedTuple):
+    """A log as estimators get it."""
+
+    sequence: Sequence
+    recognition: Recognition | None
+    """None where the log had detections, or no images."""
+    rate_hz: float
+    """Estimates a second."""
+
+
 def compare_log(
     log: Path,
     names: list[str],
@@ -315,9 +364,20 @@ def compare_log(
     rate_hz: float | None,
 ) -> Comparison:
     """Read a log, recognise landmarks if it needs that, and compare estimators."""
+    prepared = prepared_log(log, reading, recognition, rate_hz)
+    return compare_prepared(prepared, names, overrides)
+
+
+def prepared_log(
+    log: Path,
+    reading: ReadingOptions,
+    recognition: RecogniserOptions,
+    rate_hz: float | None,
+    *,
+    are_sensors_trusted: bool = False,
+) -> PreparedLog:
+    """Read a log, compare its sensors unless they are trusted, and recognise landmarks if it needs that."""
     from sonar_graph.diagnosis import check_sensors, notes_of
-    from sonar_graph.evaluation import compare as compare_runs
-    from sonar_graph.evaluation import expense
     from sonar_graph.logs import LIVE_RATE, no_images
     from sonar_graph.logs.adapters import LogConfig
 
@@ -325,16 +385,17 @@ def compare_log(
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     check_rate(rate_hz, sequence)
-    with working("comparing sensors"):
-        found_in_sensors = notes_of(
-            check_sensors(sequence, reading.config or LogConfig())
-        )
-    if of_reading := sequence.notes.get("log.doubtful"):
-        of_sensors = found_in_sensors.get("log.doubtful", "")
-        found_in_sensors["log.doubtful"] = "; ".join(
-            text for text in (of_reading, of_sensors) if text
-        )
-    sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
+    if not are_sensors_trusted:
+        with working("comparing sensors"):
+            found_in_sensors = notes_of(
+                check_sensors(sequence, reading.config or LogConfig())
+            )
+        if of_reading := sequence.notes.get("log.doubtful"):
+            of_sensors = found_in_sensors.get("log.doubtful", "")
+            found_in_sensors["log.doubtful"] = "; ".join(
+                text for text in (of_reading, of_sensors) if text
+            )
+        sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
     found = None
     # what was recognised is in it: estimates are those of the live run
     is_of_live_run = LIVE_RATE in sequence.notes
@@ -352,13 +413,27 @@ def compare_log(
         from sonar_graph.recognition import with_detections
 
         sequence = with_detections(sequence, found)
-    if said := expense(sequence):
+    return PreparedLog(sequence, found, rate_hz)
+
+
+def compare_prepared(
+    prepared: PreparedLog, names: list[str], overrides: dict[str, dict[str, Any]]
+) -> Comparison:
+    """Compare estimators on a log that was read, with a progress bar for each."""
+    from sonar_graph.evaluation import compare as compare_runs
+    from sonar_graph.evaluation import expense
+
+    if said := expense(prepared.sequence):
         echo(f"A large log, {said}", err=True)
     with progress_bars() as progress:
         comparison = compare_runs(
-            sequence, names, overrides, rate_hz=rate_hz, progress=progress
+            prepared.sequence,
+            names,
+            overrides,
+            rate_hz=prepared.rate_hz,
+            progress=progress,
         )
-    return replace(comparison, recognition=found)
+    return replace(comparison, recognition=prepared.recognition)
 
 
 def check_rate(rate_hz: float, sequence: Sequence) -> None:

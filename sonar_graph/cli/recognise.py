@@ -440,7 +440,9 @@ def recognise_log(
             recogniser=recogniser,
             window=reading.window,
             salvage=reading.salvage,
-            progress=lambda done: progress("recognising landmarks (frames)", done, 0),
+            progress=lambda done: progress(
+                "recognising landmarks", done, 0, f"{done} frames"
+            ),
             seen=see,
         )
 

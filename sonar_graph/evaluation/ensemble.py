@@ -1,7 +1,7 @@
-"""Many runs of one simulated experiment, other seeds of everything random: what one run cannot tell.
+"""Many runs of one simulated experiment, other seeds of everything random: one run is not enough to compare estimators.
 
-Each run is scored as in a comparison. Kept are its scores, and position error and NEES over time, at the same instants
-in every run. Means and bands: docs/theory/metrics.md.
+Each run is scored as in a comparison. Kept are its scores, and its NEES at the last scored instant: there the runs are
+independent, so that their average has a chi-square band. Means and bands: docs/theory/metrics.md.
 """
 
 from __future__ import annotations
@@ -10,31 +10,23 @@ import multiprocessing
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.results import Ensemble
 from sonar_graph.evaluation.run import run_estimator
 
 if TYPE_CHECKING:
+    from sonar_graph.evaluation.results import Comparison
     from sonar_graph.simulation import BasinOptions
 
 RATE_HZ = 1.0
 KEPT = ("causal.ate_se2_m", "smoothed.ate_se2_m", "causal.own_map_m", "landmarks.se2_m")
 """Scores of each run."""
-
-
-@dataclass(frozen=True)
-class _Member:
-    """What one run leaves, by estimator."""
-
-    seconds: list[float]
-    values: dict[str, dict[str, float | None]]
-    errors_m: dict[str, list[float] | None]
-    nees: dict[str, dict[str, list[float] | None]]
+NEES_AT_END = ("causal.nees_position_end", "causal.nees_yaw_end")
+"""NEES per degree of freedom at the last scored instant."""
+Values = dict[str, dict[str, float | None]]
+"""Values of one run, by estimator, then by key of `KEPT` and `NEES_AT_END`; None where it has no such score."""
 
 
 def run_ensembles(
@@ -71,7 +63,7 @@ def run_ensembles(
     ...     experiments = {"no bias": BasinOptions(duration_s=130.0, laps=1, gyro_bias_scale=0.0)}
     ...     (ensemble,) = run_ensembles(experiments, range(20), ["isam2", "ekf-slam"])
     """
-    members: dict[tuple[str, int], _Member] = {}
+    members: dict[tuple[str, int], Values] = {}
     total = len(experiments) * len(seeds)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context) as pool:
@@ -93,64 +85,43 @@ def run_ensembles(
             pool.shutdown(cancel_futures=True)
             raise
     return [
-        _gathered(condition, list(seeds), members, names) for condition in experiments
+        Ensemble(
+            condition,
+            list(seeds),
+            _by_estimator([members[condition, seed] for seed in seeds]),
+        )
+        for condition in experiments
     ]
 
 
-def run_member(options: BasinOptions, names: list[str]) -> _Member:
-    """One run of every estimator."""
+def run_member(options: BasinOptions, names: list[str]) -> Values:
+    """Simulate one run, run every estimator on it, and return what is kept."""
     from sonar_graph.simulation import simulate_basin
 
     sequence = simulate_basin(options)
     instants_ns = sequence.instants(RATE_HZ)
     runs = [run_estimator(sequence, name, instants_ns=instants_ns) for name in names]
     comparison = judge(sequence, instants_ns, runs)
-    values: dict[str, dict[str, float | None]] = {}
-    errors_m: dict[str, list[float] | None] = {}
-    nees: dict[str, dict[str, list[float] | None]] = {}
-    for name in names:
-        scores = {key: comparison.score_of(name, key) for key in KEPT}
-        values[name] = {
-            key: None if score is None else score.value for key, score in scores.items()
-        }
-        errors = comparison.errors.get(name, {}).get("causal")
-        errors_m[name], nees[name] = None, {"position": None, "yaw": None}
-        if errors is not None:
-            place = np.searchsorted(instants_ns, errors.stamps_ns)
-            columns = np.full((3, len(instants_ns)), np.nan)
-            columns[0, place] = np.linalg.norm(errors.position_m[:, :2], axis=1)
-            columns[1:, place] = (
-                errors.nees_position / errors.position_dof,
-                errors.nees_yaw,
-            )
-            errors_m[name] = columns[0].tolist()
-            nees[name] = {"position": columns[1].tolist(), "yaw": columns[2].tolist()}
-    seconds = ((instants_ns - sequence.start_ns) * 1e-9).tolist()
-    return _Member(seconds, values, errors_m, nees)
+    return {name: _kept(comparison, name) for name in names}
 
 
-def _gathered(
-    condition: str,
-    seeds: list[int],
-    members: dict[tuple[str, int], _Member],
-    names: list[str],
-) -> Ensemble:
-    """All runs of one experiment."""
-    runs = [members[condition, seed] for seed in seeds]
-    return Ensemble(
-        condition,
-        seeds,
-        runs[0].seconds,
-        {
-            name: {key: [run.values[name][key] for run in runs] for key in KEPT}
-            for name in names
-        },
-        {name: [run.errors_m[name] for run in runs] for name in names},
-        {
-            name: {
-                what: [run.nees[name][what] for run in runs]
-                for what in ("position", "yaw")
-            }
-            for name in names
-        },
-    )
+def _kept(comparison: Comparison, name: str) -> dict[str, float | None]:
+    """Scores of one estimator, and its NEES at the last scored instant."""
+    kept: dict[str, float | None] = {}
+    for key in KEPT:
+        score = comparison.score_of(name, key)
+        kept[key] = None if score is None else score.value
+    errors = comparison.errors.get(name, {}).get("causal")
+    if errors is None:
+        return kept | dict.fromkeys(NEES_AT_END)
+    position_nees = float(errors.nees_position[-1] / errors.position_dof)
+    yaw_nees = float(errors.nees_yaw[-1])
+    return kept | dict(zip(NEES_AT_END, (position_nees, yaw_nees), strict=True))
+
+
+def _by_estimator(runs: list[Values]) -> dict[str, dict[str, list[float | None]]]:
+    """The values of all runs, by estimator and key."""
+    return {
+        name: {key: [run[name][key] for run in runs] for key in kept}
+        for name, kept in runs[0].items()
+    }

@@ -198,32 +198,29 @@ class Ensemble:
     Two runs, of which the second failed:
 
     >>> from sonar_graph.evaluation import Ensemble
-    >>> nees = {"isam2": {"position": [[0.9, 1.1], None]}}
-    >>> ensemble = Ensemble("murky", [1, 2], [30.0, 60.0], {"isam2": {}}, {"isam2": [[0.02, 0.03], None]}, nees)
-    >>> sum(errors is None for errors in ensemble.errors_m["isam2"])
-    1
+    >>> ensemble = Ensemble("murky", [1, 2], {"isam2": {"causal.ate_se2_m": [0.02, None]}})
+    >>> ensemble.of("isam2", "causal.ate_se2_m")
+    array([0.02,  inf])
     """
 
     condition: str
     """The experiment in words, as a sentence goes on after "runs"."""
     seeds: list[int]
-    seconds: list[float]
-    """Time since the start of the instants of ``errors_m`` and ``nees``."""
     values: dict[str, dict[str, list[float | None]]]
-    """By estimator, then by key of `ensemble.KEPT`."""
-    errors_m: dict[str, list[list[float] | None]]
-    """Causal horizontal position error, not aligned, by estimator, run and instant; NaN where not scored."""
-    nees: dict[str, dict[str, list[list[float] | None]]]
-    """Causal NEES per degree of freedom, by estimator, "position" or "yaw", run and instant."""
+    """By estimator, then by key of `ensemble.KEPT`, or ``causal.nees_position_end`` and ``causal.nees_yaw_end``."""
 
     def of(self, estimator: str, key: str) -> Floats:
         """Values of one score by run, shape (runs,); infinite for a run without one."""
         return np.array(
             [
                 np.inf if value is None else value
-                for value in self.values[estimator][key]
+                for value in self.values[estimator].get(key, [None] * len(self.seeds))
             ]
         )
+
+    def nees_at_end(self, estimator: str, what: Literal["position", "yaw"]) -> Floats:
+        """NEES per degree of freedom at the last scored instant by run, shape (runs,); infinite for a run without."""
+        return self.of(estimator, f"causal.nees_{what}_end")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

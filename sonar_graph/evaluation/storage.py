@@ -383,7 +383,10 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         errors=errors,
         environment=_TEXTS.validate_python(index["environment"]),
         recognition=recognition,
-        ensembles=[Ensemble(**one) for one in several["ensembles"]],
+        ensembles=[
+            Ensemble(one["condition"], one["seeds"], one["values"])
+            for one in several["ensembles"]
+        ],
     )
 
 

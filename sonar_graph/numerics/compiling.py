@@ -5,9 +5,11 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 from sonar_graph.numerics.jit import COMPILED_IN
 
@@ -51,6 +53,18 @@ class _Progress(event.Listener):
             self._depth -= 1
             if not self._depth and (terminal := _terminal()):
                 print("\r\x1b[2K", end="", file=terminal, flush=True)
+
+
+def needs_compiling(module: ModuleType) -> bool:
+    """True if a module has compiled functions and the cache has the code of none of them."""
+    functions: list[Any] = [
+        value
+        for value in vars(module).values()
+        if isinstance(value, Dispatcher) and value.__module__ == module.__name__
+    ]
+    return bool(functions) and not any(
+        function._cache._cache_file._load_index() for function in functions
+    )
 
 
 def _is_ours(event: Any) -> bool:

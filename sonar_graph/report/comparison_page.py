@@ -18,7 +18,6 @@ from sonar_graph.evaluation import (
     NONE,
     UNJUDGED,
     Comparison,
-    Ensemble,
     aligned_to_truth,
     compact_table,
     confidences,
@@ -36,11 +35,10 @@ from sonar_graph.files import COMPARISON, as_path, replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
 from sonar_graph.report.ensemble_section import (
-    ensemble_figure,
     ensemble_sentences,
     ensemble_table,
 )
-from sonar_graph.report.figure_style import Illustration, inline_svg, sized
+from sonar_graph.report.figure_style import inline_svg, sized
 from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.rendering import data_address, render
@@ -160,10 +158,7 @@ def render_report(comparison: Comparison) -> str:
         ),
         "ensemble": ensemble_sentences(comparison.ensembles),
         "ensembles": [
-            (
-                ensemble_table(one, f"runs-{place}"),
-                ensemble_illustration(one, f"runs-{place}"),
-            )
+            ensemble_table(one, f"runs-{place}")
             for place, one in enumerate(comparison.ensembles, start=1)
         ],
         "headlines": {
@@ -241,20 +236,6 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
         for place, one in enumerate(comparison.ensembles, start=1)
     ]
     return [table for table in [*tables, refused_table(comparison)] if table.rows]
-
-
-def ensemble_illustration(ensemble: Ensemble, name: str) -> Illustration:
-    """The figure of many runs."""
-    title = "Error and consistency over time"
-    caption = (
-        "Above: mean of the horizontal error of the causal positions, not aligned; the shaded band holds the middle "
-        f"80 % of {len(ensemble.seeds)} runs. Below: their average NEES; the grey band holds 95 % of consistent "
-        "estimators."
-    )
-    with sized():
-        figure = ensemble_figure(ensemble)
-    svg = "" if figure is None else inline_svg(figure, name, f"{title}. {caption}")
-    return Illustration(name, title, caption, svg, "No run came to an end.")
 
 
 def _counted(count: int, noun: str) -> str:

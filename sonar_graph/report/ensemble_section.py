@@ -1,4 +1,4 @@
-"""Section of a report on many runs of the same experiment: sentences, a table and a figure of means with bands.
+"""Section of a report on many runs of the same experiment: sentences and a table of means with bands.
 
 The mean of the final errors has its 95 % interval (Hall 1992), the ANEES at an instant the chi-square band of
 independent runs. Equations: docs/theory/metrics.md, docs/theory/batch_statistics.md.
@@ -6,18 +6,13 @@ independent runs. Equations: docs/theory/metrics.md, docs/theory/batch_statistic
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from sonar_graph.evaluation import Ensemble, anees_interval, format_value
 from sonar_graph.measurements import Floats
-from sonar_graph.report import figure_style as style
 from sonar_graph.table import Column, Table, absent, number, words
-
-if TYPE_CHECKING:
-    from sonar_graph.batch import Anees
 
 HEADLINE = "causal.ate_se2_m"
 SHOWN = {
@@ -26,14 +21,12 @@ SHOWN = {
     "causal.own_map_m": "On its own map",
     "landmarks.se2_m": "Map",
 }
-DOF = {"position": 3, "yaw": 1}
+DOF: dict[Literal["position", "yaw"], int] = {"position": 3, "yaw": 1}
 CAUSAL = " (causal: told at once, from what was measured until then; after the best shift and turn of the whole path, SE(2))"
 WORSE = (
     " Here ekf-slam is worse than dead-reckoning, which only adds up motion. That can be: as published the filter has"
     " no gyro bias in its state and believes identities, and a landmark taken for another moves path and map for good."
 )
-LOW, HIGH = 0.1, 0.9
-"""Quantiles of the runs between which the figure is shaded."""
 
 
 def mean_text(values: Floats) -> str:
@@ -87,6 +80,9 @@ def ensemble_sentences(ensembles: list[Ensemble]) -> list[str]:
 
 def ensemble_table(ensemble: Ensemble, name: str) -> Table:
     """Mean errors with intervals, and ANEES at the last instant beside its 95 % band, by estimator."""
+    # loads the simulators, which one comparison does not need
+    from sonar_graph.batch import anees
+
     columns = [Column("estimator", "Estimator", is_number=False)]
     columns += [
         Column(key, heading, "Mean of the runs (95 %), m")
@@ -114,7 +110,7 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
                 else absent()
             )
         for what, dof in DOF.items():
-            found = anees_at_end(ensemble, estimator, what, dof)
+            found = anees(ensemble.nees_at_end(estimator, what), dof)
             cells.append(
                 number(found.mean, format_value(found.mean), note=found.verdict)
             )
@@ -127,62 +123,3 @@ def ensemble_table(ensemble: Ensemble, name: str) -> Table:
         columns,
         rows,
     )
-
-
-def anees_at_end(ensemble: Ensemble, estimator: str, what: str, dof: int) -> Anees:
-    """Average over the runs, each at its last scored instant."""
-    from sonar_graph.batch import anees
-
-    runs = [np.array(run or [], dtype=float) for run in ensemble.nees[estimator][what]]
-    return anees(
-        np.array(
-            [known[-1] if len(known := run[~np.isnan(run)]) else np.inf for run in runs]
-        ),
-        dof,
-    )
-
-
-def ensemble_figure(ensemble: Ensemble) -> Figure | None:
-    """Position error over time, mean and middle 80 % of the runs, and ANEES over the runs with its 95 % band."""
-    figure, axes = style.blank_panels(2, 1, (style.width_in(), 4.8), sharex=True)
-    errors, consistency = axes[:, 0]
-    least, most = np.inf, 0.0
-    for index, name in enumerate(ensemble.values):
-        runs = np.array(
-            [run for run in ensemble.errors_m[name] if run is not None], dtype=float
-        )
-        if not len(runs):
-            continue
-        look = {
-            "color": style.colour(index),
-            "linestyle": style.line_style(index),
-            "linewidth": 1.5,
-        }
-        scored = np.flatnonzero(~np.isnan(runs).any(axis=0))
-        runs, seconds = runs[:, scored], np.array(ensemble.seconds)[scored]
-        low, high = np.quantile(runs, [LOW, HIGH], axis=0)
-        errors.fill_between(
-            seconds, low, high, color=style.colour(index), alpha=0.2, linewidth=0
-        )
-        errors.plot(seconds, runs.mean(axis=0), label=name, **look)
-        nees = [run for run in ensemble.nees[name]["position"] if run is not None]
-        if len(nees) == len(ensemble.seeds):
-            consistency.plot(
-                seconds, np.array(nees, dtype=float)[:, scored].mean(axis=0), **look
-            )
-        least, most = (
-            min(least, float(runs[:, 1:].mean(axis=0).min())),
-            max(most, float(high.max())),
-        )
-    if not most:
-        return None
-    band = anees_interval(len(ensemble.seeds), DOF["position"])
-    consistency.axhspan(*band, color=style.TRUTH, alpha=0.25, linewidth=0)
-    consistency.axhline(1.0, color=style.MUTED, linewidth=0.7)
-    for panel in (errors, consistency):
-        style.logarithmic(panel, "y")
-    errors.set_ylim(least / 2, most * 1.5)
-    style.name_axes(errors, "", "position error (m)")
-    style.name_axes(consistency, "time since start (s)", "ANEES of position / dof")
-    style.legend_above(figure, errors)
-    return figure

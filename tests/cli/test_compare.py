@@ -287,7 +287,7 @@ def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkey
     monkeypatch.setattr(
         "sonar_graph.cli.compare.DEMO", DEMO | {"duration_s": 130.0, "laps": 1}
     )
-    assert run("demo", "-o", tmp_path) == 0
+    assert run("demo", "-o", tmp_path, "--runs", 2) == 0
     told = capsys.readouterr().out
     assert f"Report: {tmp_path / 'report.html'}" in told
     assert "2014 paper x" in told
@@ -295,13 +295,14 @@ def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkey
     assert sequence.detections is None, "the log holds images, not what is in them"
     comparison = read_comparison(tmp_path)
     assert comparison.recognition is not None
-    assert comparison.recognition.frames > 600
+    assert comparison.recognition.frames > 240
+    assert [one.seeds for one in comparison.ensembles] == [[1, 2], [1, 2]]
     found = {
         run.estimator
         for run in comparison.runs
         if run.landmarks is not None and len(run.landmarks) == 4
     }
-    assert found == {"isam2", "ekf-slam"}
+    assert found == {"isam2", "ekf-slam", "invariant-ekf"}
 
 
 def test_demo_drives_the_three_laps_of_the_paper_with_images():

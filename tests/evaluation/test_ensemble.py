@@ -1,4 +1,4 @@
-"""Many runs of one experiment: gathered by seed, told in sentences, drawn, and read again."""
+"""Many runs of one experiment: gathered by seed, summed up in sentences and a table, and read again."""
 
 from dataclasses import replace
 
@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.ensemble import KEPT, run_ensembles, run_member
+from sonar_graph.evaluation.ensemble import (
+    KEPT,
+    RATE_HZ,
+    run_ensembles,
+    run_member,
+)
 from sonar_graph.evaluation.results import Ensemble
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.console import summary
-from sonar_graph.report.ensemble_section import (
-    anees_at_end,
-    ensemble_figure,
-    ensemble_sentences,
-    ensemble_table,
-)
-from sonar_graph.simulation import BasinOptions
+from sonar_graph.report.ensemble_section import ensemble_sentences, ensemble_table
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 from .conftest import straight_sequence
 
@@ -28,30 +28,20 @@ def made(
     condition: str = "by hand", scale: float = 1.0, **errors_m: list[float | None]
 ) -> Ensemble:
     """Runs with these errors, whose NEES is chi-square times the scale."""
-    rng, runs = np.random.default_rng(0), len(next(iter(errors_m.values())))
+    rng = np.random.default_rng(0)
 
-    def series(dof: int, errors: list[float | None]) -> list:
-        drawn = scale * rng.chisquare(dof, (runs, 5)) / dof
-        drawn[:, :-1] *= 100.0  # only the last instant counts
-        runs_of = zip(errors, drawn.tolist(), strict=True)
-        return [
-            None if error is None else [float("nan"), *one] for error, one in runs_of
-        ]
+    def nees_of(dof: int, errors: list[float | None]) -> list[float | None]:
+        drawn = (scale * rng.chisquare(dof, len(errors)) / dof).tolist()
+        runs = zip(errors, drawn, strict=True)
+        return [None if error is None else nees for error, nees in runs]
 
-    return Ensemble(
-        condition,
-        list(range(runs)),
-        [float(k) for k in range(6)],
-        {
-            name: {key: list(errors) for key in KEPT}
-            for name, errors in errors_m.items()
-        },
-        {name: series(2, errors) for name, errors in errors_m.items()},
-        {
-            name: {"position": series(3, errors), "yaw": series(1, errors)}
-            for name, errors in errors_m.items()
-        },
-    )
+    values = {}
+    for name, errors in errors_m.items():
+        values[name] = {key: list(errors) for key in KEPT}
+        values[name]["causal.nees_position_end"] = nees_of(3, errors)
+        values[name]["causal.nees_yaw_end"] = nees_of(1, errors)
+    seeds = list(range(len(next(iter(errors_m.values())))))
+    return Ensemble(condition, seeds, values)
 
 
 GOOD, BAD = (
@@ -74,18 +64,23 @@ def test_a_run_of_an_ensemble_is_the_run_of_a_comparison_and_seeds_make_them_dif
         progress=lambda *call: calls.append(call),
     )
     alone = run_member(options.model_copy(update={"seed": 2}), names)
+    first, second = found.values["dead-reckoning"][HEADLINE]
     assert found.seeds == [1, 2]
-    assert (
-        found.values["dead-reckoning"][HEADLINE][1]
-        == alone.values["dead-reckoning"][HEADLINE]
-    )
-    assert (
-        found.values["dead-reckoning"][HEADLINE][0]
-        != found.values["dead-reckoning"][HEADLINE][1]
-    )
-    assert found.errors_m["dead-reckoning"][1] == alone.errors_m["dead-reckoning"]
-    assert len(found.seconds) == len(found.errors_m["dead-reckoning"][0])
+    assert second == alone["dead-reckoning"][HEADLINE]
+    assert first != second
+    assert found.nees_at_end("dead-reckoning", "yaw").shape == (2,)
     assert [done for _, done, _ in calls] == [1, 2]
+
+
+def test_nees_at_the_end_is_that_of_the_last_scored_instant():
+    options = BasinOptions(duration_s=120.0, laps=1)
+    alone = run_member(options, ["dead-reckoning"])["dead-reckoning"]
+    sequence = simulate_basin(options)
+    errors = compare(sequence, ["dead-reckoning"], rate_hz=RATE_HZ).errors[
+        "dead-reckoning"
+    ]["causal"]
+    assert alone["causal.nees_position_end"] == errors.nees_position[-1] / 3
+    assert alone["causal.nees_yaw_end"] == errors.nees_yaw[-1]
 
 
 def test_sentences_tell_means_with_intervals_how_often_the_order_turns_and_both_conditions():
@@ -123,22 +118,12 @@ def test_sentences_tell_means_with_intervals_how_often_the_order_turns_and_both_
 @pytest.mark.parametrize(
     ("scale", "verdict"), [(1.0, "consistent"), (4.0, "over-confident")]
 )
-def test_consistency_of_the_runs_is_judged_at_their_last_scored_instant(scale, verdict):
-    assert (
-        anees_at_end(made(scale=scale, good=GOOD), "good", "position", 3).verdict
-        == verdict
-    )
-    lost = made(scale=scale, good=[None, *GOOD[1:]])
-    assert anees_at_end(lost, "good", "position", 3).verdict == ""
-    rows = ensemble_table(made(scale=scale, good=GOOD), "x").rows
-    assert rows[0][-2].note.startswith(verdict)
-    assert rows[0][1].text.startswith("0.11")
-
-
-def test_a_figure_shows_every_estimator_that_came_to_an_end_and_none_where_nobody_did():
-    figure = ensemble_figure(made(good=GOOD, bad=[None] * 20))
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["good"]
-    assert ensemble_figure(made(bad=[None] * 3)) is None
+def test_consistency_of_the_runs_is_judged_by_their_anees_at_the_end(scale, verdict):
+    table = ensemble_table(made(scale=scale, good=GOOD, bad=[None, *BAD[1:]]), "x")
+    good, bad = table.rows
+    assert good[-2].note.startswith(verdict)
+    assert good[1].text.startswith("0.11")
+    assert bad[-2].note == "", "a run that was lost leaves no verdict"
 
 
 def test_runs_are_kept_in_the_folder_and_stand_first_on_the_page_and_in_the_terminal(
@@ -150,10 +135,7 @@ def test_runs_are_kept_in_the_folder_and_stand_first_on_the_page_and_in_the_term
     )
     write_comparison(comparison, tmp_path)
     again = read_comparison(tmp_path)
-    assert again.ensembles[0].values == comparison.ensembles[0].values
-    assert again.ensembles[0].nees["good"]["yaw"][0][0] is None, (
-        "what is not a number is null"
-    )
+    assert again.ensembles == comparison.ensembles
     page = render_report(again)
     assert (
         page.index('id="figure-map"')
@@ -161,7 +143,6 @@ def test_runs_are_kept_in_the_folder_and_stand_first_on_the_page_and_in_the_term
         < page.index("20 runs by hand")
         < page.index("The basin is simulated")
     )
-    assert 'id="figure-runs-1"' in page
     assert "20 runs by hand" in str(summary(again).renderables[-1])
     write_comparison(replace(comparison, ensembles=[]), tmp_path)
     assert read_comparison(tmp_path).ensembles == []
