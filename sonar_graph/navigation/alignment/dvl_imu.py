@@ -34,6 +34,7 @@ from sonar_graph.navigation.alignment.time_offset import (
     RANGE_S,
     Estimate1D,
     SampleSeries,
+    are_enough,
     search_offset,
 )
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
@@ -237,6 +238,8 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
         )
         turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
         line_up = partial(velocity_changes, path, seconds, turned, runs, lever)
+        if not are_enough(line_up(0.0), PRIOR_SIGMAS):
+            return DvlMatch.unknown("too few Doppler samples between gaps")
         # small matrices: threads of BLAS would only cost
         with threadpool_limits(1, user_api="blas"):
             found = search_offset(line_up, PRIOR_SIGMAS)

@@ -105,6 +105,12 @@ def fit(
     return LeastSquaresFit(parameters, covariance, rss, variance, ratios)
 
 
+def are_enough(stretches: Sequence[SampleSeries], prior_sigmas: Floats) -> bool:
+    """Check that `fit` has more differences than parameters, those of each stretch counted."""
+    ratios = np.ones(2)  # what is free does not depend on the noise
+    return NormalEquations.of(stretches, ratios).freedom > len(prior_sigmas)
+
+
 def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float:
     """Expected whitened product of y with its own rates' noise, over sigma²: ``sum tr(P (K - tridiag(-1, 2, -1)))``.
 
