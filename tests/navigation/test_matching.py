@@ -481,3 +481,13 @@ def test_a_hole_soon_after_the_start_leaves_its_heading_untold_and_many_too_few_
             without_rows(RUN.imu, lambda t: t % 8.0 <= 0.5), early(0.2)
         ).offset.reason
     )
+
+
+@pytest.mark.parametrize("together", [13, 14, 16, 20])
+def test_a_doppler_log_in_short_pieces_is_not_matched_instead_of_an_error(together):
+    """Rows in groups, with gaps between that end each stretch before it has more differences than parameters."""
+    whole = simulate_mission(MissionOptions(duration_s=90.0, landmarks=2))
+    is_kept = np.arange(len(whole.dvl)) % (together + 5) < together
+    found = match_dvl_to_imu(whole.imu, whole.dvl.rows(is_kept), whole.calibration)
+    assert not found.offset.is_known
+    assert found.offset.reason

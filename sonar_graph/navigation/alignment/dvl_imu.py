@@ -349,6 +349,8 @@ def velocity_changes(
         interval_s = float(np.median(np.diff(stamped_s[r])))
         together = max(1, round(MEAN_OVER_S / interval_s))
         t = means_over(since, together)
+        if len(t) < 2:  # too short for a difference of means
+            continue
         upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])
         level_R_g = np.asarray(upright.as_matrix())
         y = np.diff(means_over(x[r], together), axis=0) @ level_R_g.T

@@ -107,6 +107,8 @@ def fit(
 
 def are_enough(stretches: Sequence[SampleSeries], prior_sigmas: Floats) -> bool:
     """Check that `fit` has more differences than parameters, those of each stretch counted."""
+    if not stretches:
+        return False
     ratios = np.ones(2)  # what is free does not depend on the noise
     return NormalEquations.of(stretches, ratios).freedom > len(prior_sigmas)
 
