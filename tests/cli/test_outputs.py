@@ -140,7 +140,7 @@ def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_r
         tmp_path / LOCK,
         tmp_path / MANIFEST,
     }
-    names = names_written(["dead-reckoning"])
+    names = names_written(tmp_path, ["dead-reckoning"])
     assert {path.relative_to(tmp_path).as_posix() for path in written} <= set(names)
     assert len(written) > 8
     for path in written:

@@ -12,7 +12,7 @@ from scipy.stats import binned_statistic, chi2
 from sonar_graph.calibration import Calibration, Mounting, SonarCalibration
 from sonar_graph.evaluation import consistency
 from sonar_graph.evaluation.results import Score
-from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
@@ -239,6 +239,7 @@ def test_confidence_is_that_of_the_most_probable_class_none_of_them_included():
 MOUNTING = Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.5, 0.1))
 LANDMARKS_M = np.array([[3.0, 0.5, -1.0], [5.0, -2.0, -1.1]])
 IDS = np.array([11, 7])
+STILL_NS = np.array([0, 10**9])
 
 
 def turning_truth() -> Trajectory:
@@ -275,8 +276,8 @@ def run_with(
     return Sequence(
         "hand",
         Calibration(sonar=SonarCalibration(mounting=MOUNTING)),
-        imu=None,  # type: ignore[arg-type]
-        dvl=None,  # type: ignore[arg-type]
+        imu=Imu(STILL_NS, np.zeros((2, 3)), np.zeros((2, 3))),
+        dvl=Dvl(STILL_NS, np.zeros((2, 3)), np.full((2, 3, 3), np.nan)),
         detections=detections,
         truth=turning_truth(),
         true_landmarks=LandmarkMap(IDS, LANDMARKS_M, np.full((2, 3, 3), np.nan)),

@@ -120,7 +120,7 @@ FIX_POINT = PositionAdapter(
 MARINE_DVL = DvlAdapter(
     type="marine_acoustic_msgs/msg/Dvl",
     velocity=_xyz("velocity"),
-    covariance=CovarianceFields(fields=("velocity_covar",), negative="found"),
+    covariance=CovarianceFields(fields=("velocity_covar",)),
     valid_where={"velocity_mode": 1, "beam_velocities_valid": True},
     may_be_unfilled=("velocity_mode", "beam_velocities_valid"),
     good_beams="num_good_beams",

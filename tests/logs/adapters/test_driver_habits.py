@@ -49,6 +49,22 @@ def report(
     return rows_of("/dvl", kind, rows, "dvl_link")
 
 
+def twists() -> Entry:
+    """Velocities as twists; where nothing was measured the covariance is -1, as ROS has it."""
+    rows = [
+        {
+            "twist": {
+                "twist": {"linear": NO_LOCK if row in LOST else velocity(row)},
+                "covariance": [-1.0 if row in LOST else 1e-4] + [0.0] * 35,
+            }
+        }
+        for row in range(ROWS)
+    ]
+    return rows_of(
+        "/dvl", "geometry_msgs/msg/TwistWithCovarianceStamped", rows, "dvl_link"
+    )
+
+
 # Each driver has its own way to say that there is no bottom lock.
 WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
     "Water Linked, velocity report: zeros, one beam": (
@@ -97,10 +113,8 @@ WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
                lost={"altitude": -1.0}),
         "20 with altitude below 0",
     ),
-    "a covariance, and -1 where nothing was measured": (
-        report(sent={"velocity_covar": [1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4]},
-               lost={"velocity_covar": [-1.0] * 9}),
-        "20 with a covariance that says invalid",
+    "twists, a covariance of -1 where nothing was measured": (
+        twists(), "20 with a covariance that says invalid",
     ),
     "Stonefish, covariance of -1": (
         report(kind="stonefish_ros2/msg/DVL", sent={"altitude": 3.0, "velocity_covariance": [1e-4] + [0.0] * 8},

@@ -238,10 +238,10 @@ def test_gravity_that_is_not_felt_upwards_is_told_with_the_rotation_that_puts_it
     foreign: Any, force: tuple[float, ...], warning: str | None
 ) -> None:
     notes = foreign.check(
-        [imu(force=force), dvl()], FRD_DVL, {}, {"log.warnings": warning}
+        [imu(force=force), dvl()], FRD_DVL, {}, {"log.doubtful": warning}
     ).notes
     if proposed := re.search(
-        r'give (rotation = ("\w+"|\[.*?\]))', notes.get("log.warnings", "")
+        r'give (rotation = ("\w+"|\[.*?\]))', notes.get("log.doubtful", "")
     ):
         toml = f"{FRD_DVL}[imu]\n{proposed[1]}"
         foreign.check(
