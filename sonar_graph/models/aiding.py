@@ -148,7 +148,9 @@ def huber_scale(e: Floats, S: Floats) -> float:
 
 
 CONTRADICTING_SIGMAS = 5.0
-DOUBTLESS_SIGMAS = 10.0
+DOUBTLESS_SIGMAS = {"heading": 10.0, "positions": CONTRADICTING_SIGMAS}
+"""Distances that leave no doubt where most rows have them. A filter without gyro bias is soon off by 5 sigmas in heading,
+but fixes hold every estimator's position."""
 CONTRADICTING_SHARE = 0.2
 """Of headings or fixes: less are outliers, which the kernel is for."""
 FEWEST_JUDGED = 10
@@ -181,7 +183,7 @@ class Contradictions:
         )
         self._judged[sensor] += np.size(distances)
         self._beyond_doubt[sensor] += int(
-            np.count_nonzero(np.asarray(distances) > DOUBTLESS_SIGMAS)
+            np.count_nonzero(np.asarray(distances) > DOUBTLESS_SIGMAS[sensor])
         )
 
     def messages(self) -> list[str]:

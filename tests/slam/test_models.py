@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
+    Contradictions,
     elevation_on_floor,
     locate,
     locate_jacobians,
@@ -377,3 +378,23 @@ def test_no_part_of_the_covariance_is_idle(left_out):
         joint.at(a, b)[:] = joint.at(b, a)[:] = 0.0
     without = expected_of(made(POSES["random"], motion, joint), landmarks, 5)[1][0]
     assert np.abs(S - without).max() > 0.01 * np.abs(S).max()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "sigmas", "is_named", "is_doubtless"),
+    [
+        ("positions", 4.0, False, False),
+        ("positions", 6.0, True, True),
+        ("heading", 6.0, True, False),
+        ("heading", 11.0, True, True),
+    ],
+)
+def test_most_rows_far_from_the_estimate_leave_no_doubt(
+    sensor, sigmas, is_named, is_doubtless
+):
+    """Twelve of twenty: fixes from 5 sigmas on, headings from 10."""
+    found = Contradictions()
+    found.judge(sensor, np.array([sigmas] * 12 + [1.0] * 8))
+    messages = found.messages()
+    assert bool(messages) == is_named
+    assert ("beyond doubt" in "".join(messages)) == is_doubtless
