@@ -83,9 +83,7 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     for k, G in enumerate(candidates):
         Q = rows.quadratic_form(G)
         squares[k] = np.einsum("ki,ij,kj->k", entries, Q, entries)
-        # the least that any matrix leaves
-        free = np.linalg.lstsq(Q[1:, 1:], -Q[1:, 0])[0]
-        least[k] = max(Q[0, 0] + free @ Q[1:, 0], 1e-12)
+        least[k] = least_of(Q)
     best = squares.min()
     variance = best / rows.freedom
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
@@ -109,6 +107,32 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_sure = not any((rival == other).all() for rival in rivals)
     ratio = float(np.sqrt(squares[0, 0] / squares[g, p]))
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
+
+
+def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float | None:
+    """Find velocities that do not turn with the body: in axes of the world, C P v of r is Q v with one matrix Q.
+
+    Returns
+    -------
+    Typical misfit as velocities of the body over that as velocities of the world, each with the matrix that fits best;
+    None where the second is not much smaller.
+    """
+    rows = SharedRows.of(imu, dvl, calibration)
+    if rows is None:
+        return None
+    of_body = least_of(rows.quadratic_form(np.eye(3)))
+    of_world = least_of(rows.quadratic_form(np.eye(3), is_in_world=True))
+    variance = of_world / rows.freedom
+    is_clear = of_body > LEAST_RATIO * of_world
+    if is_clear and of_body - of_world > LEAST_GAIN * variance:
+        return float(np.sqrt(of_body / of_world))
+    return None
+
+
+def least_of(Q: Floats) -> float:
+    """The least of a quadratic form of `SharedRows` that any matrix leaves."""
+    free = np.linalg.lstsq(Q[1:, 1:], -Q[1:, 0])[0]
+    return float(max(Q[0, 0] + free @ Q[1:, 0], 1e-12))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +200,8 @@ class SharedRows:
         changes = [(r.stop - r.start) // together - 1 for r, together in self.runs]
         return sum(3 * (m - 2) for m in changes) - 9
 
-    def quadratic_form(self, G: Floats) -> Floats:
-        """Q, shape (10, 10), of ``(1, P)``: the sum of squares of r(G, P)."""
+    def quadratic_form(self, G: Floats, *, is_in_world: bool = False) -> Floats:
+        """Q, shape (10, 10), of ``(1, P)``: the sum of squares of r(G, P), or with velocities in axes of the world."""
         turn = self.turn @ G.T
         C = running_rotations(turn)  # (n, 3, 3)
         # the body turns during a step: its force is felt at the middle
@@ -187,7 +211,8 @@ class SharedRows:
         C = C[self.row]  # (k, 3, 3)
         turning = C @ (cross_matrices(self.rate @ G.T) @ self.lever)[:, :, None]
         rest = -F[self.row][:, :, None] - turning
-        by_entries = np.einsum("nai,nj->naij", C, self.velocity)
+        turned = np.broadcast_to(np.eye(3), C.shape) if is_in_world else C
+        by_entries = np.einsum("nai,nj->naij", turned, self.velocity)
         columns = np.concatenate([rest, by_entries.reshape(len(C), 3, 9)], axis=2)
         Q = np.zeros((10, 10))
         for run, together in self.runs:

@@ -31,7 +31,7 @@ from sonar_graph.diagnosis.aiding_check import (
     start_heading_findings,
     vertical_bias,
 )
-from sonar_graph.diagnosis.axes import AxesMatch, match_axes
+from sonar_graph.diagnosis.axes import AxesMatch, match_axes, turns_less_than_body
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -238,6 +238,9 @@ def axes_findings(
     # the accelerometers' own axes come first
     if gravity_warning(force, calibration.imu.mounting, calibration.gravity_m_s2):
         return [], sequence
+    ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
+    if ratio is not None:
+        return [world_axes_finding(ratio)], sequence
     found = match_axes(sequence.imu, sequence.dvl, calibration)
     if found is None:
         return [], sequence
@@ -261,6 +264,18 @@ def axes_findings(
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
+
+
+def world_axes_finding(ratio: float) -> Finding:
+    """Velocities of the Doppler log that do not turn with the body."""
+    return Finding(
+        "DVL axes",
+        unknown("axes of the world"),
+        cause=f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle",
+        line="name a `topic` under [dvl] with velocities in axes of the vehicle or of the Doppler log "
+        f"{IN_LOG_CONFIG}",
+        gravity=Gravity.GRAVE,
+    )
 
 
 def force_axes(

@@ -4,10 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import check_sensors
-from sonar_graph.diagnosis.axes import match_axes, signed_permutations
+from sonar_graph.diagnosis.axes import (
+    match_axes,
+    signed_permutations,
+    turns_less_than_body,
+)
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -93,3 +98,27 @@ def test_a_gyro_whose_yaw_is_negated_is_named_first_with_the_line_that_mends_it(
     wanted = [given[0], given[1], "-z"]
     assert line_of(finding) == {"angular_velocity_axes": wanted}
     assert [other.quantity for other in others if other.acts] == []
+
+
+@pytest.mark.parametrize("k", range(48))
+def test_wrong_axes_of_gyros_or_doppler_log_are_not_those_of_the_world(k: int) -> None:
+    axes = signed_permutations()[k]
+    for run in (spoilt(axes, IDENTITY), spoilt(IDENTITY, axes)):
+        assert turns_less_than_body(run.imu, run.dvl, run.calibration) is None
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
+def test_velocities_in_axes_of_the_world_are_named_before_all_else(
+    yaw_rad: float,
+) -> None:
+    """Whatever the heading of that world."""
+    R = WORLD.calibration.dvl.mounting.pose().rotation().matrix()
+    attitude = WORLD.truth.at(WORLD.dvl.stamps_ns).rotations()
+    in_body = WORLD.dvl.velocity @ R.T
+    in_world = (Rotation.from_rotvec([0.0, 0.0, yaw_rad]) * attitude).apply(in_body)
+    run = replace(WORLD, dvl=replace(WORLD.dvl, velocity=in_world @ R))
+    ratio = turns_less_than_body(run.imu, run.dvl, run.calibration)
+    assert ratio is not None
+    assert ratio > 2.0
+    first, *_ = check_sensors(run, LogConfig())
+    assert "axes of the world" in first.text()
