@@ -147,8 +147,8 @@ def test_preintegration_consistency_tells_rules_apart():
     assert found["keyframe_coug_fgo_anees"][1] > 5
     assert found["keyframe_TURTLMap_anees"][1] > 5
     ours_mm, anees, gaps_mm, gaps_anees = found["brisk, 1 Hz rms_mm, anees, as gaps"]
-    assert ours_mm > 4 * gaps_mm
-    assert anees > 10 > 1.5 > gaps_anees
+    assert ours_mm > 2.5 * gaps_mm
+    assert anees > 5 > 1.5 > gaps_anees
     assert {"chain_pose_anees", "brisk_displacement_anees", "passed"} <= set(found)
 
 
