@@ -150,7 +150,9 @@ def own_map_errors(
 
     Instants at which the map names fewer than `LEAST_LANDMARKS` true landmarks are left out.
     """
-    truth, true, path = sequence.truth, sequence.true_landmarks, run.causal
+    truth = sequence.truth
+    true = sequence.true_landmarks
+    path = run.causal
     stamps: list[int] = []
     errors: list[float] = []
     if truth is None or true is None or path is None:

@@ -421,7 +421,8 @@ def test_the_rest_of_a_closed_gap_errs_as_a_velocity_that_walks_between_both_end
         stamps_ns[:-1], stamps_ns[1:], np.full(2, known_ns), np.zeros(3), over_gaps=True
     )
     rng = np.random.default_rng(3)
-    T, n = Vehicle.FOUND_S - Vehicle.LOST_S, 1000
+    T = Vehicle.FOUND_S - Vehicle.LOST_S
+    n = 1000
     steps = 0.1 * np.sqrt(T / n) * rng.standard_normal((4000, n))
     walk = np.cumsum(steps, axis=1)
     bridge = walk - np.linspace(1 / n, 1, n) * walk[:, -1:]
@@ -462,7 +463,8 @@ def at_rest(gap_s, imu_hz=20.0, turn=(0.0, 0.0, 0.0), sigma_m_s=0.0, walk=1e3, *
 
 def test_what_the_square_of_a_gyro_bias_does_to_the_height_has_its_second_moment_in_the_covariance():
     """Gauss-Hermite points of two horizontal biases; where the line alone counts."""
-    b, gap_s = 2e-3, 40.0
+    b = 2e-3
+    gap_s = 40.0
     nodes, weights = np.polynomial.hermite_e.hermegauss(5)
     weights = weights / weights.sum()
     moment_m2 = sum(
@@ -502,7 +504,8 @@ def test_a_line_with_less_doppler_noise_than_the_last_sample_replaces_it():
 @pytest.mark.parametrize("gap_s", [3.0, 10.0])
 def test_a_turn_with_a_constant_force_needs_no_fast_imu(gap_s):
     """On a circle rate and force are constant in the body: ten times as many rows change nothing."""
-    w, v = 0.5, 1.0
+    w = 0.5
+    v = 1.0
     found = []
     for imu_hz in (5.0, 50.0):
         imu_ns = stamps(imu_hz, 8.0 + gap_s)

@@ -309,9 +309,11 @@ def _fault(
         # where time runs back over both steps, the clock was set, and no frame is at fault
         fits = total_ns < 0 or is_between
     else:
-        gap_ns, usual_ns = before_ns, after_ns
+        gap_ns = before_ns
+        usual_ns = after_ns
         if accepted:
-            gap_ns, usual_ns = after_ns, before_ns
+            gap_ns = after_ns
+            usual_ns = before_ns
         fits = usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
     return None if fits else "its time does not fit those of the frames beside it"
 
