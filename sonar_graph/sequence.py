@@ -27,8 +27,14 @@ from sonar_graph.measurements import (
     require_blocks,
 )
 from sonar_graph.measurements import PAUSE_NS as PAUSE_NS
-from sonar_graph.states import LandmarkMap, Refusal, RefusedRow, Trajectory
-from sonar_graph.table import ABSENT, as_html, text_table
+from sonar_graph.states import (
+    ABSENT,
+    LandmarkMap,
+    Refusal,
+    RefusedRow,
+    Trajectory,
+    html_table,
+)
 
 MOST_INSTANTS = 10_000_000
 """Two months at 2 Hz; a clock that was set meanwhile could ask for all memory."""
@@ -108,14 +114,8 @@ class Sequence:
                 ["true landmarks", str(len(self.true_landmarks)), *[ABSENT] * 3]
             )
         heads = ["Block", "Rows", "First (s)", "Last (s)", "Rate (Hz)"]
-        return as_html(
-            text_table(
-                "sequence",
-                f"Sequence {self.name}, {self.duration_s:.1f} s",
-                heads,
-                rows,
-            )
-        )
+        caption = f"Sequence {self.name}, {self.duration_s:.1f} s"
+        return html_table(caption, heads, rows)
 
     def blocks(self) -> dict[str, Block]:
         """Measurements that there are, by their names in `Measurements`."""

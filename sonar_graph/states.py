@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import cached_property
+from html import escape
 from typing import NamedTuple
 
 import gtsam
@@ -18,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.table import ABSENT, as_html, text_table
 
 FIRST_ANONYMOUS_ID = 3_000_000_000
 """First identity given to landmarks that the recogniser has not named; identities of designs end at 2^31 - 1."""
@@ -39,6 +39,24 @@ def landmark_name(identity: int) -> str:
 
 MOST_ROWS = 30
 """Most landmarks that a notebook shows."""
+ABSENT = "\N{EN DASH}"
+"""Stands in tables where there is no number."""
+
+
+def html_table(caption: str, headings: list[str], rows: list[list[str]]) -> str:
+    """Plain table of texts for a notebook, all of them escaped."""
+    head = " ".join(f"<th>{escape(heading)}</th>" for heading in headings)
+    lines = [
+        "<table>",
+        f"<caption>{escape(caption)}</caption>",
+        f"<thead><tr>{head}</tr></thead>",
+        "<tbody>",
+    ]
+    for row in rows:
+        cells = " ".join(f"<td>{escape(text)}</td>" for text in row)
+        lines.append(f"<tr>{cells}</tr>")
+    lines += ["</tbody>", "</table>"]
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +140,7 @@ class Trajectory:
                     "unknown" if np.isnan(self.covariances).all() else "known",
                 ]
             )
-        return as_html(
-            text_table("trajectory", "Trajectory", ["Quantity", "Value"], rows)
-        )
+        return html_table("Trajectory", ["Quantity", "Value"], rows)
 
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
@@ -293,11 +309,7 @@ class LandmarkMap:
             "sigma y (m)",
             "sigma z (m)",
         ]
-        return as_html(
-            text_table(
-                "landmark-map", f"Map of {len(self)} landmarks{left_out}", heads, rows
-            )
-        )
+        return html_table(f"Map of {len(self)} landmarks{left_out}", heads, rows)
 
 
 class Outcome(StrEnum):

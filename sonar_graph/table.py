@@ -1,6 +1,6 @@
 """Tables of results: cells with a text for people and numbers for machines, and their HTML.
 
-Notebook, pages, CSV and LaTeX show the same `Table`.
+Scores in notebooks, pages, CSV and LaTeX show the same `Table`.
 """
 
 import math
@@ -8,8 +8,8 @@ import re
 from dataclasses import dataclass, field
 from html import escape
 
-ABSENT = "\N{EN DASH}"
-"""Stands where there is no number."""
+from sonar_graph.states import ABSENT as ABSENT
+
 RUN_COLOURS = 6
 """Colours that a page has for runs; the next run begins anew."""
 

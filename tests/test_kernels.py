@@ -15,9 +15,9 @@ from numba.core import event
 from sonar_graph.numerics import compiling
 
 KERNELS = """
-from sonar_graph.numerics import compiled, jit
+from sonar_graph.numerics import compiled, matrices
 
-jit.COMPILED_IN.clear()
+matrices.COMPILED_IN.clear()
 
 @compiled
 def twice(x):
@@ -106,7 +106,7 @@ def test_a_terminal_shows_what_is_compiled_in_place_and_nothing_stays(loops):
 
 
 def test_other_functions_of_numba_are_none_of_ours(tmp_path):
-    program = "import numba, sonar_graph.numerics.jit; assert numba.njit(lambda x: 2 * x)(2) == 4"
+    program = "import numba, sonar_graph.numerics.matrices; assert numba.njit(lambda x: 2 * x)(2) == 4"
     assert told(tmp_path, program) == ""
 
 
@@ -136,7 +136,7 @@ def inner(x):
     return x + {offset}
 """
 CHECKED = {
-    "imported": "from sonar_graph.numerics.jit import compiled",
+    "imported": "from sonar_graph.numerics.matrices import compiled",
     "decorator": "@compiled",
 }
 UNCHECKED = {

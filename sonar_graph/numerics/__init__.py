@@ -4,10 +4,9 @@
 from sonar_graph.numerics.chi_square import chi_square_exceeded, chi_square_quantile, chi_square_share
 from sonar_graph.numerics.compiled_beside import compiled_beside
 from sonar_graph.numerics.compiling import compiling_s, needs_compiling
-from sonar_graph.numerics.jit import compilable, compiled, inlined
 from sonar_graph.numerics.matrices import (
-    I3, LOWER_LEFT, LOWER_RIGHT, O3, UPPER_RIGHT, ZERO, Mat3, Mat6, Vec3, Vec6, chord_inverse,
-    cross, cross_matrix, curvature, diagonal, exp_and_mean, mat, mat6, outer, quaternion, rodrigues, rotation_log,
+    I3, LOWER_LEFT, LOWER_RIGHT, O3, UPPER_RIGHT, ZERO, Mat3, Mat6, Vec3, Vec6, chord_inverse, compilable, compiled,
+    cross, cross_matrix, curvature, diagonal, exp_and_mean, inlined, mat, mat6, outer, quaternion, rodrigues, rotation_log,
     running_rotations, skew, store, store6, store_all, store_row, store_row6, store_vector, vec,
 )
 

@@ -11,7 +11,7 @@ from typing import Any
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-from sonar_graph.numerics.jit import COMPILED_IN
+from sonar_graph.numerics.matrices import COMPILED_IN
 
 LOG = logging.getLogger(__name__)
 NOTICE = "compiling for the first use, once: later uses find the code in their cache"
