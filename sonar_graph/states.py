@@ -381,7 +381,7 @@ class Refusal(StrEnum):
     )
     WAITED = "left out: after a gap a velocity waits until a later one agrees, and the later one ends the gap; nothing to do"
     UNSOUND = "refused: its covariance is not positive definite, or no sensor gives its value or its noise"
-    INCOMPLETE = "refused: too few beams, and nothing to complete them with"
+    INCOMPLETE = "refused: too few beams to measure the whole velocity"
     BEYOND_SENSOR = "refused: no gyro or accelerometer measures this"
     OUT_OF_REACH = "refused: no vehicle reaches this depth from the last, or no other depth confirms it"
     CLOCK = "refused: more than a day from the rows that follow or precede; was the clock set between, or are these not ns?"

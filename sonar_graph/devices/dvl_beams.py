@@ -5,8 +5,7 @@ A beam of unit direction b measures ``z = b . v + n``, n ~ N(0, sigma²). Valid 
     Lambda = sum b b^T / sigma^2,      Lambda v = sum b z / sigma^2
 
 With fewer than three beams, or three in one plane, some directions are not measured. The velocity is 0 along them, with
-a sigma of `UNMEASURED_M_S`; `sonar_graph.navigation.dvl_screening.partial_beams` completes such rows. Derivation:
-docs/theory/beams.md.
+a sigma of `UNMEASURED_M_S`; odometry refuses such rows. docs/theory/beams.md.
 """
 
 import numpy as np

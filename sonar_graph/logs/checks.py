@@ -164,7 +164,7 @@ def _dvl_gap_warnings(
         else:
             by_walk.append(gap)
     if by_beams:
-        yield f"dvl: too few beams for a whole velocity {_gap_times(by_beams, start_ns)}: completed by the IMU"
+        yield f"dvl: too few beams for a whole velocity {_gap_times(by_beams, start_ns)}: left out, and bridged as a gap"
     if by_force:
         yield f"dvl: no velocity {_gap_times(by_force, start_ns)}: bridged by the IMU, with an error that grows fast"
     if by_walk:

@@ -1,8 +1,8 @@
 """Motion by gyros and Doppler log between any two instants.
 
 Epochs. The stamps of the DVL rows are *epochs*: between two epochs the velocity is known on both sides and the motion
-is final. A row is known from its own stamp on, one that waits (the first velocities, those after a long gap, those of
-too few beams) from that of the row that confirms or completes it (`sonar_graph.navigation.dvl_screening`). An epoch
+is final. A row is known from its own stamp on, one that waits (the first velocities, those after a long gap) from
+that of the row that confirms it (`sonar_graph.navigation.dvl_screening`). An epoch
 counts as reached at time t when its row is known and an IMU row at or after it is stamped at or before t. What happens
 between epochs (a detection, a depth sample, an estimate) is related to the newest reached epoch by a provisional motion
 that uses nothing known later. Results therefore depend on stamps alone, to the bit, not on how a log is cut into calls

@@ -30,8 +30,6 @@ class VelocityRow(NamedTuple):
     """Shape (3,), m/s."""
     cov: Floats
     """Shape (3, 3), m²/s²."""
-    is_partial: bool = False
-    """True where it leaves a direction unmeasured."""
 
 
 class VelocityRows(NamedTuple):

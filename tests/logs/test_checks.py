@@ -76,7 +76,7 @@ GAPS: dict[str, tuple[Imu, Dvl, Calibration, list[str]]] = {
     "bridged by a walk": (imu(force=NAN), LATE, USUAL, [
         "dvl: no velocity 100.000 to 220.000 s after the start, and no accelerometer: bridged by a random walk"]),
     "few beams": (imu(), dvl(PINGS, (PINGS > 100) & (PINGS < 130)), USUAL, [
-        "dvl: too few beams for a whole velocity 100.000 to 130.000 s after the start: completed by the IMU"]),
+        "dvl: too few beams for a whole velocity 100.000 to 130.000 s after the start: left out, and bridged as a gap"]),
     "few beams first": (imu(), dvl(PINGS, PINGS < 12), USUAL, [
         "dvl: no whole velocity until 12.000 s after the start: too few beams"]),
     "hole": (HOLED, dvl(), USUAL, [

@@ -21,7 +21,6 @@ from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl
 from sonar_graph.navigation import samples
-from sonar_graph.navigation.dvl_screening.partial_beams import LONGEST_STRETCH_NS
 from sonar_graph.navigation.dvl_screening.row_intake import RowIntake
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.states import Refusal
@@ -152,15 +151,18 @@ def told(odometry: Odometry) -> list[tuple[int, Refusal]]:
 @given(st.lists(st.integers(0, round(SECONDS * NS)), max_size=5))
 @settings(max_examples=30, deadline=None)
 def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
-    """A row after rows with one beam is compared with the whole one before them, in whatever block that came."""
-    outliers = (0, 1, 5, 10, 12, 21)
-    rows = driven(partial=(8, 9, 10, 11, 20), outliers=outliers)
+    outliers = (0, 1, 5, 12, 21)
+    partial = (8, 9, 10, 11, 20)
+    rows = driven(partial=partial, outliers=outliers)
     edges = [0, *(T0_NS + cut for cut in sorted(cuts)), T0_NS + 10 * NS]
     whole, pieces = (
         odometry_at_rest(rows),
         odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges))),
     )
-    assert told(whole) == [(k, Refusal.OUTLIER) for k in outliers]
+    assert told(whole) == sorted(
+        [(k, Refusal.OUTLIER) for k in outliers]
+        + [(k, Refusal.INCOMPLETE) for k in partial]
+    )
     assert sorted(pieces.refused) == sorted(whole.refused)
     for one, other in zip(pieces.rows()[:6], whole.rows()[:6], strict=True):
         np.testing.assert_array_equal(one, other)
@@ -173,43 +175,20 @@ def test_what_a_row_with_one_beam_did_not_measure_hides_no_outlier():
         np.arange(len(rows)) == 9, [0.0, 1.0, 0.0]
     )
     assert told(odometry_at_rest(replace(rows, velocity=velocity))) == [
-        (9, Refusal.OUTLIER)
+        (8, Refusal.INCOMPLETE),
+        (9, Refusal.OUTLIER),
     ]
 
 
-def test_rows_of_few_beams_are_named_until_they_are_completed():
-    rows = driven(partial=(0, 1, 8, 9, 28, 29, 30))
-    odometry = odometry_at_rest(rows.rows(slice(0, 9)))
-    assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 8)]
-    odometry.add(None, rows.rows(slice(9, None)))
-    assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 28, 29, 30)]
-    assert np.isnan([row.distance for row in odometry.refused]).all()
-    np.testing.assert_array_equal(odometry.rows()[3], rows.stamps_ns[2:28])
-
-
-@pytest.mark.parametrize("more_ns", [0, 1])
-def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
-    ns = T0_NS + np.array([0, NS, LONGEST_STRETCH_NS + more_ns])
-    odometry = Odometry(Calibration())
-    odometry.add(imu(ns[[0, 2]], 0.0), dvl(ns, 0.8, np.array([WHOLE, BLIND, WHOLE])))
-    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [
-        (T0_NS + NS, Refusal.INCOMPLETE)
-    ] * more_ns
-    assert len(odometry.rows()[3]) == 3 - more_ns
-
-
-@pytest.mark.parametrize(
-    ("partial", "blocks", "used"),
-    [(3, ([2, 4], [3], [5]), [2, 4, 5]), (25, ([0, 1, 25],), [0, 1])],
-    ids=["overtaken", "after a long gap"],
-)
-def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(
-    partial, blocks, used
-):
-    rows = driven(partial=(partial,))
-    odometry = odometry_at_rest(*(rows.rows(np.array(block)) for block in blocks))
-    assert told(odometry) == [(partial, Refusal.INCOMPLETE)]
-    np.testing.assert_array_equal(odometry.rows()[3], rows.stamps_ns[used])
+def test_rows_of_few_beams_are_refused_and_change_nothing():
+    partial = (0, 1, 8, 9, 28, 29, 30)
+    rows = driven(partial=partial)
+    with_them = odometry_at_rest(rows.rows(slice(0, 9)), rows.rows(slice(9, None)))
+    without = odometry_at_rest(rows.rows(np.delete(np.arange(len(rows)), partial)))
+    assert told(with_them) == [(k, Refusal.INCOMPLETE) for k in partial]
+    assert np.isnan([row.distance for row in with_them.refused]).all()
+    for one, other in zip(with_them.rows()[:7], without.rows()[:7], strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_news():
@@ -323,18 +302,15 @@ def test_held_velocities_may_jump():
     assert not odometry_at_rest(driven(outliers=(5, 12)), calibration=held).refused
 
 
-def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
+def test_an_infinite_variance_is_refused_like_one_of_a_direction_not_measured():
     turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
     logs = [
         driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured]))
         for unmeasured in (100.0**2, np.inf)
     ]
-    one, other = (
-        odometry_at_rest(rows, calibration=turned).rows()[:6] for rows in logs
-    )
-    for column, same in zip(one, other, strict=True):
-        np.testing.assert_array_equal(column, same)
-    assert len(one[3]) == len(logs[0])
+    for rows in logs:
+        odometry = odometry_at_rest(rows, calibration=turned)
+        assert told(odometry) == [(4, Refusal.INCOMPLETE), (5, Refusal.INCOMPLETE)]
 
 
 def test_an_infinite_variance_is_that_of_a_direction_not_measured_and_nan_is_not_said():

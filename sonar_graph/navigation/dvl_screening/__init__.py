@@ -1,4 +1,4 @@
-"""Doppler rows that are used, refused, waiting for confirmation, or completed from few beams."""
+"""Doppler rows that are used, refused, or waiting for confirmation."""
 
 # fmt: off
 from sonar_graph.navigation.dvl_screening.row_intake import RowIntake

@@ -5,7 +5,7 @@ Gate. A velocity v, t seconds after the last one u that was accepted, both in bo
     S = Q_u + Q_v + (q^2 t + (w t |u|)^2) I,    q velocity walk of the calibration, w `TURNING_RAD_S` (w t at most 2)
 
 since the velocity may change and the vehicle may turn. The squared Mahalanobis distance is gated at `GATE`; what passes
-is weighted by its noise. A row that leaves a direction unmeasured is compared, but nothing is compared with it.
+is weighted by its noise.
 
 Confirmation. At the start there is no velocity to compare with, and long after the last accepted one (`LONG_NS`, and
 `LONG_INTERVALS` of the log's own) the gate is wide. Such a row waits. Of the waiting rows, chains are formed in which
@@ -30,7 +30,6 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.preintegration import covariance, row_of, rows_until
 from sonar_graph.navigation.samples import (
     LATEST_NS,
-    PARTIAL_M2_S2,
     VelocityRow,
     VelocityRows,
 )
@@ -48,34 +47,25 @@ class GateResult(NamedTuple):
     """Result of the gate on n rows."""
 
     distance: Floats
-    """Squared Mahalanobis distance of each row from the last whole one accepted, shape (n,)."""
-    is_partial: Flags
-    """Rows that leave a direction unmeasured, shape (n,)."""
+    """Squared Mahalanobis distance of each row from the last one accepted, shape (n,)."""
     is_outlier: Flags
     """Shape (n,)."""
-    is_plain: bool
-    """True where no row is partial or an outlier."""
-
-    @property
-    def is_accepted(self) -> Flags:
-        """Whole rows that are no outliers, shape (n,)."""
-        return ~(self.is_outlier | self.is_partial)
+    has_outliers: bool
 
 
 def gate_velocities(
     rows: VelocityRows, known: VelocityRows, walk: float, gate: float
 ) -> GateResult:
-    """Compare each row with the last whole one accepted, beginning with the known row before the first.
+    """Compare each row with the last one accepted, beginning with the known row before the first.
 
     ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
     which a row is an outlier.
     """
     n = len(rows.stamps_ns)
     distance = np.zeros(n)
-    is_partial = np.zeros(n, np.bool_)
     is_outlier = np.zeros(n, np.bool_)
-    is_plain = _write_gated(rows, known, walk, gate, distance, is_partial, is_outlier)
-    return GateResult(distance, is_partial, is_outlier, is_plain)
+    has_outliers = _write_gated(rows, known, walk, gate, distance, is_outlier)
+    return GateResult(distance, is_outlier, has_outliers)
 
 
 @compiled
@@ -85,11 +75,10 @@ def _write_gated(
     walk: float,
     gate: float,
     distance: Floats,
-    is_partial: Flags,
     is_outlier: Flags,
 ) -> bool:
-    """Fill the columns of `GateResult`; returns ``is_plain``."""
-    is_plain = True
+    """Fill the columns of `GateResult`; returns ``has_outliers``."""
+    has_outliers = False
     last_ns = LATEST_NS
     u = ZERO
     Q_u = O3
@@ -106,15 +95,14 @@ def _write_gated(
             distance[k] = squared_distance(
                 u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk
             )
-        is_partial[k] = Q_v.x.x + Q_v.y.y + Q_v.z.z > PARTIAL_M2_S2
         is_outlier[k] = distance[k] > gate
-        if is_partial[k] or is_outlier[k]:
-            is_plain = False
+        if is_outlier[k]:
+            has_outliers = True
         else:
             last_ns = stamp_ns
             u = v
             Q_u = Q_v
-    return is_plain
+    return has_outliers
 
 
 @inlined
@@ -179,21 +167,21 @@ class VelocityConfirmation:
         """Stamps of the rows that wait."""
         return [row.stamp_ns for row in self._waiting]
 
-    def lets_all_pass(self, stamps_ns: Ints, whole_ns: Ints) -> bool:
-        """True where no row of a block would have to wait, given the whole rows of it that the gate accepts."""
+    def lets_all_pass(self, stamps_ns: Ints, accepted_ns: Ints) -> bool:
+        """True where no row of a block would have to wait, given the rows of it that the gate accepts."""
         if self._waiting or not self._recent_ns or stamps_ns[0] <= self._recent_ns[-1]:
             return False
         if stamps_ns[-1] - self._recent_ns[-1] <= LONG_NS:
             return True
-        known_ns = np.r_[self._recent_ns[-1], whole_ns]
+        known_ns = np.r_[self._recent_ns[-1], accepted_ns]
         since_ns = stamps_ns - known_ns[np.searchsorted(known_ns, stamps_ns) - 1]
         return bool((since_ns <= LONG_NS).all())
 
-    def accept(self, whole_ns: Ints) -> None:
-        """Remember whole rows that the gate accepted."""
-        if not len(whole_ns):
+    def accept(self, accepted_ns: Ints) -> None:
+        """Remember rows that the gate accepted."""
+        if not len(accepted_ns):
             return
-        recent = whole_ns[-RECENT:].tolist()
+        recent = accepted_ns[-RECENT:].tolist()
         if self._recent_ns and recent[0] <= self._recent_ns[-1]:
             recent = sorted({*self._recent_ns, *recent})
         else:
@@ -228,24 +216,20 @@ class VelocityConfirmation:
         return Confirmed(VelocityRows.of(released), refused)
 
     def _must_wait(self, row: VelocityRow) -> bool:
-        is_waiting = bool(self._waiting)
         if not self._recent_ns:
-            return is_waiting or not row.is_partial
+            return True
         intervals = np.diff(self._recent_ns)
         long_ns = LONG_NS
         if len(intervals):
             # the gate of a slow log is wide anyway
             long_ns = max(LONG_NS, LONG_INTERVALS * int(intervals.min()))
         since_ns = row.stamp_ns - self._recent_ns[-1]
-        return since_ns > 0 and (
-            is_waiting or (since_ns > long_ns and not row.is_partial)
-        )
+        return since_ns > 0 and (bool(self._waiting) or since_ns > long_ns)
 
     def first_accepted_chain(self) -> list[VelocityRow]:
         """The first chain of waiting rows that is long enough and a majority of its stretch; empty without one."""
-        whole = [row for row in self._waiting if not row.is_partial]
         chains: list[list[VelocityRow]] = []
-        for row in whole:
+        for row in self._waiting:
             before = [
                 chain for chain in chains if self._distance(chain[-1], row) <= GATE
             ]
@@ -257,7 +241,7 @@ class VelocityConfirmation:
                 part = chain[begin:]
                 in_stretch = sum(
                     part[0].stamp_ns <= one.stamp_ns <= part[-1].stamp_ns
-                    for one in whole
+                    for one in self._waiting
                 )
                 if 2 * len(part) > in_stretch:
                     return part
@@ -276,7 +260,7 @@ class VelocityConfirmation:
         for row in self._waiting:
             if row.stamp_ns > end_ns:
                 break
-            if row.is_partial or row.stamp_ns in stamps:
+            if row.stamp_ns in stamps:
                 found.append(row)
                 continue
             distance = min(self._distance(row, other) for other in chain)

@@ -2,13 +2,13 @@
 
 A row is turned into body axes and placed by its stamp. A velocity whose covariance is not positive definite is unsound,
 a row of a motion that was already used is late. A velocity that no vehicle reaches is an outlier, and one with none
-before it waits until others confirm it (`sonar_graph.navigation.dvl_screening.dvl_gate`). One of too few beams waits
-until it can be completed (`sonar_graph.navigation.dvl_screening.partial_beams`). An angular rate or a specific force
+before it waits until others confirm it (`sonar_graph.navigation.dvl_screening.dvl_gate`). One of too few beams, which
+leaves a direction unmeasured, is refused: the gap is bridged better without it. An angular rate or a specific force
 beyond `MOST_RATE_RAD_S` and `MOST_FORCE_M_S2` is measured by no sensor. Depths:
 `sonar_graph.navigation.dvl_screening.depth_gate`.
 
-A row is known from its own stamp on, one that waited from that of the row that completed or confirmed it. So what is
-known at an instant follows from stamps, not from the calls in which rows came.
+A row is known from its own stamp on, one that waited from that of the row that confirmed it. So what is known at an
+instant follows from stamps, not from the calls in which rows came.
 """
 
 from typing import TypeVar
@@ -25,17 +25,15 @@ from sonar_graph.navigation.dvl_screening.dvl_gate import (
     VelocityConfirmation,
     gate_velocities,
 )
-from sonar_graph.navigation.dvl_screening.partial_beams import (
-    InertialRows,
-    PartialVelocities,
-)
 from sonar_graph.navigation.samples import (
     EARLIEST_NS,
     LATEST_NS,
+    PARTIAL_M2_S2,
     StampedRows,
     VelocityRow,
     VelocityRows,
     in_numbers,
+    is_partial,
 )
 from sonar_graph.numerics import compiled
 from sonar_graph.states import Refusal, RefusedRow
@@ -71,7 +69,6 @@ class RowIntake:
         self._gate = np.inf if is_held else GATE
         self._walk = calibration.dvl.velocity_walk_density
         self._confirmation = None if is_held else VelocityConfirmation(self._walk)
-        self._partial = PartialVelocities(calibration)
         self.imu = StampedRows(np.empty((0, 3)), np.empty((0, 3)))
         """Angular rate and specific force, body axes."""
         self.dvl = StampedRows(
@@ -84,17 +81,13 @@ class RowIntake:
 
     @property
     def refused(self) -> list[RefusedRow]:
-        """Rows that are not used, and why; includes rows that may still be completed or confirmed."""
+        """Rows that are not used, and why; includes rows that may still be confirmed."""
         waiting_ns = self._confirmation.waiting_ns if self._confirmation else []
-        incomplete = [
-            RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan)
-            for at_ns in self._partial.not_completed_ns
-        ]
         unconfirmed = [
             RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan)
             for at_ns in waiting_ns
         ]
-        return [*self._refused, *incomplete, *unconfirmed]
+        return [*self._refused, *unconfirmed]
 
     def add_imu(self, imu: Imu) -> bool:
         """Add rows; True where some were placed before others that were there already."""
@@ -171,27 +164,25 @@ class RowIntake:
         result = self._gated(rows)
         if confirmation is None:
             return self._place(rows, result)
-        whole_ns = (
-            rows.stamps_ns if result.is_plain else rows.stamps_ns[result.is_accepted]
-        )
-        if confirmation.lets_all_pass(rows.stamps_ns, whole_ns):
-            confirmation.accept(whole_ns)
+        accepted_ns = rows.stamps_ns
+        if result.has_outliers:
+            accepted_ns = rows.stamps_ns[~result.is_outlier]
+        if confirmation.lets_all_pass(rows.stamps_ns, accepted_ns):
+            confirmation.accept(accepted_ns)
             return self._place(rows, result)
         was_placed_before = False
-        for stamp_ns, velocity, cov, is_partial in zip(
-            *rows, result.is_partial, strict=True
-        ):
-            row = VelocityRow(int(stamp_ns), velocity, cov, bool(is_partial))
+        for stamp_ns, velocity, cov in zip(*rows, strict=True):
+            row = VelocityRow(int(stamp_ns), velocity, cov)
             confirmed, refused = confirmation.confirm(row)
             self._refused += refused
             if len(confirmed.stamps_ns):
                 again = self._gated(confirmed)
-                confirmation.accept(confirmed.stamps_ns[again.is_accepted])
+                confirmation.accept(confirmed.stamps_ns[~again.is_outlier])
                 was_placed_before |= self._place(confirmed, again, row.stamp_ns)
         return was_placed_before
 
     def _sound_velocities(self, dvl: Dvl) -> VelocityRows | None:
-        """Rows in time with a positive definite covariance, without the scale error, in body axes; None without any."""
+        """Whole rows in time with a positive definite covariance, in body axes, without the scale error, if any."""
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return None
@@ -202,11 +193,14 @@ class RowIntake:
             is_sound, cov = self._judged(cov)
             if not is_sound.all():
                 self._refuse("dvl", rows.stamps_ns[~is_sound], Refusal.UNSOUND)
-                if not is_sound.any():
-                    return None
-                rows = rows.rows(is_sound)
-                velocity = rows.velocity
-                cov = cov[is_sound]
+            incomplete = is_sound & is_partial(cov)
+            self._refuse("dvl", rows.stamps_ns[incomplete], Refusal.INCOMPLETE)
+            is_used = is_sound & ~incomplete
+            if not is_used.any():
+                return None
+            rows = rows.rows(is_used)
+            velocity = rows.velocity
+            cov = cov[is_used]
         if self._scale != 1.0:
             velocity = velocity / self._scale
             cov = cov / self._scale**2
@@ -243,11 +237,8 @@ class RowIntake:
     def _place(
         self, rows: VelocityRows, result: GateResult, confirmed_ns: int = EARLIEST_NS
     ) -> bool:
-        """Complete and place rows that are no outliers; True as for `add_imu`."""
-        known_ns = rows.stamps_ns
-        if result.is_plain and not self._partial.is_waiting:
-            self._partial.remember(rows)
-        else:
+        """Place rows that are no outliers; True as for `add_imu`."""
+        if result.has_outliers:
             outlier = result.is_outlier
             outlier_ns = rows.stamps_ns[outlier].tolist()
             distances = result.distance[outlier].tolist()
@@ -255,15 +246,10 @@ class RowIntake:
                 self._refused.append(
                     RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
                 )
-            inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
-            # a completed row is known from the whole row on that completed it
-            whole_ns = rows.stamps_ns[result.is_accepted]
-            rows = self._partial.completed(
-                rows.where(~outlier), result.is_partial[~outlier], inertial
-            )
-            known_ns = whole_ns[whole_ns.searchsorted(rows.stamps_ns)]
+            rows = rows.where(~outlier)
         if not len(rows.stamps_ns):
             return False
+        known_ns = rows.stamps_ns
         if confirmed_ns > EARLIEST_NS:
             known_ns = np.maximum(known_ns, confirmed_ns)
         was_placed_before = self.dvl.insert(*rows, known_ns)
@@ -292,14 +278,14 @@ class RowIntake:
 
 @compiled
 def _is_dominant(cov: Floats) -> bool:
-    """True where each variance (n, 3, 3) exceeds the rest of its row: then all are finite and positive definite."""
+    """True where each variance (n, 3, 3) exceeds the rest of its row and all are whole: then they are sound."""
     for k in range(len(cov)):
         for i in range(3):
             variance = cov[k, i, i]
             rest = 0.0
             for j in range(3):
                 rest += abs(cov[k, i, j]) if j != i else 0.0
-            if not rest < variance < np.inf:
+            if not rest < variance < PARTIAL_M2_S2 / 3.0:
                 return False
     return True
 
