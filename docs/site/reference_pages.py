@@ -24,8 +24,6 @@ LISTED = Path(__file__).parents[1] / "reference" / "names.toml"
 FRONT_DOOR = "sonar_graph"
 INDEX = "reference/README.md"
 MARKED = re.compile(r"<!-- list -->.*<!-- end -->", re.DOTALL)
-PAGE_HEAD = "---\nsearch:\n  boost: 0.5\n---\n\n"
-"""Pages of docstrings come after pages of prose in the search."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -47,7 +45,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             File.generated(
                 config,
                 f"reference/{package}.md",
-                content=PAGE_HEAD + "\n\n".join(parts) + "\n",
+                content="\n\n".join(parts) + "\n",
             )
         )
     index = files.get_file_from_path(INDEX)
