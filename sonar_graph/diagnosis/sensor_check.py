@@ -41,6 +41,7 @@ from sonar_graph.diagnosis.findings import (
     in_degrees,
     judged,
     matters,
+    notes_of,
     numbers,
     signed_axes,
     unknown,
@@ -60,7 +61,13 @@ from sonar_graph.diagnosis.start import (
     with_fitted,
 )
 from sonar_graph.diagnosis.units import force_scale, wrong_units
-from sonar_graph.logs import gravity_warning, stuck_quantities
+from sonar_graph.logs import (
+    UNFELT,
+    gravity_warning,
+    row_notes,
+    stuck_quantities,
+    unfelt_zeros,
+)
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
@@ -74,6 +81,8 @@ from sonar_graph.navigation.alignment import (
 )
 from sonar_graph.sequence import Sequence
 
+COMPARED = "log.compared"
+"""Subject of the note that sensors were compared, or why not."""
 LONGEST_S = 600.0
 """Longest part in which Doppler log and accelerometers are compared, in the middle of the log."""
 LEAST_OFFSET_S = 0.01
@@ -115,11 +124,40 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         return worst_first(all_findings(sequence, config or LogConfig()))
 
 
+def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
+    """The sequence with notes of what its sensors contradict; itself where they were compared before.
+
+    A sequence that was not read from a log gets the notes of `row_notes` too.
+
+    Examples
+    --------
+    >>> from sonar_graph.diagnosis import compared
+    >>> from sonar_graph.testing import small_world
+    >>> compared(small_world()).notes["log.compared"]
+    'sensors with each other'
+    """
+    if COMPARED in sequence.notes:
+        return sequence
+    notes = sequence.notes | {COMPARED: "sensors with each other"}
+    if "log.topics" not in notes:
+        notes |= row_notes(sequence)
+    for subject, text in notes_of(check_sensors(sequence, config)).items():
+        of_rows = notes.get(subject)
+        notes[subject] = f"{of_rows}; {text}" if of_rows else text
+    return replace(sequence, notes=notes)
+
+
+def trusted(sequence: Sequence) -> Sequence:
+    """The sequence with a note that its sensors are as its calibration has them, such as those of a simulator."""
+    notes = sequence.notes | {COMPARED: "no: the sensors are as calibrated"}
+    return replace(sequence, notes=notes)
+
+
 def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
-    sequence = without_stuck(sequence)
+    zeros, sequence = zero_findings(without_stuck(sequence), config)
     forces, sequence = force_findings(sequence, config)
     axes, sequence = axes_findings(sequence, config)
     imu, dvl = middle_rows(sequence)
@@ -137,7 +175,17 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     reference = reference_findings(right, config, tilt)
     noise = noise_findings(sequence)
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
-    return [*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise]
+    return [
+        *zeros,
+        *forces,
+        *axes,
+        *of_dvl,
+        *lever,
+        *bias,
+        *by_motion,
+        *reference,
+        *noise,
+    ]
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -213,6 +261,29 @@ def without_stuck(sequence: Sequence) -> Sequence:
     if len(of_dvl) < len(dvl):
         dvl = dvl.rows(of_dvl)
     return replace(sequence, imu=imu, dvl=dvl)
+
+
+def zero_findings(
+    sequence: Sequence, config: LogConfig
+) -> tuple[list[Finding], Sequence]:
+    """Velocities of zero without bottom lock, and the sequence without them; a reader of logs leaves them out."""
+    is_held = sequence.calibration.odometry_interpolation == "hold-past"
+    if is_held or config.table("dvl").get("are_zeros_measured"):
+        return [], sequence
+    dvl = sequence.dvl
+    unfelt = unfelt_zeros(sequence.imu, dvl, sequence.calibration)
+    count = int(np.count_nonzero(unfelt))
+    if not count:
+        return [], sequence
+    first_s = float(dvl.stamps_ns[np.argmax(unfelt)] - sequence.start_ns) / NS_PER_S
+    finding = Finding(
+        "DVL: bottom lock",
+        unknown("zeros are no velocity"),
+        cause=f"{count} of {len(dvl)} rows {UNFELT}, the first {first_s:.3f} s after the start: sent without bottom lock?",
+        line="leave these rows out of the sequence",
+        gravity=Gravity.GRAVE,
+    )
+    return [finding], replace(sequence, dvl=dvl.rows(np.flatnonzero(~unfelt)))
 
 
 def force_findings(

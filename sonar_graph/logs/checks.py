@@ -20,7 +20,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
@@ -253,6 +253,49 @@ def gravity_warning(
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
     return f"gravity is felt along {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
+
+
+def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[str]:
+    """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
+
+    Axes of the accelerometers that gravity contradicts, and quantities that are stuck.
+    """
+    gravity_m_s2 = calibration.gravity_m_s2
+    mounting = calibration.imu.mounting
+    if gravity := gravity_warning(imu.specific_force, mounting, gravity_m_s2):
+        yield f"imu: {gravity}"
+    # wheels turn evenly, and their rates jump
+    if dvl is None or calibration.odometry_interpolation != "linear":
+        return
+    for quantity, stuck in stuck_quantities(imu, dvl).items():
+        role = "dvl" if quantity == "velocity" else "imu"
+        stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
+        if doubt := stuck_doubt(stamps_ns, stuck, quantity):
+            yield f"{role}: {doubt}"
+
+
+def row_oddities(
+    imu: Imu | None, dvl: Dvl | None, depth: Depth | None, calibration: Calibration
+) -> Iterator[tuple[str, str | None]]:
+    """Results of the checks of numbers by role; None: nothing is wrong."""
+    # of wheels rates jump, and values stay the same
+    is_linear = calibration.odometry_interpolation == "linear"
+    if imu is not None and is_linear:
+        quantities = {
+            "angular rate": imu.angular_velocity,
+            "specific force": imu.specific_force,
+        }
+        for check in (spike_warning, stuck_warning):
+            for quantity, values in quantities.items():
+                yield "imu", check(imu.stamps_ns, values, quantity)
+    if dvl is not None and is_linear:
+        yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
+    if depth is not None:
+        heights = depth.z_m[:, None]
+        yield (
+            "depth",
+            stuck_warning(depth.stamps_ns, heights, "height", is_coarse=True),
+        )
 
 
 def axes_warning(adapter: Adapter) -> str | None:
