@@ -224,6 +224,13 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def is_without_gravity(specific_force: Floats, gravity_m_s2: float) -> bool:
+    """True where specific forces, shape (n, 3), are typically so small that gravity was taken out of them."""
+    sizes = np.linalg.norm(specific_force, axis=1)
+    sizes = sizes[np.isfinite(sizes)]
+    return bool(len(sizes) and np.median(sizes) < MOST_OFF_GRAVITY * gravity_m_s2)
+
+
 def gravity_warning(
     specific_force: Floats, mounting: Mounting, gravity_m_s2: float
 ) -> str | None:
@@ -241,8 +248,8 @@ def gravity_warning(
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:
         return (
             f"the typical specific force is {length:.3g} m/s2 instead of {gravity_m_s2:.3g}: give its scale (9.80665 "
-            f"where it is in g), or turn off use_gravity in the calibration (--calibration FILE) "
-            "where gravity was taken out"
+            "where it is in g), or `use_gravity = false` in the calibration (--calibration FILE) where gravity was "
+            "taken out"
         )
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None
@@ -262,7 +269,11 @@ def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[
     """
     gravity_m_s2 = calibration.gravity_m_s2
     mounting = calibration.imu.mounting
-    if gravity := gravity_warning(imu.specific_force, mounting, gravity_m_s2):
+    # its owner has said that gravity was taken out
+    is_said = not calibration.use_gravity
+    is_said &= is_without_gravity(imu.specific_force, gravity_m_s2)
+    gravity = gravity_warning(imu.specific_force, mounting, gravity_m_s2)
+    if gravity and not is_said:
         yield f"imu: {gravity}"
     # wheels turn evenly, and their rates jump
     if dvl is None or calibration.odometry_interpolation != "linear":
