@@ -61,6 +61,7 @@ from sonar_graph.diagnosis.start import (
     bias_findings,
     find_start_heading,
     find_start_tilt,
+    lacks_gravity,
     lever_findings,
     tilt_findings,
     turned_mounting,
@@ -71,7 +72,6 @@ from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import (
     UNFELT,
     gravity_warning,
-    is_without_gravity,
     row_notes,
     stuck_quantities,
     unfelt_zeros,
@@ -179,8 +179,7 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
     is_turned = any(finding.quantity == YAW for finding in axes)
-    g = sequence.calibration.gravity_m_s2
-    if is_without_gravity(sequence.imu.specific_force, g):
+    if lacks_gravity(sequence):
         match = replace(match, gyro_bias=(unknown(NO_GRAVITY),) * 3)
     of_dvl = dvl_findings(match, sequence, config)
     lever = lever_findings(match, sequence.calibration)
@@ -197,8 +196,15 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     # one row on the bias that is known is enough
     if any(f.estimate.is_known for f in of_vertical):
         bias = [f for f in bias if f.estimate.is_known or f.acts]
-    # one line for all axes
+    # one line for all axes, with both intervals of the vertical one
     if any(f.acts for f in of_vertical):
+        known = f"{sources[2]} {with_interval(estimates[2], 'rad/s')}"
+        by_motion = [
+            replace(f, cause=f"{f.cause} ({known})")
+            if f in of_vertical and estimates[2].is_known
+            else f
+            for f in by_motion
+        ]
         by_motion += [replace(f, cause=ALSO, consequence="", line="") for f in bias]
         bias = []
     reference = reference_findings(right, config, tilt)
@@ -291,10 +297,9 @@ def without_stuck(sequence: Sequence) -> Sequence:
 
 def without_gravity(sequence: Sequence) -> Sequence:
     """The sequence as if its owner had said so, where gravity was taken out of the specific forces."""
-    calibration = sequence.calibration
-    forces = sequence.imu.specific_force
-    if is_without_gravity(forces, calibration.gravity_m_s2):
-        calibration = calibration.model_copy(update={"use_gravity": False})
+    if not lacks_gravity(sequence):
+        return sequence
+    calibration = sequence.calibration.model_copy(update={"use_gravity": False})
     return replace(sequence, calibration=calibration)
 
 
@@ -538,8 +543,12 @@ def motion_findings(
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
     found += start_depth_findings(right)
+    has_up = not lacks_gravity(right)
     for check in (DEPTH, RANGE, AZIMUTH):
         match = matches[check]
+        # without gravity the tilt of the vehicle is unknown
+        if match is not None and not has_up:
+            match = Match.unknown(NO_GRAVITY)
         # the place of a landmark depends on its range
         is_range_wrong = check is AZIMUTH and any(
             f.grave and f.quantity.startswith(RANGE.name) for f in found

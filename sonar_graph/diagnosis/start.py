@@ -180,8 +180,7 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     """Alignment at rest if the vehicle rests at the start, else in motion, of a log with the other faults corrected."""
     if np.isnan(sequence.imu.specific_force).all():
         return StartTilt(None, "no accelerometers")
-    g = sequence.calibration.gravity_m_s2
-    if is_without_gravity(sequence.imu.specific_force, g):
+    if lacks_gravity(sequence):
         return StartTilt(None, NO_GRAVITY)
     found = rest_tilt(sequence)
     imu, dvl = beginning(sequence, LONGEST_S)
@@ -198,6 +197,12 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     else:
         return StartTilt(tilt, f"from {span_s(imu):.0f} s in motion")
     return StartTilt(None, f"at rest: {found.said}; in motion: {reason}")
+
+
+def lacks_gravity(sequence: Sequence) -> bool:
+    """True where gravity was taken out of the specific forces."""
+    forces = sequence.imu.specific_force
+    return is_without_gravity(forces, sequence.calibration.gravity_m_s2)
 
 
 def rest_tilt(sequence: Sequence) -> StartTilt:

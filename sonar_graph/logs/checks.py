@@ -48,6 +48,8 @@ LARGEST_LAG_CHANGE_S = 0.5
 LEAST_MOVED = {"positions": 1.0, "heading": 0.2, "depth": 0.5, "detections": 0.5}
 """Motion, m or rad, from which on a sensor that repeats its value is stuck, by role."""
 RESOLUTIONS = 3.0
+FASTEST_RESTING_M_S = 0.05
+"""Mean speed that the noise of a Doppler log makes at rest."""
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
@@ -301,12 +303,10 @@ def row_oddities(
                 yield "imu", check(imu.stamps_ns, values, quantity)
     if dvl is not None and is_linear:
         yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
-    if depth is not None:
+    if imu is not None and dvl is not None and depth is not None:
+        way_m = way_by("positions", imu, dvl, calibration, depth.stamps_ns)
         heights = depth.z_m[:, None]
-        yield (
-            "depth",
-            stuck_warning(depth.stamps_ns, heights, "height", is_coarse=True),
-        )
+        yield "depth", stuck_warning(depth.stamps_ns, heights, "height", way_m)
 
 
 def axes_warning(adapter: Adapter) -> str | None:
@@ -350,13 +350,13 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
 
 
 def stuck_warning(
-    stamps_ns: Ints, values: Floats, quantity: str, *, is_coarse: bool = False
+    stamps_ns: Ints, values: Floats, quantity: str, way_m: Floats | None = None
 ) -> str | None:
     """Warning about stretches of rows, shape (n, k), that are equal to the bit, zeros or not; None: there are none.
 
-    Such rows are used as they are. A vehicle at rest in a simulator or a coarse sensor may look the same: of a sensor
-    that ``is_coarse``, n rows of which a share p repeats the row before, a stretch of m counts that comes by chance
-    less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
+    Such rows are used as they are. A coarse sensor may look the same. With ``way_m``, the way of the vehicle until each
+    row, shape (n,), a stretch counts only where the vehicle is not at rest, and where its m of n rows, of which a share p
+    repeats the row before, come by chance less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
     first = np.concatenate([[0], np.flatnonzero(differs) + 1])
@@ -364,9 +364,11 @@ def stuck_warning(
     is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
         last - first + 1 >= STUCK_ROWS
     )
-    if is_coarse:
+    if way_m is not None:
         # resolution alone makes short stretches of equal rows
         is_long &= ~_may_be_chance(differs, last - first)
+        duration_s = np.maximum((stamps_ns[last] - stamps_ns[first]) / 1e9, 1e-9)
+        is_long &= (way_m[last] - way_m[first]) / duration_s > FASTEST_RESTING_M_S
     is_zero = ~np.any(values[first], axis=1)
     texts = []
     for chosen, what in (

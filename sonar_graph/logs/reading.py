@@ -666,7 +666,8 @@ def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
     ):
         raise LogError(
             f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "
-            f"See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
+            '`stamp = "log"` under [imu] or [dvl] in the log configuration takes the times of recording; see '
+            "stamp_unit_s and stamp_offset_s too"
         )
     if is_partial(dvl).all():
         raise LogError(
