@@ -7,6 +7,7 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -285,10 +286,9 @@ POSITIONS = Check(
     ),
     least_lag_s=0.3,
 )
-RANGE = Check(
+SIGHTINGS = partial(Check, role="detections", against="the motion between frames")
+RANGE = SIGHTINGS(
     name="ranges to landmarks",
-    role="detections",
-    against="the motion between frames",
     compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=True),
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
     units=LENGTHS,
@@ -305,10 +305,8 @@ RANGE = Check(
         "of the Doppler log",
     ),
 )
-AZIMUTH = Check(
+AZIMUTH = SIGHTINGS(
     name="azimuths of landmarks",
-    role="detections",
-    against="the motion between frames",
     compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=False),
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units=DEGREES,

@@ -70,11 +70,9 @@ from sonar_graph.diagnosis.start import (
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import (
-    UNFELT,
     gravity_warning,
     row_notes,
     stuck_quantities,
-    unfelt_zeros,
 )
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
@@ -166,8 +164,7 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
-    zeros, sequence = zero_findings(without_stuck(sequence), config)
-    sequence = without_gravity(sequence)
+    sequence = without_gravity(without_stuck(sequence))
     forces, sequence = force_findings(sequence, config)
     axes, sequence = axes_findings(sequence, config)
     match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
@@ -212,7 +209,6 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
     of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
     return [
-        *zeros,
         *forces,
         *axes,
         *of_dvl,
@@ -301,29 +297,6 @@ def without_gravity(sequence: Sequence) -> Sequence:
         return sequence
     calibration = sequence.calibration.model_copy(update={"use_gravity": False})
     return replace(sequence, calibration=calibration)
-
-
-def zero_findings(
-    sequence: Sequence, config: LogConfig
-) -> tuple[list[Finding], Sequence]:
-    """Velocities of zero without bottom lock, and the sequence without them; a reader of logs leaves them out."""
-    is_held = sequence.calibration.odometry_interpolation == "hold-past"
-    if is_held or config.table("dvl").get("are_zeros_measured"):
-        return [], sequence
-    dvl = sequence.dvl
-    unfelt = unfelt_zeros(sequence.imu, dvl, sequence.calibration)
-    count = int(np.count_nonzero(unfelt))
-    if not count:
-        return [], sequence
-    first_s = float(dvl.stamps_ns[np.argmax(unfelt)] - sequence.start_ns) / NS_PER_S
-    finding = Finding(
-        "DVL: bottom lock",
-        unknown("zeros are no velocity"),
-        cause=f"{count} of {len(dvl)} rows {UNFELT}, the first {first_s:.3f} s after the start: sent without bottom lock?",
-        line="leave these rows out of the sequence",
-        gravity=Gravity.GRAVE,
-    )
-    return [finding], replace(sequence, dvl=dvl.rows(np.flatnonzero(~unfelt)))
 
 
 def force_findings(

@@ -20,7 +20,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
 
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
@@ -457,6 +457,72 @@ def stuck_doubt(stamps_ns: Ints, stuck: NDArray[np.bool_], quantity: str) -> str
         f"{quantity} the same to the last bit in {rows.sum()} rows, {times} s after the first, while the other sensors "
         "change: stuck; results are wrong from there on, and the part before is read by --end"
     )
+
+
+ROWS_BESIDE = 8
+FEWEST_BESIDE = 5
+LONGEST_BESIDE_S = 12.0
+"""Beyond it the bias of a gyro bends the line."""
+UNFELT_SIGMAS = 6.0
+LEAST_STEP_M_S = 0.05
+"""At such speeds a row of zeros does little harm."""
+LEAST_SHARE = 0.5
+"""Of the speed of the row beside the zeros: a vehicle that brakes is off by less where stamps are late."""
+UNFELT = "with a velocity of 0 that the accelerometers contradict"
+
+
+def unfelt_zeros(imu: Imu, dvl: Dvl, calibration: Calibration) -> NDArray[np.bool_]:
+    """Mask of rows of zeros, shape (n,), in stretches that the vehicle reaches or leaves by a step it does not feel.
+
+    With C the turn by the gyros and F = int C f dt, the differences x = C v - F are a straight line in time, whose slope is
+    gravity. A line through the rows on one side of the zeros predicts -F at the first of them. At rest the prediction
+    holds; without bottom lock it is off by the velocity.
+    """
+    is_zero: NDArray[np.bool_] = np.asarray(~dvl.velocity.any(axis=1))
+    found = np.zeros(len(dvl), bool)
+    edges = np.flatnonzero(np.diff(is_zero.astype(int), prepend=0, append=0))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        before = np.arange(max(begin - ROWS_BESIDE, 0), begin + 1)
+        after = np.arange(end - 1, min(end + ROWS_BESIDE, len(dvl)))
+        found[begin:end] = any(
+            is_unfelt(imu, dvl, calibration, rows, zero)
+            for rows, zero in ((before, begin), (after, end - 1))
+        )
+    return found
+
+
+def is_unfelt(
+    imu: Imu, dvl: Dvl, calibration: Calibration, rows: Ints, zero: int
+) -> bool:
+    """True where the row ``zero`` leaves the line of the others by far more than they scatter about it."""
+    is_beside = (rows == zero) | dvl.velocity[rows].any(axis=1)
+    stamps_ns = dvl.stamps_ns[rows]
+    is_beside &= np.abs(stamps_ns - dvl.stamps_ns[zero]) <= LONGEST_BESIDE_S * NS_PER_S
+    chosen = dvl.rows(rows[is_beside])
+    begin_ns = int(chosen.stamps_ns[0])
+    samples = imu.between(begin_ns - NS_PER_S, int(chosen.stamps_ns[-1]) + NS_PER_S)
+    if samples is None or len(chosen) <= FEWEST_BESIDE:
+        return False
+    from sonar_graph.logs.measured_start import FirstPath  # compiles
+
+    path = FirstPath.of(samples, chosen, calibration, begin_ns)
+    x = path.velocity - path.impulse  # (m, 3)
+    # a hole of the IMU ends the path
+    if len(x) < len(chosen) or not np.isfinite(x).all():
+        return False
+    at = int(np.flatnonzero(rows[is_beside] == zero)[0])
+    A = np.vander(path.seconds - path.seconds[at], 2)  # (m, 2)
+    others = np.arange(len(x)) != at
+    slope_and_level, *_ = np.linalg.lstsq(A[others], x[others])
+    residuals = x[others] - A[others] @ slope_and_level
+    freedom = 3 * (len(residuals) - 2)
+    variance = float(np.sum(residuals**2)) / freedom
+    of_line = np.linalg.inv(A[others].T @ A[others])[1, 1]
+    sigma_m_s = float(np.sqrt(variance * (1 + of_line)))
+    off_m_s = float(np.linalg.norm(x[at] - slope_and_level[1]))
+    beside = 1 if at == 0 else at - 1
+    step_m_s = LEAST_SHARE * float(np.linalg.norm(chosen.velocity[beside]))
+    return off_m_s > max(LEAST_STEP_M_S, step_m_s, UNFELT_SIGMAS * sigma_m_s)
 
 
 def _changes(stamps_ns: Ints, values: Floats, begin_ns: int, end_ns: int) -> bool:

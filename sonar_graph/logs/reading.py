@@ -33,6 +33,7 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
+    UNFELT,
     axes_warning,
     gap_warnings,
     is_partial,
@@ -41,6 +42,7 @@ from sonar_graph.logs.checks import (
     row_doubts,
     row_oddities,
     stamp_faults,
+    unfelt_zeros,
     way_by,
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
@@ -450,8 +452,6 @@ class Assembly:
         imu = self.block("imu")
         if imu is None or not self._may_lack_lock or dvl.velocity.any(axis=1).all():
             return dvl, {}
-        from sonar_graph.logs.zero_velocities import UNFELT, unfelt_zeros  # compiles
-
         unfelt = unfelt_zeros(imu, dvl, self.calibration)
         count = int(np.count_nonzero(unfelt))
         if not count:
@@ -600,8 +600,13 @@ def row_notes(sequence: Sequence) -> dict[str, str]:
     imu = sequence.imu
     dvl = sequence.dvl
     oddities = row_oddities(imu, dvl, sequence.depth, calibration)
+    doubts = list(row_doubts(imu, dvl, calibration))
+    is_held = calibration.odometry_interpolation == "hold-past"
+    count = 0 if is_held else unfelt_zeros(imu, dvl, calibration).sum()
+    if count:
+        doubts.append(f"dvl: {count} of {len(dvl)} rows {UNFELT}: leave them out")
     findings = {
-        "log.doubtful": row_doubts(imu, dvl, calibration),
+        "log.doubtful": doubts,
         "log.warnings": (f"{role}: {text}" for role, text in oddities if text),
         "log.gaps": gap_warnings(imu, dvl, calibration),
     }

@@ -10,8 +10,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 
 from sonar_graph import Calibration, Dvl, Imu, Sequence
-from sonar_graph.diagnosis import check_sensors
-from sonar_graph.logs import read_log, unfelt_zeros, write_log
+from sonar_graph.logs import read_log, row_notes, unfelt_zeros, write_log
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Floats
 
@@ -99,8 +98,4 @@ def test_a_log_with_zeros_is_read_without_them_unless_they_are_measured(
     assert "`are_zeros_measured = true`" in read.notes["log.warnings"]
     used = LogConfig.parse({"dvl": {"are_zeros_measured": True}}, "x")
     assert len(read_log(path, config=used).dvl) == 60
-    (zeros, *_) = (f for f in check_sensors(run) if f.quantity == "DVL: bottom lock")
-    assert zeros.grave
-    assert "15 of 60 rows" in zeros.advice
-    quantities = [finding.quantity for finding in check_sensors(run, used)]
-    assert "DVL: bottom lock" not in quantities
+    assert "dvl: 15 of 60 rows with a velocity of 0" in row_notes(run)["log.doubtful"]
