@@ -47,9 +47,12 @@ from sonar_graph.measurements import (
 )
 from sonar_graph.models import (
     ACCEPTED,
+    CONTRADICTS,
     MINIMUM_PROBABILITY,
     Contradictions,
+    KnownLandmarks,
     Mount,
+    Verdict,
     identify,
     tilt_sigma,
     up_direction,
@@ -77,7 +80,7 @@ NO_STAMPS = np.empty(0, np.int64)
 NO_SAMPLES = Samples(NO_STAMPS, NO_STAMPS, np.empty((0, 3)), np.empty((0, 3, 3)))
 NO_VIEWS = Views(
     stamp_ns=NO_STAMPS,
-    slot=NO_STAMPS,
+    ids=NO_STAMPS,
     z=np.empty((0, 2)),
     R_z=np.empty((0, 2, 2)),
     outcome=np.empty(0, np.int8),
@@ -169,8 +172,12 @@ class FilterShell(ABC):
         self._kept_ns = 0
         self._used_in_gap: dict[tuple[int, int], int] = {}
         self._may_be_far = False
-        self._landmarks = 0
-        self._slots: dict[int, int] = {}
+        self._known = KnownLandmarks(calibration.map)
+        ids = calibration.map.ids if calibration.map else ()
+        self._slots = {landmark_id: slot for slot, landmark_id in enumerate(ids)}
+        """Number in the state of each landmark; those of the map come first."""
+        self._landmarks = len(ids)
+        """Number of landmarks in the state; some may have been let go."""
         self._journal = DetectionJournal()
         self._estimates = CausalEstimates()
         self._refused: list[RefusedRow] = []
@@ -183,8 +190,10 @@ class FilterShell(ABC):
         """Carry the state over the motion to the next epoch."""
 
     @abstractmethod
-    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
-        """Update by range and azimuth of a known landmark, a motion after the state."""
+    def observe(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats, sonar: Sonar
+    ) -> Judged:
+        """Update by range and azimuth of a known landmark, a motion after the state, with the gate of ``sonar``."""
 
     @abstractmethod
     def observe_far(
@@ -265,7 +274,7 @@ class FilterShell(ABC):
         # results depend on stamps alone: what comes later than an estimate for its stamp is late
         since_ns = max(self._done_ns, self._reached_ns)
         self._done_ns = max(self._done_ns, end_ns)
-        ids, views = self._views(detections, since_ns)
+        views = self._views(detections, since_ns)
         estimate = None
         try:
             samples = self._samples(
@@ -284,7 +293,7 @@ class FilterShell(ABC):
             ) from error
         if detections is not None:
             self._journal.extend(
-                detections.stamps_ns, ids, views.outcome, views.e, views.S
+                detections.stamps_ns, views.ids, views.outcome, views.e, views.S
             )
         return estimate
 
@@ -295,7 +304,8 @@ class FilterShell(ABC):
     def landmarks(self) -> LandmarkMap:
         """Landmarks in the state, with the covariances of their coordinates."""
         ids = sorted(self._slots)
-        read = [self.landmark(self._slots[i]) for i in ids]
+        given = self._known.as_given()
+        read = [given.get(i) or self.landmark(self._slots[i]) for i in ids]
         return LandmarkMap(
             ids=np.array(ids, dtype=np.int64),
             positions=np.array([position for position, _ in read]).reshape(-1, 3),
@@ -310,7 +320,7 @@ class FilterShell(ABC):
 
     def withheld(self) -> list[str]:
         """Messages about headings, fixes and detections that the state contradicts."""
-        messages = self._contradictions.messages()
+        messages = self._contradictions.messages() + self._known.messages()
         if math.isfinite(self.sonar.gate) or math.isfinite(self.sonar.kernel_width):
             messages += lockout_messages(self.detections())
         return messages
@@ -334,22 +344,18 @@ class FilterShell(ABC):
 
     def _views(
         self, detections: LandmarkDetections | None, since_ns: int
-    ) -> tuple[Ints, Views]:
-        """Most probable identities of detections, and their views.
+    ) -> Views:
+        """Views of detections, with their most probable identities.
 
         Rows before the first epoch is reached, or older than those done, are refused.
         """
         if detections is None:
-            return NO_STAMPS, NO_VIEWS
+            return NO_VIEWS
         stamps_ns = detections.stamps_ns
         ids, outcome = identify(detections, self.params.minimum_id_probability)
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        slot = np.full(len(ids), -1)
-        for row in np.flatnonzero(outcome == ACCEPTED).tolist():
-            # a new landmark gets the next number: rows are used in their order
-            slot[row] = self._slots.setdefault(int(ids[row]), len(self._slots))
         z, R_z = read_detections(
             detections.range_m,
             detections.azimuth_rad,
@@ -358,7 +364,7 @@ class FilterShell(ABC):
         )
         e = np.full((len(ids), 2), math.nan)
         S = np.full((len(ids), 2, 2), math.nan)
-        return ids, Views(stamps_ns, slot, z, R_z, outcome, e, S)
+        return Views(stamps_ns, ids, z, R_z, outcome, e, S)
 
     def _samples(
         self,
@@ -555,17 +561,36 @@ class FilterShell(ABC):
         for row in in_frame(views, first):
             z = views.z[row]
             R_z = views.R_z[row]
-            slot = int(views.slot[row])
-            if slot == self._landmarks:  # the next free number: seen for the first time
+            landmark_id = int(views.ids[row])
+            slot = self._slots.get(landmark_id)
+            if slot is None:  # seen for the first time
                 self.augment(motion, z, R_z)
+                self._slots[landmark_id] = self._landmarks
                 self._landmarks += 1
                 views.outcome[row] = NEW
                 continue
             judged = (
                 self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
             )
-            judged = judged or self.observe(motion, slot, z, R_z)
+            judged = judged or self.observe(
+                motion, slot, z, R_z, self._gated(landmark_id)
+            )
             views.outcome[row], views.e[row], views.S[row] = judged
+            self._judge_map(landmark_id, judged)
+
+    def _gated(self, landmark_id: int) -> Sonar:
+        """The sonar, whose gate refuses what contradicts a landmark of the map."""
+        if landmark_id not in self._known.held:
+            return self.sonar
+        return self.sonar._replace(gate=min(self.sonar.gate, math.sqrt(CONTRADICTS)))
+
+    def _judge_map(self, landmark_id: int, judged: Judged) -> None:
+        """Let a landmark of the map go that has moved; its next sighting maps it anew."""
+        if landmark_id not in self._known.held:
+            return
+        squared = float(judged.e @ np.linalg.solve(judged.S, judged.e))
+        if self._known.judge(landmark_id, squared) is Verdict.RELEASE:
+            del self._slots[landmark_id]
 
     def _bridge(self, order: Order, k: int, views: Views) -> Motion:
         """Motion over a gap, with the share of its error that the measurements of one more event may have.

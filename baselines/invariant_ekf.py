@@ -68,6 +68,7 @@ from sonar_graph.models import (
     BIASES,
     COMPASS,
     SCALE,
+    KnownLandmarks,
     bias_jacobian,
     bias_sigmas,
     body_point_jacobian,
@@ -309,7 +310,7 @@ class InvariantEkf(FilterShell):
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
         self._walk_density = bias_sigmas(calibration)[1]
-        self._state = start_state(calibration)
+        self._state = with_map(start_state(calibration), self._known)
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
@@ -324,9 +325,11 @@ class InvariantEkf(FilterShell):
         """Carry the state over the motion to the next epoch, (2) and (3)."""
         predict(self._state, motion, self._walk_density**2 * duration_s)
 
-    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+    def observe(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats, sonar: Sonar
+    ) -> Judged:
         """Update by range and azimuth of a known landmark, (5)."""
-        return Judged(*observe(self._state, 1 + slot, motion, self.sonar, z, R_z))
+        return Judged(*observe(self._state, 1 + slot, motion, sonar, z, R_z))
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
@@ -511,3 +514,18 @@ def start_state(calibration: Calibration) -> InvariantState:
         body_p_dvl,
         calibration.use_gravity,
     )
+
+
+def with_map(state: InvariantState, known: KnownLandmarks) -> InvariantState:
+    """State with the landmarks of a map, whose places do not depend on the vehicle's.
+
+    The error d of a place is ``xi_k = d + [x_k^]x theta``, as that of the body.
+    """
+    places = known.places()  # (m, 3)
+    A = np.zeros((places.size, len(state.P)))  # of xi_1 to xi_m by xi
+    for k, place in enumerate(places):
+        A[POINT * k : POINT * (k + 1), THETA] = cross_matrix(place)
+    AP = A @ state.P
+    own = symmetric(AP @ A.T + known.joint())
+    P = np.block([[state.P, AP.T], [AP, own]])
+    return state._replace(points=np.vstack((state.points, places)), P=P)
