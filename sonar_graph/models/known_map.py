@@ -31,10 +31,12 @@ class Verdict(Enum):
 class KnownLandmarks:
     """Landmarks of the map, with the sightings that agree with it and those that contradict it."""
 
-    def __init__(self, known: KnownMap | None) -> None:
+    def __init__(self, known: KnownMap | None, *, may_release: bool = True) -> None:
         self.map = known
+        self._may_release = may_release
         self.held: set[int] = set(known.ids) if known else set()
         """Identities that still stand where the map has them."""
+        self.ids = known.ids if known else ()
         self.moved: list[int] = []
         """Identities that do not, in the order in which this was noticed."""
         self._agreeing: Counter[int] = Counter()
@@ -51,8 +53,12 @@ class KnownLandmarks:
         against = self._contradicting[landmark_id]
         if against < FEWEST or against <= self._agreeing[landmark_id]:
             return Verdict.REFUSE
+        if landmark_id not in self.moved:
+            self.moved.append(landmark_id)
+        # what has left a bounded window cannot be taken out again
+        if not self._may_release:
+            return Verdict.REFUSE
         self.held.discard(landmark_id)
-        self.moved.append(landmark_id)
         return Verdict.RELEASE
 
     def places(self) -> Floats:

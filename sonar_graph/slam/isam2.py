@@ -417,7 +417,7 @@ class Isam2:
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        return map_of(*self._frontend.smoothed())
+        return self._with_given(map_of(*self._frontend.smoothed()))
 
     def newest_landmarks(self) -> LandmarkMap:
         """Landmarks by identity as of the last update of iSAM2, in milliseconds however long the run is.
@@ -427,7 +427,15 @@ class Isam2:
         smoother = self._smoother
         # a landmark that came with the last frame may wait for the next update
         ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
-        return map_of(smoother.estimates, smoother.marginals, ids)
+        return self._with_given(map_of(smoother.estimates, smoother.marginals, ids))
+
+    def _with_given(self, found: LandmarkMap) -> LandmarkMap:
+        """The map with the landmarks of a fixed map as they were given."""
+        for landmark_id, given in self._frontend.landmarks.known.as_given().items():
+            row = int(np.searchsorted(found.ids, landmark_id))
+            if row < len(found) and found.ids[row] == landmark_id:
+                found.positions[row], found.covariances[row] = given
+        return found
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""
@@ -438,7 +446,11 @@ class Isam2:
 
         Of these the variable, the factors and what was missing.
         """
-        return [*self._keyframes.contradictions.messages(), *self._smoother.withheld]
+        return [
+            *self._keyframes.contradictions.messages(),
+            *self._frontend.landmarks.known.messages(),
+            *self._smoother.withheld,
+        ]
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, and why."""
