@@ -299,9 +299,10 @@ class Start(Section):
     """Along the world's axes."""
     rpy_sigma_rad: Sigmas = (1e-3, 1e-3, 1e-3)
     """Small rotations about the body's axes."""
-    source: Literal["stated", "fixes", "heading", "vehicle"] = "stated"
+    source: Literal["stated", "fixes", "heading", "vehicle", "map"] = "stated"
     """Where x, y and yaw come from. ``stated``: from the owner; ``fixes``: measured; ``heading``: yaw is measured, x
-    and y are zero at the vehicle; ``vehicle``: all three are zero at the vehicle, which defines the world."""
+    and y are zero at the vehicle; ``vehicle``: all three are zero at the vehicle, which defines the world; ``map``:
+    they are found in the known map."""
 
     def pose(self) -> gtsam.Pose3:
         """world_T_body."""
