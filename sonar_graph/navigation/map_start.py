@@ -57,7 +57,7 @@ ODDS = 1e4
 """Odds from which on the vehicle is located."""
 AGREES = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
-MOST_SIGHTINGS = 60
+MOST_SIGHTINGS = 24
 """Number of the newest sightings that propose starts."""
 LOOSER = 10.0
 """Sigmas of the prior start over those found: the estimator weighs the same sightings itself."""
@@ -225,18 +225,22 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     reach_m = float(np.linalg.norm(q, axis=1).max())
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
     data = MapData(q, S, rows, places, place_cov, area_m2)
+    found = [refined(proposal, data) for proposal in proposals(data)]
+    by_evidence = sorted(
+        (start for start in found if start is not None),
+        key=lambda start: -start.log_evidence,
+    )
     starts: list[FoundStart] = []
-    for proposal in proposals(data):
-        start = refined(proposal, data)
-        if start is not None and not any(is_same(start, other) for other in starts):
+    for start in by_evidence:
+        if not any(is_same(start, better) for better in starts):
             starts.append(start)
     if not starts:
         return None
     log_others = math.log(WRONG / area_m2)
     none = n * log_others
     one = math.log(n * (1.0 - WRONG) / area_m2) + (n - 1) * log_others
-    best = max(starts, key=lambda start: start.log_evidence)
-    rivals = [s.log_evidence for s in starts if s is not best] + [none, one]
+    best = starts[0]
+    rivals = [start.log_evidence for start in starts[1:]] + [none, one]
     weight = float(np.logaddexp.reduce(rivals))
     return best if best.log_evidence - weight >= math.log(ODDS) else None
 
@@ -330,11 +334,12 @@ def first_agreeing(agrees: Any, rows: Any) -> list[int]:
     return found
 
 
-def is_same(one: FoundStart, other: FoundStart) -> bool:
-    """Check that two starts are one, within the sigmas of the first."""
-    d = one.parameters - other.parameters
+def is_same(start: FoundStart, better: FoundStart) -> bool:
+    """Check that a start lies within the prior that `MapLocator.start` makes of a better one."""
+    d = start.parameters - better.parameters
     d[0] = math.remainder(d[0], 2.0 * math.pi)
-    return bool(d @ np.linalg.solve(one.covariance, d) < 30.0)
+    squared = float(d @ np.linalg.solve(better.covariance, d))
+    return squared <= LOOSER**2
 
 
 class StartInMap:
