@@ -318,11 +318,24 @@ class EkfSlam(FilterShell):
         predict(self._x, self._P, motion)
 
     def observe(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats, sonar: Sonar
+        self,
+        motion: Motion,
+        slot: int,
+        z: Floats,
+        R_z: Floats,
+        sonar: Sonar | None = None,
     ) -> Judged:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
         return Judged(
-            *observe(self._x, self._P, MAP + LANDMARK * slot, motion, sonar, z, R_z)
+            *observe(
+                self._x,
+                self._P,
+                MAP + LANDMARK * slot,
+                motion,
+                sonar or self.sonar,
+                z,
+                R_z,
+            )
         )
 
     def observe_far(
@@ -440,10 +453,11 @@ class EkfSlam(FilterShell):
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
         return pose_estimate(self._x, self._P, motion)
 
-    def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position, and its block of (5)."""
-        block = slice(MAP + LANDMARK * slot, MAP + LANDMARK * (slot + 1))
-        return self._x[block], self._P[block, block]
+    def points(self, slots: list[int]) -> tuple[Floats, Floats]:
+        """Positions, and their blocks of (5)."""
+        first = MAP + LANDMARK * np.array(slots, dtype=np.int64)
+        places = np.add.outer(first, np.arange(LANDMARK)).ravel()
+        return self._x[places].reshape(-1, 3), self._P[np.ix_(places, places)]
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""

@@ -33,7 +33,13 @@ from baselines.events import (
     remove_rate,
 )
 from baselines.kalman import NEW, Judged
-from sonar_graph.calibration import Calibration, PlanarMotion, Section, require_params
+from sonar_graph.calibration import (
+    Calibration,
+    KnownMap,
+    PlanarMotion,
+    Section,
+    require_params,
+)
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import (
     Depth,
@@ -46,7 +52,6 @@ from sonar_graph.measurements import (
     require_measurements,
 )
 from sonar_graph.models import (
-    ACCEPTED,
     CONTRADICTS,
     MINIMUM_PROBABILITY,
     Contradictions,
@@ -191,9 +196,17 @@ class FilterShell(ABC):
 
     @abstractmethod
     def observe(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats, sonar: Sonar
+        self,
+        motion: Motion,
+        slot: int,
+        z: Floats,
+        R_z: Floats,
+        sonar: Sonar | None = None,
     ) -> Judged:
-        """Update by range and azimuth of a known landmark, a motion after the state, with the gate of ``sonar``."""
+        """Update by range and azimuth of a known landmark, a motion after the state.
+
+        ``sonar``: with another gate; None: `sonar` of the filter.
+        """
 
     @abstractmethod
     def observe_far(
@@ -237,8 +250,8 @@ class FilterShell(ABC):
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
 
     @abstractmethod
-    def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position in the world (3,) and covariance (3, 3) of the landmark that was appended as number ``slot``."""
+    def points(self, slots: list[int]) -> tuple[Floats, Floats]:
+        """Positions of m landmarks by their numbers in the state, (m, 3), and their joint covariance, (3 m, 3 m)."""
 
     @abstractmethod
     def attitude(self) -> Floats:
@@ -304,15 +317,18 @@ class FilterShell(ABC):
     def landmarks(self) -> LandmarkMap:
         """Landmarks in the state, with the covariances of their coordinates."""
         ids = sorted(self._slots)
-        given = self._known.as_given()
-        read = [given.get(i) or self.landmark(self._slots[i]) for i in ids]
-        return LandmarkMap(
-            ids=np.array(ids, dtype=np.int64),
-            positions=np.array([position for position, _ in read]).reshape(-1, 3),
-            covariances=np.array([covariance for _, covariance in read]).reshape(
-                -1, 3, 3
-            ),
+        positions, joint = self.points([self._slots[i] for i in ids])
+        m = len(ids)
+        blocks = joint.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
+        return self._known.with_given(
+            LandmarkMap(np.array(ids, dtype=np.int64), positions, blocks)
         )
+
+    def known_map(self) -> KnownMap:
+        """Landmarks in the state with their joint covariance, for another run."""
+        ids = sorted(self._slots)
+        positions, joint = self.points([self._slots[i] for i in ids])
+        return KnownMap.of(ids, positions, covariance_m2=joint)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection so far."""
@@ -342,9 +358,7 @@ class FilterShell(ABC):
         self._kept_ns = start_ns
         self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
-    def _views(
-        self, detections: LandmarkDetections | None, since_ns: int
-    ) -> Views:
+    def _views(self, detections: LandmarkDetections | None, since_ns: int) -> Views:
         """Views of detections, with their most probable identities.
 
         Rows before the first epoch is reached, or older than those done, are refused.

@@ -326,10 +326,17 @@ class InvariantEkf(FilterShell):
         predict(self._state, motion, self._walk_density**2 * duration_s)
 
     def observe(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats, sonar: Sonar
+        self,
+        motion: Motion,
+        slot: int,
+        z: Floats,
+        R_z: Floats,
+        sonar: Sonar | None = None,
     ) -> Judged:
         """Update by range and azimuth of a known landmark, (5)."""
-        return Judged(*observe(self._state, 1 + slot, motion, sonar, z, R_z))
+        return Judged(
+            *observe(self._state, 1 + slot, motion, sonar or self.sonar, z, R_z)
+        )
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
@@ -482,13 +489,18 @@ class InvariantEkf(FilterShell):
         A[:, BETA] = D
         return R, X, symmetric(A @ self._state.P[:BARE, :BARE] @ A.T + motion.C)
 
-    def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position, and covariance of its coordinates, ``xi_k - [x_k]x theta``."""
-        at = self._state.points[1 + slot]
-        A = np.zeros((POINT, len(self._state.P)))
-        A[:, place_of(1 + slot)] = np.eye(3)
-        A[:, THETA] = -cross_matrix(at)
-        return at, symmetric(A @ self._state.P @ A.T)
+    def points(self, slots: list[int]) -> tuple[Floats, Floats]:
+        """Positions, and covariance of their coordinates, ``xi_k - [x_k]x theta``."""
+        P = self._state.P
+        positions = self._state.points[[1 + slot for slot in slots]]  # (m, 3)
+        first = BARE + POINT * np.array(slots, dtype=np.int64)
+        places = np.add.outer(first, np.arange(POINT)).ravel()
+        B = np.array([cross_matrix(at) for at in positions]).reshape(-1, 3)  # (3 m, 3)
+        turned = B @ P[THETA, places]  # (3 m, 3 m)
+        joint = (
+            P[np.ix_(places, places)] - turned - turned.T + B @ P[THETA, THETA] @ B.T
+        )
+        return positions, symmetric(joint)
 
 
 def start_state(calibration: Calibration) -> InvariantState:

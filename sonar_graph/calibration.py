@@ -376,8 +376,8 @@ class KnownMap(Section):
         if (sigma_m is None) == (covariance_m2 is None):
             raise SettingError("KnownMap.of: give one of sigma_m and covariance_m2")
         places = np.asarray(positions_m, np.float64)
-        if covariance_m2 is None:
-            covariance_m2 = np.square(sigma_m) * np.eye(places.size)
+        if sigma_m is not None:
+            covariance_m2 = sigma_m**2 * np.eye(places.size)
         return cls(
             ids=tuple(int(i) for i in ids),
             positions_m=tuple(map(tuple, places.tolist())),

@@ -29,7 +29,9 @@ from sonar_graph.settings import parse, toml_value
 PLACE = ("x_m", "y_m", "z_m")
 SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 TRIANGLE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-COLUMNS = f"id, {', '.join(PLACE)} and sigma_m, {', '.join(SIGMAS)} or {', '.join(TRIANGLE)}"
+COLUMNS = (
+    f"id, {', '.join(PLACE)} and sigma_m, {', '.join(SIGMAS)} or {', '.join(TRIANGLE)}"
+)
 MOST_M = 1e5
 """A coordinate beyond it is in another unit, or of a grid of a country."""
 
@@ -42,7 +44,7 @@ class ReadMap(NamedTuple):
 
 
 def read_map(path: Path) -> ReadMap:
-    """Map of known landmarks from a TOML or CSV file.
+    r"""Map of known landmarks from a TOML or CSV file.
 
     Raises
     ------
@@ -52,7 +54,7 @@ def read_map(path: Path) -> ReadMap:
     Examples
     --------
     >>> from pathlib import Path
-    >>> _ = Path("survey.csv").write_text("id,x_m,y_m,z_m,sigma_m\\n4,5.0,0.0,-1.7,0.05\\n")
+    >>> _ = Path("survey.csv").write_text("id,x_m,y_m,z_m,sigma_m\n4,5.0,0.0,-1.7,0.05\n")
     >>> read_map(Path("survey.csv")).map.ids
     (4,)
     """
@@ -93,7 +95,9 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
     if not {"id", *PLACE} <= set(heads) or not (
         is_marginal or has_axes or "sigma_m" in heads
     ):
-        raise LogError(f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}")
+        raise LogError(
+            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}"
+        )
     ids: list[int] = []
     places: list[list[float]] = []
     blocks: list[np.ndarray] = []
@@ -106,14 +110,18 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
             except (TypeError, ValueError):
                 value = math.nan
             if not math.isfinite(value):
-                raise LogError(f"{where}: {column}: expected a number, not {row[column]!r}")
+                raise LogError(
+                    f"{where}: {column}: expected a number, not {row[column]!r}"
+                )
             return value
 
         landmark_id = number("id")
         if landmark_id != int(landmark_id):
             raise LogError(f"{where}: id: expected a whole number, not {row['id']!r}")
         if int(landmark_id) in ids:
-            raise LogError(f"{where}: landmark {int(landmark_id)} stands twice; keep one line")
+            raise LogError(
+                f"{where}: landmark {int(landmark_id)} stands twice; keep one line"
+            )
         ids.append(int(landmark_id))
         places.append([number(column) for column in PLACE])
         if is_marginal:
@@ -124,7 +132,9 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
             columns = SIGMAS if has_axes else ("sigma_m",) * 3
             sigmas = [number(column) for column in columns]
             if min(sigmas) < 0.0:
-                raise LogError(f"{where}: {columns[0]}: expected a sigma of 0 m or more")
+                raise LogError(
+                    f"{where}: {columns[0]}: expected a sigma of 0 m or more"
+                )
             blocks.append(np.diag(np.square(sigmas)))
     if not ids:
         raise LogError(f"{path}: no landmark: give a line for each below the heading")

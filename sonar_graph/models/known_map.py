@@ -13,6 +13,7 @@ import numpy as np
 
 from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Floats
+from sonar_graph.states import LandmarkMap
 
 CONTRADICTS = 27.6
 """Chi-square quantile of 1 - 1e-6, two degrees of freedom."""
@@ -83,6 +84,16 @@ class KnownLandmarks:
                 given[landmark_id] = (places[k], P[block, block])
         return given
 
+    def with_given(self, found: LandmarkMap) -> LandmarkMap:
+        """An estimated map, with the landmarks of a fixed map as they were given."""
+        positions = found.positions.copy()
+        covariances = found.covariances.copy()
+        for landmark_id, given in self.as_given().items():
+            row = int(np.searchsorted(found.ids, landmark_id))
+            if row < len(found) and found.ids[row] == landmark_id:
+                positions[row], covariances[row] = given
+        return LandmarkMap(found.ids, positions, covariances)
+
     def messages(self) -> list[str]:
         """A line about what moved, and one about what was not seen."""
         if self.map is None:
@@ -93,7 +104,9 @@ class KnownLandmarks:
             lines.append(
                 f"landmarks {names} no longer stand where the map has them: mapped anew; correct the map"
             )
-        unseen = [i for i in self.map.ids if not self._agreeing[i] + self._contradicting[i]]
+        unseen = [
+            i for i in self.map.ids if not self._agreeing[i] + self._contradicting[i]
+        ]
         if unseen:
             names = ", ".join(map(str, sorted(unseen)))
             lines.append(f"landmarks of the map that were not seen: {names}")

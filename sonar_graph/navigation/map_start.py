@@ -30,6 +30,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration, KnownMap, Section, Start
 from sonar_graph.estimator import (
     Estimator,
+    known_map_of,
     newest_landmarks_of,
     refused_rows_of,
     withheld_of,
@@ -215,7 +216,9 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     """The start that outweighs all others by `ODDS`; None without one."""
     places = np.array(known.positions_m)[:, :2]
     M = known.joint()
-    place_cov = np.array([M[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] for k in range(len(places))])
+    place_cov = np.array(
+        [M[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] for k in range(len(places))]
+    )
     q = np.array([s.q for s in sightings])
     S = np.array([s.S for s in sightings])
     rows = np.array([s.row for s in sightings])
@@ -310,9 +313,11 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
         )  # (a, 2, 3)
         weighted = np.linalg.solve(W[agreeing], J)  # (a, 2, 3)
         information = np.einsum("aij,aik->jk", J, weighted)
-        step = np.linalg.solve(information, np.einsum("aij,ai->j", weighted, e[agreeing]))
+        step = np.linalg.solve(
+            information, np.einsum("aij,ai->j", weighted, e[agreeing])
+        )
         parameters = parameters + step
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     log_density = -0.5 * squared[agreeing] - 0.5 * np.log(
         np.linalg.det(2.0 * math.pi * W[agreeing])
     )
@@ -381,22 +386,39 @@ class StartInMap:
         if self._inner is None:
             return Trajectory.from_estimates([])
         whole = self._inner.trajectory()
-        return whole.rows(whole.stamps_ns >= self._from_ns)
+        return whole.rows(np.flatnonzero(whole.stamps_ns >= self._from_ns))
 
     def landmarks(self) -> LandmarkMap:
         """Best present estimate of every landmark; none before the vehicle is located."""
         if self._inner is None:
-            return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+            return LandmarkMap(
+                np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))
+            )
         return self._inner.landmarks()
 
     def newest_landmarks(self) -> LandmarkMap:
         """Landmarks as of the last update."""
-        return self.landmarks() if self._inner is None else newest_landmarks_of(self._inner)
+        return (
+            self.landmarks()
+            if self._inner is None
+            else newest_landmarks_of(self._inner)
+        )
+
+    def known_map(self) -> KnownMap:
+        """Landmarks with their joint covariance."""
+        assert self._inner is not None
+        return known_map_of(self._inner)
 
     def detections(self) -> DetectionLog:
         """Outcome of every detection since the first measurements."""
         if self._inner is None:
-            return DetectionLog(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)), [])
+            return DetectionLog(
+                np.empty(0, np.int64),
+                np.empty(0, np.int64),
+                np.empty((0, 2)),
+                np.empty((0, 2, 2)),
+                [],
+            )
         return self._inner.detections()
 
     def refused_rows(self) -> list[RefusedRow]:

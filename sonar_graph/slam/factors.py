@@ -275,11 +275,11 @@ def map_prior(
     by_coordinates = np.eye(3 * len(keys))
 
     def error(
-        factor: gtsam.CustomFactor,
+        _: gtsam.CustomFactor,
         values: gtsam.Values,
         jacobians: list[Floats] | None,
     ) -> Floats:
-        places = np.array([values.atPoint3(key) for key in factor.keys()])
+        places = np.array([values.atPoint3(key) for key in keys])
         if jacobians is not None:
             for k in range(len(jacobians)):
                 jacobians[k] = by_coordinates[:, 3 * k : 3 * k + 3]

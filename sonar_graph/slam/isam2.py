@@ -18,7 +18,13 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from pydantic import model_validator
 
-from sonar_graph.calibration import Calibration, Section, misfits, require_params
+from sonar_graph.calibration import (
+    Calibration,
+    KnownMap,
+    Section,
+    misfits,
+    require_params,
+)
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import (
     NS_PER_S,
@@ -417,7 +423,9 @@ class Isam2:
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        return self._with_given(map_of(*self._frontend.smoothed()))
+        return self._frontend.landmarks.known.with_given(
+            map_of(*self._frontend.smoothed())
+        )
 
     def newest_landmarks(self) -> LandmarkMap:
         """Landmarks by identity as of the last update of iSAM2, in milliseconds however long the run is.
@@ -427,15 +435,17 @@ class Isam2:
         smoother = self._smoother
         # a landmark that came with the last frame may wait for the next update
         ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
-        return self._with_given(map_of(smoother.estimates, smoother.marginals, ids))
+        return self._frontend.landmarks.known.with_given(
+            map_of(smoother.estimates, smoother.marginals, ids)
+        )
 
-    def _with_given(self, found: LandmarkMap) -> LandmarkMap:
-        """The map with the landmarks of a fixed map as they were given."""
-        for landmark_id, given in self._frontend.landmarks.known.as_given().items():
-            row = int(np.searchsorted(found.ids, landmark_id))
-            if row < len(found) and found.ids[row] == landmark_id:
-                found.positions[row], found.covariances[row] = given
-        return found
+    def known_map(self) -> KnownMap:
+        """Landmarks after solving the whole graph, with their joint covariance, for another run."""
+        ids = self._smoother.landmark_ids
+        found = self.landmarks()
+        rows = np.searchsorted(found.ids, ids)
+        joint = self.joint_covariance(landmarks=ids, over="history")
+        return KnownMap.of(ids, found.positions[rows], covariance_m2=joint.matrix)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""
