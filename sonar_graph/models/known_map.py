@@ -2,8 +2,10 @@
 
 Every sighting of a landmark of the map is compared with its prediction, by the squared Mahalanobis distance of range and
 azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. A wrong identity
-contradicts seldom and here and there; a landmark that has moved is contradicted each time. So a landmark counts as moved
-from `FEWEST` contradictions on, where they are more than half of its sightings. The estimator then maps it anew.
+contradicts seldom and here and there; a landmark that has moved is contradicted each time. So a landmark is contradicted
+from `FEWEST` contradictions on, where they are more than half of its sightings. As long as fewer landmarks are contradicted
+than agree, it has moved, and the estimator maps it anew. Where as many are contradicted, the start may be wrong, or those
+that agree have moved: then their sightings are refused, and a message names both.
 """
 
 from collections import Counter
@@ -51,16 +53,32 @@ class KnownLandmarks:
             self._agreeing[landmark_id] += 1
             return Verdict.USE
         self._contradicting[landmark_id] += 1
-        against = self._contradicting[landmark_id]
-        if against < FEWEST or against <= self._agreeing[landmark_id]:
+        contradicted = self._contradicted()
+        agreeing = len(self.held) - len(contradicted) - len(self._unseen())
+        if landmark_id not in contradicted:
             return Verdict.REFUSE
-        if landmark_id not in self.moved:
-            self.moved.append(landmark_id)
+        if len(self.moved) + len(contradicted) >= agreeing:
+            return Verdict.REFUSE
         # what has left a bounded window cannot be taken out again
         if not self._may_release:
             return Verdict.REFUSE
+        self.moved.append(landmark_id)
         self.held.discard(landmark_id)
         return Verdict.RELEASE
+
+    def _contradicted(self) -> list[int]:
+        """Landmarks that the map still holds against most of their sightings."""
+        return [
+            i
+            for i in self.ids
+            if i in self.held
+            and self._contradicting[i] >= FEWEST
+            and self._contradicting[i] > self._agreeing[i]
+        ]
+
+    def _unseen(self) -> list[int]:
+        """Landmarks of the map without a sighting."""
+        return [i for i in self.ids if not self._agreeing[i] + self._contradicting[i]]
 
     def places(self) -> Floats:
         """Places of all landmarks of the map, shape (m, 3), m."""
@@ -100,14 +118,21 @@ class KnownLandmarks:
             return []
         lines = []
         if self.moved:
-            names = ", ".join(map(str, sorted(self.moved)))
             lines.append(
-                f"landmarks {names} no longer stand where the map has them: mapped anew; correct the map"
+                f"landmarks {listed(self.moved)} no longer stand where the map has them: mapped anew; correct the map"
             )
-        unseen = [
-            i for i in self.map.ids if not self._agreeing[i] + self._contradicting[i]
-        ]
+        contradicted = self._contradicted()
+        if contradicted:
+            lines.append(
+                f"landmarks {listed(contradicted)} contradict the map, and too few others agree with it: they have moved,"
+                ' or the start or the map is wrong; source = "map" under [start] finds the start by all of them'
+            )
+        unseen = self._unseen()
         if unseen:
-            names = ", ".join(map(str, sorted(unseen)))
-            lines.append(f"landmarks of the map that were not seen: {names}")
+            lines.append(f"landmarks of the map that were not seen: {listed(unseen)}")
         return lines
+
+
+def listed(ids: list[int]) -> str:
+    """Identities in a message, ascending."""
+    return ", ".join(map(str, sorted(ids)))
