@@ -16,6 +16,7 @@ be, or too certain of what many landmarks share.
 import csv
 import math
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ import numpy as np
 from sonar_graph.calibration import KnownMap
 from sonar_graph.errors import LogError
 from sonar_graph.files.inputs import text_of
+from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse, toml_value
 
 PLACE = ("x_m", "y_m", "z_m")
@@ -158,3 +160,23 @@ def write_map(path: Path, known: KnownMap) -> None:
         Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise LogError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def in_map(sequence: Sequence, path: Path) -> Sequence:
+    """A sequence with the map of a file. Its start is found in the map where the log states no place.
+
+    The note ``log.map`` of the sequence says what was done.
+    """
+    known, warnings = read_map(path)
+    start = sequence.calibration.start
+    note = f"{len(known.ids)} landmarks of {path.name}"
+    if start.source in ("vehicle", "heading"):
+        start = start.model_copy(update={"source": "map"})
+        note += "; the log states no place in it: the start is found by identified landmarks"
+    changes = {"map": known, "start": start}
+    calibration = sequence.calibration.model_copy(update=changes)
+    notes = {**sequence.notes, "log.map": note}
+    if warnings:
+        earlier = [notes["log.warnings"]] if "log.warnings" in notes else []
+        notes["log.warnings"] = "; ".join([*earlier, *warnings])
+    return replace(sequence, calibration=calibration, notes=notes)
