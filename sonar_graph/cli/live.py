@@ -117,7 +117,9 @@ def live(
     from sonar_graph.logs import LiveRecord, read_log
     from sonar_graph.report import doubt_lines
 
-    reading = ReadingOptions(calibration, topics, log_config)
+    reading = ReadingOptions(
+        calibration=calibration, topics=topics, log_config=log_config
+    )
     record = output / RECORD
     if record.exists():
         advice = (
