@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch import ALL_LOGS
 from sonar_graph.measurements import Floats
 
 SIGNIFICANT = 0.05
