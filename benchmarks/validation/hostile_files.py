@@ -658,7 +658,6 @@ OURS = (
         ".sonar_graph.json",
         ".lock",
         "log.mcap",
-        "ensembles.json",
         "tables/overview.csv",
     ),
 )

@@ -33,7 +33,6 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import (
     Comparison,
-    Ensemble,
     ErrorSeries,
     Kind,
     MapSoFar,
@@ -69,7 +68,7 @@ KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 FORMAT = "sonar_graph comparison 1"
 INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
 RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
-ENSEMBLES, PAGE = "ensembles.json", "report.html"
+PAGE = "report.html"
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
 """As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
@@ -92,7 +91,6 @@ def result_names(estimators: Iterable[str]) -> list[str]:
     return [
         INDEX,
         SEQUENCE,
-        ENSEMBLES,
         RECOGNITION,
         f"{PICTURE_FOLDER}/0.jpg",
         RESULT_LOG,
@@ -138,7 +136,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
             for name in written.names
             if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/"))
         )
-        written.remove([INDEX, ENSEMBLES, PAGE, RECOGNITION, *earlier])
+        written.remove([INDEX, PAGE, RECOGNITION, *earlier])
         _write(comparison, folder)
 
 
@@ -177,11 +175,6 @@ def _write(comparison: Comparison, folder: Path) -> None:
         from sonar_graph.recognition import write_recognition
 
         write_recognition(comparison.recognition, folder)
-    if comparison.ensembles:
-        write_json(
-            folder / ENSEMBLES,
-            {"ensembles": [asdict(one) for one in comparison.ensembles]},
-        )
     sequence, instants = comparison.sequence, comparison.instants_ns
     index = {
         "format": FORMAT,
@@ -366,12 +359,8 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         from sonar_graph.recognition import read_recognition
 
         recognition = read_recognition(folder)
-    arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
-    several = (
-        read_json(folder / ENSEMBLES)
-        if (folder / ENSEMBLES).is_file()
-        else {"ensembles": []}
-    )
+    arrays = _read_arrays(folder / SEQUENCE)
+    entry = index["sequence"]
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
         sequence=_restore_sequence(
@@ -383,10 +372,6 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         errors=errors,
         environment=_TEXTS.validate_python(index["environment"]),
         recognition=recognition,
-        ensembles=[
-            Ensemble(one["condition"], one["seeds"], one["values"])
-            for one in several["ensembles"]
-        ],
     )
 
 

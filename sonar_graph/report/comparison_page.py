@@ -34,10 +34,6 @@ from sonar_graph.evaluation import (
 from sonar_graph.files import COMPARISON, as_path, replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
-from sonar_graph.report.ensemble_section import (
-    ensemble_sentences,
-    ensemble_table,
-)
 from sonar_graph.report.figure_style import inline_svg, sized
 from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
@@ -156,11 +152,6 @@ def render_report(comparison: Comparison) -> str:
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
             f"{_counted(detections, 'landmark detection')}."
         ),
-        "ensemble": ensemble_sentences(comparison.ensembles),
-        "ensembles": [
-            ensemble_table(one, f"runs-{place}")
-            for place, one in enumerate(comparison.ensembles, start=1)
-        ],
         "headlines": {
             "aligned": sentences.headline(comparison) or told[0],
             "raw": ""
@@ -230,12 +221,9 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
         score_table(comparison),
         *([landmarks] if landmarks else []),
         outcome_table(comparison),
+        refused_table(comparison),
     ]
-    tables += [
-        ensemble_table(one, f"runs-{place}")
-        for place, one in enumerate(comparison.ensembles, start=1)
-    ]
-    return [table for table in [*tables, refused_table(comparison)] if table.rows]
+    return [table for table in tables if table.rows]
 
 
 def _counted(count: int, noun: str) -> str:
