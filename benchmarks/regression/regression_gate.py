@@ -207,7 +207,8 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
     pairs: list[Pair] = []
     ratios: permutation.Ratios = {}
     for name, entry in blessed.items():
-        run, scores = runs[name], entry["scores"]
+        run = runs[name]
+        scores = entry["scores"]
         seed = "" if run.seed is None else f"seed {run.seed}: "
         if entry["status"] == "ok" and not run.ended:
             worsenings.append(
@@ -224,7 +225,8 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
                 Worsening(run.log, run.contestant, ", ".join(lost), explanation)
             )
         for column in columns:
-            old, new = scores.get(column, math.inf), run.value(column)
+            old = scores.get(column, math.inf)
+            new = run.value(column)
             if math.isfinite(old) and math.isfinite(new):
                 pairs.append(Pair(run, column, old, new))
                 case = run.log if run.seed is None else run.seed
@@ -277,7 +279,8 @@ def check_comparable(entry: dict[str, Any], run: RecordedRun, path: Path) -> Non
 
     Raises `EvaluationError` with run, field and both values.
     """
-    before, now = _flat(entry["asked"]), _flat(asked_of(run))
+    before = _flat(entry["asked"])
+    now = _flat(asked_of(run))
     for field in sorted(before | now):
         if (field in before, before.get(field)) != (field in now, now.get(field)):
             raise EvaluationError(
@@ -305,7 +308,8 @@ def _value(fields: dict[str, Any], field: str) -> str:
 def log_ratios(old: Floats, new: Floats, column: str) -> Floats:
     """Log ratios of new to old scores, shape (n,); above 0 is worse."""
     least = np.finfo(float).tiny
-    old_log, new_log = np.log(np.maximum(old, least)), np.log(np.maximum(new, least))
+    old_log = np.log(np.maximum(old, least))
+    new_log = np.log(np.maximum(new, least))
     if column in CONSISTENCY_KEYS:
         return np.asarray(np.abs(new_log) - np.abs(old_log))
     return np.asarray(new_log - old_log)
@@ -385,7 +389,8 @@ def standing_out(pairs: list[Pair], ratios: permutation.Ratios) -> list[str]:
         "the reference"
         for name, (_, pair) in sorted(farthest.items(), key=lambda one: -one[1][0])
     ]
-    known, have_test = {name[:2] for name in farthest}, permutation.testable(ratios)
+    known = {name[:2] for name in farthest}
+    have_test = permutation.testable(ratios)
     most: dict[
         tuple[str, str], tuple[float, int, str]
     ] = {}  # the column that is up most

@@ -54,7 +54,8 @@ DOUBTFUL = 3
 """Exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``."""
 RATE_SLACK = 1.01
 """Tolerance for the IMU's rate, which is counted from its stamps."""
-LOG, PAGE = "basin.mcap", "report.html"
+LOG = "basin.mcap"
+PAGE = "report.html"
 DEMO = {
     **{"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}},
     **{"gyro_bias_scale": 10.0, "dvl_dropouts_per_hour": 30.0, "dvl_dropout_s": 5.0},
@@ -82,7 +83,8 @@ def run(
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
     from sonar_graph.evaluation import write_comparison, write_viewer_files
 
-    names, recognition = [estimator], RecogniserOptions()
+    names = [estimator]
+    recognition = RecogniserOptions()
     with (
         compared(
             log,

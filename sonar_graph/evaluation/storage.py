@@ -66,8 +66,12 @@ Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
 KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 FORMAT = "sonar_graph comparison 1"
-INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
-RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
+INDEX = "comparison.json"
+SEQUENCE = "sequence.npz"
+RUNS = "runs"
+RESULT = "result.json"
+SERIES = "series.npz"
+RESULT_LOG = "result.mcap"
 PAGE = "report.html"
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
 """As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
@@ -142,10 +146,8 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
 
 def _write(comparison: Comparison, folder: Path) -> None:
     # all other rows of IMU and Doppler log are in the log
-    sequence, ends = (
-        comparison.sequence,
-        np.array([0, -1]),
-    )
+    sequence = comparison.sequence
+    ends = np.array([0, -1])
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack(
         "dvl", sequence.dvl.rows(ends)
     )
@@ -175,7 +177,8 @@ def _write(comparison: Comparison, folder: Path) -> None:
         from sonar_graph.recognition import write_recognition
 
         write_recognition(comparison.recognition, folder)
-    sequence, instants = comparison.sequence, comparison.instants_ns
+    sequence = comparison.sequence
+    instants = comparison.instants_ns
     index = {
         "format": FORMAT,
         "sequence": {
@@ -410,7 +413,8 @@ def _restore_sequence(
     name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays
 ) -> Sequence:
     """A sequence with its start, end, detections and truth, but without its motion's measurements."""
-    imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
+    imu = _unpack("imu", Imu, arrays)
+    dvl = _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
         raise EvaluationError(
             "sequence.npz: the first and last rows of imu and dvl are missing"

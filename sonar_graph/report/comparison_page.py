@@ -42,7 +42,8 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
 from sonar_graph.table import ABSENT, Column, Table, text_table, words
 
-PAGE, TEMPLATE = "report.html", "comparison.html"
+PAGE = "report.html"
+TEMPLATE = "comparison.html"
 RUN_FILES = {
     "trajectory.tum": "smoothed",
     "causal.tum": "causal",
@@ -324,7 +325,8 @@ def refused_table(comparison: Comparison) -> Table:
 
 def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     """Pictures, outcomes, warnings and the reliability of posteriors; None where nothing was recognised here."""
-    found, sequence = comparison.recognition, comparison.sequence
+    found = comparison.recognition
+    sequence = comparison.sequence
     if found is None:
         return None
     # a recogniser takes a while to load, and most logs have detections
@@ -332,7 +334,8 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
         SURE,
     )
 
-    start_ns, judged = sequence.start_ns, reliability_of(sequence)
+    start_ns = sequence.start_ns
+    judged = reliability_of(sequence)
     pictures = []
     for picture in found.shown():
         pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)

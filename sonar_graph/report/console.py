@@ -165,7 +165,8 @@ def published_counterpart(comparison: Comparison) -> Group | None:
         return None
     texts = [[cell.text for cell in row] for row in found.rows]
     (split,) = found.sections
-    positions, totals = texts[:split], texts[split:]
+    positions = texts[:split]
+    totals = texts[split:]
     landmarks = [row[0].removesuffix(", x") for row in positions[::2]]
     across = _plain_table(
         "Landmarks: position in metres (estimate minus truth)", ["", *landmarks]
