@@ -186,3 +186,31 @@ def _run(
     return RecordedRun(
         key, log, seed, name, "default", "ok", "", f"runs/{key}/log.txt", texts, values
     )
+
+
+def written_batch(
+    folder: Path, factor: float = 1.0, seeds: int = 8, not_run: int = 0
+) -> Path:
+    """A batch whose errors of isam2 are so many times as large, and whose last runs were not done."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for seed in range(seeds):
+        for name, size_m in (("dead-reckoning", 0.4), ("isam2", 0.1 * factor)):
+            row = {
+                "key": f"{name}-{seed}",
+                "log": "basin",
+                "seed": seed,
+                "estimator": name,
+                "variant": "default",
+            }
+            row |= {
+                "status": "ok",
+                "asked": json.dumps({"generator": "basin", "options": {}}),
+            }
+            rows.append(row | {"causal.ate_se2_m": size_m * rng.lognormal(0, 0.2)})
+    for row in rows[len(rows) - not_run :]:
+        row |= {"status": "not run", "causal.ate_se2_m": None}
+    folder.mkdir()
+    with (folder / "results.parquet").open("wb") as stream:
+        pq.write_table(pa.Table.from_pylist(rows), stream)
+    return folder

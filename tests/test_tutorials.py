@@ -207,15 +207,18 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
 def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path):
     page = (TUTORIALS / "07_batches.md").read_text(encoding="utf-8")
     (suite,), (program,) = blocks(page, "toml"), blocks(page, "python")
-    commands = re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
-    assert [command.split()[1] for command in commands] == [
-        "lap.toml",
-        "bless",
-        "lap.toml",
+    commands = re.findall(r"^    (sonar-graph|python) (.*)$", page, re.MULTILINE)
+    assert [words.split()[:2] for _, words in commands] == [
+        ["bench", "lap.toml"],
+        ["benchmarks/regression/regression_gate.py", "bless"],
+        ["bench", "lap.toml"],
+        ["benchmarks/regression/regression_gate.py", "judge"],
     ]
     (tmp_path / "lap.toml").write_text(suite, encoding="utf-8")
-    for command in commands:
-        said = output(tmp_path, "python", "-m", "sonar_graph", *command.split())
+    (tmp_path / "benchmarks").symlink_to(TUTORIALS.parents[1] / "benchmarks")
+    for program, words in commands:
+        module = ["-m", "sonar_graph"] if program == "sonar-graph" else []
+        said = output(tmp_path, "python", *module, *words.split())
     assert "Gate: passed, without any test of errors, 8 runs" in said
     printed = output(tmp_path, "python", "-c", program)
     assert len(printed.splitlines()) == 2 * 2 * 2

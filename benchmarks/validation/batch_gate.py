@@ -21,17 +21,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binom
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))
+BENCHMARKS = Path(__file__).resolve().parents[1]
+sys.path += [str(BENCHMARKS), str(BENCHMARKS / "regression")]
 from common import conclude, in_parallel, make_parser, print_table
-
-from sonar_graph.batch.gate import TOLERANCE, movable, worse_groups
-from sonar_graph.batch.permutation import (
-    Case,
-    Ratios,
-    detectable,
-    families,
-    with_all_logs,
-)
+from permutation import Case, Ratios, detectable, families, with_all_logs
+from regression_gate import TOLERANCE, movable, worse_groups
 
 SIGMA = 0.1
 LOST_SHARE, LOST_FACTOR = 0.1, 100.0

@@ -658,7 +658,6 @@ OURS = (
         ".sonar_graph.json",
         ".lock",
         "log.mcap",
-        "ensembles.json",
         "tables/overview.csv",
     ),
 )
@@ -693,7 +692,6 @@ def folders(log: SoundLog, folder: Path, rng: Rng) -> Case:
         ["recognise", str(log.path.parent / IMAGED), "-o", str(out / "log.mcap")],
         ["report", str(out)],
         ["bench", str(log.path.parent / SUITE), "-o", str(out), "--workers", "1"],
-        ["bench", "bless", str(log.path.parent / BATCH), str(out / "comparison.json")],
         ["calibrate", sound, "-o", str(out / "comparison.json")],
     ]
     command = commands[int(rng.integers(len(commands)))]

@@ -1,8 +1,7 @@
-"""Suites of many runs: planned from a file, done by many processes, kept, compared, and judged by a gate."""
+"""Suites of many runs: planned from a file, done by many processes, kept and compared."""
 
 # fmt: off
 from sonar_graph.batch.batch import Batch, limits_of, run_suite
-from sonar_graph.batch.gate import GateVerdict, bless, gate, is_reference
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import ALL_LOGS, GOING_ON, RESULTS, RecordedBatch, RecordedRun, is_batch, read_batch
 from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
@@ -14,9 +13,9 @@ from sonar_graph.batch.store import Limits, Where
 from sonar_graph.batch.suite import read_suite
 
 __all__ = [
-    "ALL_LOGS", "Anees", "Batch", "GOING_ON", "GateVerdict", "KINDS", "LEAST_PAIRS", "Limits", "Metric",
-    "PairedDifference", "RESULTS", "RecordedBatch", "RecordedRun", "SampleSummary", "Where", "anees", "bless",
-    "failure_rate", "gate", "holm", "is_batch", "is_reference", "least_p", "limits_of", "metrics_of",
+    "ALL_LOGS", "Anees", "Batch", "GOING_ON", "KINDS", "LEAST_PAIRS", "Limits", "Metric",
+    "PairedDifference", "RESULTS", "RecordedBatch", "RecordedRun", "SampleSummary", "Where", "anees",
+    "failure_rate", "holm", "is_batch", "least_p", "limits_of", "metrics_of",
     "paired", "plan_runs", "quantile", "quantile_error", "read_batch", "read_suite", "run_suite", "standard_error",
     "summarise",
 ]

@@ -81,7 +81,8 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     ):  # imported between two looks at its source
         with suppress(EstimatorError):  # it fails again in the run, with the reason
             load_estimator(run.estimator)
-    clock, cpu_before_s = Clock(), time.process_time()
+    clock = Clock()
+    cpu_before_s = time.process_time()
     try:
         with clock.on("read_s"):
             sequence = _sequence(

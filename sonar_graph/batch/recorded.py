@@ -343,11 +343,3 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
         values={name: value for name, value in numbers.items() if math.isfinite(value)},
         place=place,
     )
-
-
-def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) -> None:
-    """Raise `EvaluationError` if a planned run was not done; the message has the subject, and what cannot be done."""
-    if batch.missing:
-        raise EvaluationError(
-            f"{subject}: the batch {batch.name!r} cannot {purpose}, {batch.missing_count}; {GOING_ON}"
-        )

@@ -37,10 +37,8 @@ def signed_rank_p(differences: Floats) -> float:
         return 1.0
     doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)
     ranks = doubled // np.gcd.reduce(doubled[differences != 0])
-    positive, negative = (
-        int(ranks[differences > 0].sum()),
-        int(ranks[differences < 0].sum()),
-    )
+    positive = int(ranks[differences > 0].sum())
+    negative = int(ranks[differences < 0].sum())
     ranks, least = ranks[differences != 0], min(positive, negative)
     is_cheap = len(ranks) * (positive + negative) <= 2 * MOST_ADDITIONS
     return min(
@@ -186,7 +184,8 @@ def summarise(values: Floats) -> SampleSummary:
     Quantiles are values that occur or lie between two that do (linear between order statistics, as numpy's default);
     they are infinite if they fall among runs without a value.
     """
-    n, without = len(values), int(np.isinf(values).sum())
+    n = len(values)
+    without = int(np.isinf(values).sum())
     has_mean = n > 0 and not without
     low, median, high = (quantile(values, share) for share in (LOW, 0.5, HIGH))
     return SampleSummary(
@@ -207,8 +206,10 @@ def quantile(values: Floats, share: float) -> float:
     """Linear between order statistics, infinite if an infinite value takes part; NaN of nothing or between -∞ and ∞."""
     if not len(values):
         return math.nan
-    ordered, place = np.sort(values), share * (len(values) - 1)
-    below, above = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    ordered = np.sort(values)
+    place = share * (len(values) - 1)
+    below = float(ordered[math.floor(place)])
+    above = float(ordered[math.ceil(place)])
     if math.isinf(below) and below == -above:
         return math.nan
     if below == above or not math.isfinite(above):
@@ -228,14 +229,13 @@ def quantile_error(values: Floats, share: float) -> float:
     upper one is infinite, it is the distance to the lower one. For few values, two of which may agree by chance, it is
     at least a hundredth of the quantile.
     """
-    n, middle = len(values), quantile(values, share)
+    n = len(values)
+    middle = quantile(values, share)
     if n < 2 or not math.isfinite(middle):
         return math.nan
     places = math.sqrt(n * share * (1 - share)) / (n - 1)
-    below, above = (
-        quantile(values, max(0.0, share - places)),
-        quantile(values, min(1.0, share + places)),
-    )
+    below = quantile(values, max(0.0, share - places))
+    above = quantile(values, min(1.0, share + places))
     sides = [abs(side - middle) for side in (below, above) if math.isfinite(side)]
     error = sum(sides) / len(sides) if sides else math.nan
     return max(error, 0.01 * abs(middle)) if n < LEAST_PAIRS else error
@@ -305,7 +305,8 @@ def paired(
         lost = np.array([lost[which].any() for which in members], dtype=bool)
         kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
         each = kinds.pop() if len(kinds) == 1 else "case"
-    without, valued = int(lost.sum()), differences[~lost]
+    without = int(lost.sum())
+    valued = differences[~lost]
     has_mean = len(differences) > 0 and not without
     rounding_error = standard_error(valued)
     if 1 < len(valued) < LEAST_PAIRS:  # two may agree by chance
@@ -343,7 +344,8 @@ def mean_interval(values: Floats) -> tuple[float, float]:
     n = len(values)
     if n < LEAST_PAIRS:
         return math.nan, math.nan
-    mean, deviation = float(values.mean()), float(values.std(ddof=1))
+    mean = float(values.mean())
+    deviation = float(values.std(ddof=1))
     if deviation <= 1e-12 * float(np.abs(values).max()):
         return mean, mean
     skewness = float((((values - mean) / values.std()) ** 3).mean())

@@ -109,7 +109,9 @@ class Where:
 
 Progress = Callable[[PlannedRun, RunOutcome], None]
 """Called after a run is kept."""
-RUNS, ROW, LOG = "runs", "row.json", "log.txt"
+RUNS = "runs"
+ROW = "row.json"
+LOG = "log.txt"
 KEY = "key"
 SUITE = "suite.toml"
 _PARTIAL = ".partial-"
@@ -180,7 +182,8 @@ class Store:
 
         Raises `BatchError` when its folder holds files that this package did not write, or that were changed since.
         """
-        folder, gone = self.run_folder(key), self._partial_folder(key)
+        folder = self.run_folder(key)
+        gone = self._partial_folder(key)
         if others := [*others_in(folder), *changed_in(folder)]:
             raise BatchError(
                 f"{folder}: would be replaced, and holds {others[0]}, which is not as the run wrote it; move it away"

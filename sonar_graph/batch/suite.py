@@ -305,7 +305,8 @@ def line_of(text: str, place: Place) -> int:
     open_mark = ""  # of a text of several lines, in which nothing is a key
     for number, line in enumerate(text.splitlines(), start=1):
         if not open_mark and (header := _HEADER.match(line)):
-            names, table = _names(header["path"]), ()
+            names = _names(header["path"])
+            table = ()
             for depth, name in enumerate(names, start=1):
                 table = (*table, name)
                 if header["array"] and depth == len(names):

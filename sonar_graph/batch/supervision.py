@@ -50,7 +50,8 @@ def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
     The row of the outcome says where a run was killed again, took too long or needed too much memory.
     Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
     """
-    reason, log = "", ""
+    reason = ""
+    log = ""
     for _ in range(ATTEMPTS):
         with _idle_lock:
             runner = _idle.pop() if _idle else None
@@ -60,7 +61,8 @@ def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
             outcome = runner.perform(run, limits)
             return replace(outcome, row=_here() | outcome.row)
         except KilledError as error:
-            reason, log = str(error), runner.log()
+            reason = str(error)
+            log = runner.log()
         finally:
             if runner.is_fit():
                 with _idle_lock:

@@ -1,40 +1,18 @@
-"""``sonar-graph bench``: ``run`` a suite on all cores or on a cluster, ``bless`` a reference, ``gate`` a batch."""
+"""``sonar-graph bench``: run a suite on all cores or on a cluster."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
-from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, examples
-from sonar_graph.cli.outputs import progress_bars, working, writable_json
+from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo
+from sonar_graph.cli.outputs import progress_bars, working
 from sonar_graph.files import INTERRUPTED
-
-if TYPE_CHECKING:
-    from sonar_graph.batch import GateVerdict
-
-
-SHOWN = 10
-"""Most lines about runs that stand out; the report lists every run."""
-BatchFolder = Annotated[
-    Path,
-    typer.Argument(
-        metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote."
-    ),
-]
-Strict = Annotated[
-    bool,
-    typer.Option(
-        "--strict",
-        help="Fail the gate by lines that say 'look at' too: these are no tests.",
-    ),
-]
 
 
 def bench(
@@ -81,17 +59,6 @@ def bench(
             help="Do only the run of this key, which the report lists; can be repeated.",
         ),
     ] = None,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            "--gate",
-            metavar="REFERENCE.json",
-            exists=True,
-            dir_okay=False,
-            help="What `bench bless` wrote: exit with 1 where accuracy or consistency got worse, and only then.",
-        ),
-    ] = None,
-    is_strict: Strict = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
@@ -99,8 +66,6 @@ def bench(
     Writes report.html, its tables, results.parquet with one row a run, and runs/KEY/ with what compare writes and the
     log of the run.
     """
-    if is_strict and reference is None:
-        raise typer.BadParameter("--strict is about the gate; give it with --gate")
     from sonar_graph.batch import run_suite
 
     try:
@@ -135,67 +100,8 @@ def bench(
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
     echo(f"Results: {output / 'results.parquet'}")
     echo(f"Report: {write_report_of(output, overwrite=overwrite)}")
-    if reference is not None:
-        exit_by_gate(output, reference, is_strict=is_strict)
-    elif set(counts) - {"ok"}:
+    if set(counts) - {"ok"}:
         raise typer.Exit(1)
-
-
-def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
-    """Print the verdict of the gate, and exit with 1 if it fails; if strict, also if there is anything to look at."""
-    from sonar_graph.batch import gate as judge
-    from sonar_graph.batch import read_batch
-
-    with working("judging"):
-        verdict = judge(read_batch(folder), reference)
-    for line in verdict_lines(verdict):
-        echo(line)
-    is_passed = verdict.passed and not (is_strict and verdict.look_at)
-    outcome = (
-        "failed"
-        if not is_passed
-        else "passed"
-        if verdict.has_test
-        else "passed, without any test of errors"
-    )
-    echo(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
-    if not is_passed:
-        raise typer.Exit(1)
-
-
-def verdict_lines(verdict: GateVerdict) -> list[str]:
-    """Lines of the verdict: what got worse, what to look at, and what the tests could have found."""
-    lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
-    lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
-    if len(verdict.look_at) > SHOWN:
-        lines.append(
-            f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown"
-        )
-    if verdict.new:
-        lines.append(
-            f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}"
-        )
-    if verdict.untested:
-        told = ", ".join(f"{name} ({verdict.cases[name]})" for name in verdict.untested)
-        lines.append(
-            f"No test of errors: {told}: it needs 3 cases, which are seeds, or logs without seeds"
-        )
-    if verdict.unmoved:
-        lines.append(
-            f"Hardly different from the reference: {', '.join(verdict.unmoved)}"
-        )
-    if verdict.detectable:
-        sizes = []
-        for name, share in verdict.detectable.items():
-            size = (
-                f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
-            )
-            sizes.append(f"{size} ({name}, {verdict.cases[name]} cases)")
-        told = ", ".join(sizes)
-        lines.append(
-            f"Would have been found in four of five batches: one error larger on all logs by {told}"
-        )
-    return lines
 
 
 def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
@@ -216,85 +122,3 @@ def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
     for sentence in sensors_told(batch):
         echo(sentence, err=True)
     return page
-
-
-DEFAULT_COMMAND = "run"
-
-
-class SuiteFirst(TyperGroup):
-    """Group of commands with a default one: ``bench SUITE.toml`` is ``bench run SUITE.toml``."""
-
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Insert the name of the default command if none is given."""
-        is_named = (
-            not args or args[0] in self.commands or args[0] in ctx.help_option_names
-        )
-        return super().parse_args(ctx, args if is_named else [DEFAULT_COMMAND, *args])
-
-
-benches = typer.Typer(
-    name="bench",
-    cls=SuiteFirst,
-    help="Run suites: many logs, seeds, estimators and variants; judge what came out. For the options of a run: "
-    "sonar-graph bench run --help.",
-    epilog=examples(
-        "sonar-graph bench suite.toml -o results",
-        "sonar-graph bench suite.toml -o results --gate reference.json",
-        "sonar-graph bench bless results reference.json",
-    ),
-)
-benches.command(
-    DEFAULT_COMMAND,
-    epilog=examples(
-        "sonar-graph bench run suite.toml -o results",
-        "sonar-graph bench run suite.toml -o results --workers 2 --timeout 600",
-        "sonar-graph bench run suite.toml -o results --scheduler tcp://10.0.0.5:8786",
-        "sonar-graph bench run suite.toml -o results --gate reference.json",
-        "sonar-graph bench run suite.toml -o again --only 0123456789abcdef0123",
-    ),
-)(bench)
-
-
-@benches.command(epilog=examples("sonar-graph bench bless results reference.json"))
-def bless(
-    folder: BatchFolder,
-    reference: Annotated[
-        Path,
-        typer.Argument(
-            metavar="REFERENCE.json",
-            help="File to write; replaces an earlier reference.",
-        ),
-    ],
-    overwrite: Overwrite = False,
-) -> None:
-    """Make a batch the reference that later ones are held against."""
-    from sonar_graph.batch import bless as write_reference
-    from sonar_graph.batch import is_reference, read_batch
-
-    batch = read_batch(folder)
-    write_reference(
-        batch,
-        writable_json(reference, "a reference", [], is_reference, overwrite=overwrite),
-    )
-    failed = sum(not run.ended for run in batch.runs)
-    echo(
-        f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)"
-    )
-
-
-@benches.command(epilog=examples("sonar-graph bench gate results reference.json"))
-def gate(
-    folder: BatchFolder,
-    reference: Annotated[
-        Path,
-        typer.Argument(
-            metavar="REFERENCE.json",
-            exists=True,
-            dir_okay=False,
-            help="What bless wrote.",
-        ),
-    ],
-    is_strict: Strict = False,
-) -> None:
-    """Say whether accuracy or consistency got worse beyond noise; exit with 1 if so. Nothing is run."""
-    exit_by_gate(folder, reference, is_strict=is_strict)

@@ -43,7 +43,7 @@ from sonar_graph.errors import EstimatorError, EvaluationError, LogError
 from sonar_graph.files import BATCH, COMPARISON, result_written
 
 if TYPE_CHECKING:
-    from sonar_graph.evaluation import Comparison, Ensemble
+    from sonar_graph.evaluation import Comparison
     from sonar_graph.recognition import Recognition
     from sonar_graph.sequence import Sequence
     from sonar_graph.simulation import BasinOptions
@@ -54,7 +54,8 @@ DOUBTFUL = 3
 """Exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``."""
 RATE_SLACK = 1.01
 """Tolerance for the IMU's rate, which is counted from its stamps."""
-LOG, PAGE = "basin.mcap", "report.html"
+LOG = "basin.mcap"
+PAGE = "report.html"
 DEMO = {
     **{"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}},
     **{"gyro_bias_scale": 10.0, "dvl_dropouts_per_hour": 30.0, "dvl_dropout_s": 5.0},
@@ -63,14 +64,6 @@ DEMO = {
 """The three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler log that
 loses the bottom some three times. Images take most of the time: two a second still show each landmark several times."""
 DEMO_ESTIMATORS = ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"]
-DEMO_EXPERIMENTS = {
-    "with a gyro bias, a Doppler log that loses the bottom, and a tenth of the tracks wrongly identified": {
-        "tracks": True,
-        "wrong_id_rate": 0.1,
-    },
-    "without gyro bias and with all identities right": {"gyro_bias_scale": 0.0},
-}
-"""Changes of the options by condition: what makes the difference between estimators, and runs without it."""
 SHORT = {"duration_s": 120.0, "laps": 1, "dvl_dropouts_per_hour": 120.0, "image": None}
 """Changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log."""
 
@@ -90,7 +83,8 @@ def run(
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
     from sonar_graph.evaluation import write_comparison, write_viewer_files
 
-    names, recognition = [estimator], RecogniserOptions()
+    names = [estimator]
+    recognition = RecogniserOptions()
     with (
         compared(
             log,
@@ -188,19 +182,12 @@ def report(
 
 def demo(
     output: OutputFolder = Path("demo"),
-    runs: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Also so many runs of the same basin without images, with faults and without.",
-        ),
-    ] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Repeat the 2014 paper's basin experiment in short: simulate sonar images, recognise landmarks, compare, report.
 
-    Three laps in 390 s instead of 2039 s; the log takes about 40 MB. One run is not enough to compare estimators:
-    --runs 20 adds twenty runs of the same basin with faults and twenty without, from simulated detections.
+    Three laps in 390 s instead of 2039 s; the log takes about 40 MB. One run is not enough to compare estimators: bench
+    makes many.
     """
     from sonar_graph.estimator import load_estimator
     from sonar_graph.numerics import compiled_beside
@@ -232,8 +219,6 @@ def demo(
             with working("compiling the estimators for the first use"):
                 wait_until_compiled()
             comparison = compare_prepared(prepared, names, {})
-            if runs:
-                comparison = replace(comparison, ensembles=more_basins(options, runs))
             with working("writing results"):
                 page = write_report(comparison, output)
     print_outcome(comparison, f"Report: {page}")
@@ -245,23 +230,6 @@ def run_basin(options: BasinOptions, names: list[str]) -> None:
     from sonar_graph.simulation import simulate_basin
 
     compare_runs(simulate_basin(options), names)
-
-
-def more_basins(options: BasinOptions, runs: int) -> list[Ensemble]:
-    """Runs of the demonstration's basin without images under each of its conditions, with a progress bar."""
-    from sonar_graph.evaluation import run_ensembles
-
-    experiments = {
-        name: options.model_copy(update=changes)
-        for name, changes in DEMO_EXPERIMENTS.items()
-    }
-    echo(
-        f"Running {len(experiments)} times {runs} more of the same basin, without images"
-    )
-    with progress_bars() as progress:
-        return run_ensembles(
-            experiments, range(1, runs + 1), DEMO_ESTIMATORS, progress=progress
-        )
 
 
 def estimators() -> None:

@@ -64,7 +64,8 @@ def inspect(
     from sonar_graph.files import strict_json
     from sonar_graph.logs import inspect_log
 
-    config, given = reading.config, reading.given
+    config = reading.config
+    given = reading.given
     summary = inspect_log(log, config, reading.choices, reading.window, given)
     if toml:
         echo(summary.toml, nl=False)
@@ -265,7 +266,8 @@ def calibration(
         raise CalibrationError(
             "give --template: `sonar-graph calibration --template dive.mcap > vehicle.toml`"
         )
-    stated, source = Calibration(), ""
+    stated = Calibration()
+    source = ""
     if log is not None:
         window = reading.window
         sequence = read_log(

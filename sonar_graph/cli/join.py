@@ -105,11 +105,13 @@ def join(
 
     path = writable_log(output, images, navigation, overwrite=overwrite)
     refuse_images(navigation)
-    sequence, topic = reading.read(navigation), reading.choices.get("sonar")
+    sequence = reading.read(navigation)
+    topic = reading.choices.get("sonar")
     with as_log(images) as log:
         alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
         seen = look(log, topic, alone.calibration, salvage=reading.salvage)
-        is_stated, around_s = offset is not None and search is None, offset or 0.0
+        is_stated = offset is not None and search is None
+        around_s = offset or 0.0
         require_overlap(
             images,
             navigation,
@@ -233,7 +235,8 @@ def require_overlap(
     search_s: float,
 ) -> None:
     """Refuse images and navigation without common time for any offset within the search."""
-    first_ns, last_ns = min(seen.stamps_ns), max(seen.stamps_ns)
+    first_ns = min(seen.stamps_ns)
+    last_ns = max(seen.stamps_ns)
     low_ns, high_ns = (
         round((around_s + side * search_s) * NS_PER_S) for side in (-1, 1)
     )
@@ -295,7 +298,8 @@ def on_the_clock(
     """Messages of blocks of frames with their stamps moved, in the order of time; a frame that is late is left out."""
     from sonar_graph.logs import sonar_image_messages
 
-    latest_ns, done = -1, 0
+    latest_ns = -1
+    done = 0
     for block in blocks:
         late = block.stamps_ns <= latest_ns
         if not late.all():

@@ -24,7 +24,8 @@ from sonar_graph.files import COMPARISON, interrupt_event, result_written, write
 if TYPE_CHECKING:
     from sonar_graph.live import Publisher
 
-RECORD, COUNTS = "record.mcap", "live.json"
+RECORD = "record.mcap"
+COUNTS = "live.json"
 SETTLE_S = 1.0
 """Time for subscribers to find all topics, and to get the last messages."""
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]

@@ -1,6 +1,6 @@
 """The commands: thin layers over the library, one module for each group.
 
-Exit codes: 0 done; 1 a comparison with a failed run (everything is written), a batch that is worse than its reference,
+Exit codes: 0 done; 1 a comparison with a failed run or a batch with one (everything is written),
 or an inspected log that cannot be used as it is; 2 a mistake of the user, in one line on stderr; 3 an inspected
 log with something in doubt; 130 interrupted. Only unforeseen errors end in a traceback.
 """
@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from sonar_graph.cli.arguments import examples, printable
-from sonar_graph.cli.bench import benches
+from sonar_graph.cli.bench import bench
 from sonar_graph.cli.compare import compare, demo, estimators, report, run
 from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import calibration, inspect
@@ -49,7 +49,6 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
-app.add_typer(benches)
 app.command(
     epilog=examples(
         "sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"
@@ -102,6 +101,14 @@ app.command(
 app.command(
     epilog=examples("sonar-graph play dive.mcap", "sonar-graph play dive.mcap --rate 3")
 )(play)
+app.command(
+    epilog=examples(
+        "sonar-graph bench suite.toml -o results",
+        "sonar-graph bench suite.toml -o results --workers 2 --timeout 600",
+        "sonar-graph bench suite.toml -o results --scheduler tcp://10.0.0.5:8786",
+        "sonar-graph bench suite.toml -o again --only 0123456789abcdef0123",
+    )
+)(bench)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
 app.command(
     epilog=examples(

@@ -307,8 +307,10 @@ def calibrate(
             "--motion is for --labels: a log with truth has IMU and Doppler log"
         )
     recognition = RecogniserOptions(designs)
-    params, known = recognition.params(settings), recognition.read_designs()
-    topic, salvage = reading.choices.get("sonar"), reading.salvage
+    params = recognition.params(settings)
+    known = recognition.read_designs()
+    topic = reading.choices.get("sonar")
+    salvage = reading.salvage
     with working("calibrating"):
         if labels:
             given = [
@@ -395,7 +397,8 @@ def without_navigation(found: Recognition, asked: str = "") -> list[str]:
     """Lines on where the motion is from, and what is lost; ``asked`` says who left the log's navigation out."""
     from sonar_graph.recognition import NO_FLOOR
 
-    motion, lines = found.notes["detections.motion"], []
+    motion = found.notes["detections.motion"]
+    lines = []
     lines.append(f"motion {motion}")
     if motion.startswith("none"):
         lines.append(

@@ -18,7 +18,9 @@ from sonar_graph.cli.outputs import working, writable_folder
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import PAPER
 
-RESULT_LOG, LAYOUT, PAGE = "result.mcap", "result.foxglove.json", "report.html"
+RESULT_LOG = "result.mcap"
+LAYOUT = "result.foxglove.json"
+PAGE = "report.html"
 RESULT = "Folder that compare, run or bench wrote"
 
 

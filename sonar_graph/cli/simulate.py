@@ -61,7 +61,8 @@ def landmarks(
     with working("simulating"):
         sequence = add_landmarks(reading.read(log), options)
         write_log(path, sequence)
-    detections, placed = sequence.detections, sequence.true_landmarks
+    detections = sequence.detections
+    placed = sequence.true_landmarks
     echo(
         f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}"
     )

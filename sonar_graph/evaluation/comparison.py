@@ -178,7 +178,8 @@ def expense(sequence: Sequence) -> str:
     ``d = 3 n + 15``, and goes over them twice for each detection. One that keeps all detections solves for them at each
     map, some `SOLVED_DETECTION_S` for each.
     """
-    rows, detections = len(sequence.imu), sequence.detections
+    rows = len(sequence.imu)
+    detections = sequence.detections
     said = (
         [f"{rows} IMU rows, about {rows * IMU_ROW_S / 60:.0f} min"]
         if rows * IMU_ROW_S > LONG_S

@@ -26,7 +26,8 @@ GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""
 BINS = 10
-SAME_M, APART_M = 0.15, 0.40
+SAME_M = 0.15
+APART_M = 0.40
 NONE, UNJUDGED = -1, -2
 """True class of a detection that is of no landmark, and of one that is left out."""
 
@@ -40,7 +41,8 @@ def error_series(
     """
     yaw_error = yaw_errors_rad(estimate, truth)
     position_error = estimate.positions - truth.positions
-    position_cov, yaw_var = world_position_covs(estimate), yaw_variances(estimate)
+    position_cov = world_position_covs(estimate)
+    yaw_var = yaw_variances(estimate)
     axes = slice(0, position_dof)
 
     def sigma(variances: Floats) -> Floats:
@@ -275,7 +277,8 @@ def confidences(detections: LandmarkDetections) -> tuple[Floats, Ints]:
 
 def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     """The true class of each detection, shape (n,): an identity, `NONE` or `UNJUDGED`."""
-    truth, landmarks = sequence.true_poses, sequence.true_landmarks
+    truth = sequence.true_poses
+    landmarks = sequence.true_landmarks
     assert truth is not None
     assert landmarks is not None
     labels = np.full(len(detections), UNJUDGED)
@@ -286,7 +289,8 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     if not len(stamps_ns):
         return labels
     poses = truth.at(stamps_ns)
-    world_R_body, mounting = poses.matrices, sequence.calibration.sonar.mounting.pose()
+    world_R_body = poses.matrices
+    mounting = sequence.calibration.sonar.mounting.pose()
     origin = poses.positions + world_R_body @ mounting.translation()
     from_sonar = landmarks.positions[None] - origin[:, None]
     q = np.einsum(

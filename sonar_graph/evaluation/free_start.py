@@ -90,7 +90,8 @@ def with_fitted_truth(
 
 def fit_from_beginning(true: Floats, path: Floats, *, is_turned: bool) -> Alignment:
     """The motion of the truth, shape (n, 3), that begins where the path does and turns about the vertical to fit it."""
-    begin, begin_path = true[:FEWEST].mean(axis=0), path[:FEWEST].mean(axis=0)
+    begin = true[:FEWEST].mean(axis=0)
+    begin_path = path[:FEWEST].mean(axis=0)
     turn = 0.0
     if is_turned:
         (x, y), (u, v) = (true - begin).T[:2], (path - begin_path).T[:2]

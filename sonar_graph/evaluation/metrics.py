@@ -107,7 +107,8 @@ def align_yaw(points: Floats, targets: Floats) -> Alignment:
 
     Height and heading are separate in the sum of squares, so its horizontal part is also the best SE(2) alignment.
     """
-    rotation, translation = np.eye(3), (targets - points).mean(axis=0)
+    rotation = np.eye(3)
+    translation = (targets - points).mean(axis=0)
     rotation[:2, :2], translation[:2] = umeyama(points[:, :2], targets[:, :2])
     return Alignment(rotation, translation)
 
@@ -261,7 +262,8 @@ def landmark_errors(estimated: LandmarkMap, true: LandmarkMap) -> LandmarkErrors
     array([ 4,  9, 11])
     """
     ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
-    points, targets = estimated.positions[rows], true.positions[true_rows]
+    points = estimated.positions[rows]
+    targets = true.positions[true_rows]
     aligned = (
         horizontal_aligned_rmse(points, targets) if len(ids) >= 2 else float("nan")
     )
@@ -324,7 +326,8 @@ def align_map(
     Van Driessen 2006: fits to the better half, then to all within `OUTLYING`).
     """
     _, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
-    points, targets = estimated.positions[rows], true.positions[true_rows]
+    points = estimated.positions[rows]
+    targets = true.positions[true_rows]
     fit = align_yaw if is_level else align_se3
     if len(points) < (2 if is_level else 3):
         return None

@@ -189,40 +189,6 @@ class ErrorSeries:
     """The same of ``nees_yaw``."""
 
 
-@dataclass(frozen=True)
-class Ensemble:
-    """Runs of one experiment by seed; lists of an estimator have one entry a run, None where it failed.
-
-    Examples
-    --------
-    Two runs, of which the second failed:
-
-    >>> from sonar_graph.evaluation import Ensemble
-    >>> ensemble = Ensemble("murky", [1, 2], {"isam2": {"causal.ate_se2_m": [0.02, None]}})
-    >>> ensemble.of("isam2", "causal.ate_se2_m")
-    array([0.02,  inf])
-    """
-
-    condition: str
-    """The experiment in words, as a sentence goes on after "runs"."""
-    seeds: list[int]
-    values: dict[str, dict[str, list[float | None]]]
-    """By estimator, then by key of `ensemble.KEPT`, or ``causal.nees_position_end`` and ``causal.nees_yaw_end``."""
-
-    def of(self, estimator: str, key: str) -> Floats:
-        """Values of one score by run, shape (runs,); infinite for a run without one."""
-        return np.array(
-            [
-                np.inf if value is None else value
-                for value in self.values[estimator].get(key, [None] * len(self.seeds))
-            ]
-        )
-
-    def nees_at_end(self, estimator: str, what: Literal["position", "yaw"]) -> Floats:
-        """NEES per degree of freedom at the last scored instant by run, shape (runs,); infinite for a run without."""
-        return self.of(estimator, f"causal.nees_{what}_end")
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Several runs on one sequence, with scores: the content of comparison.json and of the report.
@@ -247,8 +213,6 @@ class Comparison:
     """Versions, machine, date, and the command that made it."""
     recognition: Recognition | None = None
     """The recognition of landmarks in sonar images; None where the log had detections or no images."""
-    ensembles: list[Ensemble] = field(default_factory=list)
-    """Many runs of the same experiment; empty where there is only this one."""
     is_aligned: bool = False
     """Paths, maps and errors are those of `aligned_to_truth`."""
 

@@ -139,7 +139,8 @@ def _impossible(covs: Floats) -> Flags:
     """Flags of covariances, shape (n, d, d), that are partly NaN, infinite, asymmetric or not positive semidefinite."""
     n = len(covs)
     rows = covs.reshape(n, covs.shape[1] * covs.shape[2])
-    unknown, finite = np.all(np.isnan(rows), axis=1), ~_not_finite(rows)
+    unknown = np.all(np.isnan(rows), axis=1)
+    finite = ~_not_finite(rows)
     filled = np.where(finite[:, None, None], covs, 0.0)
     size = np.abs(filled).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
@@ -382,7 +383,8 @@ class _Replay:
     ) -> RunResult:
         self._warm_up(kind)
         self._check_interrupt()
-        memory, estimator = PeakMemory(), None
+        memory = PeakMemory()
+        estimator = None
         try:
             estimator = self._fresh(kind)
             self._process(estimator, progress)
@@ -442,10 +444,8 @@ class _Replay:
 
         is_aided = any(name in self._sequence.blocks() for name in AIDING)
         for done, step in enumerate(self._steps, start=1):
-            end_ns, given = (
-                step.end_ns,
-                _Watched.of(step, self._asked) if is_aided else step,
-            )
+            end_ns = step.end_ns
+            given = _Watched.of(step, self._asked) if is_aided else step
             self._stage = f"{(end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({end_ns} ns)"
             before = time.perf_counter() - compiling_s()
             estimate = estimator.process(given)
@@ -467,9 +467,11 @@ class _Replay:
 
         self._stage = "at the end, asked for trajectory and map"
         before = time.perf_counter() - compiling_s()
-        smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
+        smoothed = estimator.trajectory()
+        landmarks = estimator.landmarks()
         finish_s = time.perf_counter() - compiling_s() - before
-        peak_memory_mb, detections = memory.rise_mb(), estimator.detections()
+        peak_memory_mb = memory.rise_mb()
+        detections = estimator.detections()
         self._stage = "at the end, outcome checked"
         causal = Trajectory.from_estimates(self._estimates)
         check_outcome(causal, smoothed, landmarks)

@@ -63,10 +63,8 @@ def trajectory_scores(
     ``world`` is `unaligned`. Scores that need true orientations are left out where the truth has positions only.
     Without ``has_height`` the estimate has the truth's, and its errors are of x and y.
     """
-    which, over = (
-        ESTIMATES[kind],
-        f"over {instants}, to which the truth is interpolated",
-    )
+    which = ESTIMATES[kind]
+    over = f"over {instants}, to which the truth is interpolated"
     space = f"{'3-D' if has_height else 'horizontal'} position error"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
     rules = [
@@ -111,7 +109,8 @@ def trajectory_scores(
         ("nees_yaw", errors.nees_yaw, 1, errors.yaw_samples, "heading"),
     )
     for key, nees, dof, samples, what in parts:
-        known, mean = int(np.isfinite(nees).sum()), mean_normalised(nees, dof)
+        known = int(np.isfinite(nees).sum())
+        mean = mean_normalised(nees, dof)
         if not math.isfinite(mean):
             continue
         protocol = (
@@ -129,10 +128,12 @@ def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Sco
     count = Score(
         float(len(estimated)), "1", "Landmarks in the map at the end.", better="none"
     )
-    true, scored = sequence.true_landmarks, scored_map(estimated, sequence)
+    true = sequence.true_landmarks
+    scored = scored_map(estimated, sequence)
     if true is None or scored is None:
         return {"landmarks.count": count}
-    named, is_aligned = scored.landmarks, scored.alignment is not None
+    named = scored.landmarks
+    is_aligned = scored.alignment is not None
     errors = landmark_errors(named, true)
     if not len(errors):
         return {"landmarks.count": count}
@@ -190,7 +191,8 @@ def own_map_scores(
 def detection_scores(log: DetectionLog) -> dict[str, Score]:
     """Counts of detections by outcome, and the NIS of those used."""
     counts = Counter(log.outcomes)
-    new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
+    new = counts[Outcome.NEW]
+    ignored = counts[Outcome.IGNORED]
     used = sum(counts[outcome] for outcome in USED)
     unnamed = (
         counts[Outcome.NO_IDENTITY]
@@ -230,7 +232,8 @@ def resource_scores(run: RunResult, log_s: float) -> dict[str, Score]:
     """Time and memory of one run over a log of this duration in seconds."""
     each = "one per instant, each with all measurements since the last"
     calls = f"wall-clock time over {len(run.update_s)} calls of process, {each}"
-    total_s, ms = float(run.update_s.sum() + run.finish_s), run.update_s * 1e3
+    total_s = float(run.update_s.sum() + run.finish_s)
+    ms = run.update_s * 1e3
     speed = f"Duration of the log ({log_s:.1f} s) divided by time.total_s."
     whole = "all calls of process and of asking for trajectory and map at the end"
     memory = (

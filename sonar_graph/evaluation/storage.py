@@ -33,7 +33,6 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import (
     Comparison,
-    Ensemble,
     ErrorSeries,
     Kind,
     MapSoFar,
@@ -67,9 +66,13 @@ Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
 KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 FORMAT = "sonar_graph comparison 1"
-INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
-RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
-ENSEMBLES, PAGE = "ensembles.json", "report.html"
+INDEX = "comparison.json"
+SEQUENCE = "sequence.npz"
+RUNS = "runs"
+RESULT = "result.json"
+SERIES = "series.npz"
+RESULT_LOG = "result.mcap"
+PAGE = "report.html"
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
 """As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
@@ -92,7 +95,6 @@ def result_names(estimators: Iterable[str]) -> list[str]:
     return [
         INDEX,
         SEQUENCE,
-        ENSEMBLES,
         RECOGNITION,
         f"{PICTURE_FOLDER}/0.jpg",
         RESULT_LOG,
@@ -138,16 +140,14 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
             for name in written.names
             if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/"))
         )
-        written.remove([INDEX, ENSEMBLES, PAGE, RECOGNITION, *earlier])
+        written.remove([INDEX, PAGE, RECOGNITION, *earlier])
         _write(comparison, folder)
 
 
 def _write(comparison: Comparison, folder: Path) -> None:
     # all other rows of IMU and Doppler log are in the log
-    sequence, ends = (
-        comparison.sequence,
-        np.array([0, -1]),
-    )
+    sequence = comparison.sequence
+    ends = np.array([0, -1])
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack(
         "dvl", sequence.dvl.rows(ends)
     )
@@ -177,12 +177,8 @@ def _write(comparison: Comparison, folder: Path) -> None:
         from sonar_graph.recognition import write_recognition
 
         write_recognition(comparison.recognition, folder)
-    if comparison.ensembles:
-        write_json(
-            folder / ENSEMBLES,
-            {"ensembles": [asdict(one) for one in comparison.ensembles]},
-        )
-    sequence, instants = comparison.sequence, comparison.instants_ns
+    sequence = comparison.sequence
+    instants = comparison.instants_ns
     index = {
         "format": FORMAT,
         "sequence": {
@@ -366,12 +362,8 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         from sonar_graph.recognition import read_recognition
 
         recognition = read_recognition(folder)
-    arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
-    several = (
-        read_json(folder / ENSEMBLES)
-        if (folder / ENSEMBLES).is_file()
-        else {"ensembles": []}
-    )
+    arrays = _read_arrays(folder / SEQUENCE)
+    entry = index["sequence"]
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
         sequence=_restore_sequence(
@@ -383,10 +375,6 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         errors=errors,
         environment=_TEXTS.validate_python(index["environment"]),
         recognition=recognition,
-        ensembles=[
-            Ensemble(one["condition"], one["seeds"], one["values"])
-            for one in several["ensembles"]
-        ],
     )
 
 
@@ -425,7 +413,8 @@ def _restore_sequence(
     name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays
 ) -> Sequence:
     """A sequence with its start, end, detections and truth, but without its motion's measurements."""
-    imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
+    imu = _unpack("imu", Imu, arrays)
+    dvl = _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
         raise EvaluationError(
             "sequence.npz: the first and last rows of imu and dvl are missing"

@@ -120,7 +120,8 @@ def score_keys(comparison: Comparison) -> list[str]:
         return names.index(name) if name in names else len(names)
 
     keys = {key for scores in comparison.scores.values() for key in scores}
-    blocks, metrics = list(BLOCKS), list(LABELS)
+    blocks = list(BLOCKS)
+    metrics = list(LABELS)
     return sorted(
         keys,
         key=lambda key: (

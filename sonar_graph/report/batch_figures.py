@@ -23,7 +23,8 @@ from sonar_graph.report.batch_tables import (
 )
 from sonar_graph.report.rendering import csv_text
 
-ROW_IN, PANEL_IN = 0.36, 0.95
+ROW_IN = 0.36
+PANEL_IN = 0.95
 STACKED = 2
 """Largest number of logs below each other; more make small multiples."""
 MOST_COLUMNS = 3
@@ -52,7 +53,8 @@ def log_panels(
     for panel in panels[len(logs) :]:
         panel.remove()
     for index, log in enumerate(logs):
-        panel, narrow = panels[index], columns > 1
+        panel = panels[index]
+        narrow = columns > 1
         shown = names if index % columns == 0 else [""] * len(names)
         labels = [folded(name, NAME_LETTERS) if narrow else name for name in shown]
         panel.set(
@@ -303,7 +305,8 @@ def cost_drawing(batch: RecordedBatch) -> style.Illustration | None:
 
 
 def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
-    known, row = values[np.isfinite(values)], place + KIND_SHIFT[over]
+    known = values[np.isfinite(values)]
+    row = place + KIND_SHIFT[over]
     own = style.colour(place)
     if not known.size:
         return
@@ -327,10 +330,8 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
             middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6
         )
     if len(known) < len(values):
-        across, note = (
-            panel.get_yaxis_transform(),
-            f"{len(values) - len(known)} without",
-        )
+        across = panel.get_yaxis_transform()
+        note = f"{len(values) - len(known)} without"
         panel.text(
             1.01,
             row,

@@ -16,7 +16,8 @@ from sonar_graph.report.rendering import render, write_tables
 FOLDED_ROWS = 24
 """Tables with more rows are folded on the screen: figures above them show the same."""
 FEW_LOGS = 2
-TEMPLATE, PAGE = "batch.html", "report.html"
+TEMPLATE = "batch.html"
+PAGE = "report.html"
 ORIGINS = (
     *("machine", "versions", "sonar_graph", "source", "estimator_source"),
     *("gtsam", "numpy", "scipy", "numba", "python"),

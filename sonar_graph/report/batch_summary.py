@@ -34,11 +34,9 @@ from sonar_graph.table import Cell, Column, Table, absent, number, words
 SCORED = "scored_instants"
 NAMED = 3
 """Largest number of logs that a warning names; others are counted."""
-LOWER, HIGHER, DIFFERENT = (
-    "\N{DOWNWARDS ARROW}",
-    "\N{UPWARDS ARROW}",
-    "\N{NOT EQUAL TO}",
-)
+LOWER = "\N{DOWNWARDS ARROW}"
+HIGHER = "\N{UPWARDS ARROW}"
+DIFFERENT = "\N{NOT EQUAL TO}"
 SIDES = {LOWER: "lower", HIGHER: "higher", DIFFERENT: "different"}
 
 
@@ -105,10 +103,8 @@ def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> li
         )
         unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
         which = f"{over.lower()} " if over else ""
-        told, alike = (
-            [f"{log}, median {which}error{unit} ({metric.label}): {listed}."],
-            [],
-        )
+        told = [f"{log}, median {which}error{unit} ({metric.label}): {listed}."]
+        alike = []
         for contestant in batch.contestants:
             if (key, log, contestant) not in tests:
                 continue
@@ -300,10 +296,8 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             if not batch.is_asked(log, name, key):
                 rows[-1].append(absent(2))
                 continue
-            told, found = (
-                summarise(batch.values(log, name, key)),
-                tests.get((key, log, name)),
-            )
+            told = summarise(batch.values(log, name, key))
+            found = tests.get((key, log, name))
             text = quantile_text(
                 told.median * metric.factor, told.median_error * metric.factor
             )
@@ -331,7 +325,8 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
 
 def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:
     """Contestants that have the estimate; the smoothed one only where it is not the causal one everywhere."""
-    key, first = metric.keys[over], next(iter(metric.keys.values()))
+    key = metric.keys[over]
+    first = next(iter(metric.keys.values()))
     asked = [
         name
         for name in batch.contestants

@@ -149,7 +149,8 @@ def failure_table(batch: RecordedBatch) -> Table:
     rows = []
     for log in batch.logs:
         for contestant in batch.contestants:
-            group, not_run = batch.group(log, contestant), missing[log, contestant]
+            group = batch.group(log, contestant)
+            not_run = missing[log, contestant]
             if not group and not not_run:
                 continue
             cells = [count(0), *[absent()] * (1 + len(FAILURES)), absent(3)]
@@ -329,7 +330,8 @@ def is_evidence(told: dict[str, Anees | None], kind: str) -> bool:
     At the last instant a smoothed estimate rests on the same measurements as the causal one, and is the same but for a
     solver's last steps. It differs where a decision is made anew, as on doubtful identities.
     """
-    causal, own = told["causal"], told[kind]
+    causal = told["causal"]
+    own = told[kind]
     if own is None or causal is None or kind == "causal":
         return own is not None
     if math.isnan(causal.mean):
@@ -375,10 +377,8 @@ def consistency_table(batch: RecordedBatch) -> Table:
         )
         cells.append(number(low, f"{low:.2f} to {high:.2f}", high))
         for kind in kinds:
-            one, values = (
-                both[kind],
-                batch.values(log, contestant, f"{kind}.nees_{what}{LATEST}"),
-            )
+            one = both[kind]
+            values = batch.values(log, contestant, f"{kind}.nees_{what}{LATEST}")
             if one is None:
                 cells += [absent(), words("")]
             elif not is_evidence(both, kind):

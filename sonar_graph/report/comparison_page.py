@@ -34,10 +34,6 @@ from sonar_graph.evaluation import (
 from sonar_graph.files import COMPARISON, as_path, replacing, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
-from sonar_graph.report.ensemble_section import (
-    ensemble_sentences,
-    ensemble_table,
-)
 from sonar_graph.report.figure_style import inline_svg, sized
 from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
@@ -46,7 +42,8 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
 from sonar_graph.table import ABSENT, Column, Table, text_table, words
 
-PAGE, TEMPLATE = "report.html", "comparison.html"
+PAGE = "report.html"
+TEMPLATE = "comparison.html"
 RUN_FILES = {
     "trajectory.tum": "smoothed",
     "causal.tum": "causal",
@@ -156,11 +153,6 @@ def render_report(comparison: Comparison) -> str:
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
             f"{_counted(detections, 'landmark detection')}."
         ),
-        "ensemble": ensemble_sentences(comparison.ensembles),
-        "ensembles": [
-            ensemble_table(one, f"runs-{place}")
-            for place, one in enumerate(comparison.ensembles, start=1)
-        ],
         "headlines": {
             "aligned": sentences.headline(comparison) or told[0],
             "raw": ""
@@ -230,12 +222,9 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
         score_table(comparison),
         *([landmarks] if landmarks else []),
         outcome_table(comparison),
+        refused_table(comparison),
     ]
-    tables += [
-        ensemble_table(one, f"runs-{place}")
-        for place, one in enumerate(comparison.ensembles, start=1)
-    ]
-    return [table for table in [*tables, refused_table(comparison)] if table.rows]
+    return [table for table in tables if table.rows]
 
 
 def _counted(count: int, noun: str) -> str:
@@ -336,7 +325,8 @@ def refused_table(comparison: Comparison) -> Table:
 
 def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     """Pictures, outcomes, warnings and the reliability of posteriors; None where nothing was recognised here."""
-    found, sequence = comparison.recognition, comparison.sequence
+    found = comparison.recognition
+    sequence = comparison.sequence
     if found is None:
         return None
     # a recogniser takes a while to load, and most logs have detections
@@ -344,7 +334,8 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
         SURE,
     )
 
-    start_ns, judged = sequence.start_ns, reliability_of(sequence)
+    start_ns = sequence.start_ns
+    judged = reliability_of(sequence)
     pictures = []
     for picture in found.shown():
         pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)

@@ -13,7 +13,6 @@ from sonar_graph.evaluation import (
     score_keys,
 )
 from sonar_graph.report import sentences
-from sonar_graph.report.ensemble_section import ensemble_sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
 from sonar_graph.table import ABSENT
 
@@ -98,8 +97,7 @@ def summary(comparison: Comparison) -> Group:
 
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     """Failures, doubts of the log, what runs say that may follow from these, and the meaning of the columns."""
-    lines = ensemble_sentences(comparison.ensembles)
-    lines += [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
     doubtful = sentences.doubtful_lines(comparison)
     lines += doubtful
     lines += [
@@ -167,7 +165,8 @@ def published_counterpart(comparison: Comparison) -> Group | None:
         return None
     texts = [[cell.text for cell in row] for row in found.rows]
     (split,) = found.sections
-    positions, totals = texts[:split], texts[split:]
+    positions = texts[:split]
+    totals = texts[split:]
     landmarks = [row[0].removesuffix(", x") for row in positions[::2]]
     across = _plain_table(
         "Landmarks: position in metres (estimate minus truth)", ["", *landmarks]

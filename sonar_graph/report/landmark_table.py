@@ -26,7 +26,9 @@ from sonar_graph.table import ABSENT, Column, Table, words
 PAPER = "2014 paper"
 MOST_LANDMARKS = 30
 """Largest number of landmarks in rows; others are left to ``landmarks.csv``."""
-DECIMALS, PAPER_DECIMALS, PAPER_RETURN_DECIMALS = 3, 2, 4
+DECIMALS = 3
+PAPER_DECIMALS = 2
+PAPER_RETURN_DECIMALS = 4
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ def landmark_table(comparison: Comparison) -> Table | None:
     experiment is repeated (then also runs with a path only). Rows: x and y of each landmark; below a section heading
     the RMS errors and the displacement.
     """
-    runs, true = comparison.runs, comparison.sequence.true_landmarks
+    runs = comparison.runs
+    true = comparison.sequence.true_landmarks
     repeats = repeats_published(comparison.sequence)
     mapped = {}
     is_aligned = comparison.is_aligned
@@ -169,7 +172,8 @@ def _return_rows(
 
     rows = []
     for axis in (0, 1):
-        first, cells = ABSENT, []
+        first = ABSENT
+        cells = []
         for place, path in enumerate(paths):
             if path is None:
                 cells.append(fixed(RETURN_M[axis], PAPER_RETURN_DECIMALS))

@@ -22,8 +22,13 @@ from sonar_graph.report.figures import drawings
 from sonar_graph.report.rendering import FOLDER, latex_text, write_tables
 from sonar_graph.table import Table
 
-COLUMN_IN, PAGE_IN, TEXT_PT, FONT = 3.5, 7.16, 8.0, "STIXGeneral"
-FIGURES, DOCUMENT, PROTOCOL = "figures", "paper.tex", "protocol.txt"
+COLUMN_IN = 3.5
+PAGE_IN = 7.16
+TEXT_PT = 8.0
+FONT = "STIXGeneral"
+FIGURES = "figures"
+DOCUMENT = "paper.tex"
+PROTOCOL = "protocol.txt"
 EMBEDDED: Any = {
     "pdf.fonttype": 42,
     "svg.fonttype": "path",
@@ -116,7 +121,8 @@ def _of_comparison(
             figures.append(
                 PaperFigure(name.replace("_", "-"), caption, figure, drawing.columns)
             )
-    sequence, environment = comparison.sequence, comparison.environment
+    sequence = comparison.sequence
+    environment = comparison.environment
     lines = [
         f"{', '.join(run.estimator for run in comparison.runs)} were run by sonar_graph {environment['sonar_graph']} "
         f"(GTSAM {environment['gtsam']}) on {sequence.name}, {sequence.duration_s:.1f} s, with the same measurements "
@@ -137,10 +143,8 @@ def _rules(comparison: Comparison) -> list[str]:
     rules = []
     labels = {row[0].text for row in score_table(comparison).rows}
     for column in compact_table(comparison).columns[1:]:
-        heading, names = (
-            f"{column.over}, {column.heading}".removeprefix(", "),
-            dict[str, list[str]](),
-        )
+        heading = f"{column.over}, {column.heading}".removeprefix(", ")
+        names = dict[str, list[str]]()
         for run in comparison.runs:
             if score := comparison.score_of(run.estimator, column.key):
                 names.setdefault(score.protocol, []).append(run.estimator)

@@ -89,7 +89,8 @@ def as_csv(table: Table) -> str:
         for column in table.columns
         for part in column.parts
     ]
-    rows, section = [["section", *head] if table.sections else head], ""
+    rows = [["section", *head] if table.sections else head]
+    section = ""
     for place, row in enumerate(table.rows):
         section = table.sections.get(place, section)
         texts = [section] if table.sections else []
@@ -130,7 +131,9 @@ def as_latex(table: Table) -> str:
     """A ``table`` with the digits that people are shown; it needs the packages booktabs and textcomp."""
     above: list[str] = []
     if any(heading for heading, _ in table.groups):
-        cells, rules, first = [], [], 1
+        cells = []
+        rules = []
+        first = 1
         for heading, width in table.groups:
             cells.append(rf"\multicolumn{{{width}}}{{c}}{{{latex_text(heading)}}}")
             if heading:

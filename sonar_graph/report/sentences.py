@@ -51,7 +51,8 @@ NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNF
 """Outcomes of detections whose landmark an estimator does not know."""
 UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
 """Outcomes of detections that were refused before their landmark mattered."""
-POLICY, UNKNOWN = "identity.policy", "identity.unknown.policy"
+POLICY = "identity.policy"
+UNKNOWN = "identity.unknown.policy"
 WARNING = "Warning"
 DOUBTFUL = "Doubtful"
 BEYOND_DOUBT = 100.0
@@ -123,7 +124,8 @@ def finding(comparison: Comparison) -> list[str]:
             ),
         ]
     sentences.append(_causal_sentence(comparison, metric))
-    improved, judged = [], []
+    improved = []
+    judged = []
     for name in (run.estimator for run in runs):
         causal, smoothed = (
             comparison.score_of(name, f"{kind}.{metric}")

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from regression_gate import GateVerdict, bless, gate, log_ratios, worse_groups
 
-from sonar_graph.batch.gate import GateVerdict, bless, gate, log_ratios, worse_groups
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.errors import EvaluationError
 from tests.recorded_batches import (
@@ -281,7 +281,7 @@ def test_what_is_no_reference_is_refused(batch, reference, tmp_path):
         ('{"format": "something else"}', r"other\.json: format is 'something else'"),
         (
             '{"format": "sonar_graph batch reference 1", "runs": []}',
-            "make it again with bench bless",
+            "make it again with bless",
         ),
     ):
         other.write_text(content)

@@ -5,10 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
-
-from sonar_graph.batch.gate import movable, worse_groups
-from sonar_graph.batch.permutation import (
+from permutation import (
     ALL_SIGNS,
     DRAWN,
     Family,
@@ -18,6 +15,9 @@ from sonar_graph.batch.permutation import (
     families,
     with_all_logs,
 )
+from regression_gate import movable, worse_groups
+from scipy import stats
+
 from sonar_graph.batch.recorded import ALL_LOGS
 
 

@@ -132,7 +132,6 @@ MISTAKES = {
     "bench logs.toml -o out": r"logs\.toml, line 3: logs",
     "bench late.toml -o out": r"late\.toml, line 7: est",
     "bench late.toml -o out --workers 2 --scheduler tcp://127.0.0.1:1": "give one of them",
-    "bench bless empty new.json": r"no results\.parquet in it",
     "recognise bare.mcap -o new.mcap": r"bare\.mcap: has no sonar images; .*inspect .*` lists .*compare` .* need none",
     "recognise lane.mcap -o new.mcap --rule bayes": "rule.*virtual-evidence.*jeffrey",
     "recognise lane.mcap -o new.mcap --model words.json": r"words\.json is not JSON",

@@ -282,3 +282,15 @@ def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
     assert run("inspect", tmp_path / "cut.mcap", "--quick") == 1
     capsys.readouterr()
+
+
+@pytest.mark.parametrize("content", ['{"a": 1}', "words", "[]"])
+def test_a_json_file_of_others_does_not_become_a_model(
+    content, basin, run, tmp_path, capsys
+):
+    mine = tmp_path / "mine.json"
+    mine.write_text(content)
+    assert run("calibrate", basin, "-o", mine) == 2
+    said = "holds something else than a model; choose another name, or give --overwrite"
+    assert said in capsys.readouterr().err
+    assert mine.read_text() == content

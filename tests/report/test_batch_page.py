@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.gate import bless, gate
 from sonar_graph.batch.recorded import RecordedBatch, read_batch
 from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.errors import EvaluationError
@@ -245,20 +244,6 @@ def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone):
     html = render_batch(batch)
     assert "Every run that was done ended well." in html
     assert f"({gone} 6 of 6)" in html
-
-
-def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete, tmp_path):
-    reference = tmp_path / "reference.json"
-    with pytest.raises(
-        EvaluationError,
-        match=r"the batch 'drawn' cannot become a reference, 14 of 60 runs",
-    ):
-        bless(incomplete, reference)
-    assert not reference.exists()
-    bless(drawn_batch(9), reference)
-    extended = with_missing(drawn_batch(10), "isam2", LOGS[0], 1)
-    with pytest.raises(EvaluationError, match="1 of 60 runs has not been done"):
-        gate(extended, reference)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,8 @@ def innovation_figure(comparison: Comparison) -> Figure | None:
                     style.evenly(len(values), style.SERIES_POINTS // 2),
                     style.thinned(values, style.SERIES_POINTS // 20),
                 )
-                x, y = seconds[chosen][rows], values[rows]
+                x = seconds[chosen][rows]
+                y = values[rows]
                 if marker == ".":
                     style.dots(panel, x, y, shade, label=outcome)
                 else:

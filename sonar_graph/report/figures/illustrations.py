@@ -208,10 +208,8 @@ def _instead(comparison: Comparison, drawing: Drawing) -> str:
 
 def _captions(comparison: Comparison) -> dict[str, str]:
     """Captions that depend on the comparison."""
-    is_repeated, world = (
-        repeats_published(comparison.sequence),
-        ALIGNED if comparison.is_aligned else unaligned(comparison.sequence),
-    )
+    is_repeated = repeats_published(comparison.sequence)
+    world = ALIGNED if comparison.is_aligned else unaligned(comparison.sequence)
     counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
     factor = enlargement(comparison)
     as_large = "" if factor == 1 else f", drawn {factor} times as large"
@@ -232,7 +230,8 @@ def _captions(comparison: Comparison) -> dict[str, str]:
         run.landmarks is not None and len(run.landmarks) for run in comparison.runs
     )
     landmarks = f" Ellipses hold 95 %{as_large}."
-    gone, far = paths_cut_off(comparison), error_figures.errors_cut_off(comparison)
+    gone = paths_cut_off(comparison)
+    far = error_figures.errors_cut_off(comparison)
     return {
         "map": (
             f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)}"

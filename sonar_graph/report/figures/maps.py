@@ -49,7 +49,8 @@ def map_figure(comparison: Comparison) -> Figure | None:
     view = view if factor == 1 else with_room(view)
     figure, axes = style.blank_panels(1, 1, (style.width_in(), style.width_in()))
     panel: Axes = axes[0, 0]
-    truth, true_landmarks = comparison.sequence.truth, true_landmarks_drawn(comparison)
+    truth = comparison.sequence.truth
+    true_landmarks = true_landmarks_drawn(comparison)
     if truth is not None and len(truth):
         look: dict[str, Any] = {
             "color": style.TRUTH,
@@ -251,7 +252,8 @@ def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
 
 def growth_figure(comparison: Comparison) -> Figure | None:
     """A row a run, a column a time: causal path until then, landmarks with ellipses as known then."""
-    view, runs = map_view(comparison), _runs_with_maps(comparison)
+    view = map_view(comparison)
+    runs = _runs_with_maps(comparison)
     if view is None or not runs:
         return None
     view = with_room(view)
@@ -265,7 +267,8 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     for row, (index, run) in enumerate(runs):
         for column, stamp_ns in enumerate(stamps_ns.tolist()):
             panel: Axes = axes[row, column]
-            own, truth = style.colour(index), comparison.sequence.truth
+            own = style.colour(index)
+            truth = comparison.sequence.truth
             _draw_until(
                 panel,
                 stamp_ns,
@@ -327,7 +330,8 @@ def grown_at(comparison: Comparison) -> Ints:
 
 def enlargement(comparison: Comparison) -> int:
     """The factor by which ellipses are enlarged, so that they can be seen and do not cover each other."""
-    view, grown_ns = map_view(comparison), grown_at(comparison)
+    view = map_view(comparison)
+    grown_ns = grown_at(comparison)
     sigmas = [
         np.sqrt(np.linalg.eigvalsh(cov).max())
         for _, run in _runs_with_maps(comparison)

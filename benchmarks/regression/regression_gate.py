@@ -2,29 +2,43 @@
 
 The same suite is run before and after a change. Runs are paired by log, contestant and seed, and each pair gives a log
 ratio: ``ln(new / old)`` of errors, and ``|ln(new)| - |ln(old)|`` of the normalised squared error (1 is consistent).
-`sonar_graph.batch.permutation` tests the ratios of each contestant and column, on a log and on all logs together: a
+`permutation` tests the ratios of each contestant and column, on a log and on all logs together: a
 batch in which nothing truly got worse fails with 5 % probability. A run that fails now and did not before is worse
 without a test. Single runs, and logs with few cases, are reported but fail no batch: of two draws from one
 distribution, the second has the worst run as often as the first. Method: docs/theory/batch_statistics.md.
+
+Write the reference, then judge later batches by it. Exit code 0: passed, 1: worse, 2: nothing could be judged::
+
+    python benchmarks/regression/regression_gate.py bless results reference.json
+    python benchmarks/regression/regression_gate.py judge later reference.json --strict
 """
 
+import argparse
 import json
 import math
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch import permutation
-from sonar_graph.batch.recorded import (
+sys.path.append(str(Path(__file__).resolve().parent))
+import permutation
+
+from sonar_graph.batch import (
     ALL_LOGS,
+    GOING_ON,
+    KINDS,
     RecordedBatch,
     RecordedRun,
-    require_complete,
+    metrics_of,
+    read_batch,
 )
-from sonar_graph.batch.result_table import KINDS, is_timing, metrics_of
-from sonar_graph.errors import EvaluationError
+from sonar_graph.batch.result_table import is_timing
+from sonar_graph.cli.outputs import writable_json
+from sonar_graph.errors import EvaluationError, SonarGraphError
 from sonar_graph.files import read_json, write_json
 from sonar_graph.measurements import Floats
 
@@ -172,7 +186,7 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
     content = read_json(reference)
     if content.get("format") != FORMAT:
         raise EvaluationError(
-            f"{reference}: format is {content.get('format')!r}, expected {FORMAT!r}; make it again with bench bless, "
+            f"{reference}: format is {content.get('format')!r}, expected {FORMAT!r}; make it again with bless, "
             "from a batch run with the code that it stands for"
         )
     blessed: dict[Name, dict[str, Any]] = {
@@ -193,7 +207,8 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
     pairs: list[Pair] = []
     ratios: permutation.Ratios = {}
     for name, entry in blessed.items():
-        run, scores = runs[name], entry["scores"]
+        run = runs[name]
+        scores = entry["scores"]
         seed = "" if run.seed is None else f"seed {run.seed}: "
         if entry["status"] == "ok" and not run.ended:
             worsenings.append(
@@ -210,7 +225,8 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
                 Worsening(run.log, run.contestant, ", ".join(lost), explanation)
             )
         for column in columns:
-            old, new = scores.get(column, math.inf), run.value(column)
+            old = scores.get(column, math.inf)
+            new = run.value(column)
             if math.isfinite(old) and math.isfinite(new):
                 pairs.append(Pair(run, column, old, new))
                 case = run.log if run.seed is None else run.seed
@@ -263,7 +279,8 @@ def check_comparable(entry: dict[str, Any], run: RecordedRun, path: Path) -> Non
 
     Raises `EvaluationError` with run, field and both values.
     """
-    before, now = _flat(entry["asked"]), _flat(asked_of(run))
+    before = _flat(entry["asked"])
+    now = _flat(asked_of(run))
     for field in sorted(before | now):
         if (field in before, before.get(field)) != (field in now, now.get(field)):
             raise EvaluationError(
@@ -291,7 +308,8 @@ def _value(fields: dict[str, Any], field: str) -> str:
 def log_ratios(old: Floats, new: Floats, column: str) -> Floats:
     """Log ratios of new to old scores, shape (n,); above 0 is worse."""
     least = np.finfo(float).tiny
-    old_log, new_log = np.log(np.maximum(old, least)), np.log(np.maximum(new, least))
+    old_log = np.log(np.maximum(old, least))
+    new_log = np.log(np.maximum(new, least))
     if column in CONSISTENCY_KEYS:
         return np.asarray(np.abs(new_log) - np.abs(old_log))
     return np.asarray(new_log - old_log)
@@ -371,7 +389,8 @@ def standing_out(pairs: list[Pair], ratios: permutation.Ratios) -> list[str]:
         "the reference"
         for name, (_, pair) in sorted(farthest.items(), key=lambda one: -one[1][0])
     ]
-    known, have_test = {name[:2] for name in farthest}, permutation.testable(ratios)
+    known = {name[:2] for name in farthest}
+    have_test = permutation.testable(ratios)
     most: dict[
         tuple[str, str], tuple[float, int, str]
     ] = {}  # the column that is up most
@@ -391,3 +410,106 @@ def standing_out(pairs: list[Pair], ratios: permutation.Ratios) -> list[str]:
         "here, which no test judges"
         for (log, contestant), (mean, cases, column) in most.items()
     ]
+
+
+def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) -> None:
+    """Raise `EvaluationError` if a planned run was not done; the message has the subject, and what cannot be done."""
+    if batch.missing:
+        raise EvaluationError(
+            f"{subject}: the batch {batch.name!r} cannot {purpose}, {batch.missing_count}; {GOING_ON}"
+        )
+
+
+SHOWN = 10
+"""Most printed lines about single runs that stand out."""
+
+
+def verdict_lines(verdict: GateVerdict) -> list[str]:
+    """Lines of the verdict: worsenings, runs that stand out, and the worsening that the tests could have found."""
+    lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
+    lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
+    if len(verdict.look_at) > SHOWN:
+        lines.append(
+            f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown"
+        )
+    if verdict.new:
+        lines.append(
+            f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}"
+        )
+    if verdict.untested:
+        counted = [f"{name} ({verdict.cases[name]})" for name in verdict.untested]
+        lines.append(
+            f"No test of errors: {', '.join(counted)}: it needs 3 cases, which are seeds, or logs without seeds"
+        )
+    if verdict.unmoved:
+        lines.append(
+            f"Hardly different from the reference: {', '.join(verdict.unmoved)}"
+        )
+    if verdict.detectable:
+        sizes = []
+        for name, share in verdict.detectable.items():
+            is_found = math.isfinite(share)
+            size = f"about {share:.0%}" if is_found else "more than ten times"
+            sizes.append(f"{size} ({name}, {verdict.cases[name]} cases)")
+        lines.append(
+            f"Would have been found in four of five batches: one error larger on all logs by {', '.join(sizes)}"
+        )
+    return lines
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Bless or judge a batch, print the outcome, and return the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    blessing = commands.add_parser("bless", help="make a batch the reference")
+    judging = commands.add_parser("judge", help="judge a batch by a reference")
+    for command in (blessing, judging):
+        command.add_argument("batch", type=Path, help="folder that bench wrote")
+        command.add_argument("reference", type=Path, help="a file *.json")
+    blessing.add_argument(
+        "--overwrite", action="store_true", help="also replace a file of others"
+    )
+    judging.add_argument(
+        "--strict", action="store_true", help="lines that begin with 'Look at' fail too"
+    )
+    arguments = parser.parse_args(words)
+    try:
+        batch = read_batch(arguments.batch)
+        if arguments.command == "bless":
+            writable_json(
+                arguments.reference,
+                "a reference",
+                [],
+                is_reference,
+                overwrite=arguments.overwrite,
+            )
+            bless(batch, arguments.reference)
+            failed = sum(not run.ended for run in batch.runs)
+            print(
+                f"Reference: {arguments.reference} ({len(batch.runs)} runs, {failed} of which did not end)"
+            )
+            return 0
+        return print_verdict(
+            gate(batch, arguments.reference),
+            arguments.reference,
+            is_strict=arguments.strict,
+        )
+    except (SonarGraphError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def print_verdict(verdict: GateVerdict, reference: Path, *, is_strict: bool) -> int:
+    """Print the verdict, and return 1 if the batch fails; if strict, also if any run stands out."""
+    for line in verdict_lines(verdict):
+        print(line)
+    is_passed = verdict.passed and not (is_strict and verdict.look_at)
+    outcome = "passed" if is_passed else "failed"
+    if is_passed and not verdict.has_test:
+        outcome = "passed, without any test of errors"
+    print(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
+    return 0 if is_passed else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

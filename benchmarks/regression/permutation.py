@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch import ALL_LOGS
 from sonar_graph.measurements import Floats
 
 SIGNIFICANT = 0.05
@@ -175,7 +175,8 @@ def statistics(weights: Floats, scored: Floats, prior: Floats) -> Floats:
     square s₀² of like groups and its weight w, `PRIOR_WEIGHT`.
     """
     present = ~np.isnan(scored)
-    values, n = np.where(present, scored, 0.0), present.sum(axis=0)
+    values = np.where(present, scored, 0.0)
+    n = present.sum(axis=0)
     mean = weights @ values / n
     rest = np.maximum(np.square(values).sum(axis=0) - n * np.square(mean), 0.0)
     return np.asarray(
@@ -245,7 +246,8 @@ def detectable_in(family: Family, number: int, limit: float) -> float:
             1e-300,
         )
     )
-    low, high = 0, len(SHARES)
+    low = 0
+    high = len(SHARES)
     while low < high:  # by bisection, since power grows with the worsening
         middle = (low + high) // 2
         shifted = noise + np.log1p(SHARES[middle]) - limit
