@@ -60,7 +60,7 @@ MOST_WAITING_S = 2.0
 MOST_STEPS_AT_ONCE = 50
 MOST_DURATIONS = 20_000
 WARM_UP = MissionOptions(
-    duration_s=80.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=240.0, dvl_dropout_s=3.0
+    duration_s=30.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=500.0, dvl_dropout_s=3.0
 )
 """Run on which all is compiled, with frames in gaps of the Doppler log."""
 
