@@ -59,6 +59,7 @@ from sonar_graph.diagnosis.start import (
     turned_mounting,
     with_fitted,
 )
+from sonar_graph.diagnosis.start_place import start_place_findings
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import gravity_warning, stuck_quantities
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
@@ -432,6 +433,9 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
     # a wrong unit of either makes another height too
     if not any(f.grave for f in found):
         found += fix_height_findings(right)
+    # sensors that are wrong lead elsewhere too
+    if not any(f.grave for f in found):
+        found += start_place_findings(right, motion)
     return found
 
 
