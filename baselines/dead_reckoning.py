@@ -167,7 +167,7 @@ class DeadReckoning:
 
     def landmarks(self) -> LandmarkMap:
         """An empty map."""
-        return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        return LandmarkMap.empty()
 
     def detections(self) -> DetectionLog:
         """Every detection, ignored or unsound."""

@@ -7,13 +7,54 @@ From a log to a report::
     sequence = sg.read_log("dive.mcap")  # IMU, DVL, depth, heading, fixes, detections, truth: those there are
     sequence = sg.recognise("dive.mcap")  # or: with landmarks recognised in its sonar images
     result = sg.run_estimator(sequence, "isam2")  # one estimator
-    comparison = sg.compare(sequence, ["isam2", "ekf-slam", "dead-reckoning"])  # several, on the same measurements
+    comparison = sg.compare(sequence, ["isam2", "ekf-slam", MyFilter])  # several, and your own class
     sg.write_report(comparison, "comparison")  # page, numbers, trajectories, log for viewers
 
 The rooms: `sonar_graph.navigation` (motion from IMU and DVL), `sonar_graph.slam` (models, factors, iSAM2),
 `sonar_graph.sonar` (recognition in images), `sonar_graph.simulation`, `sonar_graph.evaluation` (scores),
 `sonar_graph.testing` (checks for your own estimators and factors). Filters: `baselines.ekf_slam`,
 `baselines.invariant_ekf`, `baselines.dead_reckoning`.
+
+Names
+-----
+Read and write
+    ``read_log``            measurements of an MCAP log, as a `Sequence`
+    ``recognise``           the same, with landmarks recognised in the sonar images of the log
+    ``inspect_log``         contents of a log, and what is wrong with it
+    ``write_log``           a sequence as an MCAP log
+    ``simulate_basin``      a simulated run in a basin with four landmarks
+    ``TimeWindow``          part of a log to read
+    ``LogConfig``           topics and fields of a log that are not found by themselves
+Run and compare
+    ``run_estimator``       one estimator on a sequence, as a `RunResult`
+    ``compare``             several estimators on a sequence, as a `Comparison` with scores
+    ``write_report``        page, numbers, trajectories and a log for viewers of a comparison
+    ``run_suite``           many runs from a file, and their tables
+    ``RunResult``           estimates, map, outcomes and times of one run
+    ``Comparison``          runs on one sequence, their scores and errors against the truth
+Measurements
+    ``Sequence``            a run: calibration, measurements, truth
+    ``Calibration``         noise, mountings, start and floor
+    ``Measurements``        measurements of one step, as an estimator receives them
+    ``Imu``                 rows of angular velocity and specific force
+    ``Dvl``                 rows of velocity from the Doppler log
+    ``Depth``               rows of height
+    ``Heading``             rows of yaw
+    ``PositionFixes``       rows of position
+    ``LandmarkDetections``  rows of range, azimuth and identity posterior
+    ``SonarFrames``         sonar images
+An estimator of your own
+    ``Estimator``           the contract: five methods
+    ``Section``             base class of settings
+    ``Odometry``            motion between two instants from IMU and Doppler log, with covariance
+    ``Estimate``            pose and covariance at one instant
+    ``Trajectory``          poses over time
+    ``LandmarkMap``         positions of landmarks
+    ``DetectionLog``        outcomes of detections
+    ``CausalEstimates``     collects estimates, and gives them as a trajectory
+    ``DetectionJournal``    collects outcomes of detections, and gives them as a log
+    ``Outcome``             outcome of one detection, such as ``Outcome.USED``
+    ``load_estimator``      class of an installed estimator
 
 Conventions
 -----------
@@ -83,7 +124,7 @@ from sonar_graph.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from sonar_graph.batch import run_suite
-    from sonar_graph.calibration import Calibration
+    from sonar_graph.calibration import Calibration, Section
     from sonar_graph.estimator import Estimator, load_estimator
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
     from sonar_graph.logs import inspect_log, read_log, write_log
@@ -104,12 +145,22 @@ if TYPE_CHECKING:
     from sonar_graph.report import write_report
     from sonar_graph.sequence import Sequence
     from sonar_graph.simulation import simulate_basin
-    from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+    from sonar_graph.states import (
+        CausalEstimates,
+        DetectionJournal,
+        DetectionLog,
+        Estimate,
+        LandmarkMap,
+        Outcome,
+        Trajectory,
+    )
 
 __all__ = [
     "Calibration",
+    "CausalEstimates",
     "Comparison",
     "Depth",
+    "DetectionJournal",
     "DetectionLog",
     "Dvl",
     "Estimate",
@@ -121,8 +172,10 @@ __all__ = [
     "LogConfig",
     "Measurements",
     "Odometry",
+    "Outcome",
     "PositionFixes",
     "RunResult",
+    "Section",
     "Sequence",
     "SonarFrames",
     "TimeWindow",
@@ -140,8 +193,10 @@ __all__ = [
 ]
 
 
-def at_first_use(package: str) -> Callable[[str], Any]:
-    """``__getattr__`` of a package whose names are imported when they are first used, not with the package.
+def at_first_use(
+    package: str,
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """``__getattr__`` and ``__dir__`` of a package whose names are imported when they are first used (PEP 562).
 
     Its ``__init__`` lists them once, as imports under ``if TYPE_CHECKING``.
     """
@@ -165,8 +220,11 @@ def at_first_use(package: str) -> Callable[[str], Any]:
             f"{package} has no {name!r}; it has: {', '.join(module.__all__)}"
         )
 
-    return find
+    def listed() -> list[str]:
+        return sorted(sys.modules[package].__all__)
+
+    return find, listed
 
 
 if not TYPE_CHECKING:
-    __getattr__ = at_first_use(__name__)
+    __getattr__, __dir__ = at_first_use(__name__)

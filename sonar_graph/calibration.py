@@ -102,7 +102,15 @@ class SectionType(ModelMetaclass):
 
 
 class Section(BaseModel, metaclass=SectionType):
-    """A frozen group of settings that refuses names it does not know."""
+    """A frozen group of settings that refuses names it does not know.
+
+    Examples
+    --------
+    >>> class Params(Section):
+    ...     gate: float = 3.0
+    >>> Params(gate=2).gate
+    2.0
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -6,11 +6,14 @@ An estimator is any class with the methods of `Estimator`, announced by its pack
     [project.entry-points."sonar_graph.estimators"]
     my-filter = "my_package.my_module:MyFilter"
 
-It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.testing.check_estimator` tests the contract.
+It then takes part in ``sonar-graph compare`` under that name. In a program the class itself may stand where a name does,
+and so may a function that makes an estimator. `sonar_graph.testing.check_estimator` tests the contract.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 from sonar_graph.calibration import Calibration, KnownMap, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
@@ -150,12 +153,87 @@ def known_map_of(estimator: Estimator) -> KnownMap:
     return estimator.known_map()
 
 
+MakeEstimator = Callable[[Calibration, MotionSource], Estimator]
+EstimatorChoice = str | type[Estimator] | MakeEstimator
+"""Name of an installed estimator, the class of an estimator, or a function that makes one."""
+Returned = TypeVar("Returned")
+METHODS = ("process", "trajectory", "landmarks", "detections")
+"""Methods of the contract."""
+INSTEAD = {
+    Trajectory: "CausalEstimates keeps what process returned, and Trajectory.from_poses makes one of poses",
+    LandmarkMap: "without landmarks return LandmarkMap.empty()",
+    DetectionLog: "DetectionJournal keeps outcomes, and DetectionLog.empty() is one without rows",
+}
+"""Advice to an estimator that returns something else."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An estimator that is to run, with all of its settings."""
+
+    make: Callable[..., Estimator]
+    params: Section | None
+    """None of a function, which makes an estimator with settings of its own."""
+
+    def fresh(self, calibration: Calibration, odometry: MotionSource) -> Estimator:
+        """An estimator that has seen nothing."""
+        settings = () if self.params is None else (self.params,)
+        estimator = self.make(calibration, odometry, *settings)
+        missing = missing_of(estimator, METHODS)
+        if missing:
+            raise EstimatorError(
+                f"what was made is {article(estimator)}, which lacks {missing} of the estimator contract"
+            )
+        return estimator
+
+    def settings(self) -> dict[str, Any]:
+        """Settings as plain values; empty of a function."""
+        return {} if self.params is None else self.params.model_dump(mode="json")
+
+
+def article(value: object) -> str:
+    """Kind of a value in words: ``None``, ``a Pose3``."""
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def missing_of(value: object, names: tuple[str, ...]) -> str:
+    """Those of some attributes that a value lacks, as a text."""
+    return ", ".join(name for name in names if not hasattr(value, name))
+
+
+def returned(value: object, kind: type[Returned], method: str) -> Returned:
+    """A value that a method of an estimator returned; an `EstimatorError` where it is of another kind."""
+    if isinstance(value, kind):
+        return value
+    raise EstimatorError(
+        f"{method} returned {article(value)}, not a {kind.__name__}: {INSTEAD[kind]}"
+    )
+
+
+def returned_estimate(value: object) -> Estimate | None:
+    """A value that `Estimator.process` returned; an `EstimatorError` where it is neither an estimate nor None."""
+    if value is None or isinstance(value, Estimate):
+        return value
+    raise EstimatorError(
+        f"process returned {article(value)}, not an Estimate(stamp_ns, world_T_body, covariance) or None"
+    )
+
+
+def points_by_name() -> dict[str, list[EntryPoint]]:
+    """Entry points of all installed estimators; two where two packages use one name."""
+    found: dict[str, list[EntryPoint]] = {}
+    for point in sorted(
+        entry_points(group=ENTRY_POINT_GROUP), key=lambda one: one.name
+    ):
+        same = found.setdefault(point.name, [])
+        if point.value not in [one.value for one in same]:
+            same.append(point)
+    return found
+
+
 def installed_estimators() -> dict[str, EntryPoint]:
-    """Entry points by name; nothing is imported. Of two with one name the first found wins."""
-    found: dict[str, EntryPoint] = {}
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        found.setdefault(point.name, point)
-    return dict(sorted(found.items()))
+    """Entry points by name; nothing is imported. `load_estimator` refuses a name that two packages use."""
+    return {name: points[0] for name, points in points_by_name().items()}
 
 
 def is_foreign(name: str) -> bool:
@@ -166,13 +244,48 @@ def is_foreign(name: str) -> bool:
     )
 
 
+def name_of(estimator: EstimatorChoice) -> str:
+    """Name of an estimator in results: the one under which it is installed, else that of its class or function.
+
+    Raises
+    ------
+    UnknownEstimatorError
+        When it is neither a name nor a class nor a function, or has no name.
+    EstimatorError
+        When a class does not keep the contract.
+    """
+    if isinstance(estimator, str):
+        return estimator
+    own = getattr(estimator, "__name__", "")
+    if isinstance(estimator, type):
+        missing = missing_of(estimator, ("Params", *METHODS))
+        if missing:
+            raise EstimatorError(
+                f"the class {own} lacks {missing} of the estimator contract; see help(sonar_graph.Estimator)"
+            )
+        place = f"{estimator.__module__}:{own}"
+        installed = installed_estimators().items()
+        return next((name for name, point in installed if point.value == place), own)
+    if not callable(estimator):
+        raise UnknownEstimatorError(
+            f"expected the name of an installed estimator, the class of one or a function that makes one, not "
+            f"{estimator!r:.60}; every run makes its own: {' or '.join(map(repr, installed_estimators()))}"
+        )
+    if not own.isidentifier():
+        raise UnknownEstimatorError(
+            "a function that makes an estimator needs a name for the results: "
+            "def my_filter(calibration, odometry): return ..."
+        )
+    return own
+
+
 def load_estimator(name: str) -> type[Estimator]:
     """Class of an installed estimator.
 
     Raises
     ------
     UnknownEstimatorError
-        Listing the names that exist.
+        Listing the names that exist; or the packages, where two bring an estimator of that name.
     EstimatorError
         When its package cannot be imported or does not keep the contract.
 
@@ -182,49 +295,59 @@ def load_estimator(name: str) -> type[Estimator]:
     >>> load_estimator("ekf-slam").__name__
     'EkfSlam'
     """
-    installed = installed_estimators()
-    asked: Any = name
+    asked: object = name
     if not isinstance(asked, str):
-        kind = asked if isinstance(asked, type) else type(asked)
-        same = [
-            own
-            for own, point in installed.items()
-            if point.value == f"{kind.__module__}:{kind.__name__}"
-        ]
-        given = f"the class {kind.__name__}" if kind is asked else f"{asked!r:.60}"
         raise UnknownEstimatorError(
-            f"expected the name of an installed estimator, not {given}; give"
-            f" {' or '.join(map(repr, same or installed))}, or announce your own as sonar_graph.estimator says"
+            f"expected the name of an installed estimator, not {asked!r:.60}"
         )
+    installed = points_by_name()
     if name not in installed:
         known = ", ".join(installed) or "none; reinstall the package"
         raise UnknownEstimatorError(
             f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}"
         )
+    if len(installed[name]) > 1:
+        places = " and ".join(
+            f"{point.dist.name if point.dist else 'a package'} ({point.value})"
+            for point in installed[name]
+        )
+        raise UnknownEstimatorError(
+            f"two packages bring an estimator called {name!r}: {places}; uninstall one, or rename its entry point"
+        )
+    point = installed[name][0]
     try:
-        loaded: Any = installed[name].load()
+        loaded: Any = point.load()
     except (
         Exception,
         SystemExit,
     ) as error:  # a third party's import may fail in any way
-        said = (
+        reason = (
             f"it calls sys.exit({error})"
             if isinstance(error, SystemExit)
             else str(error)
         )
         raise EstimatorError(
-            f"{name} ({installed[name].value}) cannot be loaded: {said}"
+            f"{name} ({point.value}) cannot be loaded: {reason}"
         ) from error
-    missing = [
-        m
-        for m in ("Params", "process", "trajectory", "landmarks", "detections")
-        if not hasattr(loaded, m)
-    ]
+    missing = missing_of(loaded, ("Params", *METHODS))
     if missing:
         raise EstimatorError(
-            f"{name} ({installed[name].value}) lacks {', '.join(missing)} of the estimator contract"
+            f"{name} ({point.value}) lacks {missing} of the estimator contract"
         )
     return loaded
+
+
+def make_candidate(
+    kind: type[Estimator] | MakeEstimator, overrides: dict[str, Any], name: str
+) -> Candidate:
+    """An estimator of this name with some of its settings replaced; `make_params` says how. A function takes none."""
+    if isinstance(kind, type):
+        return Candidate(kind, make_params(kind, overrides, name))
+    if overrides:
+        raise EstimatorError(
+            f"settings of {name}: a function takes none; make the estimator with them in it"
+        )
+    return Candidate(kind, None)
 
 
 def make_params(

@@ -6,6 +6,7 @@ import math
 import reprlib
 from array import array
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import cached_property
@@ -143,19 +144,70 @@ class Trajectory:
         return html_table("Trajectory", ["Quantity", "Value"], rows)
 
     @classmethod
+    def from_poses(
+        cls,
+        stamps_ns: Ints | Iterable[int],
+        poses: Iterable[gtsam.Pose3 | Floats],
+        covariances: Floats | None = None,
+    ) -> Trajectory:
+        """Trajectory through poses in time order.
+
+        Parameters
+        ----------
+        stamps_ns
+            Shape (n,), strictly increasing.
+        poses
+            world_T_body of each stamp: a ``gtsam.Pose3``, or a matrix of shape (4, 4).
+        covariances
+            Of the body-frame perturbation [rotation, translation], shape (n, 6, 6); None: unknown.
+
+        Raises
+        ------
+        MeasurementError
+            When the numbers of stamps, poses and covariances differ.
+
+        Examples
+        --------
+        >>> import gtsam
+        >>> path = Trajectory.from_poses([0, 1_000_000_000], [gtsam.Pose3(), gtsam.Pose3()])
+        >>> len(path), path.has_orientation
+        (2, True)
+        """
+        stamps = np.asarray(list(stamps_ns), dtype=np.int64)
+        n = len(stamps)
+        matrices = np.array(
+            [one.matrix() if isinstance(one, gtsam.Pose3) else one for one in poses],
+            dtype=np.float64,
+        )  # (n, 4, 4)
+        matrices = matrices if len(matrices) else np.empty((0, 4, 4))
+        if matrices.shape != (n, 4, 4):
+            raise MeasurementError(
+                f"Trajectory.from_poses: expected {n} poses, one a stamp, as gtsam.Pose3 or of shape (4, 4); "
+                f"as matrices they have shape {matrices.shape}"
+            )
+        covs = np.full((n, 6, 6), np.nan) if covariances is None else covariances
+        if np.shape(covs) != (n, 6, 6):
+            raise MeasurementError(
+                f"Trajectory.from_poses: expected covariances of shape {(n, 6, 6)}, not {np.shape(covs)}"
+            )
+        R = matrices[:, :3, :3]
+        return cls(
+            stamps_ns=stamps,
+            positions=matrices[:, :3, 3],
+            quaternions_xyzw=Rotation.from_matrix(R).as_quat()
+            if n
+            else np.empty((0, 4)),
+            covariances=np.asarray(covs, dtype=np.float64),
+        )
+
+    @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
         """Trajectory through a list of estimates in time order."""
         n = len(estimates)
-        rotations = np.array([e.world_T_body.rotation().matrix() for e in estimates])
-        return cls(
-            stamps_ns=np.fromiter((e.stamp_ns for e in estimates), np.int64, n),
-            positions=np.array(
-                [e.world_T_body.translation() for e in estimates]
-            ).reshape(n, 3),
-            quaternions_xyzw=Rotation.from_matrix(rotations.reshape(n, 3, 3)).as_quat()
-            if n
-            else np.empty((0, 4)),
-            covariances=np.array([e.covariance for e in estimates]).reshape(n, 6, 6),
+        return cls.from_poses(
+            [estimate.stamp_ns for estimate in estimates],
+            [estimate.world_T_body for estimate in estimates],
+            np.array([estimate.covariance for estimate in estimates]).reshape(n, 6, 6),
         )
 
     @classmethod
@@ -238,7 +290,16 @@ class Trajectory:
 
 
 class CausalEstimates:
-    """Causal estimates of a filter in order of time, one an instant."""
+    """Causal estimates of a filter in order of time, one an instant: its `trajectory`.
+
+    Examples
+    --------
+    >>> import gtsam, numpy as np
+    >>> estimates = CausalEstimates()
+    >>> estimates.keep(Estimate(stamp_ns=0, world_T_body=gtsam.Pose3(), covariance=1e-6 * np.eye(6)))
+    >>> len(estimates.trajectory())
+    1
+    """
 
     def __init__(self) -> None:
         self._estimates: list[Estimate] = []
@@ -273,6 +334,11 @@ class LandmarkMap:
     """In the world, shape (m, 3), metres."""
     covariances: Floats
     """Shape (m, 3, 3), m²; NaN where unknown."""
+
+    @classmethod
+    def empty(cls) -> LandmarkMap:
+        """Map of no landmarks."""
+        return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -313,7 +379,13 @@ class LandmarkMap:
 
 
 class Outcome(StrEnum):
-    """Outcome of a detection in an estimator."""
+    """Outcome of a detection in an estimator.
+
+    Examples
+    --------
+    >>> Outcome.GATED.value
+    'refused: innovation outside the gate'
+    """
 
     USED = "used"
     NEW = "new landmark"
@@ -363,6 +435,11 @@ class DetectionLog:
     outcomes: list[Outcome]
     """Length n."""
 
+    @classmethod
+    def empty(cls) -> DetectionLog:
+        """Log of an estimator that was given no detections."""
+        return DetectionJournal().log()
+
     def __len__(self) -> int:
         return len(self.outcomes)
 
@@ -400,7 +477,15 @@ class RefusedRow(NamedTuple):
 
 
 class DetectionJournal:
-    """Growing `DetectionLog` of an estimator, as columns of numbers: 73 bytes a row in logs of hours."""
+    """Growing `DetectionLog` of an estimator, as columns of numbers: 73 bytes a row in logs of hours.
+
+    Examples
+    --------
+    >>> journal = DetectionJournal()
+    >>> row = journal.record(0, landmark_id=3, outcome=Outcome.IGNORED)
+    >>> journal.log()
+    DetectionLog(1 IGNORED)
+    """
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")

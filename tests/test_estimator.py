@@ -1,18 +1,30 @@
+import re
 from importlib.metadata import EntryPoint
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
+from baselines.dead_reckoning import DeadReckoning
 from sonar_graph import estimator as module
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.errors import (
+    EstimatorError,
+    SonarGraphError,
+    UnknownEstimatorError,
+)
 from sonar_graph.estimator import (
     Estimator,
     installed_estimators,
     load_estimator,
     make_params,
 )
-from sonar_graph.evaluation import compare, run_estimator
+from sonar_graph.evaluation import (
+    compare,
+    read_comparison,
+    run_estimator,
+    write_comparison,
+)
 from sonar_graph.navigation import Odometry
 from sonar_graph.testing import small_world
 
@@ -90,26 +102,127 @@ def test_protocol_is_told_apart_by_its_methods():
     assert not isinstance(OnlyTrajectory(), Estimator)
 
 
-def test_a_class_or_an_instance_in_the_place_of_a_name_is_answered_with_its_name():
-    kind = load_estimator("ekf-slam")
+class Silent(Nothing):
+    """Keeps the contract in name: every method returns nothing."""
+
+    def __init__(self, calibration, odometry, params=None): ...
+
+
+class Asleep(DeadReckoning):
+    """Never has an estimate."""
+
+    def process(self, measurements):
+        super().process(measurements)
+
+
+class NoMap(DeadReckoning):
+    """Returns nothing where an empty map belongs."""
+
+    def landmarks(self): ...
+
+
+class Tuples(DeadReckoning):
+    """Returns a pose where an estimate belongs."""
+
+    def process(self, measurements):
+        return (measurements.end_ns, None)
+
+
+def tilted(calibration, odometry):
+    """Dead reckoning with a setting of its own."""
+    return DeadReckoning(calibration, odometry, DeadReckoning.Params())
+
+
+def test_classes_and_functions_stand_where_names_do():
+    found = compare(
+        small_world(),
+        ["dead-reckoning", tilted],
+        {"dead-reckoning": {"gravity_interval_s": 2.0}},
+    )
+    assert [(run.estimator, run.status) for run in found.runs] == [
+        ("dead-reckoning", "ok"),
+        ("tilted", "ok"),
+    ]
+    assert found.runs[0].params == {"gravity_interval_s": 2.0}
+    assert found.runs[1].params == {}
+    class_run = run_estimator(small_world(), DeadReckoning)
+    named_run = run_estimator(small_world(), "dead-reckoning")
+    assert class_run.estimator == "dead-reckoning"  # under which it is installed
+    np.testing.assert_array_equal(
+        class_run.causal.positions, named_run.causal.positions
+    )
+    own = run_estimator(small_world(), NoSetting, {"gravity_interval_s": 3.0})
+    assert (own.estimator, own.params) == ("NoSetting", {"gravity_interval_s": 3.0})
+
+
+class NoSetting(DeadReckoning):
+    """An estimator of another name."""
+
+
+def test_what_is_no_estimator_is_refused_before_anything_runs():
+    instance = DeadReckoning(Calibration(), Odometry(Calibration()))
     for asked, said in (
-        (kind, "not the class EkfSlam; give 'ekf-slam', or announce"),
+        ([instance], "a function that makes one, not <.*DeadReckoning object"),
+        ([None], "a function that makes one, not None"),
+        ([{"isam2": {}}], "a function that makes one, not {'isam2'"),
+        ([OnlyTrajectory], "OnlyTrajectory lacks process, landmarks, detections of"),
+        ([lambda *_: instance], "needs a name for the results"),
+        (["dead-reckoning", DeadReckoning], "more than once: dead-reckoning"),
+        ("isam2", r"estimators is a list: give \['isam2'\]"),
+        (DeadReckoning, r"estimators is a list: give \[DeadReckoning\]"),
         (
-            kind(Calibration(), Odometry(Calibration())),
-            "not <.*EkfSlam object.*; give 'ekf-slam', or",
+            {"isam2": {}, "ekf-slam": {}},
+            r"give \['isam2', 'ekf-slam'\], and settings after it",
         ),
-        (Nothing, "not the class Nothing; give 'dead-reckoning' or 'ekf-slam' or"),
-        (None, "not None; give 'dead-reckoning'"),
+        (7, r"give \[\"isam2\"\], not 7"),
     ):
-        for run in (
-            lambda name: run_estimator(small_world(), name),
-            lambda name: compare(small_world(), [name]),
-        ):
-            with pytest.raises(
-                UnknownEstimatorError,
-                match=f"expected the name of an installed estimator, {said}",
-            ):
-                run(asked)
+        with pytest.raises(SonarGraphError, match=said):
+            compare(small_world(), asked)
+    with pytest.raises(EstimatorError, match="settings of tilted: a function takes no"):
+        compare(small_world(), [tilted], {"tilted": {"gravity_interval_s": 2.0}})
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (Silent, "process never returned an estimate"),
+        (Asleep, "process never returned an estimate"),
+        (NoMap, r"landmarks\(\) returned None, .* return LandmarkMap.empty\(\)"),
+        (Tuples, "process returned a tuple, not an Estimate"),
+        (lambda *_: None, "what was made is None, which lacks process, trajectory"),
+    ],
+)
+def test_what_an_estimator_does_not_return_is_the_reason_of_its_failure(kind, said):
+    kind.__name__ = getattr(kind, "__name__", "").strip("<>").replace("lambda", "none")
+    run = run_estimator(small_world(), kind)
+    assert run.status == "failed"
+    assert re.search(said, run.reason), run.reason
+
+
+def test_a_missing_score_is_answered_with_those_that_exist(tmp_path):
+    comparison = compare(small_world(), ["dead-reckoning"])
+    write_comparison(comparison, tmp_path)
+    for one in (comparison, read_comparison(tmp_path)):
+        with pytest.raises(KeyError, match=r"did you mean causal.ate_raw_m\?"):
+            _ = one.scores["dead-reckoning"]["causal.ate_raw"]
+        with pytest.raises(KeyError, match="'isam2'; there are: dead-reckoning"):
+            _ = one.scores["isam2"]
+
+
+def test_two_packages_that_bring_one_name_are_named(monkeypatch):
+    points = [
+        EntryPoint("mine", "one.filter:A", module.ENTRY_POINT_GROUP),
+        EntryPoint("mine", "other.filter:B", module.ENTRY_POINT_GROUP),
+    ]
+    monkeypatch.setattr(module, "entry_points", lambda group: points if group else [])
+    with pytest.raises(
+        UnknownEstimatorError, match=r"one.filter:A\) and a package \(other.filter:B"
+    ):
+        compare(small_world(), ["mine"])
+
+
+def test_settings_that_are_no_dict_are_refused():
+    kind = load_estimator("ekf-slam")
     for settings, said in (
         ("gain=2", 'not str; give {"name": value}'),
         (kind.Params(), r"give params.model_dump\(\)"),

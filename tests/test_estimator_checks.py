@@ -381,3 +381,35 @@ def test_what_is_no_covariance_is_refused(covariance, complaint):
     require_covariance(np.zeros((6, 6)), 6, "P")
     with pytest.raises(ContractError, match=complaint):
         require_covariance(covariance, 6, "P")
+
+
+class Silent(PlainDeadReckoning):
+    """Returns nothing at all."""
+
+    def process(self, measurements): ...
+    def trajectory(self): ...
+    def landmarks(self): ...
+    def detections(self): ...
+
+
+class Strict(PlainDeadReckoning):
+    """Needs a Doppler log in every step."""
+
+    def process(self, measurements):
+        len(measurements.dvl)
+        return super().process(measurements)
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (Silent, r"trajectory\(\) returned None, not a Trajectory: CausalEstimates"),
+        (
+            Strict,
+            r"TypeError: .*NoneType.* \(test_estimator_checks.py, line \d+\); any block",
+        ),
+    ],
+)
+def test_the_true_cause_is_named(broken: Any, said: str) -> None:
+    with pytest.raises(ContractError, match=said):
+        check_estimator(broken)

@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import re
 import subprocess
 import sys
 import tomllib
@@ -221,6 +222,26 @@ def test_names_that_are_imported_at_first_use_are_those_that_are_listed(
     }
     assert listed == set(module.__all__)
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+@pytest.mark.parametrize(
+    "package",
+    ["sonar_graph", "sonar_graph.devices", "sonar_graph.logs", "sonar_graph.report"],
+)
+def test_completion_and_help_offer_exactly_the_public_names(package: str) -> None:
+    module = import_module(package)
+    assert dir(module) == sorted(module.__all__)
+
+
+def test_help_of_the_front_door_has_a_line_for_each_public_name() -> None:
+    text = str(sonar_graph.__doc__)
+    described = re.findall(r"^    ``(\w+)`` {2,}\S", text, re.MULTILINE)
+    names, units = text.split("\nConventions\n")
+    assert "read_log" not in units
+    assert sorted(re.findall(r"^    ``(\w+)`` {2,}\S", names, re.MULTILINE)) == sorted(
+        sonar_graph.__all__
+    )
+    assert len(described) > len(sonar_graph.__all__)  # frames and units have theirs
 
 
 def test_reading_a_log_loads_no_compiler_and_no_plots() -> None:

@@ -42,7 +42,7 @@ def with_map(dive: Sequence, known: KnownMap | None, start: Start | None = None)
 
 def run(kind: type, dive: Sequence, rate_hz: float = 2.0):
     """The estimator after the dive, and its causal estimates by stamp."""
-    estimator = make_estimator(kind, dive.calibration, None)
+    estimator = make_estimator(kind, dive.calibration)
     told = {}
     for window in dive.replay(dive.instants(rate_hz)):
         told[window.end_ns] = estimator.process(window)

@@ -1,5 +1,6 @@
 """The tutorials run as they stand, and what they print is true."""
 
+import ast
 import json
 import os
 import re
@@ -317,6 +318,28 @@ def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulate
     )
     np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-9)
     np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_programs_on_the_page_of_your_own_script_are_short_and_find_the_landmarks(
+    tmp_path,
+):
+    page = (TUTORIALS.parent / "howto" / "own_estimator.md").read_text("utf-8")
+    programs = blocks(page, "python")
+    for program, most in zip(programs, (20, 30, 40), strict=True):
+        assert len([line for line in program.splitlines() if line.strip()]) <= most
+    simulate = re.findall(r"^    sonar-graph (simulate .*)$", page, re.MULTILINE)[0]
+    output(tmp_path, "sonar-graph", *simulate.split())
+    scored, graph, compared = (
+        output(tmp_path, "python", "-W", "error", "-c", program) for program in programs
+    )
+    assert number_after(scored, "isam2: position error") < 0.1
+    assert (tmp_path / "comparison" / "report.html").is_file()
+    for landmark, true in TRUE_LANDMARKS.items():
+        found = ast.literal_eval(graph.splitlines()[-1])[landmark]
+        np.testing.assert_allclose(found[:2], true, atol=0.1)
+    for name in ("MyEkf", "ekf-slam", "isam2"):
+        assert number_after(compared, rf"'{name}': '") < 0.3
 
 
 def test_first_page_makes_a_sequence_a_report_and_a_log_from_arrays(tmp_path):

@@ -202,7 +202,7 @@ def run(
     changes = {"map": known, "start": start or one.sequence.calibration.start}
     calibration = one.sequence.calibration.model_copy(update=changes)
     sequence = replace(one.sequence, calibration=calibration)
-    estimator = make_estimator(load_estimator(name), calibration, None)
+    estimator = make_estimator(load_estimator(name), calibration)
     found = []
     for window in sequence.replay(sequence.instants(2.0)):
         estimate = estimator.process(window)

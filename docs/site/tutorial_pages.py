@@ -23,8 +23,9 @@ HEADING = re.compile(r"(?P<number>\d+)\. (?P<title>[^.:]+)[.:] ")
 
 
 def page_of_script(path: Path) -> str | None:
-    """The page of a tutorial; None of other files."""
-    return f"tutorials/{path.stem}.md" if path in TUTORIALS.glob("[0-9]*.py") else None
+    """The page of a tutorial that is a program or a notebook; None of other files."""
+    programs = {*TUTORIALS.glob("[0-9]*.py"), *TUTORIALS.glob("[0-9]*.ipynb")}
+    return f"tutorials/{path.stem}.md" if path in programs else None
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -75,9 +75,7 @@ graph.push_back(factors.floor_prior(L(1), landmark[2], sigma_m=0.01))
 for index in (1, 2):
     q = values.atPose3(X(index)).compose(sonar_mounting).transformTo(landmark)
     z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])])
-    sighting = factors.landmark_sighting(
-        X(index), L(1), sonar_mounting, z, noise, robust=lambda model: model
-    )
+    sighting = factors.landmark_sighting(X(index), L(1), sonar_mounting, z, noise)
     for factor in sighting.values():
         graph.push_back(factor)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import shutil
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,13 +21,17 @@ from sonar_graph.cli.arguments import (
 )
 from sonar_graph.cli.outputs import working
 from sonar_graph.errors import LogError
-from sonar_graph.files import COMPARISON, interrupt_event, result_written, write_json
+from sonar_graph.files import interrupt_event, write_json
 
 if TYPE_CHECKING:
+    import threading
+
     from sonar_graph.live import Publisher
 
 RECORD = "record.mcap"
 COUNTS = "live.json"
+REMIND_S = 10.0
+"""Time between two lines of a log that waits to be played."""
 SETTLE_S = 1.0
 """Time for subscribers to find all topics, and to get the last messages."""
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
@@ -93,19 +99,14 @@ def live(
 ) -> None:
     """Estimate while the robot moves: topics of ROS 2 over zenoh in, poses and landmarks out, and a record.
 
-    Writes DIR/record.mcap: everything that came, from which `run` gives the same estimates, bit for bit; at the end
-    what `run` writes, and live.json with numbers of messages.
+    A line each second has the time, the position with its sigmas, rates, landmarks, drops and latency. Writes
+    DIR/record.mcap: everything that came, from which `run` gives the same estimates, bit for bit; at the end, after
+    Ctrl-C, what `run` writes, report.html among it, and live.json with numbers of messages.
     """
     import numpy as np
 
     from sonar_graph.diagnosis import compared
-    from sonar_graph.evaluation import (
-        RunResult,
-        check_request,
-        judge,
-        write_comparison,
-        write_viewer_files,
-    )
+    from sonar_graph.evaluation import RunResult, check_request, judge
     from sonar_graph.live import (
         DEFAULT_ROUTER,
         LiveOptions,
@@ -116,7 +117,7 @@ def live(
         recorded_messages,
     )
     from sonar_graph.logs import LiveRecord, read_log
-    from sonar_graph.report import doubt_lines
+    from sonar_graph.report import doubt_lines, write_report
 
     reading = ReadingOptions(
         calibration=calibration, topics=topics, log_config=log_config
@@ -145,10 +146,13 @@ def live(
     ):
         output.mkdir(parents=True, exist_ok=True)
         outlets = open_outlets(link, foxglove)
-        echo("compiling what the estimator needs")
+        screen = StatusLine()
+        echo("compiling what the estimator needs; nothing is awaited until then")
         with (
             LiveRecord(record) as written,
-            LiveRun(written, link.definition_of, options, outlets, echo) as run,
+            LiveRun(
+                written, link.definition_of, options, outlets, screen.say, screen.show
+            ) as run,
         ):
             if resume is not None:
                 last_ns = run.catch_up(
@@ -167,6 +171,7 @@ def live(
             last_s = time.monotonic() + (float("inf") if duration is None else duration)
             while not ended.is_set() and time.monotonic() < last_s:
                 run.turn()
+            screen.end()
             link.stop()
             outcome = run.finish()
     if not run.engine.topics:
@@ -190,13 +195,11 @@ def live(
         update_s=np.array(outcome.update_s),
         finish_s=outcome.finish_s,
     )
-    with working("writing results"):
+    with working("writing results and the page"):
         sequence = read_log(record)
         sequence = compared(sequence, reading.config)
         comparison = judge(sequence, outcome.causal.stamps_ns, [result])
-        with result_written(output, COMPARISON):
-            write_comparison(comparison, output)
-            write_viewer_files(comparison, output)
+        page = write_report(comparison, output)
     echo(
         f"{sum(counts['received'].values())} messages, {sum(counts['lost'].values())} lost"
     )
@@ -207,7 +210,7 @@ def live(
         for name, number in counts[what].items():
             echo(f"{what}: {number} of {name}")
     echo(
-        f"Results: {output}; the same estimates from the record: sonar-graph run {record} -o DIR"
+        f"Results: {page}; the same estimates from the record: sonar-graph run {record} -o DIR"
     )
 
 
@@ -232,13 +235,13 @@ def play(
     ] = None,
     domain: DOMAIN = 0,
     wait: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="Longest time to wait for somebody who listens.",
+            help="Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
         ),
-    ] = 30.0,
+    ] = None,
     after: Annotated[
         Path | None,
         typer.Option(
@@ -264,20 +267,21 @@ def play(
         except LogError as error:
             unknown.add(topic)
             echo(f"not sent: {topic}: {error}")
+    where = ", ".join(connect or [listen])
     with interrupt_event() as ended:
-        last_s = time.monotonic() + wait
-        if wait:
-            echo(f"waiting up to {wait:g} s for somebody who listens")
-        while (
-            not any(one.is_heard for one in publishers.values())
-            and time.monotonic() < last_s
-        ):
-            if ended.wait(0.05):
-                break
+        if wait != 0.0:
+            command = (
+                f"sonar-graph live -o DIR --connect {(connect or [listen])[0]}"
+                f" --domain {domain} --calibration {log}"
+            )
+            wait_for_listener(publishers, command, wait, ended)
         ended.wait(SETTLE_S)
+        if not ended.is_set():
+            for line in unheard_lines(publishers):
+                echo(line)
         while after is not None and not after.exists() and not ended.wait(0.05):
             pass
-        echo(f"playing {log} to {', '.join(connect or [listen])}; Ctrl-C ends")
+        echo(f"playing {log} to {where}; Ctrl-C ends")
         wanted = (
             message
             for message in recorded_messages(log)
@@ -294,6 +298,76 @@ def play(
     echo(
         f"{count} messages of {len(publishers)} topics, the latest {latest_s * 1e3:.0f} ms behind its time"
     )
+
+
+class StatusLine:
+    """Lines of a live run on the terminal; the status of a second replaces that of the second before."""
+
+    def __init__(self) -> None:
+        self._is_terminal = sys.stdout.isatty()
+        self._is_shown = False
+
+    def show(self, status: str) -> None:
+        """Show a status: in its own line, or as a line where the output is no terminal."""
+        if not self._is_terminal:
+            echo(status)
+            return
+        width = shutil.get_terminal_size().columns
+        echo_status(status[: width - 1])
+        self._is_shown = True
+
+    def say(self, line: str) -> None:
+        """Print a line that stays."""
+        self.end()
+        echo(line)
+
+    def end(self) -> None:
+        """Leave the line of the status, which stays as it is."""
+        if self._is_shown:
+            typer.echo()
+        self._is_shown = False
+
+
+def echo_status(status: str) -> None:
+    """Write a status over the line of the terminal."""
+    typer.echo("\r\x1b[2K", nl=False)
+    echo(status, nl=False)
+    sys.stdout.flush()
+
+
+def wait_for_listener(
+    publishers: dict[str, Publisher],
+    command: str,
+    wait_s: float | None,
+    ended: threading.Event,
+) -> None:
+    """Wait until a topic has a subscriber; a `LogError` with the ``command`` of one where none comes in time."""
+    limit = "" if wait_s is None else f" up to {wait_s:g} s (--wait)"
+    echo(f"waiting{limit} for a listener, such as: {command}")
+    begin_s = time.monotonic()
+    next_s = REMIND_S
+    while not any(one.is_heard for one in publishers.values()):
+        waited_s = time.monotonic() - begin_s
+        if wait_s is not None and waited_s > wait_s:
+            raise LogError(
+                f"nobody listened within {wait_s:g} s: start `{command}` in another terminal;"
+                " a longer --wait waits longer, --wait 0 sends at once"
+            )
+        if waited_s > next_s:
+            echo(f"nobody listens yet after {next_s:g} s; `live` compiles first")
+            next_s += REMIND_S
+        if ended.wait(0.05):
+            return
+
+
+def unheard_lines(publishers: dict[str, Publisher]) -> list[str]:
+    """Line with the topics that nobody subscribes to; of topics of static frames zenoh does not know."""
+    unheard = [
+        topic
+        for topic, one in publishers.items()
+        if not one.is_heard and not topic.endswith("_static")
+    ]
+    return [f"nobody listens to {', '.join(unheard)}"] if unheard else []
 
 
 def topics_of(log: Path) -> dict[str, str]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     )
     from sonar_graph.devices.sonar_lenses import DIDSON_BEAMS, aris_azimuths, didson_azimuths, even_azimuths
 else:
-    __getattr__ = at_first_use(__name__)
+    __getattr__, __dir__ = at_first_use(__name__)
 
 __all__ = [
     "DEFAULT_DESIGNS", "DIDSON_BEAMS", "LEAST_BRIGHT_DB", "LandmarkDesign", "OWN_DESIGNS", "UNMEASURED_M_S",

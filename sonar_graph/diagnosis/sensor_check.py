@@ -67,6 +67,7 @@ from sonar_graph.diagnosis.start import (
     turned_mounting,
     with_fitted,
 )
+from sonar_graph.diagnosis.start_place import start_place_findings
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import (
@@ -543,6 +544,9 @@ def motion_findings(
     # a wrong unit of either makes another height too
     if not any(f.grave for f in found):
         found += fix_height_findings(right)
+    # sensors that are wrong lead elsewhere too
+    if not any(f.grave for f in found):
+        found += start_place_findings(right, motion)
     return found
 
 

@@ -17,10 +17,12 @@ import numpy as np
 
 from sonar_graph.diagnosis import compared
 from sonar_graph.errors import ArgumentError, EvaluationError
+from sonar_graph.estimator import EstimatorChoice, name_of
 from sonar_graph.evaluation.aligned import shared_map_instants
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.free_start import with_fitted_truth
 from sonar_graph.evaluation.results import (
+    ByName,
     Comparison,
     ErrorSeries,
     Kind,
@@ -73,7 +75,7 @@ def describe_environment() -> dict[str, str]:
 
 def compare(
     sequence: Sequence,
-    names: list[str],
+    estimators: list[EstimatorChoice] | list[str],
     overrides: dict[str, dict[str, Any]] | None = None,
     *,
     rate_hz: float = 2.0,
@@ -85,10 +87,11 @@ def compare(
 
     Parameters
     ----------
-    names
-        Estimators by the names under which they are installed, each once.
+    estimators
+        Names under which estimators are installed, classes of your own, or functions ``make(calibration, odometry)``
+        that return an estimator; each name once. A class or function gives its results its own name.
     overrides
-        Settings that differ from the defaults, by estimator: ``{"isam2": {"identity.policy": "gate"}}``.
+        Settings that differ from the defaults, by name: ``{"isam2": {"identity.policy": "gate"}}``.
     rate_hz
         Rate at which estimates are asked for, from the start on, Hz.
     progress
@@ -105,7 +108,7 @@ def compare(
     UnknownEstimatorError, EstimatorError
         As in `run_estimator`, before anything runs: mistakes in names and settings. A failed run is a result instead.
     ArgumentError
-        When `sequence` is no `Sequence`, `names` is a single text, or `overrides` is no mapping.
+        When `sequence` is no `Sequence`, `estimators` is no list, or `overrides` is no mapping.
 
     Examples
     --------
@@ -118,16 +121,16 @@ def compare(
     >>> comparison.scores["ekf-slam"]["causal.ate_se2_m"].value < 0.1
     True
     """
-    require_sequence(sequence, "compare(sequence, names)")
-    asked: object = names
-    if isinstance(asked, str):
+    require_sequence(sequence, "compare(sequence, estimators)")
+    if not isinstance(estimators, list | tuple):
         raise ArgumentError(
-            f"compare(sequence, names): names is a list: give [{asked!r}]"
+            f"compare(sequence, estimators): estimators is a list: give {as_list(estimators)}"
         )
+    names = [name_of(one) for one in estimators]
     settings = overrides or {}
     if not isinstance(settings, Mapping):
         raise ArgumentError(
-            f"compare(sequence, names, overrides): expected settings by estimator, such as "
+            f"compare(sequence, estimators, overrides): expected settings by estimator, such as "
             f"{{'isam2': {{'kernel.width': 2.0}}}}, not {type(settings).__name__}"
         )
     if not names:
@@ -143,17 +146,17 @@ def compare(
             f"settings for {', '.join(idle)}, which is not among {', '.join(names)}; "
             f"give them by estimator: {{{names[0]!r}: {{...}}}}"
         )
-    for name in names:
-        check_request(name, settings.get(name))
+    for name, estimator in zip(names, estimators, strict=True):
+        check_request(estimator, settings.get(name))
     sequence = with_doubts(sequence)
     instants_ns = sequence.instants(rate_hz)
     runs = []
-    for name in names:
+    for name, estimator in zip(names, estimators, strict=True):
         told = None if progress is None else partial(progress, name)
         runs.append(
             run_estimator(
                 sequence,
-                name,
+                estimator,
                 settings.get(name),
                 instants_ns=instants_ns,
                 progress=told,
@@ -169,6 +172,19 @@ def with_doubts(sequence: Sequence) -> Sequence:
         if found is not sequence and subject in found.notes:
             LOG.warning("%s: %s: %s", sequence.name, subject, found.notes[subject])
     return found
+
+
+def as_list(given: object) -> str:
+    """Text of the list that a user may have meant who gave something else in its place."""
+    if isinstance(given, Mapping):
+        names = ", ".join(repr(name) for name in given)
+        return (
+            f"[{names}], and settings after it: compare(sequence, [{names}], {{...}})"
+        )
+    if isinstance(given, str):
+        return f"[{given!r}]"
+    name = getattr(given, "__name__", "")
+    return f"[{name}]" if name else f'["isam2"], not {given!r:.60}'
 
 
 def expense(sequence: Sequence) -> str:
@@ -218,15 +234,17 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
     if is_flat:
         sequence = replace(sequence, notes={**sequence.notes, HEIGHTS: NO_HEIGHTS})
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
-    scores: dict[str, dict[str, Score]] = {run.estimator: {} for run in runs}
+    scores: dict[str, dict[str, Score]] = {run.estimator: ByName() for run in runs}
     ended = [run for run in runs if run.status != "failed"]
     for run in ended:
-        own = scores[run.estimator] = resource_scores(run, sequence.duration_s)
+        own = scores[run.estimator]
+        own |= resource_scores(run, sequence.duration_s)
         if run.landmarks is not None:
             own |= landmark_scores(run.landmarks, sequence)
         if run.detections is not None:
             own |= detection_scores(run.detections)
-    comparison = Comparison(sequence, instants_ns, runs, scores, errors, environment)
+    by_name = ByName(scores)
+    comparison = Comparison(sequence, instants_ns, runs, by_name, errors, environment)
     if sequence.truth is None or not len(sequence.truth):
         environment["scored instants"] = (
             "none: the log has no truth, so no trajectory error can be given"

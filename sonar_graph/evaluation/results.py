@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from html import escape
 from importlib import import_module
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.settings import flattened
+from sonar_graph.settings import flattened, suggestion
 from sonar_graph.states import (
     DetectionLog,
     LandmarkMap,
@@ -36,6 +36,18 @@ TOLERATED_FACTOR = 2.0
 """An interval that reaches beyond this factor of 1 is too wide to call a value inside it consistent."""
 MOST_ROWS_NAMED = 5
 """Refused rows of one sensor and reason that are named one by one, and messages of one run that are shown."""
+
+
+Named = TypeVar("Named")
+
+
+class ByName(dict[str, Named]):
+    """Values by name, in which a name that is missing is answered with those that exist."""
+
+    def __missing__(self, name: str) -> NoReturn:
+        raise KeyError(
+            f"{name!r}{suggestion(str(name), self)} there are: {', '.join(self) or 'none'}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +218,7 @@ class Comparison:
     instants_ns: Ints
     runs: list[RunResult]
     scores: dict[str, dict[str, Score]]
-    """By run name, then by key such as ``causal.ate_se2_m``; empty for a failed run."""
+    """By run name, then by key such as ``causal.ate_se2_m``; empty for a failed run. A `KeyError` names those there are."""
     errors: dict[str, dict[Kind, ErrorSeries]]
     """By run name; empty where there is no truth."""
     environment: dict[str, str]

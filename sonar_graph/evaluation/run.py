@@ -17,14 +17,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
 from sonar_graph.estimator import (
+    Candidate,
     Estimator,
+    EstimatorChoice,
+    MakeEstimator,
     is_foreign,
     load_estimator,
-    make_params,
+    make_candidate,
+    name_of,
     refused_rows_of,
+    returned,
+    returned_estimate,
     withheld_of,
 )
 from sonar_graph.evaluation.results import MapSoFar, RunResult
@@ -32,7 +37,13 @@ from sonar_graph.evaluation.scored_instants import kept_map_instants
 from sonar_graph.files import KilledError, OwnProcess, Tell, noticed_interrupts, serve
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
-from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
+from sonar_graph.states import (
+    DetectionLog,
+    Estimate,
+    LandmarkMap,
+    RefusedRow,
+    Trajectory,
+)
 
 Flags = NDArray[np.bool_]
 LOG = logging.getLogger(__name__)
@@ -88,11 +99,9 @@ def check_outcome(
 ) -> None:
     """Refuse results that cannot be scored.
 
-    Raises `EvaluationError` when there is no estimate; the smoothed trajectory is not at the causal one's instants; a
+    Raises `EvaluationError` when the smoothed trajectory is not at the causal one's instants; a
     pose or landmark is not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
     """
-    if not len(causal):
-        raise EvaluationError("process never returned an estimate")
     if not np.array_equal(causal.stamps_ns, smoothed.stamps_ns):
         raise EvaluationError(
             f"trajectory() has {len(smoothed)} instants, not the {len(causal)} for which process returned estimates"
@@ -153,7 +162,7 @@ def _impossible(covs: Floats) -> Flags:
 
 def run_estimator(
     sequence: Sequence,
-    name: str,
+    estimator: EstimatorChoice,
     overrides: dict[str, Any] | None = None,
     *,
     instants_ns: Ints | None = None,
@@ -168,12 +177,14 @@ def run_estimator(
     so that first calls are not counted; time in which numba compiles later is taken off. Only calls of the estimator
     are timed. The map is kept at `kept_map_instants`; asking for it before the end is not timed. The estimator gets a
     copy of the measurements, so that one that changes them does not change those of the next. One of another package
-    runs in a process of its own: what it does to numpy, the working folder or the environment stays there.
+    runs in a process of its own: what it does to numpy, the working folder or the environment stays there. A class or
+    function runs in this process.
 
     Parameters
     ----------
-    name
-        Name under which the estimator is installed.
+    estimator
+        Name under which an estimator is installed; the class of one; or a function ``make(calibration, odometry)``
+        that returns one, for settings that are no numbers. Results have the name of the class or function.
     overrides
         Settings that differ from the estimator's defaults, by dotted name: ``{"identity.policy": "gate"}``.
     instants_ns
@@ -191,9 +202,9 @@ def run_estimator(
     Raises
     ------
     UnknownEstimatorError
-        When no estimator has that name.
+        When no estimator has that name, or two packages bring one.
     EstimatorError
-        When a setting does not exist or does not fit.
+        When a setting does not exist or does not fit, or a class does not keep the contract.
     ArgumentError
         When `sequence` is no `Sequence`, such as the path of a log.
 
@@ -205,46 +216,56 @@ def run_estimator(
     >>> run.status, len(run.causal), run.causal.positions.shape
     ('ok', 20, (20, 3))
     """
-    require_sequence(sequence, "run_estimator(sequence, name)")
+    require_sequence(sequence, "run_estimator(sequence, estimator)")
+    name = name_of(estimator)
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
-    if not is_apart and is_foreign(name):
+    if not is_apart and isinstance(estimator, str) and is_foreign(name):
         return _run_apart(
             _Request(name, overrides or {}, sequence, instants, interim_maps), progress
         )
     try:
-        kind = load_estimator(name)
+        kind = _loaded(estimator)
     except UnknownEstimatorError:
         raise
     except EstimatorError as error:
         return RunResult(name, dict(overrides or {}), "failed", one_line(error))
-    params = make_params(kind, overrides or {}, name)
+    candidate = make_candidate(kind, overrides or {}, name)
     own = copy.deepcopy(sequence)
     replay = _Replay(
-        sequence, list(own.replay(instants)), name, params, interim_maps=interim_maps
+        sequence, list(own.replay(instants)), name, candidate, interim_maps=interim_maps
     )
-    return replay.run(kind, progress)
+    return replay.run(progress)
+
+
+def _loaded(estimator: EstimatorChoice) -> type[Estimator] | MakeEstimator:
+    """Class or function; an `EstimatorError` where an installed estimator cannot be loaded."""
+    return load_estimator(estimator) if isinstance(estimator, str) else estimator
 
 
 def check_request(
-    name: str, overrides: dict[str, Any] | None = None, *, is_apart: bool = False
+    estimator: EstimatorChoice,
+    overrides: dict[str, Any] | None = None,
+    *,
+    is_apart: bool = False,
 ) -> dict[str, Any] | None:
     """All settings of an estimator with some replaced; None where it cannot be loaded, and its run will fail.
 
     Raises for a name or setting that does not exist, as `run_estimator` does, without running anything.
     """
-    if not is_apart and is_foreign(name):
+    name = name_of(estimator)
+    if not is_apart and isinstance(estimator, str) and is_foreign(name):
         with _process() as process:
             try:
                 return _asked(process, _Request(name, overrides or {}), None)
             except KilledError:
                 return None
     try:
-        kind = load_estimator(name)
+        kind = _loaded(estimator)
     except UnknownEstimatorError:
         raise
     except EstimatorError:
         return None
-    return make_params(kind, overrides or {}, name).model_dump(mode="json")
+    return make_candidate(kind, overrides or {}, name).settings()
 
 
 @dataclass(frozen=True)
@@ -351,14 +372,14 @@ class _Replay:
         sequence: Sequence,
         steps: list[Measurements],
         name: str,
-        params: Section,
+        candidate: Candidate,
         *,
         interim_maps: bool,
     ) -> None:
         self._sequence = sequence
         self._steps = steps
         self._name = name
-        self._params = params
+        self._candidate = candidate
         self._estimates: list[Estimate] = []
         self._update_s: list[float] = []
         ends_ns = np.array([step.end_ns for step in steps], dtype=np.int64)
@@ -369,24 +390,20 @@ class _Replay:
         self._stage = "at the start"
         self._check_interrupt: Callable[[], None]
 
-    def run(
-        self, kind: type[Estimator], progress: Callable[[int, int], None] | None
-    ) -> RunResult:
+    def run(self, progress: Callable[[int, int], None] | None) -> RunResult:
         """Everything from construction to the final map."""
         with noticed_interrupts() as self._check_interrupt:
-            result = self._run(kind, progress)
+            result = self._run(progress)
             self._check_interrupt()
             return result
 
-    def _run(
-        self, kind: type[Estimator], progress: Callable[[int, int], None] | None
-    ) -> RunResult:
-        self._warm_up(kind)
+    def _run(self, progress: Callable[[int, int], None] | None) -> RunResult:
+        self._warm_up()
         self._check_interrupt()
         memory = PeakMemory()
         estimator = None
         try:
-            estimator = self._fresh(kind)
+            estimator = self._fresh()
             self._process(estimator, progress)
             return self._finish(estimator, memory)
         except (
@@ -405,14 +422,14 @@ class _Replay:
                 "failed", reason, **told, peak_memory_mb=memory.rise_mb()
             )
 
-    def _fresh(self, kind: type[Estimator]) -> Estimator:
+    def _fresh(self) -> Estimator:
         """The estimator, with an odometry of its own."""
         # loads numba, which a result does not need
         from sonar_graph.navigation.map_start import make_estimator
 
-        return make_estimator(kind, self._sequence.calibration, self._params)
+        return make_estimator(self._candidate.fresh, self._sequence.calibration)
 
-    def _warm_up(self, kind: type[Estimator]) -> None:
+    def _warm_up(self) -> None:
         """Let an estimator that is thrown away compile its code, until landmarks were seen again."""
 
         def is_named(
@@ -429,7 +446,7 @@ class _Replay:
         with contextlib.suppress(
             Exception, SystemExit
         ):  # what fails here fails again below, where it is reported
-            estimator = self._fresh(kind)
+            estimator = self._fresh()
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
                 estimator.process(copy.deepcopy(step))
                 self._check_interrupt()
@@ -451,6 +468,7 @@ class _Replay:
             estimate = estimator.process(given)
             self._update_s.append(time.perf_counter() - compiling_s() - before)
             self._check_interrupt()
+            estimate = returned_estimate(estimate)
             if estimate is not None and estimate.stamp_ns != end_ns:
                 raise EvaluationError(
                     f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns"
@@ -458,7 +476,10 @@ class _Replay:
             if estimate is not None:
                 self._estimates.append(estimate)
                 if end_ns in self._map_at_ns:
-                    self._maps.append(MapSoFar(end_ns, estimator.landmarks()))
+                    landmarks = returned(
+                        estimator.landmarks(), LandmarkMap, "landmarks()"
+                    )
+                    self._maps.append(MapSoFar(end_ns, landmarks))
             if progress:
                 progress(done, len(self._steps))
 
@@ -473,6 +494,11 @@ class _Replay:
         peak_memory_mb = memory.rise_mb()
         detections = estimator.detections()
         self._stage = "at the end, outcome checked"
+        if not self._estimates:
+            raise EvaluationError("process never returned an estimate")
+        returned(smoothed, Trajectory, "trajectory()")
+        returned(landmarks, LandmarkMap, "landmarks()")
+        returned(detections, DetectionLog, "detections()")
         causal = Trajectory.from_estimates(self._estimates)
         check_outcome(causal, smoothed, landmarks)
         self._maps.append(MapSoFar(int(causal.stamps_ns[-1]), landmarks))
@@ -503,10 +529,9 @@ class _Replay:
         return [*self._sequence.off_the_clock(), *refused_rows_of(estimator)]
 
     def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
-        params = self._params.model_dump(mode="json")
         return RunResult(
             self._name,
-            params,
+            self._candidate.settings(),
             status,
             reason,
             update_s=np.array(self._update_s),

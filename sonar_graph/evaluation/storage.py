@@ -32,6 +32,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import (
+    ByName,
     Comparison,
     ErrorSeries,
     Kind,
@@ -339,17 +340,18 @@ def read_comparison(folder: Path) -> Comparison:
 def _restore(index: dict[str, Any], folder: Path) -> Comparison:
     """The comparison that ``comparison.json`` and the arrays describe."""
     runs: list[RunResult] = []
-    scores: dict[str, dict[str, Score]] = {}
+    scores: dict[str, dict[str, Score]] = ByName()
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     for name, entry in index["runs"].items():
         arrays = _read_arrays(folder / RUNS / name / SERIES)
         runs.append(_restore_run(name, entry, arrays))
-        scores[name] = {
+        restored = {
             key: _SCORE.validate_python(
                 score | ({"value": np.nan} if score["value"] is None else {})
             )
             for key, score in entry["scores"].items()
         }
+        scores[name] = ByName(restored)
         if "errors" in entry:
             series = {
                 kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS

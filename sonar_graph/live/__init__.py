@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sonar_graph.live.predictor import Prediction, Predictor
     from sonar_graph.live.zenoh_link import DEFAULT_ROUTER, Publisher, definition_of, open_session, subscribe
 else:
-    __getattr__ = at_first_use(__name__)
+    __getattr__, __dir__ = at_first_use(__name__)
 
 __all__ = [
     "Arrivals", "DEFAULT_ROUTER", "Engine", "LiveOptions", "LiveRun", "Message", "Prediction", "Predictor", "Publisher",

@@ -33,6 +33,7 @@ from sonar_graph.live.outlets import (
     TOPICS,
     Outlet,
     PoseForms,
+    Status,
     payload_of_detections,
     payload_of_state,
     payloads_of_map,
@@ -60,7 +61,7 @@ MOST_WAITING_S = 2.0
 MOST_STEPS_AT_ONCE = 50
 MOST_DURATIONS = 20_000
 WARM_UP = MissionOptions(
-    duration_s=80.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=240.0, dvl_dropout_s=3.0
+    duration_s=30.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=500.0, dvl_dropout_s=3.0
 )
 """Run on which all is compiled, with frames in gaps of the Doppler log."""
 
@@ -78,6 +79,8 @@ class LiveRun:
         Where messages are sent.
     said
         Called with lines for the user.
+    status
+        Called with the line of each second, which replaces the one before; None: it is not made.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class LiveRun:
         options: LiveOptions,
         outlets: list[Outlet],
         said: Callable[[str], None],
+        status: Callable[[str], None] | None = None,
     ) -> None:
         self.inbox = Inbox()
         self.engine = Engine(
@@ -102,12 +106,12 @@ class LiveRun:
         """Durations of the newest predictions, by the wall clock."""
         self.predict_cpu_s: list[float] = []
         """The same by this thread's own time: what other threads and processes take meanwhile does not count."""
-        self._record, self._options, self._outlets, self._said = (
-            record,
-            options,
-            outlets,
-            said,
-        )
+        self._record = record
+        self._options = options
+        self._outlets = outlets
+        self._said = said
+        self._status = status
+        self._now = Status()
         self._types = wanted_types(options.config or LogConfig(), ROLES)
         self._unused: set[str] = set()
         self._faulty: set[str] = set()
@@ -223,7 +227,7 @@ class LiveRun:
             self._record.flush()
             self._flushed_s = now_s
         if now_s > self._stated_s + STATE_S and self._predictor is not None:
-            self._state()
+            self._state(now_s - self._stated_s)
             self._stated_s = now_s
             motion = {
                 topic for role, topic in self.engine.in_use.items() if role in MOTION
@@ -298,6 +302,8 @@ class LiveRun:
 
     def _move_on(self, parts: list[Part], arrival_ns: int) -> None:
         for part in parts:
+            if part.role == "detections" and part.block is not None and len(part.block):
+                self._now.detected_ns = max(self._now.detected_ns, part.stamp_ns)
             if (
                 self._predictor is None
                 or part.role not in ("imu", "dvl")
@@ -354,6 +360,7 @@ class LiveRun:
         self.predict_cpu_s.append(time.thread_time() - before_cpu_s)
         self.predict_s.append(time.perf_counter() - before_s)
         self._newest_ns = at.stamp_ns
+        self._now.predicted(at)
         self._put("/sonar_graph/odometry", self._forms.odometry(at))
         if at.stamp_ns >= self._next_frame_ns:
             self._next_frame_ns = at.stamp_ns + FRAME_PERIOD_NS
@@ -365,6 +372,9 @@ class LiveRun:
         self._withheld = answer.withheld
         self._longest_update_s = max(self._longest_update_s, answer.update_s)
         self._estimates += len(answer.estimates)
+        self._now.estimates += len(answer.estimates)
+        if answer.landmarks is not None:
+            self._now.landmarks = len(answer.landmarks)
         for estimate in answer.estimates:
             self._put("/sonar_graph/pose", self._forms.estimate(estimate))
         if answer.estimates:
@@ -379,7 +389,8 @@ class LiveRun:
                 self._put("/sonar_graph/landmarks", landmarks)
                 self._put("/sonar_graph/markers", markers)
 
-    def _state(self) -> None:
+    def _state(self, period_s: float) -> None:
+        """Publish the state of the seconds since the last one, and give its line to the user."""
         counts = self.engine.counts
         lost = +(counts.lost + self.inbox.dropped)
         values = {
@@ -404,7 +415,15 @@ class LiveRun:
             "/sonar_graph/state",
             payload_of_state(self._newest_ns, is_well, summary, values),
         )
-        self._latency_ns, self._longest_update_s = 0, 0.0
+        if self._status is not None:
+            line = self._now.line(
+                dropped=counts.dropped.total() + lost.total(),
+                latency_ms=self._latency_ns * 1e-6,
+                period_s=period_s,
+            )
+            self._status(line)
+        self._latency_ns = 0
+        self._longest_update_s = 0.0
         del self.predict_s[:-MOST_DURATIONS], self.predict_cpu_s[:-MOST_DURATIONS]
 
     def _put(self, topic: str, payload: bytes) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from struct import Struct
 from typing import Any, Protocol
@@ -239,6 +240,62 @@ def payload_of_state(
     return encode(struct, 1, said, {"status": 1, "status.values": len(values)})[
         0
     ].tobytes()
+
+
+@dataclass
+class Status:
+    """Numbers of the line that the user sees each second; counts are those since the line before.
+
+    Examples
+    --------
+    >>> Status().line(dropped=0, latency_ms=2.0, period_s=1.0)
+    'no pose yet: it needs rows of IMU and Doppler log'
+    """
+
+    start_ns: int = 0
+    """Stamp of the first prediction."""
+    at: Prediction | None = None
+    """Newest prediction."""
+    predictions: int = 0
+    estimates: int = 0
+    landmarks: int = 0
+    detected_ns: int = 0
+    """Stamp of the newest frame with a detection; 0: none has come."""
+
+    def predicted(self, at: Prediction) -> None:
+        """Count a prediction."""
+        self.start_ns = self.start_ns or at.stamp_ns
+        self.at = at
+        self.predictions += 1
+
+    def line(self, *, dropped: int, latency_ms: float, period_s: float) -> str:
+        """The line, and counts from zero again."""
+        if self.at is None:
+            return "no pose yet: it needs rows of IMU and Doppler log"
+        world_R_body = self.at.world_T_body[:3, :3]
+        of_position = world_R_body @ self.at.covariance[3:, 3:] @ world_R_body.T
+        sigmas_m = np.sqrt(np.diag(of_position))  # (3,), along the world's axes
+        place = ", ".join(
+            f"{axis} {value:.2f} ± {sigma:.2f}"
+            for axis, value, sigma in zip(
+                "xyz", self.at.world_T_body[:3, 3], sigmas_m, strict=True
+            )
+        )
+        age_s = (self.at.stamp_ns - self.detected_ns) / NS_PER_S
+        seen = (
+            f"last seen {age_s:.1f} s ago" if self.detected_ns else "no detection yet"
+        )
+        parts = [
+            f"{(self.at.stamp_ns - self.start_ns) / NS_PER_S:.0f} s",
+            f"{place} m",
+            f"{self.predictions / period_s:.0f} poses/s, {self.estimates / period_s:.0f} estimates/s",
+            f"{self.landmarks} landmarks, {seen}",
+            f"{dropped} dropped",
+            f"latency {latency_ms:.0f} ms",
+        ]
+        self.predictions = 0
+        self.estimates = 0
+        return " | ".join(parts)
 
 
 class ZenohOutlet:

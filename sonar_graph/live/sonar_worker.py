@@ -67,14 +67,15 @@ class _Recogniser:
 
 def warm_recogniser() -> None:
     """Compile what a recogniser needs, on images of noise with a bright spot that moves."""
+    from sonar_graph.devices import DEFAULT_DESIGNS
     from sonar_graph.recognition import RecognitionSession
 
-    world, noise = (
-        simulate_mission(MissionOptions(duration_s=6.0)),
-        np.random.default_rng(0),
-    )
-    session = RecognitionSession(world, pictures=False)
-    ranges_m, azimuths_rad = np.linspace(0.5, 10.0, BINS), np.linspace(1.0, -1.0, BEAMS)
+    world = simulate_mission(MissionOptions(duration_s=6.0))
+    noise = np.random.default_rng(0)
+    # templates of a single design: drawing them takes longer than all that is compiled
+    session = RecognitionSession(world, DEFAULT_DESIGNS[:1], pictures=False)
+    ranges_m = np.linspace(0.5, 10.0, BINS)
+    azimuths_rad = np.linspace(1.0, -1.0, BEAMS)
     for k, stamp_ns in enumerate(world.instants(4.0)[2:]):
         intensity = noise.integers(0, 40, (1, BEAMS, BINS)).astype(np.uint8)
         intensity[0, 40 + k : 46 + k, 200:220] = 250

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sonar_graph.calibration import Calibration
@@ -88,12 +89,13 @@ def serve_estimator() -> None:
 
 def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     if isinstance(request, Begin):
-        from sonar_graph.navigation import Odometry  # loads numba
+        # loads numba
+        from sonar_graph.navigation.map_start import make_estimator
 
         kind = load_estimator(request.name)
         params = make_params(kind, request.overrides, request.name)
-        _Served.estimator = kind(
-            request.calibration, Odometry(request.calibration), params
+        _Served.estimator = make_estimator(
+            partial(kind, params=params), request.calibration
         )
         _Served.estimates, _Served.update_s, _Served.next_map_s = [], [], 0.0
         return READY

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sonar_graph.logs.viewer_messages import PICTURES, Picture, landmark_markers
     from sonar_graph.logs.writing import detection_messages, landmark_map_message, sonar_image_messages, write_log
 else:
-    __getattr__ = at_first_use(__name__)
+    __getattr__, __dir__ = at_first_use(__name__)
 
 __all__ = [
     "Amended", "Assembly", "Choice", "DETECTIONS", "DROPPED_TOPIC", "ImagesAlone", "LATENESS", "LIVE_RATE",

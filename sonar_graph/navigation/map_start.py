@@ -27,9 +27,10 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
-from sonar_graph.calibration import Calibration, KnownMap, Section, Start
+from sonar_graph.calibration import Calibration, KnownMap, Start
 from sonar_graph.estimator import (
     Estimator,
+    MakeEstimator,
     known_map_of,
     newest_landmarks_of,
     refused_rows_of,
@@ -353,12 +354,9 @@ class StartInMap:
     `process` returns None until then.
     """
 
-    def __init__(
-        self, kind: type[Estimator], calibration: Calibration, params: Any
-    ) -> None:
-        self._kind = kind
+    def __init__(self, make: MakeEstimator, calibration: Calibration) -> None:
+        self._make = make
         self._calibration = calibration
-        self._params = params
         self._locator = MapLocator(calibration)
         self._waiting: list[Measurements] = []
         self._inner: Estimator | None = None
@@ -373,7 +371,7 @@ class StartInMap:
         if self._locator.found is None:
             return None
         started = self._calibration.model_copy(update={"start": self._locator.start()})
-        self._inner = self._kind(started, Odometry(started), self._params)
+        self._inner = self._make(started, Odometry(started))
         self._from_ns = measurements.end_ns
         estimate = None
         for each in self._waiting:
@@ -434,10 +432,8 @@ class StartInMap:
         return withheld_of(self._inner)
 
 
-def make_estimator(
-    kind: type[Estimator], calibration: Calibration, params: Section | None
-) -> Any:
+def make_estimator(make: MakeEstimator, calibration: Calibration) -> Any:
     """Estimator with an odometry of its own, which waits for its start where that is to be found in the map."""
     if calibration.start.source == "map":
-        return StartInMap(kind, calibration, params)
-    return kind(calibration, Odometry(calibration), params)
+        return StartInMap(make, calibration)
+    return make(calibration, Odometry(calibration))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sonar_graph.report.rendering import render
     from sonar_graph.report.sentences import doubt_lines, doubtful_lines
 else:
-    __getattr__ = at_first_use(__name__)
+    __getattr__, __dir__ = at_first_use(__name__)
 
 __all__ = [
     "doubt_lines", "doubtful_lines", "lost_told", "missing_told", "published_counterpart", "render", "sensors_told",

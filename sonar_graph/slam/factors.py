@@ -39,6 +39,7 @@ from sonar_graph.models import (
     BIASES,
     COMPASS,
     HUBER_WIDTHS,
+    GaussianKernel,
     Robust,
     body_point_jacobian,
     polar_difference,
@@ -317,10 +318,10 @@ def landmark_sighting(
     body_T_sonar: gtsam.Pose3,
     z: Floats,
     cov: Floats,
-    robust: Robust,
+    robust: Robust | None = None,
     elevation_sigma_rad: float | None = None,
 ) -> dict[str, gtsam.NoiseModelFactor]:
-    """Range and azimuth of a landmark, by their labels in messages.
+    """Range and azimuth of a landmark, by their labels in messages; all of them belong in the graph.
 
     Parameters
     ----------
@@ -328,10 +329,13 @@ def landmark_sighting(
         Sonar in the keyframe's body frame when the frame was taken.
     z, cov
         Range (m) and azimuth (rad), shape (2,), and their covariance, shape (2, 2).
+    robust
+        Kernel as ``RobustKernel().robust()`` gives it; None: Gaussian noise.
     elevation_sigma_rad
         Elevation is N(0, sigma²); None: unknown. Give it once a landmark. Its elevation does not vary between frames as
         noise would, so that repeating it would invent information.
     """
+    robust = robust or GaussianKernel().robust()
     range_m = float(z[0])
     range_sigma_m = math.sqrt(cov[0, 0])
     azimuth_sigma_rad = math.sqrt(cov[1, 1])

@@ -15,17 +15,24 @@ and without: ``check_estimator(MyFilter)``. An estimator that never iterates, su
 data nor simulator.
 """
 
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.estimator import Estimator
+from sonar_graph.errors import EstimatorError
+from sonar_graph.estimator import (
+    Estimator,
+    MakeEstimator,
+    returned,
+    returned_estimate,
+)
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
-from sonar_graph.motion import MotionSource
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
@@ -40,7 +47,6 @@ from sonar_graph.testing.drives import (
     still_world,
 )
 
-MakeEstimator = Callable[[Calibration, MotionSource], Estimator]
 ASK_HZ = 1.0
 SYMMETRY = 1e-9
 """Largest asymmetry or negative eigenvalue of a covariance, relative to its largest entry."""
@@ -104,7 +110,7 @@ def run(
         sequence.instants(ASK_HZ) if instants_ns is None else instants_ns
     )
     for number, step in enumerate(steps, start=1):
-        estimate = estimator.process(step)
+        estimate = returned_estimate(estimator.process(step))
         estimates += [] if estimate is None else [estimate]
         if ask_every and number % ask_every == 0:
             _answer_twice(estimator, estimates)
@@ -117,7 +123,10 @@ def run(
 
 def _answer(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
     return EstimatorRun(
-        estimates, estimator.trajectory(), estimator.landmarks(), estimator.detections()
+        estimates,
+        returned(estimator.trajectory(), Trajectory, "trajectory()"),
+        returned(estimator.landmarks(), LandmarkMap, "landmarks()"),
+        returned(estimator.detections(), DetectionLog, "detections()"),
     )
 
 
@@ -260,12 +269,8 @@ def settings_have_defaults(make: MakeEstimator) -> None:
 
 def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:
     """A fresh estimator has no pose, no landmark and no detection."""
-    estimator = fresh(make, small_world().calibration)
-    sizes = (
-        len(estimator.trajectory()),
-        len(estimator.landmarks()),
-        len(estimator.detections()),
-    )
+    answer = _answer(fresh(make, small_world().calibration), [])
+    sizes = (len(answer.trajectory), len(answer.landmarks), len(answer.detections))
     require(
         sizes == (0, 0, 0),
         f"a fresh estimator has {sizes} poses, landmarks, detections",
@@ -278,7 +283,7 @@ def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
     estimator = fresh(make, world.calibration)
     instants = np.arange(START_NS + NS_PER_S // 4, world.end_ns, NS_PER_S // 4)
     for step in world.replay(instants):
-        estimate = estimator.process(step)
+        estimate = returned_estimate(estimator.process(step))
         if step.end_ns < world.start_ns:
             require(
                 estimate is None, "an estimate is returned before the first DVL sample"
@@ -288,10 +293,6 @@ def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
                 raise ContractError(
                     "nothing is returned although there are IMU and DVL"
                 )
-            require(
-                isinstance(estimate, Estimate),
-                f"{type(estimate).__name__} is returned, not an Estimate",
-            )
             require(
                 estimate.stamp_ns == step.end_ns,
                 f"asked for {step.end_ns}, answered for {estimate.stamp_ns}",
@@ -506,10 +507,16 @@ def check_estimator(make: MakeEstimator) -> None:
     for check in CHECKS:
         try:
             check(make)
-        except ContractError as violation:
+        except (ContractError, EstimatorError) as violation:
             raise ContractError(f"{check.__name__}: {violation}") from violation
         except Exception as error:
-            said = f"{type(error).__name__}: {error}"
-            raise ContractError(
-                f"{check.__name__}: the estimator raised {said}; any block of Measurements may be None"
-            ) from error
+            raise ContractError(f"{check.__name__}: {_cause(error)}") from error
+
+
+def _cause(error: Exception) -> str:
+    """What an estimator raised, and in which line."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(place.filename).name}, line {place.lineno}"
+    is_of_none = "NoneType" in str(error)
+    advice = "; any block of Measurements may be None" if is_of_none else ""
+    return f"the estimator raised {type(error).__name__}: {error} ({where}){advice}"

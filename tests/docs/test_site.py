@@ -36,7 +36,8 @@ LOADED = {
 OPENED = [
     "index.html", "install.html", "quick_start.html", "results.html", "reference/index.html",
     "gallery/index.html", "settings.html", "limits.html", "messages.html",
-    "tutorials/01_first_comparison.html", "tutorials/07_batches.html", "howto/own_estimator.html", "theory/isam2.html",
+    "tutorials/01_first_comparison.html", "tutorials/07_batches.html", "howto/own_estimator.html",
+    "tutorials/12_notebook.html", "theory/isam2.html",
     "theory/metrics.html", "theory/from_the_paper.html", "reference/conventions.html", "reference/sonar_graph.html",
     "reference/sonar_graph.slam.html", "source/CHANGELOG.html", "source/sonar_graph/motion.py.html",
     "CONTRIBUTING.html",

@@ -316,7 +316,7 @@ def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
         ((["offset"], {"ekf": {}}), EvaluationError, "settings for ekf"),
         ((["offset", "nobody"],), UnknownEstimatorError, "nobody"),
         ((["offset"], {"offset": {"colour": 1}}), EstimatorError, "colour"),
-        (("offset",), TypeError, r"names is a list: give \['offset'\]"),
+        (("offset",), TypeError, r"estimators is a list: give \['offset'\]"),
     ],
 )
 def test_mistakes_of_the_user_are_raised_before_anything_runs(

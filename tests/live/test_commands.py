@@ -1,14 +1,20 @@
 """``live`` and ``play`` as commands: mistakes in one line, and a rehearsal with a crash in it."""
 
+import re
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
+from sonar_graph.cli.live import unheard_lines
 from sonar_graph.cli.main import main
+from sonar_graph.live import Prediction
+from sonar_graph.live.outlets import Status
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from tests.live.traffic import free_endpoint
 
@@ -56,6 +62,43 @@ def test_an_estimator_that_does_not_exist_is_refused_at_once(tmp_path, capsys):
     assert not (tmp_path / "dive").exists()
 
 
+def test_a_log_that_nobody_listens_to_is_not_played_away(tmp_path, capsys):
+    log = tmp_path / "log.mcap"
+    write_log(log, simulate_mission(MissionOptions(duration_s=6.0)))
+    where = free_endpoint()
+    code, line = said(capsys, "play", log, "--listen", where, "--wait", "0.2")
+    assert code == 2
+    assert f"start `sonar-graph live -o DIR --connect {where} --domain 0" in line
+    assert "a longer --wait waits longer" in line
+
+
+def test_topics_that_nobody_listens_to_are_named():
+    heard = SimpleNamespace(is_heard=True)
+    unheard = SimpleNamespace(is_heard=False)
+    topics = {"/imu": heard, "/depth": unheard, "/tf_static": unheard}
+    assert unheard_lines(topics) == ["nobody listens to /depth"]
+    assert unheard_lines({"/imu": heard}) == []
+
+
+def test_the_status_has_sigmas_along_the_axes_of_the_world():
+    turned = np.eye(4)
+    turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    turned[:3, 3] = [3.0, -4.0, -1.0]
+    covariance = np.diag([0.0, 0.0, 0.0, 0.25, 0.01, 0.0001])  # ahead, left, up
+    status = Status(landmarks=4, detected_ns=9_500_000_000, estimates=20)
+    for stamp_ns in (2_000_000_000, 10_000_000_000):
+        status.predicted(
+            Prediction(stamp_ns, turned, covariance, np.eye(4), np.zeros(3))
+        )
+    line = status.line(dropped=3, latency_ms=12.4, period_s=2.0)
+    assert line == (
+        "8 s | x 3.00 ± 0.10, y -4.00 ± 0.50, z -1.00 ± 0.01 m | 1 poses/s, 10 estimates/s"
+        " | 4 landmarks, last seen 0.5 s ago | 3 dropped | latency 12 ms"
+    )
+    again = status.line(dropped=3, latency_ms=0.0, period_s=1.0)
+    assert "0 poses/s, 0 estimates/s" in again  # counts are since the line before
+
+
 @pytest.mark.slow
 def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_path):
     """With both ends as commands: play, live, SIGKILL, live --resume, Ctrl-C, run."""
@@ -87,6 +130,9 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     finally:
         player.kill()
     assert live.returncode == 0, output
+    assert re.search(r"\d s \| x .* ± .* landmarks, .* latency \d+ ms", output)
+    assert "report.html" in output
+    assert (tmp_path / "second" / "report.html").is_file()
     subprocess.run(
         [*COMMAND, "run", tmp_path / "second/record.mcap", "-o", tmp_path / "again"],
         check=True,

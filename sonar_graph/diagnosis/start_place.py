@@ -1,0 +1,132 @@
+"""A stated start that the truth or the true landmarks contradict: such as that of a `live` run that came too late.
+
+With the pose of the body at the start (x_0, yaw_0) and the level motion since then (path d, yaw psi, in axes of the body
+at the start), a landmark seen at range r and azimuth a is, as complex numbers of the level plane, at::
+
+    x_0 + exp(i yaw_0) (d + exp(i psi) (l + r cos(e) exp(i a)))        l: place of the sonar on the body
+
+with the elevation e from the heights. Its median distance from the true place over the first sightings is compared with the
+sigmas of the start.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sonar_graph.diagnosis.findings import (
+    ACTING_SIGMAS,
+    IN_CALIBRATION,
+    Finding,
+    Gravity,
+    numbers,
+)
+from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.sequence import Sequence
+
+FARTHEST_M = 0.5
+"""Distance of a start from the truth that a rough survey of both makes."""
+STAMPS_S = 1.0
+"""Error of the truth's stamps that is no error of the start."""
+SEEN_WITHIN_S = 60.0
+"""Time after the start in which sightings of true landmarks count: later the gyros may have turned the path."""
+FEWEST_SIGHTINGS = 5
+SUREST = 0.9
+"""Least probability of the identity of a sighting that counts."""
+
+
+def start_place_findings(right: Sequence, motion: BodyMotion) -> Iterator[Finding]:
+    """Distance of a stated start from the truth or, without one, of the first landmarks from their true places."""
+    start = right.calibration.start
+    if start.source != "stated" or "position_m" not in start.model_fields_set:
+        return
+    by_truth = truth_finding(right, motion)
+    if by_truth is not None:
+        yield by_truth
+        return
+    by_map = map_finding(right, motion)
+    if by_map is not None:
+        yield by_map
+
+
+def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
+    """The truth at the start; None where they agree or the truth begins later."""
+    truth = right.truth
+    begin_ns = right.start_ns
+    if (
+        truth is None
+        or len(truth) < 2
+        or not truth.stamps_ns[0] <= begin_ns <= truth.stamps_ns[-1]
+    ):
+        return None
+    x, y, z = right.calibration.start.position_m
+    true = truth.at(np.array([begin_ns])).positions[0]
+    off_m = float(np.hypot(*(true[:2] - (x, y))))
+    soon = motion.seconds <= motion.seconds[0] + STAMPS_S
+    way_m = float(np.abs(motion.path_m[soon] - motion.path_m[0]).max())
+    sigma_m = sigma_of(right)
+    if off_m <= FARTHEST_M + way_m + ACTING_SIGMAS * sigma_m:
+        return None
+    place = (float(true[0]), float(true[1]), z)
+    return Finding(
+        "start position: distance from the truth",
+        Estimate1D(off_m, sigma_m),
+        "m",
+        cause=f"the truth begins {off_m:.2f} m from the start of the calibration: a log that is joined after its beginning, "
+        "or another world of the truth?",
+        line=f"`start.position_m = {numbers(place, 2)}` {IN_CALIBRATION}",
+        gravity=Gravity.GRAVE,
+    )
+
+
+def map_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
+    """True landmarks as the first sightings place them from the start; None where they agree, or are too few."""
+    seen = right.detections
+    true = right.true_landmarks
+    if seen is None or true is None or not len(true):
+        return None
+    ids, sureness = seen.most_probable()
+    t = motion.since_origin(seen.stamps_ns)
+    begin_s = float(motion.since_origin(np.array([right.start_ns]))[0])
+    counts = seen.are_sound() & (sureness >= SUREST) & np.isin(ids, true.ids)
+    counts &= (t >= begin_s) & (t <= begin_s + SEEN_WITHIN_S)
+    # in a gap the motion is not known
+    counts &= np.isfinite(motion.reference(motion.path_m)(t))
+    if np.count_nonzero(counts) < FEWEST_SIGHTINGS:
+        return None
+    start = right.calibration.start
+    mounting = right.calibration.sonar.mounting.pose()
+    lever = mounting.translation()
+    landmarks = true.positions[np.searchsorted(true.ids, ids[counts])]  # (k, 3)
+    height_m = start.position_m[2] + motion.reference(motion.height_m)(t[counts])
+    down_m = np.nan_to_num(landmarks[:, 2] - height_m - lever[2])
+    range_m = seen.range_m[counts]
+    level_m = np.sqrt(np.maximum(range_m**2 - down_m**2, 0.0))
+    azimuth = seen.azimuth_rad[counts] + mounting.rotation().yaw()
+    on_body = lever[0] + 1j * lever[1] + level_m * np.exp(1j * azimuth)
+    yaw = motion.reference(motion.yaw_rad)(t[counts])
+    since_start = motion.reference(motion.path_m)(t[counts]) + on_body * np.exp(
+        1j * yaw
+    )
+    x, y, _ = start.position_m
+    placed = x + 1j * y + since_start * np.exp(1j * start.rpy_rad[2])
+    off = placed - (landmarks[:, 0] + 1j * landmarks[:, 1])
+    off_m = float(np.median(np.abs(off)))
+    reach_m = float(np.median(np.abs(since_start)))
+    sigma_m = float(np.hypot(sigma_of(right), reach_m * start.rpy_sigma_rad[2]))
+    if not off_m > FARTHEST_M + ACTING_SIGMAS * sigma_m:
+        return None
+    return Finding(
+        "start pose: distance of the first landmarks from the map",
+        Estimate1D(off_m, sigma_m),
+        "m",
+        cause=f"seen from the start of the calibration, landmarks are {off_m:.2f} m from their true places: another start, "
+        "another world of the map, or a log that is joined after its beginning?",
+        line=f"`start.position_m` and `start.rpy_rad` {IN_CALIBRATION}",
+        gravity=Gravity.GRAVE,
+    )
+
+
+def sigma_of(right: Sequence) -> float:
+    """Standard deviation of the stated start's place in the level plane, m."""
+    return float(np.hypot(*right.calibration.start.position_sigma_m[:2]))

@@ -1,0 +1,56 @@
+"""A start that the truth or the true landmarks contradict is grave; one that agrees, or that defines the world, is not."""
+
+from dataclasses import replace
+
+import pytest
+
+from sonar_graph.calibration import Start
+from sonar_graph.diagnosis import check_sensors
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import BasinOptions, simulate_basin
+
+BASIN = simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1))
+PLACE = BASIN.calibration.start.position_m
+YAW_RAD = BASIN.calibration.start.rpy_rad[2]
+
+
+def started(run: Sequence, start: Start) -> Sequence:
+    return replace(run, calibration=run.calibration.model_copy(update={"start": start}))
+
+
+def stated(east_m: float = 0.0, turn_rad: float = 0.0) -> Start:
+    """The right start, moved and turned."""
+    return Start(
+        position_m=(PLACE[0] + east_m, PLACE[1], PLACE[2]),
+        rpy_rad=(*BASIN.calibration.start.rpy_rad[:2], YAW_RAD + turn_rad),
+    )
+
+
+def grave(run: Sequence) -> list[str]:
+    return [finding.quantity for finding in check_sensors(run) if finding.grave]
+
+
+@pytest.mark.parametrize("run", [BASIN, replace(BASIN, truth=None)])
+@pytest.mark.parametrize("start", [stated(), stated(east_m=0.3)])
+def test_a_start_that_agrees_is_not_named(run, start):
+    assert grave(started(run, start)) == []
+
+
+def test_a_start_far_from_the_truth_is_named_with_the_line_that_mends_it():
+    found = check_sensors(started(BASIN, stated(east_m=-2.0)))
+    assert found[0].quantity == "start position: distance from the truth"
+    assert found[0].estimate.value == pytest.approx(2.0, abs=0.05)
+    assert found[0].grave
+    assert "`start.position_m = [" in found[0].line
+
+
+@pytest.mark.parametrize("start", [stated(east_m=2.0), stated(turn_rad=1.2)])
+def test_without_a_truth_the_map_contradicts_a_wrong_start(start):
+    run = started(replace(BASIN, truth=None), start)
+    assert grave(run) == ["start pose: distance of the first landmarks from the map"]
+    assert grave(replace(run, true_landmarks=None)) == []
+
+
+def test_a_start_that_defines_the_world_contradicts_nothing():
+    anywhere = Start(position_m=(0.0, 0.0, PLACE[2]), source="vehicle")
+    assert grave(started(replace(BASIN, truth=None), anywhere)) == []
