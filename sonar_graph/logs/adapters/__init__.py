@@ -5,7 +5,7 @@ from sonar_graph.logs.adapters.adapter import (
     ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES, Adapter, axes_matrix, leaf_fields, turned,
 )
 from sonar_graph.logs.adapters.aiding_messages import GeodeticFields, HeadingAdapter, PositionAdapter
-from sonar_graph.logs.adapters.drivers import SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
+from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.landmark_messages import (
@@ -13,7 +13,7 @@ from sonar_graph.logs.adapters.landmark_messages import (
 )
 from sonar_graph.logs.adapters.landmark_rows import DetectionRowsAdapter, LandmarkRowsAdapter
 from sonar_graph.logs.adapters.log_config import (
-    ADAPTERS, LogConfig, as_log_config, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
+    LogConfig, as_log_config, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
 from sonar_graph.logs.adapters.message_table import LARGEST, Dropped, FieldTable, MessageTable, field_of, header_stamps_ns
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter

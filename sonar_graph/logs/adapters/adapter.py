@@ -3,16 +3,16 @@
 A role is a part that a topic plays: IMU, Doppler log, depth, detections, truth, sonar. Each has one subclass of
 `Adapter` (`vehicle_messages`, `dvl_messages`, `landmark_messages`, `sonar_messages`), whose attributes are field paths
 and conventions. A message type is added without code, as an instance of that subclass: for everybody in
-`drivers.SHIPPED`, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
+``drivers.toml``, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
@@ -164,6 +164,20 @@ class Adapter(Section):
     """Name of the sensor's frame, where the message has none or a wrong one."""
     rotation: Rotation = "flu"
     """Axes of the driver: "flu", "frd", or [roll, pitch, yaw] in degrees of ours_R_driver."""
+
+    def changed(self, table: Mapping[str, Any]) -> Self:
+        """The adapter with the settings of a table in TOML; pydantic's ValidationError where one cannot be."""
+        values = self.model_dump()
+        for key, value in table.items():
+            old = getattr(self, key, None)
+            # false takes away a field, and is a value where a switch is meant
+            if value is False and not isinstance(old, bool):
+                values[key] = None
+            elif isinstance(old, BaseModel) and isinstance(value, Mapping):
+                values[key] = {**old.model_dump(), **value}
+            else:
+                values[key] = value
+        return type(self).model_validate(values)
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have, except for the stamp's."""

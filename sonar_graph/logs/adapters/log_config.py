@@ -18,40 +18,16 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, text_of
 from sonar_graph.logs.adapters.adapter import UNITS, Adapter, leaf_fields
-from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
-from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
-from sonar_graph.logs.adapters.landmark_messages import (
-    DetectionArrayAdapter,
-    LandmarkMapAdapter,
-)
+from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED
 from sonar_graph.logs.adapters.message_table import LOG_TIME, field_of
-from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
-from sonar_graph.logs.adapters.vehicle_messages import (
-    DepthAdapter,
-    ImuAdapter,
-    TruthAdapter,
-)
 from sonar_graph.logs.cdr import Struct, short_name
 from sonar_graph.settings import faults_in, meanings_of, toml_key, toml_value
 
-ADAPTERS: dict[str, type[Adapter]] = {
-    "imu": ImuAdapter,
-    "dvl": DvlAdapter,
-    "depth": DepthAdapter,
-    "heading": HeadingAdapter,
-    "positions": PositionAdapter,
-    "detections": DetectionArrayAdapter,
-    "truth": TruthAdapter,
-    "true_landmarks": LandmarkMapAdapter,
-    "sonar": SonarAdapter,
-}
-"""Adapter of each role, for types that are not shipped."""
 Table = Mapping[str, Any]
 
 
@@ -141,18 +117,8 @@ class LogConfig:
             bases = [ADAPTERS[role].model_construct(type=type_name)]
         found = []
         for base in bases:
-            values = base.model_dump()
-            for key, value in {**table, "type": type_name}.items():
-                old = getattr(base, key, None)
-                # false takes away a field, and is a value where a switch is meant
-                if value is False and not isinstance(old, bool):
-                    values[key] = None
-                elif isinstance(old, BaseModel) and isinstance(value, Mapping):
-                    values[key] = {**old.model_dump(), **value}
-                else:
-                    values[key] = value
             try:
-                found.append(type(base).model_validate(values))
+                found.append(base.changed({**table, "type": type_name}))
             except ValidationError as error:
                 # a type that is not shipped needs all of its fields
                 is_incomplete = any(
