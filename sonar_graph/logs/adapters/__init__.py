@@ -15,14 +15,16 @@ from sonar_graph.logs.adapters.landmark_rows import DetectionRowsAdapter, Landma
 from sonar_graph.logs.adapters.log_config import (
     LogConfig, as_log_config, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
-from sonar_graph.logs.adapters.message_table import LARGEST, Dropped, FieldTable, MessageTable, field_of, header_stamps_ns
+from sonar_graph.logs.adapters.message_table import (
+    LARGEST, LAST_S, Dropped, FieldTable, MessageTable, field_of, header_stamps_ns,
+)
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter, body_to_ros
 
 __all__ = [
     "ADAPTERS", "ANGLES", "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter",
     "DetectionRowsAdapter", "Dropped", "DvlAdapter", "FORCES", "FieldTable", "GeodeticFields", "HeadingAdapter",
-    "ImuAdapter", "LARGEST", "LENGTHS", "LandmarkMapAdapter", "LandmarkRowsAdapter", "LogConfig", "MessageTable",
+    "ImuAdapter", "LARGEST", "LAST_S", "LENGTHS", "LandmarkMapAdapter", "LandmarkRowsAdapter", "LogConfig", "MessageTable",
     "Origin", "PRESSURES", "PositionAdapter", "RATES", "Refused", "SAMPLE_TYPES", "SHIPPED", "SPEEDS", "Shipped",
     "SonarAdapter", "TIMES", "TRUTH_WORDS", "TruthAdapter", "Z_DOWN_TYPES", "as_log_config", "axes_matrix", "body_to_ros",
     "changes_text", "detection_warnings", "east_north_up", "field_of", "header_stamps_ns", "leaf_fields", "plain_lines",

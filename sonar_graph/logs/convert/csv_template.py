@@ -21,15 +21,16 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import (
     ANGLES,
     FORCES,
+    LAST_S,
     LENGTHS,
     PRESSURES,
     RATES,
     SPEEDS,
     TIMES,
+    plain_lines,
 )
 from sonar_graph.logs.convert.csv_evidence import (
     FEWEST_ROWS,
-    LAST_S,
     UNITS,
     VALIDITY,
     is_absent,
@@ -41,7 +42,7 @@ from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, is_date, plain_
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import toml_value
 
-_FORMS: tuple[dict[str, str], ...] = tuple(
+_FORMS: tuple[dict[str, Any], ...] = tuple(
     encoding | decimal
     for encoding in ({}, {"encoding": "cp1252"}, {"encoding": "utf-16"})
     for decimal in ({}, {"decimal": ","})
@@ -53,6 +54,8 @@ _TIMES = (
 )
 """Names of columns of the time, the likeliest first."""
 _NOT_MEASURED = r"(set_?point|desired|demand|command|cmd|err|error|std|sigma|var|cov|bias|uncertainty)(_|$)"
+TUM_COLUMNS = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""Columns of a trajectory as `write_tum` writes it."""
 _DEPTHS = ("height", "pressure")
 _LISTS = ("ids", "probabilities")
 """Keys with a column for each candidate."""
@@ -502,7 +505,7 @@ class _Match:
 def _file(path: Path) -> tuple[CsvFile, list[str]]:
     """A file read in the form in which most cells of its first row have values, and the lines that state it."""
     # a file that no form fits keeps the error of the usual form
-    best: tuple[int, CsvFile, dict[str, str]] | None = None
+    best: tuple[int, CsvFile, dict[str, Any]] | None = None
     fault: LogError | None = None
     for form in _FORMS:
         if best:
@@ -521,7 +524,20 @@ def _file(path: Path) -> tuple[CsvFile, list[str]]:
             best = (count, file, form)
     if best is None:
         raise fault or LogError(f"{path}: holds no table")
-    return best[1], [f"{key} = {toml_value(value)}" for key, value in best[2].items()]
+    _, file, stated = best
+    if _is_tum(file):
+        stated = stated | {"columns": TUM_COLUMNS}
+        file = CsvFile(path, CsvForm.model_validate(stated))
+    return file, plain_lines(stated)
+
+
+def _is_tum(file: CsvFile) -> bool:
+    """True for poses without a header in the format of TUM, whose last four numbers are a unit quaternion."""
+    if file.layout.is_named or len(file.layout.names) != len(TUM_COLUMNS):
+        return False
+    quaternions = np.column_stack(file.numbers("5", "6", "7", "8"))
+    lengths = np.linalg.norm(quaternions, axis=1)
+    return bool((np.abs(lengths - 1.0) < 1e-3).all())
 
 
 def _stamps(
