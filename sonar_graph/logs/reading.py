@@ -653,23 +653,20 @@ def _counts(dropped: Dropped) -> str:
     return ", ".join(f"{count} {fault}" for fault, count in dropped.items())
 
 
-OF_RECORDING = (
-    ', or take the time of recording with stamp = "log" under [imu] and [dvl]'
-)
+OF_RECORDING = ' The time of recording is stamp = "log" under [imu] and [dvl].'
 
 
 def require_use(file: str, imu: Imu, dvl: Dvl, advice: str = "") -> None:
     """Refuse an IMU and a Doppler log without common time, or without a row of velocity in all directions.
 
-    ``advice``: words for the end of the refusal, on what else can be done about the times.
+    ``advice``: a sentence on what else can be done about the times.
     """
     if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(
         imu.stamps_ns[-1], dvl.stamps_ns[-1]
     ):
         raise LogError(
             f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit?"
-            f"{_likely_unit(imu, dvl)} "
-            f"See stamp, stamp_unit_s and stamp_offset_s of the log configuration{advice}"
+            f"{_likely_unit(imu, dvl) or advice} See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
         )
     if is_partial(dvl).all():
         raise LogError(

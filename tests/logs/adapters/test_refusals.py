@@ -84,7 +84,7 @@ REFUSALS: dict[str, Refusal] = {
         "", r"nothing for dvl: no .*--topic dvl=/twist_0.*`sonar-graph inspect .* --toml` begins"),
     "no common time": (
         [imu(ROWS), ("/dvl", "marine_acoustic_msgs/msg/Dvl", LATER)], "",
-        r'IMU from .* DVL from .*no common time; .* See stamp, stamp_unit_s and stamp_offset_s .*stamp = "log" under'),
+        r'IMU from .* DVL from .*no common time; .*stamp = "log" under .* See stamp, stamp_unit_s and stamp_offset_s'),
     "stamps of a boot in microseconds": (
         [imu(ROWS), STAMPED], STAMPED_TABLE + 'stamp = "time"',
         r'no common time; .* Perhaps stamp_unit_s = "us" under \[dvl\]'),
