@@ -23,13 +23,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.errors import LogError
-from sonar_graph.files import replacing
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
-from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS
+from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS, write_text
 from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing, stamped
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
@@ -305,12 +303,7 @@ def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
         (FOXGLOVE_SUFFIX, layout),
         (RVIZ_SUFFIX, rviz_config(layers, scene)),
     ):
-        path = result.with_suffix(suffix)
-        try:
-            with replacing(path) as partial:
-                partial.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise LogError(f"{path} cannot be written: {error.strerror}") from error
+        write_text(result.with_suffix(suffix), text)
 
 
 def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from sonar_graph.logs.adapters.message_table import (
     FieldTable,
     MessageTable,
     field_of,
+    share,
 )
 from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
@@ -104,15 +105,19 @@ TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 UNITS = RATES | FORCES | SPEEDS | LENGTHS | PRESSURES | ANGLES | TIMES
 
 
+def did_you_mean(name: str, known: Iterable[str], form: str = "{}") -> str:
+    """Question about a misspelt name, for the middle of a refusal; empty where no known one is close."""
+    close = get_close_matches(name, list(known), 1)
+    return f"did you mean {form.format(close[0])}? " if close else ""
+
+
 def _from_units(units: Mapping[str, float]) -> BeforeValidator:
     """Validator that takes the name of a unit for its factor."""
 
     def factor(value: object) -> object:
         if isinstance(value, str) and value not in units:
-            close = get_close_matches(value, units, 1)
-            meant = f"did you mean {close[0]}? " if close else ""
             raise ValueError(
-                f"{meant}expected a factor or one of the units {', '.join(units)}"
+                f"{did_you_mean(value, units)}expected a factor or one of the units {', '.join(units)}"
             )
         return units[value] if isinstance(value, str) else value
 
@@ -301,10 +306,10 @@ class CovarianceFields(PathSection):
         matrices = self._matrices(table)
         # a negative first element and zeros alone are a driver's ways to send no covariance
         is_stated = (matrices[:, 0, 0] >= 0) & matrices.any(axis=(1, 2))
-        count = np.count_nonzero(_is_impossible(matrices) & is_stated)
-        if count:
+        is_none = _is_impossible(matrices) & is_stated
+        if is_none.any():
             yield (
-                f"{', '.join(self.fields)}: no covariance in {count} of {len(table)} messages, since some direction's "
+                f"{', '.join(self.fields)}: no covariance in {share(is_none)} messages, since some direction's "
                 f"variance is negative or an axis' is zero: the calibration's noise is taken there"
             )
 
@@ -338,6 +343,11 @@ class CovarianceFields(PathSection):
         # of a pose the translation comes first
         side = 3 if column.shape[1] == 9 else 6
         return column.reshape(-1, side, side)[:, :3, :3]
+
+
+def variances(fields: CovarianceFields | None, table: FieldTable) -> Floats:
+    """Variances of all rows, shape (n,); NaN: unknown."""
+    return fields.read_variance(table) if fields else np.full(len(table), np.nan)
 
 
 def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from pydantic import ValidationError
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, text_of
-from sonar_graph.logs.adapters.adapter import UNITS, Adapter, leaf_fields
+from sonar_graph.logs.adapters.adapter import UNITS, Adapter, did_you_mean, leaf_fields
 from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED
 from sonar_graph.logs.adapters.message_table import LOG_TIME, field_of
 from sonar_graph.logs.cdr import Struct, short_name
@@ -153,11 +152,9 @@ class LogConfig:
                     )
                 if is_absent:
                     # a misspelt field is the usual fault
-                    similar = get_close_matches(path, known, 1)
-                    suggestion = f"did you mean {similar[0]}? " if similar else ""
                     names = ", ".join(name + size for name, size in known.items())
                     faults.append(
-                        f"{key}: {definition.name} has no field {path}; {suggestion}it has: {names}"
+                        f"{key}: {definition.name} has no field {path}; {did_you_mean(path, known)}it has: {names}"
                     )
             if not faults:
                 return
@@ -206,13 +203,18 @@ def read_log_config(path: Path) -> LogConfig:
 
     A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
     """
+    return LogConfig.parse(read_toml(path), str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file; a LogError where it cannot be read, or is not TOML."""
     try:
-        values = tomllib.loads(text_of(Path(path)))
+        return tomllib.loads(text_of(path))
     except OSError as error:
-        raise LogError(f"{path} cannot be read: {error.strerror}") from error
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
+    # the parser recurses into nested arrays
     except (ValueError, RecursionError) as error:
         raise LogError(f"{path}: not TOML: {error}") from error
-    return LogConfig.parse(values, str(path))
 
 
 def as_log_config(value: LogConfig | str | Path | None, call: str) -> LogConfig | None:

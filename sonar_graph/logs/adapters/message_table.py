@@ -176,6 +176,11 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
     ).astype(np.int64)
 
 
+def share(has_it: NDArray[np.bool_]) -> str:
+    """How many of some rows have a fault, such as "3 of 20"."""
+    return f"{np.count_nonzero(has_it)} of {len(has_it)}"
+
+
 def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
     """Mask of rows in which some column has a value that is not finite or larger than `LARGEST`, shape (n,)."""
     return ~np.all(
