@@ -97,6 +97,8 @@ def csv(
     for subject, heading in (("csv.left_out", "left out"), ("csv.warnings", "warning")):
         if subject in sequence.notes:
             echo(f"{heading}: {sequence.notes[subject]}", err=True)
+    # the log states this start from now on, as if its owner had
+    echo(f"start: {sequence.notes['log.start']}", err=True)
     for finding in doubts(sequence, LogConfig()):
         if finding.quantity.endswith(": unit"):
             echo(

@@ -7,6 +7,7 @@ configuration that it begins makes, read back unchanged, the same choices (docs/
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Never
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from sonar_graph.logs.roles import (
     as_window,
     choose_each,
     refusal,
+    refuse_unknown,
     require_topics,
     wanted_types,
 )
@@ -195,6 +197,7 @@ def inspect_log(
     topics: Mapping[str, str] | None = None,
     window: Window | None = None,
     calibration: Calibration | PartialCalibration | str | Path | None = None,
+    **unknown: Never,
 ) -> LogSummary:
     """Summarise an MCAP file; faults of the log become part of the summary.
 
@@ -216,7 +219,7 @@ def inspect_log(
         When there is no such file, it is not MCAP, `config` names fields that the messages do not have, or `topics` one
         that is not in the log.
     ArgumentError
-        When an argument is of another kind.
+        When an argument is of another kind, or does not exist.
 
     See Also
     --------
@@ -240,6 +243,7 @@ def inspect_log(
     " gravity is felt along +y (9.81 m/s2) instead of the body's +z"
     """
     call = "inspect_log"
+    refuse_unknown(unknown, call)
     path = as_path(path, f"{call}(path)")
     config = as_log_config(config, call) or LogConfig()
     given = as_calibration(calibration, call)

@@ -8,7 +8,7 @@ was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md
 import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, spelt
 from sonar_graph.logs.adapters import (
+    TIMES,
     Adapter,
     DepthAdapter,
     Dropped,
@@ -62,6 +63,7 @@ from sonar_graph.logs.roles import (
     Window,
     as_window,
     choose_topics,
+    refuse_unknown,
     require_topics,
     wanted_types,
 )
@@ -126,6 +128,7 @@ def read_log(
     window: Window | None = None,
     salvage: bool = False,
     progress: Progress | None = None,
+    **unknown: Never,
 ) -> Sequence:
     """Read a log of ROS 2 messages as a `Sequence`.
 
@@ -169,7 +172,7 @@ def read_log(
     CalibrationError
         When the calibration in the file is invalid, or becomes so by `calibration`, or that file cannot be read.
     ArgumentError
-        When an argument is of another kind, such as a list of topics.
+        When an argument is of another kind, such as a list of topics, or does not exist.
 
     See Also
     --------
@@ -191,6 +194,7 @@ def read_log(
     'imu: /imu/data; dvl: /dvl/data; ...'
     """
     call = "read_log"
+    refuse_unknown(unknown, call)
     path = as_path(path, f"{call}(path)")
     given = as_calibration(calibration, call)
     part = as_window(window, call)
@@ -492,7 +496,7 @@ class Assembly:
                 raise self._useless(role)
         imu = blocks["imu"]
         dvl = blocks["dvl"]
-        require_use(str(self._recording.path), imu, dvl)
+        require_use(str(self._recording.path), imu, dvl, OF_RECORDING)
         from sonar_graph.logs.measured_start import (  # compiles
             is_whole,
             with_measured_start,
@@ -664,21 +668,40 @@ def _counts(dropped: Dropped) -> str:
     return ", ".join(f"{count} {fault}" for fault, count in dropped.items())
 
 
-def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
-    """Refuse an IMU and a Doppler log without common time, or without a row of velocity in all directions."""
+OF_RECORDING = ' The time of recording is stamp = "log" under [imu] and [dvl].'
+
+
+def require_use(file: str, imu: Imu, dvl: Dvl, advice: str = "") -> None:
+    """Refuse an IMU and a Doppler log without common time, or without a row of velocity in all directions.
+
+    ``advice``: a sentence on what else can be done about the times.
+    """
     if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(
         imu.stamps_ns[-1], dvl.stamps_ns[-1]
     ):
         raise LogError(
-            f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "
-            '`stamp = "log"` under [imu] or [dvl] in the log configuration takes the times of recording; see '
-            "stamp_unit_s and stamp_offset_s too"
+            f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit?"
+            f"{_likely_unit(imu, dvl) or advice} See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
         )
     if is_partial(dvl).all():
         raise LogError(
             f"{file}: DVL: too few valid beams in all {len(dvl)} rows; at least one row needs three, for a velocity in "
             f"all directions"
         )
+
+
+def _likely_unit(imu: Imu, dvl: Dvl) -> str:
+    """Question about the unit of the sensor that lasts a thousand, million or milliard times as long as the other."""
+    imu_ns = int(np.ptp(imu.stamps_ns))
+    dvl_ns = int(np.ptp(dvl.stamps_ns))
+    shorter_ns = min(imu_ns, dvl_ns)
+    longer = "imu" if imu_ns > dvl_ns else "dvl"
+    for unit in ("ms", "us", "ns"):
+        # the two last about as long as each other where the unit is right
+        ratio = max(imu_ns, dvl_ns) * TIMES[unit] / max(shorter_ns, 1)
+        if 0.1 < ratio < 10.0:
+            return f' Perhaps stamp_unit_s = "{unit}" under [{longer}].'
+    return ""
 
 
 def _span(rows: Block) -> str:

@@ -269,6 +269,27 @@ def as_window(value: Window | None, call: str) -> TimeWindow | None:
     )
 
 
+_IN_PYTHON = {
+    "log_config": "config",
+    "topic": "topics",
+    "start": "window",
+    "end": "window",
+}
+"""Arguments of functions by the options of the commands."""
+
+
+def refuse_unknown(unknown: Mapping[str, object], call: str) -> None:
+    """Refuse arguments that a function does not have; those called like an option of a command are named."""
+    for name in unknown:
+        meant = _IN_PYTHON.get(name)
+        advice = (
+            f"; `--{name.replace('_', '-')}` of the commands is {meant}="
+            if meant
+            else ""
+        )
+        raise ArgumentError(f"{call} has no argument {name}={advice}")
+
+
 def require_roles(wanted: Mapping[str, str]) -> None:
     """Refuse topics that are chosen for roles that do not exist."""
     if unknown := wanted.keys() - ROLES.keys():

@@ -68,7 +68,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         seconds, nanoseconds = divmod(abs(stamp_ns), NS_PER_S)
         stamp = f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
         lines.append(_LINE % (stamp, *pose))
-    _write(path, "".join(lines))
+    write_text(path, "".join(lines))
 
 
 def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
@@ -95,10 +95,11 @@ def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
         f"{i},{','.join(map(repr, row))}"
         for i, row in zip(landmarks.ids.tolist(), numbers, strict=True)
     ]
-    _write(path, "\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")
 
 
-def _write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole, or not at all; a LogError where it cannot be written."""
     try:
         with replacing(Path(path)) as partial:
             partial.write_text(text, encoding="utf-8")

@@ -6,7 +6,7 @@ correlations); an ellipsoid marker looks the same in all of them. A viewer can s
 
 Without a layout, viewers open with every topic switched off. `write_layouts` writes one for Foxglove and Lichtblick
 and one for RViz 2, with a camera, a grid and lines that fit the result. A new kind of topic needs an entry in
-`foxglove_layout` and in ``templates/rviz.jinja`` (docs/tutorials/03_viewers.md).
+``templates/foxglove.jinja`` and in ``templates/rviz.jinja`` (docs/tutorials/03_viewers.md).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,13 +23,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.errors import LogError
-from sonar_graph.files import replacing
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
-from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS
+from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS, write_text
 from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing, stamped
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
@@ -217,11 +214,6 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
 PATH = "nav_msgs/msg/Path"
 FOXGLOVE_SUFFIX = ".foxglove.json"
 RVIZ_SUFFIX = ".rviz"
-_PLOTS = {
-    "Plot!height": ("pose.pose.position.z", ("/pose", "/ground_truth/odometry")),
-    "Plot!variance": ("pose.covariance[0]", ("/pose",)),
-}
-"""Field of each plot, and endings of the topics of which it is shown."""
 
 
 @dataclass(frozen=True)
@@ -311,89 +303,22 @@ def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
         (FOXGLOVE_SUFFIX, layout),
         (RVIZ_SUFFIX, rviz_config(layers, scene)),
     ):
-        path = result.with_suffix(suffix)
-        try:
-            with replacing(path) as partial:
-                partial.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise LogError(f"{path} cannot be written: {error.strerror}") from error
+        write_text(result.with_suffix(suffix), text)
 
 
 def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     """Layout that Foxglove and Lichtblick import: a 3D view, with plots over time and pictures beside it."""
-    template = files("sonar_graph.logs").joinpath("templates", "foxglove.json")
-    layout: dict[str, Any] = json.loads(template.read_text(encoding="utf-8"))
-    panels = layout["configById"]
-    view = panels["3D!result"]
-    view["topics"] = {}
-    for layer in layers:  # the 3D panel does not draw Odometry
-        colour = layer.css(1)
-        settings: dict[str, dict[str, Any]] = {
-            PATH: {
-                "type": "line",
-                "lineWidth": scene.line_m,
-                "gradient": [colour, colour],
-            },
-            MARKER_ARRAY: {},
-            POSE_WITH_COVARIANCE: {
-                "type": "axis",
-                "axisScale": scene.axis_m,
-                "showCovariance": False,
-            },
-            POINT_CLOUD: {"pointSize": 6, "colorMode": "flat", "flatColor": colour},
-        }
-        if layer.type_name in settings:
-            view["topics"][layer.topic] = {"visible": layer.is_shown} | settings[
-                layer.type_name
-            ]
-    view["cameraState"] |= {"distance": scene.camera_m, "targetOffset": scene.centre_m}
-    view["cameraState"] |= {
-        "near": round(scene.size_m / 1000, 4),
-        "far": 100 * scene.size_m,
-    }
-    view["scene"]["transforms"] |= {
-        "axisScale": scene.axis_m,
-        "labelSize": round(scene.text_height_m / 2, 3),
-    }
-    x_m, y_m, _ = scene.centre_m
-    grid = {
-        "size": scene.cells * scene.cell_m,
-        "divisions": scene.cells,
-        "position": [x_m, y_m, 0],
-    }
-    view["layers"]["grid"] |= grid
-    for panel, (field, endings) in _PLOTS.items():
-        panels[panel]["paths"] = [
-            {
-                "value": f"{layer.topic}.{field}",
-                "enabled": True,
-                "timestampMethod": "headerStamp",
-                "label": layer.topic.split("/")[1],
-                "color": layer.css(1),
-                "showLine": True,
-                "lineSize": 1,
-            }
-            for layer in layers
-            if layer.topic.endswith(endings)
-        ]
-    if pictures := [
-        layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE
-    ]:
-        panel = "Image!pictures"
-        beside = layout["layout"]
-        panels[panel] = {"imageMode": {"imageTopic": pictures[0]}}
-        plots = beside["second"]
-        beside["second"] = {
-            "direction": "column",
-            "splitPercentage": 40,
-            "first": panel,
-            "second": plots,
-        }
+    layout: dict[str, Any] = json.loads(_filled("foxglove.jinja", layers, scene))
     return layout
 
 
 def rviz_config(layers: Sequence[Layer], scene: Scene) -> str:
     """Configuration that ``rviz2 -d`` opens, with a display for each topic."""
+    return _filled("rviz.jinja", layers, scene)
+
+
+def _filled(template: str, layers: Sequence[Layer], scene: Scene) -> str:
+    """Text of a template, to which the types of topics are known by the names of the constants here."""
     environment = Environment(
         loader=PackageLoader("sonar_graph.logs", "templates"),
         undefined=StrictUndefined,
@@ -410,6 +335,10 @@ def rviz_config(layers: Sequence[Layer], scene: Scene) -> str:
         "POINT_CLOUD": POINT_CLOUD,
         "COMPRESSED_IMAGE": COMPRESSED_IMAGE,
     }
-    return environment.get_template("rviz.jinja").render(
-        layers=layers, scene=scene, **types
+
+    def plotted(*endings: str) -> list[Layer]:
+        return [layer for layer in layers if layer.topic.endswith(endings)]
+
+    return environment.get_template(template).render(
+        layers=layers, scene=scene, plotted=plotted, **types
     )

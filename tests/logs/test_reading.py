@@ -12,6 +12,7 @@ import pytest
 import sonar_graph as sg
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.errors import (
+    ArgumentError,
     CalibrationError,
     LogError,
     MissingTopicError,
@@ -610,3 +611,14 @@ def test_recordings_of_other_kinds_are_refused_with_what_is_in_them(
     }.items():
         with pytest.raises(LogError, match=message):
             read_log(recordings / "bags" / name)
+
+
+@pytest.mark.parametrize("reading", [read_log, inspect_log])
+def test_an_argument_called_like_an_option_names_the_one_of_python(
+    bench: Bench, reading: Any
+) -> None:
+    path = bench.write(*bench.basics())
+    with pytest.raises(ArgumentError, match=r"no argument log_config=; .* is config="):
+        reading(path, log_config="dive.toml")
+    with pytest.raises(LogError, match="its start must be less than its end"):
+        reading(path, window=(20, 10))

@@ -3,16 +3,16 @@
 A role is a part that a topic plays: IMU, Doppler log, depth, detections, truth, sonar. Each has one subclass of
 `Adapter` (`vehicle_messages`, `dvl_messages`, `landmark_messages`, `sonar_messages`), whose attributes are field paths
 and conventions. A message type is added without code, as an instance of that subclass: for everybody in
-`drivers.SHIPPED`, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
+``drivers.toml``, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
@@ -21,6 +21,7 @@ from sonar_graph.logs.adapters.message_table import (
     FieldTable,
     MessageTable,
     field_of,
+    share,
 )
 from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
@@ -104,15 +105,19 @@ TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 UNITS = RATES | FORCES | SPEEDS | LENGTHS | PRESSURES | ANGLES | TIMES
 
 
+def did_you_mean(name: str, known: Iterable[str], form: str = "{}") -> str:
+    """Question about a misspelt name, for the middle of a refusal; empty where no known one is close."""
+    close = get_close_matches(name, list(known), 1)
+    return f"did you mean {form.format(close[0])}? " if close else ""
+
+
 def _from_units(units: Mapping[str, float]) -> BeforeValidator:
     """Validator that takes the name of a unit for its factor."""
 
     def factor(value: object) -> object:
         if isinstance(value, str) and value not in units:
-            close = get_close_matches(value, units, 1)
-            meant = f"did you mean {close[0]}? " if close else ""
             raise ValueError(
-                f"{meant}expected a factor or one of the units {', '.join(units)}"
+                f"{did_you_mean(value, units)}expected a factor or one of the units {', '.join(units)}"
             )
         return units[value] if isinstance(value, str) else value
 
@@ -164,6 +169,20 @@ class Adapter(Section):
     """Name of the sensor's frame, where the message has none or a wrong one."""
     rotation: Rotation = "flu"
     """Axes of the driver: "flu", "frd", or [roll, pitch, yaw] in degrees of ours_R_driver."""
+
+    def changed(self, table: Mapping[str, Any]) -> Self:
+        """The adapter with the settings of a table in TOML; pydantic's ValidationError where one cannot be."""
+        values = self.model_dump()
+        for key, value in table.items():
+            old = getattr(self, key, None)
+            # false takes away a field, and is a value where a switch is meant
+            if value is False and not isinstance(old, bool):
+                values[key] = None
+            elif isinstance(old, BaseModel) and isinstance(value, Mapping):
+                values[key] = {**old.model_dump(), **value}
+            else:
+                values[key] = value
+        return type(self).model_validate(values)
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have, except for the stamp's."""
@@ -287,10 +306,10 @@ class CovarianceFields(PathSection):
         matrices = self._matrices(table)
         # a negative first element and zeros alone are a driver's ways to send no covariance
         is_stated = (matrices[:, 0, 0] >= 0) & matrices.any(axis=(1, 2))
-        count = np.count_nonzero(_is_impossible(matrices) & is_stated)
-        if count:
+        is_none = _is_impossible(matrices) & is_stated
+        if is_none.any():
             yield (
-                f"{', '.join(self.fields)}: no covariance in {count} of {len(table)} messages, since some direction's "
+                f"{', '.join(self.fields)}: no covariance in {share(is_none)} messages, since some direction's "
                 f"variance is negative or an axis' is zero: the calibration's noise is taken there"
             )
 
@@ -324,6 +343,11 @@ class CovarianceFields(PathSection):
         # of a pose the translation comes first
         side = 3 if column.shape[1] == 9 else 6
         return column.reshape(-1, side, side)[:, :3, :3]
+
+
+def variances(fields: CovarianceFields | None, table: FieldTable) -> Floats:
+    """Variances of all rows, shape (n,); NaN: unknown."""
+    return fields.read_variance(table) if fields else np.full(len(table), np.nan)
 
 
 def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:

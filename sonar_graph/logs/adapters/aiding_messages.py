@@ -22,6 +22,7 @@ from sonar_graph.logs.adapters.adapter import (
     LengthScale,
     PathSection,
     axes_matrix,
+    variances,
 )
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
@@ -30,6 +31,7 @@ from sonar_graph.logs.adapters.message_table import (
     FieldTable,
     fit_block,
     not_finite,
+    share,
 )
 from sonar_graph.logs.mcap import Keep, Topic
 from sonar_graph.measurements import (
@@ -144,11 +146,7 @@ class HeadingAdapter(Adapter):
             # a bearing turns clockwise from north
             yaw_rad = np.pi / 2 - yaw_rad if self.world == "ned" else yaw_rad
             faults[NOT_FINITE] = not_finite(yaw_rad)
-        variance = (
-            self.variance.read_variance(table)
-            if self.variance
-            else np.full(len(table), np.nan)
-        )
+        variance = variances(self.variance, table)
         yaw_rad = yaw_rad + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad
         return fit_block(Heading, table.stamps_ns, faults, yaw_rad, np.sqrt(variance))
 
@@ -161,7 +159,7 @@ class HeadingAdapter(Adapter):
             )
             if is_beyond.any():
                 yield (
-                    f"{np.count_nonzero(is_beyond)} of {len(table)} rows have a sigma beyond a full turn "
+                    f"{share(is_beyond)} rows have a sigma beyond a full turn "
                     f"({self.variance.fields[0]}): estimators do not use them"
                 )
         if self.yaw is not None:
@@ -381,9 +379,9 @@ class PositionAdapter(PlaceAdapter):
             yield from self.covariance.warnings(table)
         if self.position is not None:
             positions = self.scaled(table)
-            is_far = (np.abs(positions) > FARTHEST_FIX_M).any(axis=1)
+            is_far = np.asarray((np.abs(positions) > FARTHEST_FIX_M).any(axis=1))
             if is_far.any():
                 yield (
-                    f"{np.count_nonzero(is_far)} of {len(table)} rows have a position beyond "
+                    f"{share(is_far)} rows have a position beyond "
                     f"{FARTHEST_FIX_M / 1e3:.0f} km: estimators do not use them"
                 )

@@ -32,6 +32,7 @@ from sonar_graph.logs.adapters.message_table import (
     FieldTable,
     fit_block,
     not_finite,
+    share,
 )
 from sonar_graph.measurements import Dvl, Floats, Ints
 
@@ -195,12 +196,11 @@ class DvlAdapter(Adapter):
             ] = count < fewest
         else:
             assert self.velocity is not None  # by the validator
-            velocity = table.beside(self.velocity)
-            velocity = velocity if self.scale == 1 else velocity * self.scale
+            velocity = table.beside(self.velocity) * self.scale
             covariance = np.full((len(table), 3, 3), np.nan)
         if self.covariance is not None and not self._is_noise_of_beams:
             covariance, faults[SAID_INVALID] = self.covariance.read(table)
-            covariance = covariance if self.scale == 1 else covariance * self.scale**2
+            covariance = covariance * self.scale**2
         faults |= self._marked_invalid(table)
         faults[NOT_FINITE] = not_finite(velocity)
         faults |= self._signs_of_no_lock(table, velocity)
@@ -346,7 +346,7 @@ class DvlAdapter(Adapter):
         for reason, has_it in self._signs_of_no_lock(table, velocity).items():
             if has_it.any():
                 yield (
-                    f"{np.count_nonzero(has_it)} of {len(table)} messages {reason}: left out; "
+                    f"{share(has_it)} messages {reason}: left out; "
                     f"`{self.accepts(reason)}` under [dvl] in a log configuration uses them"
                 )
 

@@ -26,6 +26,7 @@ from sonar_graph.logs.adapters.message_table import (
     fit_block,
     header_stamps_ns,
     not_finite,
+    share,
 )
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
@@ -111,11 +112,10 @@ class DetectionListsAdapter(Adapter):
         parts = [self._rows(topic, group, log_times_ns) for group in groups]
         rows = _joined(topic, parts)
         ranges, azimuths, covariances, tracks = rows.values
-        if self.range_scale != 1 or self.azimuth_scale != 1:
-            scales = np.array([self.range_scale, self.azimuth_scale])
-            ranges = ranges * self.range_scale
-            azimuths = azimuths * self.azimuth_scale
-            covariances = covariances * np.outer(scales, scales)
+        scales = np.array([self.range_scale, self.azimuth_scale])
+        ranges = ranges * self.range_scale
+        azimuths = azimuths * self.azimuth_scale
+        covariances = covariances * np.outer(scales, scales)
         faults = {
             NOT_FINITE: not_finite(ranges, azimuths, rows.probabilities),
             NO_POSTERIOR: no_posterior(rows.probabilities),
@@ -340,11 +340,11 @@ def detection_warnings(
     }
     for fault, has_it in faults.items():
         if has_it.any():
-            yield f"{np.count_nonzero(has_it)} of {len(detections)} rows have {fault}: estimators do not use them"
-    beyond = np.count_nonzero(np.abs(detections.azimuth_rad) > np.pi)
-    if beyond:
+            yield f"{share(has_it)} rows have {fault}: estimators do not use them"
+    beyond = np.abs(detections.azimuth_rad) > np.pi
+    if beyond.any():
         yield (
-            f"{beyond} of {len(detections)} rows have an azimuth beyond ±3.14 rad (up to "
+            f"{share(beyond)} rows have an azimuth beyond ±3.14 rad (up to "
             f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? Beyond a full turn they are not used"
         )
     tracked = detections.track != NO_TRACK

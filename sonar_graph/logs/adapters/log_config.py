@@ -14,44 +14,19 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, text_of
-from sonar_graph.logs.adapters.adapter import UNITS, Adapter, leaf_fields
-from sonar_graph.logs.adapters.aiding_messages import HeadingAdapter, PositionAdapter
-from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
-from sonar_graph.logs.adapters.landmark_messages import (
-    DetectionArrayAdapter,
-    LandmarkMapAdapter,
-)
+from sonar_graph.logs.adapters.adapter import UNITS, Adapter, did_you_mean, leaf_fields
+from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED
 from sonar_graph.logs.adapters.message_table import LOG_TIME, field_of
-from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
-from sonar_graph.logs.adapters.vehicle_messages import (
-    DepthAdapter,
-    ImuAdapter,
-    TruthAdapter,
-)
 from sonar_graph.logs.cdr import Struct, short_name
 from sonar_graph.settings import faults_in, meanings_of, toml_key, toml_value
 
-ADAPTERS: dict[str, type[Adapter]] = {
-    "imu": ImuAdapter,
-    "dvl": DvlAdapter,
-    "depth": DepthAdapter,
-    "heading": HeadingAdapter,
-    "positions": PositionAdapter,
-    "detections": DetectionArrayAdapter,
-    "truth": TruthAdapter,
-    "true_landmarks": LandmarkMapAdapter,
-    "sonar": SonarAdapter,
-}
-"""Adapter of each role, for types that are not shipped."""
 Table = Mapping[str, Any]
 
 
@@ -141,18 +116,8 @@ class LogConfig:
             bases = [ADAPTERS[role].model_construct(type=type_name)]
         found = []
         for base in bases:
-            values = base.model_dump()
-            for key, value in {**table, "type": type_name}.items():
-                old = getattr(base, key, None)
-                # false takes away a field, and is a value where a switch is meant
-                if value is False and not isinstance(old, bool):
-                    values[key] = None
-                elif isinstance(old, BaseModel) and isinstance(value, Mapping):
-                    values[key] = {**old.model_dump(), **value}
-                else:
-                    values[key] = value
             try:
-                found.append(type(base).model_validate(values))
+                found.append(base.changed({**table, "type": type_name}))
             except ValidationError as error:
                 # a type that is not shipped needs all of its fields
                 is_incomplete = any(
@@ -187,11 +152,9 @@ class LogConfig:
                     )
                 if is_absent:
                     # a misspelt field is the usual fault
-                    similar = get_close_matches(path, known, 1)
-                    suggestion = f"did you mean {similar[0]}? " if similar else ""
                     names = ", ".join(name + size for name, size in known.items())
                     faults.append(
-                        f"{key}: {definition.name} has no field {path}; {suggestion}it has: {names}"
+                        f"{key}: {definition.name} has no field {path}; {did_you_mean(path, known)}it has: {names}"
                     )
             if not faults:
                 return
@@ -240,13 +203,18 @@ def read_log_config(path: Path) -> LogConfig:
 
     A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
     """
+    return LogConfig.parse(read_toml(path), str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file; a LogError where it cannot be read, or is not TOML."""
     try:
-        values = tomllib.loads(text_of(Path(path)))
+        return tomllib.loads(text_of(path))
     except OSError as error:
-        raise LogError(f"{path} cannot be read: {error.strerror}") from error
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
+    # the parser recurses into nested arrays
     except (ValueError, RecursionError) as error:
         raise LogError(f"{path}: not TOML: {error}") from error
-    return LogConfig.parse(values, str(path))
 
 
 def as_log_config(value: LogConfig | str | Path | None, call: str) -> LogConfig | None:

@@ -18,6 +18,10 @@ NOT_FINITE = "with values that are not finite or beyond 1e15"
 SAME_STAMP = "with the stamp of another"
 LARGEST = 1e15
 """No sensor gives more, in whatever unit; products of a few such numbers overflow."""
+LAST_S = 1e10
+"""Seconds since 1970 of the year 2286: no time is later."""
+SMALLER = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of stamps that are no seconds."""
 LOG_TIME = "log"
 """Value of `Adapter.stamp` that stands for the time of recording."""
 
@@ -88,7 +92,9 @@ class MessageTable(FieldTable):
         if stamp == LOG_TIME:
             self.stamps_ns = log_times_ns
         elif self.has(stamp):
-            self.stamps_ns = nanoseconds(self.column(stamp), stamp_unit_s)
+            numbers = self.column(stamp)
+            self._require_dates(stamp, numbers * stamp_unit_s)
+            self.stamps_ns = nanoseconds(numbers, stamp_unit_s)
         else:
             self._require(f"{stamp}.sec")
             self.stamps_ns = np.empty(len(topic), np.int64)
@@ -98,6 +104,18 @@ class MessageTable(FieldTable):
                 )
         if stamp_offset_s:
             self.stamps_ns = self.stamps_ns + round(stamp_offset_s * NS_PER_S)
+
+    def _require_dates(self, stamp: str, seconds: NDArray[Any]) -> None:
+        """Refuse stamps that are typically of no date, since their unit is another one."""
+        # single wrong stamps are left to the checks of the stamps
+        typical_s = float(np.median(np.abs(seconds)))
+        if typical_s > LAST_S:
+            fits = next((u for u in SMALLER if typical_s * SMALLER[u] < LAST_S), "...")
+            self.refuse(
+                stamp,
+                f"is typically {typical_s:.4g} s, beyond any date: another unit? "
+                f'`stamp_unit_s = "{fits}"` in the log configuration',
+            )
 
     def has(self, path: str) -> bool:
         """Tell whether every message has a field with values."""
@@ -156,6 +174,11 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
     return whole.astype(np.int64) * round(unit_ns) + np.rint(
         (finite - whole) * unit_ns
     ).astype(np.int64)
+
+
+def share(has_it: NDArray[np.bool_]) -> str:
+    """How many of some rows have a fault, such as "3 of 20"."""
+    return f"{np.count_nonzero(has_it)} of {len(has_it)}"
 
 
 def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:

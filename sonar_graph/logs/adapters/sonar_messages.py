@@ -18,7 +18,7 @@ from sonar_graph.measurements import Floats, Ints
 
 SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """Type of a sample, as numpy names it, for each number in marine_acoustic_msgs/SonarImageData."""
-_GAIN_BYTES = 4
+GAIN_BYTES = 4
 Refused = Callable[[int, str], None]
 """Called with the stamp of a message and the reason why it is no image."""
 
@@ -36,6 +36,19 @@ class _Images(NamedTuple):
     """Shape (n, beams, bins)."""
     ranges_m: Floats
     azimuths_rad: Floats
+
+
+def samples_of_rows(
+    rows: NDArray[np.uint8], dtype: np.dtype[np.generic], *, has_gains: bool
+) -> NDArray[np.generic]:
+    """Samples in rows of bytes, shape (..., bytes), where each row may begin with its gain, a uint32."""
+    head = GAIN_BYTES if has_gains else 0
+    values: NDArray[np.generic] = np.ascontiguousarray(rows[..., head:]).view(dtype)
+    if not has_gains:
+        return values
+    gains = np.ascontiguousarray(rows[..., :head]).view("<u4").astype(np.float32)
+    # the gain of a row is of power, and samples are amplitudes; a gain of 0 would be none at all
+    return np.asarray(values / np.sqrt(np.maximum(gains, 1)), np.float32)
 
 
 class SonarAdapter(Adapter):
@@ -217,9 +230,9 @@ class SonarAdapter(Adapter):
                     f"is {sample_bytes}; samples have 1, 2 or 4 bytes",
                 )
         dtype = np.dtype((">" if big_endian > 0 else "<") + name)
-        data = np.ascontiguousarray(data).view(np.uint8)
-        size = data.shape[1]
-        head = _GAIN_BYTES if row_gains > 0 else 0
+        data_bytes: NDArray[np.uint8] = np.ascontiguousarray(data).view(np.uint8)
+        size = data_bytes.shape[1]
+        head = GAIN_BYTES if row_gains > 0 else 0
         if self.image_order == "range-major":
             used = head + beams * dtype.itemsize
             # rows may be padded
@@ -238,16 +251,8 @@ class SonarAdapter(Adapter):
                 self.data,
                 f"has {size} bytes; that is no image of {beams} beams of {dtype} samples",
             )
-        image = data.reshape(len(data), row_count, row_bytes)
-        values = np.ascontiguousarray(image[:, :, head:used]).view(dtype)
-        if row_gains > 0:
-            gains = (
-                np.ascontiguousarray(image[:, :, :_GAIN_BYTES])
-                .view("<u4")
-                .astype(np.float32)
-            )
-            # the gain of a row is of power, and samples are amplitudes
-            values = (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32)
+        image = data_bytes.reshape(len(data), row_count, row_bytes)
+        values = samples_of_rows(image[:, :, :used], dtype, has_gains=row_gains > 0)
         return (
             values.transpose(0, 2, 1) if self.image_order == "range-major" else values
         )

@@ -28,6 +28,7 @@ from sonar_graph.logs.adapters.adapter import (
     SignedAxes,
     axes_matrix,
     turn,
+    variances,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, PlaceAdapter
 from sonar_graph.logs.adapters.geodesy import Origin
@@ -39,6 +40,7 @@ from sonar_graph.logs.adapters.message_table import (
     fit_block,
     fit_rows,
     not_finite,
+    share,
 )
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
@@ -80,7 +82,7 @@ class ImuAdapter(Adapter):
 
     def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
-        rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
+        rate = table.beside(self.angular_velocity) * self.angular_velocity_scale
         force = self._force(table)
         # NaN is what estimators take as not measured
         unmeasured = _is_marked(
@@ -116,7 +118,7 @@ class ImuAdapter(Adapter):
         if self._is_force_unfilled(table, force):
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
         elif bad.any() and not bad.all():
-            yield f"{names} are not finite in {bad.sum()} of {len(table)} messages: taken as not measured there"
+            yield f"{names} are not finite in {share(bad)} messages: taken as not measured there"
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
@@ -153,9 +155,8 @@ class ImuAdapter(Adapter):
         """Specific force in m/s², shape (n, 3); NaN without accelerometers."""
         if self.linear_acceleration is None:
             return np.full((len(table), 3), np.nan)
-        return _scaled(
-            table.beside(self.linear_acceleration), self.linear_acceleration_scale
-        )
+        force = table.beside(self.linear_acceleration)
+        return np.asarray(force * self.linear_acceleration_scale)
 
     def _is_force_unfilled(self, table: FieldTable, force: Floats) -> bool:
         """Tell whether the force is zero in all messages, which not even free fall gives."""
@@ -163,10 +164,6 @@ class ImuAdapter(Adapter):
             return False
         measured = force[~_is_marked(table, self.linear_acceleration_status, force)]
         return bool(len(measured)) and not measured.any()
-
-
-def _scaled(values: np.ndarray, scale: float) -> np.ndarray:
-    return values if scale == 1 else values * scale
 
 
 def _is_marked(table: FieldTable, path: str | None, values: Floats) -> np.ndarray:
@@ -219,13 +216,7 @@ class DepthAdapter(Adapter):
         self, table: FieldTable, gravity_m_s2: float
     ) -> tuple[Depth | None, Dropped]:
         """Heights with variances; NaN: unknown."""
-        variance_m2 = (
-            self.variance.read_variance(table)
-            if self.variance
-            else np.full(len(table), np.nan)
-        )
-        if self.scale != 1:
-            variance_m2 = variance_m2 * self.scale**2
+        variance_m2 = variances(self.variance, table) * self.scale**2
         if self.pressure is not None:
             pascals_per_metre = self.water_density_kg_m3 * gravity_m_s2
             z_m = (

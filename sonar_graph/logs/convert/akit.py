@@ -19,7 +19,7 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.adapters import east_north_up
+from sonar_graph.logs.adapters import ENU_R_NED, east_north_up
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, Ints
 from sonar_graph.sequence import Sequence
@@ -32,7 +32,6 @@ DVL_DELAY_NS = NS_PER_S
 FLU_OF_FRD = np.array([1.0, -1.0, -1.0])
 IMU_FRD_SIGNS = np.array([1.0, -1.0, 1.0])
 """Signs that turn the IMU's own axes into forward, right, down."""
-ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Estimated from trajectories 1 to 7 against the reference (docs/theory/datasets.md).
 GYRO_NOISE_DENSITY = 2e-5
 GYRO_BIAS_SIGMA_RAD_S = 3e-6

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.logs.adapters import TIMES
+from sonar_graph.logs.adapters import LAST_S, TIMES
 from sonar_graph.measurements import Floats
 
 UNITS = ("s", "ms", "us", "ns")
@@ -20,8 +20,6 @@ VALIDITY = r"valid|lock|flag|status|good"
 """Names of columns that may mark valid rows."""
 _DATES_S = (6.3e8, 4.1e9)
 """Seconds since 1970 of the years 1990 and 2100."""
-LAST_S = 1e10
-"""Seconds since 1970 of the year 2286: no time is later."""
 
 
 def time_units(

@@ -15,10 +15,8 @@ of fields, and with the keys of `CsvForm`. What stands before the first table ho
 """
 
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from pydantic import BaseModel, ValidationError
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
-from sonar_graph.files import as_path, spelt, text_of
+from sonar_graph.files import as_path, spelt
 from sonar_graph.logs.adapters import (
     ADAPTERS,
     Adapter,
@@ -35,7 +33,9 @@ from sonar_graph.logs.adapters import (
     DetectionRowsAdapter,
     DvlAdapter,
     LandmarkRowsAdapter,
+    did_you_mean,
     plain_lines,
+    read_toml,
 )
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.convert.csv_evidence import VALIDITY, time_units, valid_mark
@@ -80,13 +80,7 @@ def read_csv_config(path: Path) -> dict[str, CsvRole]:
 
     A LogError where it cannot be read, is not TOML, or has a key that cannot be; it names table and key.
     """
-    try:
-        values = tomllib.loads(text_of(path))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise LogError(f"{path}: not TOML: {error}") from error
-    return parse_csv_config(values, str(path))
+    return parse_csv_config(read_toml(path), str(path))
 
 
 def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRole]:
@@ -107,8 +101,7 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
             )
     for role in tables:
         if role not in CSV_ADAPTERS:
-            close = get_close_matches(role, CSV_ADAPTERS, 1)
-            hint = f"did you mean [{close[0]}]? " if close else ""
+            hint = did_you_mean(role, CSV_ADAPTERS, "[{}]")
             raise LogError(
                 f"{source}: there is no role [{role}]; {hint}tables are for {', '.join(CSV_ADAPTERS)}"
             )

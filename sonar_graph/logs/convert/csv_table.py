@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
-from difflib import get_close_matches
 from pathlib import Path
 from typing import NoReturn
 
@@ -20,7 +19,7 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.errors import LogError
 from sonar_graph.files import regular
-from sonar_graph.logs.adapters import FieldTable
+from sonar_graph.logs.adapters import FieldTable, did_you_mean
 from sonar_graph.logs.mcap import START_BYTES, foreign_kind
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 
@@ -229,8 +228,7 @@ class CsvFile:
                 f"has no column {name} ({key}); it has {len(names)}, numbered from 1"
             )
         # wide tables have hundreds of columns: the message names the first of them
-        close = get_close_matches(name, names, 1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
+        hint = did_you_mean(name, names, "{!r}")
         rest = len(names) - _MOST_NAMED
         more = f" and {rest} more" if rest > 0 else ""
         without = (

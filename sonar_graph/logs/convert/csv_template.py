@@ -1,15 +1,19 @@
 """A first guess at what the columns of text tables are, as a commented TOML file for the user to edit.
 
-`QUANTITIES` lists what a column may hold, with the names and units that headers use. The values have to agree: a column
-that never changes is no motion, and a magnitude that no vehicle reaches is of another unit. Where names or values leave
-a choice, the role stands as a comment that names the candidates. Under every file all columns are listed.
+``csv_quantities.toml`` lists what a column may hold, with the names and units that headers use. The values have to
+agree: a column that never changes is no motion, and a magnitude that no vehicle reaches is of another unit. Where names
+or values leave a choice, the role stands as a comment that names the candidates. Under every file all columns are
+listed.
 """
 
 import re
+import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,15 +21,16 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import (
     ANGLES,
     FORCES,
+    LAST_S,
     LENGTHS,
     PRESSURES,
     RATES,
     SPEEDS,
     TIMES,
+    plain_lines,
 )
 from sonar_graph.logs.convert.csv_evidence import (
     FEWEST_ROWS,
-    LAST_S,
     UNITS,
     VALIDITY,
     is_absent,
@@ -37,46 +42,7 @@ from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, is_date, plain_
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import toml_value
 
-_SPELLINGS = {
-    spelling: unit
-    for unit, spellings in {
-        "deg": "deg degree degrees ° grad",
-        "rad": "rad radian radians",
-        "deg/s": "deg/s deg/sec °/s dps degs deg_s deg_sec",
-        "rad/s": "rad/s rad/sec rad_s rads rad_sec rps",
-        "mrad/s": "mrad/s mrad_s",
-        "m/s2": "m/s2 m/s^2 m/s² m/s/s m_s2 m_s_2 mps2 ms2",
-        "g": "g",
-        "mg": "mg",
-        "cm/s2": "cm/s2 cm/s^2 cm/s² cm_s2",
-        "m/s": "m/s m/sec mps m_s",
-        "cm/s": "cm/s cm/sec cm_s cmps",
-        "mm/s": "mm/s mm/sec mm_s mmps",
-        "km/h": "km/h kmh km_h",
-        "kn": "kn kt kts knot knots",
-        "m": "m meter meters metre metres",
-        "cm": "cm",
-        "mm": "mm",
-        "ft": "ft feet foot",
-        "Pa": "pa",
-        "hPa": "hpa",
-        "mbar": "mbar",
-        "kPa": "kpa",
-        "dbar": "dbar",
-        "bar": "bar",
-        "psi": "psi",
-        "s": "s sec secs second seconds",
-        "ms": "ms msec millis milliseconds",
-        "us": "us µs μs usec micros microseconds",
-        "ns": "ns nsec nanos nanoseconds",
-        "min": "min",
-    }.items()
-    for spelling in spellings.split()
-}
-"""Units as headers write them, in small letters, by their names in a log configuration."""
-XYZ = ("x", "y", "z")
-RPY = ("roll|phi", "pitch|theta", "yaw|psi|heading")
-_FORMS: tuple[dict[str, str], ...] = tuple(
+_FORMS: tuple[dict[str, Any], ...] = tuple(
     encoding | decimal
     for encoding in ({}, {"encoding": "cp1252"}, {"encoding": "utf-16"})
     for decimal in ({}, {"decimal": ","})
@@ -87,81 +53,72 @@ _TIMES = (
     r"(.*_)?time_?stamp(_.*)?|time_.*|.*_time|date.*|.*zeit",
 )
 """Names of columns of the time, the likeliest first."""
-_STATIC = r"^((?!rate|vel|speed|dot|acc|wind|current).)*$"
-"""Names without a word for a rate of change."""
 _NOT_MEASURED = r"(set_?point|desired|demand|command|cmd|err|error|std|sigma|var|cov|bias|uncertainty)(_|$)"
-_TRUTH = r"truth|ground(?!_?speed)|^gt|_gt(_|$)|reference|mocap"
-_FILES = {
-    "imu": r"imu|inertial|gyro|ahrs|mti|xsens",
-    "dvl": r"dvl|doppler|navquest|nucleus",
-    "depth": r"depth|press|ctd",
-    "heading": r"head|compass|ahrs",
-    "positions": r"gps|gnss|usbl|lbl|fix",
-    "detections": r"detect|sonar|beacon|seen|range",
-    "truth": _TRUTH,
-    "true_landmarks": r"map|landmark|beacon",
-}
-"""Names of files that point to a role, by role."""
+TUM_COLUMNS = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""Columns of a trajectory as `write_tum` writes it."""
 _DEPTHS = ("height", "pressure")
 _LISTS = ("ids", "probabilities")
 """Keys with a column for each candidate."""
 _OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
 
 
+_UNITS = {
+    "rates": RATES,
+    "forces": FORCES,
+    "speeds": SPEEDS,
+    "lengths": LENGTHS,
+    "pressures": PRESSURES,
+    "angles": ANGLES,
+}
+
+
 @dataclass(frozen=True)
 class Quantity:
-    """What columns may hold: one column for each component, whose names differ in the component alone."""
+    """What columns may hold, from ``csv_quantities.toml``: one column a component; names differ in that alone."""
 
     key: str
     """Key of the configuration."""
     stem: str
-    """Pattern of the name without the component."""
     parts: tuple[str, ...] = ("",)
     """Patterns of the components; one without a name for a single column."""
     units: Mapping[str, float] | None = None
     scale: str = "scale"
-    """Key of the unit."""
     usual: tuple[float, float] = (0.0, np.inf)
-    """Magnitudes of measurements, in the first unit: of nearly all, or of a typical one where the first is not 0."""
     more: str = ""
-    """Another line of the configuration."""
 
 
-_RATE = (
-    "angular_velocity_scale",
-    (0.0, 2.5),
-    '# rotation = "frd"  # where gravity is felt along -z',
+@dataclass(frozen=True)
+class Part:
+    """A role that a table may play, from ``csv_quantities.toml``."""
+
+    files: str
+    empty: str
+    needs: tuple[str, ...]
+    may: Mapping[str, str] = field(default_factory=dict)
+
+
+def _quantities(key: str, shared: dict[str, Any]) -> list[Quantity]:
+    columns = shared.pop("columns")
+    shared["units"] = _UNITS.get(shared.get("units", ""))
+    return [Quantity(key, **(shared | column)) for column in columns]
+
+
+_KNOWN = tomllib.loads(
+    files("sonar_graph.logs.convert")
+    .joinpath("csv_quantities.toml")
+    .read_text(encoding="utf-8")
 )
-_FORCE = ("linear_acceleration_scale", (7.0, 13.0))
-_SPEED = ("scale", (0.0, 10.0), '# rotation = "frd"')
-_ANGLE = ("scale", (0.0, 2.02 * np.pi), 'world = "ned"')
-_AZIMUTH = (_ANGLE[1], '# rotation = "frd"  # azimuth positive to the right')
-QUANTITIES = (
-    Quantity("angular_velocity", r"gyr|omega|angular_?vel|(ang|turn|angular)_?rate|^rate|^w$|^g$", XYZ, RATES, *_RATE),
-    Quantity("angular_velocity", r"^$|body|imu", ("p", "q", "r"), RATES, *_RATE),
-    Quantity("angular_velocity", r"rate|speed|dot", ("roll", "pitch", "yaw"), RATES, *_RATE),
-    Quantity("linear_acceleration", r"acc|force|^a$|^f$", XYZ, FORCES, *_FORCE),
-    Quantity("velocity", r"bottom|btm", XYZ, SPEEDS, *_SPEED),
-    Quantity("velocity", r"^((?!wat).)*(vel|speed|^v$|dvl)((?!wat).)*$", XYZ, SPEEDS, *_SPEED),
-    Quantity("velocity", r"", ("u", "v", "w"), SPEEDS, *_SPEED),
-    Quantity("velocity", r"", ("surge", "sway", "heave"), SPEEDS, *_SPEED),
-    Quantity("range", r"range|distance|^r$", ("",), LENGTHS, "range_scale", (0.0, 300.0)),
-    Quantity("azimuth", r"azimuth|bearing", ("",), ANGLES, "azimuth_scale", *_AZIMUTH),
-    Quantity("ids", r"^id$|_id$|label|class|landmark|beacon"),
-    Quantity("id", r"^id$|_id$|label|class|landmark|beacon"),
-    Quantity("probabilities", r"prob|posterior|score|confidence"),
-    Quantity("track", r"track"),
-    Quantity("geodetic", r"", (r"lat(?:itude)?", r"lon(?:gitude)?|lng")),
-    Quantity("position", r"pos|^$|^p$|^t$|translation|location|gt|truth|mocap", XYZ, LENGTHS),
-    Quantity("position", _STATIC, ("east|easting|e", "north|northing|n", "up|z|alt|altitude|height"), LENGTHS),
-    Quantity("position", _STATIC, ("north|n", "east|e", "down|d"), LENGTHS, more='world = "ned"'),
-    Quantity("orientation", r"", (r"q_?x", r"q_?y", r"q_?z", r"q_?w")),
-    Quantity("rpy", _STATIC, RPY, ANGLES, "rpy_scale", _ANGLE[1]),
-    Quantity("height", r"(?<!water_)(?<!bottom_)(depth|tiefe)(?!.*_(of|cell|to|above|rate|vel|speed))", ("",), LENGTHS),
-    Quantity("pressure", r"press|druck", ("",), PRESSURES, "scale", (8e4, 2e5)),
-    Quantity("yaw", r"^(.*_)?(yaw|heading|compass|hdg|psi)(?!.*(rate|vel|speed|dot))", ("",), ANGLES, *_ANGLE),
-)  # fmt: skip
-"""What columns may hold; of several with one key the first that fits counts."""
+_SPELLINGS = {
+    spelling: unit
+    for unit, spellings in _KNOWN["spellings"].items()
+    for spelling in spellings.split()
+}
+"""Names of units by their spellings in headers."""
+QUANTITIES = {
+    key: _quantities(key, table) for key, table in _KNOWN["quantities"].items()
+}
+"""What columns may hold by key; of several the first that fits counts."""
+PARTS = {role: Part(**table) for role, table in _KNOWN["roles"].items()}
 
 
 @dataclass(frozen=True)
@@ -190,55 +147,8 @@ class _Guess:
         is_weak = (self.role == "positions" and "geodetic" not in text) or (
             self.role == "depth" and "pressure" in text
         )
-        is_named = bool(re.search(_FILES[self.role], self.file.lower()))
+        is_named = bool(re.search(PARTS[self.role].files, self.file.lower()))
         return bool(self.doubt), is_weak, not is_named
-
-
-_SLOTS = {
-    "imu": (
-        ("angular_velocity", None),
-        ("linear_acceleration", "linear_acceleration = false"),
-    ),
-    "dvl": (("velocity", None),),
-    "depth": (("height pressure", None),),
-    "heading": (("yaw", None),),
-    "positions": (("geodetic position", None),),
-    "detections": (
-        ("range", None),
-        ("azimuth", None),
-        ("ids", "ids = false  # no column of identities was found"),
-        ("probabilities", ""),
-        ("track", ""),
-    ),
-    "truth": (("geodetic position", None), ("orientation rpy", "")),
-    "true_landmarks": (("id", None), ("geodetic position", None)),
-}
-"""Quantities of a role, each with the alternatives and the line without it; None: needed."""
-_EMPTY = {
-    "imu": [
-        'angular_velocity = ["...", "...", "..."]',
-        'linear_acceleration = ["...", "...", "..."]',
-    ],
-    "dvl": ['velocity = ["...", "...", "..."]'],
-    "depth": [
-        'height = "..."',
-        "scale = -1  # of a depth, downwards; or pressure = ...",
-    ],
-    "heading": [
-        'yaw = "..."',
-        'scale = "deg"',
-        'world = "ned"  # a bearing, clockwise from north',
-    ],
-    "positions": [
-        'geodetic = {latitude = "...", longitude = "..."}  # or position = [x, y, z]'
-    ],
-    "detections": ['range = "..."', 'azimuth = "..."', 'ids = ["..."]'],
-    "truth": [
-        'position = ["...", "...", "..."]  # or geodetic = {latitude = ..., longitude = ...}'
-    ],
-    "true_landmarks": ['id = "..."', 'position = ["...", "...", "..."]'],
-}
-"""Keys to fill in, of roles that nothing was found for."""
 
 
 def csv_template(tables: list[Path]) -> str:
@@ -272,8 +182,7 @@ def csv_template(tables: list[Path]) -> str:
         "# All keys: docs/tutorials/11_tables.md#the-keys"
     ]
     parts += [table.listing() for table in found.values()]
-    # the order in which a user thinks of the sensors, those that are needed first
-    for role, empty in _EMPTY.items():
+    for role, part in PARTS.items():
         options = sorted(
             (guess for guess in guesses if guess.role == role),
             key=lambda guess: guess.rank,
@@ -281,7 +190,7 @@ def csv_template(tables: list[Path]) -> str:
         best = [guess for guess in options if guess.rank == options[0].rank]
         if not best:
             likely = next((name for name in found if role in name.lower()), "...")
-            best = [_Guess(role, likely, empty, "nothing found")]
+            best = [_Guess(role, likely, part.empty.splitlines(), "nothing found")]
         choice = ""
         if len(best) > 1:
             choice = (
@@ -339,8 +248,8 @@ class _Table:
         for key in keys.split():
             fitting = (
                 _Match(self, quantity, options)
-                for quantity in QUANTITIES
-                if quantity.key == key and (options := _fitting(quantity, columns))
+                for quantity in QUANTITIES[key]
+                if (options := _fitting(quantity, columns))
             )
             matches += [match.moving() for match in islice(fitting, 1)]
         return min(matches, key=lambda match: bool(match.doubt()), default=None)
@@ -370,8 +279,12 @@ class _Table:
 
     def guesses(self) -> Iterator[_Guess]:
         """Roles that the table may play."""
-        is_truth = bool(re.search(_TRUTH, self.name.lower()))
-        true = [c for c in self.columns if is_truth or re.search(_TRUTH, c.name)]
+        is_truth = bool(re.search(PARTS["truth"].files, self.name.lower()))
+        true = [
+            c
+            for c in self.columns
+            if is_truth or re.search(PARTS["truth"].files, c.name)
+        ]
         live = [
             column
             for column in self.columns
@@ -399,7 +312,7 @@ class _Table:
             has_place
             and has_angles
             and not has_forces
-            and not re.search(_FILES["positions"], self.name.lower())
+            and not re.search(PARTS["positions"].files, self.name.lower())
         ):
             # a pose is computed by another system
             yield from self._play("truth", live)
@@ -415,7 +328,8 @@ class _Table:
     ) -> Iterator[_Guess]:
         """Guess at a role where the table has all that it needs; the first question about a quantity counts."""
         lines: list[str] = []
-        for keys, without in _SLOTS[role]:
+        part = PARTS[role]
+        for keys in (*part.needs, *part.may):
             match = self.find(keys, columns)
             if (
                 match
@@ -430,10 +344,10 @@ class _Table:
                 doubt = doubt or match.doubt()
                 if role == "dvl":
                     lines += self._validity(match)
-            elif without is None:
+            elif keys in part.needs:
                 return
-            elif without:
-                lines.append(without)
+            elif part.may[keys]:
+                lines.append(part.may[keys])
         yield _Guess(role, self.name, lines, doubt)
 
     def _validity(self, velocity: "_Match") -> list[str]:
@@ -591,7 +505,7 @@ class _Match:
 def _file(path: Path) -> tuple[CsvFile, list[str]]:
     """A file read in the form in which most cells of its first row have values, and the lines that state it."""
     # a file that no form fits keeps the error of the usual form
-    best: tuple[int, CsvFile, dict[str, str]] | None = None
+    best: tuple[int, CsvFile, dict[str, Any]] | None = None
     fault: LogError | None = None
     for form in _FORMS:
         if best:
@@ -610,7 +524,20 @@ def _file(path: Path) -> tuple[CsvFile, list[str]]:
             best = (count, file, form)
     if best is None:
         raise fault or LogError(f"{path}: holds no table")
-    return best[1], [f"{key} = {toml_value(value)}" for key, value in best[2].items()]
+    _, file, stated = best
+    if _is_tum(file):
+        stated = stated | {"columns": TUM_COLUMNS}
+        file = CsvFile(path, CsvForm.model_validate(stated))
+    return file, plain_lines(stated)
+
+
+def _is_tum(file: CsvFile) -> bool:
+    """True for poses without a header in the format of TUM, whose last four numbers are a unit quaternion."""
+    if file.layout.is_named or len(file.layout.names) != len(TUM_COLUMNS):
+        return False
+    quaternions = np.column_stack(file.numbers("5", "6", "7", "8"))
+    lengths = np.linalg.norm(quaternions, axis=1)
+    return bool((np.abs(lengths - 1.0) < 1e-3).all())
 
 
 def _stamps(

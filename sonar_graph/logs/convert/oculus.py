@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import SonarImage
 from sonar_graph.errors import DatasetError
+from sonar_graph.logs.adapters import samples_of_rows
 from sonar_graph.logs.convert.sonar_file import (
     ByteSource,
     DamagedFrameError,
@@ -195,14 +196,8 @@ class OculusFormat(SonarFormat):
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
         """Image, shape (beams, bins); rows with a gain are divided by its root, as in `read_sonar_frames`."""
         _, _, _, flags, size, offset, ranges, beams, *_ = map(int, settings[:8])
-        kind = np.dtype(f"<u{size}")
         row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
         row_bytes = row_gain + beams * size
         rows = np.frombuffer(frame, np.uint8, ranges * row_bytes, offset)
         rows = rows.reshape(ranges, row_bytes)
-        values = np.ascontiguousarray(rows[:, row_gain:]).view(kind)
-        if not row_gain:
-            return values.T
-        gains = np.ascontiguousarray(rows[:, :row_gain]).view("<u4").astype(np.float32)
-        # a gain of 0 would be none at all
-        return (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32).T
+        return samples_of_rows(rows, np.dtype(f"<u{size}"), has_gains=bool(row_gain)).T

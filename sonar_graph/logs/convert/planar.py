@@ -47,6 +47,7 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import DatasetError
+from sonar_graph.logs.adapters import range_and_azimuth
 from sonar_graph.logs.convert.text_tables import numbers, read_lines
 from sonar_graph.measurements import (
     NS_PER_S,
@@ -151,19 +152,6 @@ def planar_calibration(
     )
 
 
-def range_azimuth(points: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]:
-    """Points (n, 2) with covariances (n, 2, 2) as range (n,), azimuth (n,) and their covariances (n, 2, 2).
-
-    First order: ``J S J^T`` with ``J = [[x/r, y/r], [-y/r², x/r²]]``.
-    """
-    x, y = points.T
-    r = np.hypot(x, y)
-    J = np.stack(
-        [np.stack([x / r, y / r], -1), np.stack([-y / r**2, x / r**2], -1)], -2
-    )
-    return r, np.arctan2(y, x), J @ covs @ np.swapaxes(J, -1, -2)
-
-
 @dataclass(frozen=True, eq=False)
 class StepRun:
     """Steps of a planar robot, and landmarks seen between them."""
@@ -222,7 +210,9 @@ def _detections(run: StepRun, stamps_ns: Ints) -> LandmarkDetections:
     # no identity is more probable than another
     is_known = candidate_ids >= 0
     id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
-    polar = range_azimuth(run.points, run.point_covs)
+    # the sonar is in the plane of the landmarks
+    points = np.pad(run.points, ((0, 0), (0, 1)))
+    polar = range_and_azimuth(points, np.pad(run.point_covs, ((0, 0), (0, 1), (0, 1))))
     return LandmarkDetections(
         stamps_ns[run.poses], *polar, candidate_ids, id_probability
     )

@@ -101,6 +101,6 @@ class TimeWindow:
         end_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
         if start_ns >= end_ns:
             raise LogError(
-                "the wanted part of the log ends before it starts: --start must be less than --end"
+                "the wanted part of the log ends before it starts: its start must be less than its end"
             )
         return start_ns, end_ns

@@ -26,6 +26,23 @@ LATER = [
     for row in range(ROWS)
 ]
 
+STAMPED_TABLE = """[dvl]
+type = "dvl_msgs/msg/DVL"
+covariance = false
+valid_where = {}
+altitude = false
+"""
+
+
+def dated(first: float) -> tuple[str, str, list[dict[str, Any]]]:
+    """Velocities at 10 Hz, stamped by numbers of microseconds from a first one on."""
+    rows = [
+        {"time": first + 1e5 * row, "velocity": vector(1, 2, 3)} for row in range(ROWS)
+    ]
+    return "/dvl", "dvl_msgs/msg/DVL", rows
+
+
+STAMPED = dated(5e9)
 Refusal = tuple[list[Any], str, str]
 """Entries of a log, a log configuration, and what the refusal must name."""
 # fmt: off
@@ -67,7 +84,13 @@ REFUSALS: dict[str, Refusal] = {
         "", r"nothing for dvl: no .*--topic dvl=/twist_0.*`sonar-graph inspect .* --toml` begins"),
     "no common time": (
         [imu(ROWS), ("/dvl", "marine_acoustic_msgs/msg/Dvl", LATER)], "",
-        r"IMU from .* DVL from .*no common time; .*`stamp = \"log\"` under"),
+        r'IMU from .* DVL from .*no common time; .*stamp = "log" under .* See stamp, stamp_unit_s and stamp_offset_s'),
+    "stamps of a boot in microseconds": (
+        [imu(ROWS), STAMPED], STAMPED_TABLE + 'stamp = "time"',
+        r'no common time; .* Perhaps stamp_unit_s = "us" under \[dvl\]'),
+    "stamps since 1970 in microseconds": (
+        [imu(ROWS), dated(1.7e15)], STAMPED_TABLE + 'stamp = "time"',
+        r'field time .* 1\.7e\+15 s, beyond any date: another unit[?] `stamp_unit_s = "us"`'),
 }
 # fmt: on
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs import read_log, write_log
+from sonar_graph.logs import read_log, write_log, write_tum
 from sonar_graph.logs.convert import csv_template, read_csv
 from sonar_graph.logs.convert.csv_table import date_ns
 from sonar_graph.measurements import LandmarkDetections
@@ -306,6 +306,21 @@ def write_headed(folder: Path) -> None:
         (folder / name).write_text(
             "\n".join([header, *(sep.join(row) for row in rows)]) + "\n"
         )
+
+
+def test_poses_in_the_format_of_tum_are_found_as_the_truth(
+    tmp_path: Path,
+) -> None:
+    write_headed(tmp_path)
+    (tmp_path / "ground_truth.csv").unlink()
+    truth = small_world().true_poses.rows(slice(5))
+    write_tum(tmp_path / "own.tum", truth)
+    table = tomllib.loads(csv_template([tmp_path]))["truth"]
+    assert table["file"] == "own.tum"
+    assert table["position"] == ["x", "y", "z"]
+    assert table["orientation"] == ["qx", "qy", "qz", "qw"]
+    (tmp_path / "map.csv").write_text("".join(f"{k} 1 2 3 4 5 6 7\n" for k in range(9)))
+    assert "columns" not in csv_template([tmp_path / "map.csv"]).split("[truth]")[1]
 
 
 def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path):

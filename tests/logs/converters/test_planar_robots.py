@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from sonar_graph.errors import DatasetError
+from sonar_graph.logs.adapters import range_and_azimuth
 from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.planar import (
-    range_azimuth,
     read_dlr,
     read_victoria_park,
     twists_of_steps,
@@ -72,17 +72,20 @@ def test_twist_held_over_the_step_makes_the_step_and_its_noise(dx, dy, turn):
     st.floats(-0.9, 0.9),
 )
 def test_polar_covariance_is_the_numerical_jacobians(distance, azimuth, sx, sy, rho):
-    point = distance * np.array([[np.cos(azimuth), np.sin(azimuth)]])
-    S = np.array([[[sx**2, rho * sx * sy], [rho * sx * sy, sy**2]]])
+    point = distance * np.array([[np.cos(azimuth), np.sin(azimuth), 0.0]])
+    S = np.zeros((1, 3, 3))
+    S[0, :2, :2] = [[sx**2, rho * sx * sy], [rho * sx * sy, sy**2]]
 
     def polar(offset):
-        return np.concatenate(range_azimuth(point + offset, S)[:2])
+        return np.concatenate(range_and_azimuth(point + offset, S)[:2])
 
     assert np.allclose(polar(0), [distance, azimuth])
     J = np.column_stack(
-        [(polar(offset) - polar(-offset)) / 2e-6 for offset in 1e-6 * np.eye(2)]
+        [(polar(offset) - polar(-offset)) / 2e-6 for offset in 1e-6 * np.eye(3)]
     )
-    assert np.allclose(range_azimuth(point, S)[2], J @ S[0] @ J.T, rtol=1e-6, atol=1e-9)
+    assert np.allclose(
+        range_and_azimuth(point, S)[2], J @ S[0] @ J.T, rtol=1e-6, atol=1e-9
+    )
 
 
 # ---- axes and identities of DLR
