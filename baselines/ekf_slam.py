@@ -295,11 +295,13 @@ class EkfSlam(FilterShell):
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         angles = euler_from_rotation(mat(start.pose().rotation().matrix()))
-        self._x = np.zeros(MAP)
+        places = self._known.places()
+        self._x = np.concatenate((np.zeros(MAP), places.ravel()))
         self._x[:3] = start.position_m
         self._x[ROLL:POSE] = angles
         E = np.array(euler_rates_from_body(angles.x, angles.y))
-        self._P = np.zeros((MAP, MAP))
+        self._P = np.zeros((len(self._x), len(self._x)))
+        self._P[MAP:, MAP:] = self._known.joint()
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
         self._P[ROLL:POSE, ROLL:POSE] = (
             E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
@@ -315,11 +317,24 @@ class EkfSlam(FilterShell):
         """Carry the state over the motion to the next epoch."""
         predict(self._x, self._P, motion)
 
-    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+    def observe(
+        self,
+        motion: Motion,
+        slot: int,
+        z: Floats,
+        R_z: Floats,
+        sonar: Sonar | None = None,
+    ) -> Judged:
         """Update by range and azimuth of a known landmark, (6) and (7)."""
         return Judged(
             *observe(
-                self._x, self._P, MAP + LANDMARK * slot, motion, self.sonar, z, R_z
+                self._x,
+                self._P,
+                MAP + LANDMARK * slot,
+                motion,
+                sonar or self.sonar,
+                z,
+                R_z,
             )
         )
 
@@ -438,10 +453,11 @@ class EkfSlam(FilterShell):
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
         return pose_estimate(self._x, self._P, motion)
 
-    def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position, and its block of (5)."""
-        block = slice(MAP + LANDMARK * slot, MAP + LANDMARK * (slot + 1))
-        return self._x[block], self._P[block, block]
+    def points(self, slots: list[int]) -> tuple[Floats, Floats]:
+        """Positions, and their blocks of (5)."""
+        first = MAP + LANDMARK * np.array(slots, dtype=np.int64)
+        places = np.add.outer(first, np.arange(LANDMARK)).ravel()
+        return self._x[places].reshape(-1, 3), self._P[np.ix_(places, places)]
 
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""

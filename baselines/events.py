@@ -79,8 +79,8 @@ class Views(NamedTuple):
     """Detections of a call: range and azimuth z (m, 2) with covariance R_z, innovation e with S (NaN without one)."""
 
     stamp_ns: Ints
-    slot: Ints
-    """Number of the landmark in the state; the next free one for a new landmark."""
+    ids: Ints
+    """Identity of the landmark that is most probable."""
     z: Floats
     R_z: Floats
     outcome: NDArray[np.int8]

@@ -33,7 +33,13 @@ from baselines.events import (
     remove_rate,
 )
 from baselines.kalman import NEW, Judged
-from sonar_graph.calibration import Calibration, PlanarMotion, Section, require_params
+from sonar_graph.calibration import (
+    Calibration,
+    KnownMap,
+    PlanarMotion,
+    Section,
+    require_params,
+)
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import (
     Depth,
@@ -46,10 +52,12 @@ from sonar_graph.measurements import (
     require_measurements,
 )
 from sonar_graph.models import (
-    ACCEPTED,
+    CONTRADICTS,
     MINIMUM_PROBABILITY,
     Contradictions,
+    KnownLandmarks,
     Mount,
+    Verdict,
     identify,
     tilt_sigma,
     up_direction,
@@ -77,7 +85,7 @@ NO_STAMPS = np.empty(0, np.int64)
 NO_SAMPLES = Samples(NO_STAMPS, NO_STAMPS, np.empty((0, 3)), np.empty((0, 3, 3)))
 NO_VIEWS = Views(
     stamp_ns=NO_STAMPS,
-    slot=NO_STAMPS,
+    ids=NO_STAMPS,
     z=np.empty((0, 2)),
     R_z=np.empty((0, 2, 2)),
     outcome=np.empty(0, np.int8),
@@ -169,8 +177,12 @@ class FilterShell(ABC):
         self._kept_ns = 0
         self._used_in_gap: dict[tuple[int, int], int] = {}
         self._may_be_far = False
-        self._landmarks = 0
-        self._slots: dict[int, int] = {}
+        self._known = KnownLandmarks(calibration.map)
+        ids = calibration.map.ids if calibration.map else ()
+        self._slots = {landmark_id: slot for slot, landmark_id in enumerate(ids)}
+        """Number in the state of each landmark; those of the map come first."""
+        self._landmarks = len(ids)
+        """Number of landmarks in the state; some may have been let go."""
         self._journal = DetectionJournal()
         self._estimates = CausalEstimates()
         self._refused: list[RefusedRow] = []
@@ -183,8 +195,18 @@ class FilterShell(ABC):
         """Carry the state over the motion to the next epoch."""
 
     @abstractmethod
-    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
-        """Update by range and azimuth of a known landmark, a motion after the state."""
+    def observe(
+        self,
+        motion: Motion,
+        slot: int,
+        z: Floats,
+        R_z: Floats,
+        sonar: Sonar | None = None,
+    ) -> Judged:
+        """Update by range and azimuth of a known landmark, a motion after the state.
+
+        ``sonar``: with another gate; None: `sonar` of the filter.
+        """
 
     @abstractmethod
     def observe_far(
@@ -228,8 +250,8 @@ class FilterShell(ABC):
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
 
     @abstractmethod
-    def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position in the world (3,) and covariance (3, 3) of the landmark that was appended as number ``slot``."""
+    def points(self, slots: list[int]) -> tuple[Floats, Floats]:
+        """Positions of m landmarks by their numbers in the state, (m, 3), and their joint covariance, (3 m, 3 m)."""
 
     @abstractmethod
     def attitude(self) -> Floats:
@@ -265,7 +287,7 @@ class FilterShell(ABC):
         # results depend on stamps alone: what comes later than an estimate for its stamp is late
         since_ns = max(self._done_ns, self._reached_ns)
         self._done_ns = max(self._done_ns, end_ns)
-        ids, views = self._views(detections, since_ns)
+        views = self._views(detections, since_ns)
         estimate = None
         try:
             samples = self._samples(
@@ -284,7 +306,7 @@ class FilterShell(ABC):
             ) from error
         if detections is not None:
             self._journal.extend(
-                detections.stamps_ns, ids, views.outcome, views.e, views.S
+                detections.stamps_ns, views.ids, views.outcome, views.e, views.S
             )
         return estimate
 
@@ -295,14 +317,18 @@ class FilterShell(ABC):
     def landmarks(self) -> LandmarkMap:
         """Landmarks in the state, with the covariances of their coordinates."""
         ids = sorted(self._slots)
-        read = [self.landmark(self._slots[i]) for i in ids]
-        return LandmarkMap(
-            ids=np.array(ids, dtype=np.int64),
-            positions=np.array([position for position, _ in read]).reshape(-1, 3),
-            covariances=np.array([covariance for _, covariance in read]).reshape(
-                -1, 3, 3
-            ),
+        positions, joint = self.points([self._slots[i] for i in ids])
+        m = len(ids)
+        blocks = joint.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
+        return self._known.with_given(
+            LandmarkMap(np.array(ids, dtype=np.int64), positions, blocks)
         )
+
+    def known_map(self) -> KnownMap:
+        """Landmarks in the state with their joint covariance, for another run."""
+        ids = sorted(self._slots)
+        positions, joint = self.points([self._slots[i] for i in ids])
+        return KnownMap.of(ids, positions, covariance_m2=joint)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection so far."""
@@ -310,7 +336,7 @@ class FilterShell(ABC):
 
     def withheld(self) -> list[str]:
         """Messages about headings, fixes and detections that the state contradicts."""
-        messages = self._contradictions.messages()
+        messages = self._contradictions.messages() + self._known.messages()
         if math.isfinite(self.sonar.gate) or math.isfinite(self.sonar.kernel_width):
             messages += lockout_messages(self.detections())
         return messages
@@ -332,24 +358,18 @@ class FilterShell(ABC):
         self._kept_ns = start_ns
         self._opened_velocity = self.odometry.velocity_at_imu(start_ns)
 
-    def _views(
-        self, detections: LandmarkDetections | None, since_ns: int
-    ) -> tuple[Ints, Views]:
-        """Most probable identities of detections, and their views.
+    def _views(self, detections: LandmarkDetections | None, since_ns: int) -> Views:
+        """Views of detections, with their most probable identities.
 
         Rows before the first epoch is reached, or older than those done, are refused.
         """
         if detections is None:
-            return NO_STAMPS, NO_VIEWS
+            return NO_VIEWS
         stamps_ns = detections.stamps_ns
         ids, outcome = identify(detections, self.params.minimum_id_probability)
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        slot = np.full(len(ids), -1)
-        for row in np.flatnonzero(outcome == ACCEPTED).tolist():
-            # a new landmark gets the next number: rows are used in their order
-            slot[row] = self._slots.setdefault(int(ids[row]), len(self._slots))
         z, R_z = read_detections(
             detections.range_m,
             detections.azimuth_rad,
@@ -358,7 +378,7 @@ class FilterShell(ABC):
         )
         e = np.full((len(ids), 2), math.nan)
         S = np.full((len(ids), 2, 2), math.nan)
-        return ids, Views(stamps_ns, slot, z, R_z, outcome, e, S)
+        return Views(stamps_ns, ids, z, R_z, outcome, e, S)
 
     def _samples(
         self,
@@ -555,17 +575,36 @@ class FilterShell(ABC):
         for row in in_frame(views, first):
             z = views.z[row]
             R_z = views.R_z[row]
-            slot = int(views.slot[row])
-            if slot == self._landmarks:  # the next free number: seen for the first time
+            landmark_id = int(views.ids[row])
+            slot = self._slots.get(landmark_id)
+            if slot is None:  # seen for the first time
                 self.augment(motion, z, R_z)
+                self._slots[landmark_id] = self._landmarks
                 self._landmarks += 1
                 views.outcome[row] = NEW
                 continue
             judged = (
                 self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
             )
-            judged = judged or self.observe(motion, slot, z, R_z)
+            judged = judged or self.observe(
+                motion, slot, z, R_z, self._gated(landmark_id)
+            )
             views.outcome[row], views.e[row], views.S[row] = judged
+            self._judge_map(landmark_id, judged)
+
+    def _gated(self, landmark_id: int) -> Sonar:
+        """The sonar, whose gate refuses what contradicts a landmark of the map."""
+        if landmark_id not in self._known.held:
+            return self.sonar
+        return self.sonar._replace(gate=min(self.sonar.gate, math.sqrt(CONTRADICTS)))
+
+    def _judge_map(self, landmark_id: int, judged: Judged) -> None:
+        """Let a landmark of the map go that has moved; its next sighting maps it anew."""
+        if landmark_id not in self._known.held:
+            return
+        squared = float(judged.e @ np.linalg.solve(judged.S, judged.e))
+        if self._known.judge(landmark_id, squared) is Verdict.RELEASE:
+            del self._slots[landmark_id]
 
     def _bridge(self, order: Order, k: int, views: Views) -> Motion:
         """Motion over a gap, with the share of its error that the measurements of one more event may have.

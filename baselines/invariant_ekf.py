@@ -68,6 +68,7 @@ from sonar_graph.models import (
     BIASES,
     COMPASS,
     SCALE,
+    KnownLandmarks,
     bias_jacobian,
     bias_sigmas,
     body_point_jacobian,
@@ -309,7 +310,7 @@ class InvariantEkf(FilterShell):
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
         self._walk_density = bias_sigmas(calibration)[1]
-        self._state = start_state(calibration)
+        self._state = with_map(start_state(calibration), self._known)
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
@@ -324,9 +325,18 @@ class InvariantEkf(FilterShell):
         """Carry the state over the motion to the next epoch, (2) and (3)."""
         predict(self._state, motion, self._walk_density**2 * duration_s)
 
-    def observe(self, motion: Motion, slot: int, z: Floats, R_z: Floats) -> Judged:
+    def observe(
+        self,
+        motion: Motion,
+        slot: int,
+        z: Floats,
+        R_z: Floats,
+        sonar: Sonar | None = None,
+    ) -> Judged:
         """Update by range and azimuth of a known landmark, (5)."""
-        return Judged(*observe(self._state, 1 + slot, motion, self.sonar, z, R_z))
+        return Judged(
+            *observe(self._state, 1 + slot, motion, sonar or self.sonar, z, R_z)
+        )
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
@@ -479,13 +489,18 @@ class InvariantEkf(FilterShell):
         A[:, BETA] = D
         return R, X, symmetric(A @ self._state.P[:BARE, :BARE] @ A.T + motion.C)
 
-    def landmark(self, slot: int) -> tuple[Floats, Floats]:
-        """Position, and covariance of its coordinates, ``xi_k - [x_k]x theta``."""
-        at = self._state.points[1 + slot]
-        A = np.zeros((POINT, len(self._state.P)))
-        A[:, place_of(1 + slot)] = np.eye(3)
-        A[:, THETA] = -cross_matrix(at)
-        return at, symmetric(A @ self._state.P @ A.T)
+    def points(self, slots: list[int]) -> tuple[Floats, Floats]:
+        """Positions, and covariance of their coordinates, ``xi_k - [x_k]x theta``."""
+        P = self._state.P
+        positions = self._state.points[[1 + slot for slot in slots]]  # (m, 3)
+        first = BARE + POINT * np.array(slots, dtype=np.int64)
+        places = np.add.outer(first, np.arange(POINT)).ravel()
+        B = np.array([cross_matrix(at) for at in positions]).reshape(-1, 3)  # (3 m, 3)
+        turned = B @ P[THETA, places]  # (3 m, 3 m)
+        joint = (
+            P[np.ix_(places, places)] - turned - turned.T + B @ P[THETA, THETA] @ B.T
+        )
+        return positions, symmetric(joint)
 
 
 def start_state(calibration: Calibration) -> InvariantState:
@@ -511,3 +526,18 @@ def start_state(calibration: Calibration) -> InvariantState:
         body_p_dvl,
         calibration.use_gravity,
     )
+
+
+def with_map(state: InvariantState, known: KnownLandmarks) -> InvariantState:
+    """State with the landmarks of a map, whose places do not depend on the vehicle's.
+
+    The error d of a place is ``xi_k = d + [x_k^]x theta``, as that of the body.
+    """
+    places = known.places()  # (m, 3)
+    A = np.zeros((places.size, len(state.P)))  # of xi_1 to xi_m by xi
+    for k, place in enumerate(places):
+        A[POINT * k : POINT * (k + 1), THETA] = cross_matrix(place)
+    AP = A @ state.P
+    own = symmetric(AP @ A.T + known.joint())
+    P = np.block([[state.P, AP.T], [AP, own]])
+    return state._replace(points=np.vstack((state.points, places)), P=P)

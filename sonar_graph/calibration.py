@@ -4,10 +4,13 @@ A `Calibration` travels inside the log (a metadata record) or comes from a TOML 
 in its name or docstring. Every estimator gets the same one.
 """
 
-from typing import Annotated, Any, Literal
+from collections import Counter
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Self
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -15,6 +18,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    model_validator,
 )
 from pydantic._internal._model_construction import ModelMetaclass
 from pydantic.fields import FieldInfo
@@ -78,7 +82,9 @@ class SectionType(ModelMetaclass):
         except ValidationError as error:
             faults = []
             for fault in error.errors():
-                told = f"{expectation(fault['type'], fault['msg'])}, not {fault['input']!r:.60}"
+                told = expectation(fault["type"], fault["msg"])
+                if fault["type"] != MISFIT:
+                    told += f", not {fault['input']!r:.60}"
                 if fault["type"] == "extra_forbidden":
                     known = (
                         getattr(cls, "model_fields", {})
@@ -293,13 +299,91 @@ class Start(Section):
     """Along the world's axes."""
     rpy_sigma_rad: Sigmas = (1e-3, 1e-3, 1e-3)
     """Small rotations about the body's axes."""
-    source: Literal["stated", "fixes", "heading", "vehicle"] = "stated"
+    source: Literal["stated", "fixes", "heading", "vehicle", "map"] = "stated"
     """Where x, y and yaw come from. ``stated``: from the owner; ``fixes``: measured; ``heading``: yaw is measured, x
-    and y are zero at the vehicle; ``vehicle``: all three are zero at the vehicle, which defines the world."""
+    and y are zero at the vehicle; ``vehicle``: all three are zero at the vehicle, which defines the world; ``map``:
+    they are found in the known map."""
 
     def pose(self) -> gtsam.Pose3:
         """world_T_body."""
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.position_m))
+
+
+class KnownMap(Section):
+    """Landmarks whose places were known before the run, by a survey or by the map of an earlier run.
+
+    All coordinates are jointly normal: ``p ~ N(positions_m, covariance_m2)``.
+
+    Examples
+    --------
+    >>> surveyed = KnownMap.of([4, 9], [[5.0, 0.0, -1.7], [7.0, -3.0, -1.7]], sigma_m=0.05)
+    >>> surveyed.ids, surveyed.joint().shape
+    ((4, 9), (6, 6))
+    """
+
+    ids: tuple[int, ...]
+    """Identity of each of m landmarks."""
+    positions_m: tuple[Vector, ...]
+    """In the world, m places."""
+    covariance_m2: tuple[tuple[Number, ...], ...]
+    """Joint covariance of all coordinates, x, y, z of each landmark in turn, shape (3 m, 3 m)."""
+    is_fixed: bool = False
+    """True: estimators count the map's covariance, and report its landmarks as they were given."""
+    source: str = ""
+    """Origin of the map: a survey, or log and estimator of an earlier run."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.ids:
+            raise misfits(type(self), {"ids": "a map needs at least one landmark"})
+        twice = [i for i, count in Counter(self.ids).items() if count > 1]
+        if twice:
+            raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
+        if len(self.positions_m) != len(self.ids):
+            reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
+            raise misfits(type(self), {"positions_m": reason})
+        size = 3 * len(self.ids)
+        if [len(row) for row in self.covariance_m2] != [size] * size:
+            reason = f"expected {size} rows of {size} numbers, three a landmark"
+            raise misfits(type(self), {"covariance_m2": reason})
+        P = self.joint()
+        largest = float(np.abs(P).max())
+        is_symmetric = bool((np.abs(P - P.T) <= 1e-6 * largest).all())
+        if not is_symmetric or np.linalg.eigvalsh(P)[0] < -1e-9 * largest:
+            reason = "expected a symmetric matrix without negative eigenvalues"
+            raise misfits(type(self), {"covariance_m2": reason})
+        return self
+
+    def joint(self) -> NDArray[np.float64]:
+        """The joint covariance as an array, shape (3 m, 3 m), m²."""
+        return np.array(self.covariance_m2, dtype=np.float64)
+
+    @classmethod
+    def of(
+        cls,
+        ids: Sequence[int],
+        positions_m: ArrayLike,
+        *,
+        sigma_m: float | None = None,
+        covariance_m2: ArrayLike | None = None,
+        is_fixed: bool = False,
+    ) -> Self:
+        """Map from arrays.
+
+        ``positions_m``: shape (m, 3). Either ``sigma_m`` of every coordinate, without correlations, or
+        ``covariance_m2``, shape (3 m, 3 m).
+        """
+        if (sigma_m is None) == (covariance_m2 is None):
+            raise SettingError("KnownMap.of: give one of sigma_m and covariance_m2")
+        places = np.asarray(positions_m, np.float64)
+        if sigma_m is not None:
+            covariance_m2 = sigma_m**2 * np.eye(places.size)
+        return cls(
+            ids=tuple(int(i) for i in ids),
+            positions_m=tuple(map(tuple, places.tolist())),
+            covariance_m2=tuple(map(tuple, np.asarray(covariance_m2).tolist())),
+            is_fixed=is_fixed,
+        )
 
 
 class Calibration(Section):
@@ -323,6 +407,8 @@ class Calibration(Section):
     """None: landmark heights are known only through the sonar's vertical aperture."""
     planar: PlanarMotion | None = None
     """None: the vehicle moves in three dimensions."""
+    map: KnownMap | None = None
+    """Landmarks whose places are known; None: none is."""
     use_gravity: bool = True
     """Take roll and pitch from the accelerometers, where they measure."""
     odometry_interpolation: Literal["linear", "hold-past"] = "linear"

@@ -12,7 +12,7 @@ It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.test
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from sonar_graph.calibration import Calibration, Section
+from sonar_graph.calibration import Calibration, KnownMap, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
 from sonar_graph.motion import MotionSource
@@ -128,6 +128,26 @@ def newest_landmarks_of(estimator: Estimator) -> LandmarkMap:
         if isinstance(estimator, HasNewestLandmarks)
         else estimator.landmarks()
     )
+
+
+@runtime_checkable
+class HasKnownMap(Protocol):
+    """Optional part of the contract: an estimator whose map can be given to another run."""
+
+    def known_map(self) -> KnownMap:
+        """Landmarks with their joint covariance."""
+        ...
+
+
+def known_map_of(estimator: Estimator) -> KnownMap:
+    """Map for another run; an `EstimatorError` where an estimator has no landmark, or does not give its map."""
+    if not isinstance(estimator, HasKnownMap):
+        raise EstimatorError(
+            f"{type(estimator).__name__} has no known_map(): it cannot save a map; isam2 and both filters can"
+        )
+    if not len(estimator.landmarks()):
+        raise EstimatorError("no landmark was seen: there is no map to save")
+    return estimator.known_map()
 
 
 def installed_estimators() -> dict[str, EntryPoint]:

@@ -247,9 +247,12 @@ def of_velocity() -> Iterator[Fault]:
     row = partial(Fault, "velocity", roles=roles("dvl"))
     yield row("stuck", FROM, FROM_S, stuck("dvl_s", "velocity"), r"(velocity|DVL).*(same|stuck|repeat)")
     yield row("late", "seconds", (0.5, 1.0, 1.5), late("dvl_s"), r"DVL against IMU")
+    either = roles("dvl", "imu")  # of a turn about the vertical, which the pair alone does not tell apart
     for name, axes in MIRRORS.items():
-        yield row(SENSE, name, AGAIN, turned("velocity", axes), r"DVL axes")
-    yield row(SENSE, "turned by 90 degrees", AGAIN, turned("velocity", QUARTER_TURN), r"DVL axes|mounting yaw")
+        may_change = either if name == "x and y negated" else roles("dvl")
+        yield row(SENSE, name, AGAIN, turned("velocity", axes), r"DVL axes", roles=may_change)
+    quarter = turned("velocity", QUARTER_TURN)
+    yield row(SENSE, "turned by 90 degrees", AGAIN, quarter, r"DVL axes|mounting yaw", roles=either)
     yield row("marked invalid", "share, huge variance", SHARES, Marked("velocity", "dvl_s", "velocity", True), LEFT_OUT)
     yield row("marked invalid", "share, NaN", SHARES, Marked("velocity", "dvl_s", "velocity", False), LEFT_OUT)
     row = partial(row, roles=roles("dvl", "positions", "detections", "depth"))

@@ -7,7 +7,7 @@ A source is a kind and its options. With a seed it gives the same sequence on ev
 import hashlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import gtsam
 from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.diagnosis import check_sensors, notes_of
+from sonar_graph.diagnosis import compared, trusted
 from sonar_graph.files import regular
 from sonar_graph.logs import PartialCalibration, read_log
 from sonar_graph.logs.adapters import LogConfig, read_log_config
@@ -178,10 +178,9 @@ def read_source(
 def with_findings(kind: str, options: dict[str, Any], sequence: Sequence) -> Sequence:
     """The sequence of a log with notes of what its sensors contradict; simulators and data sets are known."""
     if kind != LOG:
-        return sequence
+        return trusted(sequence)
     _, config, _ = _parsed(LogOptions.model_validate(options))
-    found = notes_of(check_sensors(sequence, config))
-    return replace(sequence, notes={**sequence.notes, **found})
+    return compared(sequence, config)
 
 
 def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:

@@ -93,6 +93,13 @@ class ReadingOptions:
             "TOML or JSON file, or a log, whose fields go before those of the log's own calibration and mountings."
         ),
     ] = None
+    map: Annotated[
+        Path | None,
+        existing_file(
+            "Map of known landmarks: a map.toml that a run has written, or a CSV table of a survey. A start that the log "
+            "does not state is found in it."
+        ),
+    ] = None
     topics: Annotated[
         list[str] | None,
         typer.Option(
@@ -176,8 +183,9 @@ class ReadingOptions:
     ) -> Sequence:
         """Read a log as a sequence."""
         from sonar_graph.logs import read_log
+        from sonar_graph.map_file import in_map
 
-        return read_log(
+        sequence = read_log(
             log,
             calibration=self.given,
             topics=self.choices,
@@ -186,6 +194,7 @@ class ReadingOptions:
             salvage=self.salvage,
             progress=progress,
         )
+        return sequence if self.map is None else in_map(sequence, self.map)
 
 
 def with_options(

@@ -377,25 +377,19 @@ def prepared_log(
     are_sensors_trusted: bool = False,
 ) -> PreparedLog:
     """Read a log, compare its sensors unless they are trusted, and recognise landmarks if it needs that."""
-    from sonar_graph.diagnosis import check_sensors, notes_of
+    from sonar_graph.diagnosis import compared, trusted
     from sonar_graph.logs import LIVE_RATE, no_images
-    from sonar_graph.logs.adapters import LogConfig
 
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     check_rate(rate_hz, sequence)
-    if not are_sensors_trusted:
-        with working("comparing sensors"):
-            found_in_sensors = notes_of(
-                check_sensors(sequence, reading.config or LogConfig())
-            )
-        if of_reading := sequence.notes.get("log.doubtful"):
-            of_sensors = found_in_sensors.get("log.doubtful", "")
-            found_in_sensors["log.doubtful"] = "; ".join(
-                text for text in (of_reading, of_sensors) if text
-            )
-        sequence = replace(sequence, notes={**sequence.notes, **found_in_sensors})
+    with working("comparing sensors"):
+        sequence = (
+            trusted(sequence)
+            if are_sensors_trusted
+            else compared(sequence, reading.config)
+        )
     found = None
     # what was recognised is in it: estimates are those of the live run
     is_of_live_run = LIVE_RATE in sequence.notes

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -98,7 +97,7 @@ def live(
     """
     import numpy as np
 
-    from sonar_graph.diagnosis import check_sensors, notes_of
+    from sonar_graph.diagnosis import compared
     from sonar_graph.evaluation import (
         RunResult,
         check_request,
@@ -118,7 +117,9 @@ def live(
     from sonar_graph.logs import LiveRecord, read_log
     from sonar_graph.report import doubt_lines
 
-    reading = ReadingOptions(calibration, topics, log_config)
+    reading = ReadingOptions(
+        calibration=calibration, topics=topics, log_config=log_config
+    )
     record = output / RECORD
     if record.exists():
         advice = (
@@ -190,8 +191,7 @@ def live(
     )
     with working("writing results"):
         sequence = read_log(record)
-        notes = notes_of(check_sensors(sequence, reading.config))
-        sequence = replace(sequence, notes={**sequence.notes, **notes})
+        sequence = compared(sequence, reading.config)
         comparison = judge(sequence, outcome.causal.stamps_ns, [result])
         with result_written(output, COMPARISON):
             write_comparison(comparison, output)
@@ -199,7 +199,8 @@ def live(
     echo(
         f"{sum(counts['received'].values())} messages, {sum(counts['lost'].values())} lost"
     )
-    for line in doubt_lines(notes):
+    of_sensors = {"log.doubtful", "log.sensors"} & sequence.notes.keys()
+    for line in doubt_lines({name: sequence.notes[name] for name in of_sensors}):
         echo(line, err=True)
     for what in ("lost", "dropped"):
         for name, number in counts[what].items():

@@ -1,9 +1,9 @@
 """Diagnosis of a log: its sensors compared with each other and with the calibration."""
 
 # fmt: off
-from sonar_graph.diagnosis.findings import Finding, notes_of
-from sonar_graph.diagnosis.sensor_check import check_sensors, doubts
+from sonar_graph.diagnosis.findings import Finding
+from sonar_graph.diagnosis.sensor_check import check_sensors, compared, doubts, trusted
 
 __all__ = [
-    "Finding", "check_sensors", "doubts", "notes_of",
+    "Finding", "check_sensors", "compared", "doubts", "trusted",
 ]

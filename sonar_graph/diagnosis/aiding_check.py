@@ -7,6 +7,7 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +35,14 @@ from sonar_graph.diagnosis.signals import (
 )
 from sonar_graph.diagnosis.start import LEAST_BIAS_RAD_S, turned_mounting
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, PositionFixes
+from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, Floats, PositionFixes
 from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 
 HEADING_SENSE = "heading: turn over that of the gyros"
+VERTICAL_BIAS = "gyro bias about the vertical"
 HEADING_TURN = "heading: turn towards the positions"
 LARGEST_GAIN_SIGMA = 0.12
 """Of a gain that is told: 1 and -1 are sixteen sigmas apart."""
@@ -284,10 +286,9 @@ POSITIONS = Check(
     ),
     least_lag_s=0.3,
 )
-RANGE = Check(
+SIGHTINGS = partial(Check, role="detections", against="the motion between frames")
+RANGE = SIGHTINGS(
     name="ranges to landmarks",
-    role="detections",
-    against="the motion between frames",
     compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=True),
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
     units=LENGTHS,
@@ -304,10 +305,8 @@ RANGE = Check(
         "of the Doppler log",
     ),
 )
-AZIMUTH = Check(
+AZIMUTH = SIGHTINGS(
     name="azimuths of landmarks",
-    role="detections",
-    against="the motion between frames",
     compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=False),
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units=DEGREES,
@@ -465,9 +464,13 @@ LEAST_BIAS_S = 30.0
 
 
 def vertical_bias(
-    sequence: Sequence, motion: BodyMotion | None = None
+    sequence: Sequence,
+    motion: BodyMotion | None = None,
+    of_axes_rad_s: Floats | None = None,
 ) -> Finding | None:
     """Bias of the gyros about the vertical, by a heading or by true orientations; None without either.
+
+    ``of_axes_rad_s``: bias along the axes of the body as otherwise known, shape (3,), whose level part enters the line.
 
     The slope over time of the gyros' turn, less the bias that is known, less the heading.
     """
@@ -482,7 +485,7 @@ def vertical_bias(
         yaw_rad = np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
     else:
         return None
-    quantity = "gyro bias about the vertical"
+    quantity = VERTICAL_BIAS
     bias = unknown(f"too little time beside {source}")
     motion = motion or BodyMotion.of(sequence)
     if motion is None:
@@ -502,9 +505,15 @@ def vertical_bias(
     if not matters(bias, LEAST_BIAS_RAD_S, allowed):
         cause = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
         return Finding(quantity, bias, "rad/s", cause)
+    up = np.median(motion.up, axis=0)
+    up = up / np.linalg.norm(up)
+    level_rad_s = np.zeros(3)
+    if of_axes_rad_s is not None:
+        level_rad_s = of_axes_rad_s - (of_axes_rad_s @ up) * up
     # the line is in the axes of the IMU
-    up = np.median(motion.up, axis=0) @ imu.mounting.pose().rotation().matrix()
-    whole = np.add(imu.gyro_bias_rad_s, bias.value * up / np.linalg.norm(up))
+    body_R_imu = imu.mounting.pose().rotation().matrix()
+    more_rad_s = (level_rad_s + bias.value * up) @ body_R_imu
+    whole = np.add(imu.gyro_bias_rad_s, more_rad_s)
     turned_rad = abs(bias.value) * sequence.duration_s
     return Finding(
         quantity,
@@ -657,7 +666,7 @@ def heading_turn(
         yield row
         return
     offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
-    rpy = numbers(turned_mounting(right.calibration.dvl, angle.value), 4)
+    rpy = numbers(turned_mounting(right.calibration.dvl.mounting, angle.value), 4)
     vertical = vertical_bias(right, motion)
     is_biased = vertical is not None and vertical.acts
     first = "once the gyro bias is put right, which comes first, " if is_biased else ""

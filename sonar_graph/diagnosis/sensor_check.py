@@ -23,6 +23,7 @@ from sonar_graph.diagnosis.aiding_check import (
     LARGE_TURN_RAD,
     POSITIONS,
     RANGE,
+    VERTICAL_BIAS,
     findings_of,
     fix_height_findings,
     heading_findings,
@@ -33,6 +34,7 @@ from sonar_graph.diagnosis.aiding_check import (
 )
 from sonar_graph.diagnosis.axes import AxesMatch, match_axes, turns_less_than_body
 from sonar_graph.diagnosis.findings import (
+    ALSO,
     IN_CALIBRATION,
     IN_LOG_CONFIG,
     NO_NEED,
@@ -41,26 +43,37 @@ from sonar_graph.diagnosis.findings import (
     in_degrees,
     judged,
     matters,
+    notes_of,
     numbers,
     signed_axes,
     unknown,
+    with_interval,
     worst_first,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.signals import Match
 from sonar_graph.diagnosis.start import (
+    ARM,
+    LEAST_BIAS_RAD_S,
     LEAST_HEADING_RAD,
+    NO_GRAVITY,
     StartTilt,
     bias_findings,
     find_start_heading,
     find_start_tilt,
+    lacks_gravity,
     lever_findings,
     tilt_findings,
     turned_mounting,
     with_fitted,
 )
+from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
 from sonar_graph.diagnosis.units import force_scale, wrong_units
-from sonar_graph.logs import gravity_warning, stuck_quantities
+from sonar_graph.logs import (
+    gravity_warning,
+    row_notes,
+    stuck_quantities,
+)
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
@@ -74,6 +87,9 @@ from sonar_graph.navigation.alignment import (
 )
 from sonar_graph.sequence import Sequence
 
+YAW = "DVL mounting yaw"
+COMPARED = "log.compared"
+"""Subject of the note that sensors were compared, or why not."""
 LONGEST_S = 600.0
 """Longest part in which Doppler log and accelerometers are compared, in the middle of the log."""
 LEAST_OFFSET_S = 0.01
@@ -115,29 +131,93 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         return worst_first(all_findings(sequence, config or LogConfig()))
 
 
+def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
+    """The sequence with notes of what its sensors contradict; itself where they were compared before.
+
+    A sequence that was not read from a log gets the notes of `row_notes` too.
+
+    Examples
+    --------
+    >>> from sonar_graph.diagnosis import compared
+    >>> from sonar_graph.testing import small_world
+    >>> compared(small_world()).notes["log.compared"]
+    'sensors with each other'
+    """
+    if COMPARED in sequence.notes:
+        return sequence
+    notes = sequence.notes | {COMPARED: "sensors with each other"}
+    if "log.topics" not in notes:
+        notes |= row_notes(sequence)
+    for subject, text in notes_of(check_sensors(sequence, config)).items():
+        of_rows = notes.get(subject)
+        notes[subject] = f"{of_rows}; {text}" if of_rows else text
+    return replace(sequence, notes=notes)
+
+
+def trusted(sequence: Sequence) -> Sequence:
+    """The sequence with a note that its sensors are as its calibration has them, such as those of a simulator."""
+    notes = sequence.notes | {COMPARED: "no: the sensors are as calibrated"}
+    return replace(sequence, notes=notes)
+
+
 def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
-    sequence = without_stuck(sequence)
+    sequence = without_gravity(without_stuck(sequence))
     forces, sequence = force_findings(sequence, config)
     axes, sequence = axes_findings(sequence, config)
-    imu, dvl = middle_rows(sequence)
-    match = match_dvl_to_imu(imu, dvl, sequence.calibration)
+    match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
+    if matters(match.yaw, LARGE_TURN_RAD):
+        pair = TurnedPair(sequence, match.yaw.value)
+        cause = "velocity changes as the IMU measures, turned by as much"
+        angle = in_degrees(match.yaw)
+        axes.append(pair.finding(YAW, angle, cause))
+        sequence = pair.corrected()
+        match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
+    is_turned = any(finding.quantity == YAW for finding in axes)
+    if lacks_gravity(sequence):
+        match = replace(match, gyro_bias=(unknown(NO_GRAVITY),) * 3)
     of_dvl = dvl_findings(match, sequence, config)
     lever = lever_findings(match, sequence.calibration)
+    if any(EITHER in finding.cause for finding in axes):
+        lever = [Finding(ARM, unknown("IMU or Doppler log is turned"), "m")]
     # each following check sees the log as these lines would make it
     right = corrected_sequence(sequence, match, of_dvl)
     tilt = find_start_tilt(right)
-    bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
-    by_motion = motion_findings(right, config)
+    estimates, sources = surest_bias(match, tilt)
+    bias = bias_findings(estimates, sources, sequence.calibration.imu)
+    axes_rad_s = np.array([b.value if b.is_known else 0.0 for b in estimates])
+    by_motion = motion_findings(right, config, axes_rad_s)
+    of_vertical = [f for f in by_motion if f.quantity == VERTICAL_BIAS]
     # one row on the bias that is known is enough
-    if any(is_vertical_bias(f) and f.estimate.is_known for f in by_motion):
+    if any(f.estimate.is_known for f in of_vertical):
         bias = [f for f in bias if f.estimate.is_known or f.acts]
+    # one line for all axes, with both intervals of the vertical one
+    if any(f.acts for f in of_vertical):
+        known = f"{sources[2]} {with_interval(estimates[2], 'rad/s')}"
+        by_motion = [
+            replace(f, cause=f"{f.cause} ({known})")
+            if f in of_vertical and estimates[2].is_known
+            else f
+            for f in by_motion
+        ]
+        by_motion += [replace(f, cause=ALSO, consequence="", line="") for f in bias]
+        bias = []
     reference = reference_findings(right, config, tilt)
     noise = noise_findings(sequence)
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
-    return [*forces, *axes, *of_dvl, *lever, *bias, *by_motion, *reference, *noise]
+    of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
+    return [
+        *forces,
+        *axes,
+        *of_dvl,
+        *lever,
+        *bias,
+        *by_motion,
+        *reference,
+        *noise,
+    ]
 
 
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -148,7 +228,8 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """
     if faults := wrong_units(sequence, config):
         return faults
-    forces, right = force_findings(without_stuck(sequence), config)
+    right = without_gravity(without_stuck(sequence))
+    forces, right = force_findings(right, config)
     axes, right = axes_findings(right, config)
     found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
@@ -176,11 +257,6 @@ def by_late_imu(
         line=f"`stamp_offset_s = {total_s:.3f}` under [imu] {IN_LOG_CONFIG}",
     )
     return [of_imu, *others], [f for f in by_motion if f not in delays]
-
-
-def is_vertical_bias(finding: Finding) -> bool:
-    """True for the row of `vertical_bias`."""
-    return finding.quantity.startswith("gyro bias about")
 
 
 def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
@@ -213,6 +289,14 @@ def without_stuck(sequence: Sequence) -> Sequence:
     if len(of_dvl) < len(dvl):
         dvl = dvl.rows(of_dvl)
     return replace(sequence, imu=imu, dvl=dvl)
+
+
+def without_gravity(sequence: Sequence) -> Sequence:
+    """The sequence as if its owner had said so, where gravity was taken out of the specific forces."""
+    if not lacks_gravity(sequence):
+        return sequence
+    calibration = sequence.calibration.model_copy(update={"use_gravity": False})
+    return replace(sequence, calibration=calibration)
 
 
 def force_findings(
@@ -259,7 +343,13 @@ def axes_findings(
         )
         findings.append(gyro_axes_finding(found.gyro, cause, sequence, config))
         sequence = turned_gyros(sequence, found.gyro)
-    if (found.dvl != np.eye(3)).any():
+    turn = vertical_turn(found.dvl)
+    if turn is not None:
+        pair = TurnedPair(sequence, turn)
+        cause = axes_cause(found)
+        findings.append(pair.finding("DVL axes", unknown("wrong axes"), cause))
+        sequence = pair.corrected()
+    elif (found.dvl != np.eye(3)).any():
         axes = found.dvl if found.is_vertical_sure else upright(found.dvl, sequence)
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
@@ -343,13 +433,13 @@ def is_surely_negative(found: Match) -> bool:
 
 
 def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
-    """Axes of the Doppler log, as a mounting where they are turned, as a driver's where they are mirrored."""
+    """Axes of the Doppler log, as a mounting where they are turned, as a driver's where they are mirrored.
+
+    Gravity shows that the IMU is upright: a turn about another axis than the vertical is that of the Doppler log.
+    """
     axes = found.dvl
     body_R_dvl = sequence.calibration.dvl.mounting.pose().rotation().matrix()
-    cause = (
-        f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes "
-        f"({', '.join(signed_axes(axes))})"
-    )
+    cause = axes_cause(found)
     if np.linalg.det(axes) > 0:
         rpy = Rotation.from_matrix(axes @ body_R_dvl).as_euler("ZYX")[::-1]
         cause += (
@@ -370,6 +460,21 @@ def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
     )
 
 
+def axes_cause(found: AxesMatch) -> str:
+    """How much better the axes of the Doppler log fit the IMU."""
+    return (
+        f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes "
+        f"({', '.join(signed_axes(found.dvl))})"
+    )
+
+
+def vertical_turn(axes: Floats) -> float | None:
+    """Angle of a turn about the vertical, rad; None for other axes and for none."""
+    is_turn = axes[2, 2] == 1.0 and np.linalg.det(axes) > 0
+    yaw_rad = float(np.arctan2(axes[1, 0], axes[0, 0]))
+    return yaw_rad if is_turn and yaw_rad else None
+
+
 def turned_gyros(sequence: Sequence, axes: Floats) -> Sequence:
     """Sequence with rates about other axes of the body."""
     R = sequence.calibration.imu.mounting.pose().rotation().matrix()
@@ -387,7 +492,9 @@ def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
     return replace(sequence, dvl=turned)
 
 
-def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
+def motion_findings(
+    right: Sequence, config: LogConfig, bias_rad_s: Floats | None = None
+) -> list[Finding]:
     """Depth, heading, fixes and sightings against the motion of the body, and the gyros' bias about the vertical."""
     motion = BodyMotion.of(right)
     if motion is None:
@@ -409,8 +516,12 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
     found += start_depth_findings(right)
+    has_up = not lacks_gravity(right)
     for check in (DEPTH, RANGE, AZIMUTH):
         match = matches[check]
+        # without gravity the tilt of the vehicle is unknown
+        if match is not None and not has_up:
+            match = Match.unknown(NO_GRAVITY)
         # the place of a landmark depends on its range
         is_range_wrong = check is AZIMUTH and any(
             f.grave and f.quantity.startswith(RANGE.name) for f in found
@@ -421,7 +532,7 @@ def motion_findings(right: Sequence, config: LogConfig) -> list[Finding]:
     is_heading_wrong = any(
         f.quantity == HEADING.quantity and f.acts for f in of_heading
     )
-    vertical = vertical_bias(right, motion)
+    vertical = vertical_bias(right, motion, bias_rad_s)
     if vertical is not None and not is_heading_wrong:
         found.append(vertical)
     found += of_heading
@@ -442,9 +553,9 @@ def dvl_findings(
     offset = with_instant(found.offset, sequence.imu)
     late = offset_row("DVL against IMU", offset, "dvl", config)
     yaw_rad = found.yaw.value if found.yaw.is_known else 0.0
-    rpy = turned_mounting(sequence.calibration.dvl, yaw_rad)
+    rpy = turned_mounting(sequence.calibration.dvl.mounting, yaw_rad)
     turned = Finding(
-        "DVL mounting yaw",
+        YAW,
         in_degrees(found.yaw),
         "°",
         "turn the DVL's mounting",
@@ -496,13 +607,9 @@ def corrected_sequence(
     calibration = with_fitted(match, sequence.calibration)
     shift_ns = round(match.offset.value * NS_PER_S) if is_late else 0
     velocity = dvl.velocity * (match.scale.value if is_scaled else 1.0)
-    if is_turned:
-        rpy = turned_mounting(calibration.dvl, match.yaw.value)
-        mounting = calibration.dvl.mounting.model_copy(update={"rpy_rad": rpy})
-        section = calibration.dvl.model_copy(update={"mounting": mounting})
-        calibration = calibration.model_copy(update={"dvl": section})
     moved = Dvl(dvl.stamps_ns + shift_ns, velocity, dvl.velocity_cov)
-    return replace(sequence, dvl=moved, calibration=calibration)
+    right = replace(sequence, dvl=moved, calibration=calibration)
+    return TurnedPair(right, match.yaw.value).as_if("dvl") if is_turned else right
 
 
 def surest_bias(
@@ -510,12 +617,18 @@ def surest_bias(
 ) -> tuple[Estimates3D, tuple[str, str, str]]:
     """Gyro bias of the whole drive or of a rest, whichever is more certain on each axis, and its source."""
     still = tilt.gyro_bias() or match.gyro_bias
-    pairs = [
-        (at_rest, tilt.said)
-        if tilt.is_rest and (not driven.is_known or at_rest.sigma < driven.sigma)
-        else (driven, FROM_DRIVE)
-        for at_rest, driven in zip(still, match.gyro_bias, strict=True)
-    ]
+    pairs = list[tuple[Estimate1D, str]]()
+    for at_rest, driven in zip(still, match.gyro_bias, strict=True):
+        pair = (driven, FROM_DRIVE)
+        other = (at_rest, tilt.said)
+        if tilt.is_rest and (not driven.is_known or at_rest.sigma < driven.sigma):
+            pair, other = other, pair
+        (bias, source), (rival, of_rival) = pair, other
+        apart = replace(bias, value=rival.value - bias.value)
+        # a bias that changed is one row with both numbers
+        if rival.is_known and matters(apart, LEAST_BIAS_RAD_S, rival.sigma):
+            source += f" ({of_rival} {with_interval(rival, 'rad/s')})"
+        pairs.append((bias, source))
     (x, of_x), (y, of_y), (z, of_z) = pairs
     return (x, y, z), (of_x, of_y, of_z)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
+from sonar_graph.calibration import Calibration, ImuCalibration, Mounting, Start
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     NO_NEED,
@@ -23,6 +23,7 @@ from sonar_graph.diagnosis.findings import (
     unknown,
 )
 from sonar_graph.errors import AlignmentError
+from sonar_graph.logs import is_without_gravity
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Heading, Imu
 from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import (
@@ -45,6 +46,7 @@ LEAST_BIAS_RAD_S = 1e-4
 AXES = "xyz"
 ARM = "lever arm from IMU to DVL"
 BIAS = "gyro bias"
+NO_GRAVITY = "no gravity in the specific forces"
 
 
 def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
@@ -129,9 +131,9 @@ def largest(bias: Estimates3D) -> float:
     return max((abs(one.value) for one in bias if one.is_known), default=0.0)
 
 
-def turned_mounting(dvl: DvlCalibration, yaw_rad: float) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of the mounting after a turn about the body's z axis."""
-    before = Rotation.from_euler("ZYX", dvl.mounting.rpy_rad[::-1])
+def turned_mounting(mounting: Mounting, yaw_rad: float) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a mounting after a turn about the body's z axis."""
+    before = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
     after = Rotation.from_euler("z", yaw_rad) * before
     yaw, pitch, roll = after.as_euler("ZYX").tolist()
     return roll, pitch, yaw
@@ -178,6 +180,8 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     """Alignment at rest if the vehicle rests at the start, else in motion, of a log with the other faults corrected."""
     if np.isnan(sequence.imu.specific_force).all():
         return StartTilt(None, "no accelerometers")
+    if lacks_gravity(sequence):
+        return StartTilt(None, NO_GRAVITY)
     found = rest_tilt(sequence)
     imu, dvl = beginning(sequence, LONGEST_S)
     if found.tilt is not None or imu is None or dvl is None:
@@ -193,6 +197,12 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     else:
         return StartTilt(tilt, f"from {span_s(imu):.0f} s in motion")
     return StartTilt(None, f"at rest: {found.said}; in motion: {reason}")
+
+
+def lacks_gravity(sequence: Sequence) -> bool:
+    """True where gravity was taken out of the specific forces."""
+    forces = sequence.imu.specific_force
+    return is_without_gravity(forces, sequence.calibration.gravity_m_s2)
 
 
 def rest_tilt(sequence: Sequence) -> StartTilt:

@@ -1,5 +1,6 @@
 """Comparison of estimators: the same measurements, the same instants, the same truth. See docs/design/0007."""
 
+import logging
 import os
 import platform
 import shlex
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_graph.diagnosis import compared
 from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.evaluation.aligned import shared_map_instants
 from sonar_graph.evaluation.consistency import error_series
@@ -41,6 +43,7 @@ from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Trajectory
 from sonar_graph.version import __version__
 
+LOG = logging.getLogger("sonar_graph.evaluation")
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
 IMU_ROW_S, SOLVED_DETECTION_S, MEMORY_BYTES_S, LONG_S = 3e-5, 1.3e-3, 1e10, 30.0
 """Time for a row of the IMU, time for a detection in the batch solutions that a smoother gives as maps (4.5 s for 3,460
@@ -76,7 +79,9 @@ def compare(
     rate_hz: float = 2.0,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Comparison:
-    """Run estimators one after the other over one sequence and score them.
+    """Compare the sensors of a sequence, run estimators one after the other over it, and score them.
+
+    What the sensors contradict is in the notes of the comparison's sequence and is logged.
 
     Parameters
     ----------
@@ -140,6 +145,7 @@ def compare(
         )
     for name in names:
         check_request(name, settings.get(name))
+    sequence = with_doubts(sequence)
     instants_ns = sequence.instants(rate_hz)
     runs = []
     for name in names:
@@ -154,6 +160,15 @@ def compare(
             )
         )
     return judge(sequence, instants_ns, runs)
+
+
+def with_doubts(sequence: Sequence) -> Sequence:
+    """The sequence with notes of what its sensors contradict, which are logged too unless it had them before."""
+    found = compared(sequence)
+    for subject in ("log.doubtful", "log.sensors"):
+        if found is not sequence and subject in found.notes:
+            LOG.warning("%s: %s: %s", sequence.name, subject, found.notes[subject])
+    return found
 
 
 def expense(sequence: Sequence) -> str:

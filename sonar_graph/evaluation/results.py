@@ -381,13 +381,17 @@ class RefusedRows:
 
 
 def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
-    """Refused rows by sensor and reason, in this order: up to `MOST_ROWS_NAMED` one by one, more in one summary."""
+    """Refused rows by sensor and reason, in this order.
+
+    Up to `MOST_ROWS_NAMED` that have a distance are named one by one. More, and rows that differ only in their time, are
+    one summary.
+    """
     ordered = sorted(rows, key=lambda row: (row.sensor, row.reason, row.stamp_ns))
     found: list[RefusedRows] = []
     for _, alike in groupby(ordered, key=lambda row: (row.sensor, row.reason)):
         several = list(alike)
-        together = (
-            [several] if len(several) > MOST_ROWS_NAMED else [[row] for row in several]
-        )
+        is_one = len(several) > MOST_ROWS_NAMED
+        is_one |= all(math.isnan(row.distance) for row in several)
+        together = [several] if is_one else [[row] for row in several]
         found += map(RefusedRows.of, together)
     return found

@@ -406,12 +406,9 @@ class _Replay:
     def _fresh(self, kind: type[Estimator]) -> Estimator:
         """The estimator, with an odometry of its own."""
         # loads numba, which a result does not need
-        from sonar_graph.navigation import (
-            Odometry,
-        )
+        from sonar_graph.navigation.map_start import make_estimator
 
-        calibration = self._sequence.calibration
-        return kind(calibration, Odometry(calibration), self._params)
+        return make_estimator(kind, self._sequence.calibration, self._params)
 
     def _warm_up(self, kind: type[Estimator]) -> None:
         """Let an estimator that is thrown away compile its code, until landmarks were seen again."""

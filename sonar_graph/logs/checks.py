@@ -20,7 +20,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
-from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
 
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
@@ -48,6 +48,8 @@ LARGEST_LAG_CHANGE_S = 0.5
 LEAST_MOVED = {"positions": 1.0, "heading": 0.2, "depth": 0.5, "detections": 0.5}
 """Motion, m or rad, from which on a sensor that repeats its value is stuck, by role."""
 RESOLUTIONS = 3.0
+FASTEST_RESTING_M_S = 0.05
+"""Mean speed that the noise of a Doppler log makes at rest."""
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
@@ -224,6 +226,13 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def is_without_gravity(specific_force: Floats, gravity_m_s2: float) -> bool:
+    """True where specific forces, shape (n, 3), are typically so small that gravity was taken out of them."""
+    sizes = np.linalg.norm(specific_force, axis=1)
+    sizes = sizes[np.isfinite(sizes)]
+    return bool(len(sizes) and np.median(sizes) < MOST_OFF_GRAVITY * gravity_m_s2)
+
+
 def gravity_warning(
     specific_force: Floats, mounting: Mounting, gravity_m_s2: float
 ) -> str | None:
@@ -241,8 +250,8 @@ def gravity_warning(
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:
         return (
             f"the typical specific force is {length:.3g} m/s2 instead of {gravity_m_s2:.3g}: give its scale (9.80665 "
-            f"where it is in g), or turn off use_gravity in the calibration (--calibration FILE) "
-            "where gravity was taken out"
+            "where it is in g), or `use_gravity = false` in the calibration (--calibration FILE) where gravity was "
+            "taken out"
         )
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None
@@ -253,6 +262,51 @@ def gravity_warning(
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
     return f"gravity is felt along {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
+
+
+def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[str]:
+    """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
+
+    Axes of the accelerometers that gravity contradicts, and quantities that are stuck.
+    """
+    gravity_m_s2 = calibration.gravity_m_s2
+    mounting = calibration.imu.mounting
+    # its owner has said that gravity was taken out
+    is_said = not calibration.use_gravity
+    is_said &= is_without_gravity(imu.specific_force, gravity_m_s2)
+    gravity = gravity_warning(imu.specific_force, mounting, gravity_m_s2)
+    if gravity and not is_said:
+        yield f"imu: {gravity}"
+    # wheels turn evenly, and their rates jump
+    if dvl is None or calibration.odometry_interpolation != "linear":
+        return
+    for quantity, stuck in stuck_quantities(imu, dvl).items():
+        role = "dvl" if quantity == "velocity" else "imu"
+        stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
+        if doubt := stuck_doubt(stamps_ns, stuck, quantity):
+            yield f"{role}: {doubt}"
+
+
+def row_oddities(
+    imu: Imu | None, dvl: Dvl | None, depth: Depth | None, calibration: Calibration
+) -> Iterator[tuple[str, str | None]]:
+    """Results of the checks of numbers by role; None: nothing is wrong."""
+    # of wheels rates jump, and values stay the same
+    is_linear = calibration.odometry_interpolation == "linear"
+    if imu is not None and is_linear:
+        quantities = {
+            "angular rate": imu.angular_velocity,
+            "specific force": imu.specific_force,
+        }
+        for check in (spike_warning, stuck_warning):
+            for quantity, values in quantities.items():
+                yield "imu", check(imu.stamps_ns, values, quantity)
+    if dvl is not None and is_linear:
+        yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
+    if imu is not None and dvl is not None and depth is not None:
+        way_m = way_by("positions", imu, dvl, calibration, depth.stamps_ns)
+        heights = depth.z_m[:, None]
+        yield "depth", stuck_warning(depth.stamps_ns, heights, "height", way_m)
 
 
 def axes_warning(adapter: Adapter) -> str | None:
@@ -296,13 +350,13 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
 
 
 def stuck_warning(
-    stamps_ns: Ints, values: Floats, quantity: str, *, is_coarse: bool = False
+    stamps_ns: Ints, values: Floats, quantity: str, way_m: Floats | None = None
 ) -> str | None:
     """Warning about stretches of rows, shape (n, k), that are equal to the bit, zeros or not; None: there are none.
 
-    Such rows are used as they are. A vehicle at rest in a simulator or a coarse sensor may look the same: of a sensor
-    that ``is_coarse``, n rows of which a share p repeats the row before, a stretch of m counts that comes by chance
-    less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
+    Such rows are used as they are. A coarse sensor may look the same. With ``way_m``, the way of the vehicle until each
+    row, shape (n,), a stretch counts only where the vehicle is not at rest, and where its m of n rows, of which a share p
+    repeats the row before, come by chance less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
     first = np.concatenate([[0], np.flatnonzero(differs) + 1])
@@ -310,9 +364,11 @@ def stuck_warning(
     is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
         last - first + 1 >= STUCK_ROWS
     )
-    if is_coarse:
+    if way_m is not None:
         # resolution alone makes short stretches of equal rows
         is_long &= ~_may_be_chance(differs, last - first)
+        duration_s = np.maximum((stamps_ns[last] - stamps_ns[first]) / 1e9, 1e-9)
+        is_long &= (way_m[last] - way_m[first]) / duration_s > FASTEST_RESTING_M_S
     is_zero = ~np.any(values[first], axis=1)
     texts = []
     for chosen, what in (
@@ -401,6 +457,72 @@ def stuck_doubt(stamps_ns: Ints, stuck: NDArray[np.bool_], quantity: str) -> str
         f"{quantity} the same to the last bit in {rows.sum()} rows, {times} s after the first, while the other sensors "
         "change: stuck; results are wrong from there on, and the part before is read by --end"
     )
+
+
+ROWS_BESIDE = 8
+FEWEST_BESIDE = 5
+LONGEST_BESIDE_S = 12.0
+"""Beyond it the bias of a gyro bends the line."""
+UNFELT_SIGMAS = 6.0
+LEAST_STEP_M_S = 0.05
+"""At such speeds a row of zeros does little harm."""
+LEAST_SHARE = 0.5
+"""Of the speed of the row beside the zeros: a vehicle that brakes is off by less where stamps are late."""
+UNFELT = "with a velocity of 0 that the accelerometers contradict"
+
+
+def unfelt_zeros(imu: Imu, dvl: Dvl, calibration: Calibration) -> NDArray[np.bool_]:
+    """Mask of rows of zeros, shape (n,), in stretches that the vehicle reaches or leaves by a step it does not feel.
+
+    With C the turn by the gyros and F = int C f dt, the differences x = C v - F are a straight line in time, whose slope is
+    gravity. A line through the rows on one side of the zeros predicts -F at the first of them. At rest the prediction
+    holds; without bottom lock it is off by the velocity.
+    """
+    is_zero: NDArray[np.bool_] = np.asarray(~dvl.velocity.any(axis=1))
+    found = np.zeros(len(dvl), bool)
+    edges = np.flatnonzero(np.diff(is_zero.astype(int), prepend=0, append=0))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        before = np.arange(max(begin - ROWS_BESIDE, 0), begin + 1)
+        after = np.arange(end - 1, min(end + ROWS_BESIDE, len(dvl)))
+        found[begin:end] = any(
+            is_unfelt(imu, dvl, calibration, rows, zero)
+            for rows, zero in ((before, begin), (after, end - 1))
+        )
+    return found
+
+
+def is_unfelt(
+    imu: Imu, dvl: Dvl, calibration: Calibration, rows: Ints, zero: int
+) -> bool:
+    """True where the row ``zero`` leaves the line of the others by far more than they scatter about it."""
+    is_beside = (rows == zero) | dvl.velocity[rows].any(axis=1)
+    stamps_ns = dvl.stamps_ns[rows]
+    is_beside &= np.abs(stamps_ns - dvl.stamps_ns[zero]) <= LONGEST_BESIDE_S * NS_PER_S
+    chosen = dvl.rows(rows[is_beside])
+    begin_ns = int(chosen.stamps_ns[0])
+    samples = imu.between(begin_ns - NS_PER_S, int(chosen.stamps_ns[-1]) + NS_PER_S)
+    if samples is None or len(chosen) <= FEWEST_BESIDE:
+        return False
+    from sonar_graph.logs.measured_start import FirstPath  # compiles
+
+    path = FirstPath.of(samples, chosen, calibration, begin_ns)
+    x = path.velocity - path.impulse  # (m, 3)
+    # a hole of the IMU ends the path
+    if len(x) < len(chosen) or not np.isfinite(x).all():
+        return False
+    at = int(np.flatnonzero(rows[is_beside] == zero)[0])
+    A = np.vander(path.seconds - path.seconds[at], 2)  # (m, 2)
+    others = np.arange(len(x)) != at
+    slope_and_level, *_ = np.linalg.lstsq(A[others], x[others])
+    residuals = x[others] - A[others] @ slope_and_level
+    freedom = 3 * (len(residuals) - 2)
+    variance = float(np.sum(residuals**2)) / freedom
+    of_line = np.linalg.inv(A[others].T @ A[others])[1, 1]
+    sigma_m_s = float(np.sqrt(variance * (1 + of_line)))
+    off_m_s = float(np.linalg.norm(x[at] - slope_and_level[1]))
+    beside = 1 if at == 0 else at - 1
+    step_m_s = LEAST_SHARE * float(np.linalg.norm(chosen.velocity[beside]))
+    return off_m_s > max(LEAST_STEP_M_S, step_m_s, UNFELT_SIGMAS * sigma_m_s)
 
 
 def _changes(stamps_ns: Ints, values: Floats, begin_ns: int, end_ns: int) -> bool:

@@ -33,17 +33,16 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
+    UNFELT,
     axes_warning,
     gap_warnings,
-    gravity_warning,
     is_partial,
     repeated_sightings,
     repeats,
-    spike_warning,
+    row_doubts,
+    row_oddities,
     stamp_faults,
-    stuck_doubt,
-    stuck_quantities,
-    stuck_warning,
+    unfelt_zeros,
     way_by,
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
@@ -97,7 +96,14 @@ WARNED = (
 )
 """Notes that `read_log` also logs: the user may have to act on them."""
 FOUND_ANEW = frozenset(
-    {"log.warnings", "log.gaps", "log.noise", "log.sensors", "log.doubtful"}
+    {
+        "log.warnings",
+        "log.gaps",
+        "log.noise",
+        "log.sensors",
+        "log.doubtful",
+        "log.compared",
+    }
 )
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
@@ -307,6 +313,11 @@ class Assembly:
         dvl = self.adapters.get("dvl")
         # wheels stop and turn evenly, which would look like a Doppler log without lock
         is_held = self.calibration.odometry_interpolation == "hold-past"
+        self._may_lack_lock = (
+            isinstance(dvl, DvlAdapter)
+            and dvl.lock == "found"
+            and not (dvl.are_zeros_measured or is_held)
+        )
         if isinstance(dvl, DvlAdapter) and (is_held or is_described(recording)):
             self.adapters["dvl"] = dvl.with_marks_alone()
 
@@ -403,6 +414,9 @@ class Assembly:
         if rows is not None and role in LEAST_MOVED and not self._is_live:
             rows, stuck = self._without_repeats(role, rows)
             dropped = dropped | stuck
+        if rows is not None and role == "dvl" and not self._is_live:
+            rows, unfelt = self._without_unfelt_zeros(rows)
+            dropped = dropped | unfelt
         self._blocks[role] = rows
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
@@ -432,6 +446,21 @@ class Assembly:
         text = f"repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
         self._stuck[role] = f"{count} of {len(rows)} rows {text}: left out"
         return rows.rows(np.flatnonzero(~stuck)), {f"that {text}": count}
+
+    def _without_unfelt_zeros(self, dvl: Dvl) -> tuple[Dvl, Dropped]:
+        """Rows without those of zeros that were sent without bottom lock, and their number."""
+        imu = self.block("imu")
+        if imu is None or not self._may_lack_lock or dvl.velocity.any(axis=1).all():
+            return dvl, {}
+        unfelt = unfelt_zeros(imu, dvl, self.calibration)
+        count = int(np.count_nonzero(unfelt))
+        if not count:
+            return dvl, {}
+        self._stuck["dvl"] = (
+            f"{count} of {len(dvl)} rows {UNFELT}: left out; "
+            "`are_zeros_measured = true` under [dvl] in a log configuration uses them"
+        )
+        return dvl.rows(np.flatnonzero(~unfelt)), {UNFELT: count}
 
     def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
         """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
@@ -526,26 +555,10 @@ class Assembly:
         ]
 
     def doubts(self) -> Iterator[str]:
-        """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
-
-        Axes of the accelerometers that gravity contradicts, and quantities that are stuck.
-        """
+        """Sentences of `row_doubts` about the rows that were chosen."""
         imu = self.block("imu")
-        dvl = self.block("dvl")
-        if imu is None:
-            return
-        mounting = self.calibration.imu.mounting
-        g = self.calibration.gravity_m_s2
-        if gravity := gravity_warning(imu.specific_force, mounting, g):
-            yield f"imu: {gravity}"
-        # wheels turn evenly, and their rates jump
-        if dvl is None or self.calibration.odometry_interpolation != "linear":
-            return
-        for quantity, stuck in stuck_quantities(imu, dvl).items():
-            role = "dvl" if quantity == "velocity" else "imu"
-            stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
-            if doubt := stuck_doubt(stamps_ns, stuck, quantity):
-                yield f"{role}: {doubt}"
+        if imu is not None:
+            yield from row_doubts(imu, self.block("dvl"), self.calibration)
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
@@ -575,28 +588,30 @@ class Assembly:
         """Results of the checks of numbers by role; None: nothing is wrong."""
         imu = self.block("imu")
         dvl = self.block("dvl")
-        depth = self.block("depth")
-        # of wheels rates jump, and values stay the same
-        is_linear = self.calibration.odometry_interpolation == "linear"
-        if imu is not None:
-            quantities = {
-                "angular rate": imu.angular_velocity,
-                "specific force": imu.specific_force,
-            }
-            for check in (spike_warning, stuck_warning) if is_linear else ():
-                for quantity, values in quantities.items():
-                    yield "imu", check(imu.stamps_ns, values, quantity)
-        if dvl is not None and is_linear:
-            yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
-        if depth is not None:
-            heights = depth.z_m[:, None]
-            yield (
-                "depth",
-                stuck_warning(depth.stamps_ns, heights, "height", is_coarse=True),
-            )
+        yield from row_oddities(imu, dvl, self.block("depth"), self.calibration)
         if "dvl" in self._tables and not self._is_mounting_known:
             yield "dvl", axes_warning(self.adapters["dvl"])
         yield from self._stuck.items()
+
+
+def row_notes(sequence: Sequence) -> dict[str, str]:
+    """Notes of a sequence that no log was read for: what `read_log` would note about the same rows."""
+    calibration = sequence.calibration
+    imu = sequence.imu
+    dvl = sequence.dvl
+    oddities = row_oddities(imu, dvl, sequence.depth, calibration)
+    doubts = list(row_doubts(imu, dvl, calibration))
+    is_held = calibration.odometry_interpolation == "hold-past"
+    count = 0 if is_held else unfelt_zeros(imu, dvl, calibration).sum()
+    if count:
+        doubts.append(f"dvl: {count} of {len(dvl)} rows {UNFELT}: leave them out")
+    findings = {
+        "log.doubtful": doubts,
+        "log.warnings": (f"{role}: {text}" for role, text in oddities if text),
+        "log.gaps": gap_warnings(imu, dvl, calibration),
+    }
+    found = {subject: "; ".join(texts) for subject, texts in findings.items()}
+    return {subject: text for subject, text in found.items() if text}
 
 
 def common_origin(
@@ -656,7 +671,8 @@ def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
     ):
         raise LogError(
             f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "
-            f"See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
+            '`stamp = "log"` under [imu] or [dvl] in the log configuration takes the times of recording; see '
+            "stamp_unit_s and stamp_offset_s too"
         )
     if is_partial(dvl).all():
         raise LogError(

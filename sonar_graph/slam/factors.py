@@ -268,6 +268,28 @@ def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFacto
     return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(cov))
 
 
+def map_prior(
+    keys: list[int], positions_m: Floats, covariance_m2: Floats
+) -> gtsam.NonlinearFactor:
+    """Joint prior of m landmarks: their coordinates are ``N(positions_m, covariance_m2)``, shapes (m, 3), (3 m, 3 m)."""
+    by_coordinates = np.eye(3 * len(keys))
+
+    def error(
+        _: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[Floats] | None,
+    ) -> Floats:
+        places = np.array([values.atPoint3(key) for key in keys])
+        if jacobians is not None:
+            for k in range(len(jacobians)):
+                jacobians[k] = by_coordinates[:, 3 * k : 3 * k + 3]
+        return np.asarray((places - positions_m).ravel())
+
+    # a coordinate that is known exactly still needs a variance
+    noise = gaussian(covariance_m2 + EXACT**2 * by_coordinates)
+    return gtsam.CustomFactor(noise, keys, error)
+
+
 def bias_prior(bias_key: int, sigmas: Floats) -> gtsam.NonlinearFactor:
     """Biases are N(0, sigma²), one sigma each; where it is zero, `EXACT`."""
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, EXACT), False)

@@ -55,7 +55,9 @@ class Frontend:
         calibration = keyframes.calibration
         factors = SightingFactors(calibration.sonar, kernel.robust(), calibration.floor)
         self.journal = AmendableJournal()
-        self.landmarks = LandmarkGraph(keyframes.smoother, factors, self.journal)
+        self.landmarks = LandmarkGraph(
+            keyframes.smoother, factors, self.journal, calibration.map
+        )
         self._keyframes = keyframes
         self._uses_tracks = identity.longest_wait_s > 0
         self.policy: IdentityPolicy
@@ -121,6 +123,8 @@ class Frontend:
         """Set the keyframes that are due at an instant."""
         for changed in self._keyframes.advance(until_ns):
             self._follow(changed)
+        if self._keyframes.newest_ns is not None:
+            self.landmarks.begin(self._keyframes.newest_s)
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph, with the doubtful identities that fit it best."""
@@ -225,6 +229,8 @@ class Frontend:
         for assignments in decision.rounds:
             self.landmarks.apply(assignments, self._keyframes.newest_s)
             self.update_if_due()
+        for landmark_id in decision.released:
+            self.landmarks.release(landmark_id, self._keyframes.newest_s)
 
     def _follow(self, changed: Changed) -> None:
         self.landmarks.follow(changed)

@@ -18,7 +18,13 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from pydantic import model_validator
 
-from sonar_graph.calibration import Calibration, Section, misfits, require_params
+from sonar_graph.calibration import (
+    Calibration,
+    KnownMap,
+    Section,
+    misfits,
+    require_params,
+)
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import (
     NS_PER_S,
@@ -417,7 +423,9 @@ class Isam2:
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        return map_of(*self._frontend.smoothed())
+        return self._frontend.landmarks.known.with_given(
+            map_of(*self._frontend.smoothed())
+        )
 
     def newest_landmarks(self) -> LandmarkMap:
         """Landmarks by identity as of the last update of iSAM2, in milliseconds however long the run is.
@@ -427,7 +435,17 @@ class Isam2:
         smoother = self._smoother
         # a landmark that came with the last frame may wait for the next update
         ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
-        return map_of(smoother.estimates, smoother.marginals, ids)
+        return self._frontend.landmarks.known.with_given(
+            map_of(smoother.estimates, smoother.marginals, ids)
+        )
+
+    def known_map(self) -> KnownMap:
+        """Landmarks after solving the whole graph, with their joint covariance, for another run."""
+        ids = self._smoother.landmark_ids
+        found = self.landmarks()
+        rows = np.searchsorted(found.ids, ids)
+        joint = self.joint_covariance(landmarks=ids, over="history")
+        return KnownMap.of(ids, found.positions[rows], covariance_m2=joint.matrix)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""
@@ -438,7 +456,11 @@ class Isam2:
 
         Of these the variable, the factors and what was missing.
         """
-        return [*self._keyframes.contradictions.messages(), *self._smoother.withheld]
+        return [
+            *self._keyframes.contradictions.messages(),
+            *self._frontend.landmarks.known.messages(),
+            *self._smoother.withheld,
+        ]
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, and why."""

@@ -115,8 +115,8 @@ def test_pose_and_landmarks_have_the_numerical_covariance_of_the_contract(
         G, _ = numerical(
             lambda true, _, slot=slot: true.landmarks[slot], filter_, world
         )
-        position, covariance = slam.landmark(slot)
-        assert_array_equal(position, at)
+        positions, covariance = slam.points([slot])
+        assert_array_equal(positions, at[None])
         assert_covariance(covariance, G @ P @ G.T)
 
 

@@ -81,7 +81,8 @@ def augmented(filter_, angles, scale, z, calibration=CALIBRATION):
     """Filter that sees its first landmark, and this landmark with its covariance."""
     slam = begun(filter_, *bare(filter_, angles, scale), calibration)
     slam.augment(MOTION, np.array(z), NOISE)
-    return slam, *slam.landmark(0)
+    (position,), covariance = slam.points([0])
+    return slam, position, covariance
 
 
 @pytest.mark.slow

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import aiding_check
 from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
+from sonar_graph.diagnosis.sightings import sighting_changes
 from sonar_graph.logs.adapters.log_config import LogConfig
-from sonar_graph.measurements import Heading
+from sonar_graph.measurements import Heading, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
@@ -131,3 +132,55 @@ def test_a_turn_in_a_hole_of_the_imu_is_no_bias_of_the_gyros(
     assert (abs(found.estimate.value) < 1e-3) == is_broken
     rows = list(aiding_check.heading_findings(run, LogConfig(), motion))
     assert not (is_broken and any(row.acts for row in rows))
+
+
+def by_hand(seconds: np.ndarray, parts: list[int], height_m: np.ndarray) -> BodyMotion:
+    """A level vehicle that goes ahead at 0.5 m/s and climbs."""
+    n = len(seconds)
+    return BodyMotion(
+        origin_ns=0,
+        seconds=seconds,
+        parts=np.array(parts),
+        up=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        yaw_rad=np.zeros(n),
+        height_m=height_m,
+        path_m=0.5 * seconds + 0j,
+    )
+
+
+def test_an_instant_at_a_row_is_in_the_part_of_the_row() -> None:
+    seconds = np.array([0.0, 1.0, 5.0, 6.0])
+    motion = by_hand(seconds, [0, 0, 1, 1], 0 * seconds)
+    assert motion.part_at(seconds).tolist() == [0, 0, 1, 1]
+    path = motion.reference(motion.path_m)
+    np.testing.assert_array_equal(path(seconds), motion.path_m)
+    assert np.isnan(path(np.array([1.5, 4.9]))).all()
+
+
+@pytest.mark.parametrize("climb_m_s", [0.2, -0.2])
+def test_a_sonar_that_looks_down_sees_ranges_change_as_the_vehicle_climbs(
+    climb_m_s: float,
+) -> None:
+    """Landmark in the plane of a sonar with a pitch of 45 degrees: p_j = p_i - d, all by hand."""
+    seconds = np.arange(0.0, 40.0, 0.5)
+    motion = by_hand(seconds, [0] * len(seconds), climb_m_s * seconds)
+    down = Mounting(rpy_rad=(0.0, np.pi / 4, 0.0))
+    sonar = RUN.calibration.sonar.model_copy(update={"mounting": down})
+    n = len(seconds)
+    seen = LandmarkDetections(
+        np.round(seconds * 1e9).astype(np.int64),
+        np.full(n, 10.0),
+        np.zeros(n),
+        np.tile(np.diag([1e-4, 1e-4]), (n, 1, 1)),
+        np.zeros((n, 1), dtype=np.int64),
+        np.ones((n, 1)),
+    )
+    calibration = RUN.calibration.model_copy(update={"sonar": sonar})
+    run = replace(RUN, detections=seen, calibration=calibration)
+    changes = sighting_changes(run, motion)
+    assert changes is not None
+    place = 10.0 * np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
+    moved = np.array([0.5, 0.0, climb_m_s]) * 1.0
+    expected = np.linalg.norm(place - moved) - 10.0
+    found = changes.range.reference(changes.range.seconds)
+    np.testing.assert_allclose(found, expected, atol=1e-9)

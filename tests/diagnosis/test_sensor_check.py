@@ -14,7 +14,7 @@ from sonar_graph.diagnosis.findings import Finding, Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import range_changes, wrong_units
 from sonar_graph.logs.adapters.log_config import LogConfig
-from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.measurements import Dvl, Floats, Heading, Imu
 from sonar_graph.navigation.alignment import InitialTilt
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
@@ -313,9 +313,10 @@ def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
         drive, StartTilt(rest, "from 20 s of rest", is_rest=True)
     )
     assert [one.value for one in bias] == [1.0, 20.0, 30.0]
+    # a bias that changed is one row with both numbers
     assert sources == (
-        "from the turns of the drive",
-        "from 20 s of rest",
+        "from the turns of the drive (from 20 s of rest 10 ± 0.002 rad/s)",
+        "from 20 s of rest (from the turns of the drive 2 ± 0.02 rad/s)",
         "from 20 s of rest",
     )
     moving, sources = sensor_check.surest_bias(
@@ -542,3 +543,39 @@ def test_a_start_on_its_back_makes_results_doubtful(off_rad, is_grave):
     row = found["start roll: value"]
     assert row.acts
     assert (row.gravity is Gravity.GRAVE) == is_grave
+
+
+def test_of_forces_without_gravity_nothing_else_is_blamed() -> None:
+    """Neither a bias of the gyros nor depth, heading or fixes."""
+    up = SHORT.truth.at(SHORT.imu.stamps_ns).rotations().as_matrix()[:, 2, :]
+    force = SHORT.imu.specific_force - 9.80665 * up
+    imu = replace(SHORT.imu, specific_force=force)
+    found = sensor_check.check_sensors(replace(SHORT, imu=imu))
+    assert [finding.quantity for finding in found if finding.acts] == []
+    bias = by_name(found)["gyro bias"]
+    assert bias.estimate.reason == "no gravity in the specific forces"
+
+
+def test_a_bias_by_the_drive_and_another_by_a_heading_are_one_line_with_both() -> None:
+    """The level axes by the drive or the rest, the vertical by the heading, which drifts."""
+    bias_rad_s = np.array([0.002, -0.001, 0.003])
+    drift_rad_s = 0.05
+    imu = SHORT.imu
+    truth = SHORT.truth
+    biased = replace(imu, angular_velocity=imu.angular_velocity + bias_rad_s)
+    stamps_ns = truth.stamps_ns[::10]
+    yaw_rad = np.unwrap(truth.rotations().as_euler("ZYX")[::10, 0])
+    yaw_rad -= drift_rad_s * (stamps_ns - stamps_ns[0]) * 1e-9
+    noise_rad = 0.01 * np.random.default_rng(0).standard_normal(len(yaw_rad))
+    heading = Heading(stamps_ns, yaw_rad + noise_rad, np.full(len(yaw_rad), np.nan))
+    run = replace(SHORT, imu=biased, heading=heading, truth=None)
+    (finding,) = (
+        found
+        for found in sensor_check.check_sensors(run)
+        if found.acts and "gyro_bias" in found.line
+    )
+    told_rad_s = line_of(finding)["imu"]["gyro_bias_rad_s"]
+    vertical_rad_s = bias_rad_s[2] + drift_rad_s
+    np.testing.assert_allclose(told_rad_s, [*bias_rad_s[:2], vertical_rad_s], atol=2e-3)
+    assert "by the heading" in finding.advice
+    assert "from the turns of the drive 0.00" in finding.advice

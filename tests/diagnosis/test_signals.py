@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from sonar_graph.diagnosis.signals import CLEARLY_BETTER, SignalStretch, match
+from sonar_graph.diagnosis.signals import (
+    CLEARLY_BETTER,
+    SMALL_SAMPLE,
+    RobustFit,
+    SignalStretch,
+    match,
+    weighted,
+)
 from sonar_graph.measurements import Floats
 
 T = np.arange(0.0, 120.0, 0.2)
@@ -138,3 +145,27 @@ def test_too_few_rows_or_no_reference_are_unknown():
         found = match([part])
         assert not found.gain.is_known
         assert found.gain.reason.startswith("too few rows")
+
+
+def test_an_interval_is_of_few_blocks_by_hand() -> None:
+    """Rows of 1 and -1 by turns: a dozen blocks of one row, whose mean has freedom 11; pairs of rows cancel."""
+    n = 12
+    residuals = np.tile([1.0, -1.0], n // 2)[None]
+    rows = np.ones((1, n), dtype=bool)
+    fit = RobustFit(
+        A=np.ones((1, n, 1)),
+        p=np.zeros((1, 1)),
+        inverse=np.full((1, 1, 1), 1 / n),
+        residuals=residuals,
+        usable=rows,
+        kept=rows,
+    )
+    (sigma,) = fit.sigmas()
+    assert sigma == pytest.approx(SMALL_SAMPLE * np.sqrt(n * n / (n - 1)) / n)
+
+
+def test_stretches_that_agree_by_chance_are_no_surer_than_each_of_them_allows() -> None:
+    alike = weighted([(1.0, 0.1), (1.0, 0.1)])
+    assert alike.sigma == pytest.approx(0.1 / np.sqrt(2))
+    apart = weighted([(0.0, 0.1), (2.0, 0.1)])
+    assert apart.sigma == pytest.approx(1.0)

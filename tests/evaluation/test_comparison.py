@@ -15,11 +15,13 @@ from sonar_graph.evaluation.scores import (
     landmark_scores,
     resource_scores,
 )
+from sonar_graph.logs import read_log, write_log
 from sonar_graph.measurements import Imu, LandmarkDetections, Measurements
 from sonar_graph.report import sentences
 from sonar_graph.report.figures.maps import true_landmarks_drawn
 from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.testing import small_world
 
 from .conftest import Offset, straight_sequence
 
@@ -83,6 +85,30 @@ def test_only_large_logs_are_said_to_take_long():
         expense(replace(small, imu=rows))
         == "for each estimator: 2000000 IMU rows, about 1 min"
     )
+
+
+def test_what_sensors_contradict_is_found_of_a_sequence_as_of_the_log_that_is_written_of_it(
+    tmp_path, caplog
+):
+    """Also by the checks of single numbers, and told once: notes of the comparison, log, page and `inspect`."""
+    world = small_world()
+    velocity = 1.3 * world.dvl.velocity
+    velocity[40:60] = velocity[40]
+    wrong = replace(world, dvl=replace(world.dvl, velocity=velocity))
+    comparison = compare(wrong, ["dead-reckoning"])
+    notes = comparison.sequence.notes
+    path = tmp_path / "wrong.mcap"
+    write_log(path, wrong)
+    read = compare(read_log(path), ["dead-reckoning"]).sequence.notes
+    assert "same to the last bit" in notes["log.doubtful"]
+    assert "ranges to landmarks" in notes["log.doubtful"]
+    for subject in ("log.doubtful", "log.sensors", "log.warnings"):
+        assert notes.get(subject) == read.get(subject)
+    logged = [r.getMessage() for r in caplog.records if r.name.endswith("evaluation")]
+    assert any(notes["log.doubtful"] in message for message in logged)
+    assert f"Doubtful: {notes['log.doubtful']}" in sentences.doubtful_lines(comparison)
+    again = compare(comparison.sequence, ["dead-reckoning"])
+    assert again.sequence.notes == notes
 
 
 def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install):

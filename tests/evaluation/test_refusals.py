@@ -56,6 +56,9 @@ def test_few_rows_are_named_each_and_many_are_counted_by_sensor_and_reason():
     (many,) = gathered([*few, outlier(99, 7.5)])
     assert (many.count, many.first_ns, many.last_ns) == (MOST_ROWS_NAMED + 1, 0, 99)
     assert (many.times(-NS), many.distances()) == ("1.000 to 1.000", "7.50 to 54")
+    # rows that differ in their time alone are one line
+    (waited,) = gathered([late(0), late(7)])
+    assert (waited.count, waited.first_ns, waited.last_ns) == (2, 0, 7)
     rows = (
         [outlier(k) for k in range(9)]
         + [late(k) for k in range(9)]

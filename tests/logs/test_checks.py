@@ -16,6 +16,7 @@ from sonar_graph.logs.checks import (
     gap_warnings,
     repeated_sightings,
     repeats,
+    row_doubts,
     spike_warning,
     stamp_faults,
     stuck_doubt,
@@ -247,18 +248,34 @@ def test_a_single_wild_force_is_a_spike_and_unmeasured_ones_are_none() -> None:
     )
 
 
+@pytest.mark.parametrize("use_gravity", [True, False])
+def test_forces_without_gravity_are_named_until_the_calibration_says_so(
+    use_gravity: bool,
+) -> None:
+    rng = np.random.default_rng(4)
+    n = len(EVEN)
+    values = rng.standard_normal((2, n, 3))
+    imu = Imu(EVEN, 0.01 * values[0], 0.1 * values[1])
+    found = list(row_doubts(imu, None, Calibration(use_gravity=use_gravity)))
+    assert bool(found) is use_gravity
+    assert all("`use_gravity = false` in the calibration" in text for text in found)
+
+
 def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
     rng, stamps_ns = np.random.default_rng(4), EVEN[0] + np.arange(1500) * SECOND // 5
+    way = 0.5 * (stamps_ns - stamps_ns[0]) * 1e-9
     fine = 3.0 + np.cumsum(0.003 * rng.standard_normal(1500))[:, None]
     for step_m, hangs_s in ((1e-4, 5.0), (0.01, 60.0)):
         height = np.round(fine / step_m) * step_m
-        assert stuck_warning(stamps_ns, height, "height", is_coarse=True) is None
+        assert stuck_warning(stamps_ns, height, "height", way) is None
         height[500 : 500 + round(5 * hangs_s)] = height[500]
         assert "height the same to the last bit" in (
-            stuck_warning(stamps_ns, height, "height", is_coarse=True) or ""
+            stuck_warning(stamps_ns, height, "height", way) or ""
         )
+    # a vehicle that rests has one depth, but for the resolution
+    assert stuck_warning(stamps_ns, height, "height", 0.04 * way) is None
     assert "in 1500 rows" in (
-        stuck_warning(stamps_ns, 0 * fine + 3.0, "height", is_coarse=True) or ""
+        stuck_warning(stamps_ns, 0 * fine + 3.0, "height", way) or ""
     )
 
 

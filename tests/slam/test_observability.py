@@ -70,6 +70,36 @@ def test_what_is_open_does_not_depend_on_how_surely_the_rest_is_held(
     assert left_open(graph_of([*made, along([0.0, 1.0, 0.0], 1.0)]), HERE, [L(1)]) == []
 
 
+def test_what_hardly_moves_along_an_open_direction_is_not_open() -> None:
+    """A landmark is a billionth of another along x, which is open: one metre there is a nanometre here."""
+    values = values_of(X0=gtsam.Pose3(), L1=np.zeros(3), L2=np.zeros(3))
+    share = np.array([[1e-9, 0.0, 0.0]])
+    itself = np.array([[1.0, 0.0, 0.0]])
+
+    def error(_, found, jacobians):
+        if jacobians is not None:
+            jacobians[0] = share
+            jacobians[1] = -itself
+        return share @ found.atPoint3(L(1)) - itself @ found.atPoint3(L(2))
+
+    tie = gtsam.CustomFactor(isotropic(1, 0.1), [L(1), L(2)], error)
+
+    def held(key: int, axis: int) -> gtsam.NonlinearFactor:
+        J = np.eye(3)[[axis]]
+
+        def error(_, found, jacobians):
+            if jacobians is not None:
+                jacobians[0] = J
+            return J @ found.atPoint3(key)
+
+        return gtsam.CustomFactor(isotropic(1, 0.1), [key], error)
+
+    others = [held(key, axis) for key in (L(1), L(2)) for axis in (1, 2)]
+    (open_,) = left_open(graph_of([tie, *others]), values, [L(1), L(2)], 0.0)
+    assert open_.key == L(1)
+    np.testing.assert_allclose(np.abs(open_.directions), [[1.0, 0.0, 0.0]], atol=1e-6)
+
+
 def test_a_range_leaves_open_what_is_across_it() -> None:
     """Of the landmark when the pose is known; what is said too weakly counts as not said."""
     distance = gtsam.RangeFactor3D(X(0), L(1), 2.0, isotropic(1, 0.1))

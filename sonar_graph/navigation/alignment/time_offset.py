@@ -28,6 +28,8 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 
+LEAST_VARIANCE = 1e-18
+"""Of a sample, (m/s)²: without noise only the prior makes the information regular."""
 LOG_RATIO_LIMIT = 12.0
 """Largest logarithm of either ratio, in units of the mean duration."""
 RANK_TOLERANCE = 1e-9
@@ -219,7 +221,7 @@ class NormalEquations:
     def solve(self, prior_sigmas: Floats) -> tuple[Floats, Floats, float, float]:
         """Parameters, information, sum of squares and sample variance; the prior's weight depends on the variance."""
         count = len(prior_sigmas)
-        variance = self.yty / self.freedom
+        variance = max(self.yty / self.freedom, LEAST_VARIANCE)
         for _ in range(3):
             information = self.AtA + np.diag(variance / np.square(prior_sigmas))
             parameters = np.asarray(
@@ -228,7 +230,7 @@ class NormalEquations:
             rss = max(
                 self.yty - float(parameters @ self.Aty), 1e-12 * self.yty + 1e-300
             )
-            variance = rss / max(self.freedom - count, 1)
+            variance = max(rss / max(self.freedom - count, 1), LEAST_VARIANCE)
         return parameters, information, rss, variance
 
     def criterion(self, prior_sigmas: Floats) -> float:

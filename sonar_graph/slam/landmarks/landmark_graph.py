@@ -25,16 +25,27 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import gtsam
+import numpy as np
 from gtsam.symbol_shorthand import L
 
+from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.models import KnownLandmarks
+from sonar_graph.slam.factors import map_prior
 from sonar_graph.slam.landmarks.sighting import (
     Frame,
     SeenFrame,
     Sighting,
     SightingFactors,
 )
-from sonar_graph.slam.smoother import Changed, FactorGroup, Known, Marginals, Smoother
+from sonar_graph.slam.smoother import (
+    Changed,
+    FactorGroup,
+    Known,
+    Marginals,
+    Sightline,
+    Smoother,
+)
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     UNKNOWN,
@@ -103,14 +114,18 @@ class Decision:
     """What becomes of sightings: rounds of assignments, each applied before the next, with an update between them."""
 
     rounds: tuple[tuple[Assignment, ...], ...] = ()
+    released: tuple[int, ...] = ()
+    """Landmarks of the map that have moved: they leave the graph afterwards."""
     settles: bool = False
     """True: before all rounds, add what waits to the estimate and iterate it to convergence."""
 
     @classmethod
-    def of(cls, assignments: Iterable[Assignment]) -> Decision:
+    def of(
+        cls, assignments: Iterable[Assignment], released: Iterable[int] = ()
+    ) -> Decision:
         """Decision of one round, or of none without assignments."""
         one_round = tuple(assignments)
-        return cls((one_round,)) if one_round else UNCHANGED
+        return cls((one_round,), tuple(released)) if one_round else UNCHANGED
 
     @property
     def assignments(self) -> list[Assignment]:
@@ -222,6 +237,15 @@ class AmendableJournal(DetectionJournal):
         self._innovation_covs[4 * row : 4 * row + 4] = array("d", S)
 
 
+ON_MAP = Sighting(
+    stamp_ns=0,
+    row=-1,
+    line=Sightline(-1, gtsam.Pose3(), np.zeros(2)),
+    noise=np.zeros((2, 2)),
+)
+"""Stands for the first sighting of a landmark of the map, whose prior takes the place of its first factors."""
+
+
 class State(NamedTuple):
     """What has become of a sighting so far."""
 
@@ -240,16 +264,27 @@ class LandmarkGraph:
     """Sightings with their states and landmarks, and the journal of all detections."""
 
     def __init__(
-        self, smoother: Smoother, factors: SightingFactors, journal: AmendableJournal
+        self,
+        smoother: Smoother,
+        factors: SightingFactors,
+        journal: AmendableJournal,
+        known_map: KnownMap | None = None,
     ) -> None:
         self.smoother = smoother
         self.factors = factors
         self.journal = journal
+        self.known = KnownLandmarks(known_map, may_release=not smoother.is_bounded)
+        """Landmarks of the map that was given."""
+        self._map_prior: int | None = None
+        """Handle of their joint prior."""
         self._states: dict[Sighting, State] = {}
-        self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
-        """Sightings of each landmark, in the order in which they came."""
         self._rooted: dict[int, Sighting] = {}
-        """A sighting that has left a bounded window, of each landmark that has one."""
+        """Of each landmark that keeps its first factors: a sighting that has left a bounded window, or `ON_MAP`."""
+        self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
+        """Sightings of each landmark, in the order in which they came; those of the map need none."""
+        for landmark_id in self.known.ids:
+            self._of[landmark_id] = {}
+            self._rooted[landmark_id] = ON_MAP
 
     @property
     def ids(self) -> list[int]:
@@ -284,6 +319,41 @@ class LandmarkGraph:
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Stamps of the frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
+
+    def begin(self, time_s: float) -> None:
+        """Add the landmarks of the map with their joint prior, once the graph has its first keyframe."""
+        if not self.known.held or self._map_prior is not None:
+            return
+        keys = [L(i) for i in self.known.ids]
+        for key, place in zip(keys, self.known.places(), strict=True):
+            self.smoother.add_landmark(key, place)
+        prior = map_prior(keys, self.known.places(), self.known.joint())
+        self._map_prior = self.smoother.add({"map prior": prior})
+        self.follow(self.smoother.flush(time_s))
+
+    def release(self, landmark_id: int, time_s: float) -> None:
+        """Take a landmark that has moved out of the graph, with its sightings; the others keep their prior."""
+        fitted = self.sightings(landmark_id)
+        self.apply([Assignment(each, Outcome.UNFIT) for each in fitted], time_s)
+        del self._of[landmark_id]
+        del self._rooted[landmark_id]
+        rows = [k for k, i in enumerate(self.known.ids) if i in self.known.held]
+        groups = []
+        if rows:
+            coordinates = np.add.outer(3 * np.array(rows), np.arange(3)).ravel()
+            prior = map_prior(
+                [L(self.known.ids[k]) for k in rows],
+                self.known.places()[rows],
+                self.known.joint()[np.ix_(coordinates, coordinates)],
+            )
+            groups.append(FactorGroup({"map prior": prior}))
+        assert self._map_prior is not None
+        changed = self.smoother.exchange(
+            time_s, [self._map_prior], groups, lost_landmarks=[L(landmark_id)]
+        )
+        if changed.added:
+            self._map_prior = changed.added[0]
+        self.follow(changed)
 
     def settle(self, time_s: float) -> None:
         """Add the factors that wait to the estimate, and iterate it to convergence."""

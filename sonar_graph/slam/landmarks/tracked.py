@@ -21,7 +21,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
-from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, identify, locate
+from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, Verdict, identify, locate
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
@@ -225,7 +225,8 @@ class TrackedIdentities(IdentityPolicy):
         frame = seen.frame
         named = self._named(frame)
         known = [row for row in named if frame.ids[row] in self.landmarks]
-        judged = self._compared(seen, known) if known else []
+        released: list[int] = []
+        judged = self._compared(seen, known, released) if known else []
         judged += [self._begun(seen, row) for row in named if row not in known]
         others = [row for row in range(len(frame)) if frame.refusals[row] is not None]
         waiting = seen.sightings(others, seen.beam_points(others)) if others else []
@@ -246,7 +247,7 @@ class TrackedIdentities(IdentityPolicy):
                 track.waiting.append(each.sighting)
             else:
                 track.settled.append(each.sighting)
-        return Decision.of(judged)
+        return Decision.of(judged, released)
 
     def held(self) -> dict[int, float]:
         """Keyframes of sightings that wait, of tracks that may still be of a landmark."""
@@ -370,8 +371,13 @@ class TrackedIdentities(IdentityPolicy):
         """Detections whose identity is accepted."""
         return [row for row, why in enumerate(frame.refusals) if why is None]
 
-    def _compared(self, seen: SeenFrame, rows: list[int]) -> list[Assignment]:
-        """Use detections of landmarks of the graph that lie inside the gate."""
+    def _compared(
+        self, seen: SeenFrame, rows: list[int], released: list[int]
+    ) -> list[Assignment]:
+        """Use detections of landmarks of the graph that lie inside the gate and do not contradict the map.
+
+        Landmarks of the map that have moved are added to ``released``.
+        """
         frame = seen.frame
         keys = [L(frame.ids[row]) for row in rows]
         # (m, 3)
@@ -386,12 +392,17 @@ class TrackedIdentities(IdentityPolicy):
         )
         judged = []
         for k, sighting in enumerate(seen.sightings(rows, points)):
-            is_inside = bool(compared.distance[k] <= self._gate)
+            squared = float(compared.distance[k])
+            landmark_id = frame.ids[rows[k]]
+            verdict = self.landmarks.known.judge(landmark_id, squared)
+            if verdict is Verdict.RELEASE:
+                released.append(landmark_id)
+            is_inside = squared <= self._gate and verdict is Verdict.USE
             judged.append(
                 Assignment(
                     sighting,
                     Outcome.USED if is_inside else Outcome.GATED,
-                    frame.ids[rows[k]],
+                    landmark_id,
                     compared.innovation[k],
                     compared.S[k],
                     gain=float(compared.gain[k]) if is_inside else 0.0,

@@ -67,7 +67,7 @@ REFUSALS: dict[str, Refusal] = {
         "", r"nothing for dvl: no .*--topic dvl=/twist_0.*`sonar-graph inspect .* --toml` begins"),
     "no common time": (
         [imu(ROWS), ("/dvl", "marine_acoustic_msgs/msg/Dvl", LATER)], "",
-        r"IMU from .* DVL from .*no common time; .* See stamp, stamp_unit_s and stamp_offset_s"),
+        r"IMU from .* DVL from .*no common time; .*`stamp = \"log\"` under"),
 }
 # fmt: on
 

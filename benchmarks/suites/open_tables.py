@@ -1,4 +1,4 @@
-"""Write the tables of a batch as Markdown: ``python open_bench.py FOLDER``.
+"""Write the tables of a batch as Markdown: ``python benchmarks/suites/open_tables.py FOLDER``.
 
 The folder is what ``sonar-graph bench`` wrote. A number is the median of a log's runs; a run that failed makes it a
 dash with the share of runs that ended, for a median over survivors would flatter.

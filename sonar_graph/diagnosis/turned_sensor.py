@@ -1,0 +1,119 @@
+"""Which of IMU and Doppler log is turned about the vertical: gravity and accelerations fit both alike.
+
+A turn of the Doppler log by an angle, and one of the IMU by its opposite, differ only in where the vehicle's axes are.
+Sensors with axes of their own decide: sightings of landmarks, or the course by position fixes from a known heading at
+the start. A heading may come from the turned IMU itself: it decides only where it agrees with the Doppler log.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sonar_graph.calibration import Mounting
+from sonar_graph.diagnosis.aiding_check import POSITIONS, RANGE
+from sonar_graph.diagnosis.findings import (
+    IN_CALIBRATION,
+    Finding,
+    Gravity,
+    numbers,
+)
+from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER
+from sonar_graph.diagnosis.start import turned_mounting
+from sonar_graph.models import wrap_angle
+from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.sequence import Sequence
+
+EITHER = "the Doppler log or the IMU, no other sensor shows which"
+NEAR = 1 / 3
+"""Share of the turn within which a course counts as right; the other candidate is off by all of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class TurnedPair:
+    """IMU and Doppler log that are turned against each other."""
+
+    sequence: Sequence
+    yaw_rad: float
+    """Turn of the Doppler log that would make them agree."""
+
+    def as_if(self, role: str) -> Sequence:
+        """The sequence with the mounting of one of them, ``dvl`` or ``imu``, put right."""
+        calibration = self.sequence.calibration
+        section = getattr(calibration, role)
+        turned = section.model_copy(update={"mounting": self.mounting(role)})
+        right = calibration.model_copy(update={role: turned})
+        return replace(self.sequence, calibration=right)
+
+    def mounting(self, role: str) -> Mounting:
+        """Mounting of one of them after its turn."""
+        before: Mounting = getattr(self.sequence.calibration, role).mounting
+        angle_rad = self.yaw_rad if role == "dvl" else -self.yaw_rad
+        rpy_rad = turned_mounting(before, angle_rad)
+        return before.model_copy(update={"rpy_rad": rpy_rad})
+
+    def wrong_one(self) -> str:
+        """``dvl`` or ``imu``; empty where no third sensor decides."""
+        scatters = dict[str, float]()
+        for role in ("dvl", "imu"):
+            right = self.as_if(role)
+            motion = BodyMotion.of(right)
+            if motion is None:
+                return ""
+            if self.is_near_course(right, motion) and (
+                role == "imu" or is_heading_stated(right)
+            ):
+                return role
+            ranges = RANGE.compare(right, motion)
+            if ranges is not None and ranges.gain.is_known:
+                scatters[role] = ranges.scatter
+        if len(scatters) < 2:
+            return ""
+        best, worst = sorted(scatters, key=scatters.__getitem__)
+        is_clear = scatters[worst] > CLEARLY_BETTER * scatters[best]
+        return best if is_clear else ""
+
+    def is_near_course(self, right: Sequence, motion: BodyMotion) -> bool:
+        """True where the fixes move from the start as the heading there and the Doppler log have it."""
+        if right.heading is None and not is_heading_stated(right):
+            return False
+        course = POSITIONS.compare(right, motion)
+        if course is None or not course.angle.is_known or course.is_mirrored:
+            return False
+        start = right.calibration.start
+        sigma = np.hypot(course.angle.sigma, start.rpy_sigma_rad[2])
+        off_rad = abs(wrap_angle(course.angle.value - start.rpy_rad[2]))
+        return bool(off_rad + 2 * sigma < NEAR * abs(self.yaw_rad))
+
+    def finding(self, quantity: str, estimate: Estimate1D, cause: str) -> Finding:
+        """A grave finding with the line for the one that is turned, or for either."""
+        role = self.wrong_one()
+        of_dvl, of_imu = (
+            f"`{name}.mounting.rpy_rad = {numbers(self.mounting(name).rpy_rad, 4)}`"
+            for name in ("dvl", "imu")
+        )
+        names = {"dvl": "the Doppler log is", "imu": "the IMU is"}
+        who = names.get(role, f"{EITHER}, is")
+        lines = {
+            "dvl": f"{of_dvl} {IN_CALIBRATION}",
+            "imu": f"{of_imu} {IN_CALIBRATION}",
+        }
+        either = f"{of_dvl} {IN_CALIBRATION} or, if that mounting is sure, {of_imu}"
+        return Finding(
+            quantity.replace("DVL", "IMU") if role == "imu" else quantity,
+            estimate,
+            "°" if estimate.is_known else "",
+            cause=f"{cause}: {who} turned on the vehicle, or its driver has other axes",
+            line=lines.get(role, either),
+            gravity=Gravity.GRAVE,
+        )
+
+    def corrected(self) -> Sequence:
+        """The sequence with the wrong mounting put right; that of the Doppler log where nothing decides."""
+        return self.as_if(self.wrong_one() or "dvl")
+
+
+def is_heading_stated(sequence: Sequence) -> bool:
+    """True where the owner states the heading at the start."""
+    start = sequence.calibration.start
+    return start.source == "stated" and "rpy_rad" in start.model_fields_set

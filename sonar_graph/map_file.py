@@ -1,0 +1,182 @@
+"""A map of known landmarks as a file that a person can write and a run writes.
+
+TOML, as a run writes it::
+
+    source = "dive-1.mcap, isam2"
+    ids = [4, 9]
+    positions_m = [[5.0, 0.0, -1.7], [7.0, -3.0, -1.7]]
+    covariance_m2 = [[...], ...]          # joint, three rows a landmark
+
+CSV, as a survey gives it: columns ``id``, ``x_m``, ``y_m``, ``z_m`` and ``sigma_m``, or ``sigma_x_m``, ``sigma_y_m``,
+``sigma_z_m``. The ``landmarks.csv`` of a comparison has the covariance of each landmark (``cov_xx`` to ``cov_zz``); the
+correlations between landmarks are missing there, so that a vehicle in such a map is less certain of itself than it could
+be, or too certain of what many landmarks share.
+"""
+
+import csv
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_graph.calibration import KnownMap
+from sonar_graph.errors import LogError
+from sonar_graph.files.inputs import text_of
+from sonar_graph.sequence import Sequence
+from sonar_graph.settings import parse, toml_value
+
+PLACE = ("x_m", "y_m", "z_m")
+SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+TRIANGLE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+COLUMNS = (
+    f"id, {', '.join(PLACE)} and sigma_m, {', '.join(SIGMAS)} or {', '.join(TRIANGLE)}"
+)
+MOST_M = 1e5
+"""A coordinate beyond it is in another unit, or of a grid of a country."""
+
+
+class ReadMap(NamedTuple):
+    """A map and what is to be said about it."""
+
+    map: KnownMap
+    warnings: list[str]
+
+
+def read_map(path: Path) -> ReadMap:
+    r"""Map of known landmarks from a TOML or CSV file.
+
+    Raises
+    ------
+    LogError
+        Naming file, row and column, and what was expected.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> _ = Path("survey.csv").write_text("id,x_m,y_m,z_m,sigma_m\n4,5.0,0.0,-1.7,0.05\n")
+    >>> read_map(Path("survey.csv")).map.ids
+    (4,)
+    """
+    try:
+        text = text_of(path)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path}: expected a map as TOML or CSV text") from error
+    warnings = []
+    if path.suffix.lower() == ".toml":
+        try:
+            values = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise LogError(f"{path}: {error}") from error
+        known = parse(KnownMap, values, str(path), LogError)
+    else:
+        known, is_marginal = of_table(text, path)
+        if is_marginal:
+            warnings.append(
+                f"{path}: covariances of single landmarks, and no correlations between them; run --save-map writes all"
+            )
+    farthest_m = float(np.abs(np.array(known.positions_m)).max())
+    if farthest_m > MOST_M:
+        raise LogError(
+            f"{path}: a landmark at {farthest_m:.0f} m: give metres from an origin near by, along the world's axes"
+        )
+    return ReadMap(known, warnings)
+
+
+def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
+    """Map of a CSV table, and whether it has covariances of single landmarks."""
+    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    heads = [head.strip() for head in reader.fieldnames or []]
+    reader.fieldnames = heads
+    is_marginal = set(TRIANGLE) <= set(heads)
+    has_axes = set(SIGMAS) <= set(heads)
+    if not {"id", *PLACE} <= set(heads) or not (
+        is_marginal or has_axes or "sigma_m" in heads
+    ):
+        raise LogError(
+            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}"
+        )
+    ids: list[int] = []
+    places: list[list[float]] = []
+    blocks: list[np.ndarray] = []
+    for row in reader:
+        where = f"{path}, line {reader.line_num}"
+
+        def number(column: str, row: dict[str, str] = row, where: str = where) -> float:
+            try:
+                value = float(row[column])
+            except (TypeError, ValueError):
+                value = math.nan
+            if not math.isfinite(value):
+                raise LogError(
+                    f"{where}: {column}: expected a number, not {row[column]!r}"
+                )
+            return value
+
+        landmark_id = number("id")
+        if landmark_id != int(landmark_id):
+            raise LogError(f"{where}: id: expected a whole number, not {row['id']!r}")
+        if int(landmark_id) in ids:
+            raise LogError(
+                f"{where}: landmark {int(landmark_id)} stands twice; keep one line"
+            )
+        ids.append(int(landmark_id))
+        places.append([number(column) for column in PLACE])
+        if is_marginal:
+            block = np.zeros((3, 3))
+            block[np.triu_indices(3)] = [number(column) for column in TRIANGLE]
+            blocks.append(block + np.triu(block, 1).T)
+        else:
+            columns = SIGMAS if has_axes else ("sigma_m",) * 3
+            sigmas = [number(column) for column in columns]
+            if min(sigmas) < 0.0:
+                raise LogError(
+                    f"{where}: {columns[0]}: expected a sigma of 0 m or more"
+                )
+            blocks.append(np.diag(np.square(sigmas)))
+    if not ids:
+        raise LogError(f"{path}: no landmark: give a line for each below the heading")
+    joint = np.zeros((3 * len(ids), 3 * len(ids)))
+    for k, block in enumerate(blocks):
+        joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = block
+    values = {
+        "ids": ids,
+        "positions_m": places,
+        "covariance_m2": joint.tolist(),
+        "source": path.name,
+    }
+    return parse(KnownMap, values, str(path), LogError), is_marginal
+
+
+def write_map(path: Path, known: KnownMap) -> None:
+    """Write a map as TOML."""
+    fields = known.model_dump()
+    text = "".join(f"{name} = {toml_value(value)}\n" for name, value in fields.items())
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LogError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def in_map(sequence: Sequence, path: Path) -> Sequence:
+    """A sequence with the map of a file. Its start is found in the map where the log states no place.
+
+    The note ``log.map`` of the sequence says what was done.
+    """
+    known, warnings = read_map(path)
+    start = sequence.calibration.start
+    note = f"{len(known.ids)} landmarks of {path.name}"
+    if start.source in ("vehicle", "heading"):
+        start = start.model_copy(update={"source": "map"})
+        note += "; the log states no place in it: the start is found by identified landmarks"
+    changes = {"map": known, "start": start}
+    calibration = sequence.calibration.model_copy(update=changes)
+    notes = {**sequence.notes, "log.map": note}
+    if warnings:
+        earlier = [notes["log.warnings"]] if "log.warnings" in notes else []
+        notes["log.warnings"] = "; ".join([*earlier, *warnings])
+    return replace(sequence, calibration=calibration, notes=notes)

@@ -1,0 +1,138 @@
+"""Landmarks of a map that was given: which of them have moved since, and which are not seen.
+
+Every sighting of a landmark of the map is compared with its prediction, by the squared Mahalanobis distance of range and
+azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. A wrong identity
+contradicts seldom and here and there; a landmark that has moved is contradicted each time. So a landmark is contradicted
+from `FEWEST` contradictions on, where they are more than half of its sightings. As long as fewer landmarks are contradicted
+than agree, it has moved, and the estimator maps it anew. Where as many are contradicted, the start may be wrong, or those
+that agree have moved: then their sightings are refused, and a message names both.
+"""
+
+from collections import Counter
+from enum import Enum
+
+import numpy as np
+
+from sonar_graph.calibration import KnownMap
+from sonar_graph.measurements import Floats
+from sonar_graph.states import LandmarkMap
+
+CONTRADICTS = 27.6
+"""Chi-square quantile of 1 - 1e-6, two degrees of freedom."""
+FEWEST = 3
+"""Number of contradictions from which on a landmark may have moved."""
+
+
+class Verdict(Enum):
+    """Treatment of a sighting."""
+
+    USE = "use"
+    REFUSE = "refuse"
+    RELEASE = "release: the landmark has moved"
+
+
+class KnownLandmarks:
+    """Landmarks of the map, with the sightings that agree with it and those that contradict it."""
+
+    def __init__(self, known: KnownMap | None, *, may_release: bool = True) -> None:
+        self.map = known
+        self._may_release = may_release
+        self.held: set[int] = set(known.ids) if known else set()
+        """Identities that still stand where the map has them."""
+        self.ids = known.ids if known else ()
+        self.moved: list[int] = []
+        """Identities that do not, in the order in which this was noticed."""
+        self._agreeing: Counter[int] = Counter()
+        self._contradicting: Counter[int] = Counter()
+
+    def judge(self, landmark_id: int, squared: float) -> Verdict:
+        """Treatment of a sighting at a squared Mahalanobis distance from its prediction."""
+        if landmark_id not in self.held:
+            return Verdict.USE
+        if squared <= CONTRADICTS:
+            self._agreeing[landmark_id] += 1
+            return Verdict.USE
+        self._contradicting[landmark_id] += 1
+        contradicted = self._contradicted()
+        agreeing = len(self.held) - len(contradicted) - len(self._unseen())
+        if landmark_id not in contradicted:
+            return Verdict.REFUSE
+        if len(self.moved) + len(contradicted) >= agreeing:
+            return Verdict.REFUSE
+        # what has left a bounded window cannot be taken out again
+        if not self._may_release:
+            return Verdict.REFUSE
+        self.moved.append(landmark_id)
+        self.held.discard(landmark_id)
+        return Verdict.RELEASE
+
+    def _contradicted(self) -> list[int]:
+        """Landmarks that the map still holds against most of their sightings."""
+        return [
+            i
+            for i in self.ids
+            if i in self.held
+            and self._contradicting[i] >= FEWEST
+            and self._contradicting[i] > self._agreeing[i]
+        ]
+
+    def _unseen(self) -> list[int]:
+        """Landmarks of the map without a sighting."""
+        return [i for i in self.ids if not self._agreeing[i] + self._contradicting[i]]
+
+    def places(self) -> Floats:
+        """Places of all landmarks of the map, shape (m, 3), m."""
+        given = self.map.positions_m if self.map else ()
+        return np.array(given, dtype=np.float64).reshape(-1, 3)
+
+    def joint(self) -> Floats:
+        """Joint covariance of all their coordinates, shape (3 m, 3 m), m²."""
+        return self.map.joint() if self.map else np.empty((0, 0))
+
+    def as_given(self) -> dict[int, tuple[Floats, Floats]]:
+        """Place (3,) and covariance (3, 3) of each landmark of a fixed map that has not moved."""
+        if self.map is None or not self.map.is_fixed:
+            return {}
+        P = self.map.joint()
+        places = np.array(self.map.positions_m)
+        given = {}
+        for k, landmark_id in enumerate(self.map.ids):
+            if landmark_id in self.held:
+                block = slice(3 * k, 3 * k + 3)
+                given[landmark_id] = (places[k], P[block, block])
+        return given
+
+    def with_given(self, found: LandmarkMap) -> LandmarkMap:
+        """An estimated map, with the landmarks of a fixed map as they were given."""
+        positions = found.positions.copy()
+        covariances = found.covariances.copy()
+        for landmark_id, given in self.as_given().items():
+            row = int(np.searchsorted(found.ids, landmark_id))
+            if row < len(found) and found.ids[row] == landmark_id:
+                positions[row], covariances[row] = given
+        return LandmarkMap(found.ids, positions, covariances)
+
+    def messages(self) -> list[str]:
+        """A line about what moved, and one about what was not seen."""
+        if self.map is None:
+            return []
+        lines = []
+        if self.moved:
+            lines.append(
+                f"landmarks {listed(self.moved)} no longer stand where the map has them: mapped anew; correct the map"
+            )
+        contradicted = self._contradicted()
+        if contradicted:
+            lines.append(
+                f"landmarks {listed(contradicted)} contradict the map, and too few others agree with it: they have moved,"
+                ' or the start or the map is wrong; source = "map" under [start] finds the start by all of them'
+            )
+        unseen = self._unseen()
+        if unseen:
+            lines.append(f"landmarks of the map that were not seen: {listed(unseen)}")
+        return lines
+
+
+def listed(ids: list[int]) -> str:
+    """Identities in a message, ascending."""
+    return ", ".join(map(str, sorted(ids)))

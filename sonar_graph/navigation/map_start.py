@@ -1,0 +1,443 @@
+"""Start at an unknown place of a known map: where the vehicle is, from the landmarks that it identifies.
+
+The level frame o has its origin at the body's first position, and its yaw is zero there. Odometry carries it on, so that
+a sighting of landmark i gives a place ``q_k`` in o, with covariance ``S_k``; the landmark's height in the map gives the
+elevation. Heading psi and position t of the start are common to all sightings::
+
+    m_i = R(psi) q_k + t + e_k,    e_k ~ N(0, R(psi) S_k R(psi)^T + M_i)                                       (1)
+
+Two sightings of different landmarks give psi and t (two-point resection). Every pair proposes a start, refined by least
+squares over the landmarks that agree with it. A landmark agrees where most of its sightings lie within the 99.9 % ellipse
+of (1). One with a wrong identity lies anywhere in the area A of the map. The evidence of a start h, with the prior of a
+pose uniform over A and all headings, and its posterior covariance Sigma::
+
+    E(h) = prod_agreeing (1 - w) N(e_i) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
+    E(one) = n (1 - w) / A (w / A)^(n - 1),    E(none) = (w / A)^n                                             (3)
+
+w is the probability of a wrong identity. Sightings of one landmark count once: a recogniser errs in the same way again.
+The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`. Arun, Huang and Blostein,
+"Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory, Inference, and Learning
+Algorithms", 2003, chapter 28 (evidence).
+"""
+
+import math
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+
+from sonar_graph.calibration import Calibration, KnownMap, Section, Start
+from sonar_graph.estimator import (
+    Estimator,
+    known_map_of,
+    newest_landmarks_of,
+    refused_rows_of,
+    withheld_of,
+)
+from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
+from sonar_graph.models import (
+    ACCEPTED,
+    MINIMUM_PROBABILITY,
+    elevation_on_floor,
+    identify,
+    locate,
+)
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.states import (
+    DetectionLog,
+    Estimate,
+    LandmarkMap,
+    RefusedRow,
+    Trajectory,
+)
+
+WRONG = 0.1
+"""Probability of a wrong identity."""
+ODDS = 1e4
+"""Odds from which on the vehicle is located."""
+AGREES = 13.8
+"""Chi-square quantile of 99.9 %, two degrees of freedom."""
+MOST_SIGHTINGS = 24
+"""Number of the newest sightings that propose starts."""
+LOOSER = 10.0
+"""Sigmas of the prior start over those found: the estimator weighs the same sightings itself."""
+STEPS = 5
+
+
+class MapSighting(NamedTuple):
+    """A landmark of the map as seen in the level frame o."""
+
+    row: int
+    """Row of the landmark in the map."""
+    q: Floats
+    """Place in o, shape (2,), m."""
+    S: Floats
+    """Its covariance, shape (2, 2), m²."""
+
+
+class FoundStart(NamedTuple):
+    """Position and heading of the start in the map."""
+
+    parameters: Floats
+    """(psi, t_x, t_y), shape (3,), rad and m."""
+    covariance: Floats
+    """Shape (3, 3)."""
+    log_evidence: float
+    """Logarithm of (2)."""
+
+
+class MapLocator:
+    """Finds the start in a map, frame by frame; results depend on stamps alone."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        assert calibration.map is not None
+        self.found: FoundStart | None = None
+        self._calibration = calibration
+        self._map = calibration.map
+        self._places = np.array(self._map.positions_m)
+        self._rows = {landmark_id: row for row, landmark_id in enumerate(self._map.ids)}
+        self._odometry = Odometry(calibration)
+        self._start_ns: int | None = None
+        self._sightings: list[MapSighting] = []
+        sonar = calibration.sonar
+        self._body_T_sonar = sonar.mounting.pose()
+        self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
+
+    def add(self, measurements: Measurements) -> None:
+        """Take in measurements, and look for the start after each frame until it is found."""
+        self._odometry.add(measurements.imu, measurements.dvl)
+        if measurements.detections is None:
+            return
+        for frame in measurements.detections.frames():
+            if self.found is None and self._see(frame):
+                self.found = located(self._sightings[-MOST_SIGHTINGS:], self._map)
+
+    def _see(self, frame: LandmarkDetections) -> bool:
+        """Add the sightings of a frame; True where there are any."""
+        stamp_ns = int(frame.stamps_ns[0])
+        if self._start_ns is None:
+            self._start_ns = self._odometry.start_by(stamp_ns)
+        if self._start_ns is None or stamp_ns < self._start_ns:
+            return False
+        ids, outcomes = identify(frame, MINIMUM_PROBABILITY)
+        rows = [
+            k
+            for k in range(len(frame))
+            if outcomes[k] == ACCEPTED and int(ids[k]) in self._rows
+        ]
+        if not rows:
+            return False
+        start = self._calibration.start
+        roll, pitch, _ = start.rpy_rad
+        o_T_start = gtsam.Pose3(
+            gtsam.Rot3.RzRyRx(roll, pitch, 0.0),
+            np.array([0.0, 0.0, start.position_m[2]]),
+        )
+        motion = self._odometry.motion(
+            self._start_ns,
+            stamp_ns,
+            np.zeros(3),
+            o_T_start.rotation().matrix(),
+            stamp_ns,
+        )
+        o_T_body = o_T_start.compose(motion.i_T_j)
+        o_T_sonar = o_T_body.compose(self._body_T_sonar)
+        by_bias = motion.D_bias * self._calibration.imu.gyro_bias_sigma  # (6, 3)
+        C = motion.covariance + by_bias @ by_bias.T
+        for k in rows:
+            row = self._rows[int(ids[k])]
+            z = np.array([frame.range_m[k], frame.azimuth_rad[k]])
+            elevation_rad = elevation_on_floor(
+                o_T_sonar,
+                float(z[0]),
+                float(z[1]),
+                float(self._places[row, 2]),
+                self._calibration.sonar.elevation_aperture_rad,
+            )
+            point = locate(o_T_sonar, float(z[0]), float(z[1]), elevation_rad or 0.0)
+            R_z = frame.range_azimuth_cov[k]
+            R_z = self._R_z if np.isnan(R_z).any() else R_z
+            S = spread(o_T_body, o_T_sonar, point, R_z, C)
+            self._sightings.append(MapSighting(row, point[:2], S))
+        return True
+
+    def start(self) -> Start:
+        """Prior start at the place that was found, `LOOSER` than it is known."""
+        assert self.found is not None
+        psi, x, y = self.found.parameters.tolist()
+        sigmas = LOOSER * np.sqrt(np.diag(self.found.covariance))
+        start = self._calibration.start
+        roll, pitch, _ = start.rpy_rad
+        level_sigma_m = float(max(sigmas[1:].max(), 0.1))
+        return start.model_copy(
+            update={
+                "position_m": (x, y, start.position_m[2]),
+                "rpy_rad": (roll, pitch, psi),
+                "position_sigma_m": (
+                    level_sigma_m,
+                    level_sigma_m,
+                    start.position_sigma_m[2],
+                ),
+                "rpy_sigma_rad": (
+                    *start.rpy_sigma_rad[:2],
+                    float(max(sigmas[0], 0.02)),
+                ),
+            }
+        )
+
+
+def spread(
+    o_T_body: gtsam.Pose3,
+    o_T_sonar: gtsam.Pose3,
+    point: Floats,
+    R_z: Floats,
+    C: Floats,
+) -> Floats:
+    """Covariance of the level place of a point that was seen, shape (2, 2), m².
+
+    ``R_z``: of range and azimuth; ``C``: of the perturbation of the body's pose, in its own axes, shape (6, 6).
+    """
+    sight = point - o_T_sonar.translation()
+    range_m = float(np.linalg.norm(sight))
+    along = sight / range_m
+    # azimuth turns the sight about the sonar's third axis
+    across = np.cross(o_T_sonar.rotation().matrix()[:, 2], along)
+    by_z = np.column_stack([along, range_m * across])  # (3, 2)
+    R = o_T_body.rotation().matrix()
+    x, y, z = o_T_body.transformTo(point)
+    by_turn = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    by_body = np.hstack([by_turn, R])  # (3, 6)
+    cov = by_z @ R_z @ by_z.T + by_body @ C @ by_body.T
+    return np.asarray(cov[:2, :2])
+
+
+def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
+    """The start that outweighs all others by `ODDS`; None without one."""
+    places = np.array(known.positions_m)[:, :2]
+    M = known.joint()
+    place_cov = np.array(
+        [M[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] for k in range(len(places))]
+    )
+    q = np.array([s.q for s in sightings])
+    S = np.array([s.S for s in sightings])
+    rows = np.array([s.row for s in sightings])
+    n = len(np.unique(rows))
+    if n < 2:
+        return None
+    reach_m = float(np.linalg.norm(q, axis=1).max())
+    area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
+    data = MapData(q, S, rows, places, place_cov, area_m2)
+    found = [refined(proposal, data) for proposal in proposals(data)]
+    by_evidence = sorted(
+        (start for start in found if start is not None),
+        key=lambda start: -start.log_evidence,
+    )
+    starts: list[FoundStart] = []
+    for start in by_evidence:
+        if not any(is_same(start, better) for better in starts):
+            starts.append(start)
+    if not starts:
+        return None
+    log_others = math.log(WRONG / area_m2)
+    none = n * log_others
+    one = math.log(n * (1.0 - WRONG) / area_m2) + (n - 1) * log_others
+    best = starts[0]
+    rivals = [start.log_evidence for start in starts[1:]] + [none, one]
+    weight = float(np.logaddexp.reduce(rivals))
+    return best if best.log_evidence - weight >= math.log(ODDS) else None
+
+
+class MapData(NamedTuple):
+    """Sightings and landmarks as arrays."""
+
+    q: Floats
+    """Shape (k, 2)."""
+    S: Floats
+    """Shape (k, 2, 2)."""
+    rows: Any
+    """Landmark of each sighting, shape (k,)."""
+    places: Floats
+    """Shape (m, 2)."""
+    place_cov: Floats
+    """Shape (m, 2, 2)."""
+    area_m2: float
+    """A."""
+
+
+def proposals(data: MapData) -> list[Floats]:
+    """(psi, t_x, t_y) by each pair of sightings of two landmarks whose distance in the map fits."""
+    found = []
+    for k, j in combinations(range(len(data.q)), 2):
+        a = data.rows[k]
+        b = data.rows[j]
+        if a == b:
+            continue
+        seen = data.q[j] - data.q[k]
+        placed = data.places[b] - data.places[a]
+        cov = data.S[k] + data.S[j] + data.place_cov[a] + data.place_cov[b]
+        far_m = float(np.linalg.norm(placed))
+        sigma_m = math.sqrt(float(np.trace(cov)))
+        if abs(float(np.linalg.norm(seen)) - far_m) > 4.0 * sigma_m or far_m < sigma_m:
+            continue
+        psi = math.atan2(placed[1], placed[0]) - math.atan2(seen[1], seen[0])
+        middle = 0.5 * (data.q[k] + data.q[j])
+        t = 0.5 * (data.places[a] + data.places[b]) - turn(psi) @ middle
+        found.append(np.array([psi, *t]))
+    return found
+
+
+def turn(psi: float) -> Floats:
+    """Rotation of the plane, shape (2, 2)."""
+    c = math.cos(psi)
+    s = math.sin(psi)
+    return np.array([[c, -s], [s, c]])
+
+
+def refined(parameters: Floats, data: MapData) -> FoundStart | None:
+    """Least squares of (1) over the landmarks that agree, with the evidence (2)."""
+    agreeing: list[int] = []
+    information = np.zeros((3, 3))
+    for _ in range(STEPS):
+        R = turn(parameters[0])
+        e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)
+        W = R @ data.S @ R.T + data.place_cov[data.rows]  # (k, 2, 2)
+        squared = np.einsum("ki,ki->k", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
+        agreeing = first_agreeing(squared <= AGREES, data.rows)
+        if len(agreeing) < 2:
+            return None
+        by_psi = data.q[agreeing] @ turn(parameters[0] + 0.5 * math.pi).T
+        J = np.concatenate(
+            [by_psi[:, :, None], np.broadcast_to(np.eye(2), (len(agreeing), 2, 2))],
+            axis=2,
+        )  # (a, 2, 3)
+        weighted = np.linalg.solve(W[agreeing], J)  # (a, 2, 3)
+        information = np.einsum("aij,aik->jk", J, weighted)
+        step = np.linalg.solve(
+            information, np.einsum("aij,ai->j", weighted, e[agreeing])
+        )
+        parameters = parameters + step
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    log_density = -0.5 * squared[agreeing] - 0.5 * np.log(
+        np.linalg.det(2.0 * math.pi * W[agreeing])
+    )
+    n = len(np.unique(data.rows))
+    wrong = (n - len(agreeing)) * math.log(WRONG / data.area_m2)
+    right = float(log_density.sum()) + len(agreeing) * math.log(1.0 - WRONG)
+    volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
+    prior = math.log(2.0 * math.pi * data.area_m2)
+    return FoundStart(parameters, covariance, right + wrong + volume - prior)
+
+
+def first_agreeing(agrees: Any, rows: Any) -> list[int]:
+    """First agreeing sighting of each landmark most of whose sightings agree."""
+    found = []
+    for row in np.unique(rows).tolist():
+        of_landmark = np.flatnonzero(rows == row)
+        if 2 * np.count_nonzero(agrees[of_landmark]) > len(of_landmark):
+            found.append(int(of_landmark[np.argmax(agrees[of_landmark])]))
+    return found
+
+
+def is_same(start: FoundStart, better: FoundStart) -> bool:
+    """Check that a start lies within the prior that `MapLocator.start` makes of a better one."""
+    d = start.parameters - better.parameters
+    d[0] = math.remainder(d[0], 2.0 * math.pi)
+    squared = float(d @ np.linalg.solve(better.covariance, d))
+    return squared <= LOOSER**2
+
+
+class StartInMap:
+    """An estimator that begins once its start is found in the map, with all measurements since the first.
+
+    `process` returns None until then.
+    """
+
+    def __init__(
+        self, kind: type[Estimator], calibration: Calibration, params: Any
+    ) -> None:
+        self._kind = kind
+        self._calibration = calibration
+        self._params = params
+        self._locator = MapLocator(calibration)
+        self._waiting: list[Measurements] = []
+        self._inner: Estimator | None = None
+        self._from_ns = 0
+
+    def process(self, measurements: Measurements) -> Estimate | None:
+        """Causal estimate at the end of the measurements; None as long as the vehicle is not located in the map."""
+        if self._inner is not None:
+            return self._inner.process(measurements)
+        self._waiting.append(measurements)
+        self._locator.add(measurements)
+        if self._locator.found is None:
+            return None
+        started = self._calibration.model_copy(update={"start": self._locator.start()})
+        self._inner = self._kind(started, Odometry(started), self._params)
+        self._from_ns = measurements.end_ns
+        estimate = None
+        for each in self._waiting:
+            estimate = self._inner.process(each)
+        self._waiting = []
+        return estimate
+
+    def trajectory(self) -> Trajectory:
+        """Estimates from the instant on at which the vehicle was located."""
+        if self._inner is None:
+            return Trajectory.from_estimates([])
+        whole = self._inner.trajectory()
+        return whole.rows(np.flatnonzero(whole.stamps_ns >= self._from_ns))
+
+    def landmarks(self) -> LandmarkMap:
+        """Best present estimate of every landmark; none before the vehicle is located."""
+        if self._inner is None:
+            return LandmarkMap(
+                np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))
+            )
+        return self._inner.landmarks()
+
+    def newest_landmarks(self) -> LandmarkMap:
+        """Landmarks as of the last update."""
+        return (
+            self.landmarks()
+            if self._inner is None
+            else newest_landmarks_of(self._inner)
+        )
+
+    def known_map(self) -> KnownMap:
+        """Landmarks with their joint covariance."""
+        assert self._inner is not None
+        return known_map_of(self._inner)
+
+    def detections(self) -> DetectionLog:
+        """Outcome of every detection since the first measurements."""
+        if self._inner is None:
+            return DetectionLog(
+                np.empty(0, np.int64),
+                np.empty(0, np.int64),
+                np.empty((0, 2)),
+                np.empty((0, 2, 2)),
+                [],
+            )
+        return self._inner.detections()
+
+    def refused_rows(self) -> list[RefusedRow]:
+        """Refused rows so far."""
+        return [] if self._inner is None else refused_rows_of(self._inner)
+
+    def withheld(self) -> list[str]:
+        """Messages of the estimator; before it begins, that the vehicle is not located."""
+        if self._inner is None:
+            return [
+                "not yet located in the map: at least two landmarks of the map must be identified from different places"
+            ]
+        return withheld_of(self._inner)
+
+
+def make_estimator(
+    kind: type[Estimator], calibration: Calibration, params: Section | None
+) -> Any:
+    """Estimator with an odometry of its own, which waits for its start where that is to be found in the map."""
+    if calibration.start.source == "map":
+        return StartInMap(kind, calibration, params)
+    return kind(calibration, Odometry(calibration), params)

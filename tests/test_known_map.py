@@ -1,0 +1,273 @@
+"""Runs with a map of known landmarks: every estimator starts with it, and notices what moved."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from baselines.ekf_slam import EkfSlam
+from baselines.invariant_ekf import InvariantEkf
+from sonar_graph.calibration import Calibration, KnownMap, Start
+from sonar_graph.errors import LogError, SettingError
+from sonar_graph.estimator import known_map_of
+from sonar_graph.map_file import read_map, write_map
+from sonar_graph.navigation import Odometry
+from sonar_graph.navigation.map_start import make_estimator
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
+from sonar_graph.slam import Isam2
+
+SIGMA_M = 0.05
+KINDS = [EkfSlam, InvariantEkf, Isam2]
+each = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture(scope="module")
+def dive() -> Sequence:
+    return simulate_mission(MissionOptions(duration_s=90.0, landmarks=12, seed=4))
+
+
+def surveyed(dive: Sequence, seed: int = 0, **changes: object) -> KnownMap:
+    """The true landmarks with errors of a survey."""
+    truth = dive.true_landmarks
+    errors = SIGMA_M * np.random.default_rng(seed).standard_normal((len(truth), 3))
+    return KnownMap.of(truth.ids, truth.positions + errors, sigma_m=SIGMA_M, **changes)
+
+
+def with_map(dive: Sequence, known: KnownMap | None, start: Start | None = None):
+    changes = {"map": known, "start": start or dive.calibration.start}
+    return replace(dive, calibration=dive.calibration.model_copy(update=changes))
+
+
+def run(kind: type, dive: Sequence, rate_hz: float = 2.0):
+    """The estimator after the dive, and its causal estimates by stamp."""
+    estimator = make_estimator(kind, dive.calibration, None)
+    told = {}
+    for window in dive.replay(dive.instants(rate_hz)):
+        told[window.end_ns] = estimator.process(window)
+    return estimator, told
+
+
+def rms_m(dive: Sequence, told: dict) -> float:
+    stamps = [stamp for stamp, estimate in told.items() if estimate is not None]
+    truth = dive.true_poses.at(np.array(stamps)).positions
+    found = np.array([told[stamp].world_T_body.translation() for stamp in stamps])
+    return float(np.sqrt(np.mean(np.sum((found - truth) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf])
+def test_a_filter_begins_with_the_places_and_the_joint_covariance_of_the_map(kind):
+    """Wherever the vehicle starts, and however unsure of its pose."""
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((9, 9))
+    known = KnownMap.of(
+        [7, 3, 5], rng.normal(0, 9, (3, 3)), covariance_m2=root @ root.T
+    )
+    start = Start(
+        position_m=(3.0, -2.0, -1.0),
+        rpy_rad=(0.1, -0.2, 2.0),
+        position_sigma_m=(1.0, 2.0, 0.5),
+        rpy_sigma_rad=(0.1, 0.1, 0.3),
+    )
+    calibration = Calibration(map=known, start=start)
+    slam = kind(calibration, Odometry(calibration))
+    positions, joint = slam.points([0, 1, 2])
+    np.testing.assert_allclose(positions, known.positions_m)
+    np.testing.assert_allclose(joint, known.joint(), atol=1e-9)
+
+
+@each
+def test_a_map_makes_a_dive_more_accurate_and_stays_consistent(dive, kind):
+    _, without = run(kind, with_map(dive, None))
+    estimator, told = run(kind, with_map(dive, surveyed(dive)))
+    assert rms_m(dive, told) < 0.6 * rms_m(dive, without)
+    found = known_map_of(estimator)
+    truth = dive.true_landmarks
+    rows = np.searchsorted(truth.ids, found.ids)
+    e = (np.array(found.positions_m) - truth.positions[rows]).ravel()
+    assert 0.3 < e @ np.linalg.solve(found.joint(), e) / e.size < 2.0
+
+
+def test_all_estimators_agree_about_a_dive_in_a_map(dive):
+    ends = []
+    for kind in KINDS:
+        _, told = run(kind, with_map(dive, surveyed(dive)))
+        ends.append(list(told.values())[-1])
+    for other in ends[1:]:
+        e = ends[0].world_T_body.localCoordinates(other.world_T_body)
+        assert e @ np.linalg.solve(ends[0].covariance, e) < 6.0
+
+
+@each
+def test_a_fixed_map_is_reported_as_given_and_serves_like_another(dive, kind):
+    fixed = surveyed(dive, is_fixed=True)
+    estimator, told = run(kind, with_map(dive, fixed))
+    _, refined = run(kind, with_map(dive, surveyed(dive)))
+    landmarks = estimator.landmarks()
+    rows = np.argsort(fixed.ids)
+    np.testing.assert_array_equal(
+        landmarks.positions, np.array(fixed.positions_m)[rows]
+    )
+    np.testing.assert_allclose(
+        landmarks.covariances, np.tile(SIGMA_M**2 * np.eye(3), (12, 1, 1))
+    )
+    assert rms_m(dive, told) == rms_m(dive, refined)
+
+
+@each
+def test_landmarks_that_moved_are_named_and_mapped_anew(dive, kind):
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    places[:2, 0] += 1.0
+    _, right = run(kind, with_map(dive, known))
+    wrong = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    estimator, told = run(kind, with_map(dive, wrong))
+    assert rms_m(dive, told) < 1.2 * rms_m(dive, right) + 1e-3
+    (message,) = estimator.withheld()
+    assert message.startswith("landmarks 1, 2 no longer stand where the map has them")
+    found = estimator.landmarks()
+    away = np.linalg.norm(found.positions - dive.true_landmarks.positions, axis=1)
+    assert away[:2].max() < 0.3
+
+
+@each
+def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
+    known = surveyed(dive)
+    more = KnownMap.of(
+        [*known.ids, 99], [*known.positions_m, (500.0, 0.0, -2.0)], sigma_m=SIGMA_M
+    )
+    estimator, _ = run(kind, with_map(dive, more))
+    assert estimator.withheld() == ["landmarks of the map that were not seen: 99"]
+
+
+LOST = {"position_m": (300.0, -80.0, 0.0), "source": "map"}
+
+
+def unknown_start(dive: Sequence) -> Start:
+    """A start far from the true one in place and heading."""
+    start = dive.calibration.start
+    x, y, _ = LOST["position_m"]
+    place = (x, y, start.position_m[2])
+    turned = (*start.rpy_rad[:2], start.rpy_rad[2] + 2.5)
+    return start.model_copy(
+        update={"position_m": place, "rpy_rad": turned, "source": "map"}
+    )
+
+
+@each
+def test_an_unknown_start_is_found_in_the_map_and_no_pose_is_claimed_before(dive, kind):
+    lost = with_map(dive, surveyed(dive), unknown_start(dive))
+    _, told = run(kind, lost)
+    estimates = list(told.values())
+    located = next(k for k, estimate in enumerate(estimates) if estimate is not None)
+    assert 0 < located < 40
+    assert all(estimate is not None for estimate in estimates[located:])
+    assert rms_m(dive, told) < 0.1
+    truth = dive.true_poses
+    for stamp, estimate in told.items():
+        if estimate is not None:
+            e = (
+                truth.at(np.array([stamp])).positions[0]
+                - estimate.world_T_body.translation()
+            )
+            assert np.linalg.norm(e) < 0.5
+
+
+def test_a_start_that_is_found_does_not_depend_on_how_the_log_is_cut(dive):
+    lost = with_map(dive, surveyed(dive), unknown_start(dive))
+    _, seldom = run(EkfSlam, lost, rate_hz=1.0)
+    _, often = run(EkfSlam, lost, rate_hz=4.0)
+    common = [s for s in seldom if seldom[s] is not None and often.get(s) is not None]
+    assert len(common) > 50
+    for stamp in common:
+        one = seldom[stamp]
+        other = often[stamp]
+        np.testing.assert_array_equal(
+            one.world_T_body.matrix(), other.world_T_body.matrix()
+        )
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
+    known = surveyed(dive)
+    shuffled = np.random.default_rng(3).permutation(known.ids).tolist()
+    other = KnownMap.of(shuffled, known.positions_m, sigma_m=SIGMA_M)
+    estimator, told = run(EkfSlam, with_map(dive, other, unknown_start(dive)))
+    assert set(told.values()) == {None}
+    (message,) = estimator.withheld()
+    assert message.startswith("not yet located in the map")
+
+
+def test_a_second_dive_starts_with_the_map_of_the_first(dive, tmp_path):
+    estimator, _ = run(Isam2, with_map(dive, None))
+    write_map(tmp_path / "map.toml", known_map_of(estimator))
+    known = read_map(tmp_path / "map.toml").map
+    assert known == known_map_of(estimator)
+    again = simulate_mission(MissionOptions(duration_s=60.0, landmarks=12, seed=4))
+    _, told = run(EkfSlam, with_map(again, known, unknown_start(again)))
+    assert rms_m(again, told) < 0.15
+
+
+HEAD = "id,x_m,y_m,z_m,sigma_m\n"
+BAD = {
+    "no columns": (
+        "id,x_m\n1,2\n",
+        "expected the columns id, x_m, y_m, z_m and sigma_m",
+    ),
+    "empty": (HEAD, "no landmark: give a line for each"),
+    "a word": (HEAD + "1,a,2,3,0.1\n", "line 2: x_m: expected a number, not 'a'"),
+    "a short row": (HEAD + "1,2.0\n", "line 2: y_m: expected a number, not None"),
+    "twice": (HEAD + "1,0,2,3,0.1\n1,0,2,3,0.1\n", "line 3: landmark 1 stands twice"),
+    "half an id": (HEAD + "1.5,0,2,3,0.1\n", "line 2: id: expected a whole number"),
+    "a negative sigma": (
+        HEAD + "1,0,2,3,-0.1\n",
+        "line 2: sigma_m: expected a sigma of 0 m or more",
+    ),
+    "a grid of a country": (
+        HEAD + "1,512345,2,3,0.1\n",
+        "give metres from an origin near by",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
+def test_a_bad_map_is_refused_with_file_and_remedy(tmp_path, text, message):
+    path = tmp_path / "map.csv"
+    path.write_text(text)
+    with pytest.raises(LogError, match=r"map\.csv") as refused:
+        read_map(path)
+    assert message in str(refused.value)
+    assert len(str(refused.value)) < 300
+
+
+@pytest.mark.parametrize(
+    ("covariance", "message"),
+    [
+        (np.eye(2), "expected 3 rows of 3 numbers"),
+        (np.diag([1.0, 1.0, -1.0]), "without negative eigenvalues"),
+        (
+            np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]),
+            "expected a symmetric matrix",
+        ),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused(covariance, message):
+    with pytest.raises(SettingError, match=message):
+        KnownMap.of([1], [[0.0, 0.0, 0.0]], covariance_m2=covariance)
+
+
+def test_the_landmarks_of_a_comparison_are_a_map_without_correlations(
+    dive, tmp_path: Path
+):
+    from sonar_graph.logs import write_landmarks_csv
+
+    estimator, _ = run(EkfSlam, with_map(dive, None))
+    landmarks = estimator.landmarks()
+    write_landmarks_csv(tmp_path / "landmarks.csv", landmarks)
+    known, warnings = read_map(tmp_path / "landmarks.csv")
+    np.testing.assert_allclose(known.positions_m, landmarks.positions)
+    np.testing.assert_allclose(
+        known.joint()[3:6, 3:6], landmarks.covariances[1], atol=1e-15
+    )
+    assert "no correlations" in warnings[0]
