@@ -24,7 +24,7 @@ import numpy as np
 
 from sonar_graph.calibration import KnownMap
 from sonar_graph.errors import LogError
-from sonar_graph.files.inputs import text_of
+from sonar_graph.files import replacing, text_of
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse, toml_value
 
@@ -157,9 +157,15 @@ def write_map(path: Path, known: KnownMap) -> None:
     fields = known.model_dump()
     text = "".join(f"{name} = {toml_value(value)}\n" for name, value in fields.items())
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        with replacing(Path(path)) as partial:
+            partial.write_text(text, encoding="utf-8")
     except OSError as error:
         raise LogError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def map_origin(sequence: Sequence) -> str:
+    """Name of a log in the source of its map, with the stamp of its beginning, since names repeat."""
+    return f"{sequence.name} of {sequence.start_ns} ns"
 
 
 def in_map(sequence: Sequence, path: Path) -> Sequence:
@@ -173,6 +179,10 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     if start.source in ("vehicle", "heading"):
         start = start.model_copy(update={"source": "map"})
         note += "; the log states no place in it: the start is found by identified landmarks"
+    if known.source.startswith(f"{map_origin(sequence)}, "):
+        warnings.append(
+            f"{path}: this map was made from the same log, whose measurements count twice then: results look too certain"
+        )
     changes = {"map": known, "start": start}
     calibration = sequence.calibration.model_copy(update=changes)
     notes = {**sequence.notes, "log.map": note}

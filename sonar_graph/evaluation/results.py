@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar
 
 import numpy as np
 
+from sonar_graph.calibration import KnownMap
 from sonar_graph.evaluation.digits import format_value
 from sonar_graph.evaluation.tables import compact_table, score_table
 from sonar_graph.measurements import Floats, Ints
@@ -84,6 +85,8 @@ class RunResult:
     smoothed: Trajectory | None = None
     """The `trajectory` at the end, at the same instants. A filter's is its causal one."""
     landmarks: LandmarkMap | None = None
+    known_map: KnownMap | None = None
+    """The landmarks with their joint covariance, for another run; None where an estimator gives none, or of many."""
     detections: DetectionLog | None = None
     refused: list[RefusedRow] = field(default_factory=list)
     """Rows of IMU and Doppler log that it names as not used."""

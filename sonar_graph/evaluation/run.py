@@ -17,13 +17,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
+from sonar_graph.calibration import KnownMap
+from sonar_graph.errors import (
+    EstimatorError,
+    EvaluationError,
+    SonarGraphError,
+    UnknownEstimatorError,
+)
 from sonar_graph.estimator import (
     Candidate,
     Estimator,
     EstimatorChoice,
     MakeEstimator,
     is_foreign,
+    known_map_of,
     load_estimator,
     make_candidate,
     name_of,
@@ -35,6 +42,7 @@ from sonar_graph.estimator import (
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import kept_map_instants
 from sonar_graph.files import KilledError, OwnProcess, Tell, noticed_interrupts, serve
+from sonar_graph.map_file import map_origin
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import (
@@ -58,6 +66,8 @@ REASON_WIDTH = 400
 WARM_UP_STEPS = 20
 MAX_WARM_UP_STEPS = 200
 """Steps given to the instance that warms up: without and with detections to wait for."""
+MOST_MAPPED = 100
+"""Landmarks up to which a run keeps their joint covariance: its size grows with their square."""
 WARM_UP_FRAMES = 4
 """Steps with a landmark that can be named: it is begun, waited for, and seen again."""
 
@@ -507,6 +517,7 @@ class _Replay:
             causal=causal,
             smoothed=smoothed,
             landmarks=landmarks,
+            known_map=self._known_map(estimator, landmarks),
             detections=detections,
             refused=self._refused(estimator),
             withheld=[*withheld_of(estimator), *self._ignored()],
@@ -514,6 +525,21 @@ class _Replay:
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,
         )
+
+    def _known_map(
+        self, estimator: Estimator, landmarks: LandmarkMap
+    ) -> KnownMap | None:
+        """The landmarks with their joint covariance and their origin; None of too many."""
+        if not 0 < len(landmarks) <= MOST_MAPPED:
+            return None
+        with contextlib.suppress(SonarGraphError):
+            known = known_map_of(estimator)
+            source = f"{map_origin(self._sequence)}, {self._name}"
+            given = self._sequence.calibration.map
+            if given is not None:
+                source += f", in the map of {given.source or 'no stated source'}"
+            return known.model_copy(update={"source": source})
+        return None
 
     def _ignored(self) -> list[str]:
         """Messages about blocks that the estimator never asked for."""

@@ -8,6 +8,7 @@
                                 recognition of landmarks in sonar images, and the pictures that the report shows
     DIR/runs/NAME/trajectory.tum, causal.tum, landmarks.csv
                                 the estimates, for other tools; absent when the run failed
+    DIR/runs/NAME/map.toml      the landmarks with their joint covariance, for `--map` of another run
     DIR/runs/NAME/result.json   settings, versions, timings, status and reason
     DIR/runs/NAME/series.npz    everything as arrays, with covariances
     DIR/result.mcap             all of it for viewers, with layouts for Foxglove and RViz beside it
@@ -51,6 +52,7 @@ from sonar_graph.files import (
 )
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
 from sonar_graph.logs.mcap import Attachment
+from sonar_graph.map_file import write_map
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
@@ -76,7 +78,7 @@ RESULT_LOG = "result.mcap"
 PAGE = "report.html"
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
 """As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
-ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
+ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv", "map.toml")
 _SCORE, _TEXTS, _STATUS = (
     TypeAdapter(Score),
     TypeAdapter(dict[str, str]),
@@ -209,6 +211,8 @@ def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
         write_tum(folder / "trajectory.tum", run.smoothed)
         write_tum(folder / "causal.tum", run.causal)
         write_landmarks_csv(folder / "landmarks.csv", run.landmarks)
+    if run.known_map is not None:
+        write_map(folder / "map.toml", run.known_map)
     _write_arrays(
         folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {}))
     )

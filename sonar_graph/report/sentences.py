@@ -64,6 +64,7 @@ SAID_NOTES = {
     "log.damage": "Log",
     "log.start": "Log",
     "log.start_pose": WARNING,
+    "log.map": "Map",
     FITTED: "Truth",
     HEIGHTS: "Truth",
     "log.stamps": "Log",
