@@ -28,6 +28,7 @@ from sonar_graph.logs.convert import (
     read_victoria_park,
 )
 from sonar_graph.logs.mcap import LogFile, TimeWindow, log_parts
+from sonar_graph.map_file import in_map, read_map
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
     BasinOptions,
@@ -50,6 +51,8 @@ class LogOptions(Section):
     calibration: str | None = None
     """TOML or JSON file whose fields replace the log's own."""
     log_config: str | None = None
+    map: str | None = None
+    """Map of known landmarks, TOML or CSV."""
     topics: dict[str, str] = Field(default_factory=dict)
     """By role."""
     start: str | None = None
@@ -107,7 +110,7 @@ def _parsed(
 
 def _read_log(options: LogOptions) -> Sequence:
     given, config, window = _parsed(options)
-    return read_log(
+    sequence = read_log(
         Path(options.log),
         calibration=given,
         topics=options.topics,
@@ -115,6 +118,7 @@ def _read_log(options: LogOptions) -> Sequence:
         window=window,
         salvage=options.salvage,
     )
+    return sequence if options.map is None else in_map(sequence, Path(options.map))
 
 
 def _check_log(options: LogOptions) -> None:
@@ -122,6 +126,8 @@ def _check_log(options: LogOptions) -> None:
     for part in log_parts(Path(options.log)):
         LogFile(part).close()
     _parsed(options)
+    if options.map is not None:
+        read_map(Path(options.map))
 
 
 GENERATORS: dict[str, SourceKind] = {
@@ -149,7 +155,7 @@ KINDS: dict[str, SourceKind] = {
     **DATASETS,
     **GENERATORS,
 }
-FILES = ("log", "folder", "calibration", "log_config")
+FILES = ("log", "folder", "calibration", "log_config", "map")
 """Options that name files: their content counts, not their path."""
 FILE = "file"
 """Key in fingerprints for the file of a data set that has no option for one."""
