@@ -267,7 +267,8 @@ def gravity_warning(
 def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[str]:
     """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
 
-    Axes of the accelerometers that gravity contradicts, and quantities that are stuck.
+    Axes of the accelerometers that gravity contradicts, quantities that are stuck, and axes of the gyros that are dead
+    or clipped.
     """
     gravity_m_s2 = calibration.gravity_m_s2
     mounting = calibration.imu.mounting
@@ -285,6 +286,8 @@ def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[
         stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
         if doubt := stuck_doubt(stamps_ns, stuck, quantity):
             yield f"{role}: {doubt}"
+    for fault in axis_faults(imu.angular_velocity, "angular rate"):
+        yield f"imu: {fault}: headings and positions are wrong from the first turn on"
 
 
 def row_oddities(
@@ -303,10 +306,55 @@ def row_oddities(
                 yield "imu", check(imu.stamps_ns, values, quantity)
     if dvl is not None and is_linear:
         yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
+        for fault in axis_faults(dvl.velocity, "velocity"):
+            yield "dvl", fault
     if imu is not None and dvl is not None and depth is not None:
         way_m = way_by("positions", imu, dvl, calibration, depth.stamps_ns)
         heights = depth.z_m[:, None]
         yield "depth", stuck_warning(depth.stamps_ns, heights, "height", way_m)
+
+
+FEWEST_FRESH = 100
+FEWEST_VALUES = 50
+"""Number of different values below which a sensor is too coarse to show where it is clipped."""
+FEWEST_CLIPPED = 5
+CLIPPED_SHARE = 0.002
+CLIPPED_RATIO = 5
+
+
+def axis_faults(values: Floats, quantity: str) -> Iterator[str]:
+    """Faults of single axes of a quantity, shape (n, 3): one that never changes, and one that is clipped.
+
+    Noise makes every value its own, so that the largest one comes once. Where it comes `FEWEST_CLIPPED` times, in
+    `CLIPPED_SHARE` of the rows, and `CLIPPED_RATIO` times as often as the next, the sensor or its driver cuts there.
+    """
+    # rows of a sensor that is frozen are all alike, and have a finding of their own
+    moves = np.any(values[1:] != values[:-1], axis=1)
+    fresh = values[1:][moves]
+    if len(fresh) < FEWEST_FRESH:
+        return
+    is_dead = np.ptp(fresh, axis=0) == 0
+    # a robot on wheels has two axes that never change
+    if np.count_nonzero(is_dead) == 1:
+        axis = int(np.argmax(is_dead))
+        yield (
+            f"{quantity} along {'xyz'[axis]} is {fresh[0, axis] + 0.0:g} in every row, while the other axes change: not"
+            " filled by the driver, or dead"
+        )
+    for axis in np.flatnonzero(~is_dead).tolist():
+        found, counts = np.unique(fresh[:, axis], return_counts=True)
+        if len(found) < FEWEST_VALUES:
+            continue
+        for limit, often, beside in (
+            (found[0], counts[0], counts[1]),
+            (found[-1], counts[-1], counts[-2]),
+        ):
+            fewest = max(FEWEST_CLIPPED, CLIPPED_SHARE * len(fresh))
+            if often >= fewest and often >= CLIPPED_RATIO * beside:
+                yield (
+                    f"{quantity} along {'xyz'[axis]} is never beyond {limit:g}, its value in {often} rows: clipped by the"
+                    " sensor's range or the driver"
+                )
 
 
 def axes_warning(adapter: Adapter) -> str | None:

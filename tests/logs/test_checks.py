@@ -13,6 +13,7 @@ from sonar_graph.calibration import (
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
 from sonar_graph.logs.checks import (
+    axis_faults,
     gap_warnings,
     repeated_sightings,
     repeats,
@@ -438,3 +439,35 @@ def test_stamps_of_another_year_are_of_a_log_that_was_played_or_of_a_wrong_clock
         said
         == "stamped 400 days before recording: a log was played, or a clock was not set"
     )
+
+
+def rates(seed: int, clip: float = np.inf, dead: int | None = None, step: float = 0.0):
+    """Rates of a vehicle that turns to and fro, with noise, 2,000 rows."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(2000) * 0.02
+    turns = np.column_stack([np.sin(0.3 * t + k) for k in range(3)]) * [0.05, 0.04, 0.3]
+    rate = np.clip(turns + 1e-3 * rng.standard_normal((2000, 3)), -clip, clip)
+    if dead is not None:
+        rate[:, dead] = 0.0
+    return np.round(rate / step) * step if step else rate
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_axis_that_is_dead_or_clipped_is_named_and_no_other(seed):
+    (dead,) = axis_faults(rates(seed, dead=2), "angular rate")
+    assert dead.startswith("angular rate along z is 0 in every row")
+    low, high = axis_faults(rates(seed, clip=0.2), "angular rate")
+    assert low.startswith("angular rate along z is never beyond -0.2")
+    assert high.startswith("angular rate along z is never beyond 0.2")
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("step", [0.0, 1e-3, 0.05])
+def test_no_axis_of_a_whole_sensor_is_named_however_coarse_it_is(seed, step):
+    assert not list(axis_faults(rates(seed, step=step), "angular rate"))
+
+
+def test_wheels_have_axes_that_never_change():
+    on_wheels = rates(0)
+    on_wheels[:, :2] = 0.0
+    assert not list(axis_faults(on_wheels, "angular rate"))
