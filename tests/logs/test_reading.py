@@ -622,3 +622,19 @@ def test_an_argument_called_like_an_option_names_the_one_of_python(
         reading(path, log_config="dive.toml")
     with pytest.raises(LogError, match="its start must be less than its end"):
         reading(path, window=(20, 10))
+
+
+@pytest.mark.parametrize(("outside", "is_told"), [(1, False), (10, True)])
+def test_a_few_detections_after_the_last_odometry_are_no_warning(outside, is_told):
+    n = 200
+    stamps_ns = np.arange(n, dtype=np.int64) * 10**9
+    detections = LandmarkDetections(
+        stamps_ns=stamps_ns,
+        range_m=np.full(n, 5.0),
+        azimuth_rad=np.zeros(n),
+        range_azimuth_cov=np.full((n, 2, 2), np.nan),
+        candidate_ids=np.ones((n, 1), np.int64),
+        id_probability=np.ones((n, 1)),
+    )
+    last_ns = int(stamps_ns[-1 - outside])
+    assert bool(list(detection_warnings(detections, 0, last_ns))) == is_told
