@@ -12,8 +12,7 @@ from sonar_graph.calibration import Calibration, KnownMap, Start
 from sonar_graph.errors import LogError, SettingError
 from sonar_graph.estimator import known_map_of
 from sonar_graph.map_file import read_map, write_map
-from sonar_graph.navigation import Odometry
-from sonar_graph.navigation.map_start import make_estimator
+from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2

@@ -39,7 +39,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.estimator import known_map_of, withheld_of
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
-from sonar_graph.navigation.map_start import make_estimator
+from sonar_graph.navigation import make_estimator
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 

@@ -435,7 +435,7 @@ class _Replay:
     def _fresh(self) -> Estimator:
         """The estimator, with an odometry of its own."""
         # loads numba, which a result does not need
-        from sonar_graph.navigation.map_start import make_estimator
+        from sonar_graph.navigation import make_estimator
 
         return make_estimator(self._candidate.fresh, self._sequence.calibration)
 

@@ -90,7 +90,7 @@ def serve_estimator() -> None:
 def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     if isinstance(request, Begin):
         # loads numba
-        from sonar_graph.navigation.map_start import make_estimator
+        from sonar_graph.navigation import make_estimator
 
         kind = load_estimator(request.name)
         params = make_params(kind, request.overrides, request.name)

@@ -88,7 +88,7 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Part:
+class TemplatePart:
     """A role that a table may play, from ``csv_quantities.toml``."""
 
     files: str
@@ -118,7 +118,7 @@ QUANTITIES = {
     key: _quantities(key, table) for key, table in _KNOWN["quantities"].items()
 }
 """What columns may hold by key; of several the first that fits counts."""
-PARTS = {role: Part(**table) for role, table in _KNOWN["roles"].items()}
+PARTS = {role: TemplatePart(**table) for role, table in _KNOWN["roles"].items()}
 
 
 @dataclass(frozen=True)
