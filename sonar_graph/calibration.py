@@ -329,11 +329,13 @@ class KnownMap(Section):
     ((4, 9), (6, 6))
     """
 
-    ids: tuple[int, ...]
+    ids: tuple[int, ...] = Field(examples=[(4,)])
     """Identity of each of m landmarks."""
-    positions_m: tuple[Vector, ...]
+    positions_m: tuple[Vector, ...] = Field(examples=[((5.0, 0.0, -1.7),)])
     """In the world, m places."""
-    covariance_m2: tuple[tuple[Number, ...], ...]
+    covariance_m2: tuple[tuple[Number, ...], ...] = Field(
+        examples=[((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))]
+    )
     """Joint covariance of all coordinates, x, y, z of each landmark in turn, shape (3 m, 3 m)."""
     is_fixed: bool = False
     """True: estimators count the map's covariance, and report its landmarks as they were given."""

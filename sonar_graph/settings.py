@@ -449,7 +449,8 @@ def _template_lines(
             continue
         if is_optional:
             continue
-        usual = 0.1 if field.is_required() else field.get_default()
+        example = field.examples[0] if field.examples else 0.1
+        usual = example if field.is_required() else field.get_default()
         usual = getattr(default, name, usual)
         value = usual if stated is None else getattr(stated, name)
         meaning = _sentence(meanings_of(model).get(name))

@@ -317,12 +317,14 @@ class Assembly:
         dvl = self.adapters.get("dvl")
         # wheels stop and turn evenly, which would look like a Doppler log without lock
         is_held = self.calibration.odometry_interpolation == "hold-past"
+        # rows of a log that this package wrote were chosen before
+        is_chosen = is_held or is_described(recording)
         self._may_lack_lock = (
             isinstance(dvl, DvlAdapter)
             and dvl.lock == "found"
-            and not (dvl.are_zeros_measured or is_held)
+            and not (dvl.are_zeros_measured or is_chosen)
         )
-        if isinstance(dvl, DvlAdapter) and (is_held or is_described(recording)):
+        if isinstance(dvl, DvlAdapter) and is_chosen:
             self.adapters["dvl"] = dvl.with_marks_alone()
 
     def _read_table(self, role: str) -> None:

@@ -439,7 +439,8 @@ def is_described(recording: Recording) -> bool:
     except CalibrationError:
         return False
     stated = set() if recorded is None else recorded.model_fields_set
-    return stated | {"start"} == Calibration.model_fields.keys()
+    # a start may be left to be measured, and no log need have a map
+    return stated | {"start", "map"} == Calibration.model_fields.keys()
 
 
 def read_notes(recording: Recording) -> dict[str, str]:

@@ -181,5 +181,6 @@ def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs(
         "join",
         "label",
     }
-    elsewhere = {"run", "live", "figures", "csv"}  # test_show, test_own_files
+    # test_show, test_own_files, test_bench
+    elsewhere = {"run", "live", "figures", "csv", "bench"}
     assert writing == tried | of_folders | of_nothing | elsewhere

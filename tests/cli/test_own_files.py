@@ -127,7 +127,7 @@ WRONG = {
     f"{CSV} empty.toml": r"empty\.csv: has no line with numbers; expected a table",
     f"{CSV} image.toml": r"image\.csv, line 1: is no text",
     f"{CSV} comma.toml": r'comma\.csv: has no line with numbers like 1\.5; .* need decimal = ","',
-    f"{CSV} gap.toml": "no common time; of another clock or unit[?] `stamp = .log.` under",
+    f"{CSV} gap.toml": "no common time; of another clock or unit[?] See stamp",
     "convert csv . --config good.toml -o wall/new.mcap": r"wall/new\.mcap: cannot be written: .*choose another place",
     "convert csv . --config good.toml -o new.csv": r"logs are MCAP files",
     "inspect dive.mcap --log-config good.toml": r"good\.toml: says which text tables .* csv TABLES --config good\.toml",
