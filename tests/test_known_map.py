@@ -12,6 +12,7 @@ from sonar_graph.calibration import Calibration, KnownMap, Start
 from sonar_graph.errors import LogError, SettingError
 from sonar_graph.estimator import known_map_of
 from sonar_graph.map_file import read_map, write_map
+from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -138,6 +139,34 @@ def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
     )
     estimator, _ = run(kind, with_map(dive, more))
     assert estimator.withheld() == ["landmarks of the map that were not seen: 99"]
+
+
+RIGHT, WRONG = 1.0, 100.0
+"""Squared distances of sightings that agree with the map, and that contradict it."""
+
+
+def judged(sightings: list[tuple[int, float]]) -> KnownLandmarks:
+    """A map of five landmarks after sightings."""
+    known = KnownLandmarks(KnownMap.of(range(5), np.zeros((5, 3)), sigma_m=0.1))
+    for landmark_id, squared in sightings:
+        known.judge(landmark_id, squared)
+    return known
+
+
+def test_a_landmark_has_moved_where_most_sightings_contradict_it_and_most_landmarks_agree():
+    agree = [(i, RIGHT) for i in (1, 2, 3)]
+    assert judged(agree + [(0, WRONG)] * 2).moved == []
+    assert judged(agree + [(0, WRONG)] * 3).moved == [0]
+    assert judged(agree + [(0, RIGHT)] * 3 + [(0, WRONG)] * 3).moved == []
+    both = judged(agree + [(0, WRONG)] * 3 + [(4, WRONG)] * 3)
+    assert both.moved == [0, 4]
+
+
+def test_where_as_many_landmarks_contradict_as_agree_none_is_let_go_and_all_are_named():
+    known = judged([(1, RIGHT)] + [(0, WRONG)] * 9)
+    assert known.moved == []
+    assert known.messages()[0].startswith("landmarks 0 contradict the map")
+    assert known.messages()[1] == "landmarks of the map that were not seen: 2, 3, 4"
 
 
 LOST = {"position_m": (300.0, -80.0, 0.0), "source": "map"}

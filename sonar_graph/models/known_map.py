@@ -42,6 +42,8 @@ class KnownLandmarks:
         self.ids = known.ids if known else ()
         self.moved: list[int] = []
         """Identities that do not, in the order in which this was noticed."""
+        self.seen: set[int] = set()
+        """Identities with a sighting."""
         self._agreeing: Counter[int] = Counter()
         self._contradicting: Counter[int] = Counter()
 
@@ -49,20 +51,21 @@ class KnownLandmarks:
         """Treatment of a sighting at a squared Mahalanobis distance from its prediction."""
         if landmark_id not in self.held:
             return Verdict.USE
+        self.seen.add(landmark_id)
         if squared <= CONTRADICTS:
             self._agreeing[landmark_id] += 1
             return Verdict.USE
         self._contradicting[landmark_id] += 1
         contradicted = self._contradicted()
-        agreeing = len(self.held) - len(contradicted) - len(self._unseen())
+        agreeing = (self.held & self.seen).difference(contradicted, self.moved)
         if landmark_id not in contradicted:
             return Verdict.REFUSE
-        if len(self.moved) + len(contradicted) >= agreeing:
+        if len(self.moved) + len(contradicted) >= len(agreeing):
             return Verdict.REFUSE
+        self.moved.append(landmark_id)
         # what has left a bounded window cannot be taken out again
         if not self._may_release:
             return Verdict.REFUSE
-        self.moved.append(landmark_id)
         self.held.discard(landmark_id)
         return Verdict.RELEASE
 
@@ -72,13 +75,10 @@ class KnownLandmarks:
             i
             for i in self.ids
             if i in self.held
+            and i not in self.moved
             and self._contradicting[i] >= FEWEST
             and self._contradicting[i] > self._agreeing[i]
         ]
-
-    def _unseen(self) -> list[int]:
-        """Landmarks of the map without a sighting."""
-        return [i for i in self.ids if not self._agreeing[i] + self._contradicting[i]]
 
     def places(self) -> Floats:
         """Places of all landmarks of the map, shape (m, 3), m."""
@@ -118,8 +118,13 @@ class KnownLandmarks:
             return []
         lines = []
         if self.moved:
+            treated = (
+                "mapped anew; correct the map"
+                if self._may_release
+                else "their sightings are refused; correct the map, or give history.policy = whole to map them anew"
+            )
             lines.append(
-                f"landmarks {listed(self.moved)} no longer stand where the map has them: mapped anew; correct the map"
+                f"landmarks {listed(self.moved)} no longer stand where the map has them: {treated}"
             )
         contradicted = self._contradicted()
         if contradicted:
@@ -127,7 +132,7 @@ class KnownLandmarks:
                 f"landmarks {listed(contradicted)} contradict the map, and too few others agree with it: they have moved,"
                 ' or the start or the map is wrong; source = "map" under [start] finds the start by all of them'
             )
-        unseen = self._unseen()
+        unseen = [i for i in self.ids if i not in self.seen]
         if unseen:
             lines.append(f"landmarks of the map that were not seen: {listed(unseen)}")
         return lines

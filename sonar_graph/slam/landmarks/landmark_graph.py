@@ -518,6 +518,7 @@ class LandmarkGraph:
             self.state(sighting).outcome, landmark_id, handle
         )
         self._of[landmark_id][sighting] = None
+        self.known.seen.add(landmark_id)
 
     def _remove(self, sighting: Sighting) -> None:
         outcome, landmark_id, _ = self._states[sighting]
