@@ -14,6 +14,7 @@ from sonar_graph.estimator import known_map_of
 from sonar_graph.map_file import read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
+from sonar_graph.navigation.map_start import MapLocator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -299,3 +300,15 @@ def test_the_landmarks_of_a_comparison_are_a_map_without_correlations(
         known.joint()[3:6, 3:6], landmarks.covariances[1], atol=1e-15
     )
     assert "no correlations" in warnings[0]
+
+
+def test_the_start_that_is_found_is_a_prior_of_a_hundredth_of_its_information(dive):
+    """The estimator weighs the sightings that found it; a tighter prior would count them twice."""
+    lost = with_map(dive, surveyed(dive), unknown_start(dive))
+    locator = MapLocator(lost.calibration)
+    for window in lost.replay(lost.instants(2.0)):
+        locator.add(window)
+    sigmas = np.sqrt(np.diag(locator.found.covariance))
+    start = locator.start()
+    assert min(start.position_sigma_m[:2]) >= 9.9 * sigmas[1:].max()
+    assert start.rpy_sigma_rad[2] >= 9.9 * sigmas[0]
