@@ -34,6 +34,7 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
+    LONG_GAP_S,
     UNFELT,
     axes_warning,
     gap_warnings,
@@ -585,7 +586,9 @@ class Assembly:
             stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl")]
             first_ns = max(int(ns.min()) for ns in stamps)
             last_ns = min(int(ns.max()) for ns in stamps)
-            for text in detection_warnings(detections, first_ns, last_ns):
+            # the sensor that writes last is always some rows ahead
+            spare_ns = round(LONG_GAP_S * 1e9)
+            for text in detection_warnings(detections, first_ns, last_ns + spare_ns):
                 yield f"detections: {text}"
 
     def _oddities(self) -> Iterator[tuple[str, str | None]]:
