@@ -35,6 +35,18 @@ LEAST_LEVEL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
+class FeltMotion:
+    """Vectors at the rows of the Doppler log in the frame of the gyros' path, C, shape (n, 3) each."""
+
+    velocity_m_s: Floats
+    """C v."""
+    rate_rad_s: Floats
+    """C w."""
+    gravity_m_s2: Floats
+    """``mean(C f) - d(C v)/dt``."""
+
+
+@dataclass(frozen=True, eq=False)
 class BodyMotion:
     """Motion of the body's origin at the rows of the Doppler log."""
 
@@ -51,12 +63,8 @@ class BodyMotion:
     """Shape (n,), since the first row."""
     path_m: Values
     """Complex, shape (n,), level, in axes that are the body's at the first row."""
-    velocity_m_s: Floats
-    """C v, shape (n, 3), in the frame of the gyros' path."""
-    rate_rad_s: Floats
-    """C w, shape (n, 3), in the frame of the gyros' path."""
-    gravity_m_s2: Floats | None
-    """``mean(C f) - d(C v)/dt``, shape (n, 3), in the frame of the gyros' path; None without gravity in the forces."""
+    felt: "FeltMotion | None" = None
+    """None without gravity in the forces."""
 
     @classmethod
     def of(cls, sequence: Sequence) -> "BodyMotion | None":
@@ -87,11 +95,13 @@ class BodyMotion:
         breaks = (intervals > longest_s) | (np.diff(path.parts_at(t)) > 0)
         C = path.rotations_at(t)  # (n, 3, 3)
         velocity = np.einsum("nij,nj->ni", C, v)
-        felt = felt_gravity(path, t, velocity, calibration)
+        gravity = felt_gravity(path, t, velocity, calibration)
         up_in_path = C[:, :, 2]
-        if felt is not None:
-            size = np.maximum(np.linalg.norm(felt, axis=1), 1e-9)
-            up_in_path = felt / size[:, None]
+        felt = None
+        if gravity is not None:
+            size = np.maximum(np.linalg.norm(gravity, axis=1), 1e-9)
+            up_in_path = gravity / size[:, None]
+            felt = FeltMotion(velocity, np.einsum("nij,nj->ni", C, rate), gravity)
         up = np.einsum("nji,nj->ni", C, up_in_path)
         is_held = calibration.odometry_interpolation == "hold-past"
         # at the IMU's rate, since turns are faster than rows of the Doppler log
@@ -111,9 +121,7 @@ class BodyMotion:
             yaw_rad=np.asarray(yaw_rad, np.float64),
             height_m=integral(t, np.sum(v * up, axis=1), is_held=is_held),
             path_m=integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
-            velocity_m_s=velocity,
-            rate_rad_s=np.einsum("nij,nj->ni", C, rate),
-            gravity_m_s2=felt,
+            felt=felt,
         )
 
     def reference(self, values: Values) -> Callable[[Floats], Values]:

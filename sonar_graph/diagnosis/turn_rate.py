@@ -61,24 +61,25 @@ def turn_match(motion: BodyMotion) -> Match | None:
 
     A scale of the Doppler log's velocities shows along the velocity too, and is divided out where it is known.
     """
-    if motion.gravity_m_s2 is None:
+    felt = motion.felt
+    if felt is None:
         return None
     t = motion.seconds
-    up = motion.gravity_m_s2 / np.linalg.norm(motion.gravity_m_s2, axis=1)[:, None]
-    level = motion.velocity_m_s - np.sum(motion.velocity_m_s * up, 1)[:, None] * up
+    up = felt.gravity_m_s2 / np.linalg.norm(felt.gravity_m_s2, axis=1)[:, None]
+    level = felt.velocity_m_s - np.sum(felt.velocity_m_s * up, 1)[:, None] * up
     speed_m_s = np.linalg.norm(level, axis=1)
     along = level / np.maximum(speed_m_s, 1e-9)[:, None]
     across = np.cross(up, along)
-    r = residual(motion)  # (n, 3)
+    r = residual(motion, felt.gravity_m_s2)  # (n, 3)
     is_known = speed_m_s > LEAST_SPEED_M_S
     is_known &= np.isfinite(r).all(axis=1)
     if np.count_nonzero(is_known) < FEWEST_ROWS:
         return None
     r[~is_known] = np.nan
     # averaged as the forces are
-    turned = integral_of(t, np.cross(motion.rate_rad_s, motion.velocity_m_s))
+    turned = integral_of(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
     by_rate = np.gradient(smoothed(t, turned), t, axis=0)
-    by_velocity = np.gradient(smoothed(t, motion.velocity_m_s), t, axis=0) - by_rate
+    by_velocity = np.gradient(smoothed(t, felt.velocity_m_s), t, axis=0) - by_rate
     found = gain_along(motion, by_rate, r, across)
     of_scale = gain_along(motion, by_velocity, r, along).gain
     of_scale = of_scale.limited(LARGEST_SCALE_SIGMA, "even speed")
@@ -185,10 +186,9 @@ def integral_of(t: Floats, columns: Floats) -> Floats:
     return np.column_stack([integral(t, column) for column in columns.T])
 
 
-def residual(motion: BodyMotion) -> Floats:
+def residual(motion: BodyMotion, gravity_m_s2: Floats) -> Floats:
     """Felt gravity about a line in each stretch of `GRAVITY_OVER_S`, shape (n, 3); NaN in stretches with few rows."""
-    assert motion.gravity_m_s2 is not None
-    found = np.full_like(motion.gravity_m_s2, np.nan)
+    found = np.full_like(gravity_m_s2, np.nan)
     for part in np.unique(motion.parts):
         rows = np.flatnonzero(motion.parts == part)
         t = motion.seconds[rows]
@@ -197,6 +197,6 @@ def residual(motion: BodyMotion) -> Floats:
             if len(inside) < FEWEST_ROWS:
                 continue
             A = np.vander(motion.seconds[inside] - motion.seconds[inside[0]], 2)
-            felt = motion.gravity_m_s2[inside]
+            felt = gravity_m_s2[inside]
             found[inside] = felt - A @ np.linalg.lstsq(A, felt, rcond=None)[0]
     return found

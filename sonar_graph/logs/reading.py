@@ -34,7 +34,6 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
-    LONG_GAP_S,
     UNFELT,
     axes_warning,
     gap_warnings,
@@ -586,8 +585,11 @@ class Assembly:
             stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl")]
             first_ns = max(int(ns.min()) for ns in stamps)
             last_ns = min(int(ns.max()) for ns in stamps)
-            # the sensor that writes last is always some rows ahead
-            spare_ns = round(LONG_GAP_S * 1e9)
+            # until the next row of odometry is due, the sensor that writes last is ahead
+            spare_ns = max(
+                round(np.median(np.diff(np.sort(ns, axis=None)))) if len(ns) > 1 else 0
+                for ns in stamps
+            )
             for text in detection_warnings(detections, first_ns, last_ns + spare_ns):
                 yield f"detections: {text}"
 

@@ -481,6 +481,17 @@ def test_odometry_lasts_while_there_are_both_sensors(bench: Bench) -> None:
         assert f"detections: 1 of 3 rows have a stamp {side} odometry" in said
 
 
+def test_a_sighting_within_an_interval_of_the_last_odometry_is_no_fault(
+    bench: Bench,
+) -> None:
+    """The sensor that writes last is always ahead of odometry."""
+    frames = [
+        bench.detections(T0_NS + k * STEP_NS // 4, [2.0], [5]) for k in (4, 16, 35)
+    ]
+    path = bench.write(*bench.basics(9), ("/landmarks", "detections", frames))
+    assert "last odometry" not in read_log(path).notes["log.warnings"]
+
+
 @pytest.mark.parametrize("cross", [0.0, 0.9, -1.1, np.inf, np.nan])
 def test_a_covariance_is_told_of_where_estimators_refuse_it(cross: float) -> None:
     for variances in (
