@@ -587,8 +587,8 @@ class Assembly:
             last_ns = min(int(ns.max()) for ns in stamps)
             # until the next row of odometry is due, the sensor that writes last is ahead
             spare_ns = max(
-                round(np.median(np.diff(np.sort(ns, axis=None)))) if len(ns) > 1 else 0
-                for ns in stamps
+                (int(np.median(np.diff(np.sort(ns)))) for ns in stamps if len(ns) > 1),
+                default=0,
             )
             for text in detection_warnings(detections, first_ns, last_ns + spare_ns):
                 yield f"detections: {text}"
