@@ -35,6 +35,18 @@ LEAST_LEVEL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
+class FeltMotion:
+    """Vectors at the rows of the Doppler log in the frame of the gyros' path, C, shape (n, 3) each."""
+
+    velocity_m_s: Floats
+    """C v."""
+    rate_rad_s: Floats
+    """C w."""
+    gravity_m_s2: Floats
+    """``mean(C f) - d(C v)/dt``."""
+
+
+@dataclass(frozen=True, eq=False)
 class BodyMotion:
     """Motion of the body's origin at the rows of the Doppler log."""
 
@@ -51,6 +63,8 @@ class BodyMotion:
     """Shape (n,), since the first row."""
     path_m: Values
     """Complex, shape (n,), level, in axes that are the body's at the first row."""
+    felt: "FeltMotion | None" = None
+    """None without gravity in the forces."""
 
     @classmethod
     def of(cls, sequence: Sequence) -> "BodyMotion | None":
@@ -80,7 +94,14 @@ class BodyMotion:
         # the one place where integrals break: every reference and stretch goes by these parts
         breaks = (intervals > longest_s) | (np.diff(path.parts_at(t)) > 0)
         C = path.rotations_at(t)  # (n, 3, 3)
-        up_in_path = felt_up(path, t, np.einsum("nij,nj->ni", C, v), calibration)
+        velocity = np.einsum("nij,nj->ni", C, v)
+        gravity = felt_gravity(path, t, velocity, calibration)
+        up_in_path = C[:, :, 2]
+        felt = None
+        if gravity is not None:
+            size = np.maximum(np.linalg.norm(gravity, axis=1), 1e-9)
+            up_in_path = gravity / size[:, None]
+            felt = FeltMotion(velocity, np.einsum("nij,nj->ni", C, rate), gravity)
         up = np.einsum("nji,nj->ni", C, up_in_path)
         is_held = calibration.odometry_interpolation == "hold-past"
         # at the IMU's rate, since turns are faster than rows of the Doppler log
@@ -100,6 +121,7 @@ class BodyMotion:
             yaw_rad=np.asarray(yaw_rad, np.float64),
             height_m=integral(t, np.sum(v * up, axis=1), is_held=is_held),
             path_m=integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
+            felt=felt,
         )
 
     def reference(self, values: Values) -> Callable[[Floats], Values]:
@@ -173,20 +195,19 @@ def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
     return np.asarray(along / np.maximum(up[:, 1] ** 2 + up[:, 2] ** 2, LEAST_LEVEL))
 
 
-def felt_up(
+def felt_gravity(
     path: InertialPath, t: Floats, v: Floats, calibration: Calibration
-) -> Floats:
-    """Up in the frame of the path at times t, shape (n, 3); v is C v. The body's z without gravity in the forces."""
+) -> Floats | None:
+    """Gravity in the frame of the path at times t, shape (n, 3), upwards; v is C v. None without it in the forces."""
     if not (np.isfinite(path.impulse).all() and calibration.use_gravity):
-        return np.asarray(path.rotations_at(t)[:, :, 2])
+        return None
     # a window that goes over a hole of the IMU would hold what nobody measured
     begin = np.maximum(t - UP_OVER_S / 2, part_edges(path, t, "left"))
     end = np.minimum(t + UP_OVER_S / 2, part_edges(path, t, "right"))
     gained = path.linear_at(end, path.impulse) - path.linear_at(begin, path.impulse)
     # what moves the vehicle is no gravity
     accelerated = np.gradient(smoothed(t, v), t, axis=0)
-    up = gained / np.maximum(end - begin, 1e-9)[:, None] - accelerated
-    return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1), 1e-9)[:, None])
+    return np.asarray(gained / np.maximum(end - begin, 1e-9)[:, None] - accelerated)
 
 
 def part_edges(path: InertialPath, t: Floats, side: str) -> Floats:

@@ -68,6 +68,7 @@ from sonar_graph.diagnosis.start import (
     with_fitted,
 )
 from sonar_graph.diagnosis.start_place import start_place_findings
+from sonar_graph.diagnosis.turn_rate import turn_rate_finding
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import (
@@ -176,6 +177,9 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         axes.append(pair.finding(YAW, angle, cause))
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
+    # no other comparison is worth anything beside gyros that are wrong
+    if (turn := turn_rate_finding(sequence, config)) is not None:
+        return [*forces, *axes, turn]
     is_turned = any(finding.quantity == YAW for finding in axes)
     if lacks_gravity(sequence):
         match = replace(match, gyro_bias=(unknown(NO_GRAVITY),) * 3)
@@ -232,6 +236,8 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     right = without_gravity(without_stuck(sequence))
     forces, right = force_findings(right, config)
     axes, right = axes_findings(right, config)
+    if (turn := turn_rate_finding(right, config)) is not None:
+        return worst_first([*forces, *axes, turn])
     found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
 

@@ -587,7 +587,12 @@ class Assembly:
             stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl")]
             first_ns = max(int(ns.min()) for ns in stamps)
             last_ns = min(int(ns.max()) for ns in stamps)
-            for text in detection_warnings(detections, first_ns, last_ns):
+            # until the next row of odometry is due, the sensor that writes last is ahead
+            spare_ns = max(
+                (int(np.median(np.diff(np.sort(ns)))) for ns in stamps if len(ns) > 1),
+                default=0,
+            )
+            for text in detection_warnings(detections, first_ns, last_ns + spare_ns):
                 yield f"detections: {text}"
 
     def _oddities(self) -> Iterator[tuple[str, str | None]]:

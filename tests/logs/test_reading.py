@@ -20,7 +20,6 @@ from sonar_graph.errors import (
 )
 from sonar_graph.logs.adapters.landmark_messages import (
     LandmarkMapAdapter,
-    detection_warnings,
 )
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
@@ -481,6 +480,17 @@ def test_odometry_lasts_while_there_are_both_sensors(bench: Bench) -> None:
         assert f"detections: 1 of 3 rows have a stamp {side} odometry" in said
 
 
+def test_a_sighting_within_an_interval_of_the_last_odometry_is_no_fault(
+    bench: Bench,
+) -> None:
+    """The sensor that writes last is always ahead of odometry."""
+    frames = [
+        bench.detections(T0_NS + k * STEP_NS // 4, [2.0], [5]) for k in (4, 16, 35)
+    ]
+    path = bench.write(*bench.basics(9), ("/landmarks", "detections", frames))
+    assert "last odometry" not in read_log(path).notes["log.warnings"]
+
+
 @pytest.mark.parametrize("cross", [0.0, 0.9, -1.1, np.inf, np.nan])
 def test_a_covariance_is_told_of_where_estimators_refuse_it(cross: float) -> None:
     for variances in (
@@ -622,19 +632,3 @@ def test_an_argument_called_like_an_option_names_the_one_of_python(
         reading(path, log_config="dive.toml")
     with pytest.raises(LogError, match="its start must be less than its end"):
         reading(path, window=(20, 10))
-
-
-@pytest.mark.parametrize(("outside", "is_told"), [(1, False), (10, True)])
-def test_a_few_detections_after_the_last_odometry_are_no_warning(outside, is_told):
-    n = 200
-    stamps_ns = np.arange(n, dtype=np.int64) * 10**9
-    detections = LandmarkDetections(
-        stamps_ns=stamps_ns,
-        range_m=np.full(n, 5.0),
-        azimuth_rad=np.zeros(n),
-        range_azimuth_cov=np.full((n, 2, 2), np.nan),
-        candidate_ids=np.ones((n, 1), np.int64),
-        id_probability=np.ones((n, 1)),
-    )
-    last_ns = int(stamps_ns[-1 - outside])
-    assert bool(list(detection_warnings(detections, 0, last_ns))) == is_told

@@ -321,10 +321,6 @@ class LandmarkMapAdapter(Adapter):
         return LandmarkMap(ids[order].astype(np.int64), positions, covariances), {}
 
 
-FEW_OUTSIDE = 0.01
-"""Share of the detections without odometry up to which no warning is due."""
-
-
 def detection_warnings(
     detections: LandmarkDetections, first_ns: int, last_ns: int
 ) -> Iterator[str]:
@@ -343,9 +339,7 @@ def detection_warnings(
         "a stamp after the last odometry": detections.stamps_ns > last_ns,
     }
     for fault, has_it in faults.items():
-        # sensors do not end together: a few rows at either end are no fault of the log
-        fewest = FEW_OUTSIDE if "odometry" in fault else 0.0
-        if has_it.mean() > fewest:
+        if has_it.any():
             yield f"{share(has_it)} rows have {fault}: estimators do not use them"
     beyond = np.abs(detections.azimuth_rad) > np.pi
     if beyond.any():

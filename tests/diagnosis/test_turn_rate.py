@@ -1,0 +1,73 @@
+"""Gyros that are wrong about the vertical, of a vehicle made by hand: named without a compass, fixes or landmarks."""
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.diagnosis import check_sensors
+from sonar_graph.diagnosis.turn_rate import TURN_RATE
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.sequence import Sequence
+
+HZ = 50.0
+T = np.arange(0.0, 60.0, 1 / HZ)
+
+
+def level_drive(seed: int, spoil=lambda rate: rate, phase: float = 0.0) -> Sequence:
+    """A level vehicle that turns to and fro: ``f = (dv/dt, w v, g)`` by hand, with noise."""
+    rng = np.random.default_rng(seed)
+    speed = 0.9 + 0.25 * np.sin(0.7 * T + phase)
+    yaw_rate = 0.3 * np.sin(0.4 * T + phase) + 0.1
+    zero = np.zeros_like(T)
+    rate = np.column_stack([zero, zero, yaw_rate])
+    force = np.column_stack(
+        [0.7 * 0.25 * np.cos(0.7 * T + phase), yaw_rate * speed, zero + 9.80665]
+    )
+    rate = rate + 1e-3 * rng.standard_normal(rate.shape)
+    force = force + 1e-2 * rng.standard_normal(force.shape)
+    stamps_ns = np.round(T * 1e9).astype(np.int64)
+    rows = slice(0, len(T), 10)
+    velocity = np.column_stack([speed, zero, zero])[rows]
+    velocity = velocity + 0.01 * rng.standard_normal(velocity.shape)
+    cov = np.tile(1e-4 * np.eye(3), (len(velocity), 1, 1))
+    imu = Imu(stamps_ns, spoil(rate), force)
+    return Sequence("by hand", Calibration(), imu, Dvl(stamps_ns[rows], velocity, cov))
+
+
+def high_passed(rate):
+    width = round(10 * HZ)
+    means = [np.convolve(c, np.ones(width) / width, "same") for c in rate.T]
+    return rate - np.column_stack(means)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda rate: rate * [1.0, 1.0, 0.0],
+        lambda rate: rate * [1.0, 1.0, 0.5],
+        lambda rate: rate * [1.0, 1.0, 2.0],
+        lambda rate: np.clip(rate, -0.1, 0.1),
+        high_passed,
+    ],
+    ids=["dead", "half", "double", "clipped", "high-passed"],
+)
+def test_a_turn_that_forces_and_velocities_show_and_gyros_do_not_is_grave(spoil):
+    """No line: no single factor mends such a rate. Nothing else is advised beside it."""
+    (finding,) = (f for f in check_sensors(level_drive(0, spoil)) if f.acts)
+    assert finding.quantity == TURN_RATE
+    assert finding.grave
+    assert not finding.line
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_angles_between_samples_are_named_with_the_factor_that_makes_them_rates(seed):
+    run = level_drive(seed, lambda rate: rate / HZ, phase=float(seed))
+    finding = check_sensors(run)[0]
+    assert finding.quantity == TURN_RATE
+    assert "`angular_velocity_scale = 50`" in finding.line
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_right_gyros_are_not_contradicted(seed):
+    run = level_drive(seed, phase=0.8 * seed)
+    assert TURN_RATE not in {f.quantity for f in check_sensors(run)}
