@@ -20,6 +20,7 @@ from sonar_graph.errors import (
 )
 from sonar_graph.logs.adapters.landmark_messages import (
     LandmarkMapAdapter,
+    detection_warnings,
 )
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
