@@ -11,6 +11,7 @@ along it, which makes the part along it the measure of the noise. So ``(w x v) .
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,11 +53,21 @@ MOST_MISFIT = 0.15
 """Share of the rate's changes that goes with it."""
 OTHER_RATE = 1.3
 """Ratio of the rates, either way, from which on the gyros are wrong, not the speed of sound."""
+LEAST_EXCESS = 1.5
+"""Root mean square of r across the velocity over that along it. Waves and a noisy log make both alike."""
 LARGEST_GAIN_SIGMA = 0.12
 TURN_RATE = "gyro rate about the vertical over that by the other sensors"
 
 
-def turn_match(motion: BodyMotion) -> Match | None:
+class TurnMatch(NamedTuple):
+    """The comparison, and the size of what contradicts it beside that of the noise."""
+
+    match: Match
+    excess: float
+    """Root mean square of r across the level velocity over that along it."""
+
+
+def turn_match(motion: BodyMotion) -> TurnMatch | None:
     """Acceleration across the velocity by the gyros' rate, over that by all sensors; None without gravity or motion.
 
     A scale of the Doppler log's velocities shows along the velocity too, and is divided out where it is known.
@@ -76,6 +87,10 @@ def turn_match(motion: BodyMotion) -> Match | None:
     if np.count_nonzero(is_known) < FEWEST_ROWS:
         return None
     r[~is_known] = np.nan
+    off_across = np.sum(r * across, axis=1)[is_known]
+    off_along = np.sum(r * along, axis=1)[is_known]
+    noise = max(float(np.sqrt(np.mean(off_along**2))), 1e-12)
+    excess = float(np.sqrt(np.mean(off_across**2))) / noise
     # averaged as the forces are
     turned = integral_of(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
     by_rate = np.gradient(smoothed(t, turned), t, axis=0)
@@ -86,20 +101,23 @@ def turn_match(motion: BodyMotion) -> Match | None:
     # gyros that are wrong spoil that comparison too
     is_scale = abs(of_scale.value - 1.0) < LARGEST_SCALE
     if not (of_scale.is_known and is_scale):
-        return found.less_certain(UNKNOWN_SCALE)
+        return TurnMatch(found.less_certain(UNKNOWN_SCALE), excess)
     gain = found.gain
     ratio = replace(gain, value=gain.value / of_scale.value)
-    return replace(found, gain=ratio).less_certain(abs(ratio.value) * of_scale.sigma)
+    unsure = abs(ratio.value) * of_scale.sigma
+    return TurnMatch(replace(found, gain=ratio).less_certain(unsure), excess)
 
 
 def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
     """Rate about the vertical that accelerometers and Doppler log contradict; None: it is right, or cannot be told.
 
-    Its line is one that the data bear out: with it the contradiction is gone.
+    Its line is one that the data bear out: with it the contradiction is gone. Without such a line the rate counts as
+    wrong only where r is larger across the velocity than along it.
     """
-    found = rate_match(sequence)
-    if found is None or not is_contradicted(found, sequence):
+    compared = rate_match(sequence)
+    if compared is None or not is_contradicted(compared.match, sequence):
         return None
+    found = compared.match
     rate_hz = NS_PER_S / float(np.median(np.diff(sequence.imu.stamps_ns)))
     causes = {
         rate_hz: "angles between two samples, not rates?",
@@ -113,11 +131,13 @@ def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
     line = ""
     for factor, why in causes.items():
         right = rate_match(scaled_gyros(sequence, factor))
-        if right is not None and is_borne_out(right, sequence):
+        if right is not None and is_borne_out(right.match, sequence):
             scale = config.number("imu", "angular_velocity_scale", 1.0) * factor
             cause = f"accelerometers and Doppler log turn otherwise: {why}"
             line = f"`angular_velocity_scale = {scale:.4g}` under [imu] {IN_LOG_CONFIG}"
             break
+    if not line and compared.excess < LEAST_EXCESS:
+        return None
     return Finding(
         TURN_RATE,
         found.gain,
@@ -128,13 +148,13 @@ def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
     )
 
 
-def rate_match(sequence: Sequence) -> Match | None:
+def rate_match(sequence: Sequence) -> TurnMatch | None:
     """The comparison of a sequence, where the vehicle turns enough; None: it does not."""
     motion = BodyMotion.of(sequence)
     found = None if motion is None else turn_match(motion)
-    if found is None or not found.gain.is_known:
+    if found is None or not found.match.gain.is_known:
         return None
-    return found if found.moved > noise_m_s2(sequence) else None
+    return found if found.match.moved > noise_m_s2(sequence) else None
 
 
 def noise_m_s2(sequence: Sequence) -> float:

@@ -1,5 +1,7 @@
 """Gyros that are wrong about the vertical, of a vehicle made by hand: named without a compass, fixes or landmarks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,3 +73,23 @@ def test_angles_between_samples_are_named_with_the_factor_that_makes_them_rates(
 def test_right_gyros_are_not_contradicted(seed):
     run = level_drive(seed, phase=0.8 * seed)
     assert TURN_RATE not in {f.quantity for f in check_sensors(run)}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_waves_that_the_doppler_log_follows_too_seldom_blame_no_gyro(seed):
+    """Accelerations of either level axis that the velocities, 5 a second and noisy, do not show."""
+    run = level_drive(seed, phase=0.8 * seed)
+    rng = np.random.default_rng(100 + seed)
+    slow = np.ones(20) / 20
+    waves = np.column_stack(
+        [np.convolve(rng.standard_normal(len(T)), slow, "same") for _ in range(2)]
+    )
+    force = run.imu.specific_force.copy()
+    force[:, :2] += 3.0 * waves
+    noise = 0.1 * rng.standard_normal(run.dvl.velocity.shape)
+    rough = replace(
+        run,
+        imu=replace(run.imu, specific_force=force),
+        dvl=replace(run.dvl, velocity=run.dvl.velocity + noise),
+    )
+    assert TURN_RATE not in {f.quantity for f in check_sensors(rough)}
