@@ -1,6 +1,6 @@
 """Limits of the table of checks: the size at which each check fires, its false alarms, and the cover of its intervals.
 
-    python benchmarks/validation/check_limits.py [--quick] [--logs 100] [--table docs/theory/check_limits.md]
+    python benchmarks/validation/check_limits.py [--quick] [--logs 100] [--table benchmarks/results/check_limits.md]
 
 A vehicle on splines (`spline_vehicle`) whose sensors have white and correlated errors is spoilt by each fault at rising
 sizes, until the check fires in 95 of 100 logs. A check that fires on a log without a fault is a false alarm. Intervals
@@ -421,7 +421,7 @@ def main() -> None:
         arguments.table.write_text(
             f"# Limits of the checks\n\nWritten by `benchmarks/validation/check_limits.py --logs {count}`: "
             f"{DURATION_S:.0f} s of a vehicle on splines, whose sensors have white and correlated errors. "
-            "See [sensor_check](sensor_check.md).\n\n"
+            "See [sensor_check](../../docs/theory/sensor_check.md).\n\n"
             f"{markdown(head, rows)}\n{markdown(cover_head, covers)}",
             encoding="utf-8",
         )

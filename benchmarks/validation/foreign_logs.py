@@ -1,7 +1,7 @@
 """Logs by another hand: every fault of the table of checks at three sizes, and logs without a fault.
 
     python benchmarks/validation/foreign_logs.py [--quick] [--seed 1] [--faultless 50] [--coverage 100]
-        [--only WORD ...] [--results FILE] [--table docs/theory/foreign_logs.md]
+        [--only WORD ...] [--results FILE] [--table benchmarks/results/foreign_logs.md]
 
 Worlds and files are those of `foreign_world.py`, faults those of `foreign_faults.py`. A log is judged by
 ``sonar-graph compare``, by its exit code, its printed lines and the trajectories that it writes:
@@ -455,7 +455,7 @@ def page(
             "and a writer that share no code with the package, each with one fault, or without one. A fault is "
             "*named* where a line names its cause, and *harmless* where no line does and the error stays below five "
             "times that without the fault. "
-            "See [sensor_check](sensor_check.md).",
+            "See [sensor_check](../../docs/theory/sensor_check.md).",
             markdown(list(counts), [list(counts.values())]),
             "## By quantity and kind",
             markdown(["quantity", *KINDS], cells),
