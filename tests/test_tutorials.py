@@ -217,8 +217,8 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path)
     ]
     (tmp_path / "lap.toml").write_text(suite, encoding="utf-8")
     (tmp_path / "benchmarks").symlink_to(TUTORIALS.parents[1] / "benchmarks")
-    for program, words in commands:
-        module = ["-m", "sonar_graph"] if program == "sonar-graph" else []
+    for script, words in commands:
+        module = ["-m", "sonar_graph"] if script == "sonar-graph" else []
         said = output(tmp_path, "python", *module, *words.split())
     assert "Gate: passed, without any test of errors, 8 runs" in said
     printed = output(tmp_path, "python", "-c", program)
@@ -275,9 +275,8 @@ def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when
     cells = json.loads((tmp_path / "executed.ipynb").read_text("utf-8"))["cells"]
     shown = [one.get("data", {}) for cell in cells for one in cell.get("outputs", [])]
     tables = ["".join(one["text/html"]) for one in shown if "text/html" in one]
-    assert [
-        re.findall(r'<table id="table-([\w-]+)"', table)[0] for table in tables
-    ] == [*("sequence", "compact", "trajectory", "landmark-map")]
+    captions = [re.findall(r"<caption>(?:<span>)?(\w+)", table)[0] for table in tables]
+    assert captions == ["Sequence", "Scores", "Trajectory", "Map"]
     assert sum("image/svg+xml" in one for one in shown) == 2
     assert "at the same 240 instants" in "".join(cells[-1]["outputs"][0]["text"])
 
