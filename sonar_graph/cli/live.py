@@ -259,8 +259,31 @@ def live(
     )
 
 
+@dataclass(frozen=True)
+class PlayStart:
+    """Options for when the first message is sent."""
+
+    wait: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
+        ),
+    ] = None
+    after: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Wait until this file is there, such as one that a script makes.",
+        ),
+    ] = None
+
+
+@with_options()
 def play(
     log: LogPath,
+    *,
     rate: Annotated[
         float,
         typer.Option(min=1e-3, max=1e3, help="Speed: 2 is twice as fast as recorded."),
@@ -279,21 +302,7 @@ def play(
         ),
     ] = None,
     domain: DOMAIN = 0,
-    wait: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
-        ),
-    ] = None,
-    after: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Wait until this file is there, such as one that a script makes.",
-        ),
-    ] = None,
+    start: PlayStart,
 ) -> None:
     """Send the messages of a log over zenoh as a robot would, for rehearsals and tests of `live`."""
     from sonar_graph.live import (
@@ -314,16 +323,17 @@ def play(
             echo(f"not sent: {topic}: {error}")
     where = ", ".join(connect or [listen])
     with interrupt_event() as ended:
-        if wait != 0.0:
+        if start.wait != 0.0:
             command = (
                 f"sonar-graph live -o DIR --connect {(connect or [listen])[0]}"
                 f" --domain {domain} --calibration {log}"
             )
-            wait_for_listener(publishers, command, wait, ended)
+            wait_for_listener(publishers, command, start.wait, ended)
         ended.wait(SETTLE_S)
         if not ended.is_set():
             for line in unheard_lines(publishers):
                 echo(line)
+        after = start.after
         while after is not None and not after.exists() and not ended.wait(0.05):
             pass
         echo(f"playing {log} to {where}; Ctrl-C ends")
