@@ -388,6 +388,7 @@ def compare_prepared(
 def check_rate(rate_hz: float, sequence: Sequence) -> None:
     """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log."""
     stamps_ns = sequence.imu.stamps_ns
+    # a log of a few samples would have any rate, so it counts as one second long
     imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
     highest_hz = max(DEFAULT_RATE_HZ, imu_hz)
     if rate_hz > highest_hz * RATE_SLACK:
