@@ -88,10 +88,12 @@ def run_batch(
         try:
             for future in as_completed(list(futures)):
                 keep(futures.pop(future), future, store, progress)
+                # the scheduler would keep the outcome, with all files of the run, until the batch ends
                 future.release()
         except FutureCancelledError as error:
             raise BatchError(f"the scheduler was lost: {error}") from error
         finally:
+            # a scheduler that exists would go on with the runs of a batch that has ended early
             _within_seconds(lambda: client.cancel(list(futures)))
 
 
@@ -170,6 +172,7 @@ def _local_client(workers: int) -> Iterator[Client]:
     try:
         yield client
     finally:
+        # taken before the cluster is closed, which forgets its workers
         pids = [
             nanny.pid for nanny in cluster.workers.values() if nanny.pid is not None
         ]

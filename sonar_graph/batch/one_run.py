@@ -70,6 +70,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     folder cannot be written; neither is a result.
     """
     here = versions_of(run.estimator)
+    # results of other versions must not stand in one table with those of the plan
     if differing := _differing(here, run.versions):
         raise BatchError(
             f"a worker has {_told(here, differing)}, planned with {_told(run.versions, differing)}; "
@@ -140,6 +141,7 @@ def warm_up(run: PlannedRun) -> None:
 
     A failure here happens again in the run itself and is reported there.
     """
+    # written and thrown away: writing results loads code too
     with (
         suppress(Exception),
         tempfile.TemporaryDirectory(prefix="sonar-graph-warm-up-") as scratch,

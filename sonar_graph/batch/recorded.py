@@ -138,6 +138,7 @@ class RecordedBatch:
                 entry["name"]: entry["obtain"]
                 for entry in entries
                 if entry.get("obtain")
+                # a log of a grid has values after its name and a comma, such as `tracks, wrong_id_rate=0.05`
                 and not any(
                     f"{log}, ".startswith(f"{entry['name']}, ") for log in self.logs
                 )

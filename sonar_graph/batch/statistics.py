@@ -35,10 +35,12 @@ def signed_rank_p(differences: Floats) -> float:
         return math.nan
     if not differences.any():
         return 1.0
+    # tied ranks may end in .5: doubled, they are the integers that the exact distribution counts with
     doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)
     ranks = doubled // np.gcd.reduce(doubled[differences != 0])
     positive = int(ranks[differences > 0].sum())
     negative = int(ranks[differences < 0].sum())
+    # Pratt 1959: zeros take part in the ranking and are left out only now
     ranks, least = ranks[differences != 0], min(positive, negative)
     is_cheap = len(ranks) * (positive + negative) <= 2 * MOST_ADDITIONS
     return min(
@@ -55,6 +57,7 @@ def exact_tail(ranks: Ranks, most: int) -> float:
     chances[0] = 1.0
     for rank in ranks.tolist():
         chances *= 0.5
+        # numpy copies operands that overlap, so the addend is the distribution before this rank
         chances[rank:] += chances[: max(0, most + 1 - rank)]
     return float(chances.sum())
 
@@ -69,6 +72,7 @@ def near_tail(ranks: Ranks, most: int) -> float:
     count = len(ranks)
     positive = np.arange(count + 1)
     sigmas = np.sqrt(positive * (count - positive) / count * ranks.var(ddof=1))
+    # all signs positive, or no sign: the sum is certain, sigma is 0 and the place infinite
     with np.errstate(divide="ignore"):
         places = (most + 0.5 - positive * ranks.mean()) / sigmas
     return float(stats.binom.pmf(positive, count, 0.5) @ stats.norm.cdf(places))
@@ -291,11 +295,13 @@ def paired(
     """
     lost = np.isinf(own) | np.isinf(reference)
     both = np.isinf(own) & np.isinf(reference)
+    # two runs without a value are equal, but inf - inf is NaN
     differences = np.where(
         both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference)
     )
     each = "pair"
     if cases is not None:
+        # fromkeys: each case once, in the order of its first pair
         members = [
             np.array([one == case for one in cases]) for case in dict.fromkeys(cases)
         ]
@@ -346,6 +352,7 @@ def mean_interval(values: Floats) -> tuple[float, float]:
         return math.nan, math.nan
     mean = float(values.mean())
     deviation = float(values.std(ddof=1))
+    # the skewness of equal values would be 0 / 0
     if deviation <= 1e-12 * float(np.abs(values).max()):
         return mean, mean
     skewness = float((((values - mean) / values.std()) ** 3).mean())
@@ -357,6 +364,7 @@ def mean_interval(values: Floats) -> tuple[float, float]:
 
 def _unskewed(bound: float, skewness: float, n: int) -> float:
     """``W`` at which the cubic of `mean_interval` reaches a bound."""
+    # without skewness the cubic is W itself, and its solution below would be 0 / 0
     if abs(skewness) < 1e-6:
         return bound
     return 3 * (math.cbrt(1 + skewness * (bound - skewness / (6 * n))) - 1) / skewness

@@ -166,6 +166,7 @@ class Store:
         }
         partial.mkdir()
         try:
+            # before the files, so that what a killed batch leaves here can be removed by its manifest
             write_manifest(partial, COMPARISON, digests)
             for name, content in contents.items():
                 path = partial / name
@@ -189,6 +190,7 @@ class Store:
                 f"{folder}: would be replaced, and holds {others[0]}, which is not as the run wrote it; move it away"
             )
         with contextlib.suppress(FileNotFoundError):
+            # renamed first: a batch killed while it removes a run must not leave half of it under its key
             folder.rename(gone)
             remove_written(gone)
 

@@ -64,6 +64,7 @@ def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
             reason = str(error)
             log = runner.log()
         finally:
+            # after a timeout the process is still busy with the run: it is ended, not kept
             if runner.is_fit():
                 with _idle_lock:
                     _idle.append(runner)
@@ -82,6 +83,7 @@ def _here() -> Row:
 
 
 _idle: list[Runner] = []
+# workers of a scheduler that exists may do several runs at a time, in threads
 _idle_lock = threading.Lock()
 
 
@@ -136,6 +138,7 @@ class Runner:
             answer = self._ask(Preparation(run), Limits(WARM_UP_S))
             if answer != READY:
                 return RunOutcome(answer.row, log=self.log())
+        # the messages of the warm-up are not of the run; the process appends, so its next line is the first
         self._log.truncate(0)
         began = time.monotonic()
         answer = self._ask(run, limits)

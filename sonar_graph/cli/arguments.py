@@ -234,6 +234,7 @@ def with_options(
                 Parameter(n, Parameter.KEYWORD_ONLY, default=d, annotation=kind)
                 for n, d, kind in given
             ]
+        # typer must see the options, and `wraps` has copied the command's own signature
         run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {
             parameter.name: parameter.annotation for parameter in parameters
@@ -260,6 +261,7 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
             raise EstimatorError(
                 f"--set {text}: {name} is also set to {settings[name]}; give it once"
             )
+        # with the final dots `lag` is not taken for a section that holds `lag_s`
         if within := [
             other
             for other in settings

@@ -4,17 +4,59 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo
+from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, with_options
 from sonar_graph.cli.outputs import progress_bars, working
 from sonar_graph.files import INTERRUPTED
 
 
+@dataclass(frozen=True)
+class BenchOptions:
+    """Options for which runs of a suite are done, where, and for how long."""
+
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes on this machine. Default: one a core."),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead.",
+        ),
+    ] = None
+    timeout_s: Annotated[
+        float | None,
+        typer.Option(
+            "--timeout",
+            metavar="S",
+            min=1e-3,
+            help="End a run after so long. Default: the suite's.",
+        ),
+    ] = None
+    retry_failed: Annotated[
+        bool,
+        typer.Option(
+            "--retry-failed", help="Do runs anew that failed, timed out or were killed."
+        ),
+    ] = False
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY",
+            help="Do only the run of this key, which the report lists; can be repeated.",
+        ),
+    ] = None
+    overwrite: Overwrite = False
+
+
+@with_options()
 def bench(
     suite: Annotated[
         Path,
@@ -26,40 +68,7 @@ def bench(
         ),
     ],
     output: OutputFolder,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes on this machine. Default: one a core."),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead.",
-        ),
-    ] = None,
-    timeout_s: Annotated[
-        float | None,
-        typer.Option(
-            "--timeout",
-            metavar="S",
-            min=1e-3,
-            help="End a run after so long. Default: the suite's.",
-        ),
-    ] = None,
-    retry_failed: Annotated[
-        bool,
-        typer.Option(
-            "--retry-failed", help="Do runs anew that failed, timed out or were killed."
-        ),
-    ] = False,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY",
-            help="Do only the run of this key, which the report lists; can be repeated.",
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
+    options: BenchOptions,
 ) -> None:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
 
@@ -82,12 +91,12 @@ def bench(
             batch = run_suite(
                 suite,
                 output,
-                workers=workers,
-                scheduler=scheduler,
-                timeout_s=timeout_s,
-                retry_failed=retry_failed,
-                only=only or (),
-                overwrite=overwrite,
+                workers=options.workers,
+                scheduler=options.scheduler,
+                timeout_s=options.timeout_s,
+                retry_failed=options.retry_failed,
+                only=options.only or (),
+                overwrite=options.overwrite,
                 progress=progress,
                 notice=partial(echo, err=True),
             )
@@ -95,11 +104,12 @@ def bench(
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
         # the ordinary way waits for threads, also for those of workers that are gone
         os._exit(INTERRUPTED)
+    only = options.only
     counts = Counter(run.status for run in batch.runs if not only or run.key in only)
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
     echo(f"Results: {output / 'results.parquet'}")
-    echo(f"Report: {write_report_of(output, overwrite=overwrite)}")
+    echo(f"Report: {write_report_of(output, overwrite=options.overwrite)}")
     if set(counts) - {"ok"}:
         raise typer.Exit(1)
 

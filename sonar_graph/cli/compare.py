@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -68,17 +68,25 @@ SHORT = {"duration_s": 120.0, "laps": 1, "dvl_dropouts_per_hour": 120.0, "image"
 """Changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log."""
 
 
+@dataclass(frozen=True)
+class EstimationOptions:
+    """Options that `run` and `compare` share, for how estimators run and where their results go."""
+
+    rate_hz: RateHz = None
+    settings: EstimatorSettings = None
+    overwrite: Overwrite = False
+
+
 @with_options()
 def run(
     log: LogPath,
     output: OutputFolder,
     reading: ReadingOptions,
+    *,
     estimator: Annotated[
         str, typer.Option("--estimator", help="Name of an installed estimator.")
     ] = "isam2",
-    rate_hz: RateHz = None,
-    settings: EstimatorSettings = None,
-    overwrite: Overwrite = False,
+    estimation: EstimationOptions,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
     from sonar_graph.evaluation import write_comparison, write_viewer_files
@@ -86,16 +94,7 @@ def run(
     names = [estimator]
     recognition = RecogniserOptions()
     with (
-        compared(
-            log,
-            output,
-            names,
-            reading,
-            recognition,
-            rate_hz,
-            settings,
-            overwrite=overwrite,
-        ) as comparison,
+        compared(log, output, names, reading, recognition, estimation) as comparison,
         working("writing results"),
         result_written(output, COMPARISON),
     ):
@@ -110,12 +109,11 @@ def compare(
     output: OutputFolder,
     recognition: RecogniserOptions,
     reading: ReadingOptions,
+    *,
     estimators: Annotated[
         str, typer.Option(help="Names of installed estimators, with commas.")
     ] = DEFAULT_ESTIMATORS,
-    rate_hz: RateHz = None,
-    settings: EstimatorSettings = None,
-    overwrite: Overwrite = False,
+    estimation: EstimationOptions,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
@@ -137,16 +135,7 @@ def compare(
             f"--estimators {estimators!r}: {again} is named twice; each runs once"
         )
     with (
-        compared(
-            log,
-            output,
-            names,
-            reading,
-            recognition,
-            rate_hz,
-            settings,
-            overwrite=overwrite,
-        ) as comparison,
+        compared(log, output, names, reading, recognition, estimation) as comparison,
         working("writing results"),
     ):
         page = write_report(comparison, output)
@@ -281,16 +270,13 @@ def compared(
     names: list[str],
     reading: ReadingOptions,
     recognition: RecogniserOptions,
-    rate_hz: float | None,
-    settings: list[str] | None,
-    *,
-    overwrite: bool,
+    estimation: EstimationOptions,
 ) -> Iterator[Comparison]:
     """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first.
 
     The folder for the results is kept from other commands until the block, which writes them, ends.
     """
-    overrides = estimator_settings(settings, names)
+    overrides = estimator_settings(estimation.settings, names)
     check_requests(names, overrides)
     sources = (
         log,
@@ -299,10 +285,11 @@ def compared(
         recognition.designs,
         recognition.model,
     )
-    with writable_folder(
-        output, names_written(output, names), sources, overwrite=overwrite
-    ):
-        yield compare_log(log, names, overrides, reading, recognition, rate_hz)
+    written = names_written(output, names)
+    with writable_folder(output, written, sources, overwrite=estimation.overwrite):
+        yield compare_log(
+            log, names, overrides, reading, recognition, estimation.rate_hz
+        )
 
 
 def check_requests(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:
@@ -401,6 +388,7 @@ def compare_prepared(
 def check_rate(rate_hz: float, sequence: Sequence) -> None:
     """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log."""
     stamps_ns = sequence.imu.stamps_ns
+    # a log of a few samples would have any rate, so it counts as one second long
     imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
     highest_hz = max(DEFAULT_RATE_HZ, imu_hz)
     if rate_hz > highest_hz * RATE_SLACK:

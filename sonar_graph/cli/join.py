@@ -53,6 +53,29 @@ class Seen:
         )
 
 
+@dataclass(frozen=True)
+class JoinOptions:
+    """Options for the clock offset of the images, and for the log that is written."""
+
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
+        ),
+    ] = None
+    search: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.5,
+            max=3600.0,
+            help=f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
+        ),
+    ] = None
+    overwrite: Overwrite = False
+
+
 @with_options("start", "end")
 def join(
     images: Annotated[
@@ -72,23 +95,7 @@ def join(
     ],
     output: OutputLog,
     reading: ReadingOptions,
-    offset: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
-        ),
-    ] = None,
-    search: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.5,
-            max=3600.0,
-            help=f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
+    options: JoinOptions,
 ) -> None:
     """Write sonar images of one file and all that another has into one log, on the clock of the latter.
 
@@ -103,25 +110,26 @@ def join(
         write_amended,
     )
 
-    path = writable_log(output, images, navigation, overwrite=overwrite)
+    path = writable_log(output, images, navigation, overwrite=options.overwrite)
     refuse_images(navigation)
     sequence = reading.read(navigation)
     topic = reading.choices.get("sonar")
     with as_log(images) as log:
         alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
         seen = look(log, topic, alone.calibration, salvage=reading.salvage)
-        is_stated = offset is not None and search is None
-        around_s = offset or 0.0
+        is_stated = options.offset is not None and options.search is None
+        around_s = options.offset or 0.0
+        search_s = options.search or SEARCH_S
         require_overlap(
             images,
             navigation,
             sequence,
             seen,
             around_s,
-            0.0 if is_stated else search or SEARCH_S,
+            0.0 if is_stated else search_s,
         )
         seconds, said = offset_of(
-            seen, sequence, around_s, search or SEARCH_S, is_stated=is_stated
+            seen, sequence, around_s, search_s, is_stated=is_stated
         )
         shift_ns = round(seconds * NS_PER_S)
         notes = {

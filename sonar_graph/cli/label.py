@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import webbrowser
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Annotated
@@ -30,6 +31,29 @@ NONE = "none"
 NONE_TEXT = "none of them"
 
 
+@dataclass(frozen=True)
+class LabelOptions:
+    """Options for the frames that are shown, the page and the file of the labels."""
+
+    designs: DesignsPath = None
+    period: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Shortest time between the frames that are shown.",
+        ),
+    ] = 0.5
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free."),
+    ] = 0
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Only print the address.")
+    ] = False
+    overwrite: Overwrite = False
+
+
 @with_options()
 def label(
     log: LogPath,
@@ -40,23 +64,7 @@ def label(
         ),
     ],
     reading: ReadingOptions,
-    designs: DesignsPath = None,
-    period: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="Shortest time between the frames that are shown.",
-        ),
-    ] = 0.5,
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free."),
-    ] = 0,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Only print the address.")
-    ] = False,
-    overwrite: Overwrite = False,
+    options: LabelOptions,
 ) -> None:
     """Click landmarks in a log's sonar images, on a page in the browser; labels are saved after every click.
 
@@ -78,10 +86,11 @@ def label(
         "labels",
         [log],
         lambda content: content.keys() == {"log", "labels"},
-        overwrite=overwrite,
+        overwrite=options.overwrite,
     )
+    designs = options.designs
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
-    is_continued = path.exists() and path.stat().st_size and not overwrite
+    is_continued = path.exists() and path.stat().st_size and not options.overwrite
     labels = read_labels(path, log) if is_continued else Labels(log=spelt(log.name))
     topic = reading.choices.get("sonar")
     alone = read_images_alone(
@@ -104,7 +113,7 @@ def label(
         frames = shown_frames(
             blocks,
             alone.calibration.sonar,
-            round(period * 1e9),
+            round(options.period * 1e9),
             lambda done: progress("drawing frames", done, 0),
         )
     if not frames:
@@ -114,17 +123,17 @@ def label(
         desk,
         lambda nonce: page_of(log, path, known, desk, nonce),
         [one.id for one in known],
-        port,
+        options.port,
     ) as server:
-        serve(server, path, labels, is_shown=not no_browser)
-    options = {
+        serve(server, path, labels, is_shown=not options.no_browser)
+    repeated = {
         "--designs": designs,
         "--calibration": reading.calibration,
         "--log-config": reading.log_config,
     }
     given = [
         f"{name} {shlex.quote(str(value))}"
-        for name, value in options.items()
+        for name, value in repeated.items()
         if value is not None
     ]
     given += [f"--topic {shlex.quote(text)}" for text in reading.topics or []]

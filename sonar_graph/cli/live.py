@@ -6,8 +6,9 @@ import gc
 import shutil
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,6 +19,7 @@ from sonar_graph.cli.arguments import (
     ReadingOptions,
     echo,
     estimator_settings,
+    with_options,
 )
 from sonar_graph.cli.outputs import working
 from sonar_graph.errors import LogError
@@ -37,8 +39,10 @@ SETTLE_S = 1.0
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 
 
-def live(
-    output: OutputFolder,
+@dataclass(frozen=True)
+class LinkOptions:
+    """Options for where messages come from."""
+
     connect: Annotated[
         list[str] | None,
         typer.Option(
@@ -46,14 +50,27 @@ def live(
             help="zenoh router (tcp/ADDRESS:7447), as rmw_zenohd or `play` is one; or a foxglove_bridge "
             "(ws://ADDRESS:8765), to which nothing is sent back.",
         ),
-    ] = None,
-    domain: DOMAIN = 0,
+    ] = None
+    domain: DOMAIN = 0
+
+    @property
+    def endpoints(self) -> list[str]:
+        """Routers or bridges to connect to."""
+        from sonar_graph.live import DEFAULT_ROUTER
+
+        return self.connect or [DEFAULT_ROUTER]
+
+
+@dataclass(frozen=True)
+class LiveEstimation:
+    """Options for the estimator of a live run and for the messages that it gets."""
+
     estimator: Annotated[
         str, typer.Option("--estimator", help="Name of an installed estimator.")
-    ] = "isam2",
+    ] = "isam2"
     rate_hz: Annotated[
         float, typer.Option(min=0.1, max=100.0, help="Estimates a second.")
-    ] = 10.0,
+    ] = 10.0
     lateness: Annotated[
         float,
         typer.Option(
@@ -61,20 +78,43 @@ def live(
             min=0.0,
             help="How long an estimate waits for a sensor that is late.",
         ),
-    ] = 0.25,
-    settings: EstimatorSettings = None,
+    ] = 0.25
+    settings: EstimatorSettings = None
     topics: Annotated[
         list[str] | None,
         typer.Option(
             "--topic", metavar="ROLE=TOPIC", help="Topic for a role; may be repeated."
         ),
-    ] = None,
+    ] = None
     log_config: Annotated[
         Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
-    ] = None,
+    ] = None
     calibration: Annotated[
         Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
-    ] = None,
+    ] = None
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """Settings of the estimator that differ from its defaults."""
+        given = estimator_settings(self.settings, [self.estimator])
+        return given.get(self.estimator, {})
+
+    @property
+    def reading(self) -> ReadingOptions:
+        """Options for the topics and the calibration, as for a log."""
+        return ReadingOptions(
+            calibration=self.calibration,
+            topics=self.topics,
+            log_config=self.log_config,
+        )
+
+
+@with_options()
+def live(
+    output: OutputFolder,
+    link_options: LinkOptions,
+    estimation: LiveEstimation,
+    *,
     foxglove: Annotated[
         int | None,
         typer.Option(
@@ -108,7 +148,6 @@ def live(
     from sonar_graph.diagnosis import compared
     from sonar_graph.evaluation import RunResult, check_request, judge
     from sonar_graph.live import (
-        DEFAULT_ROUTER,
         LiveOptions,
         LiveRun,
         dropped_messages,
@@ -119,9 +158,8 @@ def live(
     from sonar_graph.logs import LiveRecord, read_log
     from sonar_graph.report import doubt_lines, write_report
 
-    reading = ReadingOptions(
-        calibration=calibration, topics=topics, log_config=log_config
-    )
+    reading = estimation.reading
+    estimator = estimation.estimator
     record = output / RECORD
     if record.exists():
         advice = (
@@ -130,7 +168,7 @@ def live(
             else "name another folder"
         )
         raise LogError(f"{record}: a record is there already: {advice}")
-    overrides = estimator_settings(settings, [estimator]).get(estimator, {})
+    overrides = estimation.overrides
     params = check_request(estimator, overrides)
     given = (
         reading.given
@@ -138,10 +176,16 @@ def live(
         else LiveRecord.resumed_calibration(resume, reading.given)
     )
     options = LiveOptions(
-        estimator, overrides, rate_hz, lateness, reading.choices, reading.config, given
+        estimator,
+        overrides,
+        estimation.rate_hz,
+        estimation.lateness,
+        reading.choices,
+        reading.config,
+        given,
     )
     with (
-        open_link(connect or [DEFAULT_ROUTER], domain) as link,
+        open_link(link_options.endpoints, link_options.domain) as link,
         interrupt_event() as ended,
     ):
         output.mkdir(parents=True, exist_ok=True)
@@ -166,7 +210,8 @@ def live(
             gc.freeze()  # what was loaded is never looked at again, which would delay a pose
             link.listen(run.accept, run.wants)
             echo(
-                f"listening to {', '.join(connect or [DEFAULT_ROUTER])}, domain {domain}; the record is {record}"
+                f"listening to {', '.join(link_options.endpoints)}, domain {link_options.domain}; "
+                f"the record is {record}"
             )
             last_s = time.monotonic() + (float("inf") if duration is None else duration)
             while not ended.is_set() and time.monotonic() < last_s:
@@ -214,8 +259,31 @@ def live(
     )
 
 
+@dataclass(frozen=True)
+class PlayStart:
+    """Options for when the first message is sent."""
+
+    wait: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
+        ),
+    ] = None
+    after: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Wait until this file is there, such as one that a script makes.",
+        ),
+    ] = None
+
+
+@with_options()
 def play(
     log: LogPath,
+    *,
     rate: Annotated[
         float,
         typer.Option(min=1e-3, max=1e3, help="Speed: 2 is twice as fast as recorded."),
@@ -234,21 +302,7 @@ def play(
         ),
     ] = None,
     domain: DOMAIN = 0,
-    wait: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
-        ),
-    ] = None,
-    after: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Wait until this file is there, such as one that a script makes.",
-        ),
-    ] = None,
+    start: PlayStart,
 ) -> None:
     """Send the messages of a log over zenoh as a robot would, for rehearsals and tests of `live`."""
     from sonar_graph.live import (
@@ -269,16 +323,17 @@ def play(
             echo(f"not sent: {topic}: {error}")
     where = ", ".join(connect or [listen])
     with interrupt_event() as ended:
-        if wait != 0.0:
+        if start.wait != 0.0:
             command = (
                 f"sonar-graph live -o DIR --connect {(connect or [listen])[0]}"
                 f" --domain {domain} --calibration {log}"
             )
-            wait_for_listener(publishers, command, wait, ended)
+            wait_for_listener(publishers, command, start.wait, ended)
         ended.wait(SETTLE_S)
         if not ended.is_set():
             for line in unheard_lines(publishers):
                 echo(line)
+        after = start.after
         while after is not None and not after.exists() and not ended.wait(0.05):
             pass
         echo(f"playing {log} to {where}; Ctrl-C ends")

@@ -152,23 +152,30 @@ class RecogniserOptions:
         )
 
 
-@with_options("start", "end")
-def recognise(
-    log: LogPath,
-    output: OutputLog,
-    recognition: RecogniserOptions,
-    reading: ReadingOptions,
-    recogniser: RecogniserName = "designs",
-    motion: Motion = None,
-    settings: Settings = None,
+@dataclass(frozen=True)
+class RecognitionChoices:
+    """Options for how landmarks are recognised beside their designs, and for the page of tracks."""
+
+    recogniser: RecogniserName = "designs"
+    motion: Motion = None
+    settings: Settings = None
     report: Annotated[
         Path | None,
         typer.Option(
             metavar="PAGE.html",
             help="Page to write: every track with picture, probabilities and fate.",
         ),
-    ] = None,
-    overwrite: Overwrite = False,
+    ] = None
+    overwrite: Overwrite = False
+
+
+@with_options("start", "end")
+def recognise(
+    log: LogPath,
+    output: OutputLog,
+    recognition: RecogniserOptions,
+    reading: ReadingOptions,
+    options: RecognitionChoices,
 ) -> None:
     """Recognise landmarks in a log's sonar images; write the log anew with the detections in it.
 
@@ -188,10 +195,14 @@ def recognise(
     from sonar_graph.report.tracks import write_track_page
     from sonar_graph.sonar import Recogniser
 
-    path = writable_log(output, log, overwrite=overwrite)
-    page = None if report is None else writable_page(report, overwrite=overwrite)
-    sequence, motion = with_motion(log, reading, motion)
-    made = recognition.recogniser(sequence.calibration, settings, recogniser)
+    path = writable_log(output, log, overwrite=options.overwrite)
+    page = None
+    if options.report is not None:
+        page = writable_page(options.report, overwrite=options.overwrite)
+    sequence, motion = with_motion(log, reading, options.motion)
+    made = recognition.recogniser(
+        sequence.calibration, options.settings, options.recogniser
+    )
     stories = TrackStories(sequence.calibration.sonar.image) if page else None
     if stories is not None and not isinstance(made, Recogniser):
         raise typer.BadParameter(
@@ -241,7 +252,7 @@ def recognise(
         out.print(
             f"Warning: {more} more such rows; with their stamps in the log's metadata record {RECORD}"
         )
-    if recognition.designs is None and recogniser == "designs":
+    if recognition.designs is None and options.recogniser == "designs":
         warn_of_other_designs(sequence)
     for topic, count in amended.replaced.items():
         echo(f"Replaced: {count} messages that the log had on {topic}")
@@ -252,6 +263,25 @@ def recognise(
         write_track_page(page, log.name, found, stories, names, sequence.start_ns)
         echo(f"Page: {page}")
     echo(f"Log: {path}")
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Options for what the model is measured by: labels, motion, designs and settings."""
+
+    labels: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="LABELS.json",
+            exists=True,
+            dir_okay=False,
+            help="Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
+        ),
+    ] = None
+    motion: Motion = None
+    designs: DesignsPath = None
+    settings: Settings = None
+    overwrite: Overwrite = False
 
 
 @with_options("start", "end")
@@ -267,31 +297,20 @@ def calibrate(
         typer.Option("--output", "-o", metavar="MODEL.json", help="File to write."),
     ],
     reading: ReadingOptions,
-    labels: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="LABELS.json",
-            exists=True,
-            dir_okay=False,
-            help="Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
-        ),
-    ] = None,
-    motion: Motion = None,
-    designs: DesignsPath = None,
-    settings: Settings = None,
-    overwrite: Overwrite = False,
+    options: CalibrateOptions,
 ) -> None:
     """Measure how often landmarks look like which, on logs with sonar images whose truth or labels are known."""
     from sonar_graph.recognition import LabelledLog, calibrate_by_labels, read_labels
     from sonar_graph.recognition import calibrate as measure
 
+    labels = options.labels
     sources = [*logs, *(labels or [])]
     path = writable_json(
         output,
         "a model",
         sources,
         lambda content: "ids" in content and "matrix" in content,
-        overwrite=overwrite,
+        overwrite=options.overwrite,
     )
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
@@ -302,12 +321,12 @@ def calibrate(
         raise LogError(
             f"{len(logs)} logs and {len(labels)} files for --labels; give one for each log, in their order"
         )
-    if motion is not None and not labels:
+    if options.motion is not None and not labels:
         raise typer.BadParameter(
             "--motion is for --labels: a log with truth has IMU and Doppler log"
         )
-    recognition = RecogniserOptions(designs)
-    params = recognition.params(settings)
+    recognition = RecogniserOptions(options.designs)
+    params = recognition.params(options.settings)
     known = recognition.read_designs()
     topic = reading.choices.get("sonar")
     salvage = reading.salvage
@@ -316,7 +335,7 @@ def calibrate(
             given = [
                 read_labels(file, log) for log, file in zip(logs, labels, strict=True)
             ]
-            runs = [with_motion(log, reading, motion) for log in logs]
+            runs = [with_motion(log, reading, options.motion) for log in logs]
             measured = calibrate_by_labels(
                 [
                     LabelledLog(log, run, own, file, how)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -98,6 +99,75 @@ worlds.command(
 )(landmarks)
 
 
+@dataclass(frozen=True)
+class BasinChoices:
+    """Options of the basin that the command line names; --set gives any other."""
+
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
+    ] = None
+    duration_s: Annotated[
+        float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")
+    ] = None
+    laps: Annotated[
+        int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")
+    ] = None
+    imu: Annotated[
+        str | None,
+        typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1."),
+    ] = None
+    dvl: Annotated[
+        str | None,
+        typer.Option(
+            help="Preset of the Doppler log: workhorse (default) or explorer."
+        ),
+    ] = None
+    no_bias: Annotated[bool, typer.Option("--no-bias", help="Gyros without bias.")] = (
+        False
+    )
+    images: Annotated[
+        bool,
+        typer.Option(
+            "--images",
+            help="Record sonar images, in which landmarks are still to be found, not detections.",
+        ),
+    ] = False
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help=f"Any other option of the basin; may be repeated: {_OTHERS}.",
+        ),
+    ] = None
+    overwrite: Overwrite = False
+
+    def of_basin(self) -> BasinOptions:
+        """Options for the simulator; a setting of --set goes before the option of the same name."""
+        from sonar_graph.simulation import BasinOptions
+
+        flags = {
+            "seed": self.seed,
+            "duration_s": self.duration_s,
+            "laps": self.laps,
+            "imu": self.imu,
+            "dvl": self.dvl,
+        }
+        values: dict[str, Any] = {
+            name: value for name, value in flags.items() if value is not None
+        }
+        if self.no_bias:
+            values["gyro_bias_scale"] = 0.0
+        given = nested_settings(self.settings)
+        if "image" in given and not self.images:
+            raise typer.BadParameter(
+                "--set image.NAME=VALUE is for sonar images: give --images too, or leave it out"
+            )
+        if self.images:
+            values["image"] = {}
+        return validated(BasinOptions, values | given, "basin")
+
+
 @worlds.command(
     epilog=examples(
         "sonar-graph simulate basin -o basin.mcap",
@@ -108,74 +178,19 @@ worlds.command(
         "sonar-graph simulate basin -o hard.mcap --images --set image.scene=hard --set image.contrast_db=-6",
     )
 )
+@with_options()
 def basin(
     output: OutputLog,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
-    ] = None,
-    duration_s: Annotated[
-        float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")
-    ] = None,
-    laps: Annotated[
-        int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")
-    ] = None,
-    imu: Annotated[
-        str | None,
-        typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1."),
-    ] = None,
-    dvl: Annotated[
-        str | None,
-        typer.Option(
-            help="Preset of the Doppler log: workhorse (default) or explorer."
-        ),
-    ] = None,
-    no_bias: Annotated[
-        bool, typer.Option("--no-bias", help="Gyros without bias.")
-    ] = False,
-    images: Annotated[
-        bool,
-        typer.Option(
-            "--images",
-            help="Record sonar images, in which landmarks are still to be found, not detections.",
-        ),
-    ] = False,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help=f"Any other option of the basin; may be repeated: {_OTHERS}.",
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
+    options: BasinChoices,
 ) -> None:
     """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections or images."""
-    from sonar_graph.simulation import LANDMARKS_XY_M, BasinOptions, designs_laid
+    from sonar_graph.simulation import LANDMARKS_XY_M, designs_laid
 
-    flags = {
-        "seed": seed,
-        "duration_s": duration_s,
-        "laps": laps,
-        "imu": imu,
-        "dvl": dvl,
-    }
-    values: dict[str, Any] = {
-        name: value for name, value in flags.items() if value is not None
-    }
-    if no_bias:
-        values["gyro_bias_scale"] = 0.0
-    given = nested_settings(settings)
-    if "image" in given and not images:
-        raise typer.BadParameter(
-            "--set image.NAME=VALUE is for sonar images: give --images too, or leave it out"
-        )
-    if images:
-        values["image"] = {}
-    options = validated(BasinOptions, values | given, "basin")
-    path = writable_log(output, overwrite=overwrite)
-    write_basin(path, options)
-    if options.image is not None:
-        placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
+    world = options.of_basin()
+    path = writable_log(output, overwrite=options.overwrite)
+    write_basin(path, world)
+    if world.image is not None:
+        placed = zip(designs_laid(world.image), LANDMARKS_XY_M.tolist(), strict=True)
         laid = ", ".join(
             f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed
         )

@@ -95,6 +95,7 @@ def _aligned_run(
 def _of_path(path: Trajectory, errors: ErrorSeries) -> Alignment:
     """The alignment of a path to the truth at the scored instants."""
     estimate = rows_at(path, errors.stamps_ns).positions  # (n, 3)
+    # estimate minus error is the true path at these instants
     return align_yaw(estimate, estimate - errors.position_m)
 
 
@@ -135,6 +136,7 @@ def _aligned_errors(
         errors,
         position_m=alignment.apply(estimate.positions) - truth,
         position_sigma_m=np.sqrt(np.maximum(variances, 0.0)),
+        # a turn about the vertical adds the same angle to every heading
         yaw_rad=wrap_angle(errors.yaw_rad + yaw_rad(R[None])),
     )
 

@@ -112,6 +112,7 @@ def normalised(errors: Floats, covs: Floats) -> Floats:
     """``P^-1/2 e`` of every row, shape (n, d); NaN where P is unknown or not positive definite."""
     unit = np.full(errors.shape, np.nan)
     known = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(errors).all(axis=1)
+    # P^-1/2 = V diag(1 / sqrt(variances)) V^T, with the eigenvectors V = axes
     variances, axes = np.linalg.eigh(covs[known])
     along = np.einsum("nji,nj->ni", axes, errors[known])
     definite = variances[:, 0] > 0 if len(variances) else np.zeros(0, dtype=bool)
@@ -136,6 +137,7 @@ def effective_samples(unit: Floats) -> int:
     n, d = u.shape
     if not n or not u.any():
         return min(n, 1)
+    # padded with n zeros: the correlation by FFT is circular, and the ends must not meet
     spectrum = np.fft.rfft(u, 2 * n, axis=0)
     sums = np.fft.irfft(
         np.einsum("fi,fj->fij", spectrum.conj(), spectrum), 2 * n, axis=0
@@ -285,6 +287,7 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     within = (detections.stamps_ns >= truth.stamps_ns[0]) & (
         detections.stamps_ns <= truth.stamps_ns[-1]
     )
+    # detections of one frame share a stamp: the true pose is interpolated once for each frame
     stamps_ns, frame = np.unique(detections.stamps_ns[within], return_inverse=True)
     if not len(stamps_ns):
         return labels
@@ -293,6 +296,7 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     mounting = sequence.calibration.sonar.mounting.pose()
     origin = poses.positions + world_R_body @ mounting.translation()
     from_sonar = landmarks.positions[None] - origin[:, None]
+    # landmarks in the sonar's frame, (detections, landmarks, 3)
     q = np.einsum(
         "nji,nmj->nmi", world_R_body @ mounting.rotation().matrix(), from_sonar
     )[frame]
@@ -300,6 +304,7 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
         np.arctan2(q[..., 1], q[..., 0]) - detections.azimuth_rad[within, None]
     )
     off_range = np.linalg.norm(q, axis=2) - detections.range_m[within, None]
+    # across the beam: the chord of the azimuth's error at the measured range
     off = np.hypot(
         off_range, detections.range_m[within, None] * 2 * np.sin(off_azimuth / 2)
     )

@@ -33,6 +33,7 @@ def format_value(value: float) -> str:
         mantissa, exponent = f"{value:.2e}".split("e")
         text = f"{mantissa}e{int(exponent)}"
     else:
+        # 9.999 becomes 10.0: the decimals are those of the rounded value
         rounded = float(f"{value:.3g}")
         text = f"{rounded:.{max(0, 2 - math.floor(math.log10(abs(rounded))))}f}"
     return text.replace("-", MINUS)

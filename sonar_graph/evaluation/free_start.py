@@ -95,6 +95,7 @@ def fit_from_beginning(true: Floats, path: Floats, *, is_turned: bool) -> Alignm
     turn = 0.0
     if is_turned:
         (x, y), (u, v) = (true - begin).T[:2], (path - begin_path).T[:2]
+        # the turn with the largest sum of scalar products, which is the least-squares fit in the plane
         turn = float(np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v)))
     R = Rotation.from_euler("z", turn).as_matrix()
     return Alignment(R, begin_path - R @ begin)

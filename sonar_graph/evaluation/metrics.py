@@ -123,6 +123,7 @@ def rmse(errors: Floats) -> float:
     >>> round(rmse(np.array([[3.0, 4.0], [0.0, 0.0]])), 3)
     3.536
     """
+    # the mean is over all elements; times the columns it is the mean of the squared norms
     return float(np.sqrt(np.mean(np.square(errors)) * errors[0].size))
 
 
@@ -224,6 +225,7 @@ def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:
     delta_ns = round(delta_s * NS_PER_S)
     first = np.arange(len(stamps_ns))
     wanted = stamps_ns + delta_ns
+    # the samples on both sides of the wanted stamp, of which the nearer one is the partner
     right = np.minimum(np.searchsorted(stamps_ns, wanted), len(stamps_ns) - 1)
     left = np.maximum(right - 1, 0)
     second = np.where(wanted - stamps_ns[left] < stamps_ns[right] - wanted, left, right)
@@ -369,6 +371,7 @@ def named_by_place(
     apart = estimated.positions[unknown, None, :2] - true.positions[None, free, :2]
     squared = np.sum(apart**2, axis=-1)
     is_near = squared <= farthest_m**2
+    # more than all near pairs cost together, so that one more near pair always costs less
     too_far = farthest_m**2 * (min(squared.shape) + 1)
     rows, columns = linear_sum_assignment(np.where(is_near, squared, too_far))
     matched = is_near[rows, columns]

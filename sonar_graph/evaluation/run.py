@@ -160,6 +160,7 @@ def _impossible(covs: Floats) -> Flags:
     rows = covs.reshape(n, covs.shape[1] * covs.shape[2])
     unknown = np.all(np.isnan(rows), axis=1)
     finite = ~_not_finite(rows)
+    # eigvalsh fails for NaN; rows that are not finite are refused all the same, by `finite` below
     filled = np.where(finite[:, None, None], covs, 0.0)
     size = np.abs(filled).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
@@ -393,6 +394,7 @@ class _Replay:
         self._estimates: list[Estimate] = []
         self._update_s: list[float] = []
         ends_ns = np.array([step.end_ns for step in steps], dtype=np.int64)
+        # the last map is the one of `_finish`
         interim_ns = kept_map_instants(ends_ns, sequence.start_ns).tolist()[:-1]
         self._map_at_ns = set(interim_ns if interim_maps else [])
         self._asked: set[str] = set()
@@ -458,6 +460,7 @@ class _Replay:
         ):  # what fails here fails again below, where it is reported
             estimator = self._fresh()
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
+                # an estimator may change the step, which the run needs as it was
                 estimator.process(copy.deepcopy(step))
                 self._check_interrupt()
 
@@ -469,11 +472,13 @@ class _Replay:
             compiling_s,
         )
 
+        # watching costs a Python call for every attribute: only where there is something to watch
         is_aided = any(name in self._sequence.blocks() for name in AIDING)
         for done, step in enumerate(self._steps, start=1):
             end_ns = step.end_ns
             given = _Watched.of(step, self._asked) if is_aided else step
             self._stage = f"{(end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({end_ns} ns)"
+            # the clock without the time that numba has compiled until now
             before = time.perf_counter() - compiling_s()
             estimate = estimator.process(given)
             self._update_s.append(time.perf_counter() - compiling_s() - before)

@@ -98,6 +98,7 @@ def scored_instants(
     """The instants with truth nearby and an estimate from each run that did not fail."""
     inside = (asked_ns >= truth.stamps_ns[0]) & (asked_ns <= truth.stamps_ns[-1])
     gap_s = gap_limit_s(truth)
+    # an instant of a truth sample has this sample on both sides, and so is in no gap
     after = np.clip(
         np.searchsorted(truth.stamps_ns, asked_ns, side="left"), 0, len(truth) - 1
     )

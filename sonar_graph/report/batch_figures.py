@@ -256,6 +256,7 @@ def failure_drawing(batch: RecordedBatch) -> style.Illustration | None:
         ["log", "contestant", "runs", "failed", "failure_rate", "low", "high"]
     ]
     for panel, log in zip(panels, batch.logs, strict=True):
+        # with room for the dots at 0 and 100 %
         panel.set_xlim(-3, 103)
         for place, contestant in enumerate(batch.contestants):
             group = batch.group(log, contestant)

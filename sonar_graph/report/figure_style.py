@@ -179,6 +179,7 @@ def arrange(figure: Figure) -> None:
     labels = [
         text.get_text() for legend in figure.legends for text in legend.get_texts()
     ]
+    # rows of the legend, by a division that rounds up
     above = -(
         -len(labels) // _legend_columns(width, labels, letter)
     ) * LEGEND_LINE * size + (EDGE_IN if labels else 0.0)
@@ -202,6 +203,7 @@ def arrange(figure: Figure) -> None:
     )
     down = GAP_IN + (2 * line + TICK_IN + titles if is_stacked else 0.0)
     panel_width = (width - left - EDGE_IN - across * (grid.ncols - 1)) / grid.ncols
+    # a map: a metre is as long in x as in y, so the height follows from what is drawn
     if panels[0].get_aspect() == 1:
         (low, high), (bottom, top) = panels[0].get_xlim(), panels[0].get_ylim()
         shape = float(np.clip((top - bottom) / (high - low), *SHAPES))
@@ -217,6 +219,7 @@ def arrange(figure: Figure) -> None:
     panel_height = (
         height - above - titles - EDGE_IN - below - down * (grid.nrows - 1)
     ) / grid.nrows
+    # matplotlib takes gaps as fractions of a panel, and margins as fractions of the figure
     figure.subplots_adjust(
         left=left / width,
         right=1 - EDGE_IN / width,
@@ -226,6 +229,7 @@ def arrange(figure: Figure) -> None:
         hspace=down / panel_height,
     )
     for panel in panels:
+        # by the widest numbers of all rows, so that labels under each other are in line
         beside = ScaledTranslation(
             -max(numbers[one] for one in outer), 0, figure.dpi_scale_trans
         )
@@ -363,6 +367,7 @@ def dots(panel: Axes, x: Floats, y: Floats, own_colour: str, label: str = "") ->
     path = MarkPath(
         np.repeat(points, 2, axis=0), [MarkPath.MOVETO, MarkPath.LINETO] * len(x)
     )
+    # simplification would leave out strokes without length
     path.should_simplify = False
     look: dict[str, Any] = {
         "edgecolor": own_colour,
@@ -373,9 +378,11 @@ def dots(panel: Axes, x: Floats, y: Floats, own_colour: str, label: str = "") ->
     panel.add_artist(
         PathPatch(path, capstyle="round", transform=panel.transData, **look)
     )
+    # a patch that is added does not widen the axes
     panel.update_datalim(points)
     panel.autoscale_view()
     if label:
+        # the legend takes its mark from a line without points, because the patch has none
         panel.plot([], [], ".", color=own_colour, label=label)
 
 
@@ -394,6 +401,7 @@ def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
         return np.arange(n)
     edges = np.linspace(0, n, points // 2 + 1).astype(np.int64)
     stretches = list(pairwise(edges.tolist()))
+    # argmin and argmax give the first NaN of a stretch that has one, which keeps the gap
     lowest = [first + int(np.argmin(values[first:last])) for first, last in stretches]
     highest = [first + int(np.argmax(values[first:last])) for first, last in stretches]
     return np.unique(np.array([0, *lowest, *highest, n - 1], dtype=np.int64))
@@ -419,6 +427,7 @@ def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> 
     """
     arrange(figure)
     buffer = io.StringIO()
+    # with a fixed salt and no date the same result gives the same page, byte for byte
     with mpl.rc_context(
         {"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}
     ):

@@ -90,6 +90,7 @@ def distance_m(run: RunResult, errors: ErrorSeries) -> Floats:
     """Distance that the truth has travelled until each scored instant, from the first one, shape (n,)."""
     assert run.causal is not None, "a run with errors has a path"
     rows = np.searchsorted(run.causal.stamps_ns, errors.stamps_ns)
+    # estimate minus error is the true path; an estimate's own would be another distance for each run
     steps = np.diff(run.causal.positions[rows] - errors.position_m, axis=0)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
 
@@ -330,6 +331,7 @@ def _headings(comparison: Comparison, path: Trajectory) -> tuple[Floats, Floats]
         style.seconds_since_start(comparison, path.stamps_ns)[rows],
         degrees[rows],
     )
+    # a NaN interrupts the line, which else crosses the panel at every turn past 180°
     jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
     return np.insert(seconds, jumps, np.nan), np.insert(degrees, jumps, np.nan)
 

@@ -104,6 +104,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
     panel.set_aspect("equal", adjustable="box")
     style.name_axes(panel, "world x (m)", "world y (m)")
     style.legend_above(figure, panel)
+    # the room for names is measured on the figure as it will be
     style.arrange(figure)
     label_landmarks(panel, comparison)
     return figure
@@ -182,6 +183,7 @@ def map_view(comparison: Comparison) -> Floats | None:
         for run in comparison.runs
         if run.landmarks and len(run.landmarks)
     ]
+    # an estimate that diverges must not shrink the truth to a point: the truth sets the scale
     anchor = box(np.vstack(references or estimates))
     largest = max(float(np.max(anchor[1] - anchor[0])), 1.0)
     limits = anchor + np.array([[-1.0], [1.0]]) * MARGIN * largest
@@ -209,6 +211,7 @@ def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[E
     ):
         if not np.isfinite(cov).all():
             continue
+        # ascending: the last direction is that of the long axis, which matplotlib calls the width
         variances, directions = np.linalg.eigh(cov)
         width, height = scale * np.sqrt(np.maximum(variances[::-1], 0.0))
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
