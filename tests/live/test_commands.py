@@ -133,10 +133,12 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     assert re.search(r"\d s \| x .* ± .* landmarks, .* latency \d+ ms", output)
     assert "report.html" in output
     assert (tmp_path / "second" / "report.html").is_file()
-    subprocess.run(
+    done = subprocess.run(
         [*COMMAND, "run", tmp_path / "second/record.mcap", "-o", tmp_path / "again"],
-        check=True,
+        check=False,
     )
+    # 3: a record that begins late is doubted, since the start that is stated is of the log's beginning
+    assert done.returncode in (0, 3)
     for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
         mine, theirs = (
             (tmp_path / folder / "runs/isam2" / name).read_bytes()
