@@ -16,6 +16,7 @@ be, or too certain of what many landmarks share.
 import csv
 import math
 import tomllib
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -164,8 +165,9 @@ def write_map(path: Path, known: KnownMap) -> None:
 
 
 def map_origin(sequence: Sequence) -> str:
-    """Name of a log in the source of its map, with the stamp of its beginning, since names repeat."""
-    return f"{sequence.name} of {sequence.start_ns} ns"
+    """Name of a log in the source of its map, with a checksum of its first rates, since names repeat."""
+    first = sequence.imu.angular_velocity[:100]
+    return f"{sequence.name} ({zlib.crc32(first.tobytes()):08x})"
 
 
 def in_map(sequence: Sequence, path: Path) -> Sequence:

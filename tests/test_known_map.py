@@ -11,7 +11,8 @@ from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, KnownMap, Start
 from sonar_graph.errors import LogError, SettingError
 from sonar_graph.estimator import known_map_of
-from sonar_graph.map_file import read_map, write_map
+from sonar_graph.evaluation import compare
+from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_start import MapLocator
@@ -312,3 +313,22 @@ def test_the_start_that_is_found_is_a_prior_of_a_hundredth_of_its_information(di
     start = locator.start()
     assert min(start.position_sigma_m[:2]) >= 9.9 * sigmas[1:].max()
     assert start.rpy_sigma_rad[2] >= 9.9 * sigmas[0]
+
+
+def test_a_map_of_the_same_log_is_doubted_and_one_of_another_dive_is_not(tmp_path):
+    """Both dives bear one name and begin at one stamp."""
+    first, second = (
+        simulate_mission(MissionOptions(duration_s=30.0, landmarks=6, seed=seed))
+        for seed in (1, 2)
+    )
+    (result,) = compare(first, ["ekf-slam"]).runs
+    write_map(tmp_path / "map.toml", result.known_map)
+    again = in_map(first, tmp_path / "map.toml")
+    assert "made from the same log" in again.notes["log.warnings"]
+    assert "log.warnings" not in in_map(second, tmp_path / "map.toml").notes
+
+
+def test_the_truth_is_not_moved_to_estimates_that_a_map_has_placed(dive):
+    lost = with_map(dive, surveyed(dive), unknown_start(dive))
+    compared = compare(lost, ["ekf-slam"])
+    assert compared.sequence.truth is lost.truth

@@ -36,7 +36,8 @@ def free_start(calibration: Calibration) -> tuple[bool, bool]:
     if "start" not in calibration.model_fields_set:
         return True, True
     start = calibration.start
-    if start.source != "stated":
+    # a map states the world
+    if start.source not in ("stated", "map"):
         return start.source == "vehicle", start.source != "fixes"
     said = start.model_fields_set
     return False, "rpy_rad" in said and "position_m" not in said
