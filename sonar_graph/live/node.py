@@ -135,7 +135,7 @@ class LiveRun:
         self._is_failed = False
         self._is_quiet = False  # while what an earlier run had is taken in: nobody waits for those poses
         self._generation = -1
-        self._flushed_s = self._stated_s = time.monotonic()
+        self._flushed_s = self._stated_s = self._listened_s = time.monotonic()
         self._withheld: list[str] = []
         self._latency_ns = self._estimates = self._newest_ns = self._next_frame_ns = 0
         self._longest_update_s = 0.0
@@ -229,12 +229,14 @@ class LiveRun:
         if now_s > self._stated_s + STATE_S and self._predictor is not None:
             self._state(now_s - self._stated_s)
             self._stated_s = now_s
+        if now_s > self._listened_s + STATE_S and self.inbox.is_empty:
+            # messages that wait in the inbox were not silent
             motion = {
                 topic for role, topic in self.engine.in_use.items() if role in MOTION
             }
-            if self.inbox.is_empty:  # messages that wait were not silent
-                for line in self._silence.lines(motion, now_s):
-                    self._said(line)
+            for line in self._silence.lines(motion, now_s):
+                self._said(line)
+            self._listened_s = now_s
         if self._worker.error is not None and not self._is_failed:
             self._is_failed = True
             self._said(f"{self._failure()}; everything is still recorded")
