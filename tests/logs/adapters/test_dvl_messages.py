@@ -243,7 +243,7 @@ def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_n
         (
             packets([PAIR * [1, *[np.nan] * 3]] * 5),
             OF_SURE_BEAMS,
-            "DVL: too few valid beams in all 5 rows",
+            "DVL: none of its 5 rows measures a velocity in all directions",
         ),
         (twists("/wheels"), "", "/wheels only if chosen: --topic dvl=/wheels"),
     ],
