@@ -43,8 +43,8 @@ LEAST_DRIFT_M_S = 0.03
 LEAST_PITCH_RAD = np.radians(3.0)
 LEAST_DEVIATION_RAD = np.radians(3.0)
 LEAST_CURRENT_M_S = 0.05
-LEAST_STEP_M_S = 0.005
-"""Typical change from row to row of the best Doppler logs."""
+BEST_NOISE_M_S = 0.01
+"""Of a row of a good Doppler log."""
 JUMPING = 2.0
 """Ratio of a change to that of the path beyond which it shows no direction."""
 LONGEST_LIST = 3
@@ -253,7 +253,9 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
         rows = np.flatnonzero(motion.parts == part)
         t = motion.seconds[rows]
         by_forces = felt.impulse_m_s[rows] - integral_of(t, gravity[rows])
-        for step in steps(t, felt.velocity_m_s[rows], by_forces, LEAST_STEP_M_S):
+        # a wrong unit of velocities was found before
+        found = steps(t, felt.velocity_m_s[rows], by_forces, BEST_NOISE_M_S, ratio=1.0)
+        for step in found:
             texts.append(f"by {step.size:.2g} m/s at {step.seconds:.1f} s")
     if not texts:
         return None

@@ -40,6 +40,8 @@ CLEARLY_BETTER = 1.5
 STEP_ROWS = 3
 STEP_SIGMAS = 10.0
 """Far beyond the largest of a long log's differences by noise, also where it has heavy tails."""
+LEAST_STEP = 4.0
+"""In sigmas of a row: a coarse sensor has no typical difference."""
 STEP_RATIO = 3.0
 MOST_STEPS = 5
 SMALL_SAMPLE = 1.2
@@ -348,21 +350,23 @@ class Step(NamedTuple):
     """Without its sign."""
 
 
-def steps(seconds: Floats, y: Values, x: Values, sigma: float) -> list[Step]:
+def steps(
+    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float = STEP_RATIO
+) -> list[Step]:
     """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
 
     The difference of the medians of `STEP_ROWS` rows of ``y - x`` on either side of an instant is beyond `STEP_SIGMAS`
-    of its own typical size, and of ``sigma``, that of a row; so is that of three times as many. A vehicle that stops and
-    goes shows a wrong scale in steps: those of x are smaller.
+    of its own typical size, and beyond `LEAST_STEP` of ``sigma``, that of a row; so is that of three times as many. A
+    vehicle that stops and goes shows a wrong scale in steps: those of x must be smaller by a ``ratio``.
     """
     known = np.isfinite(y - x).reshape(len(x), -1).all(axis=1)
     t = seconds[known]
     excess = as_columns(y - x)[known]
     near = median_changes(excess, STEP_ROWS)
     size = np.minimum(near, median_changes(excess, 3 * STEP_ROWS))
-    size[size < STEP_RATIO * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
+    size[size < ratio * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
     typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
-    least = STEP_SIGMAS * max(typical, sigma)
+    least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)
     found = list[Step]()
     while len(size) and size.max() > least:
         k = int(np.argmax(size))
