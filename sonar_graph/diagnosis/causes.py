@@ -86,7 +86,7 @@ class Cause:
     """Shape (n, q)."""
     wanted: int
     """Number of the columns, the first ones, that are the cause; the others may count without it."""
-    least: float
+    least: Callable[[Calibration], float]
     """Length of q from which on the cause matters."""
     advice: Callable[[Values, Calibration], Advice]
     """By q."""
@@ -188,14 +188,32 @@ def current_advice(q: Values, _: Calibration) -> Advice:
 
 
 PITCH = Cause(
-    "pitch of Doppler log or IMU", "°", of_way, 1, LEAST_PITCH_RAD, pitch_advice
+    "pitch of Doppler log or IMU",
+    "°",
+    of_way,
+    wanted=1,
+    least=lambda _: LEAST_PITCH_RAD,
+    advice=pitch_advice,
 )
-DRIFT = Cause("drift", "m/s", since_middle, 1, LEAST_DRIFT_M_S, drift_advice)
+DRIFT = Cause(
+    "drift",
+    "m/s",
+    since_middle,
+    wanted=1,
+    least=lambda _: LEAST_DRIFT_M_S,
+    advice=drift_advice,
+)
 DEVIATION = Cause(
-    "deviation with the heading", "°", of_turn, 2, LEAST_DEVIATION_RAD, deviation_advice
+    "deviation with the heading",
+    "°",
+    of_turn,
+    wanted=2,
+    # its owner knows of a bias, which may change with the heading
+    least=lambda known: max(LEAST_DEVIATION_RAD, 2.0 * known.heading.bias_sigma_rad),
+    advice=deviation_advice,
 )
 CURRENT = partial(
-    Cause, "current", "m/s", least=LEAST_CURRENT_M_S, advice=current_advice
+    Cause, "current", "m/s", least=lambda _: LEAST_CURRENT_M_S, advice=current_advice
 )
 OF_FIXES = CURRENT(columns=of_current, wanted=1)
 OF_RANGES = CURRENT(columns=of_way, wanted=2)
@@ -204,18 +222,21 @@ OF_RANGES = CURRENT(columns=of_way, wanted=2)
 def cause_of(
     name: str, causes: tuple[Cause, ...], found: Match, calibration: Calibration
 ) -> Finding | None:
-    """The cause that explains a sensor best; None: none does."""
-    best: tuple[Explained, Cause] | None = None
+    """The cause that explains a sensor best; None: none does, or one that is too small to matter does as well."""
+    fits = list[tuple[Explained, Cause]]()
     for cause in causes:
         result = explained(found.stretches, cause.columns, cause.wanted)
-        if result is None or not result.is_clear:
-            continue
-        is_large = float(np.linalg.norm(result.q)) > cause.least
-        if is_large and (best is None or result.after < best[0].after):
-            best = result, cause
-    if best is None or best[0].after > AS_GOOD * found.scatter:
+        if result is not None and result.is_clear:
+            fits.append((result, cause))
+    if not fits:
         return None
-    result, cause = best
+    result, cause = min(fits, key=lambda fit: fit[0].after)
+    if result.after > AS_GOOD * found.scatter:
+        return None
+    for rival, other in fits:
+        is_small = float(np.linalg.norm(rival.q)) < other.least(calibration)
+        if is_small and rival.after < AS_GOOD * result.after:
+            return None
     is_signed = len(result.q) == 1 and not np.iscomplexobj(result.q)
     value = float(result.q[0].real if is_signed else np.linalg.norm(result.q))
     estimate = Estimate1D(value, float(np.max(result.sigmas)))

@@ -93,6 +93,8 @@ from sonar_graph.navigation.alignment import (
 from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
+ANY_AXES = "axes of gyros, accelerometers or Doppler log"
+CONTRADICTED = "they contradict each other"
 START_TILT = ("start roll", "start pitch")
 COMPARED = "log.compared"
 """Subject of the note that sensors were compared, or why not."""
@@ -207,17 +209,9 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     # one row on the bias that is known is enough
     if any(f.estimate.is_known for f in of_vertical):
         bias = [f for f in bias if f.estimate.is_known or f.acts]
-    # one line for all axes, with both intervals of the vertical one
+    # one line for all axes
     if any(f.acts for f in of_vertical):
-        known = f"{sources[2]} {with_interval(estimates[2], 'rad/s')}"
-        by_motion = [
-            replace(f, cause=f"{f.cause} ({known})")
-            if f in of_vertical and estimates[2].is_known
-            else f
-            for f in by_motion
-        ]
-        by_motion += [replace(f, cause=ALSO, consequence="", line="") for f in bias]
-        bias = []
+        bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
     reference = list(reference_findings(right, config, tilt))
     if is_heading_stated(right):
         pitch = tilt.angle(1)
@@ -362,19 +356,18 @@ def tried_axes(sequence: Sequence, config: LogConfig) -> tuple[list[Finding], Se
     """Findings about axes as of `axes_findings`; without a line where other sensors fit them worse."""
     findings, right = axes_findings(sequence, config)
     if right is not sequence and (names := brought_apart(sequence, right)):
-        return [
-            no_axes_finding(f"with axes that fit them better {names} fits worse")
-        ], sequence
+        cause = f"{CONTRADICTED}, and with axes that fit them better {names} fits worse"
+        return [no_axes_finding(ANY_AXES, cause)], sequence
     return findings, right
 
 
-def no_axes_finding(why: str) -> Finding:
+def no_axes_finding(quantity: str, cause: str) -> Finding:
     """Gyros, accelerometers and Doppler log that no axes bring together."""
     return Finding(
-        "axes of gyros, accelerometers or Doppler log",
-        unknown("no axes fit"),
-        cause=f"they contradict each other, and {why}: axes of the world, or of another sensor?",
-        line="name a `topic` under [imu] or [dvl] with values in axes of the vehicle or of the sensor "
+        quantity,
+        unknown("no axes of the vehicle"),
+        cause=cause,
+        line="name a `topic` under [dvl] or [imu] with values in axes of the vehicle or of the sensor "
         f"{IN_LOG_CONFIG}",
         gravity=Gravity.GRAVE,
     )
@@ -389,13 +382,15 @@ def axes_findings(
         return [], sequence
     ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
     if ratio is not None:
-        return [world_axes_finding(ratio)], sequence
+        cause = f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle"
+        return [no_axes_finding("DVL axes", cause)], sequence
     found = match_axes(sequence.imu, sequence.dvl, calibration)
     if found is None:
         return [], sequence
     is_as_read = (found.gyro == np.eye(3)).all() and (found.dvl == np.eye(3)).all()
     if not is_as_read and found.ratio < CLEARLY_BETTER:
-        return [no_axes_finding("no axes fit clearly better")], sequence
+        cause = f"{CONTRADICTED}, and no axes fit clearly better"
+        return [no_axes_finding(ANY_AXES, cause)], sequence
     findings = list[Finding]()
     # gyros and Doppler log agree with each other: rates are reflected the other way
     is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
@@ -422,18 +417,6 @@ def axes_findings(
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
-
-
-def world_axes_finding(ratio: float) -> Finding:
-    """Velocities of the Doppler log that do not turn with the body."""
-    return Finding(
-        "DVL axes",
-        unknown("axes of the world"),
-        cause=f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle",
-        line="name a `topic` under [dvl] with velocities in axes of the vehicle or of the Doppler log "
-        f"{IN_LOG_CONFIG}",
-        gravity=Gravity.GRAVE,
-    )
 
 
 def force_axes(

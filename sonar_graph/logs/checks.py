@@ -249,8 +249,9 @@ def gravity_warning(
     # the median forgets manoeuvres, which the mean keeps
     typical = mounting.pose().rotation().matrix() @ np.median(measured, axis=0)
     length = float(np.linalg.norm(typical))
-    sizes = np.linalg.norm(measured, axis=1)
-    if length < SAME_DIRECTION * float(np.median(sizes)):
+    size = float(np.median(np.linalg.norm(measured, axis=1)))
+    is_gravity = abs(size - gravity_m_s2) < MOST_OFF_GRAVITY * gravity_m_s2
+    if is_gravity and length < SAME_DIRECTION * size:
         return (
             "specific forces point another way from row to row: two IMUs, or two drivers, on one topic; name another "
             "`topic` under [imu] in the log configuration (--log-config FILE)"
@@ -508,8 +509,7 @@ def stuck_warning(
     repeats the row before, come by chance less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    first, last = runs_of(differs)
     is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
         last - first + 1 >= STUCK_ROWS
     )
@@ -539,6 +539,13 @@ def stuck_warning(
     return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be sending without lock"
 
 
+def runs_of(differs: NDArray[np.bool_]) -> tuple[Ints, Ints]:
+    """First and last rows of runs of equal rows, of which ``differs`` tells each row but the first from the one before."""
+    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
+    last = np.concatenate([first[1:] - 1, [len(differs)]])
+    return first, last
+
+
 def _may_be_chance(differs: NDArray[np.bool_], repeated: Ints) -> NDArray[np.bool_]:
     """Stretches whose number of repeated rows comes by chance once in a thousand logs of a coarse sensor, shape (k,)."""
     if not differs.any():
@@ -562,8 +569,7 @@ def stuck_rows(
     ``others``: stamps and values of the other sensors, by name. ``may_rest``: zeros are a value at rest.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    first, last = runs_of(differs)
     chosen = (stamps_ns[last] - stamps_ns[first] > SURELY_STUCK_S * 1e9) & (
         last - first + 1 >= SURELY_STUCK_ROWS
     )
@@ -763,8 +769,7 @@ def _repeated_while_moving(
     differs: NDArray[np.bool_], moved: Floats, least: float
 ) -> NDArray[np.bool_]:
     """Rows, shape (n,), that do not differ from the row before in a stretch over which the vehicle moves by a length."""
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(differs)]])
+    first, last = runs_of(differs)
     is_stuck = np.abs(moved[last] - moved[first]) > least
     mask = np.zeros(len(differs) + 1, bool)
     for begin, end in zip(

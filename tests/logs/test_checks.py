@@ -537,3 +537,11 @@ def test_a_fix_that_is_held_is_stuck_however_far_the_next_one_is():
     way = np.column_stack([np.arange(60.0), np.zeros(60), np.zeros(60)])
     held = (way + rng.normal(size=(60, 3)))[np.arange(60) // 5 * 5]
     assert repeats(held, np.arange(60.0), 1.0).sum() == 48
+
+
+def test_two_imus_on_one_topic_are_named_and_gravity_is_not_missing():
+    force = np.tile([0.0, 0.0, 9.8], (len(EVEN), 1))
+    force[::2] *= -1.0
+    both = Imu(EVEN, np.zeros_like(force), force)
+    (found,) = row_doubts(both, None, None, Calibration())
+    assert "two IMUs" in found
