@@ -25,7 +25,7 @@ from sonar_graph.sonar.appearance import (
 )
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.place import Relief
+from sonar_graph.sonar.place import Grid, Lit, Relief
 from sonar_graph.sonar.templates import Patch, check_headings, drawn
 
 from .polar_images import candidates_at
@@ -34,12 +34,12 @@ CELL_M, SIDE, BLUR_M = 0.015, 37, (0.008, 0.01)
 SIDE_M, SHADE_STEPS, LONGER = 0.007, 3, 0.6
 """The shadow is 3.6 steps of half a cell long."""
 ROWS_COLUMNS = tuple(np.indices((SIDE, SIDE)).reshape(2, -1))
-RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, SIDE, CELL_M, BLUR_M, SHADE_STEPS)
+RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, Grid(SIDE, CELL_M, BLUR_M), SHADE_STEPS)
 
 
 def columns(relief: Relief = RELIEF) -> list[Floats]:
     """B with its side, D where no shadow lies on it, and S, written out."""
-    shade = relief.shades[0] * (1 - LONGER) + relief.shades[1] * LONGER
+    shade = relief.shorter * (1 - LONGER) + relief.longer * LONGER
     return [relief.figure + SIDE_M * relief.side, relief.dark * (1 - shade), shade]
 
 
@@ -62,7 +62,12 @@ def place_in(
     patch: Floats, start: tuple[float, float], seen: Floats | None = None
 ) -> tuple[Floats, Floats]:
     held = np.ones_like(patch) if seen is None else seen
-    return RELIEF.place(patch, held, ROWS_COLUMNS, np.array(start), SIDE_M, LONGER)
+    return RELIEF.place(
+        Patch.of(patch, held, np.zeros(2)),
+        ROWS_COLUMNS,
+        np.array(start),
+        Lit(SIDE_M, LONGER),
+    )
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (0.4, -0.3), (-0.45, 0.45)])
