@@ -191,7 +191,8 @@ class Beliefs:
     def _news(self, ids: Ints, place: Floats, sideways: Floats) -> Floats:
         """Independent share of a look from here at each track, shape (M,); places of other tracks are forgotten."""
         look, row = np.nonzero(self._looked[:, None] == ids)
-        self._looked, self._places = self._looked[look], self._places[look]
+        self._looked = self._looked[look]
+        self._places = self._places[look]
         moved = place - self._places
         aside = np.vecdot(moved, sideways[row])
         ahead = np.sqrt(np.maximum(np.vecdot(moved, moved) - aside**2, 0.0))

@@ -90,7 +90,9 @@ STRETCHES = (
     (0.83, 1.2),
 )
 """Of the figures of what is no landmark, along the design's axes x and y; the first is the design's own."""
-FLOOR, DARK, FIGURE = 0, 1, 2
+FLOOR = 0
+DARK = 1
+FIGURE = 2
 """Columns of the models: 1, D, and the first of the figures; the shadows S_q follow the figures."""
 SHADOW = FIGURE + len(STRETCHES)
 EDGES = 12
@@ -123,7 +125,9 @@ OUT = 0.12
 """Share of a cell in a figure up to which it lies outside."""
 PART = 0.5
 """Share of a cell in a figure from which on it lies inside."""
-NEAR, BEHIND, FAR = 1, 2, 4
+NEAR = 1
+BEHIND = 2
+FAR = 4
 """Zones of the floor; a cell may lie in more than one."""
 
 
