@@ -207,8 +207,6 @@ class Beliefs:
         if len(self._looked) <= self.params.most_looks:
             return
         _, first, count = np.unique(self._looked, return_index=True, return_counts=True)
-        if (too_many := first[count > self.params.most_looks]).size:
-            self._looked, self._places = (
-                np.delete(self._looked, too_many),
-                np.delete(self._places, too_many, axis=0),
-            )
+        too_many = first[count > self.params.most_looks]
+        self._looked = np.delete(self._looked, too_many)
+        self._places = np.delete(self._places, too_many, axis=0)

@@ -336,7 +336,7 @@ def _counts(independent: float) -> Floats:
     return counts
 
 
-class Part(NamedTuple):
+class PatchPart(NamedTuple):
     """Cells of a patch row by row from one on; fields as in `Patch`."""
 
     level_db: Floats32
@@ -477,9 +477,9 @@ def fill_evidence(
 
 
 @compiled
-def part_from(patch: Patch, first: int) -> Part:
+def part_from(patch: Patch, first: int) -> PatchPart:
     """A patch from one of its cells on."""
-    return Part(
+    return PatchPart(
         patch.level_db.ravel()[first:],
         patch.seen.ravel()[first:],
         patch.smooth_db.ravel()[first:],
@@ -488,7 +488,7 @@ def part_from(patch: Patch, first: int) -> Part:
 
 
 @compiled
-def viewed(part: Part, cells: NDArray[np.int32]) -> View:
+def viewed(part: PatchPart, cells: NDArray[np.int32]) -> View:
     """The levels of a part of a patch in some cells."""
     part_db = part.level_db
     part_seen = part.seen
@@ -570,7 +570,7 @@ def otherwise(products: Products, fit: DesignFitted) -> Left:
 
 @compiled
 def surroundings(
-    part: Part, cells: NDArray[np.int32], view: View, fit: DesignFitted, smooth: Floats32, zones: Bytes
+    part: PatchPart, cells: NDArray[np.int32], view: View, fit: DesignFitted, smooth: Floats32, zones: Bytes
 ) -> Surroundings:  # fmt: skip
     """Mean squares of what is brighter than the design next to it and darker farther out, and the level behind it."""
     smooth_db = part.smooth_db

@@ -121,11 +121,11 @@ class Relief(NamedTuple):
         place = start.astype(float)
         bound = np.full(2, np.inf)
         rows, columns = cells
-        fit_place(self, patch, Compared(rows, columns), lit, place, bound)
+        fit_place(self, patch, ComparedCells(rows, columns), lit, place, bound)
         return place, bound
 
 
-class Compared(NamedTuple):
+class ComparedCells(NamedTuple):
     """Cells of the figure's square that are compared."""
 
     rows: Ints
@@ -134,7 +134,7 @@ class Compared(NamedTuple):
 
 @compiled
 def fit_place(
-    relief: Relief, patch: Patch, cells: Compared, lit: Lit, place: Floats, bound: Floats
+    relief: Relief, patch: Patch, cells: ComparedCells, lit: Lit, place: Floats, bound: Floats
 ) -> None:  # fmt: skip
     """Move a place to the least squares, and fill in the Cramer-Rao bound of its standard deviations, in cells.
 

@@ -235,17 +235,14 @@ def pixel_sums(
                 else (r * cos_a, r * sin_a, r)
             )
             area *= dr * da
-            row[AREA], row[LEVEL], row[PIXELS] = (
-                row[AREA] + area,
-                row[LEVEL] + contrast_db[beam, n],
-                row[PIXELS] + 1,
-            )
-            row[X], row[Y], row[XX] = (
-                row[X] + area * x,
-                row[Y] + area * y,
-                row[XX] + area * x * x,
-            )
-            row[XY], row[YY] = row[XY] + area * x * y, row[YY] + area * y * y
+            row[AREA] += area
+            row[LEVEL] += contrast_db[beam, n]
+            row[PIXELS] += 1
+            row[X] += area * x
+            row[Y] += area * y
+            row[XX] += area * x * x
+            row[XY] += area * x * y
+            row[YY] += area * y * y
     return sums
 
 

@@ -310,7 +310,8 @@ def test_a_shadow_is_as_long_as_its_steps():
     """Of foam with a straight far edge: so many half cells behind it are dark, wholly with little blur."""
     square = LandmarkDesign(1, "square", 0.3, np.full((150, 150), 12.0))
     for steps in (0, 1, 4, 11):
-        shades = Relief.of(square, 0.0, SIDE, CELL_M, (1e-4, 1e-4), steps).shades
+        relief = Relief.of(square, 0.0, Grid(SIDE, CELL_M, (1e-4, 1e-4)), steps)
+        shades = (relief.shorter, relief.longer)
         lengths = [one[:, SIDE // 2].sum() for one in shades]
         np.testing.assert_allclose(lengths, [steps / 2, (steps + 1) / 2], atol=0.02)
 
@@ -473,10 +474,9 @@ def test_side_and_shadow_of_a_place_are_those_of_the_slope_at_which_the_sonar_lo
     for other in (0.9, slope):
         length = relief_m * (other + 1 / other) / (cell_m / 2)
         steps = int(length)
-        drawn_now = Relief.of(tall, heading_rad, side, cell_m, BLUR_M, steps)
-        shade = drawn_now.shades[0] + (length - steps) * (
-            drawn_now.shades[1] - drawn_now.shades[0]
-        )
+        drawn_now = Relief.of(tall, heading_rad, Grid(side, cell_m, BLUR_M), steps)
+        a_step = drawn_now.longer - drawn_now.shorter
+        shade = drawn_now.shorter + (length - steps) * a_step
         face = drawn_now.figure + relief_m * other * drawn_now.side
         level = np.full((appearance.patch_side, appearance.patch_side), 40.0)
         inset = (appearance.patch_side - side) // 2 + np.array([1, -2])
