@@ -26,6 +26,7 @@ from sonar_graph.logs.adapters import (
     LogConfig,
     MessageTable,
     Origin,
+    Setup,
     as_log_config,
     changes_text,
     detection_warnings,
@@ -660,14 +661,8 @@ def rows_of(
 
     ``body_R_sensor`` is of the sensor of an orientation; ``origin`` of the world, in degrees and metres.
     """
-    known = {
-        "gravity_m_s2": calibration.gravity_m_s2,
-        "sigma_m": calibration.positions.sigma_m,
-        "body_R_sensor": body_R_sensor,
-        "origin": origin,
-    }
-    needed = {name: known[name] for name in adapter.NEEDS}
-    found: tuple[Any, Dropped] = adapter.read(source, **needed)
+    setup = Setup(calibration, body_R_sensor, origin)
+    found: tuple[Any, Dropped] = adapter.read(source, setup)
     return found
 
 
