@@ -32,10 +32,9 @@ from sonar_graph.logs import (
     choose_each,
     choose_topics,
     pinned,
-    rows_of,
     sonar_frame,
 )
-from sonar_graph.logs.adapters import DvlAdapter, LogConfig
+from sonar_graph.logs.adapters import LogConfig, Setup
 from sonar_graph.logs.mcap import Keep, Recording, Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Measurements
 from sonar_graph.sequence import Sequence
@@ -346,10 +345,8 @@ class Engine:
             self._sonar = (
                 sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
             )
-            if isinstance(dvl := choices["dvl"].adapter, DvlAdapter):
-                choices = choices | {
-                    "dvl": replace(choices["dvl"], adapter=dvl.at_first())
-                }
+            dvl: Any = choices["dvl"].adapter
+            choices["dvl"] = replace(choices["dvl"], adapter=dvl.at_first())
             assembly = Assembly(recording, choices, self._given, self._sonar)
             choices = {
                 role: choice
@@ -500,10 +497,7 @@ def _rows_in(choice: Choice, topic: Topic, held: Held, calibration: Calibration)
     for message, log_time_ns in held:
         _gather(topic, message, log_time_ns)
     adapter: Any = choice.adapter
-    source = adapter.table(topic) if adapter.reads_table else topic
-    block, _ = rows_of(adapter, source, calibration, np.eye(3), None)
-    if not topic.messages():
-        raise LogError(", ".join(topic.unsound))
+    block, _ = adapter.read(adapter.table(topic), Setup(calibration))
     return block
 
 
@@ -517,7 +511,7 @@ def _is_of_use(assembly: Assembly, role: str) -> bool:
     adapter = assembly.adapters[role]
     return (
         getattr(adapter, "geodetic", None) is None
-        or assembly.axes_and_origin(role)[1] is not None
+        or assembly.setup(role).origin is not None
     )
 
 

@@ -17,14 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs import Assembly, rows_of
+from sonar_graph.logs import Assembly
 from sonar_graph.logs.adapters import (
     LARGEST,
     Adapter,
     ImuAdapter,
     axes_matrix,
     field_of,
-    header_stamps_ns,
     turned,
 )
 from sonar_graph.logs.cdr import Messages
@@ -57,24 +56,19 @@ class MessageReader:
     def __init__(self, assembly: Assembly) -> None:
         self.calibration = assembly.calibration
         self._adapters = assembly.adapters
-        self._axes_and_origin = {
-            role: assembly.axes_and_origin(role)
-            for role in assembly.topics
-            if role in BLOCKS
+        self._setups = {
+            role: assembly.setup(role) for role in assembly.topics if role in BLOCKS
         }
         self._topics: dict[str, Topic] = {}
         self._roles: dict[str, list[str]] = {}
-        for role in self._axes_and_origin:
+        self._sizes = {}
+        for role in self._setups:
             topic = assembly.topics[role]
             self._topics[topic.name] = topic.empty()
             self._roles.setdefault(topic.name, []).append(role)
+            self._sizes[role] = _sizes(self._adapters[role], topic.messages()[0])
         self._plain: dict[tuple[str, int], PlainImu | None] = {}
         """By topic and number of bytes."""
-        self._sizes = {
-            role: _sizes(self._adapters[role], assembly.topics[role].messages()[0])
-            for role in self._axes_and_origin
-            if self._adapters[role].reads_table
-        }
 
     def read(self, name: str, payload: bytes, log_time_ns: int) -> list[Part]:
         """What the message of a topic says, by role; nothing for a topic that is not used."""
@@ -104,30 +98,15 @@ class MessageReader:
 
     def _part(self, role: str, topic: Topic) -> Part:
         adapter = self._adapters[role]
-        if not adapter.reads_table:
-            groups = topic.messages()
-            block, dropped = rows_of(
-                adapter, topic, self.calibration, *self._axes_and_origin[role]
-            )
-            faults = ", ".join(topic.unsound | dropped)
-            if not groups:
-                raise LogError(faults)
-            return Part(
-                role,
-                int(header_stamps_ns(groups[0], topic.log_times_ns)[0]),
-                block,
-                faults,
-            )
         table = adapter.table(topic)
-        if _sizes(adapter, table.groups[0]) != self._sizes[role]:
+        first = table.groups[0]
+        if _sizes(adapter, first) != self._sizes[role]:
             raise LogError("has arrays of another length than the first messages")
-        block, dropped = rows_of(
-            adapter, table, self.calibration, *self._axes_and_origin[role]
-        )
+        block, dropped = adapter.read(table, self._setups[role])
         faults = ", ".join(topic.unsound | dropped)
-        place = topic.name, table.groups[0].payloads.shape[1]
-        if isinstance(adapter, ImuAdapter) and not faults and place not in self._plain:
-            self._plain[place] = PlainImu.like(adapter, table.groups[0])
+        place = topic.name, first.payloads.shape[1]
+        if role == "imu" and not faults and place not in self._plain:
+            self._plain[place] = PlainImu.like(adapter, first)
         return Part(role, int(table.stamps_ns[0]), block, faults)
 
 

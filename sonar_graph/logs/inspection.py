@@ -52,13 +52,10 @@ from sonar_graph.logs.sonar_images import (
     sonar_frame,
 )
 from sonar_graph.logs.vehicle_setup import (
-    GIVEN,
     PartialCalibration,
     as_calibration,
-    read_calibration,
     read_notes,
     recorded_name,
-    static_frames,
 )
 from sonar_graph.measurements import NS_PER_S, Ints
 
@@ -130,7 +127,7 @@ class LogSummary:
     topics: tuple[TopicSummary, ...]
     roles: tuple[RoleSummary, ...]
     calibration: str
-    """Source of the calibration, or the reason why the one in the log cannot be used."""
+    """Source of the calibration, or the reason why the one in the log cannot be used; empty where `unusable` names it."""
     notes: dict[str, str]
     damage: tuple[str, ...]
     """Lost or unreadable parts; empty for a sound file."""
@@ -259,7 +256,7 @@ def inspect_log(
     if recording.ending:
         damage.insert(len(recording.corrupt), recording.ending)
     choices = choose_each(recording, wanted, config, ROLES)
-    mounted: dict[str, str] = {}
+    calibrated = ""
     try:
         notes = read_notes(recording)
     except SonarGraphError as error:
@@ -277,10 +274,10 @@ def inspect_log(
             given,
             frame,
         )
-        mounted = assembly.mounted
+        calibrated = assembly.source
         left_out, warnings = assembly.survey()
-    except CalibrationError:
-        pass  # `calibration` says so
+    except CalibrationError as error:
+        calibrated = f"unusable: {error}"
     except SonarGraphError as error:
         unusable.append(str(error))
     sonar = None
@@ -301,7 +298,7 @@ def inspect_log(
             RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
             for c in choices.values()
         ),
-        calibration=_calibration_source(recording, mounted, given),
+        calibration=calibrated,
         notes=notes,
         damage=tuple(damage),
         unusable=tuple(unusable),
@@ -375,39 +372,6 @@ def _header_stamps(topic: Topic) -> Ints | None:
             group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
         )
     return stamps_ns
-
-
-def _calibration_source(
-    recording: Recording,
-    mounted: Mapping[str, str],
-    given: Calibration | PartialCalibration | None,
-) -> str:
-    """Source of the calibration, given the frame of each sensor whose mounting is from ``/tf_static``."""
-    if isinstance(given, Calibration):
-        return GIVEN
-    if given is not None:
-        return given.before(_calibration_source(recording, mounted, None))
-    try:
-        recorded = read_calibration(recording)
-        has_frames = bool(static_frames(recording))
-    except SonarGraphError as error:
-        return f"unusable: {error}"
-    of_sensors = ", ".join(
-        name if name == frame else f"{name}: {frame}" for name, frame in mounted.items()
-    )
-    mountings = (
-        f"mountings of /tf_static ({of_sensors})"
-        if mounted
-        else "no sensor's mounting in /tf_static"
-    )
-    if recorded is not None:
-        return f"in the log; {mountings}" if mounted else "in the log"
-    if has_frames:
-        return f"none in the log; defaults with {'the ' if mounted else ''}{mountings}"
-    return (
-        "none in the log and no /tf_static; defaults, with every sensor at base_link: sonar_graph/calibration.py lists "
-        "them with units, comparison.json with the results, and --calibration FILE gives others"
-    )
 
 
 def starting_config(

@@ -135,10 +135,9 @@ def pinned(
         tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))
     for role in ("positions", "truth"):
         if role in assembly.topics and assembly.adapters[role].geodetic is not None:
-            _, origin = assembly.axes_and_origin(role)
             tables[role]["geodetic"] = {
                 **tables[role].get("geodetic", {}),
-                "origin_deg_m": origin,
+                "origin_deg_m": assembly.setup(role).origin,
             }
     return tables
 

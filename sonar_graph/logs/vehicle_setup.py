@@ -49,12 +49,13 @@ OPTIONAL = {name for name, value in Calibration().model_dump().items() if value 
 """Fields of a calibration that may be absent."""
 GIVEN = "given by the caller"
 """Source of a calibration that replaces that of the log."""
+MOUNTING = "mounting"
 MOUNTING_FIELDS = {
-    "imu": "mounting",
-    "dvl": "mounting",
+    "imu": MOUNTING,
+    "dvl": MOUNTING,
     "depth": "port_m",
     "positions": "antenna_m",
-    "sonar": "mounting",
+    "sonar": MOUNTING,
 }
 """Field of each sensor's section that says where the sensor is."""
 

@@ -7,7 +7,7 @@ import pytest
 
 from sonar_graph.live.message_reader import PlainImu
 from sonar_graph.live.zenoh_link import definition_of
-from sonar_graph.logs.adapters import shipped_for
+from sonar_graph.logs.adapters import Setup, shipped_for
 from sonar_graph.logs.cdr import encode, parse_definition
 from sonar_graph.logs.mcap import Keep, Topic
 
@@ -66,7 +66,7 @@ def test_rows_are_those_of_the_adapter_to_the_bit(change):
                 "orientation.w": 0.3,
             },
         )
-        expected, _ = adapter.read(adapter.table(topic_of(payload)))
+        expected, _ = adapter.read(adapter.table(topic_of(payload)), Setup())
         row = form.row(payload)
         for name, column in vars(expected).items():
             assert getattr(row, name).tobytes() == column.tobytes(), name

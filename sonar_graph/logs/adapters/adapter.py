@@ -150,13 +150,13 @@ class Adapter(Section):
     """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
 
     A subclass adds the attributes of its role, names those that hold paths in `PATHS`, and gives the measurements, with
-    the number of rows left out by reason, in ``read(source, setup)``.
+    the number of rows left out by reason, in ``read(table, setup)``.
     """
 
     PATHS: ClassVar[tuple[str, ...]] = ()
     """Attributes with paths that a message must have."""
-    reads_table: ClassVar[bool] = True
-    """False where ``read`` takes the topic, because its messages have lists of different lengths."""
+    LISTS: ClassVar[tuple[str, ...]] = ()
+    """Further paths, whose fields differ in length from message to message."""
     type: str
     """Message type, such as sensor_msgs/msg/Imu."""
     topic: str | None = None
@@ -189,13 +189,14 @@ class Adapter(Section):
         return self.model_validate(values)
 
     def fields(self) -> Iterator[str]:
-        """Paths that a message must have, except for the stamp's."""
+        """Paths that a message must have, except for the stamp's; their fields have the same size in all messages."""
         return field_paths(*(getattr(self, name) for name in self.PATHS))
 
     def missing_in(self, definition: Struct) -> list[str]:
-        """Paths of `fields` that a message type does not have."""
+        """Paths that a message type must have and does not."""
         known = dict(leaf_fields(definition))
-        return [path for path in self.fields() if field_of(path)[0] not in known]
+        paths = (*self.fields(), *self.LISTS)
+        return [path for path in paths if field_of(path)[0] not in known]
 
     def refusal(self, topic: Topic) -> str | None:  # noqa: ARG002  # for subclasses
         """Reason why messages with all fields play no role, which completes "/imu ..."; None: there is none."""

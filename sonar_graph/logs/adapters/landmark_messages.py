@@ -28,13 +28,12 @@ from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     Dropped,
     FieldTable,
+    MessageTable,
     fit_block,
-    header_stamps_ns,
     not_finite,
     share,
 )
 from sonar_graph.logs.cdr import Messages
-from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
     FULL_TURN_RAD,
@@ -66,7 +65,7 @@ class _Rows(NamedTuple):
     """Columns that do not depend on the candidates."""
 
 
-def _joined(topic: Topic, parts: list[_Rows]) -> _Rows:
+def _joined(table: MessageTable, parts: list[_Rows]) -> _Rows:
     """Rows of all layouts in the order of messages, padded to the most candidates with -1 and probability 0."""
     most = max(1, *(part.ids.shape[1] for part in parts))
 
@@ -82,7 +81,7 @@ def _joined(topic: Topic, parts: list[_Rows]) -> _Rows:
         where = (
             f"message {message[np.argmax(is_large)]} has an identity of 2^56 or more"
         )
-        raise topic.error(
+        raise table.topic.error(
             f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false"
         )
     # rows of one stamp keep the order in which they were sent
@@ -100,7 +99,6 @@ def _joined(topic: Topic, parts: list[_Rows]) -> _Rows:
 class DetectionListsAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkDetections``: range, azimuth, covariance and posterior, in flat lists."""
 
-    reads_table = False
     range_scale: LengthScale = 1.0
     """Turns ranges into metres; 0.001 or "mm" from millimetres, a ratio of sound speeds where that is wrong."""
     azimuth_scale: AngleScale = 1.0
@@ -108,14 +106,14 @@ class DetectionListsAdapter(Adapter):
 
     def read(
         self,
-        topic: Topic,
+        table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
     ) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
-        groups = [group for group in topic.messages() if group["range_m"].shape[1]]
+        groups = [group for group in table.groups if group["range_m"].shape[1]]
         if not groups:
             return None, {}
-        rows = _joined(topic, [self._rows(topic, group) for group in groups])
+        rows = _joined(table, [self._rows(table, group) for group in groups])
         ranges, azimuths, covariances, tracks = rows.values
         scales = np.array([self.range_scale, self.azimuth_scale])
         ranges = ranges * self.range_scale
@@ -127,7 +125,7 @@ class DetectionListsAdapter(Adapter):
         measured = (ranges, azimuths, covariances * np.outer(scales, scales))
         return _fit(rows, faults, measured, tracks)
 
-    def _rows(self, topic: Topic, group: Messages) -> _Rows:
+    def _rows(self, table: MessageTable, group: Messages) -> _Rows:
         frames, count = group["range_m"].shape
         ids = group["candidate_ids"]
         sizes = {
@@ -138,7 +136,7 @@ class DetectionListsAdapter(Adapter):
         }
         where = f"message {group.rows[0]} has {count} ranges"
         if any(sizes.values()):
-            raise topic.error(
+            raise table.topic.error(
                 f"{where}, {group['azimuth_rad'].shape[1]} azimuths, {group['covariance'].shape[1]} covariance elements, "
                 f"{ids.shape[1]} identities, {group['id_probability'].shape[1]} probabilities; expected n, n, 4n, kn and kn"
             )
@@ -147,7 +145,7 @@ class DetectionListsAdapter(Adapter):
         # not in old logs
         if "track" in group.layout.columns and group["track"].size:
             if group["track"].shape[1] != count:
-                raise topic.error(
+                raise table.topic.error(
                     f"{where} and {group['track'].shape[1]} tracks; expected as many, or none"
                 )
             tracks = group["track"].astype(np.int64).reshape(total)
@@ -158,16 +156,16 @@ class DetectionListsAdapter(Adapter):
             tracks,
         )
         return _Rows(
-            *_places(topic, group, count),
+            *_places(table, group, count),
             ids.reshape(total, -1),
             group["id_probability"].reshape(total, -1),
             values,
         )
 
 
-def _places(topic: Topic, group: Messages, count: int) -> tuple[Ints, Ints]:
+def _places(table: MessageTable, group: Messages, count: int) -> tuple[Ints, Ints]:
     """Number and stamp of the message of each detection, ``count`` to a message."""
-    stamps_ns = header_stamps_ns(group, topic.log_times_ns)
+    stamps_ns = table.stamps_ns[group.rows]
     return np.repeat(group.rows, count), np.repeat(stamps_ns, count)
 
 
@@ -194,7 +192,13 @@ class DetectionArrayAdapter(Adapter):
     Identities are integers here: a class that is a number stands for itself, others are given in `ids`.
     """
 
-    reads_table = False
+    LISTS = (
+        f"{_CENTRE}.x",
+        _SCORE,
+        _CLASS,
+        f"{_RESULT}.pose.position.x",
+        f"{_RESULT}.covariance",
+    )
     position: Literal["results", "bbox"] = "results"
     """Source of the position: a detection's first result, with its covariance, or the centre of its box, without."""
     ids: Mapping[str, int] = {}
@@ -202,21 +206,21 @@ class DetectionArrayAdapter(Adapter):
 
     def read(
         self,
-        topic: Topic,
+        table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
     ) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection that has a result; the scores are the posterior, in the order of the results."""
         groups = [
-            group for group in topic.messages() if group.lengths("detections.results")
+            group for group in table.groups if group.lengths("detections.results")
         ]
         if not groups:
             return None, {}
-        rows = _joined(topic, [self._rows(topic, group) for group in groups])
+        rows = _joined(table, [self._rows(table, group) for group in groups])
         scores = rows.probabilities
         # scores that are no probabilities would be taken for certainty
         worst = float(np.nanmax(scores.sum(axis=1), initial=0.0))
         if worst > 1 + ROUNDING or (scores < 0).any():
-            raise topic.error(
+            raise table.topic.error(
                 f"scores of one detection add up to {worst:g}; the posterior over identities must be between 0 and 1 "
                 f"in sum: normalise the scores where the log is made"
             )
@@ -232,7 +236,7 @@ class DetectionArrayAdapter(Adapter):
         }
         return _fit(rows, faults, measured, np.full(len(ranges), NO_TRACK))
 
-    def _rows(self, topic: Topic, group: Messages) -> _Rows:
+    def _rows(self, table: MessageTable, group: Messages) -> _Rows:
         """Every detection, with the results of each at its own places; NaN: unknown."""
         counts = np.array(group.lengths("detections.results"), np.int64)
         begins = np.cumsum(counts) - counts
@@ -246,7 +250,7 @@ class DetectionArrayAdapter(Adapter):
         ids = np.full((n, m, k), -1, np.int64)
         names = group.strings(_CLASS)
         ids[:, detection, result] = [
-            [self._identity(topic, name) for name in message] for message in names
+            [self._identity(table, name) for name in message] for message in names
         ]
         positions = np.full((n, m, 3), np.nan)
         covariances = np.full((n, m, 3, 3), np.nan)
@@ -261,24 +265,19 @@ class DetectionArrayAdapter(Adapter):
             known = pose.any(axis=(2, 3)) & (pose[..., 0, 0] >= 0)
             covariances[:, some] = np.where(known[..., None, None], pose, np.nan)
         return _Rows(
-            *_places(topic, group, m),
+            *_places(table, group, m),
             ids.reshape(-1, k),
             scores.reshape(-1, k),
             (positions.reshape(-1, 3), covariances.reshape(-1, 3, 3)),
         )
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        pose = (f"{_RESULT}.pose.position.x", f"{_RESULT}.covariance")
-        return iter((f"{_CENTRE}.x", _SCORE, _CLASS, *pose))
-
-    def _identity(self, topic: Topic, name: str) -> int:
+    def _identity(self, table: MessageTable, name: str) -> int:
         try:
             identity = self.ids[name] if name in self.ids else int(name)
             # beyond int64 is refused as too large as well
             return max(-1, min(identity, FIRST_TOO_LARGE_ID))
         except ValueError:
-            raise topic.error(
+            raise table.topic.error(
                 f"class {name!r} is no integer identity; say in a log configuration which it is: [detections] ids = "
                 f'{{"{name}" = 1}}, or do not use them: use = false'
             ) from None
@@ -308,26 +307,21 @@ def range_and_azimuth(
 class LandmarkMapAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkMap``: true positions of landmarks."""
 
-    reads_table = False
-
     def read(
         self,
-        topic: Topic,
+        table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
     ) -> tuple[LandmarkMap | None, Dropped]:
-        """The last sound map of a topic; None where none is."""
-        groups = topic.messages()
-        if not groups:
-            return None, {}
+        """The last map of a topic."""
         # a map is latched: the newest counts
-        last = max(groups, key=lambda group: int(group.rows[-1]))
+        last = max(table.groups, key=lambda group: int(group.rows[-1]))
         ids, position, covariance = (
             last[name][-1] for name in ("ids", "position", "covariance")
         )
         count = len(ids)
         different = len(np.unique(ids))
         if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
-            raise topic.error(
+            raise table.topic.error(
                 f"{count} ids ({different} different), {len(position)} position and {len(covariance)} covariance "
                 f"elements; expected n different, 3n and 9n"
             )

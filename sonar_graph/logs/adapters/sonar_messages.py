@@ -66,7 +66,6 @@ class SonarAdapter(Adapter):
         "row_bytes",
         "directions",
     )
-    reads_table = False
     data: str
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"
