@@ -2,7 +2,7 @@
 
 # fmt: off
 from sonar_graph.logs.adapters.adapter import (
-    ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES, Adapter, Setup, axes_matrix, did_you_mean, leaf_fields, turned,
+    ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES, Adapter, Setup, axes_matrix, did_you_mean, leaf_fields, turn,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
 from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
@@ -27,5 +27,5 @@ __all__ = [
     "SHIPPED", "SPEEDS", "Setup", "Shipped", "SonarAdapter", "TIMES", "TRUTH_WORDS", "Z_DOWN_TYPES", "as_log_config",
     "axes_matrix", "body_to_ros", "changes_text", "detection_warnings", "did_you_mean", "east_north_up", "field_of",
     "header_stamps_ns", "leaf_fields", "plain_lines", "read_log_config", "read_toml", "range_and_azimuth", "samples_of_rows",
-    "shipped_for", "shipped_like", "table_text", "turned",
+    "shipped_for", "shipped_like", "table_text", "turn",
 ]
