@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
+from sonar_graph.live.live_messages import gather
 from sonar_graph.logs import Assembly
 from sonar_graph.logs.adapters import (
     LARGEST,
@@ -25,8 +26,6 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Imu, Ints
-
-ONE: Ints = np.zeros(1, np.int64)
 
 
 class Part(NamedTuple):
@@ -73,9 +72,7 @@ class MessageReader:
                 parts.append(Part(role, int(row.stamps_ns[0]), row, ""))
                 continue
             topic = self._topics[name].empty()
-            topic.gather(
-                payload, ONE, np.array([len(payload)]), np.array([log_time_ns])
-            )
+            gather(topic, payload, log_time_ns)
             try:
                 parts.append(self._part(role, topic))
             except Exception as error:  # whatever a sender sends
