@@ -134,11 +134,11 @@ def pinned(
         # single messages must be read as all of the log are
         tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))
     for role in ("positions", "truth"):
-        if role in assembly.topics and assembly.adapters[role].geodetic is not None:
-            _, origin = assembly.axes_and_origin(role)
+        is_used = choices[role].topic is not None
+        if is_used and assembly.adapters[role].geodetic is not None:
             tables[role]["geodetic"] = {
                 **tables[role].get("geodetic", {}),
-                "origin_deg_m": origin,
+                "origin_deg_m": assembly.setup(role).origin,
             }
     return tables
 
