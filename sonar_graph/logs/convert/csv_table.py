@@ -300,11 +300,11 @@ class CsvTable(FieldTable):
             path: file.index(path, f"[{role}] {key}") for path, key in keys.items()
         }
         at = [] if stamp is None else [file.index(stamp, f"[{role}] stamp")]
-        self._lines, cells = file.columns([*wanted.values(), *at])
+        self.lines, cells = file.columns([*wanted.values(), *at])
         self._cells = dict(zip(wanted, cells, strict=False))
         # converted when an adapter reads them
         self._values: dict[str, Floats] = {}
-        self.stamps_ns = np.zeros(len(self._lines), np.int64)
+        self.stamps_ns = np.zeros(len(self.lines), np.int64)
         self.has_dates = False
         if stamp is not None:
             offset_ns = round(offset_s * NS_PER_S)
@@ -322,7 +322,7 @@ class CsvTable(FieldTable):
                 is_comma = "," in plain[row]
                 decimal = '; decimal = "," where numbers are written so' * is_comma
                 raise LogError(
-                    f"{self.file.path}, line {self._lines[row]}: column {path}: "
+                    f"{self.file.path}, line {self.lines[row]}: column {path}: "
                     f"{cells[row]!r} is no number; expected one, or nothing where it was "
                     f"not measured{decimal}"
                 ) from None
@@ -348,7 +348,7 @@ class CsvTable(FieldTable):
                     stamps[row] = int((number * unit_ns).to_integral_value())
             except (InvalidOperation, ValueError, OverflowError):
                 raise LogError(
-                    f"{self.file.path}, line {self._lines[row]}: column {name}: {cell!r} "
+                    f"{self.file.path}, line {self.lines[row]}: column {name}: {cell!r} "
                     "is no time; expected a number (unit: stamp_unit_s) or a date such "
                     "as 2026-05-01T12:30:00.25Z"
                 ) from None

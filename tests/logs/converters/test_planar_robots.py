@@ -443,9 +443,8 @@ def test_comments_and_blank_lines_are_passed_over(tmp_path):
     path = tmp_path / "t.dat"
     path.write_text("# time value\n\n  1.5 \t -2\n # again\n2.5 3e1\n")
     table = read_table(path, ("time", "value"))
-    assert table.first == ["1.5", "2.5"]
     assert np.array_equal(table.values, [[1.5, -2.0], [2.5, 30.0]])
-    assert table.stamps_ns().tolist() == [1_500_000_000, 2_500_000_000]
+    assert table.stamps_ns.tolist() == [1_500_000_000, 2_500_000_000]
 
 
 STEP, EDGE = f"STEP image 0 0 0 {COV} 1e-4\n", "ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n"
@@ -514,18 +513,26 @@ def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
         (
             "table",
             {"bad.dat": "\xff\xfe\x00\x81"},
-            ("bad.dat", "cannot be read as text"),
+            ("bad.dat", "no text in utf-8"),
         ),
-        ("table", {"bad.dat": ""}, ("bad.dat", "holds no data", "time, value")),
-        ("table", {"bad.dat": "# only a comment\n"}, ("bad.dat", "holds no data")),
+        ("table", {"bad.dat": ""}, ("bad.dat", "no line with numbers", "time, value")),
+        (
+            "table",
+            {"bad.dat": "# only a comment\n"},
+            ("bad.dat", "no line with numbers"),
+        ),
         (
             "table",
             {"bad.dat": "1 2\n\n1\n"},
-            ("bad.dat", "line 3", "1 fields", "2 numbers: time, value"),
+            ("bad.dat", "line 3", "1 cells; expected 2", "time, value"),
         ),
         ("table", {"bad.dat": "1 2\n1 two\n"}, ("bad.dat", "line 2", "two")),
-        ("table", {"bad.dat": "1 nan\n"}, ("bad.dat", "line 1", "not finite")),
-        ("dlr", {"map.circles": ""}, ("map.circles", "holds no data", "STEP")),
+        (
+            "table",
+            {"bad.dat": "1 nan\n"},
+            ("bad.dat", "line 1", "value is no finite number"),
+        ),
+        ("dlr", {"map.circles": ""}, ("map.circles", "holds no STEP line")),
         (
             "dlr",
             {"map.circles": "#\nLANDMARK_C 0 1 1 1 0 1 4"},
@@ -534,12 +541,12 @@ def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
         (
             "dlr",
             {"map.circles": "#\nSTEP image 1 2"},
-            ("line 2", "2 fields", "9 numbers"),
+            ("line 2", "2 fields", "9 finite numbers"),
         ),
         (
             "dlr",
             {"map.circles": STEP + "LANDMARK_C 0 1 1 1 0 1"},
-            ("line 2", "no landmark ID"),
+            ("line 2", "no landmark IDs"),
         ),
         (
             "dlr",
@@ -553,12 +560,12 @@ def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
             {},
             ("map.circles", "STEP", "give the folder that does, or the file itself"),
         ),
-        ("park", {"park.txt": ""}, ("park.txt", "holds no data", "ODOMETRY")),
+        ("park", {"park.txt": ""}, ("park.txt", "holds no ODOMETRY line")),
         ("park", {"park.txt": EDGE + "EDGE 1 2"}, ("park.txt", "line 2", "EDGE")),
         (
             "park",
             {"park.txt": EDGE + "ODOMETRY 1 2 1 0"},
-            ("line 2", "4 fields", "11 numbers"),
+            ("line 2", "4 fields", "11 finite numbers"),
         ),
         (
             "park",
@@ -578,18 +585,22 @@ def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
         ),
         ("akit", {GT: None}, ("GT_trajectory2.csv", "Longitude")),
         ("akit", {GT: "h\n0,1,0.5,0,0,0,0,0,0,0\n"}, ("fewer than two rows",)),
-        ("akit 5", {}, ("no trajectory 5", "it has 2")),
-        ("akit inside", {}, ("holds no TrajectoryN",)),
-        ("akit absent", {}, ("absent", "not a folder")),
+        ("akit 5", {}, ("Trajectory5: does not exist", "has Trajectory2")),
+        ("akit inside", {}, ("no such run", "holds TrajectoryN")),
+        ("akit absent", {}, ("absent", "does not exist")),
         (
             "mrclam",
             {ODOMETRY: "1 0.1 0\n2 0.1\n"},
             ("Robot1_Odometry.dat, line 2", "angular velocity"),
         ),
         *(("mrclam", {name: None}, (name,)) for name in (SEEN, BARCODES, MARKS)),
-        ("mrclam 7", {}, ("no robot 7", "1, 3")),
+        (
+            "mrclam 7",
+            {},
+            ("Robot7_Odometry.dat: does not exist", "Robot1_Odometry.dat, Robot3"),
+        ),
         ("mrclam inside", {}, ("RobotN_Odometry.dat", "Barcodes.dat")),
-        ("mrclam absent", {}, ("absent", "not a folder")),
+        ("mrclam absent", {}, ("absent", "does not exist")),
     ],
 )
 def test_a_bad_table_or_data_set_is_refused_by_file_and_line(
