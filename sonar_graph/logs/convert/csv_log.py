@@ -318,7 +318,7 @@ def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
     if not isinstance(dvl.adapter, DvlAdapter) or dvl.adapter.velocity is None:
         return
     velocity = table.beside(dvl.adapter.velocity)
-    for name in table.file.layout.names:
+    for name in table.file.names:
         if name in dvl.keys or not re.search(VALIDITY, name.lower()):
             continue
         (marks,) = table.file.numbers(name)
