@@ -3,11 +3,9 @@
 import json
 import os
 import re
-import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -34,7 +32,6 @@ from sonar_graph.logs.viewer_messages import (
     Scene,
     ellipsoids,
     foxglove_layout,
-    landmark_cloud,
     landmark_markers,
     picture_messages,
     position_ellipsoids,
@@ -99,13 +96,9 @@ def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_an
         "smoothed",
         "path",
         "landmarks",
-        "landmark_cloud",
     )
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
-    expected |= {
-        f"/ground_truth/{kind}"
-        for kind in ("odometry", "path", "landmarks", "landmark_cloud")
-    }
+    expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks")}
     assert set(result.messages) == expected | {"/tf", "/tf_static"}
     (array,) = result.messages["/isam2/landmarks"]
     spheres = [m for m in array.markers if m.type == 2]
@@ -435,61 +428,7 @@ def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(
         assert abs(np.mean(np.sum(within**2, axis=1) < 1) - 0.95) < 0.005
 
 
-# --- cloud and pictures ----------------------------------------------------------------------------------------------
-
-FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
-"""By sensor_msgs/PointField."""
-
-
-def test_a_reader_of_the_fields_finds_position_identity_and_covariance(
-    tmp_path: Path,
-) -> None:
-    ids, positions = [3, 2**40 + 1], np.array([[1.5, -2.25, 0.1], [4000.0, 5.0, -6.0]])
-    covariances = np.array(
-        [[[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 3]], np.full((3, 3), np.nan)]
-    )
-    (cloud,) = drawn(
-        tmp_path,
-        landmark_cloud("/cloud", LandmarkMap(np.array(ids), positions, covariances), 5),
-    )
-    places = {
-        f.name: (f.offset, f.offset + struct.calcsize(FORMATS[f.datatype]))
-        for f in cloud.fields
-    }
-    first, second = (
-        {
-            f.name: struct.unpack_from(
-                "<" + FORMATS[f.datatype], bytes(cloud.data), start + f.offset
-            )[0]
-            for f in cloud.fields
-        }
-        for start in (0, cloud.point_step)
-    )
-    upper = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-    assert list(first.values()) == [
-        1.5,
-        -2.25,
-        np.float32(0.1),
-        3,
-        1,
-        0.1,
-        0.2,
-        2,
-        0.3,
-        3,
-    ]
-    assert list(second.values())[:4] == [4000, 5, -6, ids[1]]
-    assert all(np.isnan(second[name]) for name in upper)
-    assert list(first) == ["x", "y", "z", "id", *upper]
-    assert {f.datatype for f in cloud.fields if f.name in "xyz"} == {7}, (
-        "RViz reads float32 only"
-    )
-    # the rules of the type
-    assert (cloud.height, cloud.width, cloud.is_bigendian) == (1, 2, False)
-    assert cloud.row_step == cloud.width * cloud.point_step == len(cloud.data)
-    assert all(end <= start for (_, end), (start, _) in pairwise(places.values()))
-    assert places["cov_zz"][1] <= cloud.point_step
-    assert {f.count for f in cloud.fields} == {1}
+# --- pictures ----------------------------------------------------------------------------------------------
 
 
 def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) -> None:
@@ -529,11 +468,11 @@ def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) 
 
 # --- layouts ---------------------------------------------------------------------------------------------------------
 
-SAME_NAME = ("Path", "Odometry", "MarkerArray", "PointCloud2")
+SAME_NAME = ("Path", "Odometry", "MarkerArray")
 DRAWN_BY_RVIZ = {f"rviz_default_plugins/{kind}": kind for kind in SAME_NAME}
 DRAWN_BY_RVIZ["rviz_default_plugins/PoseWithCovariance"] = "PoseWithCovarianceStamped"
 """By plugins_description.xml of rviz_default_plugins."""
-DRAWN_BY_FOXGLOVE = {"Path", "PoseWithCovarianceStamped", "MarkerArray", "PointCloud2"}
+DRAWN_BY_FOXGLOVE = {"Path", "PoseWithCovarianceStamped", "MarkerArray"}
 """Of the types that we write; nav_msgs/Odometry is not drawn by Lichtblick 1.28."""
 COLOUR = re.compile(r"#[0-9a-f]{6}([0-9a-f]{2})?")
 
@@ -614,13 +553,9 @@ def test_an_estimator_has_one_colour_everywhere(result: Any) -> None:
         colour = "#" + "".join(
             f"{round(255 * part):02x}" for part in (marker.r, marker.g, marker.b)
         )
-        of_layers = [
-            topics[f"/{name}/path"]["gradient"][0],
-            topics[f"/{name}/landmark_cloud"]["flatColor"],
-        ]
-        assert all(
-            COLOUR.fullmatch(layer) and layer[:7] == colour for layer in of_layers
-        )
+        layer = topics[f"/{name}/path"]["gradient"][0]
+        assert COLOUR.fullmatch(layer)
+        assert layer[:7] == colour
         seen.add(colour)
     assert len(seen) == 3
 
@@ -714,7 +649,6 @@ def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_trut
     topics = {
         "/ground_truth/path",
         "/ground_truth/landmarks",
-        "/ground_truth/landmark_cloud",
     }
     assert set(layout["configById"]["3D!result"]["topics"]) == topics
     children = {
