@@ -73,30 +73,18 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
     dropped = dropped_in(recording)
     newest_ns = read_notes(recording).get(NEWEST_FRAMES, "")
     for topic in recording.topics.values():
-        if (
-            newest_ns.isdecimal()
-            and topic.name.endswith("tf_static")
-            and short_name(topic.type_name) == short_name(TF)
-        ):
-            topic.leave_out(topic.log_times_ns[topic.log_times_ns > int(newest_ns)])
-    for name in {name for name, _ in dropped}:
-        if name in recording.topics:
-            # a message is named by topic and log time
-            times_ns = [log_time_ns for topic, log_time_ns in dropped if topic == name]
-            recording.topics[name].leave_out(np.array(times_ns, np.int64))
+        times_ns = topic.log_times_ns
+        # a message is named by topic and log time
+        gone_ns = [time_ns for name, time_ns in dropped if name == topic.name]
+        is_frames = short_name(topic.type_name) == short_name(TF) and topic.is_latched
+        if newest_ns.isdecimal() and is_frames:
+            gone_ns += times_ns[times_ns > int(newest_ns)].tolist()
+        if gone_ns:
+            topic.leave_out(np.array(gone_ns, np.int64))
     counts = Counter((name, reason) for (name, _), reason in dropped.items())
-    texts = [
-        f"{count} of {name}: {reason}"
-        for (name, reason), count in sorted(counts.items())
-    ]
-    return (
-        {
-            "log.live": "not given to the estimator live, so left out: "
-            + "; ".join(texts)
-        }
-        if texts
-        else {}
-    )
+    texts = [f"{n} of {name}: {why}" for (name, why), n in sorted(counts.items())]
+    note = f"not given to the estimator live, so left out: {'; '.join(texts)}"
+    return {"log.live": note} if texts else {}
 
 
 def recorded_config(recording: Recording) -> LogConfig | None:

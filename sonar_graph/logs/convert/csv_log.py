@@ -93,11 +93,9 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
         elif key in SHARED:
             shared[key] = value
         else:
-            place = "it belongs into the table of a role"
-            if key in CSV_ADAPTERS:
-                place = f"expected a table, [{key}]"
             raise LogError(
-                f"{source}: {key}: stands before the first table and so for all of them; {place}"
+                f"{source}: {key}: stands before the first table and so for all of them; a role is a table such as "
+                "[imu], and other keys belong into one"
             )
     for role in tables:
         if role not in CSV_ADAPTERS:
@@ -127,11 +125,13 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
         # the form of the file, a setting of the adapter, or false: the vehicle does not have it
         if key in CsvForm.model_fields:
             form[key] = value
-        elif value is not False or isinstance(getattr(defaults, key, None), bool):
+        # an unknown key is kept for the error that names it
+        elif (
+            value is not False
+            or field is None
+            or isinstance(getattr(defaults, key, None), bool)
+        ):
             stated[key] = _as_names(kind, key, value)
-        elif field is None:
-            # kept for the error that names the unknown key
-            stated[key] = value
         elif field.is_required():
             # a sensor without it, such as an IMU without accelerometers
             stated[key] = None
@@ -270,7 +270,10 @@ def _measurements(
         if role == "dvl":
             warnings += _unused_validity(roles[role], table)
         doubts += [f"{role}: {text}" for text in warnings]
-        settings = "; ".join(_settings(roles[role]))
+        stated = adapter.model_dump(
+            include=adapter.model_fields_set - {"type"}, exclude_none=True
+        )
+        settings = "; ".join(plain_lines(stated))
         notes[f"csv.{role}"] = f"{table.file.path.name}: {settings}"
     notes |= {"csv.left_out": "; ".join(left_out)} if left_out else {}
     notes |= {"csv.warnings": "; ".join(doubts)} if doubts else {}
@@ -329,16 +332,6 @@ def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
                 f"column {name} is {1 - mark} in {invalid} of {len(marks)} rows and not used: "
                 f"`valid_where = {{{toml_key(name)} = {mark}}}` under [dvl] leaves them out"
             )
-
-
-def _settings(one: CsvRole) -> list[str]:
-    """Settings of a role other than the defaults, for the notes."""
-    model = type(one.adapter)
-    base = model.model_construct(type="csv", stamp=STAMP)
-    values = {key: getattr(one.adapter, key) for key in model.model_fields}
-    return plain_lines(
-        {k: value for k, value in values.items() if value != getattr(base, k, None)}
-    )
 
 
 def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
