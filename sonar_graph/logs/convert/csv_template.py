@@ -563,7 +563,7 @@ def _stamps(
     return lines
 
 
-def _column(given: str, names: tuple[str, ...]) -> _Column:
+def _column(given: str, names: list[str]) -> _Column:
     """Column with its unit, from ``[...]``, ``(...)`` or the end of its name."""
     bare = plain_name(given)
     unit = given[len(bare) :].strip(" []()").lower() or None
