@@ -6,7 +6,7 @@ line with a number: its own lines, or else the last comment, where that names as
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from datetime import UTC, date, datetime, timedelta
 from decimal import Decimal, InvalidOperation
@@ -181,8 +181,8 @@ class CsvFile:
             for k, name in enumerate(names or [""] * count, 1)
         ]
 
-    def index(self, name: str, key: str) -> int:
-        """Place of a column by its name or its number from 1; a LogError that names the ``key`` and those there are."""
+    def index(self, name: str, use: str) -> int:
+        """Place of a column by its name or its number from 1; a LogError that names its ``use`` and those there are."""
         names = self.names
         # the whole name first: two columns may differ in their units alone
         for known in (names, [plain_name(other) for other in names]):
@@ -194,7 +194,7 @@ class CsvFile:
         rest = len(names) - _MOST_NAMED
         more = f" and {rest} more" if rest > 0 else ""
         raise self._fault(
-            f"has no column {name!r} ({key}); {did_you_mean(name, names, '{!r}')}it has "
+            f"has no column {name!r} ({use}); {did_you_mean(name, names, '{!r}')}it has "
             f"{', '.join(names[:_MOST_NAMED])}{more}, by name or numbered from 1"
         )
 
@@ -244,18 +244,16 @@ class CsvTable(FieldTable):
         self,
         file: CsvFile,
         role: str,
-        keys: dict[str, str],
+        paths: Iterable[str],
         stamp: str | None,
         unit_s: float = 1.0,
         offset_s: float = 0.0,
     ) -> None:
-        """``keys``: key of the configuration by column; ``stamp``: None where rows have no time."""
+        """``paths``: columns; ``stamp``: that of the time, None where rows have none."""
         self.file = file
         self.source = file.path.name
         self._role = role
-        wanted = {
-            path: file.index(path, f"[{role}] {key}") for path, key in keys.items()
-        }
+        wanted = {path: file.index(path, f"[{role}]") for path in paths}
         at = [] if stamp is None else [file.index(stamp, f"[{role}] stamp")]
         self.lines, cells = file.columns([*wanted.values(), *at])
         self._cells = dict(zip(wanted, cells, strict=False))

@@ -33,8 +33,8 @@ from sonar_graph.logs.convert.csv_evidence import (
     UNITS,
     VALIDITY,
     is_absent,
+    marked_valid,
     time_units,
-    valid_mark,
 )
 from sonar_graph.logs.convert.csv_log import table_files
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, is_date, plain_name
@@ -336,21 +336,14 @@ class _Table:
 
     def _validity(self, velocity: "_Match") -> list[str]:
         """Line that leaves out invalid rows; in use where the valid mark is known."""
-        marks = [
-            column
-            for word in VALIDITY.split("|")
-            for column in self.columns
-            if word in column.name and column not in velocity.chosen
-        ]
-        for column in marks:
-            mark = valid_mark(
-                column.name, self.values([column])[:, 0], self.values(velocity.chosen)
-            )
-            if mark is not None:
-                return [f"valid_where = {{{toml_value(column.given)} = {mark}}}"]
+        names = [c.given for c in self.columns if c not in velocity.chosen]
+        values = self.values(velocity.chosen)
+        for name, mark, _ in marked_valid(self.file, names, values):
+            return [f"valid_where = {{{toml_value(name)} = {mark}}}"]
+        unclear = [n for n in names if any(word in n.lower() for word in VALIDITY)]
         return [
-            f"# valid_where = {{{toml_value(column.given)} = 1}}  # which value is valid?"
-            for column in marks[:1]
+            f"# valid_where = {{{toml_value(name)} = 1}}  # which value is valid?"
+            for name in unclear[:1]
         ]
 
 

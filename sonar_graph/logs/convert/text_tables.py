@@ -28,7 +28,7 @@ def read_table(
     """
     try:
         file = CsvFile(path, CsvForm(columns=columns, delimiter=delimiter))
-        table = CsvTable(file, path.stem, {name: name for name in columns}, columns[0])
+        table = CsvTable(file, path.stem, columns, columns[0])
         values = table.beside(columns)
     except LogError as error:
         raise DatasetError(f"{error}; expected rows of {', '.join(columns)}") from error
