@@ -4,7 +4,6 @@ import re
 import struct
 import tracemalloc
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta, timezone
 from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
@@ -336,18 +335,6 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
         assert recording.corrupt or recording.ending
 
 
-def test_a_chunk_before_a_damaged_record_is_whole_also_without_summary(
-    path: Path,
-) -> None:
-    written = write(path)
-    first = chunk_indexes(path)[0]
-    path.write_bytes(path.read_bytes()[: chunk_indexes(path)[5].chunk_start_offset])
-    flip(path, chunk_end(first), 0x40)  # the opcode of its message index
-    found = read(path)
-    assert found == written[: len(found)]
-    assert "no valid record after a whole chunk" in scan_all(path).corrupt[0]
-
-
 def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
     path: Path,
 ) -> None:
@@ -593,19 +580,6 @@ def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -
         scan_all(path, TimeWindow(Instant.parse("1000")))
 
 
-def test_a_window_is_the_same_without_summary(path: Path) -> None:
-    written = write(path)
-    for kept in (path.stat().st_size, chunk_indexes(path)[-1].chunk_start_offset):
-        path.write_bytes(path.read_bytes()[:kept])
-        recording = scan_all(
-            path, TimeWindow(Instant.parse("100e-9"), Instant.parse("150e-9"))
-        )
-        assert entries(recording.topics["/bytes"]) == [
-            entry for entry in written if 1100 <= entry[0] < 1150
-        ]
-        assert (recording.skipped_chunks > 0) == (recording.ending is None)
-
-
 def test_a_summary_without_crc_is_not_used_to_skip(path: Path) -> None:
     """The index of a chunk with /a has only /b in it."""
     write_apart(path)
@@ -626,18 +600,6 @@ def test_a_summary_without_crc_is_not_used_to_skip(path: Path) -> None:
 
 
 BEGINNING_NS = 1_700_000_000_000_000_001
-
-
-@given(
-    st.datetimes(min_value=datetime(1971, 1, 1), max_value=datetime(2200, 1, 1)),
-    st.integers(-12, 14),
-)
-def test_a_date_is_absolute_in_its_zone(when: datetime, hours: int) -> None:
-    zoned = when.replace(tzinfo=timezone(timedelta(hours=hours)))
-    expected_us = (zoned - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(
-        microseconds=1
-    )
-    assert Instant.parse(zoned.isoformat()).resolve(BEGINNING_NS) == expected_us * 1000
 
 
 @pytest.mark.parametrize("text", ["-1", "nan", "inf", "x", "", "12:30", "1e30"])

@@ -1,10 +1,7 @@
 """Results, their messages and layouts for viewers, as other libraries decode them."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -291,48 +288,7 @@ def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(
     ]
 
 
-def test_the_command_of_evo_reads_every_trajectory(result, tmp_path):
-    kinds = ("odometry", "pose", "smoothed")
-    topics = [f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in kinds]
-    command = [
-        Path(sys.executable).with_name("evo_traj"),
-        "mcap",
-        result.path.name,
-        *topics,
-    ]
-    home = {**os.environ, "HOME": str(tmp_path)}
-    done = subprocess.run(
-        command,
-        cwd=result.path.parent,
-        capture_output=True,
-        text=True,
-        env=home,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert re.findall(r"name:\s+(\S+)", done.stdout) == topics
-    assert re.findall(r"infos:\s+(\d+) poses, ([\d.]+)m", done.stdout) == [
-        ("100", "99.000")
-    ] * len(topics)
-
-
 # --- ellipsoids -----------------------------------------------------------------------------------------------------
-
-
-@given(st.integers(0, 10_000))
-def test_points_on_the_drawn_ellipsoid_have_the_same_mahalanobis_distance(
-    seed: int,
-) -> None:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(1, 3, 3)) + 2 * np.eye(3)
-    covariances = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
-    diameters, quaternions = ellipsoids(covariances)
-    sphere = rng.normal(size=(50, 3))
-    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    points = Rotation.from_quat(quaternions[0]).apply(sphere * diameters[0] / 2)
-    squared = np.einsum("ni,ij,nj->n", points, np.linalg.inv(covariances[0]), points)
-    # chi-square table: 3 degrees of freedom, 0.95
-    np.testing.assert_allclose(squared, 7.814727903251179)
 
 
 def test_unknown_covariances_are_small_spheres_and_landmarks_known_exactly_can_still_be_seen() -> (
@@ -627,13 +583,6 @@ def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(
     }
     assert heights
     assert all(0.01 < height_m / camera["distance"] < 0.05 for height_m in heights)
-
-
-def test_a_grid_has_few_cells_and_reaches_over_the_scene() -> None:
-    for size_m in (1.0, 9.9, 10.0, 320.0, 4000.0):
-        scene = Scene((0, 0, 0), size_m)
-        assert 2 <= scene.cells <= 12
-        assert scene.cells * scene.cell_m >= size_m
 
 
 def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_truth_is_left(
