@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Chunk
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
@@ -12,6 +13,7 @@ from sonar_graph.live.live_messages import recorded_messages
 from sonar_graph.logs import inspect_log, read_log, write_amended, write_log
 from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, log_parts, stream
 from sonar_graph.logs.mcap.bag_folder import earlier_parts
+from sonar_graph.logs.mcap.chunks import unpack_beginning
 from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.testing import small_world
 
@@ -242,3 +244,9 @@ def test_a_file_before_is_a_part_where_it_ends_as_the_next_begins(
             writer.finish()
     found = earlier_parts(tmp_path / "dive_1.mcap")
     assert [path.name for path in found] == ["dive_0.mcap"] * is_part
+
+
+def test_a_chunk_that_is_cut_off_in_its_first_record_has_none() -> None:
+    data = bytes([0]) + (100).to_bytes(8, "little") + b"cut off"
+    chunk = Chunk("", data, 0, 0, 0, len(data))
+    assert unpack_beginning(chunk) == b""

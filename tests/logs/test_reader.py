@@ -335,6 +335,18 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
         assert recording.corrupt or recording.ending
 
 
+def test_a_chunk_before_a_damaged_record_is_whole_also_without_summary(
+    path: Path,
+) -> None:
+    written = write(path)
+    first = chunk_indexes(path)[0]
+    path.write_bytes(path.read_bytes()[: chunk_indexes(path)[5].chunk_start_offset])
+    flip(path, chunk_end(first), 0x40)  # the opcode of its message index
+    found = read(path)
+    assert found == written[: len(found)]
+    assert "no valid record after a whole chunk" in scan_all(path).corrupt[0]
+
+
 def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
     path: Path,
 ) -> None:
@@ -607,6 +619,8 @@ def test_a_number_is_seconds_from_the_beginning_a_date_without_a_zone_in_utc_and
     text: str,
 ) -> None:
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
+    zoned = Instant.parse("1970-01-02T01:00:01.5+01:00")
+    assert zoned.resolve(BEGINNING_NS) == 86_401_500_000_000
     assert Instant.parse("1.5").resolve(BEGINNING_NS) == BEGINNING_NS + 1_500_000_000
     assert Instant.parse("1700000000").resolve(0) == 1_700_000_000 * 10**9
     with pytest.raises(

@@ -247,7 +247,8 @@ def test_units_and_axes_of_a_foreign_vehicle_are_turned_into_ours(tmp_path):
     ("unit", "number"),
     [("s", "1893456000.123456789"), ("ms", "1893456000123.456789"), ("us", "1893456000123456.789"),
      ("ns", "1893456000123456789"), ("s", "2030-01-01T00:00:00.123456789Z"),
-     ("s", "2030-01-01 01:00:00.123456789+01:00")],
+     ("s", "2030-01-01 01:00:00.123456789+01:00"),
+     ("s", "31.12.2029 23:00:00,123456789 -01:00"), ("s", "31-Dec-2029 23:00:00.123456789-01:00")],
 )  # fmt: skip
 def test_stamps_of_every_unit_keep_their_nanoseconds(tmp_path, unit, number):
     for name in ("imu", "dvl"):

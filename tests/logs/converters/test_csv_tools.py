@@ -269,6 +269,9 @@ def test_an_imu_that_may_be_of_1_hz_or_of_1_khz_is_asked_about(folder, tmp_path)
         guessed(folder, tmp_path)
     stated = guessed(folder, tmp_path, 'stamp_unit_s = "s"\n' + text)
     assert stated.duration_s == pytest.approx(ROWS, abs=20)
+    d.s += EPOCH_S
+    plain(folder, d, "imu", "dvl", "depth")
+    assert "which unit?" not in template(folder)[0]
 
 
 def test_depths_in_another_unit_of_time_are_refused_where_nothing_states_it(folder):
