@@ -38,8 +38,8 @@ from sonar_graph.evaluation import (
 from sonar_graph.files import LOCK, MANIFEST, READY, Tell, serve
 from sonar_graph.sequence import Sequence
 
+# sequences kept in memory, since estimators of one log mostly follow each other; one is that of the warm-up
 KEPT_SEQUENCES = 3
-"""Sequences kept in memory, since estimators of one log mostly follow each other; one is that of the warm-up."""
 WARM_UP_LOG = ("basin", {"duration_s": 120.0, "laps": 1, "wrong_id_rate": 0.1})
 TWO_DIMENSIONS = 2
 LOG = logging.getLogger(__name__)

@@ -38,11 +38,11 @@ PROTOCOLS = {
 HIGHER_IS_BETTER = {"real_time_factor"}
 NO_BETTER = {"count", "used", "refused", "unnamed"}
 INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
+# columns of time and memory that every run has
 TIMINGS = (
     *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
     *("update_p50_ms", "update_p99_ms", "finish_s"),
 )
-"""Columns of time and memory that every run has."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ def metrics_of(keys: list[str]) -> list[Metric]:
 
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
+# notes of the comparison of a log's sensors with each other, as of `sonar-graph compare`
 FINDINGS = ("doubtful", "sensors")
-"""Notes of the comparison of a log's sensors with each other, as of `sonar-graph compare`."""
 VERSIONS = (
     "sonar_graph",
     "source",

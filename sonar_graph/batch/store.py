@@ -36,10 +36,10 @@ from sonar_graph.files import (
 )
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
+# status in the table of a run that is planned and not done yet
 NOT_RUN = "not run"
-"""Status in the table of a run that is planned and not done yet."""
+# a row of the results by column
 Row = dict[str, str | int | float | None]
-"""A row of the results by column."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Where:
     """Address of a scheduler, used in place of local workers."""
 
 
+# called after a run is kept
 Progress = Callable[[PlannedRun, RunOutcome], None]
-"""Called after a run is kept."""
 RUNS = "runs"
 ROW = "row.json"
 LOG = "log.txt"

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from sonar_graph.sequence import Sequence
 
 Model = TypeVar("Model", bound="Section")
+# columns of output that does not go to a terminal, so that lines stay whole
 FILE_WIDTH = 200
-"""Columns of output that does not go to a terminal, so that lines stay whole."""
 
 
 def existing_file(meaning: str, metavar: str = "FILE") -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -98,7 +97,6 @@ def bench(
                 only=options.only or (),
                 overwrite=options.overwrite,
                 progress=progress,
-                notice=partial(echo, err=True),
             )
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)

@@ -50,22 +50,23 @@ if TYPE_CHECKING:
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
+# exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``
 DOUBTFUL = 3
-"""Exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``."""
+# tolerance for the IMU's rate, which is counted from its stamps
 RATE_SLACK = 1.01
-"""Tolerance for the IMU's rate, which is counted from its stamps."""
 LOG = "basin.mcap"
 PAGE = "report.html"
+# the three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler
+# log that loses the bottom some three times. Images take most of the time: two a second still show each
+# landmark several times
 DEMO = {
     **{"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}},
     **{"gyro_bias_scale": 10.0, "dvl_dropouts_per_hour": 30.0, "dvl_dropout_s": 5.0},
     "frame_rate_hz": 2.0,
 }
-"""The three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler log that
-loses the bottom some three times. Images take most of the time: two a second still show each landmark several times."""
 DEMO_ESTIMATORS = ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"]
+# changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log
 SHORT = {"duration_s": 120.0, "laps": 1, "dvl_dropouts_per_hour": 120.0, "image": None}
-"""Changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log."""
 
 
 @dataclass(frozen=True)

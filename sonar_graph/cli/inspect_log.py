@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from sonar_graph.diagnosis import Finding
     from sonar_graph.logs import LogSummary
 
+# exit codes; 2 is a mistake of the user
 UNUSABLE, DOUBTFUL = 1, 3
-"""Exit codes; 2 is a mistake of the user."""
 HEAD = """\
 # Calibration for --calibration FILE. A line that is commented out has the default, which counts where neither this file
 # nor the log says something else. Units are in the names or after the lines; angles are in rad, lengths in m.
 """
+# rows of the table for people; a log may have tens of thousands
 MOST_TOPICS = 500
-"""Rows of the table for people; a log may have tens of thousands."""
 
 
 @with_options("salvage")

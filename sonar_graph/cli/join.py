@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 TOPIC = "/sonar/image"
 SEARCH_S = 10.0
+# standard deviations of the estimated offset beyond which a stated one is doubted
 DISAGREEING = 4.0
-"""Standard deviations of the estimated offset beyond which a stated one is doubted."""
 NS_PER_S = 10**9
 
 

@@ -19,7 +19,7 @@ from sonar_graph.cli.arguments import (
     echo,
     with_options,
 )
-from sonar_graph.cli.outputs import progress_bars, writable_json
+from sonar_graph.cli.outputs import is_json, progress_bars, writable_file
 from sonar_graph.errors import LogError
 from sonar_graph.files import interrupt_event
 
@@ -81,12 +81,9 @@ def label(
         shown_frames,
     )
 
-    path = writable_json(
-        output,
-        "labels",
-        [log],
-        lambda content: content.keys() == {"log", "labels"},
-        overwrite=options.overwrite,
+    are_labels = is_json(lambda content: content.keys() == {"log", "labels"})
+    path = writable_file(
+        output, ".json", are_labels, [log], overwrite=options.overwrite
     )
     designs = options.designs
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)

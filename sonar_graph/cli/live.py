@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 RECORD = "record.mcap"
 COUNTS = "live.json"
+# time between two lines of a log that waits to be played
 REMIND_S = 10.0
-"""Time between two lines of a log that waits to be played."""
+# time for subscribers to find all topics, and to get the last messages
 SETTLE_S = 1.0
-"""Time for subscribers to find all topics, and to get the last messages."""
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 
 

@@ -24,11 +24,12 @@ from sonar_graph.cli.arguments import (
     with_options,
 )
 from sonar_graph.cli.outputs import (
+    is_json,
+    is_own_page,
     progress_bars,
     working,
-    writable_json,
+    writable_file,
     writable_log,
-    writable_page,
 )
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing
@@ -50,11 +51,11 @@ if TYPE_CHECKING:
     Run = Sequence | ImagesAlone
 
 TOPIC = "/sonar/landmarks"
+# metadata record with the outcome of every frame
 RECORD = "sonar_graph_recognition"
-"""Metadata record with the outcome of every frame."""
 MOST_WARNINGS_SHOWN = 10
+# tracks of a class below which calibrate warns
 FEW_TRACKS = 10
-"""Tracks of a class below which calibrate warns."""
 RecogniserName = Annotated[
     Literal["designs", "actag"],
     typer.Option(
@@ -198,7 +199,9 @@ def recognise(
     path = writable_log(output, log, overwrite=options.overwrite)
     page = None
     if options.report is not None:
-        page = writable_page(options.report, overwrite=options.overwrite)
+        page = writable_file(
+            options.report, ".html", is_own_page, overwrite=options.overwrite
+        )
     sequence, motion = with_motion(log, reading, options.motion)
     made = recognition.recogniser(
         sequence.calibration, options.settings, options.recogniser
@@ -305,12 +308,9 @@ def calibrate(
 
     labels = options.labels
     sources = [*logs, *(labels or [])]
-    path = writable_json(
-        output,
-        "a model",
-        sources,
-        lambda content: "ids" in content and "matrix" in content,
-        overwrite=options.overwrite,
+    is_model = is_json(lambda content: content.keys() >= {"ids", "matrix"})
+    path = writable_file(
+        output, ".json", is_model, sources, overwrite=options.overwrite
     )
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):

@@ -36,6 +36,7 @@ class Viewer:
     install: str
 
 
+# in the order in which they are tried
 VIEWERS = {
     "lichtblick": Viewer(
         ("lichtblick", "Lichtblick"),
@@ -51,7 +52,6 @@ VIEWERS = {
     ),
     "rerun": Viewer(("rerun",), "Rerun", False, "pip install rerun-sdk"),
 }
-"""In the order in which they are tried."""
 
 
 def figures(

@@ -33,8 +33,8 @@ from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
+# fewer landmarks leave the rotation of a map open; the map then moves with the causal path
 LEAST_MATCHED = 2
-"""Fewer landmarks leave the rotation of a map open; the map then moves with the causal path."""
 
 
 def aligned_to_truth(comparison: Comparison) -> Comparison | None:
@@ -141,8 +141,8 @@ def _aligned_errors(
     )
 
 
+# true landmarks that a map must name: of two, the errors alone would turn it
 LEAST_LANDMARKS = 3
-"""True landmarks that a map must name: of two, the errors alone would turn it."""
 
 
 def own_map_errors(

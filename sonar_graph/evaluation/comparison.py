@@ -47,11 +47,11 @@ from sonar_graph.version import __version__
 
 LOG = logging.getLogger("sonar_graph.evaluation")
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
+# time for a row of the IMU, time for a detection in the batch solutions that a smoother gives as maps (4.5 s
+# for 3,460 on one core), speed of memory, and what is worth a word before a comparison begins
 IMU_ROW_S, SOLVED_DETECTION_S, MEMORY_BYTES_S, LONG_S = 3e-5, 1.3e-3, 1e10, 30.0
-"""Time for a row of the IMU, time for a detection in the batch solutions that a smoother gives as maps (4.5 s for 3,460
-on one core), speed of memory, and what is worth a word before a comparison begins."""
+# fewer scored instants than this make no trajectory
 LEAST_INSTANTS = 2
-"""Fewer scored instants than this make no trajectory."""
 
 
 @lru_cache

@@ -20,8 +20,8 @@ from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
+# with fewer independent samples a small normalised error is no sign of caution: slow errors pass through zero
 LEAST_SAMPLES = 10
-"""With fewer independent samples a small normalised error is no sign of caution: slow errors pass through zero."""
 GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""

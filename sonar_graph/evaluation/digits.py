@@ -9,10 +9,11 @@ import math
 from sonar_graph.table import ABSENT
 
 MINUS = "\N{MINUS SIGN}"
+# a value that is zero at so many decimals is written with a power of ten
 MOST_DECIMALS = 12
-"""A value that is zero at so many decimals is written with a power of ten."""
+# significant digits of a quantile, however large its error: it stands without the error, and one digit may be
+# zero
 LEAST_DIGITS = 2
-"""Significant digits of a quantile, however large its error: it stands without the error, and one digit may be zero."""
 
 
 def format_value(value: float) -> str:

@@ -27,8 +27,8 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
+# instants of a fit, and of its beginning, whose mean counts
 FEWEST = 3
-"""Instants of a fit, and of its beginning, whose mean counts."""
 
 
 def free_start(calibration: Calibration) -> tuple[bool, bool]:

@@ -19,16 +19,16 @@ from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
 
+# a pair for the relative error may be this fraction of the delta longer or shorter than it
 PAIRING_TOLERANCE = 0.01
-"""A pair for the relative error may be this fraction of the delta longer or shorter than it."""
+# largest horizontal distance at which a landmark of unknown identity is matched to a true one
 FARTHEST_M = 1.0
-"""Largest horizontal distance at which a landmark of unknown identity is matched to a true one."""
+# residuals above this many times their median are outliers: three sigmas of a normal distribution
 OUTLYING = 3 * 1.4826
-"""Residuals above this many times their median are outliers: three sigmas of a normal distribution."""
+# fits to the better half
 CONCENTRATIONS = 10
-"""Fits to the better half."""
+# with fewer landmarks none can be told to be the outlier
 LEAST_OUTVOTING = 5
-"""With fewer landmarks none can be told to be the outlier."""
 
 
 @dataclass(frozen=True, eq=False)

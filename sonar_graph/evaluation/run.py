@@ -57,19 +57,19 @@ Flags = NDArray[np.bool_]
 LOG = logging.getLogger(__name__)
 STATUS = Path("/proc/self/status")
 CLEAR_REFS = Path("/proc/self/clear_refs")
+# written to `CLEAR_REFS` it resets Linux's high-water mark of resident memory
 RESET_PEAK = "5"
-"""Written to `CLEAR_REFS` it resets Linux's high-water mark of resident memory."""
+# an eigenvalue may be this far below zero, as a fraction of the largest: rounding
 NEGATIVE_TOLERANCE = 1e-9
-"""An eigenvalue may be this far below zero, as a fraction of the largest: rounding."""
+# largest number of characters of a reason: one line that a table can hold
 REASON_WIDTH = 400
-"""Largest number of characters of a reason: one line that a table can hold."""
 WARM_UP_STEPS = 20
+# steps given to the instance that warms up: without and with detections to wait for
 MAX_WARM_UP_STEPS = 200
-"""Steps given to the instance that warms up: without and with detections to wait for."""
+# landmarks up to which a run keeps their joint covariance: its size grows with their square
 MOST_MAPPED = 100
-"""Landmarks up to which a run keeps their joint covariance: its size grows with their square."""
+# steps with a landmark that can be named: it is begun, waited for, and seen again
 WARM_UP_FRAMES = 4
-"""Steps with a landmark that can be named: it is begun, waited for, and seen again."""
 
 
 class PeakMemory:
@@ -355,8 +355,8 @@ def _answer(request: _Request, tell: Tell) -> object:
     )
 
 
+# blocks that an estimator may know nothing of
 AIDING = ("heading", "positions")
-"""Blocks that an estimator may know nothing of."""
 
 
 class _Watched(Measurements):

@@ -25,14 +25,14 @@ RETURN_M = (-0.3013, -0.1758)
 DURATION_S = 2039.0
 MAP_TIMES_S = (833.1, 1369.4, 2039.0)
 """Times of path and map in Fig. 4."""
+# instants, evenly over the run, at which maps are kept beside those of Fig. 4: each costs a smoother a solution
 MAPS_KEPT = 20
-"""Instants, evenly over the run, at which maps are kept beside those of Fig. 4: each costs a smoother a solution."""
+# a true landmark this near to the published one in x and in y is that landmark
 SAME_PLACE_M = 1e-3
-"""A true landmark this near to the published one in x and in y is that landmark."""
+# between truth samples farther apart than this the truth is not interpolated (an occluded tracking system)
 TRUTH_GAP_S = 0.5
-"""Between truth samples farther apart than this the truth is not interpolated (an occluded tracking system)."""
+# the gap is at least this many times the truth's median spacing: a truth may be sparse throughout
 GAP_TO_SPACING = 1.5
-"""The gap is at least this many times the truth's median spacing: a truth may be sparse throughout."""
 
 
 def published_maps() -> tuple[LandmarkMap, LandmarkMap]:

@@ -33,17 +33,17 @@ from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
+# time differences of the relative error, seconds
 RELATIVE_DELTAS_S = (1, 10)
-"""Time differences of the relative error, seconds."""
 ESTIMATES: dict[str, str] = {
     "causal": "Causal estimate (what could be known at each instant)",
     "smoothed": "Smoothed estimate (what is known at the end about each instant)",
 }
+# outcomes of detections that are in the estimate
 USED = {
     *(Outcome.USED, Outcome.NEW, Outcome.USED_LATER),
     *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
 }
-"""Outcomes of detections that are in the estimate."""
 IN_TIME = "errors of successive instants are correlated: their mean is worth {} independent samples, for which the band is"
 
 

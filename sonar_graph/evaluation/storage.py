@@ -76,15 +76,15 @@ RESULT = "result.json"
 SERIES = "series.npz"
 RESULT_LOG = "result.mcap"
 PAGE = "report.html"
+# as `sonar_graph.recognition` names them, which is loaded where something was recognised
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
-"""As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv", "map.toml")
+# types of what people may have edited in ``comparison.json``
 _SCORE, _TEXTS, _STATUS = (
     TypeAdapter(Score),
     TypeAdapter(dict[str, str]),
     TypeAdapter(Literal["ok", "failed"]),
 )
-"""Types of what people may have edited in ``comparison.json``."""
 
 
 def result_names(estimators: Iterable[str]) -> list[str]:

@@ -78,6 +78,7 @@ HEADLINES = {
     "ate_raw_m": "RMS, not aligned",
 }
 """Position errors that can stand in the headline, best suited first, with their names there."""
+# scores of the compact table after the position errors, most important first
 COMPACT = {
     "landmarks.{map_metric}": "Map error",
     "causal.nees_position": "Position NEES",
@@ -88,9 +89,8 @@ COMPACT = {
     "time.update_median_ms": "Update, median",
     "time.update_max_ms": "Update, longest",
 }
-"""Scores of the compact table after the position errors, most important first."""
+# scores that the compact table shows beside the name of the estimator
 MOST_SCORES = 5
-"""Scores that the compact table shows beside the name of the estimator."""
 DIRECTIONS = {
     "lower": "lower is better",
     "higher": "higher is better",

@@ -25,16 +25,16 @@ from sonar_graph.report.rendering import csv_text
 
 ROW_IN = 0.36
 PANEL_IN = 0.95
+# largest number of logs below each other; more make small multiples
 STACKED = 2
-"""Largest number of logs below each other; more make small multiples."""
 MOST_COLUMNS = 3
+# width of names beside and headings above small panels
 NAME_LETTERS, HEADING_LETTERS = 18, 20
-"""Width of names beside and headings above small panels."""
 KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
 FILLED = {"": True, "Causal": True, "Smoothed": False}
 SMALL = 9.0
+# consistency is drawn from a quarter to four times its expected value, or farther: small deviations look small
 LEAST_SPAN = 4.0
-"""Consistency is drawn from a quarter to four times its expected value, or farther: small deviations look small."""
 Rows = list[list[str]]
 
 

@@ -17,8 +17,6 @@ from sonar_graph.batch import (
     RecordedBatch,
     holm,
     least_p,
-    quantile,
-    quantile_error,
     summarise,
 )
 from sonar_graph.evaluation import quantile_text
@@ -26,14 +24,13 @@ from sonar_graph.report.batch_tables import (
     GROUP_COLUMNS,
     SIGNIFICANT,
     Tests,
-    p_text,
     unit_of,
 )
 from sonar_graph.table import Cell, Column, Table, absent, number, words
 
 SCORED = "scored_instants"
+# largest number of logs that a warning names; others are counted
 NAMED = 3
-"""Largest number of logs that a warning names; others are counted."""
 LOWER = "\N{DOWNWARDS ARROW}"
 HIGHER = "\N{UPWARDS ARROW}"
 DIFFERENT = "\N{NOT EQUAL TO}"
@@ -68,73 +65,6 @@ def reference_told(batch: RecordedBatch) -> list[str]:
         f"The reference {batch.reference} never ended on {_few(lost)}: whoever ended is better there, by no known "
         "amount."
     ]
-
-
-def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
-    """A sentence for each log on the first error that it has: medians, then significant differences."""
-    columns = [
-        (metric, over, key)
-        for metric in metrics
-        if metric.is_error
-        for over, key in metric.keys.items()
-    ]
-    sentences = []
-    for log in batch.logs:
-        known = (
-            one
-            for one in columns
-            if any(batch.is_asked(log, name, one[2]) for name in batch.contestants)
-        )
-        found = next(known, None)
-        if found is None:
-            sentences.append(f"{log}: no run has an error to compare.")
-            continue
-        metric, over, key = found
-        values = {name: batch.values(log, name, key) for name in batch.contestants}
-        medians = sorted(
-            (quantile(own, 0.5), name, quantile_error(own, 0.5) * metric.factor)
-            for name, own in values.items()
-            if len(own)
-        )
-        listed = ", ".join(
-            f"{name} {quantile_text(value * metric.factor, error)}"
-            for value, name, error in medians
-            if value < math.inf
-        )
-        unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
-        which = f"{over.lower()} " if over else ""
-        told = [f"{log}, median {which}error{unit} ({metric.label}): {listed}."]
-        alike = []
-        for contestant in batch.contestants:
-            if (key, log, contestant) not in tests:
-                continue
-            test, p_value = tests[key, log, contestant]
-            if p_value < SIGNIFICANT:
-                p = p_text(p_value)
-                sign = "" if p.startswith("<") else "= "
-                told.append(
-                    f"{contestant} {_side_told(batch, metric, test)} (p {sign}{p})."
-                )
-            else:
-                alike.append(contestant)
-        if alike:
-            told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
-        sentences.append(" ".join(told))
-    return sentences
-
-
-def _side_told(batch: RecordedBatch, metric: Metric, test: PairedDifference) -> str:
-    """The side of most differences, which the rank test is about; their mean can be turned by one run."""
-    counted = f"smaller in {test.smaller} of {test.counted}"
-    if math.isnan(test.median) or test.median == 0:
-        return f"differs from {batch.reference}, {counted}"
-    side = f"is {'below' if test.median < 0 else 'above'} {batch.reference}"
-    if math.isinf(test.median):
-        return f"{side}, {counted}"
-    size = quantile_text(
-        abs(test.median) * metric.factor, test.median_error * metric.factor
-    )
-    return f"{side} by {size} in the median, {counted}"
 
 
 def instants_told(batch: RecordedBatch) -> list[str]:

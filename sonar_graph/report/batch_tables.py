@@ -35,8 +35,8 @@ from sonar_graph.evaluation import (
 from sonar_graph.table import Cell, Column, Table, absent, count, number, words
 
 SIGNIFICANT = 0.05
+# by column, log and contestant: the differences, and their p value corrected over the tests of the metric
 Tests = dict[tuple[str, str, str], tuple[PairedDifference, float]]
-"""By column, log and contestant: the differences, and their p value corrected over the tests of the metric."""
 FAILURES = ("failed", "timeout", "memory", "killed")
 COSTS = {
     "update_p50_ms": "Update, median (ms)",
@@ -46,10 +46,10 @@ COSTS = {
     "peak_memory_mb": "Memory, rise (MB)",
 }
 QUANTILES = ("10_percent", "90_percent")
+# end of the names of columns with the normalised squared error at a run's last instant
 LATEST = "_end"
-"""End of the names of columns with the normalised squared error at a run's last instant."""
+# relative difference of a smoothed ANEES to the causal one up to which it is the same evidence, shown once
 SAME_AT_END = 0.1
-"""Relative difference of a smoothed ANEES to the causal one up to which it is the same evidence, shown once."""
 SAME_EVIDENCE = (
     "At the last instant a smoothed estimate has seen no more than the causal one: it is no second evidence, and is "
     "shown only where it differs by more than a tenth."

@@ -24,8 +24,8 @@ from sonar_graph.states import LandmarkMap, Trajectory, landmark_name
 from sonar_graph.table import ABSENT, Column, Table, words
 
 PAPER = "2014 paper"
+# largest number of landmarks in rows; others are left to ``landmarks.csv``
 MOST_LANDMARKS = 30
-"""Largest number of landmarks in rows; others are left to ``landmarks.csv``."""
 DECIMALS = 3
 PAPER_DECIMALS = 2
 PAPER_RETURN_DECIMALS = 4

@@ -7,6 +7,7 @@ import base64
 import csv
 import io
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,43 @@ def render(template: str, content: dict[str, Any]) -> str:
         as_html(table, is_sortable=is_sortable)
     )
     return spelt(environment.get_template(template).render(**content))
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a page; the template of the page's kind has a macro of its name."""
+
+    anchor: str
+    title: str
+    is_folded: bool = False
+
+
+def write_html(
+    path: Path, kind: str, sections: list[Section], content: dict[str, Any]
+) -> Path:
+    """Write a page from its sections, whole or not at all, and return its path.
+
+    The page needs nothing but itself: figures are inline SVG in the page's colours, and style is inline.
+
+    Parameters
+    ----------
+    path
+        Path of the page, which is replaced.
+    kind
+        ``comparison``, ``batch`` or ``recognition``: the template with the macros of the sections.
+    sections
+        Sections in their order; links to them stand above.
+    content
+        Values by the names that the macros use; ``name`` and ``names`` make the title.
+    """
+    with replacing(path) as partial:
+        partial.write_text(html_of(kind, sections, content), "utf-8")
+    return path
+
+
+def html_of(kind: str, sections: list[Section], content: dict[str, Any]) -> str:
+    """The text of a page, as of `write_html`."""
+    return render("page.html", content | {"kind": kind, "sections": sections})
 
 
 def data_address(text: str | bytes, kind: str) -> str:

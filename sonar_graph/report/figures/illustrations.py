@@ -52,6 +52,7 @@ class Drawing:
     """The figure has a second view, after alignment to the truth."""
 
 
+# in reading order
 DRAWINGS = {
     "map": Drawing("Map", map_figure, columns=1, is_aligned_too=True),
     "growth": Drawing(
@@ -123,13 +124,12 @@ DRAWINGS = {
         columns=1,
     ),
 }
-"""In reading order."""
 
 
+# marks the narrow one of two drawings of a figure
 PHONE = "phone"
-"""Marks the narrow one of two drawings of a figure."""
+# ends the name of a figure or table before alignment, where there is one after it too
 RAW_VIEW = "-raw"
-"""Ends the name of a figure or table before alignment, where there is one after it too."""
 
 
 def drawings(comparison: Comparison) -> dict[str, tuple[Comparison, Drawing]]:
@@ -177,7 +177,7 @@ def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illust
     numbers = _read_out(comparison, drawing)
     if drawing.draw is map_figure:
         widths_in = {"": HALF_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
-        numbers = " ".join(sentences.finding(comparison))
+        numbers = sentences.headline(comparison, aligned=comparison.is_aligned)
     described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
     svg = ""
     for width, width_in in widths_in.items():
