@@ -184,6 +184,7 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
         }
         row = store.row(run.key)
         if row is None:
+            # a batch that ends early can be read without the code that planned it
             row = {"status": NOT_RUN, "reason": "not done when this table was written"}
         else:
             # versions are those that the run itself found
@@ -192,6 +193,7 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
                 **row,
             }
         rows.append(described | row)
+    # scores differ from log to log; every table has all of them in one order
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
     types = COLUMNS | {
         name: "int64" if name.endswith("_dof") else "float64" for name in scores

@@ -36,6 +36,7 @@ def signed_rank_p(differences: Floats) -> float:
     # tied ranks may end in .5: doubled, they are the integers that the exact distribution counts with
     doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)
     ranks = doubled // np.gcd.reduce(doubled[differences != 0])
+    # infinite differences have the highest ranks: a lost run is worse than any other
     positive = int(ranks[differences > 0].sum())
     negative = int(ranks[differences < 0].sum())
     # Pratt 1959: zeros take part in the ranking and are left out only now
@@ -169,6 +170,7 @@ def summarise(values: Floats) -> SampleSummary:
     """
     n = len(values)
     without = int(np.isinf(values).sum())
+    # an average over the survivors would praise whoever fails where it is hard
     has_mean = n > 0 and not without
     low, median, high = (quantile(values, share) for share in (LOW, 0.5, HIGH))
     return SampleSummary(
@@ -290,6 +292,7 @@ def paired(
         lost = np.array([lost[which].any() for which in members], dtype=bool)
         kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
         each = kinds.pop() if len(kinds) == 1 else "case"
+    # a case is lost with any of its pairs
     without = int(lost.sum())
     valued = differences[~lost]
     has_mean = len(differences) > 0 and not without
@@ -313,6 +316,7 @@ def paired(
 def case_difference(differences: Floats) -> float:
     """Mean of one case's differences; infinite to the side that has more infinite ones, without them if none has."""
     infinite = np.isinf(differences)
+    # as many lost runs on one side as on the other cancel
     side = float(np.sign(differences[infinite]).sum())
     if side:
         return math.copysign(math.inf, side)
@@ -364,6 +368,7 @@ def holm(p_values: Floats) -> Floats:
     """
     corrected = np.full(len(p_values), np.nan)
     known = np.flatnonzero(~np.isnan(p_values))
+    # the smallest p value has the largest factor
     order = known[np.argsort(p_values[known], kind="stable")]
     factors = np.arange(len(order), 0, -1)
     corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))

@@ -146,6 +146,7 @@ class Store:
     def row(self, key: str) -> Row | None:
         """Row of a run; None if it is not done, or its row is lost or belongs to another run."""
         try:
+            # a machine that lost power may have kept the folder and not its content
             row = dict(read_json(self.run_folder(key) / ROW))
         except EvaluationError:
             return None
@@ -157,6 +158,7 @@ class Store:
         Raises `OSError` when there is no space; nothing of the run is left then, and no other run is touched.
         Raises `BatchError` as `discard` does.
         """
+        # filled under another name: a folder with its final name is complete
         partial = self._partial_folder(key)
         row = strict_json({KEY: key, **outcome.row}) + "\n"
         contents = {**outcome.files, LOG: outcome.log.encode(), ROW: row.encode()}

@@ -114,6 +114,7 @@ class LogEntry(Section):
         seeds = (
             value if isinstance(value, list) else [value] if value is not None else []
         )
+        # a number of seeds is a number of runs, which nobody wants by the million
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
         if not are_numbers or len(set(seeds)) < len(seeds):
@@ -219,6 +220,7 @@ class SuiteFile:
 
         Raises `BatchError` when it is in neither.
         """
+        # files beside the suite go before those of a folder for all suites
         roots = self._roots()
         found = [root / name for root in roots if (root / name).exists()]
         if not found:
@@ -299,6 +301,7 @@ _TEXT_MARKS = ('"""', "'''")
 
 def line_of(text: str, place: Place) -> int:
     """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it."""
+    # the nearest place that is known stands for one that the file does not name
     lines: dict[Place, int] = {(): 1}
     entries: dict[Place, int] = {}
     table: Place = ()

@@ -104,6 +104,7 @@ def bench(
         os._exit(INTERRUPTED)
     only = options.only
     counts = Counter(run.status for run in batch.runs if not only or run.key in only)
+    # those that ended first
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
     echo(f"Results: {output / 'results.parquet'}")

@@ -87,6 +87,7 @@ def label(
     )
     designs = options.designs
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
+    # labels are hours of work: an existing file is added to
     is_continued = path.exists() and path.stat().st_size and not options.overwrite
     labels = read_labels(path, log) if is_continued else Labels(log=spelt(log.name))
     topic = reading.choices.get("sonar")
@@ -146,6 +147,7 @@ def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) ->
     echo("Ctrl-C ends.")
     if is_shown:
         webbrowser.open(server.address)
+    # the main thread waits for Ctrl-C
     serving = Thread(target=server.serve_forever, daemon=True)
     serving.start()
     with interrupt_event() as ended:

@@ -93,6 +93,7 @@ def writable_folder(
     """
     if path.exists() and not path.is_dir():
         raise EvaluationError(f"{path}: is a file; give a folder with -o")
+    # through links too: the source may lie in the folder of the results
     for written in (path / name for name in names if (path / name).exists()):
         if any(source is not None and written.samefile(source) for source in sources):
             raise EvaluationError(
@@ -121,6 +122,7 @@ def _require_writing_in(
     Nothing is made for that: another command may be about to write there.
     """
     try:
+        # the only sure way to find out: rights, quotas and read-only mounts differ
         with TemporaryFile(
             dir=next(
                 one
@@ -142,6 +144,7 @@ Report = Callable[..., None]
 @contextmanager
 def progress_bars() -> Iterator[Report]:
     """Progress bars, one for each name of work, while the context is open."""
+    # stdout is for answers that another program may read
     console = Console(stderr=True)
     bar = (
         BarColumn(),

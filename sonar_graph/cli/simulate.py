@@ -158,6 +158,7 @@ class BasinChoices:
         }
         if self.no_bias:
             values["gyro_bias_scale"] = 0.0
+        # a setting may name anything, and goes before the option of its name
         given = nested_settings(self.settings)
         if "image" in given and not self.images:
             raise typer.BadParameter(

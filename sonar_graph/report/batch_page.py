@@ -67,6 +67,7 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     """Values by the names that the template uses."""
     metrics = metrics_of(batch.metrics)
     tests = tables.all_tests(batch, metrics)
+    # a metric is a chapter only where some run can have it
     groups = [(log, name) for log in batch.logs for name in batch.contestants]
     chapters: list[dict[str, Any]] = []
     for metric in metrics:
@@ -102,19 +103,23 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         tables.consistency_table(batch),
         tables.cost_table(batch),
     )
+    # tables leave the page as files, and must state there too what is missing
     failures, consistency, costs = (summary.marked(batch, table) for table in others)
     anees = [figures.consistency_drawing(batch, what) for what in ("position", "yaw")]
+    # logs may have different numbers of seeds
     seeds = max(len(batch.group(log, name)) for log, name in groups)
     settings: dict[str, str] = {}
     for column, name in (
         ("options", "log {0.log}"),
         ("params", "estimator {0.contestant}"),
     ):
+        # the first run of each log and estimator is enough: all of one have the same settings
         for run in batch.runs:
             if run.texts.get(column):
                 settings.setdefault(name.format(run), run.texts[column])
     origins = {}
     for name in ORIGINS:
+        # a batch that was resumed on another machine has several values
         counts = Counter(run.texts[name] for run in batch.runs if name in run.texts)
         if counts:
             many = len(counts) > 1

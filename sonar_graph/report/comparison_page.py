@@ -156,6 +156,7 @@ def _page(comparison: Comparison) -> tuple[list[Section], dict[str, Any]]:
     sequence = comparison.sequence
     runs = comparison.runs
     detections = len(sequence.detections) if sequence.detections else 0
+    # None without errors: then figures and tables have one view
     aligned = aligned_to_truth(comparison)
     outcomes = outcome_table(comparison)
     content: dict[str, Any] = {
@@ -260,13 +261,16 @@ def protocols(
 
     The runs are left out where one rule is of all.
     """
+    # labels and their order are those of the table
     table = score_table(comparison)
     found: dict[str, list[tuple[str, str, list[tuple[str, str]]]]] = {}
     for place, (key, row) in enumerate(
         zip(score_keys(comparison), table.rows, strict=True)
     ):
+        # the place of a row is also the place of its block's heading
         if place in table.sections:
             told = found.setdefault(table.sections[place], [])
+        # runs may be measured by different rules, as where one has no covariance
         rules: dict[str, list[str]] = {}
         for name in (run.estimator for run in comparison.runs):
             if key in (scores := comparison.scores.get(name, {})):
@@ -292,6 +296,7 @@ def outcome_table(comparison: Comparison) -> Table:
     ]
     rows = []
     for outcome in Outcome:
+        # outcomes that no run has would be most of the table
         if any(count and count[outcome] for count in counts):
             shares = [_share(count, outcome) for count in counts]
             rows.append([outcome.value.capitalize(), *shares])
@@ -420,6 +425,7 @@ def naming_table(sequence: Sequence) -> Table | None:
         or sequence.true_landmarks is None
     ):
         return None
+    # by place, since identities are what is judged
     labels = true_identities(sequence, sequence.detections)
     _, named = confidences(sequence.detections)
 

@@ -58,6 +58,7 @@ def summary(comparison: Comparison) -> Group:
         if metric
         else {}
     )
+    # columns that no run has would take the place of names
     present = score_keys(comparison)
     mapped = {} if metric else {"landmarks.se2_m": "map"}
     columns = {
@@ -98,6 +99,7 @@ def summary(comparison: Comparison) -> Group:
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     """Failures, doubts of the log, what runs say that may follow from these, and the meaning of the columns."""
     lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    # first, as the numbers above are not to be relied on
     doubtful = sentences.doubtful_lines(comparison)
     lines += doubtful
     lines += [

@@ -114,6 +114,7 @@ def sized(
     font: str = "sans-serif",
 ) -> Iterator[None]:
     """Let all figures that are drawn in the block have this width and size of text."""
+    # settings, not arguments: the same functions then draw for a page and for a paper
     settings: Any = {
         "figure.figsize": (width_in, width_in),
         "font.size": text_pt,
@@ -143,6 +144,7 @@ def text_pt() -> float:
 
 def size_in(rows: int, row_in: float = 1.75) -> tuple[float, float]:
     """Width and height of a figure of rows, inches; on a narrow one they are lower."""
+    # a phone shows a figure as wide as itself: as high as on a page it would fill the screen
     narrow = min(1.0, 0.55 + 0.45 * width_in() / PAGE_WIDTH_IN)
     return width_in(), ((row_in if rows > 1 else 2.3) * rows + 0.8) * narrow
 
@@ -151,11 +153,13 @@ def blank_panels(
     rows: int, columns: int, size_in: tuple[float, float], **sharing: Any
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure of styled, empty panels, shape (rows, columns), without any state of pyplot."""
+    # not by pyplot, whose figures stay in memory until they are closed
     figure = Figure(figsize=size_in, facecolor="none")
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
     for panel in axes.flat:
         panel.set_facecolor("none")
         panel.grid(True, color=RULE, linewidth=0.6)
+        # grid lines behind the data
         panel.set_axisbelow(True)
         panel.tick_params(which="both", color=RULE, labelcolor=MUTED)
         panel.xaxis.label.set_color(INK)
@@ -206,6 +210,7 @@ def arrange(figure: Figure) -> None:
 
 def _fit(figure: Figure) -> None:
     """Fit the panels into the figure, below its legend, which matplotlib leaves out of account."""
+    # tight_layout leaves a figure's legend out of account
     legend_px = sum(legend.get_window_extent().height for legend in figure.legends)
     top = 1.0 - legend_px / figure.bbox.height
     figure.tight_layout(pad=0.5, rect=(0.0, 0.0, 1.0, top))
@@ -225,6 +230,7 @@ def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
     panel.set(**{f"{direction}scale": "log"})
     axis.set_major_locator(SeveralTicks())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    # minor ticks between labelled ones are clutter at this size
     axis.set_minor_locator(NullLocator())
 
 
@@ -254,6 +260,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
     frame = np.array([[edges.x0, edges.y0], [edges.x1, edges.y1]]) * scale
     size_in = text_pt() / POINTS_PER_INCH
     height = NAME_HEIGHT * size_in
+    # names must not cover the marks of other landmarks
     taken = [(at - MARK_IN, at + MARK_IN) for at in places_in]
     for name, at, point in zip(names, places_in, points, strict=True):
         width = size_in * BOLD_LETTER * len(name)
@@ -263,6 +270,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
             if x == 0:
                 low[0] -= width / 2
             high = low + np.array([width, height])
+            # two boxes are apart where they are apart in one direction
             is_free = all(
                 np.any((high <= other_low) | (low >= other_high))
                 for other_low, other_high in taken
@@ -340,6 +348,7 @@ def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
     n = len(values)
     if n <= points:
         return np.arange(n)
+    # two rows a stretch: its lowest and its highest
     edges = np.linspace(0, n, points // 2 + 1).astype(np.int64)
     stretches = list(pairwise(edges.tolist()))
     # argmin and argmax give the first NaN of a stretch that has one, which keeps the gap
@@ -371,6 +380,7 @@ def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> 
     ``description``: content of the figure in words, for those who cannot see it. ``width``: "phone" for the narrow one
     of two drawings of a figure.
     """
+    # here and not by the caller, so that no figure can reach a page without margins
     arrange(figure)
     buffer = io.StringIO()
     # with a fixed salt and no date the same result gives the same page, byte for byte

@@ -129,6 +129,7 @@ def as_csv(table: Table) -> str:
     ]
     rows = [["section", *head] if table.sections else head]
     section = ""
+    # a section is a heading between rows on a page, and a column in a file
     for place, row in enumerate(table.rows):
         section = table.sections.get(place, section)
         texts = [section] if table.sections else []
@@ -159,6 +160,7 @@ def _plain_cell(text: str) -> str:
     if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
         return text
     try:
+        # a negative number also begins with a minus
         float(text)
     except ValueError:
         return f"'{text}"

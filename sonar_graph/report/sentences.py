@@ -120,6 +120,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     aligned
         Errors after alignment to the truth, where the runs have them, instead of before.
     """
+    # numbers of sensors that contradict each other are no finding
     if doubtful := doubtful_lines(comparison):
         return doubtful[0]
     metric = headline_metric(comparison)
@@ -128,6 +129,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     if not aligned:
         metric = RAW
     (name, least), *others = _in_order(comparison, f"causal.{metric}")
+    # one run is too little to separate such errors
     close = [
         other
         for other, score in others
@@ -136,6 +138,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     equals = f", {' and '.join(close)} equally near" if close else ""
     what = label(metric, comparison, HEADLINES)
     opening = f"{name} is nearest to the truth{equals}: {least.with_unit} off ({what}, causal)"
+    # a wrong map can come with a small error by luck
     is_in_doubt = any(
         name in line
         for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]
@@ -180,6 +183,7 @@ def _worth_of_covariances(comparison: Comparison, name: str) -> str:
 
 def published_filters(comparison: Comparison) -> str:
     """Which filters have the settings of their publication, with their fair neighbour; empty without any."""
+    # a reader must not take the filter of a paper for a poor implementation
     names = [run.estimator for run in comparison.runs if run.is_as_published]
     if not names:
         return ""
@@ -195,6 +199,7 @@ def _without_errors(comparison: Comparison) -> str:
     """The headline where no run has a position error."""
     if len(comparison.failed_runs) == len(comparison.runs):
         return "No estimator came to an end, so there is nothing to compare."
+    # maps can be judged where paths cannot
     maps = _in_order(comparison, "landmarks.se2_m")
     listed = ", ".join(f"{name} {score.with_unit}" for name, score in maps)
     if listed:
@@ -224,6 +229,7 @@ def lost_runs(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         outcomes = run.detections.outcomes if run.detections else []
         gated = outcomes.count(Outcome.GATED)
+        # a gate that refuses so much refuses the truth
         if gated > GATED_SHARE * max(len(outcomes), 1):
             is_smoother = flattened(run.params).get(POLICY) == "gate"
             advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
@@ -249,6 +255,7 @@ def beside_the_paper(comparison: Comparison) -> str | None:
     sequence = comparison.sequence
     calibration = sequence.calibration
     params = flattened(run.params)
+    # bridged by accelerometers, which the paper does not do
     longest_s = float(np.diff(sequence.dvl.stamps_ns).max(initial=0)) * 1e-9
     is_held = calibration.odometry_interpolation == "hold-past"
     has_gaps = longest_s > calibration.dvl.gap_s and not is_held
@@ -284,6 +291,7 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
             if run.detections
             else []
         )
+        # no identity can be used, so nothing is mapped
         if outcomes and set(outcomes) <= NAMELESS:
             blind[run.estimator] = len(outcomes)
     if blind:
@@ -303,6 +311,7 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
             scored = scored_map(run.landmarks, comparison.sequence)
             if scored is None:
                 continue
+            # with a truth the errors show which landmark is wrong
             errors = landmark_errors(scored.landmarks, true)
             squares = normalised_squares(
                 errors.horizontal_m, errors.horizontal_covs
@@ -481,6 +490,7 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
 
 def refused_by(comparison: Comparison) -> dict[RefusedRows, list[str]]:
     """Refused rows of IMU and Doppler log, with the names of the runs that refused them."""
+    # runs mostly refuse the same rows: one line for all
     names: dict[RefusedRows, list[str]] = {}
     for run in comparison.runs:
         for refused in gathered(run.refused):

@@ -35,14 +35,17 @@ def innovation_figure(comparison: Comparison) -> Figure | None:
         style.head_panel(panels[0], comparison.runs[index].estimator, own)
         panels[-1].set_xlabel(style.TIME_LABEL)
         is_predicted = np.isfinite(log.innovations).all(axis=1)  # (n,)
+        # refused detections are drawn apart from used ones
         is_gated = np.array([one is Outcome.GATED for one in log.outcomes], dtype=bool)
         seconds = style.seconds_since_start(comparison, log.stamps_ns)
         for panel, innovations in zip(panels, log.innovations.T, strict=True):
             for is_refused in (False, True):
                 chosen = is_predicted & (is_gated == is_refused)
                 values = innovations[chosen]
+                # the second row is the azimuth, which people read in degrees
                 if panel is panels[-1]:
                     values = np.degrees(values)
+                # an even choice shows the noise, the extremes show what was refused
                 rows = np.union1d(
                     style.evenly(len(values), style.SERIES_POINTS // 2),
                     style.thinned(values, style.SERIES_POINTS // 20),
@@ -73,6 +76,7 @@ def nis_figure(comparison: Comparison) -> Figure | None:
         return None
     figure, panel = style.one_panel()
     highest = max(30.0, *(float(values.max()) for values in known.values()))
+    # the scale is logarithmic
     grid = np.geomspace(1e-2, highest, 200)
     expected = 100 * chi_square_share(grid, NIS_DOF)
     panel.plot(grid, expected, label="expected: χ²", **style.TRUTH_LOOK)

@@ -61,6 +61,7 @@ def error_figure(comparison: Comparison) -> Figure | None:
             ):
                 panel.plot(along[rows], error[rows], label=run.estimator, **look)
     for row, label in enumerate(labels):
+        # one scale for all, or a small error would look like a large one
         limit = shared_limit([both[row] for both in sizes.values()])
         axes[row, 0].set_ylim(0.0, ROOM * limit)
         axes[row, 0].set_ylabel(label)
@@ -78,6 +79,7 @@ def _sizes(errors: ErrorSeries) -> list[Floats]:
 def distance_m(run: RunResult, errors: ErrorSeries) -> Floats:
     """Distance that the truth has travelled until each scored instant, from the first one, shape (n,)."""
     assert run.causal is not None, "a run with errors has a path"
+    # scored instants are some of the path's own
     rows = np.searchsorted(run.causal.stamps_ns, errors.stamps_ns)
     # estimate minus error is the true path; an estimate's own would be another distance for each run
     steps = np.diff(run.causal.positions[rows] - errors.position_m, axis=0)
@@ -86,6 +88,7 @@ def distance_m(run: RunResult, errors: ErrorSeries) -> Floats:
 
 def shared_limit(sizes: list[Floats]) -> float:
     """The largest error that runs show on a common axis: of all, or `LARGER` times that of the best run."""
+    # a run without an error of this kind has NaN throughout
     largest = [
         float(np.nanmax(values)) for values in sizes if np.isfinite(values).any()
     ]
@@ -122,6 +125,7 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
     figure, axes = style.blank_panels(
         len(labels), len(series), size_in, sharex=True, sharey="row"
     )
+    # columns beside each other are narrow: fewer points are seen
     points = style.SERIES_POINTS // min(len(series), 2)
     for row, label in enumerate(labels):
         limit = 0.0
@@ -140,6 +144,7 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
         for panel, (index, errors, error, half) in zip(axes[row], drawn, strict=True):
             seconds = style.seconds_since_start(comparison, errors.stamps_ns)
             own = style.colour(index)
+            # an estimator may report no covariance
             if np.isfinite(half).any():
                 band = style.evenly_with_extremes(half, points // 4)
                 panel.fill_between(
@@ -159,6 +164,7 @@ def own_map_figure(comparison: Comparison) -> Figure | None:
     found = {}
     for index, errors in _causal_errors(comparison).items():
         run = comparison.runs[index]
+        # at instants at which the map was kept
         series = own_map_errors(run, comparison.sequence, errors.stamps_ns)
         if len(series[0]):
             found[index] = series
@@ -223,6 +229,7 @@ def nees_figure(comparison: Comparison) -> Figure | None:
     )
     for panel, (label, values) in zip(axes[:, 0], per_dof.items(), strict=True):
         style.logarithmic(panel, "y")
+        # chi-square with the degrees of freedom of the error
         low, high = _band(position_dof if label == "position" else 1)
         panel.axhspan(low, high, color=style.TRUTH, alpha=0.25, linewidth=0)
         panel.axhline(1.0, color=style.MUTED, linewidth=0.7)

@@ -138,6 +138,7 @@ def drawings(comparison: Comparison) -> dict[str, tuple[Comparison, Drawing]]:
     Where errors are known, a figure of paths or errors has two views: after alignment under its name, and before it
     under its name with `RAW_VIEW`.
     """
+    # once for all figures: each alignment is a fit over the whole path
     aligned = aligned_to_truth(comparison)
     found = {}
     for name, drawing in DRAWINGS.items():
@@ -173,6 +174,7 @@ def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]
 
 def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
     """One figure of the page; a map is drawn in two widths, of which the page shows the one that fits."""
+    # a map is drawn twice, because its names cannot be shrunk to a phone
     widths_in = {"": HALF_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
     numbers = _read_out(comparison, drawing)
     if drawing.draw is map_figure:
@@ -208,6 +210,7 @@ def _instead(comparison: Comparison, drawing: Drawing) -> str:
 
 def _captions(comparison: Comparison) -> dict[str, str]:
     """Captions that depend on the comparison."""
+    # only the repeated experiment may name the paper's figures
     is_repeated = repeats_published(comparison.sequence)
     world = ALIGNED if comparison.is_aligned else unaligned(comparison.sequence)
     counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""

@@ -45,11 +45,13 @@ def map_figure(comparison: Comparison) -> Figure | None:
     view = map_view(comparison)
     if view is None:
         return None
+    # one factor for all landmarks, so that ellipses can be compared
     factor = enlargement(comparison)
     view = view if factor == 1 else with_room(view)
     figure, axes = style.blank_panels(1, 1, (style.width_in(), style.width_in()))
     panel: Axes = axes[0, 0]
     truth = comparison.sequence.truth
+    # in the world of the estimates, as paths are
     true_landmarks = true_landmarks_drawn(comparison)
     look: dict[str, Any]
     if truth is not None and len(truth):
@@ -94,6 +96,7 @@ def landscape(view: Floats) -> Floats:
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
     """The true landmarks in the world of the start pose: where they are surveyed in another, the first map tells."""
     true = comparison.sequence.true_landmarks
+    # the first map decides, so that all are drawn in one world
     maps = [
         run.landmarks
         for run in comparison.runs
@@ -121,6 +124,7 @@ def smoothed_differs(run: RunResult) -> bool:
     """True where the smoothed path is not the causal one."""
     if run.smoothed is None or not len(run.smoothed):
         return False
+    # paths of different lengths are different paths
     if run.causal is None or len(run.causal) != len(run.smoothed):
         return True
     return bool(np.abs(run.smoothed.positions - run.causal.positions).max() > SAME_M)
@@ -216,6 +220,7 @@ def label_landmarks(panel: Axes, comparison: Comparison) -> None:
     ids = np.concatenate([own for own, _ in shown])
     points = np.concatenate([positions[:, :2] for _, positions in shown])
     low, high = np.array([panel.get_xlim(), panel.get_ylim()]).T
+    # a name outside the view would stand at the edge of the paper
     rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     names = [landmark_name(identity) for identity in ids[rows].tolist()]
     style.label_points(panel, names, points[rows])
@@ -246,6 +251,7 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     for panels, (index, run) in zip(axes, runs.items(), strict=True):
         own = style.colour(index)
         panels[0].set_ylabel(f"{run.estimator}\nworld y (m)")
+        # a run may have kept its map at other instants too
         known_at = {known.stamp_ns: known.landmarks for known in run.maps}
         for panel, stamp_ns in zip(panels, stamps_ns.tolist(), strict=True):
             look = style.TRUTH_LOOK | {"linewidth": 2.6}
@@ -296,6 +302,7 @@ def enlargement(comparison: Comparison) -> int:
     ]
     if view is None or not variances:
         return 1
+    # relative to the view: what can be seen depends on the size of the picture
     room_m = LARGEST_ELLIPSE * float(np.ptp(view, axis=0).max())
     radius = chi_square_quantile(ELLIPSE_PROBABILITY, 2)
     half_m = math.sqrt(max(variances) * radius)
