@@ -129,7 +129,7 @@ WRONG = {
     f"{CSV} comma.toml": r'comma\.csv: has no line with numbers like 1\.5; .* need decimal = ","',
     f"{CSV} gap.toml": "no common time; of another clock or unit[?] See stamp",
     "convert csv . --config good.toml -o wall/new.mcap": r"wall/new\.mcap: cannot be written: .*choose another place",
-    "convert csv . --config good.toml -o new.csv": r"logs are MCAP files",
+    "convert csv . --config good.toml -o new.csv": r"expected the name of a file that ends in .mcap",
     "inspect dive.mcap --log-config good.toml": r"good\.toml: says which text tables .* csv TABLES --config good\.toml",
     "compare imu.csv -o out": r"a text that begins with 'time,wx.*text tables by `sonar-graph convert csv`",
     "view dive.mcap --viewer browser": r"dive\.mcap: is a log, .* `sonar-graph compare dive\.mcap -o DIR` makes",
@@ -291,6 +291,6 @@ def test_a_json_file_of_others_does_not_become_a_model(
     mine = tmp_path / "mine.json"
     mine.write_text(content)
     assert run("calibrate", basin, "-o", mine) == 2
-    said = "holds something else than a model; choose another name, or give --overwrite"
+    said = "and sonar-graph did not write it; choose another name, or give --overwrite"
     assert said in capsys.readouterr().err
     assert mine.read_text() == content
