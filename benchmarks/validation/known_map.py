@@ -736,7 +736,8 @@ def resumed(
     return [known[f"{what} {item}"] for item in items]
 
 
-CHUNK = 20
+CHUNK = 2
+"""Number of items between two additions to the file."""
 
 
 def main() -> None:

@@ -67,8 +67,11 @@ MOST_OF_LANDMARK = 4
 """Of one landmark: their mean counts as one sighting, and more of them would share the errors of odometry."""
 LINEAR_SIGMAS = 3.0
 """Error of the heading that is found, in sigmas, up to which a sighting must be linear in it within its own sigma."""
-LOOSER = 10.0
-"""Sigmas of the prior start over those found: the estimator weighs the same sightings itself."""
+LOOSER = 3.0
+"""Sigmas of the prior start over those found: the estimator weighs the same sightings itself, so that a ninth of their
+information counts twice. With a looser prior it would follow a moved landmark that it sees first."""
+SAME = 10.0
+"""Distance, in sigmas, of starts that are refined to the same one."""
 STEPS = 5
 CONVERGED = 1e-6
 """Squared length of a step of least squares, in sigmas."""
@@ -376,11 +379,11 @@ def is_linear(start: FoundStart, data: MapData) -> bool:
 
 
 def is_same(parameters: Floats, better: FoundStart) -> bool:
-    """Check that (psi, t_x, t_y) lies within the prior that `MapLocator.start` makes of a better start."""
+    """Check that (psi, t_x, t_y) is a better start, within `SAME` sigmas of it."""
     d = parameters - better.parameters
     d[0] = math.remainder(d[0], 2.0 * math.pi)
     squared = float(d @ np.linalg.solve(better.covariance, d))
-    return squared <= LOOSER**2
+    return squared <= SAME**2
 
 
 class StartInMap:
