@@ -133,6 +133,7 @@ class RecordedBatch:
     def absent(self) -> dict[str, str]:
         """Source of each log of the suite that was left out, because its files were not there, by its name."""
         with contextlib.suppress(ValueError):
+            # the suite names logs that no row can name
             entries = tomllib.loads(self.suite).get("logs", [])
             return {
                 entry["name"]: entry["obtain"]
@@ -167,6 +168,7 @@ class RecordedBatch:
 
         `ALL_LOGS` gives those of every log. Logs on which either cannot have the score have no pairs.
         """
+        # all logs together are pooled by seed
         logs = self.logs if log == ALL_LOGS else [log]
         both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
         values = np.array(
@@ -190,6 +192,7 @@ class RecordedBatch:
             self.is_asked(log, name, key) for name in (contestant, self.reference)
         ):
             return []
+        # the same seed draws the same world for both
         reference = {run.seed: run for run in self.group(log, self.reference)}
         return [
             (run, reference[run.seed])
@@ -203,6 +206,7 @@ class RecordedBatch:
         Dead reckoning has no map, and a log without truth has no errors; neither is a failure. A contestant none of
         whose runs ended is expected to have every score. Without finished runs on the log nothing is expected.
         """
+        # without this a missing score would count as a failure of whoever cannot have it
         on_log, of_contestant, ended = self._known_scores
         is_known = (key, contestant) in of_contestant or contestant not in ended
         return (key, log) in on_log and is_known and (log, contestant) in self._groups
@@ -244,6 +248,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
             f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to"
         )
     try:
+        # loaded here, because a comparison needs no extra
         import pyarrow as pa  # of the extra `bench`
         import pyarrow.parquet as pq
     except ModuleNotFoundError as error:
@@ -277,6 +282,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
         raise EvaluationError(
             f"{folder}: none of its {len(planned)} runs has been done yet; {GOING_ON}"
         )
+    # a table that another program wrote has no such metadata
     about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
     chosen = (
         reference
@@ -302,6 +308,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
 def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
     """A run from its row of the table; from its own folder if it was done after the table was written."""
     if row["status"] == NOT_RUN:
+        # a batch that was killed could not write its table again
         kept = Path(RUNS) / str(row["key"])
         with contextlib.suppress(EvaluationError):
             row = (
@@ -326,6 +333,7 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
             else json.dumps(value, sort_keys=True, default=str)
         )
     texts |= {name: value for name, value in row.items() if isinstance(value, str)}
+    # null stands for what was not measured
     numbers = {
         name: float(value)
         for name, value in row.items()

@@ -47,10 +47,10 @@ from sonar_graph.evaluation import SCORES
 from sonar_graph.files import text_of
 from sonar_graph.settings import choice, faults_in, flattened
 
+# names of tables and keys, and indices of the entries of arrays, from the top of the file
 Place = tuple[int | str, ...]
-"""Names of tables and keys, and indices of the entries of arrays, from the top of the file."""
+# environment variable: folder of data sets that do not lie beside the suite
 DATA_VARIABLE = "SONAR_GRAPH_DATA"
-"""Environment variable: folder of data sets that do not lie beside the suite."""
 DEFAULT_METRICS = (
     "causal.ate_se2_m",
     "causal.ate_raw_m",
@@ -60,22 +60,22 @@ DEFAULT_METRICS = (
     "smoothed.ate_raw_m",
     "landmarks.se2_m",
 )
+# every key that a score can have
 METRICS = tuple(
     f"{block}.{name}" for block, labels in SCORES.items() for name in labels
 )
-"""Every key that a score can have."""
 MOST_SEEDS = 1_000_000
+# largest integer that a column of the results can hold
 LARGEST_SEED = 2**63 - 1
-"""Largest integer that a column of the results can hold."""
 
 
+# values by name; names of nested settings are dotted
 Grid = Annotated[
     dict[str, list[Any]],
     BeforeValidator(
         lambda given: flattened(given) if isinstance(given, dict) else given
     ),
 ]
-"""Values by name; names of nested settings are dotted."""
 
 
 def _printable(name: str) -> str:
@@ -114,6 +114,7 @@ class LogEntry(Section):
         seeds = (
             value if isinstance(value, list) else [value] if value is not None else []
         )
+        # a number of seeds is a number of runs, which nobody wants by the million
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
         if not are_numbers or len(set(seeds)) < len(seeds):
@@ -219,6 +220,7 @@ class SuiteFile:
 
         Raises `BatchError` when it is in neither.
         """
+        # files beside the suite go before those of a folder for all suites
         roots = self._roots()
         found = [root / name for root in roots if (root / name).exists()]
         if not found:
@@ -299,6 +301,7 @@ _TEXT_MARKS = ('"""', "'''")
 
 def line_of(text: str, place: Place) -> int:
     """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it."""
+    # the nearest place that is known stands for one that the file does not name
     lines: dict[Place, int] = {(): 1}
     entries: dict[Place, int] = {}
     table: Place = ()

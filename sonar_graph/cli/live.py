@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 RECORD = "record.mcap"
 COUNTS = "live.json"
+# time between two lines of a log that waits to be played
 REMIND_S = 10.0
-"""Time between two lines of a log that waits to be played."""
+# time for subscribers to find all topics, and to get the last messages
 SETTLE_S = 1.0
-"""Time for subscribers to find all topics, and to get the last messages."""
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 
 
@@ -189,6 +189,7 @@ def live(
             else "name another folder"
         )
         raise LogError(f"{record}: a record is there already: {advice}")
+    # before anything is written: a wrong setting leaves no folder
     overrides = estimation.overrides
     params = check_request(estimator, overrides)
     given = estimation.given
@@ -207,6 +208,7 @@ def live(
         open_link(link_options.endpoints, link_options.domain) as link,
         interrupt_event() as ended,
     ):
+        # only once a link is open: a wrong address leaves no folder
         output.mkdir(parents=True, exist_ok=True)
         outlets = open_outlets(link, foxglove)
         screen = StatusLine()
@@ -260,6 +262,7 @@ def live(
         finish_s=outcome.finish_s,
     )
     with working("writing results and the page"):
+        # the page is of the record, so that it can be repeated from the record
         sequence = read_log(record)
         sequence = compared(sequence, reading.config)
         comparison = judge(sequence, outcome.causal.stamps_ns, [result])
@@ -331,6 +334,7 @@ def play(
         recorded_messages,
     )
 
+    # as a router, because most rehearsals have none
     session = open_session(connect or (), () if connect else [listen])
     publishers: dict[str, Publisher] = {}
     unknown: set[str] = set()
@@ -436,6 +440,7 @@ def wait_for_listener(
 
 def unheard_lines(publishers: dict[str, Publisher]) -> list[str]:
     """Line with the topics that nobody subscribes to; of topics of static frames zenoh does not know."""
+    # static frames are latched, so their listeners come and go
     unheard = [
         topic
         for topic, one in publishers.items()

@@ -24,11 +24,12 @@ from sonar_graph.cli.arguments import (
     with_options,
 )
 from sonar_graph.cli.outputs import (
+    is_json,
+    is_own_page,
     progress_bars,
     working,
-    writable_json,
+    writable_file,
     writable_log,
-    writable_page,
 )
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing
@@ -50,11 +51,11 @@ if TYPE_CHECKING:
     Run = Sequence | ImagesAlone
 
 TOPIC = "/sonar/landmarks"
+# metadata record with the outcome of every frame
 RECORD = "sonar_graph_recognition"
-"""Metadata record with the outcome of every frame."""
 MOST_WARNINGS_SHOWN = 10
+# tracks of a class below which calibrate warns
 FEW_TRACKS = 10
-"""Tracks of a class below which calibrate warns."""
 RecogniserName = Annotated[
     Literal["designs", "actag"],
     typer.Option(
@@ -124,6 +125,7 @@ class RecogniserOptions:
                 raise typer.BadParameter(
                     f"--rule {self.rule} and --set identity.rule={identity['rule']}: give one of them"
                 )
+            # the option is a shorter name of the setting
             identity["rule"] = self.rule
         if self.model is not None:
             values["confusion"] = confusion = read_confusion(self.model)
@@ -198,7 +200,10 @@ def recognise(
     path = writable_log(output, log, overwrite=options.overwrite)
     page = None
     if options.report is not None:
-        page = writable_page(options.report, overwrite=options.overwrite)
+        page = writable_file(
+            options.report, ".html", is_own_page, overwrite=options.overwrite
+        )
+    # images alone are enough: their own motion stands in for navigation
     sequence, motion = with_motion(log, reading, options.motion)
     made = recognition.recogniser(
         sequence.calibration, options.settings, options.recogniser
@@ -212,6 +217,7 @@ def recognise(
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
+        # what was lost on the way into the new log must not be lost to its reader
         notes = sequence.notes
         losses = {
             f"copied.{k}": f"{log.name}: {notes[k]}"
@@ -305,12 +311,9 @@ def calibrate(
 
     labels = options.labels
     sources = [*logs, *(labels or [])]
-    path = writable_json(
-        output,
-        "a model",
-        sources,
-        lambda content: "ids" in content and "matrix" in content,
-        overwrite=options.overwrite,
+    is_model = is_json(lambda content: content.keys() >= {"ids", "matrix"})
+    path = writable_file(
+        output, ".json", is_model, sources, overwrite=options.overwrite
     )
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
@@ -362,6 +365,7 @@ def calibrate(
         partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
     for number in range(1, len(labels or []) + 1):
         answers().print(measured.provenance[f"labels {number}"])
+    # frames of one track are alike: a model of few tracks knows few views
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
         frames, tracks = (
@@ -393,6 +397,7 @@ def with_motion(
     """Read what goes with a log's images, and say how the sonar's motion will be known."""
     from sonar_graph.logs import lacking_navigation, read_images_alone
 
+    # without IMU or Doppler log only the images can give the motion
     lacking = lacking_navigation(log, reading.choices, reading.config, reading.window)
     if motion == "navigation" and lacking:
         raise LogError(

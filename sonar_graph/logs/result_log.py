@@ -9,11 +9,10 @@ For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
 ``/NAME/smoothed``         the same type: what is known at the end about each instant; equal to it for a filter
 ``/NAME/path``             ``nav_msgs/Path``: the causal estimate so far, now and then; at the end the smoothed
 ``/NAME/landmarks``        ``visualization_msgs/MarkerArray`` at the end: 95 % ellipsoids and identities
-``/NAME/landmark_cloud``   ``sensor_msgs/PointCloud2`` at the end: position, identity, covariance
 ``/tf``                    ``map`` to ``NAME/base_link``, and to ``base_link``, which follows the first estimator
 ``/tf_static``             ``base_link`` to the sensors
-``/ground_truth/...``      ``odometry`` (of positions only ``point``), ``path``, ``landmarks``, ``landmark_cloud``
-                           from the start, and its frame in ``/tf``, where known
+``/ground_truth/...``      ``odometry`` (of positions only ``point``), ``path``, ``landmarks`` from the start,
+                           and its frame in ``/tf``, where known
 ``/sonar/recognised``      ``sensor_msgs/CompressedImage``: sonar images with the recognised identities drawn in
 =========================  ==============================================================================
 
@@ -192,12 +191,9 @@ def _landmarks(
 ) -> list[Outgoing]:
     if not len(landmarks):
         return []
-    markers = viewer.landmark_markers(
-        f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m
-    )
+    topic = f"/{name}/landmarks"
     return [
-        markers,
-        viewer.landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns),
+        viewer.landmark_markers(topic, landmarks, stamp_ns, colour, scene.text_height_m)
     ]
 
 

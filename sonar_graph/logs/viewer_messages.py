@@ -1,4 +1,4 @@
-"""Messages and layouts for viewers: ellipsoids and landmarks, clouds, pictures, and the first look of a result.
+"""Messages and layouts for viewers: ellipsoids and landmarks, pictures, and the first look of a result.
 
 Viewers differ in how large they draw the covariance of a pose (RViz: one sigma; Lichtblick: half a sigma, without
 correlations); an ellipsoid marker looks the same in all of them. A viewer can switch markers by their namespace:
@@ -27,7 +27,7 @@ from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
-from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS, write_text
+from sonar_graph.logs.trajectory_files import write_text
 from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing, stamped
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
@@ -147,42 +147,6 @@ def _marker_columns(
     values |= fields("markers.scale", "xyz", sizes_m)
     parts = zip("rgba", colour, strict=True)
     return values | {f"markers.color.{name}": part for name, part in parts}
-
-
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_FLOAT32 = 7
-_FLOAT64 = 8
-"""Types of a ``sensor_msgs/PointField``."""
-_NUMBERS = ("id", *LANDMARK_COLUMNS[4:])
-POINT = np.dtype([("xyz", "<f4", 3), ("", "<f4"), ("numbers", "<f8", len(_NUMBERS))])
-"""One point of `landmark_cloud`; the float64 numbers are aligned."""
-
-
-def landmark_cloud(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
-    """``sensor_msgs/PointCloud2``: positions, identities and covariances that a program can read.
-
-    A point has ``x y z`` as float32, because RViz reads nothing else, and as float64 ``id`` (exact up to 2^53) and the
-    upper triangle of the covariance, ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` (m²; NaN where unknown).
-    """
-    points = np.zeros(len(landmarks), POINT)
-    points["xyz"] = landmarks.positions
-    points["numbers"][:, 0] = landmarks.ids
-    points["numbers"][:, 1:] = landmarks.covariances[:, *np.triu_indices(3)]
-    at_ns = np.array([stamp_ns])
-    values = header(at_ns, WORLD_FRAME) | {
-        "height": 1,
-        "width": len(points),
-        "fields.name": ["x", "y", "z", *_NUMBERS],
-        "fields.offset": np.array([[0, 4, 8, *range(16, POINT.itemsize, 8)]]),
-        "fields.datatype": np.array([[_FLOAT32] * 3 + [_FLOAT64] * len(_NUMBERS)]),
-        "fields.count": np.ones((1, 3 + len(_NUMBERS))),
-        "point_step": POINT.itemsize,
-        "row_step": len(points) * POINT.itemsize,
-        "data": np.frombuffer(points.tobytes(), np.uint8)[None, :],
-        "is_dense": 1,
-    }
-    lengths = {"fields": 3 + len(_NUMBERS)}
-    return outgoing(topic, POINT_CLOUD, at_ns, values, lengths, is_latched=True)
 
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -332,7 +296,6 @@ def _filled(template: str, layers: Sequence[Layer], scene: Scene) -> str:
         "MARKER_ARRAY": MARKER_ARRAY,
         "POSE_WITH_COVARIANCE": POSE_WITH_COVARIANCE,
         "ODOMETRY": ODOMETRY,
-        "POINT_CLOUD": POINT_CLOUD,
         "COMPRESSED_IMAGE": COMPRESSED_IMAGE,
     }
 

@@ -118,7 +118,7 @@ def test_a_json_file_of_others_is_replaced_only_when_asked_for(
     mine.write_text(content)
     folder = written_batch(tmp_path / "batch")
     assert run("bless", folder, mine) == 2
-    said = "holds something else than a reference; choose another name, or give --overwrite"
+    said = "and sonar-graph did not write it; choose another name, or give --overwrite"
     assert said in capsys.readouterr().err
     assert mine.read_text() == content
     assert run("bless", folder, mine, "--overwrite") == 0

@@ -208,7 +208,7 @@ def test_a_model_that_calibrate_wrote_is_used(
     assert f"{sigmas}{of_errors}" in said
     assert run("label", lane_log, "-o", tmp_path / "model.json") == 2
     assert (
-        "model.json: exists, and holds something else than labels; choose"
+        "model.json: exists, and sonar-graph did not write it; choose"
         in capsys.readouterr().err
     )
     assert model.provenance["logs"] == "lane.mcap"

@@ -420,12 +420,8 @@ def test_a_map_in_another_world_is_scored_after_alignment_where_no_path_tells_th
     )
     assert "aligned" in scores["landmarks.nees"].protocol
     if not has_truth:
-        said = [
-            one
-            for one in sentences.finding(comparison)
-            if one.startswith("No true path is known, but the landmarks")
-        ]
-        assert len(said) == 1
+        said = sentences.headline(comparison)
+        assert said.startswith("No true path is known, but the landmarks")
         drawn = true_landmarks_drawn(comparison)
         np.testing.assert_allclose(
             drawn.positions, comparison.runs[0].landmarks.positions, atol=1e-9

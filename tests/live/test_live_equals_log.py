@@ -9,7 +9,7 @@ import pytest
 from sonar_graph import Odometry, load_estimator, read_log, write_log
 from sonar_graph.calibration import Calibration, KnownMap
 from sonar_graph.errors import LogError
-from sonar_graph.live import Engine, Message, recorded_messages
+from sonar_graph.live import Engine, LiveOptions, Message, recorded_messages
 from sonar_graph.live.zenoh_link import definition_of
 from sonar_graph.logs import PartialCalibration
 from sonar_graph.logs.live_record import LiveRecord
@@ -22,7 +22,8 @@ NS = 1_000_000_000
 
 def live(path: Path, messages: list[Message], **options):
     with LiveRecord(path) as record:
-        engine, generation, steps = Engine(record, definition_of, **options), 0, []
+        engine = Engine(record, definition_of, LiveOptions(**options))
+        generation, steps = 0, []
         for message in messages:
             engine.take(message)
             if engine.generation != generation:
@@ -264,7 +265,11 @@ def test_a_topic_that_was_chosen_may_come_late(tmp_path):
     late_ns = messages[0].arrival_ns + 5 * NS
     with LiveRecord(tmp_path / "record.mcap") as record:
         engine, waited_for = (
-            Engine(record, definition_of, wanted={"detections": "/sonar/landmarks"}),
+            Engine(
+                record,
+                definition_of,
+                LiveOptions(topics={"detections": "/sonar/landmarks"}),
+            ),
             set(),
         )
         for message in messages:
@@ -296,7 +301,7 @@ def test_several_topics_for_one_role_are_recorded_with_advice_and_resumed_with_a
     assert "--resume" in engine.waits_for
     assert sum(engine.counts.received.values()) == len(both)
     kept = list(recorded_messages(tmp_path / "first.mcap"))
-    engine, steps = live(tmp_path / "second.mcap", kept, wanted={"imu": "/imu/data"})
+    engine, steps = live(tmp_path / "second.mcap", kept, topics={"imu": "/imu/data"})
     assert len(steps) > 100
     assert engine.in_use["imu"] == "/imu/data"
 

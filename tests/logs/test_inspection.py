@@ -62,7 +62,7 @@ def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(
         "header",
         "log",
     )
-    assert "mountings of /tf_static (imu: imu_link)" in summary.calibration
+    assert "mountings from /tf_static: imu (imu_link)" in summary.calibration
 
 
 def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
@@ -78,8 +78,7 @@ def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
     assert role(summary, "truth")[0] is None
     assert "/odom only if chosen: --topic truth=/odom" in role(summary, "truth")[1]
     assert summary.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
-    assert summary.calibration.startswith("none in the log and no /tf_static")
-    assert "sonar_graph/calibration.py lists them" in summary.calibration
+    assert summary.calibration.startswith("defaults; mountings from /tf_static: none")
     assert '# [imu]  # one of\n# topic = "/imu"\n# topic = "/second"' in summary.toml
     assert '# [truth]  # one of\n# topic = "/odom"' in summary.toml
     assert 'rotation = "flu"' in summary.toml
@@ -108,7 +107,7 @@ def test_the_roles_are_those_that_reading_uses(
     used = read_log(tmp_path / "a.mcap").notes["log.topics"]
     assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles if r.topic)
     assert (summary.calibration, summary.name, summary.notes) == (
-        "in the log",
+        "from the log",
         sequence.name,
         sequence.notes,
     )

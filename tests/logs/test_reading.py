@@ -19,14 +19,11 @@ from sonar_graph.errors import (
     SonarGraphError,
 )
 from sonar_graph.logs.adapters.landmark_messages import (
-    LandmarkMapAdapter,
     detection_warnings,
 )
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
-from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 from sonar_graph.logs.writing import write_log
@@ -43,8 +40,8 @@ UNKNOWN = [-1.0] + [0.0] * 8
 
 # fmt: off
 REFUSED_CHOICES: list[tuple[str, dict[str, str], type[Exception], str]] = [
-    ("/imu", {}, MissingTopicError, r"nothing for dvl: no marine_acoustic_msgs/msg/Dvl and 5 more.*/imu \(sens"),
-    ("/dvl", {}, MissingTopicError, r"nothing for imu.*IMU and Doppler log must both be in the log.*/dvl \(marine"),
+    ("/imu", {}, MissingTopicError, r"nothing for dvl: no topic of a known type, such as marine_acoustic.*/imu \(sens"),
+    ("/dvl", {}, MissingTopicError, r"nothing for imu: no topic of a known type.*/dvl \(marine"),
     ("/imu /dvl /other", {}, LogError, r"2 topics fit: /imu, /other; choose one: --topic imu=/imu \(topics=\{'imu'"),
     ("/imu /dvl", {"imu": "/nowhere"}, MissingTopicError, "/nowhere was chosen but is not in the log; the log has .*/"),
     ("/imu /dvl", {"imu": "/dvl"}, MissingTopicError,
@@ -198,7 +195,7 @@ def test_noise_of_zero_in_the_calibration_is_in_doubt_where_the_log_states_none(
     )
     # of a file that is given, the summary names the fields
     source = inspect_log(tmp_path / "a.mcap", calibration=given).calibration
-    assert source == f"from {given}: dvl.velocity_sigma_m_s; else in the log"
+    assert source == f"from {given}: dvl.velocity_sigma_m_s; else from the log"
 
 
 # --- rows -----------------------------------------------------------------------------------------------------------
@@ -345,10 +342,8 @@ def test_the_last_map_counts_whatever_the_lengths_of_those_before(bench: Bench) 
             | {"covariance": [0.0] * 9 * len(ids)}
             for ids in ([1, 2], [3], last)
         ]
-        topic = scan(
-            bench.write(("/truth/landmarks", "map", maps)), lambda _: Keep.ALL
-        ).topics["/truth/landmarks"]
-        found, _ = LandmarkMapAdapter(type=topic.type_name).read(topic)
+        path = bench.write(*bench.basics(), ("/truth/landmarks", "map", maps))
+        found = read_log(path).true_landmarks
         assert found is not None
         assert found.ids.tolist() == last
 

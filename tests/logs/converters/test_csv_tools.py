@@ -227,6 +227,8 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
     assert "imu" not in config
     assert "# [imu]  # no accelerometer: is this the IMU?" in text
     assert config["heading"]["scale"] == "deg"
+    # the battery has an identity
+    assert "true_landmarks" not in config
     with pytest.raises(LogError, match=r"has no table \[imu\]"):
         guessed(folder, tmp_path)
     taken = uncommented(text, "imu").replace(
@@ -267,17 +269,9 @@ def test_an_imu_that_may_be_of_1_hz_or_of_1_khz_is_asked_about(folder, tmp_path)
         guessed(folder, tmp_path)
     stated = guessed(folder, tmp_path, 'stamp_unit_s = "s"\n' + text)
     assert stated.duration_s == pytest.approx(ROWS, abs=20)
-
-
-def test_tables_may_count_time_in_different_units(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", scale=1e6)
-    plain(folder, d, "dvl", scale=1e3)
-    plain(folder, d, "depth")
-    _, config = template(folder)
-    units = [config[r].get("stamp_unit_s") for r in ("imu", "dvl", "depth")]
-    assert units == ["us", "ms", None]
-    assert_is(guessed(folder, tmp_path), d)
+    d.s += EPOCH_S
+    plain(folder, d, "imu", "dvl", "depth")
+    assert "which unit?" not in template(folder)[0]
 
 
 def test_depths_in_another_unit_of_time_are_refused_where_nothing_states_it(folder):
