@@ -318,6 +318,11 @@ class Start(Section):
         """world_T_body."""
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.position_m))
 
+    def in_map(self) -> Self:
+        """The start of a run with a known map: where nothing gives its place, the place is found in the map."""
+        is_placed = self.source not in ("heading", "vehicle")
+        return self if is_placed else self.model_copy(update={"source": "map"})
+
 
 class KnownMap(Section):
     """Landmarks whose places were known before the run, by a survey or by the map of an earlier run.

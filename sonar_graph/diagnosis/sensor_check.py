@@ -740,7 +740,8 @@ def reference_findings(
     )
     yield judged(jump, found.start_heading, LEAST_HEADING_RAD)
     heading = None
-    if offset.is_known and start != Start():
+    # a start that is found in the map has no heading yet
+    if offset.is_known and start != Start() and start.source != "map":
         heading = find_start_heading(right, reference, offset)
     # rows on the start must not contradict each other
     is_wrong = heading is not None and heading.acts
