@@ -6,7 +6,6 @@ read back to the bit (docs/design/0004-logs.md).
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -130,24 +129,7 @@ def write_log(
         "notes": json.dumps(sequence.notes),
     }
     with recording(path, {METADATA: record}) as out:
-        begins = [0] * len(messages)
-        for entry in more:  # with each, what comes up to its end
-            until_ns = int(entry.log_times_ns[-1])
-            ends = [
-                int(np.searchsorted(m.log_times_ns, until_ns, side="right"))
-                for m in messages
-            ]
-            out.write([*map(_rows, messages, begins, ends), entry])
-            begins = ends
-        out.write([_rows(m, first) for m, first in zip(messages, begins, strict=True)])
-
-
-def _rows(entry: Outgoing, first: int, end: int | None = None) -> Outgoing:
-    return replace(
-        entry,
-        log_times_ns=entry.log_times_ns[first:end],
-        payloads=entry.payloads[first:end],
-    )
+        out.write(messages, more)
 
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:

@@ -233,8 +233,6 @@ class Plan:
             kind = PRIMITIVES.get(entry.kind, "u1")
             counted = Counted(self._next(), path, kind, is_text=is_text)
             self.leaves[path] = Leaf(counted, kind, is_single)
-            if not is_text:
-                self.sequences[path] = counted
             if not is_text or not entry.is_array:
                 return counted
             inner = [counted]
