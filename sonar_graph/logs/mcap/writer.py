@@ -199,14 +199,15 @@ class LogWriter:
         """
         streamed = chain.from_iterable(by_time([entry]) for entry in more)
         # topics are listed in the order of the list, also those without a message
-        for entry in messages:
-            self._offer(entry)
+        channels = {entry.topic: self._offer(entry) for entry in messages}
         written = self._stream.tell()
         for time_ns, entry, payload in heapq.merge(
             by_time(messages), streamed, key=lambda message: message[0]
         ):
+            if entry.topic not in channels:
+                channels[entry.topic] = self._offer(entry)
             at_ns = max(time_ns, 0)
-            self.mcap.add_message(self._offer(entry), at_ns, payload, at_ns)
+            self.mcap.add_message(channels[entry.topic], at_ns, payload, at_ns)
             # a chunk was full: on the disk it survives the end of this process
             if self._stream.tell() != written:
                 self._stream.flush()
