@@ -103,6 +103,7 @@ def write_log(
     """
     path = as_path(path, "write_log(path, sequence)")
     require_sequence(sequence, "write_log(path, sequence)")
+    # latched messages come first: players send them before any sensor
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
     mountings = encode_mountings(sequence.calibration)
     messages = [static_message("/tf_static", TF, first_ns, mountings)]
@@ -123,6 +124,7 @@ def write_log(
         messages += detection_messages("/sonar/landmarks", sequence.detections)
     if sequence.truth is not None:
         messages.append(truth_messages(sequence.truth))
+    # what no ROS message holds: without it a reader would have to guess noise and start
     record = {
         "name": sequence.name,
         "calibration": recorded_calibration(sequence.calibration),
@@ -137,6 +139,7 @@ def imu_messages(topic: str, imu: Imu) -> Outgoing:
     # ROS marks an acceleration that was not measured by -1 in its covariance
     unmeasured = np.isnan(imu.specific_force).all(axis=1)
     values: dict[str, Value] = {
+        # not measured, but a quaternion of zeros is none and viewers refuse it
         "orientation.w": 1.0,
         "orientation_covariance": NOT_MEASURED[None, :],
         "linear_acceleration_covariance": np.outer(unmeasured, NOT_MEASURED),
@@ -148,6 +151,7 @@ def imu_messages(topic: str, imu: Imu) -> Outgoing:
 
 def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
     """``marine_acoustic_msgs/Dvl`` over the bottom, without single beams."""
+    # an unknown covariance is NaN here, and -1 in ROS
     covariances = dvl.velocity_cov.reshape(-1, 9).copy()
     covariances[np.isnan(covariances).any(axis=1)] = NOT_MEASURED
     values = fields("velocity", "xyz", dvl.velocity)
@@ -160,6 +164,7 @@ def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
 def depth_messages(topic: str, depth: Depth) -> Outgoing:
     """``PoseWithCovarianceStamped`` of which only z counts; it keeps every bit of a height, a pressure does not."""
     covariances = np.zeros((len(depth), 6, 6))
+    # zeros mean unknown in ROS
     covariances[:, 2, 2] = np.nan_to_num(depth.variance_m2, posinf=np.inf)
     values = {"pose.pose.position.z": depth.z_m}
     return _upright_poses(topic, depth.stamps_ns, values, covariances)
@@ -211,6 +216,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
         else np.empty((len(detections), 0), np.int64),
     }
     entries = []
+    # all messages of an entry have one size, which depends on the number of detections
     for count in np.unique(counts).tolist():
         frames = counts == count
         rows = first[frames][:, None] + np.arange(count)
@@ -224,6 +230,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
 
 def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
     """Columns of a ``PoseWithCovariance`` called ``pose``, with zeros for an unknown covariance."""
+    # covariances are in body axes here, in world axes in ROS
     covariances = body_to_ros(trajectory.covariances, trajectory.matrices)
     values = fields("pose.pose.position", "xyz", trajectory.positions)
     values |= fields("pose.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
