@@ -18,7 +18,7 @@ from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import lz4.frame
 
@@ -178,13 +178,15 @@ _ADVICE = {
 
 def limited_bz2(packed: bytes) -> bytes:
     """Content of a bz2 chunk; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
-    chunk = bz2.BZ2Decompressor()
-    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
+    return _unpacked(bz2.BZ2Decompressor(), packed)
 
 
 def limited_zstd(packed: bytes) -> bytes:
-    """Content of a zstd chunk or message; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
-    chunk = import_module(_ZSTD).ZstdDecompressor()
+    """Content of a zstd chunk or message; a LogError as of `limited_bz2`."""
+    return _unpacked(import_module(_ZSTD).ZstdDecompressor(), packed)
+
+
+def _unpacked(chunk: Any, packed: bytes) -> bytes:
     return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
 
 
