@@ -1,4 +1,5 @@
 """Logs in and out: MCAP with ROS 2 messages, trajectory files, converters."""
+
 # fmt: off
 from typing import TYPE_CHECKING
 from sonar_graph import at_first_use
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from sonar_graph.logs.writing import detection_messages, landmark_map_message, sonar_image_messages, write_log
 else:
     __getattr__, __dir__ = at_first_use(__name__)
-
 __all__ = [
     "Amended", "Assembly", "Choice", "DETECTIONS", "DROPPED_TOPIC", "ImagesAlone", "LATENESS", "LIVE_RATE",
     "LiveRecord", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "ROLES", "STEPPED_BACK",
