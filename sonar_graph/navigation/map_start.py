@@ -398,7 +398,6 @@ class StartInMap:
         self._locator = MapLocator(calibration)
         self._waiting: list[Measurements] = []
         self._inner: Estimator | None = None
-        self._from_ns = 0
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Causal estimate at the end of the measurements; None as long as the vehicle is not located in the map."""
@@ -410,7 +409,6 @@ class StartInMap:
             return None
         started = self._calibration.model_copy(update={"start": self._locator.start()})
         self._inner = self._make(started, Odometry(started))
-        self._from_ns = measurements.end_ns
         estimate = None
         for each in self._waiting:
             estimate = self._inner.process(each)
@@ -418,11 +416,10 @@ class StartInMap:
         return estimate
 
     def trajectory(self) -> Trajectory:
-        """Estimates from the instant on at which the vehicle was located."""
+        """Poses at all instants, also those before the vehicle was located; none until then."""
         if self._inner is None:
             return Trajectory.from_estimates([])
-        whole = self._inner.trajectory()
-        return whole.rows(np.flatnonzero(whole.stamps_ns >= self._from_ns))
+        return self._inner.trajectory()
 
     def landmarks(self) -> LandmarkMap:
         """Best present estimate of every landmark; none before the vehicle is located."""
