@@ -357,6 +357,11 @@ def test_the_page_of_a_located_dive_has_the_given_map_and_what_became_of_it(dive
     assert all(cell.endswith("moved") for cell in rows[0][3:])
     assert [row[0] for row in rows if row[3:] == ["not seen"] * 2] == ["99"]
     assert located_line(compared).startswith("Located in the map (star): isam2: after ")
+    smoothed = compared.runs[0].smoothed
+    assert len(smoothed) > len(compared.runs[0].causal)
+    truth = dive.true_poses.at(smoothed.stamps_ns[:5])
+    away = smoothed.positions[:5] - truth.positions
+    assert np.abs(away).max() < 0.3
     page = render_report(compared)
     assert 'id="show-raw" checked' in page
     assert "map that was given" in page
