@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import threading
 
     from sonar_graph.live import Publisher
+    from sonar_graph.logs import PartialCalibration
 
 RECORD = "record.mcap"
 COUNTS = "live.json"
@@ -92,6 +93,9 @@ class LiveEstimation:
     calibration: Annotated[
         Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
     ] = None
+    map: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
+    ] = None
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -107,6 +111,23 @@ class LiveEstimation:
             topics=self.topics,
             log_config=self.log_config,
         )
+
+    @property
+    def given(self) -> PartialCalibration | None:
+        """Fields of the calibration, the map of landmarks among them."""
+        from sonar_graph.logs import PartialCalibration
+        from sonar_graph.map_file import read_map
+
+        given = self.reading.given
+        if self.map is None:
+            return given
+        known, warnings = read_map(self.map)
+        for line in warnings:
+            echo(line, err=True)
+        of_map = PartialCalibration(
+            {"map": known.model_dump(mode="json")}, str(self.map)
+        )
+        return of_map if given is None else of_map.over(given)
 
 
 @with_options()
@@ -171,11 +192,9 @@ def live(
     # before anything is written: a wrong setting leaves no folder
     overrides = estimation.overrides
     params = check_request(estimator, overrides)
-    given = (
-        reading.given
-        if resume is None
-        else LiveRecord.resumed_calibration(resume, reading.given)
-    )
+    given = estimation.given
+    if resume is not None:
+        given = LiveRecord.resumed_calibration(resume, given)
     options = LiveOptions(
         estimator,
         overrides,

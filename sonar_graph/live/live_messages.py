@@ -9,6 +9,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from sonar_graph.logs import DROPPED_TOPIC, dropped_in
 from sonar_graph.logs.mcap import (
     ChunkPart,
@@ -16,6 +18,7 @@ from sonar_graph.logs.mcap import (
     LogFile,
     Passage,
     Recording,
+    Topic,
     log_parts,
     scan,
 )
@@ -44,6 +47,12 @@ class Message(NamedTuple):
     """Number that the sender gave it; 0: none."""
     sent_ns: int = 0
     sender: bytes = b""
+
+
+def gather(topic: Topic, payload: bytes, log_time_ns: int) -> None:
+    """Add one message to a topic."""
+    at = np.zeros(1, np.int64)
+    topic.gather(payload, at, np.array([len(payload)]), np.array([log_time_ns]))
 
 
 def recorded_messages(path: Path) -> Iterator[Message]:

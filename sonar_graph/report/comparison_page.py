@@ -36,6 +36,7 @@ from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
 from sonar_graph.report.figure_style import inline_svg, sized
 from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
+from sonar_graph.report.given_map import given_map_table
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.rendering import Section, data_address, html_of, write_html
 from sonar_graph.sequence import Sequence
@@ -198,6 +199,7 @@ def _page(comparison: Comparison) -> tuple[list[Section], dict[str, Any]]:
             landmark_table(comparison),
         ),
         "left_out": landmarks_left_out(comparison),
+        "given_map": given_map_table(comparison),
         "has_true_landmarks": sequence.true_landmarks is not None,
         "nameless": sentences.nameless_landmarks(comparison),
         "paper": PAPER if repeats_published(sequence) else "",

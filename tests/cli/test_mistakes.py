@@ -87,7 +87,7 @@ MISTAKES = {
         r"1000 m above the floor and sees nothing of it up to its range of .* \(metres\)"
     ),
     "recognise lane.mcap -o out.mcap --calibration strange.toml": "is a file of landmark designs, .*with --designs",
-    "recognise lane.mcap -o out.mcap --calibration labels.json": "is a file of labels, not a calibration; .*--labels",
+    "recognise lane.mcap -o out.mcap --calibration labels.json": "is not a calibration; .*--labels",
     "compare basin.mcap -o out --rate-hz 0": "--rate-hz",
     "compare basin.mcap -o out --rate-hz inf": "--rate-hz",
     "compare basin.mcap -o out --rate-hz nan": "--rate-hz",

@@ -31,6 +31,7 @@ from sonar_graph.report.figures.maps import (
     map_figure,
     paths_cut_off,
 )
+from sonar_graph.report.given_map import located_line
 
 ALIGNED = "aligned to the truth"
 
@@ -233,11 +234,12 @@ def _captions(comparison: Comparison) -> dict[str, str]:
         run.landmarks is not None and len(run.landmarks) for run in comparison.runs
     )
     landmarks = f" Ellipses hold 95 %{as_large}."
+    located = "" if comparison.is_aligned else located_line(comparison)
     gone = paths_cut_off(comparison)
     far = error_figures.errors_cut_off(comparison)
     return {
         "map": (
-            f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)}"
+            f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)} {located}".rstrip()
         ),
         "growth": growth,
         "errors": DRAWINGS["errors"].caption.format(

@@ -15,6 +15,7 @@ from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_m
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
+from sonar_graph.report.given_map import draw_given_map
 from sonar_graph.states import (
     FIRST_ANONYMOUS_ID,
     LandmarkMap,
@@ -75,6 +76,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
             panel.plot(*x_y, "os^Dv<"[index % 6], color=own, **look)
             for ellipse in ellipses(run.landmarks, own, factor):
                 panel.add_patch(ellipse)
+    draw_given_map(panel, comparison)
     view = landscape(view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
