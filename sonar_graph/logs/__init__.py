@@ -1,4 +1,5 @@
 """Logs in and out: MCAP with ROS 2 messages, trajectory files, converters."""
+
 # fmt: off
 from typing import TYPE_CHECKING
 from sonar_graph import at_first_use

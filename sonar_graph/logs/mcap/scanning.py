@@ -94,11 +94,11 @@ def _fixed(window: TimeWindow | None, first: LogFile) -> TimeWindow | None:
     if window is None or not (window.start or window.end):
         return window
     beginning_ns = first_time_ns(first)
-    start, end = (
+    limits = [
         None if limit is None else Instant(absolute_ns=limit.resolve(beginning_ns))
         for limit in (window.start, window.end)
-    )
-    return TimeWindow(start, end)
+    ]
+    return TimeWindow(*limits)
 
 
 def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:

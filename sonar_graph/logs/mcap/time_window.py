@@ -72,10 +72,10 @@ class TimeWindow:
     @classmethod
     def parse(cls, start: str | None, end: str | None) -> TimeWindow:
         """Window between two times in text, as `Instant.parse` takes them; None: no limit."""
-        first, last = (
+        limits = [
             None if text is None else Instant.parse(text) for text in (start, end)
-        )
-        return cls(first, last)
+        ]
+        return cls(*limits)
 
     def describe(self, beginning_ns: int) -> str:
         """Text with the limits in seconds after the log's beginning."""
