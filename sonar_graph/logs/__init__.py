@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from sonar_graph.logs.writing import detection_messages, landmark_map_message, sonar_image_messages, write_log
 else:
     __getattr__, __dir__ = at_first_use(__name__)
-
 __all__ = [
     "Amended", "Assembly", "Choice", "DETECTIONS", "DROPPED_TOPIC", "ImagesAlone", "LATENESS", "LIVE_RATE",
     "LiveRecord", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "ROLES", "STEPPED_BACK",
