@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
 from sonar_graph.live.live_messages import gather
@@ -20,6 +19,7 @@ from sonar_graph.logs.adapters import (
     LARGEST,
     Adapter,
     ImuAdapter,
+    Mask,
     field_of,
     turn,
 )
@@ -173,7 +173,7 @@ def _bytes_of(messages: Messages, path: str) -> Ints:
     return column.starts[0] + (index or 0) * size + np.arange(size)
 
 
-def _stays(messages: Messages) -> NDArray[np.bool_]:
+def _stays(messages: Messages) -> Mask:
     """Mask of the bytes that decide where the numbers are, and whether the message is sound."""
     layout = messages.layout
     stays = np.zeros(messages.payloads.shape[1], bool)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Never
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
@@ -23,6 +22,7 @@ from sonar_graph.logs.adapters import (
     FieldTable,
     GeodeticFields,
     LogConfig,
+    Mask,
     MessageTable,
     Origin,
     Setup,
@@ -423,7 +423,7 @@ class Assembly:
             self._dropped[role] = dropped
         return rows
 
-    def _contradicted(self, role: str, rows: Any) -> tuple[NDArray[np.bool_], str, str]:
+    def _contradicted(self, role: str, rows: Any) -> tuple[Mask, str, str]:
         """Mask of rows that other sensors contradict, shape (n,), the reason, and a setting that uses them."""
         none = np.zeros(len(rows), bool)
         imu = self.block("imu") if role != "imu" else None

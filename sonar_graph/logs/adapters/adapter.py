@@ -11,7 +11,6 @@ from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
@@ -20,6 +19,7 @@ from sonar_graph.logs.adapters.geodesy import Origin
 from sonar_graph.logs.adapters.message_table import (
     SAME_STAMP,
     FieldTable,
+    Mask,
     MessageTable,
     field_of,
     share,
@@ -283,7 +283,7 @@ class CovarianceFields(PathSection):
     zero: Reading = "unknown"
     """Meaning of a covariance of zeros."""
 
-    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
         is_negative = matrices[:, 0, 0] < 0
@@ -296,7 +296,7 @@ class CovarianceFields(PathSection):
             matrices = matrices**2 * np.eye(3)
         return np.where(is_unknown[:, None, None], np.nan, matrices), is_invalid
 
-    def of_negative(self, is_negative: NDArray[np.bool_]) -> Reading:
+    def of_negative(self, is_negative: Mask) -> Reading:
         """Meaning of negative first elements, given which messages have one."""
         if self.negative != "found":
             return self.negative
@@ -350,7 +350,7 @@ def variances(fields: CovarianceFields | None, table: FieldTable) -> Floats:
     return fields.read_variance(table) if fields else np.full(len(table), np.nan)
 
 
-def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:
+def _is_impossible(matrices: Floats) -> Mask:
     """Matrices with a zero on the diagonal or a negative eigenvalue beyond rounding, shape (n,); False for NaN."""
     is_finite = np.all(np.isfinite(matrices), axis=(1, 2))
     finite = np.where(is_finite[:, None, None], matrices, np.eye(3))

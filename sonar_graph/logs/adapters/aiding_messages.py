@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
@@ -29,8 +28,9 @@ from sonar_graph.logs.adapters.adapter import (
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
+    Mask,
     fit_block,
     not_finite,
     share,
@@ -101,7 +101,7 @@ class HeadingAdapter(Adapter):
             "status = false under [heading] in a log configuration"
         )
 
-    def is_measured(self, table: FieldTable) -> NDArray[np.bool_]:
+    def is_measured(self, table: FieldTable) -> Mask:
         """Mask of messages that say that yaw is measured, shape (n,)."""
         is_measured = np.ones(len(table), bool)
         if self.status is not None:
@@ -110,7 +110,7 @@ class HeadingAdapter(Adapter):
             is_measured &= np.isfinite(self.variance.read_variance(table))
         return is_measured
 
-    def read(self, table: FieldTable, setup: Setup) -> tuple[Heading | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Heading]:
         """Yaw of the body with its sigma; NaN: unknown."""
         faults = {NO_MEASUREMENT: ~self.is_measured(table)}
         if self.orientation is not None:
@@ -156,7 +156,7 @@ class HeadingAdapter(Adapter):
                 )
 
 
-def not_zero(quaternions: Floats) -> NDArray[np.bool_]:
+def not_zero(quaternions: Floats) -> Mask:
     """Mask of quaternions that are rotations, shape (n,)."""
     lengths = np.linalg.norm(quaternions, axis=1)
     return np.isfinite(lengths) & (lengths > 0.5)
@@ -167,9 +167,9 @@ class Places(NamedTuple):
 
     position_m: Floats
     """Shape (n, 3), z up; a height that was not measured is 0."""
-    faults: dict[str, NDArray[np.bool_]]
+    faults: dict[str, Mask]
     """Masks of rows without a position, by reason."""
-    has_height: NDArray[np.bool_]
+    has_height: Mask
 
 
 class GeodeticFields(PathSection):
@@ -190,7 +190,7 @@ class GeodeticFields(PathSection):
     origin_deg_m: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
 
-    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
 
         Drivers without a fix send latitude and longitude 0; a height that is not measured is NaN.
@@ -298,9 +298,7 @@ class PositionAdapter(PlaceAdapter):
         """Values of `position` in metres from the origin, along the driver's axes, shape (n, 3)."""
         return super().scaled(table) - self.origin_m
 
-    def read(
-        self, table: FieldTable, setup: Setup
-    ) -> tuple[PositionFixes | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[PositionFixes]:
         """Fixes with covariances, NaN: unknown; the calibration's noise counts for fixes without height and covariance."""
         places = self.places(table, setup.origin)
         C = np.full((len(table), 3, 3), np.nan)

@@ -26,8 +26,8 @@ from sonar_graph.logs.adapters.adapter import (
 from sonar_graph.logs.adapters.aiding_messages import ENU_R, World
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
     MessageTable,
     fit_block,
     not_finite,
@@ -108,7 +108,7 @@ class DetectionListsAdapter(Adapter):
         self,
         table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkDetections | None, Dropped]:
+    ) -> Fit[LandmarkDetections]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
         groups = [group for group in table.groups if group["range_m"].shape[1]]
         if not groups:
@@ -174,7 +174,7 @@ def _fit(
     faults: Mapping[str, np.ndarray],
     measured: tuple[Floats, Floats, Floats],
     tracks: Floats | Ints,
-) -> tuple[LandmarkDetections | None, Dropped]:
+) -> Fit[LandmarkDetections]:
     """Rows fit for use, from ranges, azimuths and covariances."""
     columns = (*measured, rows.ids, rows.probabilities, tracks)
     return fit_block(LandmarkDetections, rows.stamps_ns, faults, *columns, unique=False)
@@ -208,7 +208,7 @@ class DetectionArrayAdapter(Adapter):
         self,
         table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkDetections | None, Dropped]:
+    ) -> Fit[LandmarkDetections]:
         """One row a detection that has a result; the scores are the posterior, in the order of the results."""
         groups = [
             group for group in table.groups if group.lengths("detections.results")
@@ -311,7 +311,7 @@ class LandmarkMapAdapter(Adapter):
         self,
         table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkMap | None, Dropped]:
+    ) -> Fit[LandmarkMap]:
         """The last map of a topic."""
         # a map is latched: the newest counts
         last = max(table.groups, key=lambda group: int(group.rows[-1]))
@@ -422,7 +422,7 @@ class DetectionRowsAdapter(Adapter):
         self,
         table: FieldTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkDetections | None, Dropped]:
+    ) -> Fit[LandmarkDetections]:
         """Detections in the order of their stamps."""
         range_m = table.column(self.range) * self.range_scale
         to_the_left = -1.0 if self.rotation == "frd" else 1.0
@@ -477,7 +477,7 @@ class LandmarkRowsAdapter(Adapter):
         self,
         table: FieldTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkMap | None, Dropped]:
+    ) -> Fit[LandmarkMap]:
         """Map of the rows, of which each has another identity."""
         ids = _whole(table, self.id)
         positions = table.beside(self.position) * self.scale
