@@ -91,6 +91,7 @@ class MessageReader:
         adapter = self._adapters[role]
         table = adapter.table(topic)
         first = table.groups[0]
+        # a log of such messages is refused, so that its record must not have them
         if _sizes(adapter, first) != self._sizes[role]:
             raise LogError("has arrays of another length than the first messages")
         block, dropped = adapter.read(table, self._setups[role])
@@ -177,7 +178,7 @@ def _stays(messages: Messages) -> Mask:
     """Mask of the bytes that decide where the numbers are, and whether the message is sound."""
     layout = messages.layout
     stays = np.zeros(messages.payloads.shape[1], bool)
-    stays[:2] = True
+    stays[:2] = True  # the byte order
     for at, _ in layout.words:
         stays[at : at + 4] = True
     for path in (*layout.plan.texts, *layout.plan.booleans):
