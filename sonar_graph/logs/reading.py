@@ -255,12 +255,11 @@ def _scanned(
 
     types = wanted_types(config or LogConfig())
     recording = scanned(types)
-    if config is not None:
-        return recording, config
-    own = recorded_config(recording) or LogConfig()
+    used = config or recorded_config(recording) or LogConfig()
     # the types of its own topics are known only now
-    is_enough = wanted_types(own) <= types
-    return recording if is_enough else scanned(wanted_types(own)), own
+    if not wanted_types(used) <= types:
+        recording = scanned(wanted_types(used))
+    return recording, used
 
 
 class Assembly:

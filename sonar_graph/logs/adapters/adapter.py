@@ -54,6 +54,7 @@ def axes_matrix(rotation: Rotation) -> Floats:
     if isinstance(rotation, str):
         signs = [1.0, 1.0, 1.0] if rotation == "flu" else [1.0, -1.0, -1.0]
         return np.diag(signs)
+    # written as rows of a matrix, a mirrored driver needs no angles
     if isinstance(rotation[0], str):
         return np.array([_ALONG[axis] for axis in rotation])
     angles = np.array(rotation, float)
@@ -210,6 +211,7 @@ class Adapter(Section):
         """Frame of the sensor; empty where the messages do not name one."""
         if self.frame_id is not None:
             return self.frame_id
+        # one sensor fills a topic, so that the first message is enough
         named = map(messages[0].first_string, field_paths(self.frame_id_field))
         return next(filter(None, named), "")
 
@@ -291,6 +293,7 @@ class CovarianceFields(PathSection):
         is_invalid = is_negative & (self.of_negative(is_negative) == "invalid")
         is_invalid |= is_zero & (self.zero == "invalid")
         is_finite = np.isfinite(matrices).all(axis=(1, 2))
+        # estimators would take a matrix that is no covariance for certainty
         is_unknown = is_negative | is_zero | ~is_finite | _is_impossible(matrices)
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)

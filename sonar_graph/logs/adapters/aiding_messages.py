@@ -91,6 +91,7 @@ class HeadingAdapter(Adapter):
 
     def refusal(self, topic: Topic) -> str | None:
         """Reason why no message has a heading, which completes "/imu ..."."""
+        # an inspection may hold the stamps alone, which do not show it
         is_read = topic.keep is Keep.ALL and topic.messages()
         if not is_read or self.is_measured(self.table(topic)).any():
             return None
@@ -122,6 +123,7 @@ class HeadingAdapter(Adapter):
             body_R_driver = setup.body_R_sensor @ axes_matrix(self.rotation)
             R = ENU_R[self.world] @ world_R_sensor @ body_R_driver.T  # (n, 3, 3)
             yaw_rad = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+            # near the vertical the yaw is that of rounding
             is_steep = np.abs(R[:, 2, 0]) > np.sin(STEEPEST_RAD)
             faults["without an orientation"] = ~is_rotation
             faults["with the nose too steep for a heading"] = is_steep
@@ -205,6 +207,7 @@ class GeodeticFields(PathSection):
         height = np.full(len(table), np.nan)
         if self.height:
             height = table.column(self.height).astype(float)
+        # receivers without satellites send zeros
         is_fix = np.isfinite(place).all(axis=1) & place.any(axis=1)
         is_fix &= (np.abs(place) <= [90.0, 360.0]).all(axis=1)
         if self.status is not None:
@@ -226,6 +229,7 @@ class GeodeticFields(PathSection):
         fixes = places[order[is_fix[order]]]
         if not len(fixes):
             return None
+        # some receivers give heights later than places
         heights = fixes[np.isfinite(fixes[:, 2]), 2].tolist()
         latitude, longitude, _ = fixes[0].tolist()
         return latitude, longitude, next(iter(heights), 0.0)

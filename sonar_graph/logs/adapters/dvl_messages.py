@@ -76,6 +76,7 @@ class BeamGeometry(PathSection):
                 fault = f"has {marks.shape[1:]} elements; there are {count} beams"
                 table.refuse(self.valid, fault)
             is_valid &= marks.astype(bool)
+        # with one noise for all beams its size does not matter
         velocity, _ = velocity_of_beams(self.directions(), along, is_valid, 1.0)
         return velocity, is_valid.sum(axis=1) < FEWEST_BEAMS
 
@@ -197,6 +198,7 @@ class DvlAdapter(Adapter):
             f"with {path} not {str(self.valid_where[path]).lower()}": ~is_valid
             for path, is_valid in self._filled(table).items()
         }
+        # a mark and a count do not exclude each other
         if self.good_beams is not None and self._is_filled(table, self.good_beams):
             faults[NO_BEAM] = table.column(self.good_beams) == 0
         return faults
@@ -219,6 +221,7 @@ class DvlAdapter(Adapter):
             faults[SENTINEL] = is_same & (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S)
             if self.lock == "found" and not self.are_zeros_measured:
                 faults[ZEROS] = _in_time(zeros_in_one_step, table, velocity)
+        # a habit shows in many messages, not in a single one
         if self.lock == "found":
             faults[REPEATED] = _in_time(repeats, table, velocity)
         return faults
@@ -267,6 +270,7 @@ class DvlAdapter(Adapter):
             settings["altitude"] = False
         if self.covariance is not None:
             settings["covariance"] = self.covariance.pinned(table).model_dump()
+        # a count that never reached three beams would leave out everything
         is_by_signs = can_count and not self._is_marked(table)
         return settings | {"lock": "signs" if is_by_signs else "marked"}
 

@@ -229,6 +229,7 @@ class DetectionArrayAdapter(Adapter):
             turn(self.rotation, positions), turn_covariances(self.rotation, covariances)
         )
         ranges, azimuths, _ = measured
+        # a detection that is nothing in particular has no results
         faults = {
             "without a result": rows.ids[:, 0] < 0,
             NOT_FINITE: not_finite(ranges, azimuths, scores),
@@ -439,6 +440,7 @@ class DetectionRowsAdapter(Adapter):
             given = table.beside(self.probabilities)
             is_given = ~np.isnan(given).all(axis=1)
             probability[is_given] = np.nan_to_num(given[is_given])
+        # an unknown landmark takes no share of the posterior
         probability[ids < 0] = 0.0
         covariance = np.full((len(table), 2, 2), np.nan)
         if self.range_sigma is not None and self.azimuth_sigma is not None:
@@ -492,6 +494,7 @@ class LandmarkRowsAdapter(Adapter):
             )
         if not len(fit):
             return None, dropped
+        # maps are compared by identity
         order = fit[np.argsort(ids[fit])]
         in_enu_m = turned(ENU_R[self.world], positions[order])
         unknown = np.full((len(order), 3, 3), np.nan)

@@ -200,6 +200,7 @@ def fit_rows(
     Faults are masks, shape (n,), by name; a row counts for its first fault only. With ``unique``, all but the first of
     rows with the same stamp are left out.
     """
+    # one fault a row, so that the counts add up to the rows left out
     fit = np.ones(len(stamps_ns), bool)
     counts = {}
     for fault, has_it in faults.items():

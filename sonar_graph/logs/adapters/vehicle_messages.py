@@ -134,6 +134,7 @@ class ImuAdapter(Adapter):
     def pinned(self, table: FieldTable) -> dict[str, Any]:
         """Settings by which single messages are read as all messages of a table are together."""
         imu, _ = self.read(table, Setup())
+        # what no message fills now may be filled later, message by message
         has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
         settings: dict[str, Any] = {"unfilled": "each"}
         if has_force:
@@ -277,7 +278,7 @@ class TruthAdapter(PlaceAdapter):
             return Trajectory.of_positions(stamps_ns, positions[rows]), dropped
         chosen = quaternions[rows]
         lengths = np.linalg.norm(chosen, axis=1)
-        # unit quaternions keep every bit
+        # of drivers that round to four digits; unit quaternions keep every bit
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
         chosen = chosen / scale[:, None]
         if self.world != "enu" or self.rotation != "flu":
