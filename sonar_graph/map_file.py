@@ -176,10 +176,9 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     The note ``log.map`` of the sequence says what was done.
     """
     known, warnings = read_map(path)
-    start = sequence.calibration.start
+    start = sequence.calibration.start.in_map()
     note = f"{len(known.ids)} landmarks of {path.name}"
-    if start.source in ("vehicle", "heading"):
-        start = start.model_copy(update={"source": "map"})
+    if start.source == "map":
         note += "; the log states no place in it: the start is found by identified landmarks"
     if known.source.startswith(f"{map_origin(sequence)}, "):
         warnings.append(

@@ -36,6 +36,7 @@ class Viewer:
     install: str
 
 
+# in the order in which they are tried
 VIEWERS = {
     "lichtblick": Viewer(
         ("lichtblick", "Lichtblick"),
@@ -51,7 +52,6 @@ VIEWERS = {
     ),
     "rerun": Viewer(("rerun",), "Rerun", False, "pip install rerun-sdk"),
 }
-"""In the order in which they are tried."""
 
 
 def figures(
@@ -113,6 +113,7 @@ def view(
         raise EvaluationError(
             f"--viewer {viewer}: expected {', '.join(VIEWERS)} or browser"
         )
+    # an installed viewer is worth more than advice on another
     found = {
         name: command for name, one in VIEWERS.items() if (command := command_of(one))
     }
@@ -150,6 +151,7 @@ def view(
             + (f", or {page} in a browser" if page else "")
         )
         return
+    # the viewer goes on when the command has ended
     subprocess.Popen(
         [*found[asked], str(log.absolute())],
         stdin=subprocess.DEVNULL,

@@ -35,6 +35,7 @@ from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
     UNFELT,
+    UNLIKELY_ZEROS,
     axes_warning,
     gap_warnings,
     is_partial,
@@ -42,8 +43,10 @@ from sonar_graph.logs.checks import (
     repeats,
     row_doubts,
     row_oddities,
+    stamp_doubts,
     stamp_faults,
     unfelt_zeros,
+    unlikely_zeros,
     way_by,
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
@@ -448,6 +451,9 @@ class Assembly:
         else:
             values = getattr(rows, VALUES[role]).reshape(len(rows), -1)
             stuck = repeats(values, moved, least)
+            zeros = unlikely_zeros(values, moved, least)
+            if zeros.any():
+                return zeros, UNLIKELY_ZEROS, ""
         # times are counted from where estimators begin
         start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
         late_s = (rows.stamps_ns[np.argmax(stuck)] - start_ns) * 1e-9
@@ -544,7 +550,14 @@ class Assembly:
         """Sentences of `row_doubts` about the rows that were chosen."""
         imu = self.block("imu")
         if imu is not None:
-            yield from row_doubts(imu, self.block("dvl"), self.calibration)
+            dvl = self.block("dvl")
+            depth = self.block("depth")
+            yield from row_doubts(imu, dvl, depth, self.calibration)
+        for role in ("imu", "dvl"):
+            if (table := self._tables.get(role)) is not None:
+                times_ns = table.topic.log_times_ns
+                for text in stamp_doubts(table.stamps_ns, times_ns):
+                    yield f"{role}: {text}"
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
@@ -600,7 +613,7 @@ def row_notes(sequence: Sequence) -> dict[str, str]:
     imu = sequence.imu
     dvl = sequence.dvl
     oddities = row_oddities(imu, dvl, sequence.depth, calibration)
-    doubts = list(row_doubts(imu, dvl, calibration))
+    doubts = list(row_doubts(imu, dvl, sequence.depth, calibration))
     is_held = calibration.odometry_interpolation == "hold-past"
     count = 0 if is_held else unfelt_zeros(imu, dvl, calibration).sum()
     if count:
@@ -673,9 +686,11 @@ def require_use(file: str, imu: Imu, dvl: Dvl, advice: str = "") -> None:
             f"{_likely_unit(imu, dvl) or advice} See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
         )
     if is_partial(dvl).all():
+        largest_m2_s2 = float(np.nanmax(dvl.velocity_cov))
         raise LogError(
-            f"{file}: DVL: too few valid beams in all {len(dvl)} rows; at least one row needs three, for a velocity in "
-            f"all directions"
+            f"{file}: DVL: none of its {len(dvl)} rows measures a velocity in all directions: too few valid beams (three "
+            f"are needed), or variances of up to {largest_m2_s2:.3g} m²/s² in another unit: `covariance = false` under "
+            "[dvl] in a log configuration takes the calibration's noise"
         )
 
 

@@ -77,7 +77,7 @@ MISTAKES = {
     "compare notes.txt -o out": r"notes\.txt",
     "compare basin.mcap -o notes.txt": "is a file; give a folder",
     "compare basin.mcap -o notes.txt/deeper": "cannot be written",
-    "simulate basin -o empty": "is a folder; give the name of a file",
+    "simulate basin -o empty": "expected the name of a file that ends in .mcap",
     "simulate basin -o basin.bag": r"ends in \.mcap",
     "compare basin.mcap -o out --estimators isam3": "no estimator is called 'isam3'; did you mean isam2[?] installed",
     "compare basin.mcap -o out --estimators ,": "expected names such as",

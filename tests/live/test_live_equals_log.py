@@ -1,15 +1,19 @@
 """Live equals log, to the bit: messages in the order of arrival against the record of them, read as a log."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sonar_graph import Odometry, load_estimator, read_log, write_log
+from sonar_graph.calibration import Calibration, KnownMap
 from sonar_graph.errors import LogError
 from sonar_graph.live import Engine, LiveOptions, Message, recorded_messages
 from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.logs import PartialCalibration
 from sonar_graph.logs.live_record import LiveRecord
+from sonar_graph.navigation import make_estimator
 from sonar_graph.testing import aided_world, small_world
 from tests.live.traffic import messages_of
 
@@ -78,6 +82,36 @@ def test_estimates_of_a_record_are_those_of_the_live_run_to_the_bit(tmp_path, na
         )
     assert bits[0] == bits[1]
     assert bits[0]
+
+
+@pytest.mark.parametrize("name", ["isam2", "ekf-slam"])
+def test_a_start_is_found_in_a_map_live_as_from_the_record_to_the_bit(tmp_path, name):
+    """No pose before; the record keeps the map."""
+    world = small_world()
+    truth = world.true_landmarks
+    known = KnownMap.of(truth.ids, truth.positions, sigma_m=0.02)
+    given = PartialCalibration({"map": known.model_dump(mode="json")}, "map.toml")
+    nowhere = world.calibration.model_dump(mode="json", exclude={"start"})
+    unplaced = replace(world, calibration=Calibration.model_validate(nowhere))
+    write_log(tmp_path / "log.mcap", unplaced)
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.2)
+    engine, steps = live(tmp_path / "record.mcap", messages, calibration=given)
+    assert engine.calibration.start.source == "map"
+    record = read_log(tmp_path / "record.mcap")
+    assert record.calibration == engine.calibration
+    runs = []
+    for run in (steps, record.replay(record.instants(10.0))):
+        estimator = make_estimator(load_estimator(name), record.calibration)
+        runs.append([estimator.process(step) for step in run])
+    assert runs[0][0] is None
+    assert runs[0][-1] is not None
+    for mine, theirs in zip(*runs, strict=True):
+        assert (mine is None) == (theirs is None)
+        if mine is not None:
+            np.testing.assert_array_equal(
+                mine.world_T_body.matrix(), theirs.world_T_body.matrix()
+            )
+            np.testing.assert_array_equal(mine.covariance, theirs.covariance)
 
 
 def test_a_record_whose_writer_was_killed_goes_on_as_if_nothing_had_been(tmp_path):

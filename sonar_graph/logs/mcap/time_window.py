@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from sonar_graph.errors import LogError
 
 _NS_PER_S = 1_000_000_000
-_FIRST_NS, _LAST_NS = -(1 << 63), (1 << 63) - 1
+_FIRST_NS = -(1 << 63)
+_LAST_NS = (1 << 63) - 1
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
@@ -36,13 +38,8 @@ class Instant:
                 raise LogError(
                     f"{text!r} is no time in a log: give {expected}"
                 ) from None
-            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(
-                1970, 1, 1, tzinfo=UTC
-            )
-            return cls(
-                absolute_ns=(since.days * 86_400 + since.seconds) * _NS_PER_S
-                + since.microseconds * 1000
-            )
+            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - _EPOCH
+            return cls(absolute_ns=since // timedelta(microseconds=1) * 1000)
         if not 0 <= seconds < _LAST_NS / _NS_PER_S:
             raise LogError(
                 f"{text!r} is no time in a log: give seconds from its beginning, 0 or more"
@@ -83,17 +80,9 @@ class TimeWindow:
     def describe(self, beginning_ns: int) -> str:
         """Text with the limits in seconds after the log's beginning."""
         start_ns, end_ns = self.resolve(beginning_ns)
-        start = (
-            "the beginning"
-            if self.start is None
-            else f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        )
-        end = (
-            "the end"
-            if self.end is None
-            else f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        )
-        return f"{start} to {end} of the recording"
+        start = f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        end = f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        return f"{start if self.start else 'the beginning'} to {end if self.end else 'the end'} of the recording"
 
     def resolve(self, beginning_ns: int) -> tuple[int, int]:
         """First instant within and first instant after the window, nanoseconds since 1970."""

@@ -362,21 +362,6 @@ def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
     assert np.linalg.norm(sequence.dvl.velocity, axis=1).max() < 1.5
 
 
-@pytest.mark.recording
-def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(
-    recordings, tmp_path
-):
-    convert_rosbag(recordings / "bags" / "husky.bag", tmp_path / "new.mcap")
-    topics = {"dvl": "/husky_velocity_controller/odom"}
-    plain = read_log(tmp_path / "new.mcap", topics=topics)
-    assert "gravity is felt along +y" in plain.notes["log.doubtful"]
-    turned = LogConfig.parse({"imu": {"rotation": [90, 0, 0]}}, "x")
-    sequence = read_log(tmp_path / "new.mcap", topics=topics, config=turned)
-    assert "gravity" not in sequence.notes.get("log.doubtful", "")
-    assert "to the last bit in" in sequence.notes["log.warnings"]  # wheels at rest
-    assert np.median(sequence.imu.specific_force[:, 2]) == pytest.approx(9.8, abs=0.1)
-
-
 # --- bags without definitions, ROS 1 in MCAP, messages that are compressed by themselves ------------------------------
 
 A50 = {
