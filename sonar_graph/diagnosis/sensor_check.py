@@ -73,6 +73,7 @@ from sonar_graph.diagnosis.turn_rate import turn_rate_finding
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair, is_heading_stated
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import (
+    OTHER_WAYS,
     STEPPED_BACK,
     axis_doubts,
     gravity_warning,
@@ -247,7 +248,8 @@ def spoilt_by(sequence: Sequence) -> str:
         return fault
     force = sequence.imu.specific_force
     mounting = calibration.imu.mounting
-    return gravity_warning(force, mounting, calibration.gravity_m_s2) or ""
+    gravity = gravity_warning(force, mounting, calibration.gravity_m_s2) or ""
+    return gravity if OTHER_WAYS in gravity else ""
 
 
 def rate_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -379,7 +381,9 @@ def axes_findings(
 ) -> tuple[list[Finding], Sequence]:
     """Findings about axes and signs of gyros and Doppler log, and the sequence with the axes put right."""
     calibration = sequence.calibration
-    if lacks_gravity(sequence):
+    force = sequence.imu.specific_force
+    # the accelerometers' own axes come first
+    if gravity_warning(force, calibration.imu.mounting, calibration.gravity_m_s2):
         return [], sequence
     ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
     if ratio is not None:

@@ -26,6 +26,7 @@ MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
 LEAST_PART_UPWARDS = 0.7
 """Part of the typical specific force that must point up in the body."""
+OTHER_WAYS = "specific forces point another way from row to row"
 SAME_DIRECTION = 0.5
 """Length of the typical force over the typical length, below which rows contradict each other."""
 MOST_OFF_GRAVITY = 0.2
@@ -253,7 +254,7 @@ def gravity_warning(
     is_gravity = abs(size - gravity_m_s2) < MOST_OFF_GRAVITY * gravity_m_s2
     if is_gravity and length < SAME_DIRECTION * size:
         return (
-            "specific forces point another way from row to row: two IMUs, or two drivers, on one topic; name another "
+            f"{OTHER_WAYS}: two IMUs, or two drivers, on one topic; name another "
             "`topic` under [imu] in the log configuration (--log-config FILE)"
         )
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:

@@ -395,6 +395,7 @@ def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: 
         0 * t,
         height_m,
         0j * t,
+        0 * t,
     )
     expected = (2 * np.sin(w / 2)) ** 2 / 12
     assert motion.sampling_error(height_m) == pytest.approx(expected, rel=0.02)
