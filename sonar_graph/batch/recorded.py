@@ -35,19 +35,7 @@ GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
 """Name for all logs of a batch taken together."""
 NEEDED = ("key", "log", "estimator", "status")
-WORDS = (
-    "key",
-    "suite",
-    "log",
-    "generator",
-    "estimator",
-    "variant",
-    "status",
-    "reason",
-    "log_file",
-    "machine",
-)
-OBJECTS = ("options", "params", "versions")
+FIELDS = ("key", "log", "estimator", "variant", "status", "reason", "log_file")
 
 
 @dataclass(frozen=True)
@@ -320,35 +308,25 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
         row.get("log_file") and (folder / row["log_file"]).is_file()
     ):  # its folder was moved or removed
         row = row | {"log_file": None}
-    words = {name: str(row.pop(name, None) or "") for name in WORDS}
+    fields: dict[str, Any] = {name: str(row.pop(name, None) or "") for name in FIELDS}
     seed = row.pop("seed", None)
-    objects = {name: row.pop(name) for name in OBJECTS if row.get(name)}
     texts = {
-        name: words[name] for name in ("suite", "generator", "machine") if words[name]
+        name: value
+        if isinstance(value, str)
+        else json.dumps(value, sort_keys=True, default=str)
+        for name, value in row.items()
+        if value and isinstance(value, str | dict | list)
     }
-    for name, value in objects.items():
-        texts[name] = (
-            value
-            if isinstance(value, str)
-            else json.dumps(value, sort_keys=True, default=str)
-        )
-    texts |= {name: value for name, value in row.items() if isinstance(value, str)}
     # null stands for what was not measured
-    numbers = {
+    values = {
         name: float(value)
         for name, value in row.items()
-        if isinstance(value, int | float)
+        if isinstance(value, int | float) and math.isfinite(value)
     }
     return RecordedRun(
-        key=words["key"],
-        log=words["log"],
+        **fields,
         seed=None if seed is None else int(seed),
-        estimator=words["estimator"],
-        variant=words["variant"],
-        status=words["status"],
-        reason=words["reason"],
-        log_file=words["log_file"],
         texts=texts,
-        values={name: value for name, value in numbers.items() if math.isfinite(value)},
+        values=values,
         place=place,
     )

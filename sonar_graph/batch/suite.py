@@ -19,15 +19,14 @@
     [[estimators]]
     name = "dead-reckoning"
 
-Mistakes are found before anything runs and reported with file, line and key. `tomllib` gives values without line
-numbers, so `line_of` finds the line of a key again.
+Mistakes are found before anything runs and reported with file, line and key.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -292,45 +291,23 @@ def read_suite(path: Path) -> SuiteFile:
     return found
 
 
-_NAME = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
-_DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
-_HEADER = re.compile(rf"\s*(?P<array>\[)?\[\s*(?P<path>{_DOTTED})\s*\]")
-_KEY = re.compile(rf"\s*(?P<path>{_DOTTED})\s*=")
-_TEXT_MARKS = ('"""', "'''")
-
-
 def line_of(text: str, place: Place) -> int:
-    """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it."""
-    # the nearest place that is known stands for one that the file does not name
-    lines: dict[Place, int] = {(): 1}
-    entries: dict[Place, int] = {}
-    table: Place = ()
-    open_mark = ""  # of a text of several lines, in which nothing is a key
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not open_mark and (header := _HEADER.match(line)):
-            names = _names(header["path"])
-            table = ()
-            for depth, name in enumerate(names, start=1):
-                table = (*table, name)
-                if header["array"] and depth == len(names):
-                    lines.setdefault(table, number)
-                    entries[table] = entries.get(table, -1) + 1
-                if table in entries:
-                    table = (*table, entries[table])
-            lines.setdefault(table, number)
-        elif not open_mark and (key := _KEY.match(line)):
-            names = _names(key["path"])
-            for length in range(1, len(names) + 1):
-                lines.setdefault((*table, *names[:length]), number)
-        for mark in _TEXT_MARKS:
-            if open_mark in ("", mark) and line.count(mark) % 2:
-                open_mark = "" if open_mark else mark
-    return next(
-        lines[place[:length]]
-        for length in range(len(place), -1, -1)
-        if place[:length] in lines
-    )
+    """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it.
 
-
-def _names(path: str) -> list[str]:
-    return [name.strip("\"'") for name in re.findall(_NAME, path)]
+    The first lines of a document are a document too, unless a value goes on below them. So a key begins after the
+    longest such part that does not have it.
+    """
+    lines = text.splitlines(keepends=True)
+    for length in range(len(place), 0, -1):
+        begin = 1
+        for count in range(1, len(lines) + 1):
+            try:
+                values: Any = tomllib.loads("".join(lines[:count]))
+            except tomllib.TOMLDecodeError:
+                continue
+            with suppress(KeyError, IndexError, TypeError):
+                for name in place[:length]:
+                    values = values[name]
+                return begin
+            begin = count + 1
+    return 1

@@ -178,6 +178,26 @@ class ReadingOptions:
 
         return TimeWindow.parse(self.start, self.end)
 
+    @property
+    def of_log(self) -> dict[str, Any]:
+        """Arguments of `sonar_graph.logs.read_log`."""
+        return {
+            "calibration": self.given,
+            "topics": self.choices,
+            "config": self.config,
+            "window": self.window,
+        }
+
+    @property
+    def of_images(self) -> dict[str, Any]:
+        """Arguments of the readers of sonar images."""
+        return {
+            "topic": self.choices.get("sonar"),
+            "config": self.config,
+            "window": self.window,
+            "salvage": self.salvage,
+        }
+
     def read(
         self, log: Path, *, progress: Callable[[int, int], None] | None = None
     ) -> Sequence:
@@ -185,15 +205,7 @@ class ReadingOptions:
         from sonar_graph.logs import read_log
         from sonar_graph.map_file import in_map
 
-        sequence = read_log(
-            log,
-            calibration=self.given,
-            topics=self.choices,
-            config=self.config,
-            window=self.window,
-            salvage=self.salvage,
-            progress=progress,
-        )
+        sequence = read_log(log, **self.of_log, salvage=self.salvage, progress=progress)
         return sequence if self.map is None else in_map(sequence, self.map)
 
 

@@ -280,9 +280,12 @@ def compared(
 
     The folder for the results is kept from other commands until the block, which writes them, ends.
     """
+    from sonar_graph.evaluation import check_request
+
     # mistakes come to light before the log is read, which may take minutes
     overrides = estimator_settings(estimation.settings, names)
-    check_requests(names, overrides)
+    for name in names:
+        check_request(name, overrides.get(name))
     sources = (
         log,
         reading.calibration,
@@ -292,17 +295,8 @@ def compared(
     )
     written = names_written(output, names)
     with writable_folder(output, written, sources, overwrite=estimation.overwrite):
-        yield compare_log(
-            log, names, overrides, reading, recognition, estimation.rate_hz
-        )
-
-
-def check_requests(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:
-    """Raise for a name or setting that does not exist."""
-    from sonar_graph.evaluation import check_request
-
-    for name in names:
-        check_request(name, overrides.get(name))
+        prepared = prepared_log(log, reading, recognition, estimation.rate_hz)
+        yield compare_prepared(prepared, names, overrides)
 
 
 class PreparedLog(NamedTuple):
@@ -313,19 +307,6 @@ class PreparedLog(NamedTuple):
     """None where the log had detections, or no images."""
     rate_hz: float
     """Estimates a second."""
-
-
-def compare_log(
-    log: Path,
-    names: list[str],
-    overrides: dict[str, dict[str, Any]],
-    reading: ReadingOptions,
-    recognition: RecogniserOptions,
-    rate_hz: float | None,
-) -> Comparison:
-    """Read a log, recognise landmarks if it needs that, and compare estimators."""
-    prepared = prepared_log(log, reading, recognition, rate_hz)
-    return compare_prepared(prepared, names, overrides)
 
 
 def prepared_log(

@@ -91,13 +91,7 @@ def inspect(
         is_read = False
         try:
             with working("comparing sensors"):
-                sequence = read_log(
-                    log,
-                    calibration=given,
-                    config=config,
-                    topics=reading.choices,
-                    window=reading.window,
-                )
+                sequence = read_log(log, **reading.of_log)
                 is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
@@ -272,14 +266,7 @@ def calibration(
     stated = Calibration()
     source = ""
     if log is not None:
-        window = reading.window
-        sequence = read_log(
-            log,
-            calibration=reading.given,
-            topics=reading.choices,
-            config=reading.config,
-            window=window,
-        )
+        sequence = read_log(log, **reading.of_log)
         stated, source = (
             sequence.calibration,
             f"# {log.name}: {sequence.notes['log.calibration']}\n",

@@ -90,23 +90,8 @@ def label(
     # labels are hours of work: an existing file is added to
     is_continued = path.exists() and path.stat().st_size and not options.overwrite
     labels = read_labels(path, log) if is_continued else Labels(log=spelt(log.name))
-    topic = reading.choices.get("sonar")
-    alone = read_images_alone(
-        log,
-        calibration=reading.given,
-        topic=topic,
-        config=reading.config,
-        window=reading.window,
-        salvage=reading.salvage,
-    )
-    blocks = read_sonar_frames(
-        log,
-        topic,
-        reading.config,
-        window=reading.window,
-        salvage=reading.salvage,
-        refused=lambda *_: None,
-    )
+    alone = read_images_alone(log, calibration=reading.given, **reading.of_images)
+    blocks = read_sonar_frames(log, **reading.of_images, refused=lambda *_: None)
     with progress_bars() as progress:
         frames = shown_frames(
             blocks,

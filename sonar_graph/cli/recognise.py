@@ -6,7 +6,7 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -331,36 +331,24 @@ def calibrate(
     recognition = RecogniserOptions(options.designs)
     params = recognition.params(options.settings)
     known = recognition.read_designs()
-    topic = reading.choices.get("sonar")
-    salvage = reading.salvage
+    how: dict[str, Any] = {"designs": known, "params": params, **reading.of_images}
+    # whole logs, as --start and --end of one would be wrong for another
+    del how["window"]
     with working("calibrating"):
         if labels:
             given = [
                 read_labels(file, log) for log, file in zip(logs, labels, strict=True)
             ]
             runs = [with_motion(log, reading, options.motion) for log in logs]
-            measured = calibrate_by_labels(
-                [
-                    LabelledLog(log, run, own, file, how)
-                    for log, file, own, (run, how) in zip(
-                        logs, labels, given, runs, strict=True
-                    )
-                ],
-                topic=topic,
-                config=reading.config,
-                designs=known,
-                params=params,
-                salvage=salvage,
-            )
+            labelled = [
+                LabelledLog(log, run, own, file, motion)
+                for log, file, own, (run, motion) in zip(
+                    logs, labels, given, runs, strict=True
+                )
+            ]
+            measured = calibrate_by_labels(labelled, **how)
         else:
-            measured = measure(
-                [(log, reading.read(log)) for log in logs],
-                topic=topic,
-                config=reading.config,
-                designs=known,
-                params=params,
-                salvage=salvage,
-            )
+            measured = measure([(log, reading.read(log)) for log in logs], **how)
     with replacing(path) as partial:
         partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
     for number in range(1, len(labels or []) + 1):
@@ -406,14 +394,7 @@ def with_motion(
         )
     if motion == "navigation" or (motion is None and not lacking):
         return reading.read(log), "navigation"
-    alone = read_images_alone(
-        log,
-        calibration=reading.given,
-        topic=reading.choices.get("sonar"),
-        config=reading.config,
-        window=reading.window,
-        salvage=reading.salvage,
-    )
+    alone = read_images_alone(log, calibration=reading.given, **reading.of_images)
     return alone, motion or "images"
 
 
@@ -462,11 +443,8 @@ def recognise_log(
             log,
             sequence,
             motion=motion,
-            topic=reading.choices.get("sonar"),
-            config=reading.config,
             recogniser=recogniser,
-            window=reading.window,
-            salvage=reading.salvage,
+            **reading.of_images,
             progress=lambda done: progress(
                 "recognising landmarks", done, 0, f"{done} frames"
             ),

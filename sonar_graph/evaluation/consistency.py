@@ -198,14 +198,6 @@ def mean_normalised(squares: Floats, dof: int) -> float:
     return float(known.mean() / dof) if known.size else float("nan")
 
 
-def anees_over_runs(nees: Floats, dof: int) -> Floats:
-    """Average of shape (runs, n) over independent runs, divided by the degrees of freedom, shape (n,).
-
-    With consistent estimators each value lies in `anees_interval` with the probability given there.
-    """
-    return np.asarray(nees.mean(axis=0) / dof)
-
-
 def anees_interval(
     runs: int, dof: int, probability: float = 0.95
 ) -> tuple[float, float]:

@@ -143,6 +143,7 @@ class _AmendedCopy:
         for log_time_ns, channel, sent_ns, payload, number in merged:
             writer.add_message(channel, log_time_ns, payload, sent_ns, number)
         for log, passage in self._passages:
+            # known only when all messages have been read
             damage.extend(
                 passage.damage, log.path.name if len(self._passages) > 1 else ""
             )
@@ -192,6 +193,7 @@ class _AmendedCopy:
             yield from self._recorded_in(passage)
 
     def _recorded_in(self, passage: Passage) -> Iterator[_Message]:
+        # a chunk comes topic by topic, and its messages have to be merged by time
         for _, chunk in groupby(passage, key=lambda piece: id(piece.data)):
             copied = [
                 (piece, channel)

@@ -112,6 +112,7 @@ def pinned(
     }
     for role, choice in choices.items():
         if choice.topic is None:
+            # a role that nothing played live must not be played by a topic that came later
             tables[role] = {"use": False}
         else:
             tables.setdefault(role, {})["topic"] = choice.topic
@@ -214,6 +215,7 @@ class LiveRecord:
             "notes": json.dumps({**notes, NEWEST_FRAMES: str(newest_frames_ns)}),
         }
         self._writer.add_metadata(METADATA, content)
+        # a run may be killed at any time, and without this record it cannot be repeated
         self.flush()
 
     def add_topic(self, topic: Topic) -> None:

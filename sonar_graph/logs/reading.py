@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Never
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
@@ -23,6 +22,7 @@ from sonar_graph.logs.adapters import (
     FieldTable,
     GeodeticFields,
     LogConfig,
+    Mask,
     MessageTable,
     Origin,
     Setup,
@@ -35,6 +35,7 @@ from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
     UNFELT,
+    UNLIKELY_ZEROS,
     axes_warning,
     gap_warnings,
     is_partial,
@@ -42,8 +43,10 @@ from sonar_graph.logs.checks import (
     repeats,
     row_doubts,
     row_oddities,
+    stamp_doubts,
     stamp_faults,
     unfelt_zeros,
+    unlikely_zeros,
     way_by,
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
@@ -255,12 +258,11 @@ def _scanned(
 
     types = wanted_types(config or LogConfig())
     recording = scanned(types)
-    if config is not None:
-        return recording, config
-    own = recorded_config(recording) or LogConfig()
+    used = config or recorded_config(recording) or LogConfig()
     # the types of its own topics are known only now
-    is_enough = wanted_types(own) <= types
-    return recording if is_enough else scanned(wanted_types(own)), own
+    if not wanted_types(used) <= types:
+        recording = scanned(wanted_types(used))
+    return recording, used
 
 
 class Assembly:
@@ -423,7 +425,7 @@ class Assembly:
             self._dropped[role] = dropped
         return rows
 
-    def _contradicted(self, role: str, rows: Any) -> tuple[NDArray[np.bool_], str, str]:
+    def _contradicted(self, role: str, rows: Any) -> tuple[Mask, str, str]:
         """Mask of rows that other sensors contradict, shape (n,), the reason, and a setting that uses them."""
         none = np.zeros(len(rows), bool)
         imu = self.block("imu") if role != "imu" else None
@@ -449,6 +451,9 @@ class Assembly:
         else:
             values = getattr(rows, VALUES[role]).reshape(len(rows), -1)
             stuck = repeats(values, moved, least)
+            zeros = unlikely_zeros(values, moved, least)
+            if zeros.any():
+                return zeros, UNLIKELY_ZEROS, ""
         # times are counted from where estimators begin
         start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
         late_s = (rows.stamps_ns[np.argmax(stuck)] - start_ns) * 1e-9
@@ -545,7 +550,14 @@ class Assembly:
         """Sentences of `row_doubts` about the rows that were chosen."""
         imu = self.block("imu")
         if imu is not None:
-            yield from row_doubts(imu, self.block("dvl"), self.calibration)
+            dvl = self.block("dvl")
+            depth = self.block("depth")
+            yield from row_doubts(imu, dvl, depth, self.calibration)
+        for role in ("imu", "dvl"):
+            if (table := self._tables.get(role)) is not None:
+                times_ns = table.topic.log_times_ns
+                for text in stamp_doubts(table.stamps_ns, times_ns):
+                    yield f"{role}: {text}"
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
@@ -601,7 +613,7 @@ def row_notes(sequence: Sequence) -> dict[str, str]:
     imu = sequence.imu
     dvl = sequence.dvl
     oddities = row_oddities(imu, dvl, sequence.depth, calibration)
-    doubts = list(row_doubts(imu, dvl, calibration))
+    doubts = list(row_doubts(imu, dvl, sequence.depth, calibration))
     is_held = calibration.odometry_interpolation == "hold-past"
     count = 0 if is_held else unfelt_zeros(imu, dvl, calibration).sum()
     if count:
@@ -674,9 +686,11 @@ def require_use(file: str, imu: Imu, dvl: Dvl, advice: str = "") -> None:
             f"{_likely_unit(imu, dvl) or advice} See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
         )
     if is_partial(dvl).all():
+        largest_m2_s2 = float(np.nanmax(dvl.velocity_cov))
         raise LogError(
-            f"{file}: DVL: too few valid beams in all {len(dvl)} rows; at least one row needs three, for a velocity in "
-            f"all directions"
+            f"{file}: DVL: none of its {len(dvl)} rows measures a velocity in all directions: too few valid beams (three "
+            f"are needed), or variances of up to {largest_m2_s2:.3g} m²/s² in another unit: `covariance = false` under "
+            "[dvl] in a log configuration takes the calibration's noise"
         )
 
 

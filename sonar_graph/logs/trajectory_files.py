@@ -75,6 +75,7 @@ def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
     id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz
     """
     lines = [",".join(LANDMARK_COLUMNS)]
+    # symmetric: the upper triangle is all
     triangles = landmarks.covariances[:, _UPPER[0], _UPPER[1]]
     numbers = np.hstack([landmarks.positions, triangles]).tolist()
     lines += [

@@ -62,6 +62,7 @@ def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
     covariances[_unknown(covariances)] = (
         np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
     )
+    # C = R diag(variances) R^T: the axes of the ellipsoid are the columns of R
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
     # rounding may leave a variance below zero
@@ -87,6 +88,7 @@ def landmark_markers(
     is_unknown = _unknown(landmarks.covariances)
     diameters, quaternions = ellipsoids(landmarks.covariances)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    # above the landmark, where a small ellipsoid does not hide it
     above = landmarks.positions + np.array([0, 0, text_height_m])
     letters = np.full((count, 3), text_height_m)
     values = _marker_columns(
@@ -111,8 +113,10 @@ def landmark_markers(
 
 def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
     """``visualization_msgs/MarkerArray`` for each pose with a known covariance: the ellipsoid of its position."""
+    # the translation is the second half of a covariance in body axes
     is_known = ~_unknown(trajectory.covariances[:, 3:, 3:])
     known = trajectory.rows(np.flatnonzero(is_known))
+    # without a pose there is nothing to turn
     world_axes = known.covariances
     if len(known):
         world_axes = body_to_ros(known.covariances, known.matrices)
@@ -166,6 +170,7 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
     messages = []
     for picture in pictures:
         stamps_ns = np.array([picture.stamp_ns])
+        # pictures differ in their size, so that each is an entry
         content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
         values: dict[str, Value] = {"format": "jpeg", "data": content}
         lengths = {"data": content.shape[1]}
@@ -196,6 +201,7 @@ class Scene:
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return cls((0.0, 0.0, 0.0), 1.0)
+        # a box, not a sphere: surveys are long and flat
         low = points.min(axis=0)
         high = points.max(axis=0)
         x, y, z = np.round((low + high) / 2, 3).tolist()
@@ -224,6 +230,7 @@ class Scene:
     @property
     def cell_m(self) -> float:
         """Side of a cell of the grid: a power of ten."""
+        # a power of ten is read off without a legend
         return float(10.0 ** np.floor(np.log10(self.size_m)))
 
     @property

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from sonar_graph.cli.main import main
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.planar import read_victoria_park
@@ -164,23 +163,6 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> No
     faults = {topic.name: topic.stamp_faults for topic in summary.topics}
     assert faults["/dvl"] == ()
     assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
-
-
-def test_stuck_sensors_are_named(bench: Bench) -> None:
-    """The bench's rows are all alike."""
-    assert not any(
-        "as measured" in text
-        for text in inspect_log(bench.write(*bench.basics(10))).warnings
-    )
-    warnings = inspect_log(bench.write(*bench.basics(30), name="long.mcap")).warnings
-    for start in (
-        "dvl: velocity the same to the last bit",
-        "imu: angular rate the same to the last bit",
-    ):
-        assert any(
-            text.startswith(f"{start} in 30 rows, 0.000 to 2.900 s")
-            for text in warnings
-        )
 
 
 def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
@@ -435,16 +417,3 @@ def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench) -> None:
     )
     sequence = read_log(path, config=LogConfig.parse(tomllib.loads(table), "x"))
     assert sequence.dvl.velocity.tolist() == [[1, 2, 3]] * 3
-
-
-def test_the_command_prints_what_the_option_takes(
-    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, config = bench.write(*bench.basics()), tmp_path / "log.toml"
-    for arguments in (["--toml"], ["--log-config", str(config)]):
-        with pytest.raises(SystemExit) as done:
-            main(["inspect", str(path), *arguments])
-        assert done.value.code in (0, 3)  # five samples leave something in doubt
-        printed = capsys.readouterr().out
-        config.write_text(printed)
-    assert f"chosen in {config}" in printed

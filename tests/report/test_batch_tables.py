@@ -12,7 +12,7 @@ import pytest
 
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
-from sonar_graph.batch.statistics import paired, quantile_error
+from sonar_graph.batch.statistics import quantile_error
 from sonar_graph.evaluation.digits import quantile_text
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
@@ -380,31 +380,6 @@ def test_failures_are_counted_by_estimator_with_their_logs():
     ]
 
 
-def test_too_few_seeds_are_warned_of_and_cost_others_nothing():
-    few, many = drawn_batch(4, logs=LOGS[:1]), drawn_batch(12, logs=LOGS[:1])
-    assert "4 pairs" in summary.power_told(tables.all_tests(few, EVERY_METRIC))[0]
-    assert summary.power_told(tables.all_tests(many, EVERY_METRIC)) == []
-    assert (
-        f"{ALL_LOGS} (4 seeds)"
-        in summary.power_told(tables.all_tests(drawn_batch(4), EVERY_METRIC))[0]
-    )
-    differences = {
-        pairs: paired(np.arange(pairs) + 1.0, np.zeros(pairs)) for pairs in (5, 6)
-    }
-    tests = {
-        (KEY, f"{pairs} of them", "isam2"): (one, 1.0)
-        for pairs, one in differences.items()
-    }
-    told = "Too few pairs for any corrected p value to fall below 0.05: 5 of them (5 pairs). Add seeds."
-    assert summary.power_told(tests) == [told]
-    batch = drawn_batch(7, logs=LOGS[:1])
-    same = updated(batch, lambda run: {"smoothed.ate_se2_m": run.values[KEY]})
-    assert "7 pairs" in summary.power_told(compared_runs(batch))[0], (
-        "four tests: 4 / 2**6 is above 5 %"
-    )
-    assert summary.power_told(compared_runs(same)) == [], "two tests, as of filters"
-
-
 @pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
 def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(
     fewest, blind
@@ -488,27 +463,6 @@ def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chan
     assert "higher with isam2" in heads_of(batch)[0], "who never ended is not left out"
 
 
-@pytest.mark.parametrize(
-    ("median", "mark"),
-    [
-        *((-0.1, summary.LOWER), (0.1, summary.HIGHER), (0.0, summary.DIFFERENT)),
-        *((-math.inf, summary.LOWER), (math.inf, summary.HIGHER)),
-    ],
-)
-def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
-    test = replace(
-        paired(np.arange(8.0), np.zeros(8)), mean=-7.0 * median, median=median
-    )
-    assert summary.mark_of((test, 0.049)) == mark
-    assert summary.mark_of((replace(test, median=math.nan), 0.049)) == summary.DIFFERENT
-    assert (
-        summary.mark_of((test, 0.05))
-        == summary.mark_of((test, math.nan))
-        == summary.mark_of(None)
-        == ""
-    )
-
-
 def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
     same = updated(
         BATCH,
@@ -526,24 +480,6 @@ def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
         next(column.heading for column in table.columns if column.over == "Causal")
         == "dead-reckoning (reference)"
     )
-
-
-def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
-    batch = changed(
-        drawn_batch(logs=LOGS[:1]),
-        "isam2",
-        "causal.ate_se2_m",
-        np.append(np.ones(9), 1e5),
-    )
-    shown = float(
-        cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text.split()[0]
-    )
-    assert shown == pytest.approx(
-        np.median(batch.values(LOGS[0], "isam2", "causal.ate_se2_m")), rel=0.1
-    )
-    row = cells_of(tables.accuracy_table(batch, ATE), "isam2")
-    assert float(row[4].text) == shown
-    assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
 
 
 def test_the_sentence_counts_logs_where_somebody_is_told_apart():
@@ -571,21 +507,6 @@ def test_the_sentence_counts_logs_where_somebody_is_told_apart():
     assert heads_of(one)[0] == f"Causal {beside}: lower with isam2, ekf-slam."
     (told,) = heads_of(few)
     assert told.endswith("no estimator is told apart from dead-reckoning.")
-
-
-def test_what_only_all_logs_together_tell_is_no_count_of_logs():
-    batch = drawn_batch(1, logs=tuple("abcdefgh"))
-    assert math.isnan(compared_runs(batch)[KEY, ALL_LOGS, "isam2"][1]), (
-        "one seed is one case"
-    )
-    batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
-    tests = compared_runs(batch)
-    assert tests[KEY, ALL_LOGS, "isam2"][0].pairs == 8
-    assert summary.mark_of(tests[KEY, ALL_LOGS, "isam2"]) == summary.LOWER
-    (told,) = summary.headlines(batch, ATE, tests)
-    assert told.endswith(
-        "no estimator is told apart from dead-reckoning on any one log."
-    )
 
 
 def test_the_head_shows_the_first_error_that_most_logs_have():

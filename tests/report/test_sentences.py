@@ -211,15 +211,6 @@ def test_consistency_follows_the_interval_and_without_one_or_in_a_wide_one_nothi
     assert score.verdict == verdict
 
 
-def test_radians_are_shown_as_degrees():
-    score = Score(math.pi / 2, "rad", "By hand.")
-    assert (score.text(), score.with_unit, Score(2.0, "m", "").with_unit) == (
-        "90",
-        "90°",
-        "2\N{NO-BREAK SPACE}m",
-    )
-
-
 def test_without_detections_the_drift_is_explained_and_without_errors_the_headline():
     comparison = basin_comparison(60)
     assert sentences.remarks(comparison) == []
@@ -407,16 +398,6 @@ def test_without_true_landmarks_the_innovations_of_used_detections_tell():
 LISTED = [(2, "1 and 2"), (5, "1, 2, 3, 4 and 5"), (6, "1, 2, 3, 4, 5 and 1 more")]
 
 
-@pytest.mark.parametrize(("count", "listed"), LISTED)
-def test_five_landmarks_are_named_and_more_are_counted(count, listed):
-    ids, blank = np.arange(1, count + 1), with_map(IDS, [0.0] * 4, has_truth=False)
-    log = replace(log_of([Outcome.USED] * count, [1.0] * count), landmark_ids=ids)
-    landmarks = LandmarkMap(ids, np.zeros((count, 3)), np.zeros((count, 3, 3)))
-    run = replace(blank.runs[0], landmarks=landmarks, detections=log)
-    (line,) = sentences.doubt_of_identities(with_run(blank, run))
-    assert f"sightings of landmarks {listed} contradict its map" in line
-
-
 BEFORE = [Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED]
 NAMELESS = [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT]
 """Outcomes before an identity mattered, and those of detections without one that can be used."""
@@ -441,22 +422,6 @@ def test_a_log_without_any_identity_is_told_with_what_to_do(outcomes, count):
     )
     assert sentences.doubt_of_identities(blind) == ([line] if count else [])
     assert (line in printed(blind, 200)) == bool(count)
-
-
-def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_was_given():
-    comparison = only(basin_comparison(60), "isam2", "ekf-slam")
-    for run, n in zip(comparison.runs, (4, 6), strict=True):
-        blind = replace(run, detections=log_of([Outcome.NO_IDENTITY] * n, [np.nan] * n))
-        comparison = with_run(comparison, blind)
-    (line,) = sentences.doubt_of_identities(comparison)
-    assert line.startswith(
-        "Warning: none of 6 detections has an identity that isam2, ekf-slam can use"
-    )
-    assert "associate" in line
-    assert line.replace('"', "&#34;") in render_report(comparison)
-    params = {"identity": {"unknown": {"policy": "associate"}}}
-    asked = with_run(comparison, replace(comparison.runs[0], params=params))
-    assert not any("associate" in line for line in sentences.doubt_of_identities(asked))
 
 
 def test_landmarks_without_a_name_are_counted_and_scored_by_place():
@@ -594,33 +559,3 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
     assert not said(6, off_m=0.999 * limit_m)
     assert said(6, off_m=1.001 * limit_m)
     assert not sentences.outliers(with_map(IDS, [0.0] * 4, detections=log_of([], [])))
-
-
-@pytest.mark.parametrize(
-    ("params", "told"),
-    [
-        (
-            {"kernel": {"shape": "cauchy", "width": 1.5}},
-            ", with less weight by its kernel",
-        ),
-        (
-            {"kernel": {"shape": "none"}},
-            ", with full weight (kernel.shape sets a kernel)",
-        ),
-        ({"kernel_width": 1.5}, ", with less weight by its kernel"),
-        ({"kernel_width": 0.0}, ", with full weight (kernel_width sets a kernel)"),
-    ],
-)
-def test_of_outliers_that_were_used_is_told_how_much_they_count_in_each_run(
-    params, told
-):
-    comparison = with_map(
-        IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)
-    )
-    (run,) = comparison.runs
-    runs = [
-        replace(run, estimator="no setting", params={}),
-        replace(run, params=params),
-    ]
-    (line,) = sentences.outliers(replace(comparison, runs=runs))
-    assert f"no setting 9 of 9; isam2 9 of 9{told}: look" in line

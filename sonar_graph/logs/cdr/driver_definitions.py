@@ -10,6 +10,7 @@ from importlib.resources import files
 
 from sonar_graph.logs.cdr.definitions import DEFINITIONS, definition
 
+# types whose definition has not changed are those of this package
 DRIVER_DEFINITIONS = {
     name: [definition(name)]
     for name in (known.replace("/", "/msg/") for known in DEFINITIONS)

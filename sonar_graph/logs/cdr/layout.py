@@ -97,6 +97,7 @@ class FieldBlock(DecodingStep):
         """Offsets from the start of the block, by that start modulo 8."""
         self.counts = {value.path: value.number for value in values}
         self._sizes = [0] * _PHASES
+        # alignment depends on where the block begins, so that there are eight sets of offsets
         for phase in range(_PHASES):
             start = at = _PHASES + phase
             for value in values:
@@ -142,6 +143,7 @@ class Repeated(DecodingStep):
 
     def take(self, at: int, walk: PayloadWalk) -> int:
         """Note the start and count of the elements, and walk through them."""
+        # a fixed array has no length word
         at, count = walk.length(self, at) if self._count is None else (at, self._count)
         walk.found[self.index] += (at, count)
         if walk.most_elements is not None and count > walk.most_elements:
@@ -213,6 +215,7 @@ class Plan:
         for entry in definition.fields:
             path = prefix + entry.name
             single = is_single and not entry.is_array
+            # a nested type is part of the block: CDR has no mark where it begins
             if isinstance(entry.kind, Struct) and not entry.is_array:
                 self._add(entry.kind, path + ".", single, steps, values)
             elif (
@@ -233,8 +236,7 @@ class Plan:
             kind = PRIMITIVES.get(entry.kind, "u1")
             counted = Counted(self._next(), path, kind, is_text=is_text)
             self.leaves[path] = Leaf(counted, kind, is_single)
-            if not is_text:
-                self.sequences[path] = counted
+            # strings in an array or sequence have a length word each
             if not is_text or not entry.is_array:
                 return counted
             inner = [counted]
@@ -374,6 +376,7 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
     walk = plan.walk(read_length, most_elements=size)
     if walk.end > size:
         raise UnsoundMessageError("that end before their definition does")
+    # a definition that is too short would read as sound
     if walk.end < size - MOST_PADDING:
         raise UnsoundMessageError("that are longer than their definition says")
     return Layout(plan, order, walk)

@@ -54,6 +54,7 @@ class Messages:
     def __getitem__(self, path: str) -> NDArray[Any]:
         """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays; a KeyError where none is."""
         column = self.layout.column(path)
+        # a copy only where the values do not lie evenly
         values = _view(self.payloads, column)
         if values is None:
             values = np.ascontiguousarray(self.payloads[:, _places(column)]).view(
@@ -113,6 +114,7 @@ class Decoder:
 
     def decode(self, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
         """Messages grouped by layout, as by the function `decode`."""
+        # the decoder is shared by all pieces of a topic
         self._unsound.clear()
         groups = []
         for rows, stack in payloads:
@@ -205,6 +207,7 @@ def encode(
     ValueError
         For a field that the type does not have, and a number that does not fit into its field.
     """
+    # a misspelt field would be written as zeros
     plan = plan_of(definition)
     unknown = values.keys() - plan.leaves.keys()
     if unknown:

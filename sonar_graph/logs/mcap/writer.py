@@ -10,10 +10,12 @@ Topics for viewers that join late carry the quality of service "transient local"
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -188,25 +190,33 @@ class LogWriter:
             )
         return self._channels[key]
 
-    def write(self, messages: Iterable[Outgoing]) -> None:
-        """Write messages in the order of their log times; those of one instant in the order of the list."""
-        entries = list(messages)
-        channels = {
-            entry.topic: self.channel(
-                entry.topic,
-                own_schema(entry.type_name),
-                metadata=latched(entry.is_latched),
-            )
-            for entry in entries
-        }
+    def write(
+        self, messages: Sequence[Outgoing], more: Iterable[Outgoing] = ()
+    ) -> None:
+        """Write messages in the order of their log times; those of one instant in the order of the list.
+
+        Entries of ``more`` are in the order of time, and each is taken when the one before is written.
+        """
+        streamed = chain.from_iterable(by_time([entry]) for entry in more)
+        # topics are listed in the order of the list, also those without a message
+        channels = {entry.topic: self._offer(entry) for entry in messages}
         written = self._stream.tell()
-        for time_ns, entry, payload in by_time(entries):
+        for time_ns, entry, payload in heapq.merge(
+            by_time(messages), streamed, key=lambda message: message[0]
+        ):
+            if entry.topic not in channels:
+                channels[entry.topic] = self._offer(entry)
             at_ns = max(time_ns, 0)
             self.mcap.add_message(channels[entry.topic], at_ns, payload, at_ns)
             # a chunk was full: on the disk it survives the end of this process
             if self._stream.tell() != written:
                 self._stream.flush()
                 written = self._stream.tell()
+
+    def _offer(self, entry: Outgoing) -> int:
+        """Channel of an entry's topic."""
+        schema = own_schema(entry.type_name)
+        return self.channel(entry.topic, schema, metadata=latched(entry.is_latched))
 
     def finish(self) -> None:
         """Write the summary."""

@@ -159,6 +159,9 @@ CASES: dict[str, Case] = {
         [twists("/odom", "nav_msgs/msg/Odometry", child_frame_id="child"), tree("child", (0.5, 0, 0), z=1.0)],
         '[dvl]\ntopic = "/odom"',
         {"dvl.velocity": [VELOCITY] * 3, "calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
+    "twist of odometry without a child, in the frame of the header": (
+        [twists("/dvl/odom", "nav_msgs/msg/Odometry"), tree("dvl_link", (0.5, 0, 0), z=1.0)], "",
+        {"calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
     # units and meanings
     "millimetres": (
         [dvl(velocity=vector(1e3, 2e3, 3e3), velocity_covar=(np.array(KNOWN) * 1e6).tolist())], "[dvl]\nscale = 0.001",
