@@ -114,6 +114,8 @@ FOUND_ANEW = frozenset(
 )
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
+FEWEST_JUDGED = 10
+"""Rows from which a single one is judged by those beside it."""
 VALUES = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}
 """Column of each block that repeats where the sensor is stuck."""
 NOISE_FIELDS = {
@@ -451,9 +453,12 @@ class Assembly:
         else:
             values = getattr(rows, VALUES[role]).reshape(len(rows), -1)
             stuck = repeats(values, moved, least)
-            zeros = unlikely_zeros(values, moved, least)
-            if zeros.any():
-                return zeros, UNLIKELY_ZEROS, ""
+            # of a few rows none is beside enough others, and the first fix on the Earth is the origin, exactly 0
+            is_on_earth = getattr(self.adapters[role], "geodetic", None) is not None
+            if len(rows) >= FEWEST_JUDGED and not is_on_earth:
+                zeros = unlikely_zeros(values, moved, least)
+                if zeros.any():
+                    return zeros, UNLIKELY_ZEROS, ""
         # times are counted from where estimators begin
         start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
         late_s = (rows.stamps_ns[np.argmax(stuck)] - start_ns) * 1e-9

@@ -86,7 +86,7 @@ MISTAKES = {
     "recognise images.mcap -o out.mcap --calibration millimetres.toml": (
         r"1000 m above the floor and sees nothing of it up to its range of .* \(metres\)"
     ),
-    "recognise lane.mcap -o out.mcap --calibration strange.toml": "is a file of landmark designs, .*with --designs",
+    "recognise lane.mcap -o out.mcap --calibration strange.toml": "is not a calibration; .*--designs",
     "recognise lane.mcap -o out.mcap --calibration labels.json": "is not a calibration; .*--labels",
     "compare basin.mcap -o out --rate-hz 0": "--rate-hz",
     "compare basin.mcap -o out --rate-hz inf": "--rate-hz",
