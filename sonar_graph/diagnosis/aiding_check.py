@@ -148,7 +148,7 @@ class Check:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ComparedRows:
     """Rows of a sensor, and at the rows of the motion what they are compared with."""
 
     seconds: Floats
@@ -189,7 +189,7 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     # the noise of velocities adds up to a walk of the height, which grows with the time compared
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
-    rows = Rows(t, depth.z_m, height, motion.ahead_m)
+    rows = ComparedRows(t, depth.z_m, height, motion.ahead_m)
     found = rows.match(motion, drift_sigma=0.03, longest_s=longest_s)
     return found.less_certain(motion.sampling_error(motion.height_m))
 
@@ -212,7 +212,7 @@ def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
         return None
     t = motion.since_origin(heading.stamps_ns)
     yaw_rad = np.unwrap(heading.yaw_rad)
-    return Rows(t, yaw_rad, motion.yaw_rad).match(motion, drift_sigma=0.02)
+    return ComparedRows(t, yaw_rad, motion.yaw_rad).match(motion, drift_sigma=0.02)
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -225,7 +225,7 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = Rows(t, level, path).match(motion)
+    found = ComparedRows(t, level, path).match(motion)
     return found.less_certain(motion.sampling_error(motion.path_m))
 
 

@@ -341,7 +341,7 @@ def explained(
     return Explained(mean, sigmas, root_mean_square(before), root_mean_square(after))
 
 
-class Step(NamedTuple):
+class SignalStep(NamedTuple):
     """A change from one row to the next that stays."""
 
     seconds: float
@@ -352,7 +352,7 @@ class Step(NamedTuple):
 
 def steps(
     seconds: Floats, y: Values, x: Values, sigma: float, ratio: float = STEP_RATIO
-) -> list[Step]:
+) -> list[SignalStep]:
     """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
 
     The difference of the medians of `STEP_ROWS` rows of ``y - x`` on either side of an instant is beyond `STEP_SIGMAS`
@@ -367,10 +367,10 @@ def steps(
     size[size < ratio * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
     typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
     least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)
-    found = list[Step]()
+    found = list[SignalStep]()
     while len(size) and size.max() > least:
         k = int(np.argmax(size))
-        found.append(Step(float(t[k]), float(size[k])))
+        found.append(SignalStep(float(t[k]), float(size[k])))
         if len(found) > MOST_STEPS:
             return []
         size[max(k - 3 * STEP_ROWS, 0) : k + 3 * STEP_ROWS] = 0.0

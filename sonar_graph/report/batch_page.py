@@ -11,20 +11,20 @@ from sonar_graph.report import batch_figures as figures
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.figure_style import sized
-from sonar_graph.report.rendering import Section, html_of, write_html, write_tables
+from sonar_graph.report.rendering import PageSection, html_of, write_html, write_tables
 
 # Tables with more rows are folded on the screen: figures above them show the same
 FOLDED_ROWS = 24
 PAGE = "report.html"
 SECTIONS = (
-    Section("reading", "How to read this page"),
-    Section("ended", "Runs that ended"),
-    Section("errors", "Errors"),
-    Section("consistency", "Consistency"),
-    Section("cost", "Time and memory"),
-    Section("runs", "Every run"),
-    Section("protocol", "Protocol"),
-    Section("provenance", "Provenance"),
+    PageSection("reading", "How to read this page"),
+    PageSection("ended", "Runs that ended"),
+    PageSection("errors", "Errors"),
+    PageSection("consistency", "Consistency"),
+    PageSection("cost", "Time and memory"),
+    PageSection("runs", "Every run"),
+    PageSection("protocol", "Protocol"),
+    PageSection("provenance", "Provenance"),
 )
 # columns of the results that are normally the same for all runs
 ORIGINS = (
@@ -51,7 +51,7 @@ def write_batch_report(
         return write_html(folder / PAGE, "batch", sections_of(content), content)
 
 
-def sections_of(content: dict[str, Any]) -> list[Section]:
+def sections_of(content: dict[str, Any]) -> list[PageSection]:
     """The sections of the page: without that of errors where no run has any."""
     return [one for one in SECTIONS if content["chapters"] or one.anchor != "errors"]
 

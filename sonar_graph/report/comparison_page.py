@@ -38,23 +38,23 @@ from sonar_graph.report.figure_style import inline_svg, sized
 from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
 from sonar_graph.report.given_map import given_map_table
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
-from sonar_graph.report.rendering import Section, data_address, html_of, write_html
+from sonar_graph.report.rendering import PageSection, data_address, html_of, write_html
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
 from sonar_graph.table import ABSENT, Column, Table, text_table, words
 
 PAGE = "report.html"
 SECTIONS = (
-    Section("over-time", "Errors"),
-    Section("consistency", "Consistency and time"),
-    Section("detections", "Detections"),
-    Section("recognition", "Sonar images"),
-    Section("landmarks", "Landmarks"),
-    Section("tables", "Tables"),
-    Section("method", "Method"),
-    Section("protocol", "Protocol", is_folded=True),
-    Section("provenance", "Provenance", is_folded=True),
-    Section("files", "Files"),
+    PageSection("over-time", "Errors"),
+    PageSection("consistency", "Consistency and time"),
+    PageSection("detections", "Detections"),
+    PageSection("recognition", "Sonar images"),
+    PageSection("landmarks", "Landmarks"),
+    PageSection("tables", "Tables"),
+    PageSection("method", "Method"),
+    PageSection("protocol", "Protocol", is_folded=True),
+    PageSection("provenance", "Provenance", is_folded=True),
+    PageSection("files", "Files"),
 )
 # files of a run, and the field of `RunResult` without which a file is absent
 RUN_FILES = {
@@ -152,7 +152,7 @@ def render_report(comparison: Comparison) -> str:
     return html_of("comparison", *_page(comparison))
 
 
-def _page(comparison: Comparison) -> tuple[list[Section], dict[str, Any]]:
+def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
     """The sections of the page, and the values that their macros use."""
     sequence = comparison.sequence
     runs = comparison.runs

@@ -66,7 +66,7 @@ def render(template: str, content: dict[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A section of a page; the template of the page's kind has a macro of its name."""
 
     anchor: str
@@ -75,7 +75,7 @@ class Section:
 
 
 def write_html(
-    path: Path, kind: str, sections: list[Section], content: dict[str, Any]
+    path: Path, kind: str, sections: list[PageSection], content: dict[str, Any]
 ) -> Path:
     """Write a page from its sections, whole or not at all, and return its path.
 
@@ -97,7 +97,7 @@ def write_html(
     return path
 
 
-def html_of(kind: str, sections: list[Section], content: dict[str, Any]) -> str:
+def html_of(kind: str, sections: list[PageSection], content: dict[str, Any]) -> str:
     """The text of a page, as of `write_html`."""
     return render("page.html", content | {"kind": kind, "sections": sections})
 

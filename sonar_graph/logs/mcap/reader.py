@@ -31,7 +31,7 @@ from sonar_graph.logs.mcap.record_walk import (
     RecordWalk,
     content_of,
 )
-from sonar_graph.logs.mcap.time_window import Limits
+from sonar_graph.logs.mcap.time_window import WindowLimits
 from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic
 
 _BLOCK = 1 << 22
@@ -82,7 +82,7 @@ class Passage:
         self,
         file: LogFile,
         keep: Callable[[str], Keep],
-        limits: Limits | None = None,
+        limits: WindowLimits | None = None,
         *,
         may_skip: bool = True,
         progress: Progress | None = None,

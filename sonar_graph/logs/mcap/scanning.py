@@ -8,7 +8,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.bag_folder import log_parts
 from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile
 from sonar_graph.logs.mcap.reader import Passage, Progress, Recording, first_time_ns
-from sonar_graph.logs.mcap.time_window import Limits, TimeWindow
+from sonar_graph.logs.mcap.time_window import TimeWindow, WindowLimits
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 
 _PIECE_BYTES = 1 << 20
@@ -65,7 +65,7 @@ def _passages(
     sizes = [part.stat().st_size if part.exists() else 0 for part in parts]
     ends = list(accumulate(sizes))
     failures = []
-    limits: Limits | None = None
+    limits: WindowLimits | None = None
     for part, size, end in zip(parts, sizes, ends, strict=True):
         name = part.name if parts != [path] else ""
         try:

@@ -54,7 +54,7 @@ class Instant:
         return beginning_ns + round((self.seconds or 0.0) * _NS_PER_S)
 
 
-class Limits(NamedTuple):
+class WindowLimits(NamedTuple):
     """Times of recording of a part of a log, nanoseconds since 1970."""
 
     first_ns: int
@@ -89,7 +89,7 @@ class TimeWindow:
         ]
         return cls(*limits)
 
-    def resolve(self, beginning_ns: int) -> Limits:
+    def resolve(self, beginning_ns: int) -> WindowLimits:
         """The window of a log whose earliest message was recorded at an instant."""
         first_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
         after_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
@@ -100,4 +100,4 @@ class TimeWindow:
         start = f"{(first_ns - beginning_ns) / _NS_PER_S:.3f} s"
         end = f"{(after_ns - beginning_ns) / _NS_PER_S:.3f} s"
         text = f"{start if self.start else 'the beginning'} to {end if self.end else 'the end'} of the recording"
-        return Limits(first_ns, after_ns, text)
+        return WindowLimits(first_ns, after_ns, text)

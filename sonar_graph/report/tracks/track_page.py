@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.recognition import SEE_TRACKS, Recognition, TrackStories, TrackStory
-from sonar_graph.report.rendering import Section, write_html
+from sonar_graph.report.rendering import PageSection, write_html
 from sonar_graph.sonar import REPORTED
 
 # tracks with a picture; of more those with the most frames
@@ -16,9 +16,9 @@ MOST_TRACKS = 400
 LEAST_SHOWN = 0.005
 NONE = "none of them"
 SECTIONS = [
-    Section("tracks", "Tracks"),
-    Section("rejected", "Candidates that were rejected"),
-    Section("frames", "Frames"),
+    PageSection("tracks", "Tracks"),
+    PageSection("rejected", "Candidates that were rejected"),
+    PageSection("frames", "Frames"),
 ]
 
 
