@@ -2,6 +2,7 @@
 
 * ``REACH``, ``MOST_FILL``: a survey of 200 landmarks that is repeated every nine minutes (`dense_log.py`). Processor
   seconds of all calls and of the last ten minutes, and joint covariances that were computed for each sonar frame.
+* ``FEWEST_TOGETHER``: a mission of 34 minutes with a frame twice a second (`isam2_mission.py`), the same figures.
 * ``LEAST_BIAS_SHARE``: runs over a Doppler gap with position fixes (`gap_fixes.py`). Processor seconds, root mean
   square of the causal error (m), and normalised squared error of the causal position, divided by its 3 dimensions.
 
@@ -24,6 +25,7 @@ from gap_fixes import drive
 from sonar_graph.evaluation import judge, run_estimator
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2, keyframes
 from sonar_graph.slam.smoother import JointCovariance, smoother, window
 
@@ -31,11 +33,12 @@ LAST_NS = 600 * 1_000_000_000
 RATE_HZ = 2.0
 REACHES = (1.0, 1.25, 1.5, 2.0)
 FILLS = (1.2, 1.5, 2.0, np.inf)
+FEWEST = (2, 3, 4, 6, np.inf)
 SHARES = (0.0, 0.01, 0.1, np.inf)
 
 
 class Effort(NamedTuple):
-    """Effort of one survey."""
+    """Effort of one run."""
 
     cpu_s: float
     last_s: float
@@ -45,7 +48,7 @@ class Effort(NamedTuple):
 
 
 def effort(sequence: Sequence) -> Effort:
-    """Process a survey, asking after each frame."""
+    """Process a log, asking after each frame."""
     assert sequence.detections is not None
     stamps_ns = np.unique(sequence.detections.stamps_ns)
     stamps_ns = stamps_ns[stamps_ns > sequence.start_ns]
@@ -76,7 +79,7 @@ def effort(sequence: Sequence) -> Effort:
 def surveys(
     sequence: Sequence, module: Any, name: str, values: tuple[float, ...]
 ) -> None:
-    """One survey for each value of a constant."""
+    """One run for each value of a constant."""
     default = getattr(module, name)
     rows = []
     for value in values:
@@ -123,6 +126,11 @@ def main() -> None:
     effort(repeated_survey(2.0))
     surveys(survey, smoother, "REACH", REACHES)
     surveys(survey, window, "MOST_FILL", FILLS)
+    duration_s = 240.0 if arguments.quick else 2040.0
+    mission = simulate_mission(
+        MissionOptions(duration_s=duration_s, landmarks=20, frame_rate_hz=RATE_HZ)
+    )
+    surveys(mission, window, "FEWEST_TOGETHER", FEWEST)
     gaps(2 if arguments.quick else 8)
 
 
