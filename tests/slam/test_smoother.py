@@ -491,6 +491,22 @@ def seen_from_origin(landmark: int, z: np.ndarray) -> FactorGroup:
     return FactorGroup(made, (key, Sightline(X(0), gtsam.Pose3(), z)))
 
 
+def test_a_landmark_does_not_stay_where_a_wrong_first_sighting_placed_it():
+    """Two later sightings agree on another place; the robust kernel has a second minimum at the first one."""
+    wrong = np.array([10.0, 0.7])
+    right = np.array([10.0, 0.0])
+    smoother = Smoother(SmootherParams())
+    smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 0.01)})
+    smoother.add_landmark(L(0), 10.0 * np.array([np.cos(0.7), np.sin(0.7), 0.0]))
+    for k, z in enumerate((wrong, right, right)):
+        group = seen_from_origin(0, z)
+        smoother.add(group.factors, group.seen, gain=100.0)
+        smoother.update(float(k))
+    azimuth_rad = np.arctan2(*smoother.estimates.atPoint3(L(0))[1::-1])
+    assert abs(azimuth_rad) < 0.05
+
+
 def test_sightings_that_share_a_factor_have_the_information_of_their_own_factors():
     """Ten sightings of two landmarks from one keyframe, with robust kernels; then two leave, and three of a factor stay."""
     rng = np.random.default_rng(3)

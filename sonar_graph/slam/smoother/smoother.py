@@ -5,8 +5,10 @@ Its estimate is causal. The *history* is the batch solution of the whole graph b
 smoothed result is asked for. With a bounded history, a fixed-lag smoother takes the place of iSAM2, and the history is
 the graph of its window: newer factors and the marginals of older ones.
 
-One rule restarts the window: an update has diverged if it increased the error of the graph. The window then begins
-again at the batch solution. A large correction, such as a position fix after a gap, decreases the error and is kept.
+Two faults restart the window at the batch solution. An update has diverged if it increased the error of the graph. A
+landmark is misplaced if most of its sightings contradict the place that its first ones gave it: a robust kernel has a
+second minimum there, which no Gauss-Newton step leaves. A large correction, such as a position fix after a gap,
+decreases the error and is kept.
 """
 
 from collections import deque
@@ -25,6 +27,7 @@ from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
     KeptCovariance,
     Marginals,
+    misplaced,
     solve_in_sight,
 )
 from sonar_graph.slam.smoother.factor_store import (
@@ -266,6 +269,8 @@ class Smoother:
         self._newest_bias: int | None = None
         self._refused: set[int] = set()
         self._left: set[int] = set()
+        self._tested: dict[int, int] = {}
+        """Number of sightings of a landmark when it was last tested (`_has_misplaced`)."""
         self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, Marginals] | None = None
         self._window = self._empty_window()
@@ -458,6 +463,7 @@ class Smoother:
         relinearises = (
             time_s >= self._relinearised_s + self.params.relinearize_interval_s
         )
+        seen = self._store.newly_seen()
         # GTSAM counts updates, but their rate depends on what the sonar sees
         if relinearises:
             self._relinearised_s = time_s
@@ -465,6 +471,8 @@ class Smoother:
         if not is_solved:
             return
         self._iterate(time_s, LEAST_ITERATED)
+        if not self.is_bounded and self._has_misplaced(seen):
+            self._restart(time_s)
         # marginals of a bounded window stay linearised where their poses left
         if isinstance(self._window, FixedLagWindow):
             may_restart = time_s >= self._restarted_s + self.params.lag_s
@@ -545,6 +553,20 @@ class Smoother:
         error_after = graph.error(self.estimates.all())
         # an error that is no number has increased too
         return not error_after <= error_before
+
+    def _has_misplaced(self, keys: set[int]) -> bool:
+        """True when one of these landmarks is not where its sightings place it (`misplaced`).
+
+        A landmark is tested at its third sighting, and when its sightings have doubled since the last test. So a
+        restart that leaves it where it was, because most of its sightings are wrong, is rarely repeated.
+        """
+        due = {}
+        for key in keys:
+            lines = self._store.sightlines_of(key)
+            if len(lines) > 2 * self._tested.get(key, 1):
+                due[key] = lines
+                self._tested[key] = len(lines)
+        return bool(misplaced(self.estimates, due))
 
     def _restart(self, time_s: float) -> None:
         """Begin the window again at the batch solution of the graph."""

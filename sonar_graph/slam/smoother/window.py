@@ -85,8 +85,8 @@ class BundleError:
         self._order = gtsam.Ordering()
         for key in view:
             self._order.push_back(key)
-        factors = (self._graph.at(i) for i in range(self._graph.size()))
-        self.rows = sum(factor.dim() for factor in factors)
+        factors = [self._graph.at(i) for i in range(self._graph.size())]
+        self.rows = sum([factor.dim() for factor in factors])
 
     def __call__(
         self,
