@@ -52,7 +52,6 @@ from sonar_graph.measurements import (
     require_measurements,
 )
 from sonar_graph.models import (
-    CONTRADICTS,
     MINIMUM_PROBABILITY,
     Contradictions,
     KnownLandmarks,
@@ -596,10 +595,10 @@ class FilterShell(ABC):
         """The sonar, whose gate refuses what contradicts a landmark of the map."""
         if landmark_id not in self._known.held:
             return self.sonar
-        return self.sonar._replace(gate=min(self.sonar.gate, math.sqrt(CONTRADICTS)))
+        return self.sonar._replace(gate=min(self.sonar.gate, self._known.gate))
 
     def _judge_map(self, landmark_id: int, judged: Judged) -> None:
-        """Let a landmark of the map go that has moved; its next sighting maps it anew."""
+        """Let a landmark of the map go that has moved; its next sighting maps it again."""
         if landmark_id not in self._known.held:
             return
         squared = float(judged.e @ np.linalg.solve(judged.S, judged.e))

@@ -33,9 +33,11 @@ from sonar_graph.errors import (
 )
 
 STANDARD_GRAVITY = 9.80665
-HOLE_INTERVALS, SHORTEST_HOLE_S = 5, 0.05
+HOLE_INTERVALS = 5
+SHORTEST_HOLE_S = 0.05
 """Typical intervals and seconds of the IMU without a sample; a hole exceeds both: one lost sample does no harm."""
-ROWS_BEFORE, UNTYPICAL_S = 8, 1.0
+ROWS_BEFORE = 8
+UNTYPICAL_S = 1.0
 """Preceding intervals that define the typical one; longest interval after the very first sample that is no hole."""
 
 
@@ -315,6 +317,11 @@ class Start(Section):
     def pose(self) -> gtsam.Pose3:
         """world_T_body."""
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.position_m))
+
+    def in_map(self) -> Self:
+        """The start of a run with a known map: where nothing gives its place, the place is found in the map."""
+        is_placed = self.source not in ("heading", "vehicle")
+        return self if is_placed else self.model_copy(update={"source": "map"})
 
 
 class KnownMap(Section):

@@ -78,7 +78,7 @@ def read_map(path: Path) -> ReadMap:
         known, is_marginal = of_table(text, path)
         if is_marginal:
             warnings.append(
-                f"{path}: covariances of single landmarks, and no correlations between them; run --save-map writes all"
+                f"{path}: covariances of single landmarks, and no correlations between them; the map.toml of a run has them"
             )
     farthest_m = float(np.abs(np.array(known.positions_m)).max())
     if farthest_m > MOST_M:
@@ -176,11 +176,10 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     The note ``log.map`` of the sequence says what was done.
     """
     known, warnings = read_map(path)
-    start = sequence.calibration.start
+    start = sequence.calibration.start.in_map()
     note = f"{len(known.ids)} landmarks of {path.name}"
-    if start.source in ("vehicle", "heading"):
-        start = start.model_copy(update={"source": "map"})
-        note += "; the log states no place in it: the start is found by identified landmarks"
+    if start.source == "map":
+        note += "; the start is found in it, by identified landmarks"
     if known.source.startswith(f"{map_origin(sequence)}, "):
         warnings.append(
             f"{path}: this map was made from the same log, whose measurements count twice then: results look too certain"

@@ -77,7 +77,8 @@ class Block:
     """Time of validity, shape (n,), integer nanoseconds, not decreasing."""
 
     def __post_init__(self) -> None:
-        name, stamps = type(self).__name__, np.asarray(self.stamps_ns)
+        name = type(self).__name__
+        stamps = np.asarray(self.stamps_ns)
         if stamps.size == 0:
             raise MeasurementError(
                 f"{name}: a block needs at least one row; leave the block out instead"
@@ -431,7 +432,8 @@ class LandmarkDetections(Block):
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""
-        row, best = np.arange(len(self)), self.id_probability.argmax(axis=1)
+        row = np.arange(len(self))
+        best = self.id_probability.argmax(axis=1)
         return self.candidate_ids[row, best], self.id_probability[row, best]
 
 

@@ -148,7 +148,8 @@ class Sequence:
 
     def off_the_clock(self) -> list[RefusedRow]:
         """Rows more than a day before the start or after the end, which `replay` leaves out, or that are too fast."""
-        first_ns, last_ns = self.start_ns - PAUSE_NS, self.end_ns + PAUSE_NS
+        first_ns = self.start_ns - PAUSE_NS
+        last_ns = self.end_ns + PAUSE_NS
         too_fast = [
             RefusedRow(sensor, stamp_ns, Refusal.RATE, math.nan)
             for sensor, block in self.blocks().items()

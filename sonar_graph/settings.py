@@ -76,11 +76,9 @@ def settings_of(
             if default
             else field.get_default(call_default_factory=True)
         )
-        path, options, tag = (
-            f"{section}{name}",
-            list(_sections(field.annotation)),
-            field.discriminator,
-        )
+        path = f"{section}{name}"
+        options = list(_sections(field.annotation))
+        tag = field.discriminator
         if isinstance(tag, str):
             docs = {
                 option: " ".join((option.__doc__ or "").split("\n\n")[0].split())
@@ -201,7 +199,8 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     if error["type"] == "extra_forbidden":
         return unknown_field(place, model)
     if error["type"] == "union_tag_invalid":
-        at, given = _walk(model, place), error["ctx"]["tag"]
+        at = _walk(model, place)
+        given = error["ctx"]["tag"]
         known = [name for option in at.options for name in _tags(option, at.tag)]
         return (
             f"{_path((*at.names, at.tag))}: there is no {given!r}{choice(given, known)}"
@@ -230,11 +229,10 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 def unknown_field(place: Place, model: type[BaseModel]) -> str:
     """Message that a field does not exist, with the policy or section that has it, or the most similar one, and all."""
-    name, owner = str(place[-1]), _walk(model, place[:-1])
-    fault, whose = (
-        f"{_path((*owner.names, name))}: there is no such field",
-        _path(owner.names) or "it",
-    )
+    name = str(place[-1])
+    owner = _walk(model, place[:-1])
+    fault = f"{_path((*owner.names, name))}: there is no such field"
+    whose = _path(owner.names) or "it"
     if owner.value:
         others = [
             f'"{tag}"'
@@ -248,10 +246,8 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
         whose = f'{whose} with {owner.tag} = "{owner.value}"'
     if owner.section is None:
         return fault + choice(name, [], whose)
-    fields, inside = (
-        list(owner.section.model_fields),
-        [setting.name for setting in settings_of(owner.section)],
-    )
+    fields = list(owner.section.model_fields)
+    inside = [setting.name for setting in settings_of(owner.section)]
     meant = [
         _path((*owner.names, *dotted.split(".")))
         for dotted in inside
@@ -444,7 +440,8 @@ def _template_lines(
         inner = field.annotation
         if _is_section(inner):
             if is_nested:
-                old, new = getattr(default, name, None), getattr(stated, name, None)
+                old = getattr(default, name, None)
+                new = getattr(stated, name, None)
                 lines += _template_lines(inner, old, new, f"{prefix}{name}.", remark)  # type: ignore[arg-type]
             continue
         if is_optional:

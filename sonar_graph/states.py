@@ -279,10 +279,8 @@ class Trajectory:
         )
         if not self.has_orientation:
             return Trajectory.of_positions(stamps_ns, positions)
-        start, end = (
-            Rotation.from_quat(self.quaternions_xyzw[before]),
-            Rotation.from_quat(self.quaternions_xyzw[after]),
-        )
+        start = Rotation.from_quat(self.quaternions_xyzw[before])
+        end = Rotation.from_quat(self.quaternions_xyzw[after])
         quaternions = (
             start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())
         ).as_quat()

@@ -37,7 +37,7 @@ from sonar_graph.batch import (
     read_batch,
 )
 from sonar_graph.batch.result_table import is_timing
-from sonar_graph.cli.outputs import writable_json
+from sonar_graph.cli.outputs import is_json, writable_file
 from sonar_graph.errors import EvaluationError, SonarGraphError
 from sonar_graph.files import read_json, write_json
 from sonar_graph.measurements import Floats
@@ -476,11 +476,10 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         batch = read_batch(arguments.batch)
         if arguments.command == "bless":
-            writable_json(
+            writable_file(
                 arguments.reference,
-                "a reference",
-                [],
-                is_reference,
+                ".json",
+                is_json(is_reference),
                 overwrite=arguments.overwrite,
             )
             bless(batch, arguments.reference)

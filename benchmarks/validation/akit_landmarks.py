@@ -150,7 +150,7 @@ def reference_wander(
     """
     path = folder / f"Trajectory{number}" / f"GT_trajectory{number}.csv"
     north, east = (
-        read_table(path, REFERENCE_COLUMNS, delimiter=",", header_lines=1)
+        read_table(path, REFERENCE_COLUMNS, delimiter=",")
         .values[-len(positions) :, 4:6]
         .T
     )

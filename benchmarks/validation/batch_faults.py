@@ -1,7 +1,7 @@
 """No run is lost and no number changes when a batch is killed, its workers are killed, or its disk is full.
 
-The same suite is run undisturbed; killed with SIGKILL at random moments and resumed each time; with a process of a run,
-and a Dask worker, killed on the way; with a disk that is full for a while; and through a scheduler of its own on the
+The same suite is run undisturbed; killed with SIGKILL at random moments and resumed each time; with two processes of
+runs killed on the way; with a disk that is full for a while; and through a scheduler of its own on the
 loopback address. All tables must be equal, timings aside. A run is lost when it was done once and is not in the end.
 """
 
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -120,20 +120,20 @@ def killed_batches(suite: Path, folder: Path, kills: int, chance: random.Random)
 
 
 def killed_workers(suite: Path, folder: Path) -> None:
-    """Kill a process of a run, and later a Dask worker, while they work."""
+    """Kill a process of a run, and later another one, while they work."""
     with started(suite, folder) as process:
-        for count, is_victim in ((2, is_runner), (5, is_worker)):
+        for count in (2, 5):
             await_runs(process, folder, count)
-            kill_one(process.pid, is_victim)
+            kill_one(process.pid)
         process.wait()
 
 
-def kill_one(batch: int, is_victim: Callable[[list[str]], bool]) -> None:
+def kill_one(batch: int) -> None:
     with contextlib.suppress(psutil.Error):
         victims = [
             child
             for child in psutil.Process(batch).children(recursive=True)
-            if is_victim(child.cmdline())
+            if is_runner(child.cmdline())
         ]
         if victims:
             victims[0].kill()
@@ -141,10 +141,6 @@ def kill_one(batch: int, is_victim: Callable[[list[str]], bool]) -> None:
 
 def is_runner(arguments: list[str]) -> bool:
     return "sonar_graph.batch.one_run" in arguments
-
-
-def is_worker(arguments: list[str]) -> bool:
-    return any("spawn_main" in argument for argument in arguments)
 
 
 class FullDisk(Store):

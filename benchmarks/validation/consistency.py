@@ -30,7 +30,6 @@ from common import conclude, in_parallel, make_parser, print_table, refuse
 from sonar_graph.cli.compare import DEMO
 from sonar_graph.cli.simulate import write_basin
 from sonar_graph.evaluation import anees_interval, compare
-from sonar_graph.evaluation.consistency import anees_over_runs
 from sonar_graph.recognition import recognise
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
@@ -110,7 +109,7 @@ def judge(nees: np.ndarray, dof: int) -> Verdict:
     """From the NEES of all runs, shape (runs, n)."""
     runs = len(nees)
     band = anees_interval(runs, dof)
-    anees = anees_over_runs(nees, dof)
+    anees = nees.mean(axis=0) / dof
     own = nees.mean(axis=1) / dof
     half = 1.96 * float(own.std(ddof=1)) / np.sqrt(runs)
     mean = float(own.mean())
@@ -128,7 +127,7 @@ def draw(seconds: np.ndarray, nees: Nees, path: Path) -> None:
         axes.axhspan(*anees_interval(runs, dof), color="0.9", label="95 % band")
         for short, name in ESTIMATORS.items():
             axes.plot(
-                seconds, anees_over_runs(nees[short, quantity], dof), lw=1, label=name
+                seconds, nees[short, quantity].mean(axis=0) / dof, lw=1, label=name
             )
         axes.set_ylabel(f"ANEES of {quantity} / {dof}")
         axes.legend(loc="upper left", ncols=3)

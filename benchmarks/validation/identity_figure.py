@@ -14,7 +14,6 @@ from sonar_graph.report.figure_style import (
     head_panel,
     legend_above,
     logarithmic,
-    name_axes,
 )
 
 Figures = dict[Case, dict[str, dict[str, float]]]
@@ -62,11 +61,8 @@ def draw(figures: Figures, path: Path) -> None:
         }
         for row, (error, label) in enumerate(ROWS.items()):
             _panel(panels[row, column], cases, error)
-            name_axes(
-                panels[row, column],
-                "wrong, %" if row == len(ROWS) - 1 else "",
-                label if column == 0 else "",
-            )
+            panels[row, column].set_xlabel("wrong, %" if row == len(ROWS) - 1 else "")
+            panels[row, column].set_ylabel(label if column == 0 else "")
         head_panel(panels[0, column], title)
     legend_above(figure, panels[0, 0])
     arrange(figure)

@@ -42,7 +42,7 @@ from rich.console import Console
 from row_faults import FAULTS, NS, Effect, Fault
 
 from sonar_graph.cli.arguments import ReadingOptions
-from sonar_graph.cli.compare import compare_log
+from sonar_graph.cli.compare import compare_prepared, prepared_log
 from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.recognise import RecogniserOptions
 from sonar_graph.errors import SonarGraphError
@@ -236,9 +236,8 @@ def outcome(path: Path) -> Outcome:
         with patch(
             "time.perf_counter", time.process_time
         ):  # other processes do not count
-            comparison = compare_log(
-                path, ESTIMATORS, {}, ReadingOptions(), RecogniserOptions(), 2.0
-            )
+            prepared = prepared_log(path, ReadingOptions(), RecogniserOptions(), 2.0)
+            comparison = compare_prepared(prepared, ESTIMATORS, {})
     except SonarGraphError as error:
         return Outcome(str(error), {}, {}, {}, str(error))
     console = Console(file=StringIO(), width=10_000)

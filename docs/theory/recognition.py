@@ -11,7 +11,6 @@ from sonar_graph.report.figure_style import (
     arrange,
     blank_panels,
     colour,
-    name_axes,
 )
 from sonar_graph.sonar.bayes import jeffrey
 
@@ -150,8 +149,9 @@ def draw(path: str) -> None:
         va="top",
         fontsize=9,
     )
-    name_axes(axes[0, 0], "frame, all with the same scores", "belief in landmark 1")
-    name_axes(axes[0, 1], "frame")
+    axes[0, 0].set_xlabel("frame, all with the same scores")
+    axes[0, 0].set_ylabel("belief in landmark 1")
+    axes[0, 1].set_xlabel("frame")
     axes[0, 0].legend(
         frameon=False, fontsize=9, loc="center right", bbox_to_anchor=(1, 0.32)
     )

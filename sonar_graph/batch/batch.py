@@ -16,7 +16,6 @@ from pathlib import Path
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
-from sonar_graph.batch.sources import LOG, read_source
 from sonar_graph.batch.store import (
     SUITE,
     Limits,
@@ -28,8 +27,7 @@ from sonar_graph.batch.store import (
     Where,
 )
 from sonar_graph.batch.suite import SuiteFile, read_suite
-from sonar_graph.errors import BatchError, SonarGraphError
-from sonar_graph.evaluation import expense
+from sonar_graph.errors import BatchError
 from sonar_graph.files import (
     BATCH,
     deferred_interrupt,
@@ -55,12 +53,11 @@ def run_suite(
     only: Collection[str] = (),
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
-    notice: Callable[[str], None] | None = None,
 ) -> RecordedBatch:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
 
-    Needs the extra ``bench``. A script calls it under ``if __name__ == "__main__":``, because worker processes import
-    the script. The same call resumes a batch that was interrupted, also with more seeds or estimators in the suite.
+    Needs the extra ``bench``. The same call resumes a batch that was interrupted, also with more seeds or estimators in
+    the suite.
 
     Parameters
     ----------
@@ -82,8 +79,6 @@ def run_suite(
         Replace suite and table in the folder also where they are another suite's, or not this package's.
     progress
         Called at the start and after each run with the number of runs that are done, planned and failed.
-    notice
-        Called before the first run with a sentence on each log that takes long. Logs are read for that.
 
     Returns
     -------
@@ -156,11 +151,6 @@ def run_suite(
         limits = limits_of(file, timeout_s)
         try:
             with terminations_as_interrupts():
-                if notice is not None:
-                    for sentence in batch.large_logs():
-                        notice(
-                            f"{sentence}; a run is ended after {limits.timeout_s:g} s"
-                        )
                 batch.run(Where(workers, scheduler), limits, count, chosen)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(batch.resuming()) from None
@@ -220,22 +210,6 @@ class Batch:
             for run in self.runs
             if (row := self.store.row(run.key)) is not None
         }
-
-    def large_logs(self) -> Iterator[str]:
-        """Sentences with what the runs of large logs take, for runs that are not done.
-
-        Data sets and simulations are not read: their size is known to whoever names them.
-        """
-        done = self.rows()
-        missing = {
-            run.log: run for run in self.runs if run.kind == LOG and run.key not in done
-        }
-        for run in missing.values():
-            with contextlib.suppress(SonarGraphError):  # the run fails with the reason
-                if said := expense(
-                    read_source(run.kind, run.options, run.seed, run.landmarks)
-                ):
-                    yield f"A large log, {run.log}, {said}"
 
     def chosen(self, keys: Collection[str]) -> list[PlannedRun]:
         """Runs of these keys; all without a key.

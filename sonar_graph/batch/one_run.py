@@ -38,8 +38,8 @@ from sonar_graph.evaluation import (
 from sonar_graph.files import LOCK, MANIFEST, READY, Tell, serve
 from sonar_graph.sequence import Sequence
 
+# sequences kept in memory, since estimators of one log mostly follow each other; one is that of the warm-up
 KEPT_SEQUENCES = 3
-"""Sequences kept in memory, since estimators of one log mostly follow each other; one is that of the warm-up."""
 WARM_UP_LOG = ("basin", {"duration_s": 120.0, "laps": 1, "wrong_id_rate": 0.1})
 TWO_DIMENSIONS = 2
 LOG = logging.getLogger(__name__)
@@ -69,6 +69,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     before the estimator is loaded or after the run, or when its files have another content, and `OSError` when the
     folder cannot be written; neither is a result.
     """
+    # a worker of a cluster may have another checkout
     here = versions_of(run.estimator)
     # results of other versions must not stand in one table with those of the plan
     if differing := _differing(here, run.versions):
@@ -83,6 +84,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         with suppress(EstimatorError):  # it fails again in the run, with the reason
             load_estimator(run.estimator)
     clock = Clock()
+    # processor time is nearly free of the load of the machine, unlike the time of the clock
     cpu_before_s = time.process_time()
     try:
         with clock.on("read_s"):
@@ -121,6 +123,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         }
         row |= _versions(describe_environment())
     else:
+        # a single run can be looked at as any comparison
         write_comparison(comparison, folder)
         row = measured(comparison)
         row |= {name: sequence.notes.get(f"log.{name}") for name in FINDINGS}
@@ -198,13 +201,16 @@ def measured(comparison: Comparison) -> Row:
         "reason": run.reason,
     }
     if run.status == "failed":
+        # numpy and GTSAM name it differently
         out_of_memory = "MemoryError" in run.reason or "bad_alloc" in run.reason
         row["status"] = "memory" if out_of_memory else "failed"
     else:
+        # the longest update hangs on the machine; the 99th percentile is of the estimator
         p50, p99 = np.quantile(run.update_s * 1e3, [0.5, 0.99]).tolist()
         row |= {"peak_memory_mb": run.peak_memory_mb, "finish_s": run.finish_s}
         row |= {"update_p50_ms": p50, "update_p99_ms": p99}
     row["scored_instants"] = 0
+    # over seeds only the last instants are independent
     for kind, errors in comparison.errors.get(run.estimator, {}).items():
         row["scored_instants"] = len(errors.stamps_ns)
         for key, nees, dof in (

@@ -97,6 +97,7 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
         for seed, contestant in itertools.product(
             source.entry.seed_list(), contestants
         ):
+            # equal keys promise equal numbers, also after an update of a library
             versions = versions_of(contestant.name)
             decides = {
                 "content": source.content,
@@ -107,6 +108,7 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
                 "rate_hz": rate_hz,
                 "versions": versions,
             }
+            # sorted, so that the order of settings in a suite changes no key
             text = json.dumps(decides, sort_keys=True, default=str)
             asked = {
                 "generator": source.entry.kind,
@@ -149,6 +151,7 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
     found: list[_Contestant] = []
     for number, entry in enumerate(file.suite.estimators):
         place: Place = ("estimators", number)
+        # settings of a foreign estimator are checked in its own process
         model: type[Section] | None = None
         try:
             if not (foreign := is_foreign(entry.name)):
@@ -173,6 +176,8 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
                     )
             variant = _label(entry.variant, chosen) or DEFAULT_VARIANT
             found.append(_Contestant(place, entry.name, variant, given, values))
+    # two contestants of one name could not be told apart in tables, two with equal settings cost time for
+    # nothing
     by_name: dict[str, _Contestant] = {}
     by_settings: dict[str, str] = {}
     for contestant in found:
@@ -251,6 +256,7 @@ def sources_of(file: SuiteFile) -> list[_Source]:
             named = [
                 values[name] for name in FILES if isinstance(values.get(name), str)
             ]
+            # a suite that ships must run without the data sets that cannot be shipped
             if entry.obtain and not all(map(file.holds, named)):
                 continue
             for name in FILES:
@@ -287,6 +293,7 @@ def sources_of(file: SuiteFile) -> list[_Source]:
             ("logs",),
             f"no data of any log is here; get {'; '.join(e.obtain for e in file.suite.logs)}",
         )
+    # two logs of one name share a panel, two with equal content count one seed twice
     by_name: dict[str, _Source] = {}
     by_content: dict[str, str] = {}
     for source in found:
@@ -332,6 +339,7 @@ def _combinations(
             file.refuse(at, f"is also in {table}; give it in one of them")
         if not values:
             file.refuse(at, "has no values; give at least one")
+        # values may be lists, which cannot be compared by a set
         texts = [json.dumps(value, default=str) for value in values]
         if len(set(texts)) < len(texts):
             twice = next(text for text in texts if texts.count(text) > 1)
@@ -424,6 +432,7 @@ def source_hash_now(package: str) -> str:
     spec = find_spec(package)
     if spec is None:
         return ""
+    # a namespace package has several folders, a module none
     folders = list(spec.submodule_search_locations or ())
     files = [
         (

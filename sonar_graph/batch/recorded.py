@@ -35,19 +35,7 @@ GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
 """Name for all logs of a batch taken together."""
 NEEDED = ("key", "log", "estimator", "status")
-WORDS = (
-    "key",
-    "suite",
-    "log",
-    "generator",
-    "estimator",
-    "variant",
-    "status",
-    "reason",
-    "log_file",
-    "machine",
-)
-OBJECTS = ("options", "params", "versions")
+FIELDS = ("key", "log", "estimator", "variant", "status", "reason", "log_file")
 
 
 @dataclass(frozen=True)
@@ -133,6 +121,7 @@ class RecordedBatch:
     def absent(self) -> dict[str, str]:
         """Source of each log of the suite that was left out, because its files were not there, by its name."""
         with contextlib.suppress(ValueError):
+            # the suite names logs that no row can name
             entries = tomllib.loads(self.suite).get("logs", [])
             return {
                 entry["name"]: entry["obtain"]
@@ -167,6 +156,7 @@ class RecordedBatch:
 
         `ALL_LOGS` gives those of every log. Logs on which either cannot have the score have no pairs.
         """
+        # all logs together are pooled by seed
         logs = self.logs if log == ALL_LOGS else [log]
         both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
         values = np.array(
@@ -190,6 +180,7 @@ class RecordedBatch:
             self.is_asked(log, name, key) for name in (contestant, self.reference)
         ):
             return []
+        # the same seed draws the same world for both
         reference = {run.seed: run for run in self.group(log, self.reference)}
         return [
             (run, reference[run.seed])
@@ -203,6 +194,7 @@ class RecordedBatch:
         Dead reckoning has no map, and a log without truth has no errors; neither is a failure. A contestant none of
         whose runs ended is expected to have every score. Without finished runs on the log nothing is expected.
         """
+        # without this a missing score would count as a failure of whoever cannot have it
         on_log, of_contestant, ended = self._known_scores
         is_known = (key, contestant) in of_contestant or contestant not in ended
         return (key, log) in on_log and is_known and (log, contestant) in self._groups
@@ -244,6 +236,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
             f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to"
         )
     try:
+        # loaded here, because a comparison needs no extra
         import pyarrow as pa  # of the extra `bench`
         import pyarrow.parquet as pq
     except ModuleNotFoundError as error:
@@ -277,6 +270,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
         raise EvaluationError(
             f"{folder}: none of its {len(planned)} runs has been done yet; {GOING_ON}"
         )
+    # a table that another program wrote has no such metadata
     about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
     chosen = (
         reference
@@ -302,6 +296,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
 def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
     """A run from its row of the table; from its own folder if it was done after the table was written."""
     if row["status"] == NOT_RUN:
+        # a batch that was killed could not write its table again
         kept = Path(RUNS) / str(row["key"])
         with contextlib.suppress(EvaluationError):
             row = (
@@ -313,34 +308,25 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
         row.get("log_file") and (folder / row["log_file"]).is_file()
     ):  # its folder was moved or removed
         row = row | {"log_file": None}
-    words = {name: str(row.pop(name, None) or "") for name in WORDS}
+    fields: dict[str, Any] = {name: str(row.pop(name, None) or "") for name in FIELDS}
     seed = row.pop("seed", None)
-    objects = {name: row.pop(name) for name in OBJECTS if row.get(name)}
     texts = {
-        name: words[name] for name in ("suite", "generator", "machine") if words[name]
+        name: value
+        if isinstance(value, str)
+        else json.dumps(value, sort_keys=True, default=str)
+        for name, value in row.items()
+        if value and isinstance(value, str | dict | list)
     }
-    for name, value in objects.items():
-        texts[name] = (
-            value
-            if isinstance(value, str)
-            else json.dumps(value, sort_keys=True, default=str)
-        )
-    texts |= {name: value for name, value in row.items() if isinstance(value, str)}
-    numbers = {
+    # null stands for what was not measured
+    values = {
         name: float(value)
         for name, value in row.items()
-        if isinstance(value, int | float)
+        if isinstance(value, int | float) and math.isfinite(value)
     }
     return RecordedRun(
-        key=words["key"],
-        log=words["log"],
+        **fields,
         seed=None if seed is None else int(seed),
-        estimator=words["estimator"],
-        variant=words["variant"],
-        status=words["status"],
-        reason=words["reason"],
-        log_file=words["log_file"],
         texts=texts,
-        values={name: value for name, value in numbers.items() if math.isfinite(value)},
+        values=values,
         place=place,
     )

@@ -38,11 +38,11 @@ PROTOCOLS = {
 HIGHER_IS_BETTER = {"real_time_factor"}
 NO_BETTER = {"count", "used", "refused", "unnamed"}
 INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
+# columns of time and memory that every run has
 TIMINGS = (
     *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
     *("update_p50_ms", "update_p99_ms", "finish_s"),
 )
-"""Columns of time and memory that every run has."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ def metrics_of(keys: list[str]) -> list[Metric]:
 
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
+# notes of the comparison of a log's sensors with each other, as of `sonar-graph compare`
 FINDINGS = ("doubtful", "sensors")
-"""Notes of the comparison of a log's sensors with each other, as of `sonar-graph compare`."""
 VERSIONS = (
     "sonar_graph",
     "source",
@@ -184,6 +184,7 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
         }
         row = store.row(run.key)
         if row is None:
+            # a batch that ends early can be read without the code that planned it
             row = {"status": NOT_RUN, "reason": "not done when this table was written"}
         else:
             # versions are those that the run itself found
@@ -192,6 +193,7 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
                 **row,
             }
         rows.append(described | row)
+    # scores differ from log to log; every table has all of them in one order
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
     types = COLUMNS | {
         name: "int64" if name.endswith("_dof") else "float64" for name in scores

@@ -155,10 +155,10 @@ KINDS: dict[str, SourceKind] = {
     **DATASETS,
     **GENERATORS,
 }
+# options that name files: their content counts, not their path
 FILES = ("log", "folder", "calibration", "log_config", "map")
-"""Options that name files: their content counts, not their path."""
+# key in fingerprints for the file of a data set that has no option for one
 FILE = "file"
-"""Key in fingerprints for the file of a data set that has no option for one."""
 
 
 def read_source(

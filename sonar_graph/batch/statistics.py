@@ -15,12 +15,10 @@ from scipy import stats
 from sonar_graph.evaluation import anees_interval
 from sonar_graph.measurements import Floats
 
+# positive integers: ranks, doubled if there are ties, divided by their common divisor
 Ranks = np.ndarray[tuple[int], np.dtype[np.int64]]
-"""Positive integers: ranks, doubled if there are ties, divided by their common divisor."""
 LEAST_PAIRS = 6
 """With fewer pairs no two-sided rank test reaches 5 %: 2 / 2⁵ = 0.06."""
-MOST_ADDITIONS = 10_000_000
-"""Largest cost of an exact test: 341 differences without ties, 271 with ties; some 10 ms."""
 
 
 def signed_rank_p(differences: Floats) -> float:
@@ -38,14 +36,12 @@ def signed_rank_p(differences: Floats) -> float:
     # tied ranks may end in .5: doubled, they are the integers that the exact distribution counts with
     doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)
     ranks = doubled // np.gcd.reduce(doubled[differences != 0])
+    # infinite differences have the highest ranks: a lost run is worse than any other
     positive = int(ranks[differences > 0].sum())
     negative = int(ranks[differences < 0].sum())
     # Pratt 1959: zeros take part in the ranking and are left out only now
-    ranks, least = ranks[differences != 0], min(positive, negative)
-    is_cheap = len(ranks) * (positive + negative) <= 2 * MOST_ADDITIONS
-    return min(
-        1.0, 2 * (exact_tail(ranks, least) if is_cheap else near_tail(ranks, least))
-    )
+    signed = ranks[differences != 0]
+    return min(1.0, 2 * exact_tail(signed, min(positive, negative)))
 
 
 def exact_tail(ranks: Ranks, most: int) -> float:
@@ -62,30 +58,14 @@ def exact_tail(ranks: Ranks, most: int) -> float:
     return float(chances.sum())
 
 
-def near_tail(ranks: Ranks, most: int) -> float:
-    """Approximation of `exact_tail`: the sum is normal, given the number of positive signs, which is binomial.
-
-    The sum of ``k`` out of ``m`` ranks, drawn without replacement, has mean ``k r`` and variance ``k (m - k) s² / m``
-    with the ranks' mean ``r`` and sample variance ``s²``. Unlike a single normal distribution this keeps the steps of
-    equal ranks.
-    """
-    count = len(ranks)
-    positive = np.arange(count + 1)
-    sigmas = np.sqrt(positive * (count - positive) / count * ranks.var(ddof=1))
-    # all signs positive, or no sign: the sum is certain, sigma is 0 and the place infinite
-    with np.errstate(divide="ignore"):
-        places = (most + 0.5 - positive * ranks.mean()) / sigmas
-    return float(stats.binom.pmf(positive, count, 0.5) @ stats.norm.cdf(places))
-
-
 def least_p(pairs: int) -> float:
     """Smallest p value of the signed-rank test for a number of pairs, reached if all have one sign."""
     return float(2.0 ** (1 - pairs)) if pairs else 1.0
 
 
 CONFIDENCE = 0.95
+# quantiles shown beside the median
 LOW, HIGH = 0.1, 0.9
-"""Quantiles shown beside the median."""
 
 
 @dataclass(frozen=True)
@@ -190,6 +170,7 @@ def summarise(values: Floats) -> SampleSummary:
     """
     n = len(values)
     without = int(np.isinf(values).sum())
+    # an average over the survivors would praise whoever fails where it is hard
     has_mean = n > 0 and not without
     low, median, high = (quantile(values, share) for share in (LOW, 0.5, HIGH))
     return SampleSummary(
@@ -311,6 +292,7 @@ def paired(
         lost = np.array([lost[which].any() for which in members], dtype=bool)
         kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
         each = kinds.pop() if len(kinds) == 1 else "case"
+    # a case is lost with any of its pairs
     without = int(lost.sum())
     valued = differences[~lost]
     has_mean = len(differences) > 0 and not without
@@ -334,6 +316,7 @@ def paired(
 def case_difference(differences: Floats) -> float:
     """Mean of one case's differences; infinite to the side that has more infinite ones, without them if none has."""
     infinite = np.isinf(differences)
+    # as many lost runs on one side as on the other cancel
     side = float(np.sign(differences[infinite]).sum())
     if side:
         return math.copysign(math.inf, side)
@@ -385,6 +368,7 @@ def holm(p_values: Floats) -> Floats:
     """
     corrected = np.full(len(p_values), np.nan)
     known = np.flatnonzero(~np.isnan(p_values))
+    # the smallest p value has the largest factor
     order = known[np.argsort(p_values[known], kind="stable")]
     factors = np.arange(len(order), 0, -1)
     corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))

@@ -36,10 +36,10 @@ from sonar_graph.files import (
 )
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
+# status in the table of a run that is planned and not done yet
 NOT_RUN = "not run"
-"""Status in the table of a run that is planned and not done yet."""
+# a row of the results by column
 Row = dict[str, str | int | float | None]
-"""A row of the results by column."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Where:
     """Address of a scheduler, used in place of local workers."""
 
 
+# called after a run is kept
 Progress = Callable[[PlannedRun, RunOutcome], None]
-"""Called after a run is kept."""
 RUNS = "runs"
 ROW = "row.json"
 LOG = "log.txt"
@@ -146,6 +146,7 @@ class Store:
     def row(self, key: str) -> Row | None:
         """Row of a run; None if it is not done, or its row is lost or belongs to another run."""
         try:
+            # a machine that lost power may have kept the folder and not its content
             row = dict(read_json(self.run_folder(key) / ROW))
         except EvaluationError:
             return None
@@ -157,6 +158,7 @@ class Store:
         Raises `OSError` when there is no space; nothing of the run is left then, and no other run is touched.
         Raises `BatchError` as `discard` does.
         """
+        # filled under another name: a folder with its final name is complete
         partial = self._partial_folder(key)
         row = strict_json({KEY: key, **outcome.row}) + "\n"
         contents = {**outcome.files, LOG: outcome.log.encode(), ROW: row.encode()}

@@ -19,15 +19,14 @@
     [[estimators]]
     name = "dead-reckoning"
 
-Mistakes are found before anything runs and reported with file, line and key. `tomllib` gives values without line
-numbers, so `line_of` finds the line of a key again.
+Mistakes are found before anything runs and reported with file, line and key.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -47,10 +46,10 @@ from sonar_graph.evaluation import SCORES
 from sonar_graph.files import text_of
 from sonar_graph.settings import choice, faults_in, flattened
 
+# names of tables and keys, and indices of the entries of arrays, from the top of the file
 Place = tuple[int | str, ...]
-"""Names of tables and keys, and indices of the entries of arrays, from the top of the file."""
+# environment variable: folder of data sets that do not lie beside the suite
 DATA_VARIABLE = "SONAR_GRAPH_DATA"
-"""Environment variable: folder of data sets that do not lie beside the suite."""
 DEFAULT_METRICS = (
     "causal.ate_se2_m",
     "causal.ate_raw_m",
@@ -60,22 +59,22 @@ DEFAULT_METRICS = (
     "smoothed.ate_raw_m",
     "landmarks.se2_m",
 )
+# every key that a score can have
 METRICS = tuple(
     f"{block}.{name}" for block, labels in SCORES.items() for name in labels
 )
-"""Every key that a score can have."""
 MOST_SEEDS = 1_000_000
+# largest integer that a column of the results can hold
 LARGEST_SEED = 2**63 - 1
-"""Largest integer that a column of the results can hold."""
 
 
+# values by name; names of nested settings are dotted
 Grid = Annotated[
     dict[str, list[Any]],
     BeforeValidator(
         lambda given: flattened(given) if isinstance(given, dict) else given
     ),
 ]
-"""Values by name; names of nested settings are dotted."""
 
 
 def _printable(name: str) -> str:
@@ -114,6 +113,7 @@ class LogEntry(Section):
         seeds = (
             value if isinstance(value, list) else [value] if value is not None else []
         )
+        # a number of seeds is a number of runs, which nobody wants by the million
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
         if not are_numbers or len(set(seeds)) < len(seeds):
@@ -219,6 +219,7 @@ class SuiteFile:
 
         Raises `BatchError` when it is in neither.
         """
+        # files beside the suite go before those of a folder for all suites
         roots = self._roots()
         found = [root / name for root in roots if (root / name).exists()]
         if not found:
@@ -290,44 +291,23 @@ def read_suite(path: Path) -> SuiteFile:
     return found
 
 
-_NAME = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
-_DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
-_HEADER = re.compile(rf"\s*(?P<array>\[)?\[\s*(?P<path>{_DOTTED})\s*\]")
-_KEY = re.compile(rf"\s*(?P<path>{_DOTTED})\s*=")
-_TEXT_MARKS = ('"""', "'''")
-
-
 def line_of(text: str, place: Place) -> int:
-    """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it."""
-    lines: dict[Place, int] = {(): 1}
-    entries: dict[Place, int] = {}
-    table: Place = ()
-    open_mark = ""  # of a text of several lines, in which nothing is a key
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not open_mark and (header := _HEADER.match(line)):
-            names = _names(header["path"])
-            table = ()
-            for depth, name in enumerate(names, start=1):
-                table = (*table, name)
-                if header["array"] and depth == len(names):
-                    lines.setdefault(table, number)
-                    entries[table] = entries.get(table, -1) + 1
-                if table in entries:
-                    table = (*table, entries[table])
-            lines.setdefault(table, number)
-        elif not open_mark and (key := _KEY.match(line)):
-            names = _names(key["path"])
-            for length in range(1, len(names) + 1):
-                lines.setdefault((*table, *names[:length]), number)
-        for mark in _TEXT_MARKS:
-            if open_mark in ("", mark) and line.count(mark) % 2:
-                open_mark = "" if open_mark else mark
-    return next(
-        lines[place[:length]]
-        for length in range(len(place), -1, -1)
-        if place[:length] in lines
-    )
+    """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it.
 
-
-def _names(path: str) -> list[str]:
-    return [name.strip("\"'") for name in re.findall(_NAME, path)]
+    The first lines of a document are a document too, unless a value goes on below them. So a key begins after the
+    longest such part that does not have it.
+    """
+    lines = text.splitlines(keepends=True)
+    for length in range(len(place), 0, -1):
+        begin = 1
+        for count in range(1, len(lines) + 1):
+            try:
+                values: Any = tomllib.loads("".join(lines[:count]))
+            except tomllib.TOMLDecodeError:
+                continue
+            with suppress(KeyError, IndexError, TypeError):
+                for name in place[:length]:
+                    values = values[name]
+                return begin
+            begin = count + 1
+    return 1

@@ -1,7 +1,7 @@
 """Runs watched from outside: ended when they exceed their time or memory, repeated once when they are killed.
 
 A run is done in a process of its own (`sonar_graph.batch.one_run`), because native code cannot be stopped from within
-and a crash must not end the Dask worker. The process is kept for the next run.
+and a crash must not end the batch or the Dask worker. The process is kept for the next run.
 """
 
 from __future__ import annotations
@@ -30,61 +30,18 @@ ONE_THREAD = (
     ),
     *("VECLIB_MAXIMUM_THREADS", "TBB_NUM_THREADS"),
 )
+# fixes the order of sets of texts, and with it the last digits of sums over them
 ONE_ORDER = {"PYTHONHASHSEED": "0"}
-"""Fixes the order of sets of texts, and with it the last digits of sums over them."""
+# longest start of a process
 START_S = 300.0
-"""Longest start of a process."""
+# longest warm-up: the first processes on a machine all compile kernels
 WARM_UP_S = 3600.0
-"""Longest warm-up: the first processes on a machine all compile kernels."""
+# name among the versions of a run whose estimator this package brings. Others are not warmed up: they may take
+# any time, which then counts for their runs
 OWN = "sonar-graph"
-"""Name among the versions of a run whose estimator this package brings. Others are not warmed up: they may take any
-time, which then counts for their runs."""
 ATTEMPTS = 2
+# length of the kept end of a run's log
 LOG_CHARACTERS = 100_000
-"""Length of the kept end of a run's log."""
-
-
-def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
-    """Do a run in one of this process's runners; a run that is killed is done once more.
-
-    The row of the outcome says where a run was killed again, took too long or needed too much memory.
-    Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
-    """
-    reason = ""
-    log = ""
-    for _ in range(ATTEMPTS):
-        with _idle_lock:
-            runner = _idle.pop() if _idle else None
-        if runner is None or not runner.is_fit():
-            runner = Runner()
-        try:
-            outcome = runner.perform(run, limits)
-            return replace(outcome, row=_here() | outcome.row)
-        except KilledError as error:
-            reason = str(error)
-            log = runner.log()
-        finally:
-            # after a timeout the process is still busy with the run: it is ended, not kept
-            if runner.is_fit():
-                with _idle_lock:
-                    _idle.append(runner)
-            else:
-                runner.end()
-    return RunOutcome(
-        {**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"},
-        log=log,
-    )
-
-
-def _here() -> Row:
-    """Versions of this machine, also for runs that ended without a row."""
-    environment = describe_environment()
-    return {"python": environment["python"], "machine": environment["machine"]}
-
-
-_idle: list[Runner] = []
-# workers of a scheduler that exists may do several runs at a time, in threads
-_idle_lock = threading.Lock()
 
 
 class Runner:
@@ -181,6 +138,86 @@ class Runner:
             ):
                 reason = f"its processes needed more than {limits.memory_mb:g} MB"
                 return RunOutcome({"status": "memory", "reason": reason})
+
+
+class Runners:
+    """Processes for runs, kept from one run to the next, for threads that do several runs at a time."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._idle: list[Runner] = []
+        self._busy: set[Runner] = set()
+        self._is_ended = False
+
+    def perform(self, run: PlannedRun, limits: Limits) -> RunOutcome:
+        """Do a run in one of the processes; a run that is killed is done once more.
+
+        The row of the outcome says where a run was killed again, took too long or needed too much memory.
+        Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
+        """
+        reason = ""
+        log = ""
+        for _ in range(ATTEMPTS):
+            runner = self._taken()
+            try:
+                outcome = runner.perform(run, limits)
+                return replace(outcome, row=_here() | outcome.row)
+            except KilledError as error:
+                reason = str(error)
+                log = runner.log()
+            finally:
+                self._give_back(runner)
+        return RunOutcome(
+            {**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"},
+            log=log,
+        )
+
+    def end(self) -> None:
+        """End all processes, also those that are at work: who waits for one gets an error."""
+        with self._lock:
+            self._is_ended = True
+            runners = [*self._idle, *self._busy]
+            self._idle.clear()
+        for runner in runners:
+            runner.end()
+
+    def _taken(self) -> Runner:
+        with self._lock:
+            runner = self._idle.pop() if self._idle else None
+        if runner is None or not runner.is_fit():
+            runner = Runner()
+        with self._lock:
+            self._busy.add(runner)
+            is_ended = self._is_ended
+        if is_ended:
+            self._give_back(runner)
+            raise BatchError("the batch was ended")
+        return runner
+
+    def _give_back(self, runner: Runner) -> None:
+        with self._lock:
+            self._busy.discard(runner)
+            # after a timeout the process is still busy with the run: it is ended, not kept
+            is_kept = runner.is_fit() and not self._is_ended
+            if is_kept:
+                self._idle.append(runner)
+        if not is_kept:
+            runner.end()
+
+
+def _here() -> Row:
+    """Versions of this machine, also for runs that ended without a row."""
+    environment = describe_environment()
+    return {"python": environment["python"], "machine": environment["machine"]}
+
+
+# of a Dask worker, which may do several runs at a time, in threads
+_runners = Runners()
+
+
+def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
+    """Do a run in one of the processes of this Dask worker, as `Runners.perform`."""
+    return _runners.perform(run, limits)
 
 
 def resident_mb(pid: int) -> float:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from sonar_graph.sequence import Sequence
 
 Model = TypeVar("Model", bound="Section")
+# columns of output that does not go to a terminal, so that lines stay whole
 FILE_WIDTH = 200
-"""Columns of output that does not go to a terminal, so that lines stay whole."""
 
 
 def existing_file(meaning: str, metavar: str = "FILE") -> Any:
@@ -178,6 +178,26 @@ class ReadingOptions:
 
         return TimeWindow.parse(self.start, self.end)
 
+    @property
+    def of_log(self) -> dict[str, Any]:
+        """Arguments of `sonar_graph.logs.read_log`."""
+        return {
+            "calibration": self.given,
+            "topics": self.choices,
+            "config": self.config,
+            "window": self.window,
+        }
+
+    @property
+    def of_images(self) -> dict[str, Any]:
+        """Arguments of the readers of sonar images."""
+        return {
+            "topic": self.choices.get("sonar"),
+            "config": self.config,
+            "window": self.window,
+            "salvage": self.salvage,
+        }
+
     def read(
         self, log: Path, *, progress: Callable[[int, int], None] | None = None
     ) -> Sequence:
@@ -185,15 +205,7 @@ class ReadingOptions:
         from sonar_graph.logs import read_log
         from sonar_graph.map_file import in_map
 
-        sequence = read_log(
-            log,
-            calibration=self.given,
-            topics=self.choices,
-            config=self.config,
-            window=self.window,
-            salvage=self.salvage,
-            progress=progress,
-        )
+        sequence = read_log(log, **self.of_log, salvage=self.salvage, progress=progress)
         return sequence if self.map is None else in_map(sequence, self.map)
 
 
@@ -206,6 +218,7 @@ def with_options(
     """
 
     def expand(command: Callable[..., None]) -> Callable[..., None]:
+        # annotations are texts because of `from __future__ import annotations`
         hints = get_type_hints(command, include_extras=True)
         groups: dict[str, Any] = {
             name: kind for name, kind in hints.items() if is_dataclass(kind)
@@ -218,6 +231,7 @@ def with_options(
         @wraps(command)
         def run(**values: Any) -> None:
             for name, kind in groups.items():
+                # fields that the command does not offer keep their defaults
                 values[name] = kind(
                     **{f.name: values.pop(f.name) for f in offered[name]}
                 )
@@ -254,6 +268,7 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
         parsed: Any = value
         if "\n" not in value:
             try:
+                # TOML gives numbers, lists and booleans their types
                 parsed = tomllib.loads(f"value = {value}")["value"]
             except tomllib.TOMLDecodeError:
                 parsed = value
@@ -293,6 +308,7 @@ def estimator_settings(
         estimator, dot, setting = path.partition(".")
         if dot and estimator not in names:
             hint = suggestion(estimator, names)
+            # a setting without the estimator before it is the commonest mistake
             if hint == ";" and estimator not in installed_estimators():
                 hint = f"; the estimator's name comes first, such as {names[0]}.{path}"
             raise EstimatorError(
@@ -319,6 +335,7 @@ def examples(*commands: str) -> str:
 
 def printable(text: str) -> str:
     """Text without what a terminal would obey: names in a log may hold escape sequences, which are spelt out."""
+    # nearly every text, in a fraction of the time
     if text.isprintable():
         return text
     obeyed = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -98,7 +97,6 @@ def bench(
                 only=options.only or (),
                 overwrite=options.overwrite,
                 progress=progress,
-                notice=partial(echo, err=True),
             )
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
@@ -106,6 +104,7 @@ def bench(
         os._exit(INTERRUPTED)
     only = options.only
     counts = Counter(run.status for run in batch.runs if not only or run.key in only)
+    # those that ended first
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
     echo(f"Results: {output / 'results.parquet'}")

@@ -50,22 +50,23 @@ if TYPE_CHECKING:
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
+# exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``
 DOUBTFUL = 3
-"""Exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``."""
+# tolerance for the IMU's rate, which is counted from its stamps
 RATE_SLACK = 1.01
-"""Tolerance for the IMU's rate, which is counted from its stamps."""
 LOG = "basin.mcap"
 PAGE = "report.html"
+# the three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler
+# log that loses the bottom some three times. Images take most of the time: two a second still show each
+# landmark several times
 DEMO = {
     **{"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}},
     **{"gyro_bias_scale": 10.0, "dvl_dropouts_per_hour": 30.0, "dvl_dropout_s": 5.0},
     "frame_rate_hz": 2.0,
 }
-"""The three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler log that
-loses the bottom some three times. Images take most of the time: two a second still show each landmark several times."""
 DEMO_ESTIMATORS = ["isam2", "ekf-slam", "invariant-ekf", "dead-reckoning"]
+# changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log
 SHORT = {"duration_s": 120.0, "laps": 1, "dvl_dropouts_per_hour": 120.0, "image": None}
-"""Changes of the options for a run on which loops are compiled: shorter, with gaps of the Doppler log."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,7 @@ def compare(
     """
     from sonar_graph.report import write_report
 
+    # blanks after commas are common
     names = [name.strip() for name in estimators.split(",")]
     again = next((name for name in names if names.count(name) > 1), None)
     if not all(names):
@@ -186,8 +188,10 @@ def demo(
     names = DEMO_ESTIMATORS
     with writable_folder(output, names_written(output, names), overwrite=overwrite):
         log = writable_log(output / LOG, overwrite=overwrite)
+    # a vehicle that people can afford, on which landmarks are of use
     options = BasinOptions.model_validate(DEMO)
     short = partial(run_basin, options.model_copy(update=SHORT), names)
+    # compiled for these modules only, while images are simulated
     modules = [sys.modules[load_estimator(name).__module__] for name in names]
     with compiled_beside(short, modules) as wait_until_compiled:
         echo(
@@ -276,8 +280,12 @@ def compared(
 
     The folder for the results is kept from other commands until the block, which writes them, ends.
     """
+    from sonar_graph.evaluation import check_request
+
+    # mistakes come to light before the log is read, which may take minutes
     overrides = estimator_settings(estimation.settings, names)
-    check_requests(names, overrides)
+    for name in names:
+        check_request(name, overrides.get(name))
     sources = (
         log,
         reading.calibration,
@@ -287,17 +295,8 @@ def compared(
     )
     written = names_written(output, names)
     with writable_folder(output, written, sources, overwrite=estimation.overwrite):
-        yield compare_log(
-            log, names, overrides, reading, recognition, estimation.rate_hz
-        )
-
-
-def check_requests(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:
-    """Raise for a name or setting that does not exist."""
-    from sonar_graph.evaluation import check_request
-
-    for name in names:
-        check_request(name, overrides.get(name))
+        prepared = prepared_log(log, reading, recognition, estimation.rate_hz)
+        yield compare_prepared(prepared, names, overrides)
 
 
 class PreparedLog(NamedTuple):
@@ -308,19 +307,6 @@ class PreparedLog(NamedTuple):
     """None where the log had detections, or no images."""
     rate_hz: float
     """Estimates a second."""
-
-
-def compare_log(
-    log: Path,
-    names: list[str],
-    overrides: dict[str, dict[str, Any]],
-    reading: ReadingOptions,
-    recognition: RecogniserOptions,
-    rate_hz: float | None,
-) -> Comparison:
-    """Read a log, recognise landmarks if it needs that, and compare estimators."""
-    prepared = prepared_log(log, reading, recognition, rate_hz)
-    return compare_prepared(prepared, names, overrides)
 
 
 def prepared_log(
@@ -338,6 +324,7 @@ def prepared_log(
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
     rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
+    # more estimates than IMU samples would repeat each other
     check_rate(rate_hz, sequence)
     with working("comparing sensors"):
         sequence = (
@@ -356,6 +343,7 @@ def prepared_log(
             raise LogError(
                 f"{no_images(log)}; --designs, --model and --rule are for images"
             )
+    # designs of others look like speckle to a recogniser that does not know them
     if found is not None:
         if recognition.designs is None:
             warn_of_other_designs(sequence)
@@ -411,6 +399,7 @@ def print_outcome(comparison: Comparison, place: str) -> None:
     if counterpart is not None:
         out.print(counterpart)
     echo(place)
+    # results are written all the same: the others may be what was wanted
     failed = [run for run in comparison.runs if run.status == "failed"]
     for run in failed:
         echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)

@@ -84,6 +84,7 @@ def csv(
     if toml:
         echo(csv_template(tables), nl=False)
         return
+    # the advice can be copied as it is
     named = " ".join(map(str, tables))
     if config is None:
         raise LogError(

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from sonar_graph.diagnosis import Finding
     from sonar_graph.logs import LogSummary
 
+# exit codes; 2 is a mistake of the user
 UNUSABLE, DOUBTFUL = 1, 3
-"""Exit codes; 2 is a mistake of the user."""
 HEAD = """\
 # Calibration for --calibration FILE. A line that is commented out has the default, which counts where neither this file
 # nor the log says something else. Units are in the names or after the lines; angles are in rad, lengths in m.
 """
+# rows of the table for people; a log may have tens of thousands
 MOST_TOPICS = 500
-"""Rows of the table for people; a log may have tens of thousands."""
 
 
 @with_options("salvage")
@@ -73,6 +73,7 @@ def inspect(
     findings: list[Finding] = []
     grave: set[str] = set()
     skipped = large = ""
+    # images alone can still be recognised
     is_usable = not (
         (summary.obstacles and not summary.has_images_alone)
         or summary.unusable
@@ -90,17 +91,12 @@ def inspect(
         is_read = False
         try:
             with working("comparing sensors"):
-                sequence = read_log(
-                    log,
-                    calibration=given,
-                    config=config,
-                    topics=reading.choices,
-                    window=reading.window,
-                )
+                sequence = read_log(log, **reading.of_log)
                 is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
                 grave = {finding.quantity for finding in findings if finding.grave}
+        # the tables above are worth printing all the same
         except SonarGraphError as error:
             skipped, is_usable = f"not compared: {error}", is_usable and is_read
     if as_json:
@@ -154,6 +150,7 @@ def print_summary(
         "recorded after (s)",
     ):
         topics.add_column(heading, justify="right")
+    # spans are from the beginning of the log, not since 1970
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
     shown = summary.topics[:MOST_TOPICS]
     for topic in shown:
@@ -269,14 +266,7 @@ def calibration(
     stated = Calibration()
     source = ""
     if log is not None:
-        window = reading.window
-        sequence = read_log(
-            log,
-            calibration=reading.given,
-            topics=reading.choices,
-            config=reading.config,
-            window=window,
-        )
+        sequence = read_log(log, **reading.of_log)
         stated, source = (
             sequence.calibration,
             f"# {log.name}: {sequence.notes['log.calibration']}\n",

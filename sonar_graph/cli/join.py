@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 TOPIC = "/sonar/image"
 SEARCH_S = 10.0
+# standard deviations of the estimated offset beyond which a stated one is doubted
 DISAGREEING = 4.0
-"""Standard deviations of the estimated offset beyond which a stated one is doubted."""
 NS_PER_S = 10**9
 
 
@@ -111,6 +111,7 @@ def join(
     )
 
     path = writable_log(output, images, navigation, overwrite=options.overwrite)
+    # before the images are read, which takes minutes
     refuse_images(navigation)
     sequence = reading.read(navigation)
     topic = reading.choices.get("sonar")
@@ -132,6 +133,7 @@ def join(
             seen, sequence, around_s, search_s, is_stated=is_stated
         )
         shift_ns = round(seconds * NS_PER_S)
+        # the notes of both files are kept apart by their prefix
         notes = {
             f"images.{key}": note
             for key, note in alone.notes.items()
@@ -183,6 +185,7 @@ def as_log(images: Path) -> Iterator[Path]:
     """The file with sonar images as an MCAP log, converted if its suffix is that of a sonar."""
     from sonar_graph.logs.convert import convert_aris, convert_didson
 
+    # recordings of sonars are logs of their own formats
     converters: dict[str, Callable[..., Any]] = {
         ".aris": convert_aris,
         ".ddf": convert_didson,
@@ -261,6 +264,7 @@ def require_overlap(
 def stretch(start_ns: int, end_ns: int) -> str:
     """Begin and length of a recording; the begin as a date where the clock counts since 1970."""
     seconds = start_ns * 1e-9
+    # a clock that counts from its own start has no date
     is_dated = 1e8 < seconds < 1e11
     begin = (
         f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
@@ -309,6 +313,7 @@ def on_the_clock(
     latest_ns = -1
     done = 0
     for block in blocks:
+        # a log in order of time can be written in one pass
         late = block.stamps_ns <= latest_ns
         if not late.all():
             latest_ns, done = int(block.stamps_ns[-1]), done + len(block)

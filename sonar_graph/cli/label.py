@@ -19,7 +19,7 @@ from sonar_graph.cli.arguments import (
     echo,
     with_options,
 )
-from sonar_graph.cli.outputs import progress_bars, writable_json
+from sonar_graph.cli.outputs import is_json, progress_bars, writable_file
 from sonar_graph.errors import LogError
 from sonar_graph.files import interrupt_event
 
@@ -81,34 +81,17 @@ def label(
         shown_frames,
     )
 
-    path = writable_json(
-        output,
-        "labels",
-        [log],
-        lambda content: content.keys() == {"log", "labels"},
-        overwrite=options.overwrite,
+    are_labels = is_json(lambda content: content.keys() == {"log", "labels"})
+    path = writable_file(
+        output, ".json", are_labels, [log], overwrite=options.overwrite
     )
     designs = options.designs
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
+    # labels are hours of work: an existing file is added to
     is_continued = path.exists() and path.stat().st_size and not options.overwrite
     labels = read_labels(path, log) if is_continued else Labels(log=spelt(log.name))
-    topic = reading.choices.get("sonar")
-    alone = read_images_alone(
-        log,
-        calibration=reading.given,
-        topic=topic,
-        config=reading.config,
-        window=reading.window,
-        salvage=reading.salvage,
-    )
-    blocks = read_sonar_frames(
-        log,
-        topic,
-        reading.config,
-        window=reading.window,
-        salvage=reading.salvage,
-        refused=lambda *_: None,
-    )
+    alone = read_images_alone(log, calibration=reading.given, **reading.of_images)
+    blocks = read_sonar_frames(log, **reading.of_images, refused=lambda *_: None)
     with progress_bars() as progress:
         frames = shown_frames(
             blocks,
@@ -149,6 +132,7 @@ def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) ->
     echo("Ctrl-C ends.")
     if is_shown:
         webbrowser.open(server.address)
+    # the main thread waits for Ctrl-C
     serving = Thread(target=server.serve_forever, daemon=True)
     serving.start()
     with interrupt_event() as ended:

@@ -29,13 +29,14 @@ if TYPE_CHECKING:
     import threading
 
     from sonar_graph.live import Publisher
+    from sonar_graph.logs import PartialCalibration
 
 RECORD = "record.mcap"
 COUNTS = "live.json"
+# time between two lines of a log that waits to be played
 REMIND_S = 10.0
-"""Time between two lines of a log that waits to be played."""
+# time for subscribers to find all topics, and to get the last messages
 SETTLE_S = 1.0
-"""Time for subscribers to find all topics, and to get the last messages."""
 DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 
 
@@ -92,6 +93,9 @@ class LiveEstimation:
     calibration: Annotated[
         Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
     ] = None
+    map: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
+    ] = None
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -107,6 +111,23 @@ class LiveEstimation:
             topics=self.topics,
             log_config=self.log_config,
         )
+
+    @property
+    def given(self) -> PartialCalibration | None:
+        """Fields of the calibration, the map of landmarks among them."""
+        from sonar_graph.logs import PartialCalibration
+        from sonar_graph.map_file import read_map
+
+        given = self.reading.given
+        if self.map is None:
+            return given
+        known, warnings = read_map(self.map)
+        for line in warnings:
+            echo(line, err=True)
+        of_map = PartialCalibration(
+            {"map": known.model_dump(mode="json")}, str(self.map)
+        )
+        return of_map if given is None else of_map.over(given)
 
 
 @with_options()
@@ -168,13 +189,12 @@ def live(
             else "name another folder"
         )
         raise LogError(f"{record}: a record is there already: {advice}")
+    # before anything is written: a wrong setting leaves no folder
     overrides = estimation.overrides
     params = check_request(estimator, overrides)
-    given = (
-        reading.given
-        if resume is None
-        else LiveRecord.resumed_calibration(resume, reading.given)
-    )
+    given = estimation.given
+    if resume is not None:
+        given = LiveRecord.resumed_calibration(resume, given)
     options = LiveOptions(
         estimator,
         overrides,
@@ -188,6 +208,7 @@ def live(
         open_link(link_options.endpoints, link_options.domain) as link,
         interrupt_event() as ended,
     ):
+        # only once a link is open: a wrong address leaves no folder
         output.mkdir(parents=True, exist_ok=True)
         outlets = open_outlets(link, foxglove)
         screen = StatusLine()
@@ -241,6 +262,7 @@ def live(
         finish_s=outcome.finish_s,
     )
     with working("writing results and the page"):
+        # the page is of the record, so that it can be repeated from the record
         sequence = read_log(record)
         sequence = compared(sequence, reading.config)
         comparison = judge(sequence, outcome.causal.stamps_ns, [result])
@@ -312,6 +334,7 @@ def play(
         recorded_messages,
     )
 
+    # as a router, because most rehearsals have none
     session = open_session(connect or (), () if connect else [listen])
     publishers: dict[str, Publisher] = {}
     unknown: set[str] = set()
@@ -417,6 +440,7 @@ def wait_for_listener(
 
 def unheard_lines(publishers: dict[str, Publisher]) -> list[str]:
     """Line with the topics that nobody subscribes to; of topics of static frames zenoh does not know."""
+    # static frames are latched, so their listeners come and go
     unheard = [
         topic
         for topic, one in publishers.items()

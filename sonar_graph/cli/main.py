@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -49,79 +49,51 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
-app.command(
-    epilog=examples(
-        "sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"
+EXAMPLES: dict[Callable[..., None], list[str]] = {
+    inspect: ["dive.mcap", "dive.mcap --toml"],
+    calibration: ["--template > vehicle.toml", "--template dive.mcap > vehicle.toml"],
+    run: [
+        "dive.mcap --estimator isam2 -o out",
+        "dive.mcap --estimator ekf-slam -o out --calibration vehicle.toml",
+    ],
+    compare: [
+        "dive.mcap -o comparison",
+        "dive.mcap --estimators isam2,dead-reckoning --rate-hz 5 -o comparison",
+        "dive.mcap --log-config dive.toml -o comparison",
+    ],
+    join: [
+        "dive.aris dive.mcap -o joined.mcap",
+        "dive_sonar.mcap dive.mcap --offset 3600 --search 30 -o joined.mcap",
+    ],
+    recognise: [
+        "dive.mcap -o recognised.mcap",
+        "dive.mcap -o recognised.mcap --rule jeffrey",
+    ],
+    label: ["dive.mcap -o labels.json"],
+    calibrate: [
+        "dive.mcap -o model.json",
+        "dive.mcap --labels labels.json -o model.json",
+    ],
+    live: ["-o dive", "-o dive --calibration vehicle.toml --foxglove 8765"],
+    play: ["dive.mcap", "dive.mcap --rate 3"],
+    bench: [
+        "suite.toml -o results",
+        "suite.toml -o results --workers 2 --timeout 600",
+        "suite.toml -o results --scheduler tcp://10.0.0.5:8786",
+        "suite.toml -o again --only 0123456789abcdef0123",
+    ],
+    report: ["comparison"],
+    figures: ["comparison", "comparison -o paper"],
+    view: ["comparison", "comparison --viewer browser"],
+    estimators: [""],
+    demo: ["-o demo"],
+}
+"""Commands in the order of the help, each with what follows its name in an example."""
+for command, lines in EXAMPLES.items():
+    start = f"sonar-graph {command.__name__}"
+    app.command(epilog=examples(*(f"{start} {line}".rstrip() for line in lines)))(
+        command
     )
-)(inspect)
-app.command(
-    epilog=examples(
-        "sonar-graph calibration --template > vehicle.toml",
-        "sonar-graph calibration --template dive.mcap > vehicle.toml",
-    )
-)(calibration)
-app.command(
-    epilog=examples(
-        "sonar-graph run dive.mcap --estimator isam2 -o out",
-        "sonar-graph run dive.mcap --estimator ekf-slam -o out --calibration vehicle.toml",
-    )
-)(run)
-app.command(
-    epilog=examples(
-        "sonar-graph compare dive.mcap -o comparison",
-        "sonar-graph compare dive.mcap --estimators isam2,dead-reckoning --rate-hz 5 -o comparison",
-        "sonar-graph compare dive.mcap --log-config dive.toml -o comparison",
-    )
-)(compare)
-app.command(
-    epilog=examples(
-        "sonar-graph join dive.aris dive.mcap -o joined.mcap",
-        "sonar-graph join dive_sonar.mcap dive.mcap --offset 3600 --search 30 -o joined.mcap",
-    )
-)(join)
-app.command(
-    epilog=examples(
-        "sonar-graph recognise dive.mcap -o recognised.mcap",
-        "sonar-graph recognise dive.mcap -o recognised.mcap --rule jeffrey",
-    )
-)(recognise)
-app.command(epilog=examples("sonar-graph label dive.mcap -o labels.json"))(label)
-app.command(
-    epilog=examples(
-        "sonar-graph calibrate dive.mcap -o model.json",
-        "sonar-graph calibrate dive.mcap --labels labels.json -o model.json",
-    )
-)(calibrate)
-app.command(
-    epilog=examples(
-        "sonar-graph live -o dive",
-        "sonar-graph live -o dive --calibration vehicle.toml --foxglove 8765",
-    )
-)(live)
-app.command(
-    epilog=examples("sonar-graph play dive.mcap", "sonar-graph play dive.mcap --rate 3")
-)(play)
-app.command(
-    epilog=examples(
-        "sonar-graph bench suite.toml -o results",
-        "sonar-graph bench suite.toml -o results --workers 2 --timeout 600",
-        "sonar-graph bench suite.toml -o results --scheduler tcp://10.0.0.5:8786",
-        "sonar-graph bench suite.toml -o again --only 0123456789abcdef0123",
-    )
-)(bench)
-app.command(epilog=examples("sonar-graph report comparison"))(report)
-app.command(
-    epilog=examples(
-        "sonar-graph figures comparison", "sonar-graph figures comparison -o paper"
-    )
-)(figures)
-app.command(
-    epilog=examples(
-        "sonar-graph view comparison", "sonar-graph view comparison --viewer browser"
-    )
-)(view)
-app.command(epilog=examples("sonar-graph estimators"))(estimators)
-app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 
 
 def show_version(wanted: bool) -> None:

@@ -16,86 +16,65 @@ from sonar_graph.cli.arguments import echo, printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 from sonar_graph.files import COMPARISON, read_json, result_folder
 
+# line of every page of tracks
 OWN_PAGE = '<p class="kicker">sonar_graph recognition</p>'
-"""Line of every page of tracks."""
 
 
 def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> Path:
-    """Check that a log can be written, say whether it replaces another, and return ``path``.
+    """Check that a log can be written as `writable_file`, say whether it replaces another, and return ``path``."""
+    from sonar_graph.logs.mcap import is_own_log
 
-    A source, a file or folder, is never overwritten; a file that this package did not write, only if asked for.
-
-    Raises `LogError` when it is a folder, is not called ``*.mcap``, is a source or a part of it, is a file that this
-    package did not write, or its folder cannot be written to.
-    """
-    if path.is_dir():
-        raise LogError(
-            f"{path}: is a folder; give the name of a file such as {path / 'log.mcap'}"
-        )
-    if path.suffix != ".mcap":
-        raise LogError(f"{path}: logs are MCAP files; give a name that ends in .mcap")
-    if any(source is not None and _is_part_of(path, source) for source in sources):
-        raise LogError(
-            f"{path}: is what is read, and would be overwritten; choose another name with -o"
-        )
-    if not (overwrite or _is_replaceable(path)):
-        raise LogError(
-            f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
-        )
-    _require_writing_in(path.parent, path, LogError)
+    writable_file(path, ".mcap", is_own_log, sources, overwrite=overwrite)
     if path.exists() and path.stat().st_size:
         echo(f"Replaces {path}", err=True)
     return path
 
 
-def writable_json(
+def writable_file(
     path: Path,
-    what: str,
-    sources: Iterable[Path],
-    is_own: Callable[[dict[str, Any]], bool],
+    suffix: str,
+    is_own: Callable[[Path], bool],
+    sources: Iterable[Path | None] = (),
     *,
     overwrite: bool = False,
 ) -> Path:
-    """Check that a JSON file of ``what`` can be written, and return ``path``.
+    """Check that a file can be written, and return ``path``.
 
-    Raises `EvaluationError` when it is one of the sources, cannot be written, or has a content that is not ``is_own``.
+    A source, a file or folder, is never overwritten; a file that is not ``is_own``, only if asked for.
+
+    Raises `LogError` when it is a folder, has another suffix, is a source or a part of it, is a file that this package
+    did not write, or its folder cannot be written to.
     """
-    if path.is_dir() or path.suffix != ".json":
-        raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
-    if any(_is_part_of(path, source) for source in sources):
-        raise EvaluationError(
+    if path.is_dir() or path.suffix != suffix:
+        raise LogError(f"{path}: expected the name of a file that ends in {suffix}")
+    if any(source is not None and _is_part_of(path, source) for source in sources):
+        raise LogError(
             f"{path}: is what is read, and would be overwritten; choose another name with -o"
         )
-    if not overwrite and path.exists() and (not path.is_file() or path.stat().st_size):
-        content: dict[str, Any] = {}
-        with suppress(EvaluationError):
-            content = read_json(path)
-        if not is_own(content):
-            raise EvaluationError(
-                f"{path}: exists, and holds something else than {what}; choose another name, or give --overwrite"
-            )
-    _require_writing_in(path.parent, path, EvaluationError)
-    return path
-
-
-def writable_page(path: Path, *, overwrite: bool = False) -> Path:
-    """Check that a page can be written, and return ``path``.
-
-    Raises `EvaluationError` when it is a folder, is not called ``*.html``, cannot be written, or is a file that this
-    package did not write.
-    """
-    if path.is_dir() or path.suffix != ".html":
-        raise EvaluationError(f"{path}: expected the name of a file that ends in .html")
-    if (
-        not overwrite
-        and path.exists()
-        and OWN_PAGE not in path.read_text("utf-8", errors="replace")
-    ):
-        raise EvaluationError(
+    # an empty file, such as one that a script made for its name, holds nothing that could be lost
+    is_free = not path.exists() or (path.is_file() and not path.stat().st_size)
+    if not (overwrite or is_free or (path.is_file() and is_own(path))):
+        raise LogError(
             f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite"
         )
-    _require_writing_in(path.parent, path, EvaluationError)
+    _require_writing_in(path.parent, path, LogError)
     return path
+
+
+def is_json(is_own: Callable[[dict[str, Any]], bool]) -> Callable[[Path], bool]:
+    """A check for `writable_file`: the file holds a JSON object that is ``is_own``."""
+
+    def check(path: Path) -> bool:
+        with suppress(EvaluationError):
+            return is_own(read_json(path))
+        return False
+
+    return check
+
+
+def is_own_page(path: Path) -> bool:
+    """True for a page of tracks that this package wrote."""
+    return OWN_PAGE in path.read_text("utf-8", errors="replace")
 
 
 @contextmanager
@@ -114,6 +93,7 @@ def writable_folder(
     """
     if path.exists() and not path.is_dir():
         raise EvaluationError(f"{path}: is a file; give a folder with -o")
+    # through links too: the source may lie in the folder of the results
     for written in (path / name for name in names if (path / name).exists()):
         if any(source is not None and written.samefile(source) for source in sources):
             raise EvaluationError(
@@ -134,15 +114,6 @@ def _is_part_of(path: Path, source: Path) -> bool:
     )
 
 
-def _is_replaceable(path: Path) -> bool:
-    """True if there is no file, an empty one, or a log that this package wrote."""
-    from sonar_graph.logs.mcap import is_own_log
-
-    return not path.exists() or (
-        path.is_file() and (path.stat().st_size == 0 or is_own_log(path))
-    )
-
-
 def _require_writing_in(
     folder: Path, path: Path, refusal: type[SonarGraphError]
 ) -> None:
@@ -151,6 +122,7 @@ def _require_writing_in(
     Nothing is made for that: another command may be about to write there.
     """
     try:
+        # the only sure way to find out: rights, quotas and read-only mounts differ
         with TemporaryFile(
             dir=next(
                 one
@@ -165,13 +137,14 @@ def _require_writing_in(
         ) from error
 
 
+# called with the name of the work, the number of steps done, their total (0: not known), and perhaps a remark
 Report = Callable[..., None]
-"""Called with the name of the work, the number of steps done, their total (0: not known), and perhaps a remark."""
 
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
     """Progress bars, one for each name of work, while the context is open."""
+    # stdout is for answers that another program may read
     console = Console(stderr=True)
     bar = (
         BarColumn(),

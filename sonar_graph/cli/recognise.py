@@ -6,7 +6,7 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,11 +24,12 @@ from sonar_graph.cli.arguments import (
     with_options,
 )
 from sonar_graph.cli.outputs import (
+    is_json,
+    is_own_page,
     progress_bars,
     working,
-    writable_json,
+    writable_file,
     writable_log,
-    writable_page,
 )
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing
@@ -50,11 +51,11 @@ if TYPE_CHECKING:
     Run = Sequence | ImagesAlone
 
 TOPIC = "/sonar/landmarks"
+# metadata record with the outcome of every frame
 RECORD = "sonar_graph_recognition"
-"""Metadata record with the outcome of every frame."""
 MOST_WARNINGS_SHOWN = 10
+# tracks of a class below which calibrate warns
 FEW_TRACKS = 10
-"""Tracks of a class below which calibrate warns."""
 RecogniserName = Annotated[
     Literal["designs", "actag"],
     typer.Option(
@@ -124,6 +125,7 @@ class RecogniserOptions:
                 raise typer.BadParameter(
                     f"--rule {self.rule} and --set identity.rule={identity['rule']}: give one of them"
                 )
+            # the option is a shorter name of the setting
             identity["rule"] = self.rule
         if self.model is not None:
             values["confusion"] = confusion = read_confusion(self.model)
@@ -198,7 +200,10 @@ def recognise(
     path = writable_log(output, log, overwrite=options.overwrite)
     page = None
     if options.report is not None:
-        page = writable_page(options.report, overwrite=options.overwrite)
+        page = writable_file(
+            options.report, ".html", is_own_page, overwrite=options.overwrite
+        )
+    # images alone are enough: their own motion stands in for navigation
     sequence, motion = with_motion(log, reading, options.motion)
     made = recognition.recogniser(
         sequence.calibration, options.settings, options.recogniser
@@ -212,6 +217,7 @@ def recognise(
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
+        # what was lost on the way into the new log must not be lost to its reader
         notes = sequence.notes
         losses = {
             f"copied.{k}": f"{log.name}: {notes[k]}"
@@ -305,12 +311,9 @@ def calibrate(
 
     labels = options.labels
     sources = [*logs, *(labels or [])]
-    path = writable_json(
-        output,
-        "a model",
-        sources,
-        lambda content: "ids" in content and "matrix" in content,
-        overwrite=options.overwrite,
+    is_model = is_json(lambda content: content.keys() >= {"ids", "matrix"})
+    path = writable_file(
+        output, ".json", is_model, sources, overwrite=options.overwrite
     )
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
@@ -328,40 +331,29 @@ def calibrate(
     recognition = RecogniserOptions(options.designs)
     params = recognition.params(options.settings)
     known = recognition.read_designs()
-    topic = reading.choices.get("sonar")
-    salvage = reading.salvage
+    how: dict[str, Any] = {"designs": known, "params": params, **reading.of_images}
+    # whole logs, as --start and --end of one would be wrong for another
+    del how["window"]
     with working("calibrating"):
         if labels:
             given = [
                 read_labels(file, log) for log, file in zip(logs, labels, strict=True)
             ]
             runs = [with_motion(log, reading, options.motion) for log in logs]
-            measured = calibrate_by_labels(
-                [
-                    LabelledLog(log, run, own, file, how)
-                    for log, file, own, (run, how) in zip(
-                        logs, labels, given, runs, strict=True
-                    )
-                ],
-                topic=topic,
-                config=reading.config,
-                designs=known,
-                params=params,
-                salvage=salvage,
-            )
+            labelled = [
+                LabelledLog(log, run, own, file, motion)
+                for log, file, own, (run, motion) in zip(
+                    logs, labels, given, runs, strict=True
+                )
+            ]
+            measured = calibrate_by_labels(labelled, **how)
         else:
-            measured = measure(
-                [(log, reading.read(log)) for log in logs],
-                topic=topic,
-                config=reading.config,
-                designs=known,
-                params=params,
-                salvage=salvage,
-            )
+            measured = measure([(log, reading.read(log)) for log in logs], **how)
     with replacing(path) as partial:
         partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
     for number in range(1, len(labels or []) + 1):
         answers().print(measured.provenance[f"labels {number}"])
+    # frames of one track are alike: a model of few tracks knows few views
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
         frames, tracks = (
@@ -393,6 +385,7 @@ def with_motion(
     """Read what goes with a log's images, and say how the sonar's motion will be known."""
     from sonar_graph.logs import lacking_navigation, read_images_alone
 
+    # without IMU or Doppler log only the images can give the motion
     lacking = lacking_navigation(log, reading.choices, reading.config, reading.window)
     if motion == "navigation" and lacking:
         raise LogError(
@@ -401,14 +394,7 @@ def with_motion(
         )
     if motion == "navigation" or (motion is None and not lacking):
         return reading.read(log), "navigation"
-    alone = read_images_alone(
-        log,
-        calibration=reading.given,
-        topic=reading.choices.get("sonar"),
-        config=reading.config,
-        window=reading.window,
-        salvage=reading.salvage,
-    )
+    alone = read_images_alone(log, calibration=reading.given, **reading.of_images)
     return alone, motion or "images"
 
 
@@ -457,11 +443,8 @@ def recognise_log(
             log,
             sequence,
             motion=motion,
-            topic=reading.choices.get("sonar"),
-            config=reading.config,
             recogniser=recogniser,
-            window=reading.window,
-            salvage=reading.salvage,
+            **reading.of_images,
             progress=lambda done: progress(
                 "recognising landmarks", done, 0, f"{done} frames"
             ),

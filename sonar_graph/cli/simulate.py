@@ -69,6 +69,7 @@ def landmarks(
     )
 
 
+# written out, so that help need not import the simulator
 _OTHERS = (
     "gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
     "range_sigma_m, azimuth_sigma_rad, detection_probability, wrong_id_rate, tracks, id_delay_s, wrong_id_share, "
@@ -81,7 +82,6 @@ _OTHERS = (
     "of those from contrast_db to altitude_error_m: easy (default), murky, worn or hard. image.designs is a TOML "
     "file of at least four landmarks; the four lowest ids are laid, in their order"
 )
-"""Written out, so that help need not import the simulator."""
 worlds = typer.Typer(
     name="simulate",
     help="Simulate a run with known truth and write it as an MCAP log.",
@@ -158,6 +158,7 @@ class BasinChoices:
         }
         if self.no_bias:
             values["gyro_bias_scale"] = 0.0
+        # a setting may name anything, and goes before the option of its name
         given = nested_settings(self.settings)
         if "image" in given and not self.images:
             raise typer.BadParameter(

@@ -67,8 +67,6 @@ def velocity_of_beams(
         )
         # each ping by itself: its bits do not depend on the others
         along = along_m_s[rows][:, pattern, None]
-        velocity[rows], covariance[rows] = (
-            (inverse @ along)[:, :, 0],
-            (axes * variances) @ axes.T,
-        )
+        velocity[rows] = (inverse @ along)[:, :, 0]
+        covariance[rows] = (axes * variances) @ axes.T
     return velocity, covariance

@@ -44,13 +44,15 @@ from sonar_graph.settings import faults_in
 
 PIXEL_M = 0.002
 """Size of the pixels into which drawn shapes are turned."""
-LEAST_SIZE_M, MOST_SIZE_M = 0.02, 2.0
+LEAST_SIZE_M = 0.02
+MOST_SIZE_M = 2.0
 MOST_PIXELS = 2000
 """Along the side of a picture."""
 MOST_ID = 2**31 - 1
 LEAST_BRIGHT_DB = 3.0
 """Least level of the brightest part; below it a design does not stand out of the speckle of the floor."""
-CENTRED_M, JOINED_M = 0.0075, 0.05
+CENTRED_M = 0.0075
+JOINED_M = 0.05
 """Distance from the middle up to which a figure counts as in it, and gap over which bright parts are one figure."""
 OWN_DESIGNS = "landmark designs"
 """Note of a log that names its landmarks, where they are not those that ship."""
@@ -171,7 +173,8 @@ class _Shape(Section):
         if self.circle_m is not None:
             centre_x, centre_y, radius = self.circle_m
             return np.asarray(np.hypot(x_m - centre_x, y_m - centre_y) <= radius)
-        vertices, inside = np.array(self.polygon_m), np.zeros(np.shape(x_m), dtype=bool)
+        vertices = np.array(self.polygon_m)
+        inside = np.zeros(np.shape(x_m), dtype=bool)
         for (x1, y1), (x2, y2) in zip(
             vertices, np.roll(vertices, -1, axis=0), strict=True
         ):

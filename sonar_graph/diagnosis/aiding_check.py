@@ -12,6 +12,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.diagnosis.causes import (
+    DEVIATION,
+    DRIFT,
+    OF_FIXES,
+    OF_RANGES,
+    PITCH,
+    Advice,
+    Cause,
+    cause_of,
+    of_scale,
+    other_world,
+    scale_line,
+    step_text,
+    unused,
+)
 from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     IN_CALIBRATION,
@@ -25,11 +40,14 @@ from sonar_graph.diagnosis.findings import (
     numbers,
     unknown,
 )
-from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     Match,
+    SignalStretch,
+    Values,
+    explained,
     match,
     root_mean_square,
 )
@@ -37,7 +55,7 @@ from sonar_graph.diagnosis.start import LEAST_BIAS_RAD_S, turned_mounting
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, Floats, PositionFixes
 from sonar_graph.models import wrap_angle
-from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.navigation.alignment import Estimate1D, Estimates3D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 
@@ -79,15 +97,8 @@ LENGTHS = {
     "km": 1e3,
 }
 PRESSURES = {"kPa as Pa": 1e3, "hPa as Pa": 1e2, "dbar as Pa": 1e4, "bar as Pa": 1e5}
+MINUTES = "degrees and minutes written as 12.3456"
 DEGREES = {"degrees": float(np.radians(1.0))}
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What may be wrong, and the line that mends it."""
-
-    cause: str
-    line: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +131,10 @@ class Check:
     quantity: str = ""
     """Name of the gain where it is not made from the others."""
     is_angle: bool = False
+    causes: tuple[Cause, ...] = ()
+    """What else may be wrong."""
+    step_unit: str = ""
+    """Unit of steps; empty: there are none to look for."""
 
     @property
     def is_sighting(self) -> bool:
@@ -132,21 +147,36 @@ class Check:
         return self.is_sighting and is_wheeled
 
 
-def scale_line(role: str, key: str, config: LogConfig, gain: float) -> str:
-    """Line that divides a configured scale by a gain."""
-    scale = config.number(role, key, 1.0) / gain
-    return f"`{key} = {scale:.4g}` under [{role}] {IN_LOG_CONFIG}"
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of a sensor, and at the rows of the motion what they are compared with."""
 
+    seconds: Floats
+    """Shape (n,)."""
+    y: Values
+    """Shape (n,)."""
+    x: Values
+    """Shape (m,)."""
+    beside: Values | None = None
+    """What else may move the sensor, shape (m,)."""
 
-def unused(role: str) -> str:
-    """Line that leaves a sensor out."""
-    return f"`use = false` under [{role}] {IN_LOG_CONFIG}"
-
-
-def other_world(config: LogConfig, role: str) -> str:
-    """The world that is not the configured one, as a setting."""
-    is_ned = config.table(role).get("world", "enu") == "ned"
-    return f'`world = "{"enu" if is_ned else "ned"}"` under [{role}] {IN_LOG_CONFIG}'
+    def match(
+        self,
+        motion: BodyMotion,
+        drift_sigma: float = 0.0,
+        longest_s: float = STRETCH_S,
+    ) -> Match:
+        """The comparison, which keeps what was compared for the search of causes."""
+        x = motion.reference(self.x)
+        stretches = motion.stretches(self.seconds, self.y, x, longest_s)
+        found = match(stretches, drift_sigma)
+        if self.beside is not None:
+            beside = motion.reference(self.beside)
+            stretches = [
+                replace(part, beside=lambda t: beside(t)[:, None]) for part in stretches
+            ]
+        whole = motion.stretches(self.seconds, self.y, x, np.inf)
+        return replace(found, stretches=tuple(stretches), whole=tuple(whole))
 
 
 def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -159,8 +189,8 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     # the noise of velocities adds up to a walk of the height, which grows with the time compared
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
-    rows = motion.stretches(t, depth.z_m, motion.reference(height), longest_s)
-    found = match(rows, drift_sigma=0.03)
+    rows = Rows(t, depth.z_m, height, motion.ahead_m)
+    found = rows.match(motion, drift_sigma=0.03, longest_s=longest_s)
     return found.less_certain(motion.sampling_error(motion.height_m))
 
 
@@ -182,8 +212,7 @@ def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
         return None
     t = motion.since_origin(heading.stamps_ns)
     yaw_rad = np.unwrap(heading.yaw_rad)
-    rows = motion.stretches(t, yaw_rad, motion.reference(motion.yaw_rad))
-    return match(rows, drift_sigma=0.02)
+    return Rows(t, yaw_rad, motion.yaw_rad).match(motion, drift_sigma=0.02)
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -196,7 +225,7 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = match(motion.stretches(t, level, motion.reference(path)))
+    found = Rows(t, level, path).match(motion)
     return found.less_certain(motion.sampling_error(motion.path_m))
 
 
@@ -211,21 +240,31 @@ def sighting_match(
     sequence: Sequence, motion: BodyMotion, *, of_range: bool
 ) -> Match | None:
     """Changes between sightings of a landmark by the motion, with azimuths as they are or mirrored."""
-    found = {}
+    signs = {}
     for sign in (1.0, -1.0):
         changes = sighting_changes(sequence, motion, sign)
         if changes is None:
             return None
         # only turns show a delay: ranges change evenly
-        found[sign] = (changes, match([changes.azimuth], find_lag=not of_range))
+        signs[sign] = (changes, match([changes.azimuth], find_lag=not of_range))
     # a landmark's place depends on its azimuth: a mirrored one is more than a gain of -1
-    is_mirrored = found[-1.0][1].scatter < found[1.0][1].scatter / CLEARLY_BETTER
-    changes, by_azimuth = found[-1.0 if is_mirrored else 1.0]
+    is_mirrored = signs[-1.0][1].scatter < signs[1.0][1].scatter / CLEARLY_BETTER
+    changes, by_azimuth = signs[-1.0 if is_mirrored else 1.0]
     if of_range:
-        return match([changes.range], find_lag=False)
+        return range_match(changes.range)
     # a delay turns landmarks about the vehicle as fast as it turns, not as changes of the azimuth change
     turn_rate = root_mean_square([np.diff(motion.yaw_rad) / np.diff(motion.seconds)])
     return replace(by_azimuth, is_mirrored=is_mirrored, rate=turn_rate)
+
+
+def range_match(changes: SignalStretch) -> Match:
+    """Changes of ranges by the motion, beside what heights of landmarks take off them."""
+    found = replace(match([changes], find_lag=False), stretches=(changes,))
+    by_scale = explained(found.stretches, of_scale, 1)
+    if by_scale is None or not found.gain.is_known:
+        return found
+    scale = Estimate1D(1.0 + float(by_scale.q[0]), float(by_scale.sigmas[0]))
+    return replace(found, gain=scale)
 
 
 DEPTH = Check(
@@ -235,6 +274,8 @@ DEPTH = Check(
     compare=depth_match,
     sigma=lambda sequence: max(sequence.calibration.depth.sigma_m, 0.02),
     slow_sigma=climb_sigma,
+    causes=(PITCH, DRIFT),
+    step_unit="m",
     units=LENGTHS | PRESSURES,
     sense=lambda config: Advice(
         "it rises where the vehicle sinks by the Doppler log: depths downwards, or an altimeter?",
@@ -263,6 +304,8 @@ HEADING = Check(
     ),
     least_scale=0.01,
     quantity=HEADING_SENSE,
+    causes=(DEVIATION,),
+    step_unit="°",
     is_angle=True,
 )
 POSITIONS = Check(
@@ -274,7 +317,7 @@ POSITIONS = Check(
     slow_sigma=lambda sequence: (
         0.1 * level_sigma_m(sequence.calibration.positions.sigma_m)
     ),
-    units=LENGTHS | {"degrees": 1.1e5},
+    units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6},
     sense=lambda config: Advice(
         "north and east are exchanged",
         f"{other_world(config, 'positions')}, or the fields of position in another order",
@@ -285,6 +328,8 @@ POSITIONS = Check(
         f"`scale = {config.number('dvl', 'scale', 1.0) * gain:.4g}` under [dvl]",
     ),
     least_lag_s=0.3,
+    causes=(OF_FIXES,),
+    step_unit="m",
 )
 SIGHTINGS = partial(Check, role="detections", against="the motion between frames")
 RANGE = SIGHTINGS(
@@ -295,6 +340,7 @@ RANGE = SIGHTINGS(
     scale_key="range_scale",
     # landmarks are wrong by the error of the whole range, not of its changes
     reach=lambda sequence, _: typical_sighting(sequence)[0],
+    causes=(OF_RANGES,),
     sense=lambda _: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}",
@@ -360,24 +406,24 @@ def findings_of(
     if not found.moved * max(1.0, size) > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
     gain = found.gain.limited(LARGEST_GAIN_SIGMA * max(1.0, size), still)
+    row = Finding(quantity, gain, cause=NO_NEED)
     fault = grave_fault(check, replace(found, gain=gain), sequence, config)
+    if fault is None:
+        by_cause = cause_of(check.name, check.causes, found, sequence.calibration)
+        if by_cause is not None:
+            return [by_cause]
+        fault = odd_gain(check, replace(found, gain=gain), sequence, config)
+    if fault is None:
+        fault = other_values(check, found, sigma)
     if fault is not None:
-        return [
-            Finding(
-                quantity,
-                gain,
-                cause=fault.cause,
-                line=fault.line,
-                gravity=Gravity.GRAVE,
-            )
-        ]
+        grave = Gravity.GRAVE
+        return [replace(row, cause=fault.cause, line=fault.line, gravity=grave)]
     if not gain.is_known:
         return [Finding(quantity, gain)]
     error = abs(size - 1.0) * check.reach(sequence, found)
     # a scale matters only where its error shows beside the noise of a row
     is_off = matters(replace(gain, value=size - 1.0), check.least_scale)
     acts = is_off and error > sigma and not check.slips(sequence)
-    row = Finding(quantity, gain, cause=NO_NEED)
     if acts:
         advice = check.scaled(config, size)
         row = replace(
@@ -396,7 +442,7 @@ def findings_of(
 def grave_fault(
     check: Check, found: Match, sequence: Sequence, config: LogConfig
 ) -> Advice | None:
-    """Cause and line of a fault beyond doubt: stuck, another sense or unit, or another thing; None: none."""
+    """Cause and line of a fault beyond doubt: stuck, a jump, another sense, or a unit with a name; None: none."""
     gain = found.gain
     size = abs(gain.value)
     sigma = check.sigma(sequence)
@@ -406,21 +452,44 @@ def grave_fault(
         verb = "turns" if check is HEADING else "changes"
         cause = f"it hardly {verb} where {check.against} do: stuck, or not of the body"
         return Advice(cause, unused(check.role))
-    if found.is_mirrored or (gain.is_known and gain.value < 0):
+    if check.step_unit and (jumps := step_text(found, sigma, check.step_unit)):
+        cause = f"it jumps against {check.against}, {jumps}"
+        return Advice(cause, f"{unused(check.role)} leaves it out")
+    # another sense or unit is one where the sensor agrees with it
+    is_borne_out = found.misfit < MOST_MISFIT
+    is_opposite = found.is_mirrored or (gain.is_known and gain.value < 0)
+    if is_opposite and is_borne_out:
         return check.sense(config)
+    # a gain without a unit's name may have another cause
+    return odd_gain(check, found, sequence, config) if unit_of(check, size) else None
+
+
+def odd_gain(
+    check: Check, found: Match, sequence: Sequence, config: LogConfig
+) -> Advice | None:
+    """A gain that is surely far from 1 of a sensor that agrees with its reference otherwise; None: there is none."""
+    gain = found.gain
+    size = abs(gain.value)
     other_unit = SLIPPING_UNIT if check.slips(sequence) else OTHER_UNIT
     is_sure = matters(replace(gain, value=size - 1.0), 0.0)
-    if is_sure and not 1 / other_unit < size < other_unit:
-        return unit_advice(check, size, config)
+    is_far = is_sure and not 1 / other_unit < size < other_unit
+    if not is_far or found.misfit > MOST_MISFIT:
+        return None
+    return unit_advice(check, found, config)
+
+
+def other_values(check: Check, found: Match, sigma: float) -> Advice | None:
+    """Changes that have nothing to do with the reference; None: they have."""
     # sightings that contradict the motion are wrong identities as a rule, which the estimators name
-    is_scattered = found.scatter > LARGEST_SCATTER * sigma and not check.is_sighting
-    if is_scattered and found.misfit > MOST_MISFIT:
-        return Advice(
-            f"{100 * found.misfit:.0f} % of its changes are not those by {check.against}, {found.scatter:.3g} apart "
-            "typically: another sensor's values, or wrong axes?",
-            f"{unused(check.role)} leaves it out",
-        )
-    return None
+    if check.is_sighting or found.misfit < MOST_MISFIT:
+        return None
+    if found.scatter < LARGEST_SCATTER * sigma and not found.is_mirrored:
+        return None
+    return Advice(
+        f"{100 * found.misfit:.0f} % of its changes are not those by {check.against}, {found.scatter:.3g} apart "
+        "typically: another sensor's values, or wrong axes?",
+        f"{unused(check.role)} leaves it out",
+    )
 
 
 def unit_of(check: Check, gain: float) -> str:
@@ -430,13 +499,22 @@ def unit_of(check: Check, gain: float) -> str:
     return unit if unit and near[unit] < UNIT_TOLERANCE else ""
 
 
-def unit_advice(check: Check, gain: float, config: LogConfig) -> Advice:
+def unit_advice(check: Check, found: Match, config: LogConfig) -> Advice:
     """Question for the unit, and the line."""
+    gain = abs(found.gain.value)
     unit = unit_of(check, gain)
+    if not unit and gain < 1 and matters(found.lag, check.least_lag_s):
+        return Advice(
+            f"it follows {check.against} {found.lag.value:.2g} s late and {gain:.2g} times as far: smoothed by the sensor "
+            "or its driver",
+            unused(check.role),
+        )
     times = 1.0 / check.units[unit] if unit else gain
     line = scale_line(check.role, check.scale_key, config, times)
     if check is POSITIONS and unit == "degrees":
         line = f"`geodetic`, with the fields of latitude and longitude, under [positions] {IN_LOG_CONFIG}"
+    if unit == MINUTES:
+        line = "write them as decimal degrees"
     question = f"{unit or 'another unit'}?"
     return Advice(
         f"it changes {gain:.3g} times as much as by {check.against}: {question}", line
@@ -466,11 +544,12 @@ LEAST_BIAS_S = 30.0
 def vertical_bias(
     sequence: Sequence,
     motion: BodyMotion | None = None,
-    of_axes_rad_s: Floats | None = None,
+    of_axes: Estimates3D | None = None,
 ) -> Finding | None:
     """Bias of the gyros about the vertical, by a heading or by true orientations; None without either.
 
-    ``of_axes_rad_s``: bias along the axes of the body as otherwise known, shape (3,), whose level part enters the line.
+    ``of_axes``: bias along the axes of the body by the drive or a rest, whose level part enters the line, and whose
+    vertical part shows whether the heading drifts instead.
 
     The slope over time of the gyros' turn, less the bias that is known, less the heading.
     """
@@ -507,14 +586,21 @@ def vertical_bias(
         return Finding(quantity, bias, "rad/s", cause)
     up = np.median(motion.up, axis=0)
     up = up / np.linalg.norm(up)
+    turned_rad = abs(bias.value) * sequence.duration_s
     level_rad_s = np.zeros(3)
-    if of_axes_rad_s is not None:
-        level_rad_s = of_axes_rad_s - (of_axes_rad_s @ up) * up
+    if of_axes is not None:
+        known = np.array([one.value if one.is_known else 0.0 for one in of_axes])
+        level_rad_s = known - (known @ up) * up
+        # the truth drifts from nothing
+        is_known = sequence.heading is not None and all(one.is_known for one in of_axes)
+        sigma = float(np.linalg.norm([one.sigma for one in of_axes] * up))
+        apart = replace(bias, value=bias.value - float(known @ up))
+        if is_known and matters(apart, LEAST_BIAS_RAD_S, sigma):
+            return heading_drift(replace(apart, value=-apart.value), turned_rad)
     # the line is in the axes of the IMU
     body_R_imu = imu.mounting.pose().rotation().matrix()
     more_rad_s = (level_rad_s + bias.value * up) @ body_R_imu
     whole = np.add(imu.gyro_bias_rad_s, more_rad_s)
-    turned_rad = abs(bias.value) * sequence.duration_s
     return Finding(
         quantity,
         bias,
@@ -526,16 +612,33 @@ def vertical_bias(
     )
 
 
+def heading_drift(drift: Estimate1D, turned_rad: float) -> Finding:
+    """A heading that drifts against gyros whose bias Doppler log and accelerometers show."""
+    return Finding(
+        f"{HEADING.name}: drift",
+        drift,
+        "rad/s",
+        cause="it turns otherwise than the gyros, whose bias forces and velocities show: a compass that drifts, or is "
+        "disturbed",
+        consequence=f"a turn of {np.degrees(turned_rad):.3g}° over the log",
+        line=unused(HEADING.role),
+        gravity=gravity_of(True, turned_rad > LARGE_TURN_RAD),
+    )
+
+
 FARTHEST_FROM_START_M = 0.5
 """Difference between the height of a start and that of the first depths that waves and a rough start make."""
 FIRST_ROWS = 5
+ATMOSPHERE_M = 10.1
+"""Water that weighs as much as the air."""
+ATMOSPHERE_SHARE = 0.05
 
 
-def fix_height_findings(sequence: Sequence) -> Iterator[Finding]:
-    """Depths at another height than the position fixes, where no start decides which of them is wrong."""
+def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """Depths at another height than the position fixes: the fixes are wrong where the depths begin at a stated start."""
     depth = sequence.depth
     fixes = sequence.positions
-    if depth is None or fixes is None or sequence.calibration.start.source == "stated":
+    if depth is None or fixes is None:
         return
     heights_m2 = fixes.covariance_m2[:, 2, 2]
     inside = fixes.are_sound() & ~(heights_m2 >= 0.5 * UNMEASURED_M2)
@@ -548,12 +651,24 @@ def fix_height_findings(sequence: Sequence) -> Iterator[Finding]:
     sigma_m = sequence.calibration.positions.sigma_m[2]
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
+    is_stated = sequence.calibration.start.source == "stated"
+    cause = (
+        "another origin, sign or unit of the depths, or another height of the fixes?"
+    )
+    line = f"{unused('depth')} leaves the depths out"
+    if is_stated:
+        cause = "the depths begin at the stated start: only the heights of the fixes are wrong, of another origin or sign"
+        before = np.array(config.table("positions").get("origin_m", np.zeros(3)), float)
+        moved = numbers(np.add(before, (0.0, 0.0, off_m)), 2)
+        line = f"`origin_m = {moved}` under [positions] {IN_LOG_CONFIG}"
+        if "log.origin" in sequence.notes:
+            line = f"an `origin_deg_m` that is {off_m:+.2f} m higher, in geodetic under [positions] {IN_LOG_CONFIG}"
     yield Finding(
         "depth: height of the position fixes over it",
         Estimate1D(off_m, sigma_m),
         "m",
-        cause="another origin, sign or unit of the depths, or another height of the fixes?",
-        line=f"{unused('depth')} leaves the depths out",
+        cause=cause,
+        line=line,
         gravity=Gravity.GRAVE,
     )
 
@@ -577,13 +692,20 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     if abs(off_m) <= FARTHEST_FROM_START_M + climbed_m + ACTING_SIGMAS * sigma_m:
         return
     x, y, z = start.position_m
+    is_gauge = abs(abs(off_m) - ATMOSPHERE_M) < ATMOSPHERE_SHARE * ATMOSPHERE_M
+    of_air = (
+        f"`atmosphere_pa = 0` under [depth] {IN_LOG_CONFIG} where pressures are counted from the surface, since so much "
+        "water weighs as much as the air; "
+        if is_gauge
+        else ""
+    )
     yield Finding(
         "depth: distance from the start",
         Estimate1D(off_m, sequence.calibration.depth.sigma_m),
         "m",
         cause=f"the height begins at {height_m:.2f} m, the start of the calibration is at {height_m - off_m:.2f} m: an "
         "altimeter, another sign, unit or origin, or a wrong start?",
-        line=f"{unused('depth')} leaves the depths out, scale = -1 there is for depths downwards; "
+        line=f"{of_air}{unused('depth')} leaves the depths out, scale = -1 there is for depths downwards; "
         f"`start.position_m = {numbers((x, y, z + off_m), 2)}` {IN_CALIBRATION} where the depths are right",
         gravity=Gravity.GRAVE,
     )
@@ -662,7 +784,7 @@ def heading_turn(
         "°",
         f"the calibration's bias sigma of {allowed:.2g} rad allows it, {NO_NEED}",
     )
-    if not matters(angle, 0.0, allowed / 2):
+    if not matters(angle, 0.0, allowed):
         yield row
         return
     offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value

@@ -44,6 +44,8 @@ class FeltMotion:
     """C w."""
     gravity_m_s2: Floats
     """``mean(C f) - d(C v)/dt``."""
+    impulse_m_s: Floats
+    """``int C f dt``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,8 @@ class BodyMotion:
     """Shape (n,), since the first row."""
     path_m: Values
     """Complex, shape (n,), level, in axes that are the body's at the first row."""
+    ahead_m: Floats
+    """Way ahead, shape (n,), backwards negative, since the first row."""
     felt: "FeltMotion | None" = None
     """None without gravity in the forces."""
 
@@ -101,7 +105,9 @@ class BodyMotion:
         if gravity is not None:
             size = np.maximum(np.linalg.norm(gravity, axis=1), 1e-9)
             up_in_path = gravity / size[:, None]
-            felt = FeltMotion(velocity, np.einsum("nij,nj->ni", C, rate), gravity)
+            rate_in_path = np.einsum("nij,nj->ni", C, rate)
+            impulse = path.linear_at(t, path.impulse)
+            felt = FeltMotion(velocity, rate_in_path, gravity, impulse)
         up = np.einsum("nji,nj->ni", C, up_in_path)
         is_held = calibration.odometry_interpolation == "hold-past"
         # at the IMU's rate, since turns are faster than rows of the Doppler log
@@ -121,6 +127,7 @@ class BodyMotion:
             yaw_rad=np.asarray(yaw_rad, np.float64),
             height_m=integral(t, np.sum(v * up, axis=1), is_held=is_held),
             path_m=integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
+            ahead_m=integral(t, level_v.real, is_held=is_held),
             felt=felt,
         )
 

@@ -9,8 +9,8 @@ docs/theory/sensor_check.md.
 from collections.abc import Iterator
 from dataclasses import replace
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Start
@@ -33,6 +33,7 @@ from sonar_graph.diagnosis.aiding_check import (
     vertical_bias,
 )
 from sonar_graph.diagnosis.axes import AxesMatch, match_axes, turns_less_than_body
+from sonar_graph.diagnosis.causes import pitched_one, velocity_steps
 from sonar_graph.diagnosis.findings import (
     ALSO,
     IN_CALIBRATION,
@@ -51,7 +52,7 @@ from sonar_graph.diagnosis.findings import (
     worst_first,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.diagnosis.signals import Match
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match
 from sonar_graph.diagnosis.start import (
     ARM,
     LEAST_BIAS_RAD_S,
@@ -69,9 +70,12 @@ from sonar_graph.diagnosis.start import (
 )
 from sonar_graph.diagnosis.start_place import start_place_findings
 from sonar_graph.diagnosis.turn_rate import turn_rate_finding
-from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
+from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair, is_heading_stated
 from sonar_graph.diagnosis.units import force_scale, wrong_units
 from sonar_graph.logs import (
+    OTHER_WAYS,
+    STEPPED_BACK,
+    axis_doubts,
     gravity_warning,
     row_notes,
     stuck_quantities,
@@ -90,6 +94,9 @@ from sonar_graph.navigation.alignment import (
 from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
+ANY_AXES = "axes of gyros, accelerometers or Doppler log"
+CONTRADICTED = "they contradict each other"
+START_TILT = ("start roll", "start pitch")
 COMPARED = "log.compared"
 """Subject of the note that sensors were compared, or why not."""
 LONGEST_S = 600.0
@@ -106,6 +113,7 @@ LARGEST_DENSITY_RATIO = 1.5
 LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
 CERTAIN_SIGMAS = 4.0
+PAIRED_SIGMAS = 2.0
 LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
@@ -167,8 +175,10 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if faults := wrong_units(sequence, config):
         return faults
     sequence = without_gravity(without_stuck(sequence))
+    if reason := spoilt_by(sequence):
+        return [Finding("sensors with each other", unknown(reason))]
     forces, sequence = force_findings(sequence, config)
-    axes, sequence = axes_findings(sequence, config)
+    axes, sequence = tried_axes(sequence, config)
     match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
     if matters(match.yaw, LARGE_TURN_RAD):
         pair = TurnedPair(sequence, match.yaw.value)
@@ -178,38 +188,40 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
     # no other comparison is worth anything beside gyros that are wrong
-    if (turn := turn_rate_finding(sequence, config)) is not None:
-        return [*forces, *axes, turn]
+    if rates := rate_findings(sequence, config):
+        return [*forces, *axes, *rates]
     is_turned = any(finding.quantity == YAW for finding in axes)
     if lacks_gravity(sequence):
         match = replace(match, gyro_bias=(unknown(NO_GRAVITY),) * 3)
     of_dvl = dvl_findings(match, sequence, config)
+    # each following check sees the log as these lines would make it
+    right = corrected_sequence(sequence, match, of_dvl)
     lever = lever_findings(match, sequence.calibration)
     if any(EITHER in finding.cause for finding in axes):
         lever = [Finding(ARM, unknown("IMU or Doppler log is turned"), "m")]
-    # each following check sees the log as these lines would make it
-    right = corrected_sequence(sequence, match, of_dvl)
+    elif any(f.acts for f in of_dvl) and (names := brought_apart(sequence, right)):
+        of_dvl = [contradicted(finding, names) for finding in of_dvl]
+        lever = [Finding(ARM, unknown("IMU and Doppler log do not fit"), "m")]
+        right = sequence
     tilt = find_start_tilt(right)
     estimates, sources = surest_bias(match, tilt)
     bias = bias_findings(estimates, sources, sequence.calibration.imu)
-    axes_rad_s = np.array([b.value if b.is_known else 0.0 for b in estimates])
-    by_motion = motion_findings(right, config, axes_rad_s)
+    by_motion = motion_findings(right, config, estimates)
     of_vertical = [f for f in by_motion if f.quantity == VERTICAL_BIAS]
     # one row on the bias that is known is enough
     if any(f.estimate.is_known for f in of_vertical):
         bias = [f for f in bias if f.estimate.is_known or f.acts]
-    # one line for all axes, with both intervals of the vertical one
+    # one line for all axes
     if any(f.acts for f in of_vertical):
-        known = f"{sources[2]} {with_interval(estimates[2], 'rad/s')}"
-        by_motion = [
-            replace(f, cause=f"{f.cause} ({known})")
-            if f in of_vertical and estimates[2].is_known
-            else f
-            for f in by_motion
-        ]
-        by_motion += [replace(f, cause=ALSO, consequence="", line="") for f in bias]
-        bias = []
-    reference = reference_findings(right, config, tilt)
+        bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
+    reference = list(reference_findings(right, config, tilt))
+    if is_heading_stated(right):
+        pitch = tilt.angle(1)
+        off = replace(pitch, value=pitch.value - right.calibration.start.rpy_rad[1])
+        by_motion, is_imu = pitched_one(by_motion, off, right.calibration)
+        # a start by a pitched IMU is as wrong as its mounting
+        if is_imu:
+            reference = [f for f in reference if not f.quantity.startswith(START_TILT)]
     noise = noise_findings(sequence)
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
     of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
@@ -225,6 +237,27 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     ]
 
 
+def spoilt_by(sequence: Sequence) -> str:
+    """Fault of rows that spoils every comparison, and that is named where rows are checked; empty: there is none."""
+    if STEPPED_BACK in sequence.notes.get("log.doubtful", ""):
+        return STEPPED_BACK
+    calibration = sequence.calibration
+    rows = (sequence.imu, sequence.dvl, sequence.depth, calibration)
+    fault = next(axis_doubts(*rows), "")
+    if fault or lacks_gravity(sequence):
+        return fault
+    force = sequence.imu.specific_force
+    mounting = calibration.imu.mounting
+    gravity = gravity_warning(force, mounting, calibration.gravity_m_s2) or ""
+    return gravity if OTHER_WAYS in gravity else ""
+
+
+def rate_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
+    """Gyros or velocities that are wrong by themselves, so that they are no reference for others."""
+    found = (turn_rate_finding(sequence, config), velocity_steps(sequence))
+    return [finding for finding in found if finding is not None]
+
+
 def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Findings to act on, without the slower comparison of Doppler log and accelerometers (`check_sensors`).
 
@@ -234,10 +267,12 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if faults := wrong_units(sequence, config):
         return faults
     right = without_gravity(without_stuck(sequence))
+    if spoilt_by(right):
+        return []
     forces, right = force_findings(right, config)
-    axes, right = axes_findings(right, config)
-    if (turn := turn_rate_finding(right, config)) is not None:
-        return worst_first([*forces, *axes, turn])
+    axes, right = tried_axes(right, config)
+    if rates := rate_findings(right, config):
+        return worst_first([*forces, *axes, *rates])
     found = worst_first([*forces, *axes, *motion_findings(right, config)])
     return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
 
@@ -320,6 +355,27 @@ def force_findings(
     return [found], sequence
 
 
+def tried_axes(sequence: Sequence, config: LogConfig) -> tuple[list[Finding], Sequence]:
+    """Findings about axes as of `axes_findings`; without a line where other sensors fit them worse."""
+    findings, right = axes_findings(sequence, config)
+    if right is not sequence and (names := brought_apart(sequence, right)):
+        cause = f"{CONTRADICTED}, and with axes that fit them better {names} fits worse"
+        return [no_axes_finding(ANY_AXES, cause)], sequence
+    return findings, right
+
+
+def no_axes_finding(quantity: str, cause: str) -> Finding:
+    """Gyros, accelerometers and Doppler log that no axes bring together."""
+    return Finding(
+        quantity,
+        unknown("no axes of the vehicle"),
+        cause=cause,
+        line="name a `topic` under [dvl] or [imu] with values in axes of the vehicle or of the sensor "
+        f"{IN_LOG_CONFIG}",
+        gravity=Gravity.GRAVE,
+    )
+
+
 def axes_findings(
     sequence: Sequence, config: LogConfig
 ) -> tuple[list[Finding], Sequence]:
@@ -331,10 +387,15 @@ def axes_findings(
         return [], sequence
     ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
     if ratio is not None:
-        return [world_axes_finding(ratio)], sequence
+        cause = f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle"
+        return [no_axes_finding("DVL axes", cause)], sequence
     found = match_axes(sequence.imu, sequence.dvl, calibration)
     if found is None:
         return [], sequence
+    is_as_read = (found.gyro == np.eye(3)).all() and (found.dvl == np.eye(3)).all()
+    if not is_as_read and found.ratio < CLEARLY_BETTER:
+        cause = f"{CONTRADICTED}, and no axes fit clearly better"
+        return [no_axes_finding(ANY_AXES, cause)], sequence
     findings = list[Finding]()
     # gyros and Doppler log agree with each other: rates are reflected the other way
     is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
@@ -361,18 +422,6 @@ def axes_findings(
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
-
-
-def world_axes_finding(ratio: float) -> Finding:
-    """Velocities of the Doppler log that do not turn with the body."""
-    return Finding(
-        "DVL axes",
-        unknown("axes of the world"),
-        cause=f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle",
-        line="name a `topic` under [dvl] with velocities in axes of the vehicle or of the Doppler log "
-        f"{IN_LOG_CONFIG}",
-        gravity=Gravity.GRAVE,
-    )
 
 
 def force_axes(
@@ -448,7 +497,7 @@ def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
     body_R_dvl = sequence.calibration.dvl.mounting.pose().rotation().matrix()
     cause = axes_cause(found)
     if np.linalg.det(axes) > 0:
-        rpy = Rotation.from_matrix(axes @ body_R_dvl).as_euler("ZYX")[::-1]
+        rpy = gtsam.Rot3(axes @ body_R_dvl).rpy()
         cause += (
             ": the Doppler log is turned on the vehicle, or the driver has other axes"
         )
@@ -500,7 +549,7 @@ def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
 
 
 def motion_findings(
-    right: Sequence, config: LogConfig, bias_rad_s: Floats | None = None
+    right: Sequence, config: LogConfig, bias: Estimates3D | None = None
 ) -> list[Finding]:
     """Depth, heading, fixes and sightings against the motion of the body, and the gyros' bias about the vertical."""
     motion = BodyMotion.of(right)
@@ -539,7 +588,7 @@ def motion_findings(
     is_heading_wrong = any(
         f.quantity == HEADING.quantity and f.acts for f in of_heading
     )
-    vertical = vertical_bias(right, motion, bias_rad_s)
+    vertical = vertical_bias(right, motion, bias)
     if vertical is not None and not is_heading_wrong:
         found.append(vertical)
     found += of_heading
@@ -549,7 +598,7 @@ def motion_findings(
     found += position_findings(right, config, motion)
     # a wrong unit of either makes another height too
     if not any(f.grave for f in found):
-        found += fix_height_findings(right)
+        found += fix_height_findings(right, config)
     # sensors that are wrong lead elsewhere too
     if not any(f.grave for f in found):
         found += start_place_findings(right, motion)
@@ -584,6 +633,38 @@ def dvl_findings(
         judged(turned, found.yaw, LEAST_YAW_RAD, LARGE_TURN_RAD),
         judged(scaled, error, LEAST_SCALE, LARGE_SCALE),
     ]
+
+
+def brought_apart(before: Sequence, after: Sequence) -> str:
+    """Names of sensors that agree with the motion less after a correction than before it; empty: there are none."""
+    first = BodyMotion.of(before)
+    second = BodyMotion.of(after)
+    if first is None or second is None:
+        return ""
+    names = list[str]()
+    for check in CHECKS:
+        agreed = check.compare(before, first)
+        agrees = check.compare(after, second)
+        if agreed is None or agrees is None or not agrees.gain.is_known:
+            continue
+        error = abs(agrees.gain.value - 1.0) - abs(agreed.gain.value - 1.0)
+        # the same rows twice, whose noise is common to both
+        is_off = error > PAIRED_SIGMAS * agrees.gain.sigma
+        if is_off or agrees.scatter > CLEARLY_BETTER * agreed.scatter:
+            names.append(check.name)
+    return " and ".join(names)
+
+
+def contradicted(finding: Finding, names: str) -> Finding:
+    """A correction of the Doppler log that other sensors contradict."""
+    if not finding.acts:
+        return finding
+    return replace(
+        finding,
+        cause=f"accelerometers and gyros have it so, but {names} agree with the Doppler log as it is: gyros, "
+        "accelerometers or single axes of the Doppler log are wrong",
+        line="",
+    )
 
 
 def offset_row(name: str, offset: Estimate1D, role: str, config: LogConfig) -> Finding:
@@ -664,7 +745,8 @@ def reference_findings(
     )
     yield judged(jump, found.start_heading, LEAST_HEADING_RAD)
     heading = None
-    if offset.is_known and start != Start():
+    # a start that is found in the map has no heading yet
+    if offset.is_known and start != Start() and start.source != "map":
         heading = find_start_heading(right, reference, offset)
     # rows on the start must not contradict each other
     is_wrong = heading is not None and heading.acts

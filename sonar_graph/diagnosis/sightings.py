@@ -95,9 +95,21 @@ def sighting_changes(
         turned = np.arctan2(found[..., 1], found[..., 0]) - azimuth
         return np.asarray(wrap_angle(turned))
 
+    def by_others(at: Floats) -> Floats:
+        """What a current of 1 m/s along each axis of the path, and a height of sqrt(2) m, take off a range, shape (k, 3).
+
+        A landmark at a height h over the sonar comes nearer by cos(e) times as much, ``1 - h^2 / (2 r^2)``.
+        """
+        level = place[:, 0] + 1j * place[:, 1]
+        towards = level * np.exp(1j * yaw(at - (t[j] - t[i]))) / np.abs(level)
+        apart_s = (t[j] - t[i])[:, None]
+        of_height = by_range(at) / seen.range_m[i] ** 2
+        by_current = apart_s * np.column_stack([towards.real, towards.imag])
+        return np.asarray(-np.column_stack([by_current, of_height]))
+
     changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     longer = seen.range_m[j] - seen.range_m[i]
     return SightingChanges(
-        SignalStretch(t[j], longer, by_range, has_offset=False),
+        SignalStretch(t[j], longer, by_range, has_offset=False, beside=by_others),
         SignalStretch(t[j], changed, by_azimuth, has_offset=False),
     )

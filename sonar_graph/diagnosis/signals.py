@@ -14,13 +14,14 @@ Errors of successive rows are alike, so that covariances are of blocks of rows, 
 docs/theory/sensor_check.md.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.diagnosis.findings import unknown
+from sonar_graph.diagnosis.findings import ACTING_SIGMAS, unknown
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import Estimate1D
 
@@ -36,6 +37,13 @@ MOST_OUTLYING = 0.25
 LAG_STEP_S = 0.05
 CLEARLY_BETTER = 1.5
 """Ratio of sums of squares from which on another lag, or the mirrored reference, counts."""
+STEP_ROWS = 3
+STEP_SIGMAS = 10.0
+"""Far beyond the largest of a long log's differences by noise, also where it has heavy tails."""
+LEAST_STEP = 4.0
+"""In sigmas of a row: a coarse sensor has no typical difference."""
+STEP_RATIO = 3.0
+MOST_STEPS = 5
 SMALL_SAMPLE = 1.2
 """Quantile of Student's t for a dozen blocks over that of the normal distribution, between 2 and 4 sigma."""
 
@@ -52,6 +60,12 @@ class SignalStretch:
     """x at times of any shape; NaN where it is not known."""
     has_offset: bool = True
     """False for changes, which have none."""
+    beside: Callable[[Floats], Values] | None = None
+    """What else may move the sensor, shape (n, q), by the table of checks."""
+
+    def excess(self) -> "SignalStretch":
+        """What the sensor has beyond its reference, ``y - x``, as a signal of its own."""
+        return replace(self, y=self.y - self.shifted(np.zeros(1))[0])
 
     def shifted(self, lags_s: Floats) -> Values:
         """Reference at the rows for each lag, shape (k, n)."""
@@ -84,6 +98,10 @@ class Match:
     """Root mean square of the sensor's change a second."""
     is_mirrored: bool = False
     """True where the conjugate of the reference fits."""
+    stretches: tuple[SignalStretch, ...] = ()
+    """What was compared."""
+    whole: tuple[SignalStretch, ...] = ()
+    """The same in one piece for each part of the log."""
 
     def less_certain(self, sigma: float) -> "Match":
         """The same with an error of the gain by what the comparison leaves out."""
@@ -261,7 +279,120 @@ def refined(
         scatter**2 / max(signal**2, 1e-24),
         root_mean_square([s.slope(0.0) for s in stretches]),
         is_mirrored,
+        tuple(stretches),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """Fit of ``y - x = a + A q + B p + e`` with one q for all stretches; B has the columns that count in any case."""
+
+    q: Values
+    """Shape (q,)."""
+    sigmas: Floats
+    """Shape (q,)."""
+    before: float
+    """Root mean square of what is left without A, of the rows that fit."""
+    after: float
+    """Root mean square of e, the same."""
+
+    @property
+    def is_clear(self) -> bool:
+        """True where the columns surely count, and most of what was left over is theirs."""
+        size = float(np.linalg.norm(self.q / np.maximum(self.sigmas, 1e-12)))
+        return size > ACTING_SIGMAS and self.before > CLEARLY_BETTER * self.after
+
+    @property
+    def error(self) -> float:
+        """Root mean square of what the columns explain, in the sensor's unit."""
+        return float(np.sqrt(max(self.before**2 - self.after**2, 0.0)))
+
+
+def explained(
+    stretches: Iterable[SignalStretch],
+    columns: Callable[[SignalStretch], Values],
+    wanted: int,
+) -> Explained | None:
+    """What the first ``wanted`` columns, shape (n, q), explain of a sensor beyond its reference and the other columns.
+
+    None where some stretch is too short.
+    """
+    found = list[tuple[Values, Floats]]()
+    before = list[Values]()
+    after = list[Values]()
+    for stretch in stretches:
+        excess = stretch.excess()
+        A = columns(stretch)  # (n, q)
+        is_wanted = np.arange(A.shape[1]) < wanted
+        without = RobustFit.of(np.where(is_wanted, 0.0, A)[None], excess, 0.0)
+        fit = RobustFit.of(A[None], excess, 0.0)
+        if not fit.rows[0]:
+            return None
+        found.append((fit.p[0, :wanted], fit.sigmas()[:wanted]))
+        # of the same rows, so that an outlier is not what was explained
+        before.append(without.residuals[0, fit.kept[0]])
+        after.append(fit.residuals[0, fit.kept[0]])
+    if not found:
+        return None
+    q = np.array([values for values, _ in found])  # (stretches, q)
+    weights = np.array([np.maximum(sigmas, 1e-12) ** -2 for _, sigmas in found])
+    mean = np.sum(weights * q, axis=0) / np.sum(weights, axis=0)
+    sigmas = 1.0 / np.sqrt(np.sum(weights, axis=0))
+    return Explained(mean, sigmas, root_mean_square(before), root_mean_square(after))
+
+
+class Step(NamedTuple):
+    """A change from one row to the next that stays."""
+
+    seconds: float
+    """Time of the first row after it."""
+    size: float
+    """Without its sign."""
+
+
+def steps(
+    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float = STEP_RATIO
+) -> list[Step]:
+    """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
+
+    The difference of the medians of `STEP_ROWS` rows of ``y - x`` on either side of an instant is beyond `STEP_SIGMAS`
+    of its own typical size, and beyond `LEAST_STEP` of ``sigma``, that of a row; so is that of three times as many. A
+    vehicle that stops and goes shows a wrong scale in steps: those of x must be smaller by a ``ratio``.
+    """
+    known = np.isfinite(y - x).reshape(len(x), -1).all(axis=1)
+    t = seconds[known]
+    excess = as_columns(y - x)[known]
+    near = median_changes(excess, STEP_ROWS)
+    size = np.minimum(near, median_changes(excess, 3 * STEP_ROWS))
+    size[size < ratio * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
+    typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
+    least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)
+    found = list[Step]()
+    while len(size) and size.max() > least:
+        k = int(np.argmax(size))
+        found.append(Step(float(t[k]), float(size[k])))
+        if len(found) > MOST_STEPS:
+            return []
+        size[max(k - 3 * STEP_ROWS, 0) : k + 3 * STEP_ROWS] = 0.0
+    return sorted(found)
+
+
+def as_columns(values: Values) -> Floats:
+    """A real or complex signal, shape (n,), or columns as they are, as real columns, shape (n, k)."""
+    if values.ndim > 1:
+        return np.asarray(values, np.float64)
+    return np.column_stack([values.real, values.imag])
+
+
+def median_changes(e: Floats, rows: int) -> Floats:
+    """Length of the difference of medians after and before each row, shape (n,); 0 near the ends."""
+    size = np.zeros(len(e))
+    if len(e) >= 2 * rows:
+        windows = np.lib.stride_tricks.sliding_window_view(e, rows, axis=0)
+        medians = np.median(windows, axis=2)  # (n - rows + 1, k)
+        change = medians[rows:] - medians[:-rows]
+        size[rows : rows + len(change)] = np.linalg.norm(change, axis=1)
+    return size
 
 
 def centred(values: Values, stretch: SignalStretch) -> Values:

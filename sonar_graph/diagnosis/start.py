@@ -131,10 +131,12 @@ def largest(bias: Estimates3D) -> float:
     return max((abs(one.value) for one in bias if one.is_known), default=0.0)
 
 
-def turned_mounting(mounting: Mounting, yaw_rad: float) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a mounting after a turn about the body's z axis."""
+def turned_mounting(
+    mounting: Mounting, angle_rad: float, axis: str = "z"
+) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a mounting after a turn about an axis of the body."""
     before = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
-    after = Rotation.from_euler("z", yaw_rad) * before
+    after = Rotation.from_euler(axis, angle_rad) * before
     yaw, pitch, roll = after.as_euler("ZYX").tolist()
     return roll, pitch, yaw
 

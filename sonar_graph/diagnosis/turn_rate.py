@@ -28,7 +28,7 @@ from sonar_graph.diagnosis.motion_signals import (
     integral,
     smoothed,
 )
-from sonar_graph.diagnosis.signals import Match, match
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, match
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.sequence import Sequence
@@ -56,6 +56,8 @@ OTHER_RATE = 1.3
 LEAST_EXCESS = 1.5
 """Root mean square of r across the velocity over that along it. Waves and a noisy log make both alike."""
 LARGEST_GAIN_SIGMA = 0.12
+VERTICAL_FACTORS = (0.5, 2.0)
+"""Tried beside the inverse of the gain, which turns that are far too large spoil."""
 TURN_RATE = "gyro rate about the vertical over that by the other sensors"
 
 
@@ -111,41 +113,47 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
 def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
     """Rate about the vertical that accelerometers and Doppler log contradict; None: it is right, or cannot be told.
 
-    Its line is one that the data bear out: with it the contradiction is gone. Without such a line the rate counts as
-    wrong only where r is larger across the velocity than along it.
+    A scale is one that the data bear out: with it the contradiction is gone. Without one the rate counts as wrong only
+    where r is larger across the velocity than along it.
     """
     compared = rate_match(sequence)
-    if compared is None or not is_contradicted(compared.match, sequence):
+    if compared is None:
         return None
     found = compared.match
+    is_wrong = is_contradicted(found, sequence)
+    is_off = matters(replace(found.gain, value=found.gain.value - 1.0), 0.0)
+    if not (is_wrong or (is_off and compared.excess > LEAST_EXCESS)):
+        return None
+    row = Finding(
+        TURN_RATE,
+        found.gain,
+        cause=f"accelerometers and Doppler log turn otherwise ({100 * found.misfit:.0f} % is left): rates about the "
+        "vertical are dead, clipped, filtered or of another scale",
+        consequence="headings and positions are wrong from the first turn on",
+        gravity=Gravity.GRAVE,
+    )
     rate_hz = NS_PER_S / float(np.median(np.diff(sequence.imu.stamps_ns)))
     causes = {
         rate_hz: "angles between two samples, not rates?",
         float(np.radians(1.0)): "degrees?",
         float(np.degrees(1.0)): "radians that were converted twice?",
     }
-    cause = (
-        f"accelerometers and Doppler log turn otherwise ({100 * found.misfit:.0f} % is left): rates about the vertical are "
-        "dead, clipped, filtered or of another scale"
-    )
-    line = ""
     for factor, why in causes.items():
-        right = rate_match(scaled_gyros(sequence, factor))
-        if right is not None and is_borne_out(right.match, sequence):
+        right = rate_match(scaled_gyros(sequence, factor * np.eye(3)))
+        if is_wrong and right and is_borne_out(right.match, sequence):
             scale = config.number("imu", "angular_velocity_scale", 1.0) * factor
             cause = f"accelerometers and Doppler log turn otherwise: {why}"
             line = f"`angular_velocity_scale = {scale:.4g}` under [imu] {IN_LOG_CONFIG}"
-            break
-    if not line and compared.excess < LEAST_EXCESS:
-        return None
-    return Finding(
-        TURN_RATE,
-        found.gain,
-        cause=cause,
-        consequence="headings and positions are wrong from the first turn on",
-        line=line,
-        gravity=Gravity.GRAVE,
-    )
+            return replace(row, cause=cause, line=line)
+    for factor in (1.0 / found.gain.value, *VERTICAL_FACTORS):
+        right = rate_match(scaled_gyros(sequence, np.diag([1.0, 1.0, factor])))
+        if right is None or not is_borne_out(right.match, sequence):
+            continue
+        # what the line leaves is clearly less than what was there
+        if right.match.scatter * CLEARLY_BETTER < found.scatter:
+            cause = f"accelerometers and Doppler log turn {factor:.2g} times as fast: the scale of the gyro along z is wrong"
+            return replace(row, cause=cause)
+    return row if is_wrong and compared.excess > LEAST_EXCESS else None
 
 
 def rate_match(sequence: Sequence) -> TurnMatch | None:
@@ -183,10 +191,11 @@ def is_borne_out(found: Match, sequence: Sequence) -> bool:
     return gain.is_known and is_near and is_noise
 
 
-def scaled_gyros(sequence: Sequence, factor: float) -> Sequence:
-    """Sequence with all rates times a factor."""
+def scaled_gyros(sequence: Sequence, scales: Floats) -> Sequence:
+    """Sequence with rates of the body times a matrix, shape (3, 3)."""
     imu = sequence.imu
-    rate = factor * imu.angular_velocity
+    body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    rate = imu.angular_velocity @ (body_R_imu.T @ scales @ body_R_imu).T
     return replace(sequence, imu=replace(imu, angular_velocity=rate))
 
 

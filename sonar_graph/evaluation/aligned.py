@@ -33,8 +33,8 @@ from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
+# fewer landmarks leave the rotation of a map open; the map then moves with the causal path
 LEAST_MATCHED = 2
-"""Fewer landmarks leave the rotation of a map open; the map then moves with the causal path."""
 
 
 def aligned_to_truth(comparison: Comparison) -> Comparison | None:
@@ -50,6 +50,7 @@ def aligned_to_truth(comparison: Comparison) -> Comparison | None:
     >>> bool(abs(errors.position_m[:, :2].mean()) < 1e-9)
     True
     """
+    # without a truth there is nothing to align to
     if not any(comparison.errors.values()):
         return None
     runs = []
@@ -77,6 +78,7 @@ def _aligned_run(
         alignments[kind] = _of_path(path, own)
         paths[kind] = _moved(path, alignments[kind])
         errors[kind] = _aligned_errors(path, own, alignments[kind])
+    # a map of fewer than two true landmarks moves with the path that it was made on
     of_map = alignments["causal"]
     if run.landmarks is not None:
         of_map = _of_map(run.landmarks, sequence) or of_map
@@ -115,6 +117,7 @@ def _of_map(landmarks: LandmarkMap, sequence: Sequence) -> Alignment | None:
 
 def _moved(path: Trajectory, alignment: Alignment) -> Trajectory:
     """The path in the truth's world; covariances are in the body frame, so they stay."""
+    # heading errors are shown after the same turn as positions
     turned = Rotation.from_matrix(alignment.rotation) * path.rotations()
     return replace(
         path,
@@ -130,6 +133,7 @@ def _aligned_errors(
     R = alignment.rotation
     estimate = rows_at(path, errors.stamps_ns)
     truth = estimate.positions - errors.position_m  # (n, 3)
+    # the 95 % bands are along the axes of the truth's world
     covs = R @ world_position_covs(estimate) @ R.T  # (n, 3, 3)
     variances = np.diagonal(covs, axis1=1, axis2=2)
     return replace(
@@ -141,8 +145,8 @@ def _aligned_errors(
     )
 
 
+# true landmarks that a map must name: of two, the errors alone would turn it
 LEAST_LANDMARKS = 3
-"""True landmarks that a map must name: of two, the errors alone would turn it."""
 
 
 def own_map_errors(
@@ -162,6 +166,7 @@ def own_map_errors(
     is_level = (
         sequence.calibration.planar is not None or sequence.calibration.use_gravity
     )
+    # each error has an alignment of its own: the map of that instant
     for known in run.maps:
         if (
             known.stamp_ns not in scored_ns
@@ -181,6 +186,7 @@ def shared_map_instants(
     runs: Many[RunResult], sequence: Sequence, scored_ns: Ints
 ) -> Ints:
     """Stamps at which every run that can be scored on its map at all can be, shape (k,)."""
+    # a run without a map at all must not take all instants from the others
     shared = scored_ns
     for stamps_ns in (own_map_errors(run, sequence, scored_ns)[0] for run in runs):
         if len(stamps_ns):

@@ -47,11 +47,11 @@ from sonar_graph.version import __version__
 
 LOG = logging.getLogger("sonar_graph.evaluation")
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
+# time for a row of the IMU, time for a detection in the batch solutions that a smoother gives as maps (4.5 s
+# for 3,460 on one core), speed of memory, and what is worth a word before a comparison begins
 IMU_ROW_S, SOLVED_DETECTION_S, MEMORY_BYTES_S, LONG_S = 3e-5, 1.3e-3, 1e10, 30.0
-"""Time for a row of the IMU, time for a detection in the batch solutions that a smoother gives as maps (4.5 s for 3,460
-on one core), speed of memory, and what is worth a word before a comparison begins."""
+# fewer scored instants than this make no trajectory
 LEAST_INSTANTS = 2
-"""Fewer scored instants than this make no trajectory."""
 
 
 @lru_cache
@@ -121,6 +121,7 @@ def compare(
     >>> comparison.scores["ekf-slam"]["causal.ate_se2_m"].value < 0.1
     True
     """
+    # a path in place of a sequence is the commonest mistake
     require_sequence(sequence, "compare(sequence, estimators)")
     if not isinstance(estimators, list | tuple):
         raise ArgumentError(
@@ -140,15 +141,18 @@ def compare(
         raise EvaluationError(
             f"named more than once: {', '.join(twice)}; each estimator runs once in a comparison"
         )
+    # a misspelt name would let the defaults run, which looks like the settings had no effect
     idle = sorted(set(settings) - set(names))
     if idle:
         raise EvaluationError(
             f"settings for {', '.join(idle)}, which is not among {', '.join(names)}; "
             f"give them by estimator: {{{names[0]!r}: {{...}}}}"
         )
+    # before anything runs: a mistake found after an hour costs that hour
     for name, estimator in zip(names, estimators, strict=True):
         check_request(estimator, settings.get(name))
     sequence = with_doubts(sequence)
+    # once for all: errors at other instants cannot be compared
     instants_ns = sequence.instants(rate_hz)
     runs = []
     for name, estimator in zip(names, estimators, strict=True):
@@ -169,6 +173,7 @@ def with_doubts(sequence: Sequence) -> Sequence:
     """The sequence with notes of what its sensors contradict, which are logged too unless it had them before."""
     found = compared(sequence)
     for subject in ("log.doubtful", "log.sensors"):
+        # a sequence that had its notes was logged when they were made
         if found is not sequence and subject in found.notes:
             LOG.warning("%s: %s: %s", sequence.name, subject, found.notes[subject])
     return found
@@ -204,6 +209,7 @@ def expense(sequence: Sequence) -> str:
     if detections is not None and len(detections):
         ids = detections.candidate_ids
         count = len(np.unique(ids[ids >= 0]))
+        # pose, velocity and biases beside three numbers a landmark
         covariance_bytes = 8.0 * (3 * count + 15) ** 2
         if len(detections) * SOLVED_DETECTION_S > LONG_S:
             said.append(
@@ -222,6 +228,7 @@ def expense(sequence: Sequence) -> str:
 def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Comparison:
     """Score runs that were all asked for estimates at these instants, shape (n,)."""
     environment = describe_environment()
+    # before any score: all are against the truth in the world of the estimates
     sequence = with_fitted_truth(sequence, instants_ns, runs)
     # heights that nobody measured are all alike; true poses of a dive may be as well
     true = sequence.truth
@@ -235,6 +242,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         sequence = replace(sequence, notes={**sequence.notes, HEIGHTS: NO_HEIGHTS})
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     scores: dict[str, dict[str, Score]] = {run.estimator: ByName() for run in runs}
+    # a failed run has no numbers, and must not take instants from the others
     ended = [run for run in runs if run.status != "failed"]
     for run in ended:
         own = scores[run.estimator]
@@ -251,12 +259,14 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         )
         return comparison
     scored = scored_instants(instants_ns, sequence.truth, runs)
+    # a reader of the protocol must see that the truth was moved
     fitted = f"; {unaligned(sequence)}" if FITTED in sequence.notes else ""
     environment["scored instants"] = f"{scored}{fitted}"
     if len(scored) < LEAST_INSTANTS:
         environment["scored instants"] += ": too few for any trajectory error"
         return comparison
     truth = sequence.truth.at(scored.stamps_ns)
+    # a planar vehicle has no error in z that an estimator could make
     position_dof = 3 if sequence.calibration.planar is None and not is_flat else 2
     for run in runs:
         errors[run.estimator] = {}
@@ -264,6 +274,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             continue
         both: dict[Kind, Trajectory] = {"causal": run.causal, "smoothed": run.smoothed}
         for kind, trajectory in both.items():
+            # the same instants for every run and kind
             estimate = rows_at(trajectory, scored.stamps_ns)
             if is_flat:
                 z_m = truth.positions[:, 2]
@@ -283,6 +294,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
                 unaligned(sequence),
                 has_height=not is_flat,
             )
+    # errors on maps of other instants are of other lengths of the way
     map_instants_ns = shared_map_instants(ended, sequence, scored.stamps_ns)
     for run in ended:
         scores[run.estimator] |= own_map_scores(run, sequence, map_instants_ns)

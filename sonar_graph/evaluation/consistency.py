@@ -20,8 +20,8 @@ from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
+# with fewer independent samples a small normalised error is no sign of caution: slow errors pass through zero
 LEAST_SAMPLES = 10
-"""With fewer independent samples a small normalised error is no sign of caution: slow errors pass through zero."""
 GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""
@@ -39,10 +39,12 @@ def error_series(
 
     The NEES of position takes x and y (``position_dof`` 2, planar motion), or also z (3).
     """
+    # also checks that both are at the same instants
     yaw_error = yaw_errors_rad(estimate, truth)
     position_error = estimate.positions - truth.positions
     position_cov = world_position_covs(estimate)
     yaw_var = yaw_variances(estimate)
+    # a vehicle in a plane reports a height without uncertainty, whose NEES would be infinite
     axes = slice(0, position_dof)
 
     def sigma(variances: Floats) -> Floats:
@@ -86,6 +88,7 @@ def yaw_variances(trajectory: Trajectory) -> Floats:
     """
     R = trajectory.matrices
     jacobian = np.zeros((len(trajectory), 3))
+    # a vertical x axis has no heading: NaN is the answer, not a warning
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian[:, 1:] = R[:, 2, 1:] / (R[:, 0, 0] ** 2 + R[:, 1, 0] ** 2)[:, None]
         return np.asarray(
@@ -115,6 +118,7 @@ def normalised(errors: Floats, covs: Floats) -> Floats:
     # P^-1/2 = V diag(1 / sqrt(variances)) V^T, with the eigenvectors V = axes
     variances, axes = np.linalg.eigh(covs[known])
     along = np.einsum("nji,nj->ni", axes, errors[known])
+    # a covariance with a zero eigenvalue claims certainty and has no NEES
     definite = variances[:, 0] > 0 if len(variances) else np.zeros(0, dtype=bool)
     scaled = along[definite] / np.sqrt(variances[definite])
     unit[np.flatnonzero(known)[definite]] = np.einsum(
@@ -143,8 +147,10 @@ def effective_samples(unit: Floats) -> int:
         np.einsum("fi,fj->fij", spectrum.conj(), spectrum), 2 * n, axis=0
     )[:n]
     lag = np.arange(n)
+    # the fewer pairs of a long lag are made up for
     C = sums / (n - lag)[:, None, None] / (np.mean(u**2))
     shared = np.minimum((C**2).sum(axis=(1, 2)) / d, 1.0)
+    # beyond the first lag in the noise a sum would add noise alone
     gone = np.flatnonzero(shared < 4 * d / n)
     last = gone[0] if gone.size else n
     return max(1, int(n / (1 + 2 * np.sum((1 - lag[1:last] / n) * shared[1:last]))))
@@ -157,6 +163,7 @@ def time_average_interval(samples: int, dof: int) -> tuple[float, float] | None:
     """
     if not samples:
         return None
+    # the mean of few slow errors is often near zero without caution of the estimator
     low, high = anees_interval(samples, dof)
     return low if samples >= LEAST_SAMPLES else 0.0, high
 
@@ -177,6 +184,7 @@ def nis(log: DetectionLog) -> Floats:
     True
     """
     used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
+    # what the gate refused was chosen by its size, and would bias the mean
     squares = normalised_squares(log.innovations[used], log.innovation_covs[used])
     return squares[np.isfinite(squares)]
 
@@ -188,14 +196,6 @@ def mean_normalised(squares: Floats, dof: int) -> float:
     """
     known = squares[np.isfinite(squares)]
     return float(known.mean() / dof) if known.size else float("nan")
-
-
-def anees_over_runs(nees: Floats, dof: int) -> Floats:
-    """Average of shape (runs, n) over independent runs, divided by the degrees of freedom, shape (n,).
-
-    With consistent estimators each value lies in `anees_interval` with the probability given there.
-    """
-    return np.asarray(nees.mean(axis=0) / dof)
 
 
 def anees_interval(

@@ -9,10 +9,11 @@ import math
 from sonar_graph.table import ABSENT
 
 MINUS = "\N{MINUS SIGN}"
+# a value that is zero at so many decimals is written with a power of ten
 MOST_DECIMALS = 12
-"""A value that is zero at so many decimals is written with a power of ten."""
+# significant digits of a quantile, however large its error: it stands without the error, and one digit may be
+# zero
 LEAST_DIGITS = 2
-"""Significant digits of a quantile, however large its error: it stands without the error, and one digit may be zero."""
 
 
 def format_value(value: float) -> str:
@@ -28,6 +29,7 @@ def format_value(value: float) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
     if float(value).is_integer() or abs(value) >= 1000:
+        # counts and thousands have no use for decimals
         text = f"{value:.0f}"
     elif abs(value) < 1e-3:
         mantissa, exponent = f"{value:.2e}".split("e")
@@ -63,6 +65,7 @@ def decimals_of(standard_error: float) -> int:
     >>> decimals_of(0.034), decimals_of(0.012), decimals_of(340.0)
     (2, 3, -2)
     """
+    # rounding first: 0.0999 is 0.10, whose first digit is a 1
     leading, exponent = f"{standard_error:.6e}".split("e")
     return (1 if float(leading) < 2 else 0) - int(exponent)
 
@@ -95,6 +98,7 @@ def quantile_text(value: float, error: float) -> str:
     """
     if not is_known(value, error):
         return format_or_missing(value)
+    # a median without its error beside it must not shrink to one digit
     least = LEAST_DIGITS - 1 - math.floor(math.log10(abs(value))) if value else 0
     return fixed(value, max(decimals_of(error), least))
 

@@ -27,8 +27,8 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
+# instants of a fit, and of its beginning, whose mean counts
 FEWEST = 3
-"""Instants of a fit, and of its beginning, whose mean counts."""
 
 
 def free_start(calibration: Calibration) -> tuple[bool, bool]:
@@ -55,12 +55,14 @@ def with_fitted_truth(
     if truth is None or not len(truth) or not is_moved or FITTED in sequence.notes:
         return sequence
     at_ns = scored_instants(instants_ns, truth, runs).stamps_ns
+    # a fit to one or two positions would take the error away that is to be shown
     if len(at_ns) < FEWEST:
         return sequence
     true = truth.at(at_ns).positions
     fits: list[tuple[float, str, Alignment]] = []
     for run in runs:
         if run.smoothed is not None:
+            # the smoothed path has the least drift to disturb the fit
             path = rows_at(run.smoothed, at_ns).positions
             fit = fit_from_beginning(true, path, is_turned=is_turned)
             fits.append(
@@ -72,6 +74,7 @@ def with_fitted_truth(
             )
     if not fits:
         return sequence
+    # one fit for all runs: a fit for each would hide which one begins wrong
     _, name, fit = min(fits, key=lambda one: one[0])
     turn_deg = float(np.degrees(np.arctan2(fit.rotation[1, 0], fit.rotation[0, 0])))
     what = "no start" if is_turned else "no position of the start"
@@ -91,6 +94,7 @@ def with_fitted_truth(
 
 def fit_from_beginning(true: Floats, path: Floats, *, is_turned: bool) -> Alignment:
     """The motion of the truth, shape (n, 3), that begins where the path does and turns about the vertical to fit it."""
+    # one sample alone would bring its noise into all errors
     begin = true[:FEWEST].mean(axis=0)
     begin_path = path[:FEWEST].mean(axis=0)
     turn = 0.0

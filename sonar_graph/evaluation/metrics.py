@@ -19,16 +19,16 @@ from sonar_graph.models import wrap_angle
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
 
+# a pair for the relative error may be this fraction of the delta longer or shorter than it
 PAIRING_TOLERANCE = 0.01
-"""A pair for the relative error may be this fraction of the delta longer or shorter than it."""
+# largest horizontal distance at which a landmark of unknown identity is matched to a true one
 FARTHEST_M = 1.0
-"""Largest horizontal distance at which a landmark of unknown identity is matched to a true one."""
+# residuals above this many times their median are outliers: three sigmas of a normal distribution
 OUTLYING = 3 * 1.4826
-"""Residuals above this many times their median are outliers: three sigmas of a normal distribution."""
+# fits to the better half
 CONCENTRATIONS = 10
-"""Fits to the better half."""
+# with fewer landmarks none can be told to be the outlier
 LEAST_OUTVOTING = 5
-"""With fewer landmarks none can be told to be the outlier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,7 @@ class Alignment:
 
     def map(self, landmarks: LandmarkMap) -> LandmarkMap:
         """Landmarks moved into the truth's world, with their covariances."""
+        # covariances turn with the points
         R = self.rotation
         return LandmarkMap(
             landmarks.ids,
@@ -89,6 +90,7 @@ def umeyama(points: Floats, targets: Floats) -> tuple[Floats, Floats]:
         )
     mean_x, mean_y = points.mean(axis=0), targets.mean(axis=0)  # (34), (35)
     covariance = (targets - mean_y).T @ (points - mean_x) / len(points)  # (38)
+    # the covariance need not have full rank: points may lie in one place or on one line
     U, _, Vt = np.linalg.svd(covariance)
     S = np.ones(points.shape[1])
     # (43), which (39) equals at full rank
@@ -109,6 +111,7 @@ def align_yaw(points: Floats, targets: Floats) -> Alignment:
     """
     rotation = np.eye(3)
     translation = (targets - points).mean(axis=0)
+    # height and heading are separate terms of the sum of squares
     rotation[:2, :2], translation[:2] = umeyama(points[:, :2], targets[:, :2])
     return Alignment(rotation, translation)
 
@@ -180,6 +183,7 @@ def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
 def return_error_m(estimate: Trajectory, truth: Trajectory) -> float:
     """Error of the displacement between the first and the last instant, in the world frame."""
     check_paired(estimate, truth)
+    # a constant offset of the worlds cancels in the difference of the ends
     offset = estimate.positions - truth.positions
     return float(np.linalg.norm(offset[-1] - offset[0]))
 
@@ -206,6 +210,7 @@ def relative_errors(
     that is already there does not count again.
     """
     check_paired(estimate, truth)
+    # overlapping pairs use every instant, not only each tenth second
     first, second = pairs_apart(estimate.stamps_ns, delta_s)
 
     def body_displacement(trajectory: Trajectory) -> Floats:
@@ -222,6 +227,7 @@ def relative_errors(
 
 def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:
     """Rows i and j with ``stamp[j] - stamp[i]`` nearest to ``delta_s`` and within one per cent of it."""
+    # integers, because stamps in seconds as floats lose nanoseconds
     delta_ns = round(delta_s * NS_PER_S)
     first = np.arange(len(stamps_ns))
     wanted = stamps_ns + delta_ns
@@ -264,6 +270,7 @@ def landmark_errors(estimated: LandmarkMap, true: LandmarkMap) -> LandmarkErrors
     array([ 4,  9, 11])
     """
     ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
+    # row i of both is the same landmark
     points = estimated.positions[rows]
     targets = true.positions[true_rows]
     aligned = (
@@ -310,6 +317,7 @@ def scored_map(estimated: LandmarkMap, sequence: Sequence) -> ScoredMap | None:
     alignment = None
     if sequence.truth is None or not len(sequence.truth):
         calibration = sequence.calibration
+        # a level estimate has no freedom in roll and pitch that alignment could take away
         is_level = calibration.planar is not None or calibration.use_gravity
         alignment = align_map(estimated, true, is_level=is_level)
         if alignment is None:
@@ -343,10 +351,12 @@ def align_map(
         )
 
     for _ in range(CONCENTRATIONS):
+        # stable, so that equal residuals do not let the result hang on the machine
         better = np.argsort(residuals(alignment), kind="stable")[
             : (len(points) + 3) // 2
         ]
         alignment = fit(points[better], targets[better])
+    # the last fit uses all good landmarks, not only the better half
     near = residuals(alignment) <= OUTLYING * np.median(residuals(alignment))
     return fit(points[near], targets[near])
 
@@ -367,6 +377,7 @@ def named_by_place(
         return estimated
     from scipy.optimize import linear_sum_assignment  # takes most of a second to load
 
+    # a landmark that the map names is not at hand for one without a name
     free = np.flatnonzero(~np.isin(true.ids, estimated.ids))
     apart = estimated.positions[unknown, None, :2] - true.positions[None, free, :2]
     squared = np.sum(apart**2, axis=-1)
@@ -377,6 +388,7 @@ def named_by_place(
     matched = is_near[rows, columns]
     ids = estimated.ids.copy()
     ids[unknown[rows[matched]]] = true.ids[free[columns[matched]]]
+    # maps are sorted by identity everywhere
     order = np.argsort(ids)
     return LandmarkMap(
         ids[order], estimated.positions[order], estimated.covariances[order]

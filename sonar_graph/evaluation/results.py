@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from sonar_graph.recognition import Recognition
 
 Kind = Literal["causal", "smoothed"]
+# an interval that reaches beyond this factor of 1 is too wide to call a value inside it consistent
 TOLERATED_FACTOR = 2.0
-"""An interval that reaches beyond this factor of 1 is too wide to call a value inside it consistent."""
 MOST_ROWS_NAMED = 5
 """Refused rows of one sensor and reason that are named one by one, and messages of one run that are shown."""
 

@@ -57,19 +57,19 @@ Flags = NDArray[np.bool_]
 LOG = logging.getLogger(__name__)
 STATUS = Path("/proc/self/status")
 CLEAR_REFS = Path("/proc/self/clear_refs")
+# written to `CLEAR_REFS` it resets Linux's high-water mark of resident memory
 RESET_PEAK = "5"
-"""Written to `CLEAR_REFS` it resets Linux's high-water mark of resident memory."""
+# an eigenvalue may be this far below zero, as a fraction of the largest: rounding
 NEGATIVE_TOLERANCE = 1e-9
-"""An eigenvalue may be this far below zero, as a fraction of the largest: rounding."""
+# largest number of characters of a reason: one line that a table can hold
 REASON_WIDTH = 400
-"""Largest number of characters of a reason: one line that a table can hold."""
 WARM_UP_STEPS = 20
+# steps given to the instance that warms up: without and with detections to wait for
 MAX_WARM_UP_STEPS = 200
-"""Steps given to the instance that warms up: without and with detections to wait for."""
+# landmarks up to which a run keeps their joint covariance: its size grows with their square
 MOST_MAPPED = 100
-"""Landmarks up to which a run keeps their joint covariance: its size grows with their square."""
+# steps with a landmark that can be named: it is begun, waited for, and seen again
 WARM_UP_FRAMES = 4
-"""Steps with a landmark that can be named: it is begun, waited for, and seen again."""
 
 
 class PeakMemory:
@@ -82,6 +82,8 @@ class PeakMemory:
     def __init__(self) -> None:
         self._start_mb = float("nan")
         try:
+            # a kernel without this file, or a container that forbids it, has no high-water mark to
+            # reset
             CLEAR_REFS.write_text(RESET_PEAK)
             self._start_mb = _status_mb("VmRSS")
         except OSError:
@@ -90,6 +92,7 @@ class PeakMemory:
     def rise_mb(self) -> float:
         """Megabytes (10⁶ bytes) at the peak above the start; NaN where the system does not tell."""
         return (
+            # caches that the system took back make the difference negative
             max(_status_mb("VmHWM") - self._start_mb, 0.0)
             if self._start_mb == self._start_mb
             else float("nan")
@@ -109,14 +112,19 @@ def check_outcome(
 ) -> None:
     """Refuse results that cannot be scored.
 
-    Raises `EvaluationError` when the smoothed trajectory is not at the causal one's instants; a
+    Raises `EvaluationError` when the smoothed trajectory does not end with the causal one's instants; a
     pose or landmark is not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
     """
-    if not np.array_equal(causal.stamps_ns, smoothed.stamps_ns):
+    # scores compare both paths instant by instant; a start that is found later gives smoothed poses before it
+    earlier = len(smoothed) - len(causal)
+    if earlier < 0 or not np.array_equal(
+        causal.stamps_ns, smoothed.stamps_ns[earlier:]
+    ):
         raise EvaluationError(
             f"trajectory() has {len(smoothed)} instants, not the {len(causal)} for which process returned estimates"
         )
     for kind, trajectory in (("causal", causal), ("smoothed", smoothed)):
+        # one look at all numbers of a pose: a NaN in the rotation spoils every score too
         rows = np.column_stack([trajectory.positions, trajectory.quaternions_xyzw])
         _refuse(
             _not_finite(rows), f"{kind} pose is not finite", trajectory.stamps_ns, "ns"
@@ -158,10 +166,12 @@ def _impossible(covs: Floats) -> Flags:
     """Flags of covariances, shape (n, d, d), that are partly NaN, infinite, asymmetric or not positive semidefinite."""
     n = len(covs)
     rows = covs.reshape(n, covs.shape[1] * covs.shape[2])
+    # NaN stands for an unreported covariance, which is no fault
     unknown = np.all(np.isnan(rows), axis=1)
     finite = ~_not_finite(rows)
     # eigvalsh fails for NaN; rows that are not finite are refused all the same, by `finite` below
     filled = np.where(finite[:, None, None], covs, 0.0)
+    # tolerances are relative: covariances of centimetres and of kilometres are judged alike
     size = np.abs(filled).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     smallest = np.linalg.eigvalsh(filled)[:, 0] if n else np.zeros(0)
@@ -229,7 +239,9 @@ def run_estimator(
     """
     require_sequence(sequence, "run_estimator(sequence, estimator)")
     name = name_of(estimator)
+    # the caller gives instants where several estimators must be asked at the same ones
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
+    # code of another package may change numpy, the folder or the environment of this process
     if not is_apart and isinstance(estimator, str) and is_foreign(name):
         return _run_apart(
             _Request(name, overrides or {}, sequence, instants, interim_maps), progress
@@ -241,6 +253,7 @@ def run_estimator(
     except EstimatorError as error:
         return RunResult(name, dict(overrides or {}), "failed", one_line(error))
     candidate = make_candidate(kind, overrides or {}, name)
+    # an estimator may write into the arrays that it gets, which the next one needs unchanged
     own = copy.deepcopy(sequence)
     replay = _Replay(
         sequence, list(own.replay(instants)), name, candidate, interim_maps=interim_maps
@@ -305,6 +318,7 @@ def _process() -> Iterator[OwnProcess]:
 def _asked(
     process: OwnProcess, request: _Request, progress: Callable[[int, int], None] | None
 ) -> Any:
+    # the first answer is no result
     process.answer()  # that it is ready
     process.send(request)
     while isinstance(answer := process.answer(), _StepsDone):
@@ -341,6 +355,7 @@ def serve_runs() -> None:
 
 def _answer(request: _Request, tell: Tell) -> object:
     """In a process of its own: do a run, or give the settings of one."""
+    # the estimator may be importable only through the path of who asked
     sys.path[:] = request.path
     if request.sequence is None:
         return check_request(request.name, request.overrides, is_apart=True) or NOTHING
@@ -355,8 +370,8 @@ def _answer(request: _Request, tell: Tell) -> object:
     )
 
 
+# blocks that an estimator may know nothing of
 AIDING = ("heading", "positions")
-"""Blocks that an estimator may know nothing of."""
 
 
 class _Watched(Measurements):
@@ -365,6 +380,7 @@ class _Watched(Measurements):
     @classmethod
     def of(cls, step: Measurements, asked: set[str]) -> "_Watched":
         """The same measurements; ``asked`` grows by what is asked for."""
+        # the constructor would check all rows again, once a step
         watched = object.__new__(cls)
         vars(watched).update(vars(step), asked=asked)
         return watched
@@ -399,6 +415,7 @@ class _Replay:
         self._map_at_ns = set(interim_ns if interim_maps else [])
         self._asked: set[str] = set()
         self._maps: list[MapSoFar] = []
+        # the reason of a failure names where the run was
         self._stage = "at the start"
         self._check_interrupt: Callable[[], None]
 
@@ -422,6 +439,7 @@ class _Replay:
             Exception,
             SystemExit,
         ) as error:  # an estimator may fail in any way, and the others still run
+            # the table has one line; whoever mends the estimator needs the traceback
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
             told: dict[str, Any] = {}  # rows refused before are often why it failed
             if estimator is not None:
@@ -439,6 +457,7 @@ class _Replay:
         # loads numba, which a result does not need
         from sonar_graph.navigation import make_estimator
 
+        # each estimator needs an odometry of its own, since an odometry has a state
         return make_estimator(self._candidate.fresh, self._sequence.calibration)
 
     def _warm_up(self) -> None:
@@ -453,6 +472,7 @@ class _Replay:
                 and detections.most_probable()[1].max() > 0.5
             )
 
+        # code for a landmark that is seen again runs only after a detection that names one
         named = [i for i, step in enumerate(self._steps) if is_named(step.detections)]
         last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
         with contextlib.suppress(
@@ -481,8 +501,10 @@ class _Replay:
             # the clock without the time that numba has compiled until now
             before = time.perf_counter() - compiling_s()
             estimate = estimator.process(given)
+            # a loop that numba compiles on its first call is no time of the estimator
             self._update_s.append(time.perf_counter() - compiling_s() - before)
             self._check_interrupt()
+            # None is allowed: a smoother may wait before its first estimate
             estimate = returned_estimate(estimate)
             if estimate is not None and estimate.stamp_ns != end_ns:
                 raise EvaluationError(
@@ -503,6 +525,7 @@ class _Replay:
 
         self._stage = "at the end, asked for trajectory and map"
         before = time.perf_counter() - compiling_s()
+        # timed together with the map: a smoother solves once for both
         smoothed = estimator.trajectory()
         landmarks = estimator.landmarks()
         finish_s = time.perf_counter() - compiling_s() - before
@@ -516,6 +539,7 @@ class _Replay:
         returned(detections, DetectionLog, "detections()")
         causal = Trajectory.from_estimates(self._estimates)
         check_outcome(causal, smoothed, landmarks)
+        # the last map is the final one, which costs nothing more
         self._maps.append(MapSoFar(int(causal.stamps_ns[-1]), landmarks))
         return self._result(
             "ok",
@@ -537,6 +561,7 @@ class _Replay:
         """The landmarks with their joint covariance and their origin; None of too many."""
         if not 0 < len(landmarks) <= MOST_MAPPED:
             return None
+        # a filter that diverged has a covariance that no map can hold; the run itself still counts
         with contextlib.suppress(SonarGraphError):
             known = known_map_of(estimator)
             source = f"{map_origin(self._sequence)}, {self._name}"
@@ -573,6 +598,7 @@ class _Replay:
 def one_line(error: BaseException) -> str:
     """The exception's type and message without line breaks."""
     if isinstance(error, SystemExit):
+        # the exception has no message of its own
         return f"it called sys.exit({error})"
     return textwrap.shorten(
         f"{type(error).__name__}: {error}", REASON_WIDTH, placeholder=" ..."

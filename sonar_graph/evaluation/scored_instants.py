@@ -25,19 +25,20 @@ RETURN_M = (-0.3013, -0.1758)
 DURATION_S = 2039.0
 MAP_TIMES_S = (833.1, 1369.4, 2039.0)
 """Times of path and map in Fig. 4."""
+# instants, evenly over the run, at which maps are kept beside those of Fig. 4: each costs a smoother a solution
 MAPS_KEPT = 20
-"""Instants, evenly over the run, at which maps are kept beside those of Fig. 4: each costs a smoother a solution."""
+# a true landmark this near to the published one in x and in y is that landmark
 SAME_PLACE_M = 1e-3
-"""A true landmark this near to the published one in x and in y is that landmark."""
+# between truth samples farther apart than this the truth is not interpolated (an occluded tracking system)
 TRUTH_GAP_S = 0.5
-"""Between truth samples farther apart than this the truth is not interpolated (an occluded tracking system)."""
+# the gap is at least this many times the truth's median spacing: a truth may be sparse throughout
 GAP_TO_SPACING = 1.5
-"""The gap is at least this many times the truth's median spacing: a truth may be sparse throughout."""
 
 
 def published_maps() -> tuple[LandmarkMap, LandmarkMap]:
     """Table I as maps: estimated and true. Heights and covariances are not published: 0 and NaN."""
     unknown = np.full((len(IDS), 3, 3), np.nan)
+    # the paper gives no heights
     on_floor = np.zeros((len(IDS), 1))
     estimated, true = (
         LandmarkMap(IDS, np.hstack([xy, on_floor]), unknown)
@@ -97,6 +98,7 @@ def scored_instants(
 ) -> ScoredInstants:
     """The instants with truth nearby and an estimate from each run that did not fail."""
     inside = (asked_ns >= truth.stamps_ns[0]) & (asked_ns <= truth.stamps_ns[-1])
+    # a line between truth samples far apart is no truth
     gap_s = gap_limit_s(truth)
     # an instant of a truth sample has this sample on both sides, and so is in no gap
     after = np.clip(
@@ -109,6 +111,7 @@ def scored_instants(
     covered = inside & ~in_gap
     estimated = np.ones(len(asked_ns), dtype=bool)
     for run in runs:
+        # all runs are scored at the same instants, so one that is silent takes them from all
         if run.causal is not None:
             estimated &= np.isin(asked_ns, run.causal.stamps_ns)
     return ScoredInstants(
@@ -135,6 +138,7 @@ def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
 
 def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
     """The `map_instants`, and `MAPS_KEPT` others at equal distances."""
+    # evenly in time, because asked instants are
     rows = np.linspace(0, len(asked_ns), MAPS_KEPT + 1)[1:].astype(np.int64) - 1
     return np.union1d(map_instants(asked_ns, start_ns), asked_ns[rows[rows >= 0]])
 

@@ -33,17 +33,17 @@ from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
+# time differences of the relative error, seconds
 RELATIVE_DELTAS_S = (1, 10)
-"""Time differences of the relative error, seconds."""
 ESTIMATES: dict[str, str] = {
     "causal": "Causal estimate (what could be known at each instant)",
     "smoothed": "Smoothed estimate (what is known at the end about each instant)",
 }
+# outcomes of detections that are in the estimate
 USED = {
     *(Outcome.USED, Outcome.NEW, Outcome.USED_LATER),
     *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
 }
-"""Outcomes of detections that are in the estimate."""
 IN_TIME = "errors of successive instants are correlated: their mean is worth {} independent samples, for which the band is"
 
 
@@ -64,6 +64,7 @@ def trajectory_scores(
     Without ``has_height`` the estimate has the truth's, and its errors are of x and y.
     """
     which = ESTIMATES[kind]
+    # each protocol is one sentence that can be quoted alone
     over = f"over {instants}, to which the truth is interpolated"
     space = f"{'3-D' if has_height else 'horizontal'} position error"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
@@ -83,6 +84,7 @@ def trajectory_scores(
         }
     )
     for delta_s in RELATIVE_DELTAS_S:
+        # displacement is in the body frame, for which a true orientation is needed
         relative = relative_errors(estimate, truth, delta_s)
         if not len(relative) or not truth.has_orientation:
             continue
@@ -109,6 +111,7 @@ def trajectory_scores(
         ("nees_yaw", errors.nees_yaw, 1, errors.yaw_samples, "heading"),
     )
     for key, nees, dof, samples, what in parts:
+        # the protocol states how many instants the mean is of
         known = int(np.isfinite(nees).sum())
         mean = mean_normalised(nees, dof)
         if not math.isfinite(mean):

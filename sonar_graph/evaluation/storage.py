@@ -76,15 +76,15 @@ RESULT = "result.json"
 SERIES = "series.npz"
 RESULT_LOG = "result.mcap"
 PAGE = "report.html"
+# as `sonar_graph.recognition` names them, which is loaded where something was recognised
 RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
-"""As `sonar_graph.recognition` names them, which is loaded where something was recognised."""
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv", "map.toml")
+# types of what people may have edited in ``comparison.json``
 _SCORE, _TEXTS, _STATUS = (
     TypeAdapter(Score),
     TypeAdapter(dict[str, str]),
     TypeAdapter(Literal["ok", "failed"]),
 )
-"""Types of what people may have edited in ``comparison.json``."""
 
 
 def result_names(estimators: Iterable[str]) -> list[str]:
@@ -129,6 +129,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     ...     sorted(path.name for path in Path(folder).glob("[!.]*"))
     ['comparison.json', 'runs', 'sequence.npz']
     """
+    # the name becomes a folder: one with a separator would leave the place that was asked for
     names = [run.estimator for run in comparison.runs]
     for name in names:
         if name in ("", ".", "..") or any(
@@ -143,6 +144,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
             for name in written.names
             if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/"))
         )
+        # a page or a run of an earlier comparison would contradict the new numbers
         written.remove([INDEX, PAGE, RECOGNITION, *earlier])
         _write(comparison, folder)
 
@@ -163,6 +165,7 @@ def _write(comparison: Comparison, folder: Path) -> None:
         "instants_ns": comparison.instants_ns
     }
     _write_arrays(folder / SEQUENCE, arrays)
+    # by name, since tools look up one run
     entries = {}
     for run in comparison.runs:
         _write_run(run, comparison, folder / RUNS / run.estimator)
@@ -252,6 +255,7 @@ def _error_summary(series: ErrorSeries) -> dict[str, Any]:
         "rms_xyz_m": [rmse(series.position_m[:, axis]) for axis in range(3)],
         "max_position_m": float(np.linalg.norm(series.position_m, axis=1).max()),
     }
+    # no true heading, so no error of heading; a null would look like a lost number
     if np.isnan(series.yaw_rad).any():  # the truth has positions only
         return summary
     return summary | {
@@ -285,10 +289,12 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
         for run in comparison.runs
     }
     names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
+    # viewers show the pictures along the time of the run
     drawn = comparison.recognition.pictures if comparison.recognition else []
     pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
     about = comparison.environment | settings
     with result_written(folder, COMPARISON) as written:
+        # as written in this call, not yet in the folder: all files appear together
         contents = {name: written.as_written(name).read_bytes() for name in names}
         attachments = [
             Attachment(name, "application/json", content)
@@ -329,12 +335,14 @@ def read_comparison(folder: Path) -> Comparison:
             f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to"
         )
     index = read_json(folder / INDEX)
+    # another format may have the same keys with other meanings
     if index.get("format") != FORMAT:
         raise EvaluationError(
             f"{folder / INDEX}: format is {index.get('format')!r}, expected {FORMAT!r}; compare anew"
         )
     try:
         return _restore(index, folder)
+    # people edit JSON: a wrong value must name the file and not end in a traceback
     except (KeyError, TypeError, ValueError) as error:
         raise EvaluationError(
             f"{folder}: incomplete, {error} is missing or not as written; compare anew"
@@ -349,6 +357,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
     for name, entry in index["runs"].items():
         arrays = _read_arrays(folder / RUNS / name / SERIES)
         runs.append(_restore_run(name, entry, arrays))
+        # JSON has no NaN, which was written as null
         restored = {
             key: _SCORE.validate_python(
                 score | ({"value": np.nan} if score["value"] is None else {})
@@ -421,6 +430,7 @@ def _restore_sequence(
     """A sequence with its start, end, detections and truth, but without its motion's measurements."""
     imu = _unpack("imu", Imu, arrays)
     dvl = _unpack("dvl", Dvl, arrays)
+    # start and end of the sequence are those of these rows
     if imu is None or dvl is None:
         raise EvaluationError(
             "sequence.npz: the first and last rows of imu and dvl are missing"
@@ -464,12 +474,14 @@ def _run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
 def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
     """A run from its entry in ``comparison.json`` and its arrays."""
     maps: list[MapSoFar] = []
+    # maps are numbered from 0 without a gap
     while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
         maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
     refused = zip(
         *(arrays[f"refused.{field}"].tolist() for field in RefusedRow._fields),
         strict=True,
     )
+    # null on systems without a high-water mark
     memory = entry["peak_memory_mb"]
     return RunResult(
         name,
@@ -507,6 +519,7 @@ def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
 
     Raises `EvaluationError` naming the field that is missing.
     """
+    # fields with a default may be missing: an older version did not have them
     columns = fields(kind)  # type: ignore[arg-type]  # every kind here is a dataclass
     stored = {
         column.name: arrays[key]
@@ -523,9 +536,11 @@ def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
             f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew"
         )
     values: dict[str, Any] = {
+        # numbers were stored as arrays without dimensions
         name: array.item() if array.ndim == 0 else array
         for name, array in stored.items()
     }
+    # npz has no enumerations: outcomes are stored as texts
     if "outcomes" in values:
         values["outcomes"] = [Outcome(text) for text in values["outcomes"].tolist()]
     return kind(**values)

@@ -78,6 +78,7 @@ HEADLINES = {
     "ate_raw_m": "RMS, not aligned",
 }
 """Position errors that can stand in the headline, best suited first, with their names there."""
+# scores of the compact table after the position errors, most important first
 COMPACT = {
     "landmarks.{map_metric}": "Map error",
     "causal.nees_position": "Position NEES",
@@ -88,9 +89,8 @@ COMPACT = {
     "time.update_median_ms": "Update, median",
     "time.update_max_ms": "Update, longest",
 }
-"""Scores of the compact table after the position errors, most important first."""
+# scores that the compact table shows beside the name of the estimator
 MOST_SCORES = 5
-"""Scores that the compact table shows beside the name of the estimator."""
 DIRECTIONS = {
     "lower": "lower is better",
     "higher": "higher is better",
@@ -134,6 +134,7 @@ def score_keys(comparison: Comparison) -> list[str]:
 
 def headline_metric(comparison: Comparison) -> str | None:
     """The position error that most runs have, without its ``causal.`` or ``smoothed.``; None where no run has one."""
+    # runs may lack different errors: the headline is about the one that most have
     counts = {
         metric: sum(
             comparison.score_of(run.estimator, f"causal.{metric}") is not None
@@ -159,6 +160,7 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
         Position and map errors after alignment to the truth, as in `aligned_to_truth`, instead of before.
     """
     metric = headline_metric(comparison)
+    # only this error has a version before alignment
     if metric and not aligned:
         metric = RAW
     world = "aligned" if aligned and metric != RAW else unaligned(comparison.sequence)
@@ -175,12 +177,14 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
     columns = [Column("estimator", "Estimator", is_number=False)]
     for key, heading in headings.items():
         found = [comparison.score_of(run.estimator, key) for run in comparison.runs]
+        # a column of dashes takes the place of one with numbers
         known = [score for score in found if score is not None]
         if known and len(columns) <= MOST_SCORES:
             unit = f" ({known[0].shown_unit})" if known[0].shown_unit else ""
             columns.append(Column(key, heading + unit))
     rows = []
     for index, run in enumerate(comparison.runs):
+        # whoever compares must see that it lacks what its neighbours have
         note = AS_PUBLISHED if run.is_as_published else ""
         cells = [replace(words(run.estimator, run=index), note=note)]
         for column in columns[1:]:
@@ -234,6 +238,7 @@ def score_table(comparison: Comparison) -> Table:
             comparison.scores.get(run.estimator, {}).get(key) for run in comparison.runs
         ]
         known = [score for score in scores if score is not None]
+        # one interval for all stands in the last column, others beside their values
         intervals = {_expected(score) for score in known}
         common = intervals.pop() if len(intervals) == 1 else ""
         cells = []

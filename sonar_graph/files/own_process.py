@@ -18,7 +18,8 @@ from dataclasses import fields, is_dataclass
 from queue import Empty, SimpleQueue
 from typing import IO, Any, BinaryIO, NoReturn
 
-READY, OWN = "ready", "sonar_graph."
+READY = "ready"
+OWN = "sonar_graph."
 LOOK_EVERY_S = 0.2
 JOIN_S = 5.0
 """Longest wait for the thread that listens to an ended process, whose detached children may keep the pipe open."""

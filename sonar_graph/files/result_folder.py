@@ -23,8 +23,11 @@ from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 from sonar_graph.files.inputs import read_json, strict_json, text_of
 from sonar_graph.files.interrupts import deferred_interrupt
 
-MANIFEST, LOCK = ".sonar_graph.json", ".lock"
-COMPARISON, BATCH, PAPER = "comparison", "batch", "paper"
+MANIFEST = ".sonar_graph.json"
+LOCK = ".lock"
+COMPARISON = "comparison"
+BATCH = "batch"
+PAPER = "paper"
 """Kinds of results in the manifests of folders."""
 FORMAT = "sonar_graph folder 1"
 DIGEST_DIGITS = 32
@@ -43,12 +46,10 @@ class ResultFolder:
     def __init__(
         self, path: Path, kind: str, refusal: type[SonarGraphError], *, overwrite: bool
     ) -> None:
-        self.path, self.kind, self._refusal, self._overwrite = (
-            path,
-            kind,
-            refusal,
-            overwrite,
-        )
+        self.path = path
+        self.kind = kind
+        self._refusal = refusal
+        self._overwrite = overwrite
         self.is_writing = False
         self._digests: dict[str, list[str]] = {}
         self._staged: dict[str, Path] = {}
@@ -61,7 +62,8 @@ class ResultFolder:
             if manifest.is_symlink():
                 raise ValueError("it is a link")
             content = json.loads(text_of(manifest))
-            found, self._digests = content["kind"], content["files"]
+            found = content["kind"]
+            self._digests = content["files"]
             is_sound = all(
                 isinstance(digests, list) and _is_below(name)
                 for name, digests in self._digests.items()
@@ -146,7 +148,8 @@ class ResultFolder:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        self.is_writing, self.token = True, secrets.token_hex(6)
+        self.is_writing = True
+        self.token = secrets.token_hex(6)
         is_kept = os.path.lexists(self.path / MANIFEST)
         try:
             self._write_manifest()
@@ -158,7 +161,8 @@ class ResultFolder:
                 partial.unlink(missing_ok=True)
             self._staged.clear()
             self._gone.clear()
-            self.is_writing, self.token = False, ""
+            self.is_writing = False
+            self.token = ""
             with contextlib.suppress(
                 OSError
             ):  # then the next command removes what is no longer there

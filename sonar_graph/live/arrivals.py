@@ -35,7 +35,7 @@ NEW_CLOCK_NS = 2 * NS_PER_S
 """Time of arrival after which stamps ahead are believed, where no other was."""
 FARTHEST_NS = PAUSE_NS // 2
 """Jump that is not believed: a log that pauses for a day is two."""
-PADDING = {"candidate_ids": -1, "id_probability": 0}
+PADDING = {"candidate_ids": -1, "id_probability": 0.0}
 """Columns of detections that are as wide as a message has candidates, and what stands for none."""
 MOST_PARTS = 256
 """Number of waiting blocks of a sensor that are made one."""
@@ -105,34 +105,33 @@ class Arrivals:
         ``block``: its rows, all of this stamp; None of a sonar frame in which nothing was detected, which says that
         no detection up to its stamp will come.
         """
+        newest_ns = stamp_ns
+        # stamps and arrivals go on by the same time, unless a clock was set
         if arrival_ns is not None and self._clock_ns is not None:
             newest_ns, last_arrival_ns = self._clock_ns
-            ahead_ns, since_ns = (
-                stamp_ns - newest_ns,
-                max(arrival_ns - last_arrival_ns, 0),
-            )
-            if ahead_ns > FARTHEST_NS or (
-                ahead_ns > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS
-            ):
+            ahead_ns = stamp_ns - newest_ns
+            since_ns = max(arrival_ns - last_arrival_ns, 0)
+            is_ahead = ahead_ns > since_ns + AHEAD_NS and since_ns < NEW_CLOCK_NS
+            if is_ahead or ahead_ns > FARTHEST_NS:
                 return AHEAD
             if self.done_ns is None and ahead_ns < -FARTHEST_NS:
                 return BEHIND
         if self.done_ns is not None and stamp_ns <= self.done_ns:
             return LATE
         if block is not None:
+            # a sonar frame has many rows of one stamp
             if sensor != "detections" and stamp_ns in self._stamps_ns[sensor]:
                 return REPEATED
             self._stamps_ns[sensor].add(stamp_ns)
-            self._waiting[sensor].append(block)
-            if len(self._waiting[sensor]) > MOST_PARTS:
-                self._waiting[sensor] = [joined(self._waiting[sensor])]
+            waiting = self._waiting[sensor]
+            waiting.append(block)
+            # joining thousands of single rows at once would delay a step
+            if len(waiting) > MOST_PARTS:
+                waiting[:] = [joined(waiting)]
             self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
         self.newest_ns[sensor] = max(stamp_ns, self.newest_ns.get(sensor, stamp_ns))
         if arrival_ns is not None:
-            newest_ns = (
-                stamp_ns if self._clock_ns is None else max(stamp_ns, self._clock_ns[0])
-            )
-            self._clock_ns = newest_ns, arrival_ns
+            self._clock_ns = (max(stamp_ns, newest_ns), arrival_ns)
         return None
 
     @property
@@ -143,29 +142,28 @@ class Arrivals:
 
     def steps(self) -> Iterator[Measurements]:
         """Steps that are complete by now, in order."""
-        begun_ns = self.start_ns if self.done_ns is None else self.done_ns
-        if begun_ns is None:
-            return
-        end_ns = begun_ns + self.step_ns
-        while (
-            min(self.newest_ns.values()) >= end_ns
-            or max(self.newest_ns.values()) >= end_ns + self.lateness_ns
-        ):
+        while (end_ns := self._next_ns()) is not None:
+            newest_ns = self.newest_ns.values()
+            is_awaited = max(newest_ns) < end_ns + self.lateness_ns
+            if is_awaited and min(newest_ns) < end_ns:
+                return
             yield self._step(end_ns)
-            end_ns += self.step_ns
 
     def rest(self) -> Iterator[Measurements]:
         """Steps that are left when nothing more will come: up to the last instant with IMU and Doppler log."""
-        begun_ns = self.start_ns if self.done_ns is None else self.done_ns
-        if begun_ns is None:
-            return
-        end_ns = begun_ns + self.step_ns
-        while min(self.newest_ns[name] for name in MOTION) >= end_ns:
+        while (end_ns := self._next_ns()) is not None:
+            if min(self.newest_ns[name] for name in MOTION) < end_ns:
+                return
             yield self._step(end_ns)
-            end_ns += self.step_ns
+
+    def _next_ns(self) -> int | None:
+        """Instant at the end of the next step; None before the start."""
+        begun_ns = self.start_ns if self.done_ns is None else self.done_ns
+        return None if begun_ns is None else begun_ns + self.step_ns
 
     def _step(self, end_ns: int) -> Measurements:
         assert self.start_ns is not None
+        # the first step has what came before the start too
         after_ns = self.start_ns - PAUSE_NS if self.done_ns is None else self.done_ns
         rows: dict[str, Any] = {}
         for name, parts in self._waiting.items():
@@ -173,10 +171,9 @@ class Arrivals:
                 block = joined(parts)
                 rows[name] = block.between(after_ns, end_ns)
                 left = block.between(end_ns, int(block.stamps_ns[-1]))
-                self._waiting[name] = [] if left is None else [left]
-                self._stamps_ns[name] = (
-                    set() if left is None else set(left.stamps_ns.tolist())
-                )
+                parts[:] = [] if left is None else [left]
+                stamps_ns = [] if left is None else left.stamps_ns.tolist()
+                self._stamps_ns[name] = set(stamps_ns)
         self.done_ns = end_ns
         return Measurements(end_ns, **rows)
 
@@ -186,6 +183,7 @@ def joined(parts: list[Any]) -> Any:
     if len(parts) == 1:
         return parts[0]
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+    # late messages come after newer ones
     order = np.argsort(stamps_ns, kind="stable")
     columns = {
         name: _stacked(name, [getattr(part, name) for part in parts])[order]
@@ -198,12 +196,8 @@ def _stacked(name: str, columns: list[Any]) -> Any:
     """Columns one below the other; candidates padded to the most with -1 and probability 0, as in a log."""
     if name in PADDING:
         most = max(column.shape[1] for column in columns)
-        columns = [
-            np.pad(
-                column,
-                ((0, 0), (0, most - column.shape[1])),
-                constant_values=PADDING[name],
-            )
-            for column in columns
-        ]
+        filled = [np.full((len(column), most), PADDING[name]) for column in columns]
+        for column, wide in zip(columns, filled, strict=True):
+            wide[:, : column.shape[1]] = column
+        columns = filled
     return np.concatenate(columns)

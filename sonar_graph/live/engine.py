@@ -19,7 +19,12 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError, MissingTopicError, SonarGraphError
 from sonar_graph.live.arrivals import MOTION, Arrivals
-from sonar_graph.live.live_messages import Message, dropped_messages, recorded_messages
+from sonar_graph.live.live_messages import (
+    Message,
+    dropped_messages,
+    gather,
+    recorded_messages,
+)
 from sonar_graph.live.message_reader import MessageReader, Part
 from sonar_graph.logs import (
     LATENESS,
@@ -32,16 +37,17 @@ from sonar_graph.logs import (
     choose_each,
     choose_topics,
     pinned,
-    rows_of,
     sonar_frame,
 )
-from sonar_graph.logs.adapters import DvlAdapter, LogConfig
+from sonar_graph.logs.adapters import LogConfig, Setup
 from sonar_graph.logs.mcap import Keep, Recording, Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Measurements
 from sonar_graph.sequence import Sequence
 
 OVERLOADED = "overload: the estimator was behind"
 SETUP_NS = 2 * NS_PER_S
+FORGOTTEN_NS = 60 * NS_PER_S
+"""Time after which no detection of a step is dropped any more."""
 Held = list[tuple[Message, int]]
 """Messages with their log times."""
 
@@ -87,10 +93,8 @@ class Engine:
         Record, to which everything goes.
     definition_of
         Function that gives the definition of a message type.
-    rate_hz, lateness_s
-        As of `Arrivals`.
-    wanted, config, calibration
-        Topics by role, description of topics, and fields of a calibration, as for `read_log`.
+    options
+        Rate and lateness as of `Arrivals`; topics, their description and fields of a calibration as for `read_log`.
 
     Examples
     --------
@@ -98,13 +102,13 @@ class Engine:
 
     >>> from pathlib import Path
     >>> from sonar_graph import write_log
-    >>> from sonar_graph.live import Engine, definition_of, recorded_messages
+    >>> from sonar_graph.live import Engine, LiveOptions, definition_of, recorded_messages
     >>> from sonar_graph.logs import LiveRecord
     >>> from sonar_graph.testing import small_world
     >>> write_log("dive.mcap", small_world())
     >>> steps = []
     >>> with LiveRecord(Path("record.mcap")) as record:
-    ...     engine = Engine(record, definition_of, rate_hz=1.0)
+    ...     engine = Engine(record, definition_of, LiveOptions(rate_hz=1.0))
     ...     for message in recorded_messages(Path("dive.mcap")):
     ...         parts = engine.take(message)
     ...         steps += engine.steps()
@@ -117,13 +121,9 @@ class Engine:
         self,
         record: LiveRecord,
         definition_of: Callable[[str], str],
-        *,
-        rate_hz: float = 10.0,
-        lateness_s: float = 0.25,
-        wanted: Mapping[str, str] | None = None,
-        config: LogConfig | None = None,
-        calibration: PartialCalibration | None = None,
+        options: LiveOptions | None = None,
     ) -> None:
+        self.options = options or LiveOptions()
         self.counts = Counts()
         self.calibration: Calibration | None = None
         """Known once the first seconds are over."""
@@ -134,35 +134,26 @@ class Engine:
         self.notes: dict[str, str] = {}
         """Notes of these, as `read_log` gives them."""
         self.record_path = record.path
-        self._record = record
-        self._definition_of = definition_of
-        self._arrivals = Arrivals(rate_hz, lateness_s)
         self.generation = 0
         """Number of times that all steps began anew, since a topic of a further sensor came late."""
-        self._rate_hz, self._lateness_s = rate_hz, lateness_s
-        self._said = {
-            LIVE_RATE: repr(float(rate_hz)),
-            LATENESS: repr(float(lateness_s)),
-        }
-        self._wanted, self._config, self._given = (
-            dict(wanted or {}),
-            config or LogConfig(),
-            calibration,
-        )
         self.topics: dict[str, Topic] = {}
         """Topics that have sent."""
         self.remarks: list[str] = []
         """Lines for the user, who takes them away."""
         self.waits_for = ""
         """What the first messages lack."""
+        self.in_use: dict[str, str] = {}
+        """Topics by role."""
+        self._record = record
+        self._definition_of = definition_of
+        self._config = self.options.config or LogConfig()
+        self._arrivals = self._no_arrivals()
         self._sonar: str | None = None
         """Frame of the sonar, once an image has come."""
         self._first: Held = []
         self._first_motion_ns: int | None = None
         self._set_up_ns = 0
         """Arrival of the message with which the set-up was tried last."""
-        self.in_use: dict[str, str] = {}
-        """Topics by role."""
         self._places: dict[str, Choice] = {}
         """Topics whose first rows make all begin anew."""
         self._unfit: set[str] = set()
@@ -182,119 +173,117 @@ class Engine:
             self._add_topic(message)
         self.counts.received[name] += 1
         if message.sequence:
-            place = name, message.sender
-            if place in self._sequence:
-                self.counts.lost[name] += max(
-                    message.sequence - self._sequence[place] - 1, 0
-                )
-            self._sequence[place] = max(message.sequence, self._sequence.get(place, 0))
-        log_time_ns = self.log_time_ns = self._record.write(
+            sender = (name, message.sender)
+            last = self._sequence.get(sender, message.sequence - 1)
+            self.counts.lost[name] += max(message.sequence - last - 1, 0)
+            self._sequence[sender] = max(message.sequence, last)
+        at_ns = self.log_time_ns = self._record.write(
             name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
         )
+        # of a sensor that began late
         if is_new and self._reader is not None:
             self._find_places()
         if dropped == OVERLOADED:  # all other reasons are found again
-            self.drop(name, log_time_ns, OVERLOADED, message.arrival_ns)
+            self.drop(name, at_ns, OVERLOADED, message.arrival_ns)
             return []
         if self._reader is None:
-            self._first.append((message, log_time_ns))
-            return (
-                self._all_parts(self._first)
-                if self._is_time(message) and self._set_up(self._first)
-                else []
-            )
-        if (
-            name in self._places
-            and self._brings_rows(message, log_time_ns)
-            and (held := self._begin_anew(name))
-        ):
-            return self._all_parts(held)
-        return self._parts(
-            message, log_time_ns, self._reader.read(name, message.payload, log_time_ns)
-        )
+            self._first.append((message, at_ns))
+            is_set_up = self._is_time(message) and self._set_up(self._first)
+            return self._all_parts(self._first) if is_set_up else []
+        if name in self._places:
+            rows, _ = self._rows_alone(self._places[name], message, at_ns)
+            if rows is not None and (held := self._begin_anew(name)):
+                return self._all_parts(held)
+        found = self._reader.read(name, message.payload, at_ns)
+        return self._parts(message, at_ns, found)
 
     def steps(self) -> Iterator[Measurements]:
         """Steps that are complete by now."""
-        if self._reader is not None:
-            yield from map(self._counted, self._arrivals.steps())
+        for step in self._arrivals.steps() if self._reader else ():
+            # messages of steps long ago are not waited for
+            for stamp_ns in list(self._detections):
+                if stamp_ns <= step.end_ns - FORGOTTEN_NS:
+                    del self._detections[stamp_ns]
+            yield step
 
     def finish(self) -> Iterator[Measurements]:
         """Steps that are left when nothing more will come."""
         if self._reader is not None:
-            yield from map(self._counted, self._arrivals.rest())
+            yield from self._arrivals.rest()
 
     def without_detections(self, step: Measurements, arrival_ns: int) -> Measurements:
         """A step without its detections, for an estimator that is behind; the record says so."""
         if step.detections is not None:
             for stamp_ns in np.unique(step.detections.stamps_ns).tolist():
-                for topic, log_time_ns in self._detections.pop(stamp_ns, ()):
-                    self.drop(topic, log_time_ns, OVERLOADED, arrival_ns)
+                for topic, at_ns in self._detections.pop(stamp_ns, ()):
+                    self.drop(topic, at_ns, OVERLOADED, arrival_ns)
         return replace(step, detections=None)
 
+    def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
+        """Name a message in the record as not used."""
+        self.counts.dropped[topic, reason] += 1
+        self._record.drop(topic, log_time_ns, reason, arrival_ns)
+
+    def _no_arrivals(self) -> Arrivals:
+        return Arrivals(self.options.rate_hz, self.options.lateness_s)
+
     def _add_topic(self, message: Message) -> None:
-        is_latched = message.topic.endswith("_static")
-        text = self._definition_of(message.type_name)
         kind = message.type_name
+        text = self._definition_of(kind)
         topic = Topic(
-            self.record_path,
-            message.topic,
-            kind,
-            "cdr",
-            "ros2msg",
-            text,
-            Keep.ALL,
-            is_latched=is_latched,
+            self.record_path, message.topic, kind, "cdr", "ros2msg", text, Keep.ALL
         )
+        topic.is_latched = message.topic.endswith("_static")
         self.topics[message.topic] = topic
         self._record.add_topic(topic)
 
+    def _choices(self) -> dict[str, Choice]:
+        """Choices by the topics alone, of whose messages nothing is kept."""
+        recording = Recording(self.record_path, self.topics)
+        return choose_each(recording, self.options.topics, self._config)
+
     def _find_places(self) -> None:
         """Find topics that are not in use and may be of a sensor that has none, such as detections that begin late."""
-        choices = choose_each(
-            Recording(self.record_path, self.topics), self._wanted, self._config
-        )
+        taken = {None, *self.in_use.values(), *self._unfit}
         self._places = {
-            choice.topic: choice
-            for role, choice in choices.items()
-            if role in BLOCKS.keys() - self.in_use.keys()
-            and choice.topic is not None
-            and choice.topic not in {*self.in_use.values(), *self._unfit}
+            str(choice.topic): choice
+            for role, choice in self._choices().items()
+            if role in BLOCKS.keys() - self.in_use.keys() and choice.topic not in taken
         }
 
-    def _brings_rows(self, message: Message, log_time_ns: int) -> bool:
-        """Tell whether a message has the first rows of its sensor; one that cannot be read is dropped."""
-        assert self.calibration is not None
-        choice = self._places[message.topic]
+    def _rows_alone(
+        self, choice: Choice, message: Message, at_ns: int
+    ) -> tuple[Any, bool]:
+        """Rows of a message by itself, and whether it can be read; one that cannot is dropped."""
+        topic = self.topics[message.topic].empty()
+        gather(topic, message.payload, at_ns)
+        adapter: Any = choice.adapter
         try:
-            block = _rows_in(
-                choice,
-                self.topics[message.topic],
-                [(message, log_time_ns)],
-                self.calibration,
-            )
+            setup = Setup(self.calibration or Calibration())
+            rows, _ = adapter.read(adapter.table(topic), setup)
         except Exception as error:  # whatever a sender sends
-            self.drop(
-                message.topic, log_time_ns, _unreadable(error), message.arrival_ns
-            )
-            return False
-        return block is not None
+            fault = str(error).rpartition(": topic ")[2] or type(error).__name__
+            reason = f"cannot be read: {fault}"
+            self.drop(message.topic, at_ns, reason, message.arrival_ns)
+            return None, False
+        return rows, True
 
     def _begin_anew(self, name: str) -> Held:
         """Give all steps again from the record, with a sensor whose first rows came late; nothing where that fails.
 
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
+        # the record is what is left of the messages until now
         self._record.flush()
-        dropped, needed = (
-            dropped_messages(self.record_path),
-            {*self.in_use.values(), *self._places},
-        )
+        dropped = dropped_messages(self.record_path)
+        needed = {*self.in_use.values(), *self._places}
         held = [  # without images, which would not fit into memory
             (message, message.arrival_ns)
             for message in recorded_messages(self.record_path)
             if (message.topic, message.arrival_ns) not in dropped
             and (message.topic in needed or message.topic.endswith("tf_static"))
         ]
+        # without it everything goes on as before
         if not self._set_up(held):
             self._unfit.add(name)
             self.remarks.append(f"{name} is not used: {self.waits_for}")
@@ -306,68 +295,60 @@ class Engine:
 
     def _is_time(self, message: Message) -> bool:
         """Tell whether it is time to choose topics and calibration: some seconds of both sensors of the motion."""
+        now_ns = message.arrival_ns
         if self._first_motion_ns is None:
-            choices = choose_each(
-                Recording(self.record_path, self.topics), self._wanted, self._config
-            )
-            if not all(
-                choices[role].topic or choices[role].candidates for role in MOTION
-            ):
+            motion = [self._choices()[role] for role in MOTION]
+            if not all(choice.topic or choice.candidates for choice in motion):
                 return False
-            self._first_motion_ns = self._set_up_ns = message.arrival_ns
-        since_ns = message.arrival_ns - self._set_up_ns
-        if since_ns < 0:  # this computer's clock was set
-            self._set_up_ns = message.arrival_ns
+            self._first_motion_ns = now_ns
+            self._set_up_ns = now_ns
+        # this computer's clock may be set back
+        self._set_up_ns = min(self._set_up_ns, now_ns)
+        # the longer it was in vain, the less often it is tried
         waited_ns = self._set_up_ns - self._first_motion_ns
-        if since_ns < max(SETUP_NS, waited_ns // 8):
-            return False
-        self._set_up_ns = message.arrival_ns
-        return True
+        is_time = now_ns - self._set_up_ns >= max(SETUP_NS, waited_ns // 8)
+        if is_time:
+            self._set_up_ns = now_ns
+        return is_time
 
     def _set_up(self, held: Held) -> bool:
         """Choose topics and gather the calibration from messages; False where they are not enough yet."""
-        wanted = self._wanted | self.in_use
-        recording = self._recording(held)
+        wanted = dict(self.options.topics) | self.in_use
         try:
-            choices = choose_topics(recording, wanted, self._config)
+            choices = choose_topics(self._recording(held), wanted, self._config)
         except MissingTopicError as error:  # it may still come
             self.waits_for = str(error)
             return False
         except LogError as error:  # several topics fit
-            if self._wanted.keys() - ROLES.keys():
+            if self.options.topics.keys() - ROLES.keys():
                 raise
             again = f"everything is recorded: end with Ctrl-C, and go on with --resume {self.record_path} and a choice"
             self.waits_for = f"{error}; {again}"
             return False
-        if unreadable := self._unreadable_detections(choices["detections"], held):
-            held[:] = [one for one in held if one not in unreadable]
-            recording = self._recording(held)
+        # detections that break their own rules would make the topic useless
+        detections = choices["detections"]
+        held[:] = [
+            one
+            for one in held
+            if one[0].topic != detections.topic or self._rows_alone(detections, *one)[1]
+        ]
+        recording = self._recording(held)
         try:
-            self._sonar = (
-                sonar_frame(recording, wanted.get("sonar"), self._config) or self._sonar
-            )
-            if isinstance(dvl := choices["dvl"].adapter, DvlAdapter):
-                choices = choices | {
-                    "dvl": replace(choices["dvl"], adapter=dvl.at_first())
-                }
-            assembly = Assembly(recording, choices, self._given, self._sonar)
-            choices = {
-                role: choice
-                if _is_of_use(assembly, role)
-                else replace(choice, topic=None, adapter=None)
-                for role, choice in choices.items()
-            }
-            assembly = Assembly(recording, choices, self._given, self._sonar)
+            sonar = sonar_frame(recording, wanted.get("sonar"), self._config)
+            self._sonar = sonar or self._sonar
+            dvl: Any = choices["dvl"].adapter
+            choices["dvl"] = replace(choices["dvl"], adapter=dvl.at_first())
+            assembly = self._assembly(recording, choices)
+            # a sensor of no use may become one later
+            for role, choice in choices.items():
+                if not _is_of_use(assembly, role):
+                    choices[role] = replace(choice, topic=None, adapter=None)
             tables = pinned(self._config, choices, assembly)
-            config = LogConfig.parse(
-                json.loads(json.dumps(tables)), self._config.source
-            )
-            assembly = Assembly(
-                recording,
-                choose_topics(recording, {}, config),
-                self._given,
-                self._sonar,
-            )
+            # as a later reading of the record has it
+            plain = json.loads(json.dumps(tables))
+            config = LogConfig.parse(plain, self._config.source)
+            # by the pinned configuration, as single messages are read from now on
+            assembly = self._assembly(recording, choose_topics(recording, {}, config))
             sequence = assembly.sequence("live")
             reader = MessageReader(assembly)
         except SonarGraphError as error:
@@ -376,85 +357,65 @@ class Engine:
             self.waits_for = str(error)
             return False
         self.waits_for = ""
-        frames_ns = max(
-            (at_ns for message, at_ns in held if message.topic.endswith("tf_static")),
-            default=0,
-        )
-        self.sequence, self.calibration, self.notes = (
-            sequence,
-            sequence.calibration,
-            sequence.notes,
-        )
         self._reader = reader
-        self._record.describe(
-            self.record_path.stem, self.calibration, tables, self._said, frames_ns
-        )
-        self._arrivals = Arrivals(self._rate_hz, self._lateness_s)
-        self.in_use = {
-            role: choice.topic
-            for role, choice in choices.items()
-            if choice.topic is not None
+        self.sequence = sequence
+        self.calibration = sequence.calibration
+        self.notes = sequence.notes
+        trees = [
+            at_ns for message, at_ns in held if message.topic.endswith("tf_static")
+        ]
+        said = {
+            LIVE_RATE: repr(float(self.options.rate_hz)),
+            LATENESS: repr(float(self.options.lateness_s)),
         }
+        name = self.record_path.stem
+        newest_ns = max(trees, default=0)
+        self._record.describe(name, self.calibration, tables, said, newest_ns)
+        self._arrivals = self._no_arrivals()
+        self.in_use = {role: c.topic for role, c in choices.items() if c.topic}
         self._find_places()
         return True
 
+    def _assembly(
+        self, recording: Recording, choices: Mapping[str, Choice]
+    ) -> Assembly:
+        return Assembly(recording, choices, self.options.calibration, self._sonar)
+
     def _recording(self, held: Held) -> Recording:
         topics = {name: topic.empty() for name, topic in self.topics.items()}
-        for message, log_time_ns in held:
-            _gather(topics[message.topic], message, log_time_ns)
+        for message, at_ns in held:
+            gather(topics[message.topic], message.payload, at_ns)
         return Recording(self.record_path, topics)
-
-    def _unreadable_detections(self, choice: Choice, held: Held) -> Held:
-        """Messages of detections that break their own rules, which would make the topic useless; they are dropped."""
-        found: Held = []
-        for message, log_time_ns in held:
-            if message.topic == choice.topic:
-                try:
-                    _rows_in(
-                        choice,
-                        self.topics[message.topic],
-                        [(message, log_time_ns)],
-                        Calibration(),
-                    )
-                except Exception as error:  # whatever a sender sends
-                    found.append((message, log_time_ns))
-                    self.drop(
-                        message.topic,
-                        log_time_ns,
-                        _unreadable(error),
-                        message.arrival_ns,
-                    )
-        return found
 
     def _all_parts(self, held: Held) -> list[Part]:
         """Parts of all messages until now, after the usual difference of their stamps from their arrival is known."""
         assert self._reader is not None
         found = [
-            (m, at_ns, self._reader.read(m.topic, m.payload, at_ns))
-            for m, at_ns in held
+            (message, at_ns, self._reader.read(message.topic, message.payload, at_ns))
+            for message, at_ns in held
         ]
-        first_ns = found[0][0].arrival_ns if found else 0
+        first_ns = held[0][0].arrival_ns if held else 0
         offsets_ns = sorted(
             part.stamp_ns - message.arrival_ns
             for message, _, parts in found
             for part in parts
             if not part.fault and message.arrival_ns < first_ns + SETUP_NS
         )
+        # the median, since the first message may be the wrong one
         if offsets_ns:
-            self._arrivals.expect(first_ns + offsets_ns[len(offsets_ns) // 2], first_ns)
+            usual_ns = offsets_ns[len(offsets_ns) // 2]
+            self._arrivals.expect(first_ns + usual_ns, first_ns)
         self._first = []
-        return [
-            part for m, at_ns, parts in found for part in self._parts(m, at_ns, parts)
-        ]
+        return [part for one in found for part in self._parts(*one)]
 
-    def _parts(
-        self, message: Message, log_time_ns: int, found: list[Part]
-    ) -> list[Part]:
-        parts, reasons = [], []
+    def _parts(self, message: Message, at_ns: int, found: list[Part]) -> list[Part]:
+        """Parts that are in time and can be read; a message of which none is, is dropped."""
+        parts = []
+        reasons = []
         for part in found:
             # of some rows only: these are left out of a log too
-            fault = part.fault if part.block is None else ""
-            reason = fault or self._arrivals.add(
+            reason: str | None = part.fault if part.block is None else ""
+            reason = reason or self._arrivals.add(
                 part.role, part.stamp_ns, part.block, message.arrival_ns
             )
             if reason:
@@ -462,49 +423,11 @@ class Engine:
                 continue
             parts.append(part)
             if part.role == "detections" and part.block is not None:
-                self._detections.setdefault(part.stamp_ns, []).append(
-                    (message.topic, log_time_ns)
-                )
+                names = self._detections.setdefault(part.stamp_ns, [])
+                names.append((message.topic, at_ns))
         if reasons and not parts:
-            self.drop(message.topic, log_time_ns, reasons[0], message.arrival_ns)
+            self.drop(message.topic, at_ns, reasons[0], message.arrival_ns)
         return parts
-
-    def _counted(self, step: Measurements) -> Measurements:
-        """A step, after which its messages are no longer waited for."""
-        for stamp_ns in [
-            stamp_ns
-            for stamp_ns in self._detections
-            if stamp_ns <= step.end_ns - 60 * NS_PER_S
-        ]:
-            del self._detections[stamp_ns]
-        return step
-
-    def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
-        """Name a message in the record as not used."""
-        self.counts.dropped[topic, reason] += 1
-        self._record.drop(topic, log_time_ns, reason, arrival_ns)
-
-
-def _gather(topic: Topic, message: Message, log_time_ns: int) -> None:
-    topic.gather(
-        message.payload,
-        np.zeros(1, np.int64),
-        np.array([len(message.payload)]),
-        np.array([log_time_ns]),
-    )
-
-
-def _rows_in(choice: Choice, topic: Topic, held: Held, calibration: Calibration) -> Any:
-    """Rows of some messages by themselves; None where they have none."""
-    topic = topic.empty()
-    for message, log_time_ns in held:
-        _gather(topic, message, log_time_ns)
-    adapter: Any = choice.adapter
-    source = adapter.table(topic) if adapter.reads_table else topic
-    block, _ = rows_of(adapter, source, calibration, np.eye(3), None)
-    if not topic.messages():
-        raise LogError(", ".join(topic.unsound))
-    return block
 
 
 def _is_of_use(assembly: Assembly, role: str) -> bool:
@@ -512,14 +435,6 @@ def _is_of_use(assembly: Assembly, role: str) -> bool:
     topic = assembly.topics.get(role)
     if topic is None or role in MOTION or role not in BLOCKS:
         return True
-    if not topic.messages():
-        return False
-    adapter = assembly.adapters[role]
-    return (
-        getattr(adapter, "geodetic", None) is None
-        or assembly.axes_and_origin(role)[1] is not None
-    )
-
-
-def _unreadable(error: Exception) -> str:
-    return f"cannot be read: {str(error).rpartition(': topic ')[2] or type(error).__name__}"
+    is_geodetic = getattr(assembly.adapters[role], "geodetic", None) is not None
+    has_origin = not is_geodetic or assembly.setup(role).origin is not None
+    return bool(topic.messages()) and has_origin

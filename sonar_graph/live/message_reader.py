@@ -8,32 +8,24 @@ the message. What is left is the same arithmetic, so rows are those of the log t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from itertools import pairwise
-from operator import itemgetter
-from struct import Struct, calcsize
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs import Assembly, rows_of
+from sonar_graph.live.live_messages import gather
+from sonar_graph.logs import Assembly
 from sonar_graph.logs.adapters import (
     LARGEST,
     Adapter,
     ImuAdapter,
-    axes_matrix,
+    Mask,
     field_of,
-    header_stamps_ns,
-    turned,
+    turn,
 )
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import BLOCKS, NS_PER_S, Imu, Ints
-
-ONE: Ints = np.zeros(1, np.int64)
-KINDS = {"f8": "d", "i4": "i", "u4": "I"}
-"""Numbers that are read, by their type in numpy."""
 
 
 class Part(NamedTuple):
@@ -57,24 +49,19 @@ class MessageReader:
     def __init__(self, assembly: Assembly) -> None:
         self.calibration = assembly.calibration
         self._adapters = assembly.adapters
-        self._axes_and_origin = {
-            role: assembly.axes_and_origin(role)
-            for role in assembly.topics
-            if role in BLOCKS
+        self._setups = {
+            role: assembly.setup(role) for role in assembly.topics if role in BLOCKS
         }
         self._topics: dict[str, Topic] = {}
         self._roles: dict[str, list[str]] = {}
-        for role in self._axes_and_origin:
+        self._sizes = {}
+        for role in self._setups:
             topic = assembly.topics[role]
             self._topics[topic.name] = topic.empty()
             self._roles.setdefault(topic.name, []).append(role)
+            self._sizes[role] = _sizes(self._adapters[role], topic.messages()[0])
         self._plain: dict[tuple[str, int], PlainImu | None] = {}
         """By topic and number of bytes."""
-        self._sizes = {
-            role: _sizes(self._adapters[role], assembly.topics[role].messages()[0])
-            for role in self._axes_and_origin
-            if self._adapters[role].reads_table
-        }
 
     def read(self, name: str, payload: bytes, log_time_ns: int) -> list[Part]:
         """What the message of a topic says, by role; nothing for a topic that is not used."""
@@ -85,9 +72,7 @@ class MessageReader:
                 parts.append(Part(role, int(row.stamps_ns[0]), row, ""))
                 continue
             topic = self._topics[name].empty()
-            topic.gather(
-                payload, ONE, np.array([len(payload)]), np.array([log_time_ns])
-            )
+            gather(topic, payload, log_time_ns)
             try:
                 parts.append(self._part(role, topic))
             except Exception as error:  # whatever a sender sends
@@ -104,30 +89,16 @@ class MessageReader:
 
     def _part(self, role: str, topic: Topic) -> Part:
         adapter = self._adapters[role]
-        if not adapter.reads_table:
-            groups = topic.messages()
-            block, dropped = rows_of(
-                adapter, topic, self.calibration, *self._axes_and_origin[role]
-            )
-            faults = ", ".join(topic.unsound | dropped)
-            if not groups:
-                raise LogError(faults)
-            return Part(
-                role,
-                int(header_stamps_ns(groups[0], topic.log_times_ns)[0]),
-                block,
-                faults,
-            )
         table = adapter.table(topic)
-        if _sizes(adapter, table.groups[0]) != self._sizes[role]:
+        first = table.groups[0]
+        # a log of such messages is refused, so that its record must not have them
+        if _sizes(adapter, first) != self._sizes[role]:
             raise LogError("has arrays of another length than the first messages")
-        block, dropped = rows_of(
-            adapter, table, self.calibration, *self._axes_and_origin[role]
-        )
+        block, dropped = adapter.read(table, self._setups[role])
         faults = ", ".join(topic.unsound | dropped)
-        place = topic.name, table.groups[0].payloads.shape[1]
-        if isinstance(adapter, ImuAdapter) and not faults and place not in self._plain:
-            self._plain[place] = PlainImu.like(adapter, table.groups[0])
+        place = topic.name, first.payloads.shape[1]
+        if role == "imu" and not faults and place not in self._plain:
+            self._plain[place] = PlainImu.like(adapter, first)
         return Part(role, int(table.stamps_ns[0]), block, faults)
 
 
@@ -137,123 +108,81 @@ def _sizes(adapter: Adapter, group: Messages) -> list[tuple[int, ...]]:
 
 
 class PlainImu:
-    """IMU messages of one form; made by `like`.
-
-    Parameters
-    ----------
-    adapter
-        How they are read.
-    size
-        Number of bytes.
-    same
-        Bytes that each has, and where: encapsulation, lengths, strings and booleans.
-    numbers
-        Kinds and places of seconds, nanoseconds, rates, forces, and what is -1 where one of these was not measured.
-    byte_order
-        Of the numbers, as `struct` has it.
-    """
+    """IMU messages with the form of one that was read without faults; made by `like`."""
 
     def __init__(
-        self,
-        adapter: ImuAdapter,
-        size: int,
-        same: list[tuple[int, int, bytes]],
-        numbers: list[tuple[str, int]],
-        byte_order: str,
+        self, adapter: ImuAdapter, messages: Messages, paths: list[str]
     ) -> None:
-        self._size = size
-        self._unpack_same = _unpacking(size, [(f"{b - a}s", a) for a, b, _ in same])
-        self._same = tuple(content for _, _, content in same)
-        in_order = sorted(set(numbers), key=lambda number: number[1])
-        self._unpack_numbers = _unpacking(size, in_order, byte_order)
-        self._wanted = itemgetter(*(in_order.index(number) for number in numbers))
-        scales = adapter.angular_velocity_scale, adapter.linear_acceleration_scale
-        self._scales = np.repeat(scales, 3).tolist()
+        first = messages.payloads[0]
+        self._adapter = adapter
+        self._stays = np.flatnonzero(_stays(messages))
+        self._size = len(first)
+        self._same = first[self._stays].tobytes()
+        self._numbers = np.concatenate([_bytes_of(messages, path) for path in paths])
+        stamps = (f"{adapter.stamp}.sec", f"{adapter.stamp}.nanosec")
+        self._stamp = [_bytes_of(messages, path) for path in stamps]
+        self._order = messages.layout.byte_order
+        scales = [adapter.angular_velocity_scale, adapter.linear_acceleration_scale]
+        self._scales = np.repeat(scales, 3)
         self._offset_ns = round(adapter.stamp_offset_s * NS_PER_S)
-        self._axes = (
-            None if adapter.rotation == "flu" else axes_matrix(adapter.rotation)
-        )
 
     @classmethod
     def like(cls, adapter: ImuAdapter, messages: Messages) -> PlainImu | None:
-        """Form of a message that was read without faults; None where it takes more than numbers to read it."""
+        """Form of a message; None where it takes more than double precision numbers to read it."""
         if adapter.linear_acceleration is None:
             return None
-        if adapter.angular_velocity_axes is not None:
+        status = (adapter.angular_velocity_status, adapter.linear_acceleration_status)
+        axes = (*adapter.angular_velocity, *adapter.linear_acceleration)
+        paths = [*axes, *filter(None, status)]
+        columns = messages.layout.columns
+        names = {field_of(path)[0] for path in paths}
+        if not {*names, f"{adapter.stamp}.sec"} <= columns.keys():
             return None
-        stamp = f"{adapter.stamp}.sec", f"{adapter.stamp}.nanosec"
-        status = [
-            path
-            for path in (
-                adapter.angular_velocity_status,
-                adapter.linear_acceleration_status,
-            )
-            if path
-        ]
-        numbers = []
-        for path in (
-            *stamp,
-            *adapter.angular_velocity,
-            *adapter.linear_acceleration,
-            *status,
-        ):
-            name, index = field_of(path)
-            if name not in messages.layout.columns:
-                return None
-            column = messages.layout.column(name)
-            kind = KINDS.get(f"{column.dtype.kind}{column.dtype.itemsize}")
-            if kind is None or (kind == "d") == (path in stamp):
-                return None  # of single precision, scaling would round otherwise
-            numbers.append(
-                (kind, column.starts[0] + (index or 0) * column.dtype.itemsize)
-            )
-        payload = messages.payloads[0].tobytes()
-        same = [(a, b, payload[a:b]) for a, b in _runs_that_stay(messages)]
-        return cls(adapter, len(payload), same, numbers, messages.layout.byte_order)
+        # of single precision, scaling would round otherwise
+        kinds = {messages.layout.column(name).dtype.str[1:] for name in names}
+        return cls(adapter, messages, paths) if kinds == {"f8"} else None
 
     def row(self, payload: bytes) -> Imu | None:
         """The row of a message; None for one that the adapter must read."""
-        if len(payload) != self._size or self._unpack_same(payload) != self._same:
+        data = np.frombuffer(payload, np.uint8)
+        if len(data) != self._size or data[self._stays].tobytes() != self._same:
             return None
-        seconds, nanoseconds, *numbers = self._wanted(self._unpack_numbers(payload))
+        seconds, nanoseconds = (
+            int(data[place].view(f"{self._order}{kind}")[0])
+            for place, kind in zip(self._stamp, ("i4", "u4"), strict=True)
+        )
         stamp_ns = seconds * NS_PER_S + nanoseconds
-        values = [
-            value * scale
-            for value, scale in zip(numbers[:6], self._scales, strict=True)
-        ]
-        if not (
-            stamp_ns
-            and -1 not in numbers[6:]
-            and any(values[3:])
-            and sum(map(abs, values)) < LARGEST
-        ):
+        numbers = data[self._numbers].view(f"{self._order}f8")
+        values = numbers[:6] * self._scales
+        is_sound = np.abs(values).max() < LARGEST and values[3:].any()
+        if stamp_ns == 0 or not is_sound or (numbers[6:] == -1).any():
             return None
-        rate, force = np.array(values).reshape(2, 1, 3)
-        if self._axes is not None:
-            rate, force = turned(self._axes, rate), turned(self._axes, force)
-        return Imu.of_valid(np.array([stamp_ns + self._offset_ns]), rate, force)
+        rate, force = values.reshape(2, 1, 3)
+        rotation = self._adapter.rotation
+        rate = turn(rotation, rate)
+        if self._adapter.angular_velocity_axes is not None:
+            rate = turn(self._adapter.angular_velocity_axes, rate)
+        stamps_ns = np.array([stamp_ns + self._offset_ns])
+        return Imu.of_valid(stamps_ns, rate, turn(rotation, force))
 
 
-def _unpacking(
-    size: int, fields: list[tuple[str, int]], byte_order: str = "<"
-) -> Callable[[bytes], tuple[Any, ...]]:
-    """Function that unpacks fields, their kinds and places in order, of so many bytes."""
-    kinds, end = byte_order, 0
-    for kind, at in fields:
-        kinds += f"{at - end}x{kind}"
-        end = at + calcsize(f"={kind}")
-    return Struct(f"{kinds}{size - end}x").unpack
+def _bytes_of(messages: Messages, path: str) -> Ints:
+    """Places of the bytes of a number in a message."""
+    name, index = field_of(path)
+    column = messages.layout.column(name)
+    size = column.dtype.itemsize
+    return column.starts[0] + (index or 0) * size + np.arange(size)
 
 
-def _runs_that_stay(messages: Messages) -> Iterator[tuple[int, int]]:
-    """Beginnings and ends of the bytes that decide where the numbers are, and whether the message is sound."""
-    layout, stays = messages.layout, np.zeros(messages.payloads.shape[1] + 2, bool)
-    stays[1:3] = True
+def _stays(messages: Messages) -> Mask:
+    """Mask of the bytes that decide where the numbers are, and whether the message is sound."""
+    layout = messages.layout
+    stays = np.zeros(messages.payloads.shape[1], bool)
+    stays[:2] = True  # the byte order
     for at, _ in layout.words:
-        stays[at + 1 : at + 5] = True
+        stays[at : at + 4] = True
     for path in (*layout.plan.texts, *layout.plan.booleans):
         column = layout.column(path)
         for start, count in zip(column.starts, column.counts, strict=True):
-            stays[start + 1 : start + 1 + count] = True
-    ends = np.flatnonzero(stays[1:] != stays[:-1]).tolist()
-    yield from list(pairwise(ends))[::2]
+            stays[start : start + count] = True
+    return stays

@@ -54,10 +54,6 @@ STATE_S = 1.0
 LINE_WIDTH = 200
 WAITING_S = 5.0
 """Time after which the user is told what is missing for an estimate."""
-MOST_WAITING_S = 2.0
-"""Time of steps that may wait for the estimator before the oldest lose their detections."""
-
-
 MOST_STEPS_AT_ONCE = 50
 MOST_DURATIONS = 20_000
 WARM_UP = MissionOptions(
@@ -93,19 +89,9 @@ class LiveRun:
         status: Callable[[str], None] | None = None,
     ) -> None:
         self.inbox = Inbox()
-        self.engine = Engine(
-            record,
-            definition_of,
-            rate_hz=options.rate_hz,
-            lateness_s=options.lateness_s,
-            wanted=options.topics,
-            config=options.config,
-            calibration=options.calibration,
-        )
-        self.predict_s: list[float] = []
-        """Durations of the newest predictions, by the wall clock."""
+        self.engine = Engine(record, definition_of, options)
         self.predict_cpu_s: list[float] = []
-        """The same by this thread's own time: what other threads and processes take meanwhile does not count."""
+        """Durations of the newest predictions by this thread's own time, without what other threads take meanwhile."""
         self._record = record
         self._options = options
         self._outlets = outlets
@@ -118,26 +104,27 @@ class LiveRun:
         self._forms = PoseForms()
         self._answers: deque[Answer] = deque()
         # compiles in its process meanwhile
-        self._images = LiveImages(self.engine, options)
+        self._images = LiveImages(self.engine)
         warm_up = simulate_mission(WARM_UP)
         self._worker = Worker(
-            options.estimator,
-            dict(options.overrides),
+            options,
             warm_up,
-            options.rate_hz,
             self._answers.append,
-            max(1, round(MOST_WAITING_S * options.rate_hz)),
             lambda step: self.engine.without_detections(step, time.time_ns()),
         )
+        # in this process, whose predictions must not wait for a compiler
         warm_predictor(warm_up)
         self._predictor: Predictor | None = None
         self._silence = Silence()
         self._is_failed = False
         self._is_quiet = False  # while what an earlier run had is taken in: nobody waits for those poses
         self._generation = -1
-        self._flushed_s = self._stated_s = self._listened_s = time.monotonic()
+        self._done_s: dict[str, float] = {}
+        """When each thing that is done now and then was done last."""
         self._withheld: list[str] = []
-        self._latency_ns = self._estimates = self._newest_ns = self._next_frame_ns = 0
+        self._estimates = 0
+        self._next_frame_ns = 0
+        self._latency_ns = 0
         self._longest_update_s = 0.0
 
     def wait_for_recogniser(self) -> None:
@@ -162,34 +149,34 @@ class LiveRun:
         self, messages: Iterator[Message], dropped: Mapping[tuple[str, int], str]
     ) -> int:
         """Take the messages of an earlier record, with what was dropped then; the time of arrival of the last."""
-        last_ns, self._is_quiet = 0, True
+        last_ns = 0
+        self._is_quiet = True
+        worker = self._worker
         for message in messages:
             last_ns = max(last_ns, message.arrival_ns)
             self._take(message, dropped.get((message.topic, message.arrival_ns)))
             for step in self.engine.steps():
-                self._worker.add(step)
-            while (
-                self._worker.waiting or self._worker.is_busy
-            ) and self._worker.error is None:
+                worker.add(step)
+            # an estimator that is behind would lose detections
+            while worker.error is None and (worker.waiting or worker.is_busy):
                 time.sleep(1e-4)
-            while self._answers:
-                self._use(self._answers.popleft())
+            self._use_answers()
         self._record.flush()
         self._is_quiet = False
         return last_ns
 
+    def _lost(self) -> dict[str, int]:
+        """Numbers of messages that were lost on the way, by topic."""
+        return dict(sorted((+(self.engine.counts.lost + self.inbox.dropped)).items()))
+
     def counts(self) -> dict[str, dict[str, int]]:
         """Numbers of messages received, lost and dropped, by topic, and by topic and reason."""
         counts = self.engine.counts
-        dropped = {
-            f"{name}: {why}": number
-            for (name, why), number in sorted(counts.dropped.items())
-        }
-        lost = +(counts.lost + self.inbox.dropped)
+        dropped = sorted(counts.dropped.items())
         return {
             "received": dict(sorted(counts.received.items())),
-            "lost": dict(sorted(lost.items())),
-            "dropped": dropped,
+            "lost": self._lost(),
+            "dropped": {f"{name}: {why}": number for (name, why), number in dropped},
         }
 
     def lacking(self) -> str:
@@ -209,37 +196,41 @@ class LiveRun:
         for message in messages:
             self._silence.heard(message.topic, time.monotonic())
             self._take(message)
+        # each message gives the steps that it completes; the rest of many comes now
         if not messages:
             self._give_steps()
-        while self._answers:
-            self._use(self._answers.popleft())
+        self._use_answers()
         if failure := self._images.failure():
             self._said(failure)
         for stamp_ns, detections in self._images.recognised():
+            # recorded like detections of a robot, so that the record gives the same estimates
             payload = payload_of_detections(detections, stamp_ns)
             self._put(DETECTED, payload)
             self._take(Message(DETECTED, TOPICS[DETECTED], payload, time.time_ns()))
-        now_s = time.monotonic()
-        if self._predictor is None and now_s > self._stated_s + WAITING_S:
+        if self._predictor is None and self._elapsed_s("waiting", WAITING_S):
             self._said(f"waiting: {self.lacking()}")
-            self._stated_s = now_s
-        if now_s > self._flushed_s + FLUSH_S:
+        if self._elapsed_s("flush", FLUSH_S):
             self._record.flush()
-            self._flushed_s = now_s
-        if now_s > self._stated_s + STATE_S and self._predictor is not None:
-            self._state(now_s - self._stated_s)
-            self._stated_s = now_s
-        if now_s > self._listened_s + STATE_S and self.inbox.is_empty:
-            # messages that wait in the inbox were not silent
-            motion = {
-                topic for role, topic in self.engine.in_use.items() if role in MOTION
-            }
-            for line in self._silence.lines(motion, now_s):
+        has_pose = self._predictor is not None
+        if has_pose and (period_s := self._elapsed_s("state", STATE_S)):
+            self._state(period_s)
+        # messages that wait in the inbox were not silent
+        if self.inbox.is_empty and self._elapsed_s("silence", STATE_S):
+            motion = {self.engine.in_use[role] for role in MOTION if self.engine.in_use}
+            for line in self._silence.lines(motion, time.monotonic()):
                 self._said(line)
-            self._listened_s = now_s
         if self._worker.error is not None and not self._is_failed:
             self._is_failed = True
             self._said(f"{self._failure()}; everything is still recorded")
+
+    def _elapsed_s(self, what: str, period_s: float) -> float:
+        """Seconds since something was done last, where it is to be done again after a period; else 0."""
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._done_s.setdefault(what, now_s)
+        if elapsed_s <= period_s:
+            return 0.0
+        self._done_s[what] = now_s
+        return elapsed_s
 
     def finish(self) -> LiveOutcome | None:
         """LiveOutcome when no more messages will come; None where nothing could be estimated."""
@@ -284,10 +275,8 @@ class LiveRun:
         for remark in self.engine.remarks:
             self._said(remark)
         self.engine.remarks.clear()
-        if (
-            self.engine.calibration is not None
-            and self._generation != self.engine.generation
-        ):
+        is_ready = self.engine.calibration is not None
+        if is_ready and self._generation != self.engine.generation:
             self._begin()
         if not self._is_quiet:
             self._images.take(message, parts)
@@ -304,20 +293,18 @@ class LiveRun:
 
     def _move_on(self, parts: list[Part], arrival_ns: int) -> None:
         for part in parts:
-            if part.role == "detections" and part.block is not None and len(part.block):
-                self._now.detected_ns = max(self._now.detected_ns, part.stamp_ns)
-            if (
-                self._predictor is None
-                or part.role not in ("imu", "dvl")
-                or part.block is None
-            ):
+            if part.block is None:
                 continue
-            is_imu = part.role == "imu"
-            self._predictor.add(
-                part.block if is_imu else None, None if is_imu else part.block
-            )
-            if is_imu and part is parts[-1] and not self._is_quiet:
-                self._predict(arrival_ns)
+            if part.role == "detections" and len(part.block):
+                self._now.detected_ns = max(self._now.detected_ns, part.stamp_ns)
+            if self._predictor is None or part.role not in MOTION:
+                continue
+            # the predictor does not wait for steps
+            rows = [part.block if part.role == role else None for role in MOTION]
+            self._predictor.add(*rows)
+            # of many rows at once only the newest pose is of use
+            if part.role == "imu" and part is parts[-1] and not self._is_quiet:
+                self._predict(self._predictor, arrival_ns)
 
     def _fault(self, what: str, error: Exception) -> None:
         """Say once what went wrong with a topic, and go on."""
@@ -329,45 +316,42 @@ class LiveRun:
 
     def _begin(self) -> None:
         assert self.engine.calibration is not None
-        options, calibration = self._options, self.engine.calibration
         self._generation = self.engine.generation
         if self._generation:
             self._said(
                 "a further sensor has come: estimating anew from the beginning of the record"
             )
-        for subject in ("log.topics", "log.calibration", "log.start"):
-            if subject in self.engine.notes:
-                self._said(
-                    shorten(
-                        f"{subject.removeprefix('log.')}: {self.engine.notes[subject]}",
-                        LINE_WIDTH,
-                    )
-                )
+        notes = self.engine.notes
+        for subject in ("topics", "calibration", "start"):
+            if text := notes.get(f"log.{subject}"):
+                self._said(shorten(f"{subject}: {text}", LINE_WIDTH))
         for subject in ("log.doubtful", "log.warnings"):
-            for warning in self.engine.notes.get(subject, "").split("; "):
+            for warning in notes.get(subject, "").split("; "):
                 # the odometry after the newest has not come yet
                 if warning and not warning.startswith("detections:"):
                     self._said(f"warning: {warning}")
-        self._worker.begin(calibration)
-        self._predictor = Predictor(calibration)
-        self._newest_ns = self._next_frame_ns = 0
-        self._said(f"estimating by {options.estimator}; Ctrl-C ends")
+        self._worker.begin(self.engine.calibration)
+        self._predictor = Predictor(self.engine.calibration)
+        self._now.newest_ns = 0
+        self._next_frame_ns = 0
+        self._said(f"estimating by {self._options.estimator}; Ctrl-C ends")
 
-    def _predict(self, arrival_ns: int) -> None:
-        assert self._predictor is not None
-        before_s, before_cpu_s = time.perf_counter(), time.thread_time()
-        at = self._predictor.predict()
-        if at is None or at.stamp_ns <= self._newest_ns:
+    def _predict(self, predictor: Predictor, arrival_ns: int) -> None:
+        before_s = time.thread_time()
+        at = predictor.predict()
+        if at is None or at.stamp_ns <= self._now.newest_ns:
             return
-        self.predict_cpu_s.append(time.thread_time() - before_cpu_s)
-        self.predict_s.append(time.perf_counter() - before_s)
-        self._newest_ns = at.stamp_ns
+        self.predict_cpu_s.append(time.thread_time() - before_s)
         self._now.predicted(at)
         self._put("/sonar_graph/odometry", self._forms.odometry(at))
         if at.stamp_ns >= self._next_frame_ns:
             self._next_frame_ns = at.stamp_ns + FRAME_PERIOD_NS
             self._put("/tf", self._forms.body(at))
         self._latency_ns = max(self._latency_ns, time.time_ns() - arrival_ns)
+
+    def _use_answers(self) -> None:
+        while self._answers:
+            self._use(self._answers.popleft())
 
     def _use(self, answer: Answer) -> None:
         assert self._predictor is not None
@@ -379,54 +363,51 @@ class LiveRun:
             self._now.landmarks = len(answer.landmarks)
         for estimate in answer.estimates:
             self._put("/sonar_graph/pose", self._forms.estimate(estimate))
-        if answer.estimates:
-            newest = answer.estimates[-1]
-            self._predictor.correct(newest)
-            self._put(
-                "/tf",
-                self._forms.correction(newest.stamp_ns, self._predictor.map_T_odom),
-            )
-            if answer.landmarks is not None and len(answer.landmarks):
-                landmarks, markers = payloads_of_map(answer.landmarks, newest.stamp_ns)
-                self._put("/sonar_graph/landmarks", landmarks)
-                self._put("/sonar_graph/markers", markers)
+        if not answer.estimates:
+            return
+        newest = answer.estimates[-1]
+        self._predictor.correct(newest)
+        map_T_odom = self._predictor.map_T_odom
+        self._put("/tf", self._forms.correction(newest.stamp_ns, map_T_odom))
+        if answer.landmarks is not None and len(answer.landmarks):
+            landmarks, markers = payloads_of_map(answer.landmarks, newest.stamp_ns)
+            self._put("/sonar_graph/landmarks", landmarks)
+            self._put("/sonar_graph/markers", markers)
 
     def _state(self, period_s: float) -> None:
         """Publish the state of the seconds since the last one, and give its line to the user."""
-        counts = self.engine.counts
-        lost = +(counts.lost + self.inbox.dropped)
+        dropped = self.engine.counts.dropped
+        lost = self._lost()
+        p99_s = np.percentile(self.predict_cpu_s or [np.nan], 99)
+        lists = {
+            "lost": ", ".join(f"{name} {n}" for name, n in lost.items()),
+            "dropped": ", ".join(
+                f"{name} {n} {why}" for (name, why), n in sorted(dropped.items())
+            ),
+            "withheld": "; ".join(self._withheld),
+        }
         values = {
             "latency_ms": f"{self._latency_ns * 1e-6:.1f}",
             "longest_update_ms": f"{self._longest_update_s * 1e3:.1f}",
-            "predictor_p99_us": f"{1e6 * np.percentile(self.predict_s or [np.nan], 99):.0f}",
-            "predictor_cpu_p99_us": f"{1e6 * np.percentile(self.predict_cpu_s or [np.nan], 99):.0f}",
+            "predictor_cpu_p99_us": f"{1e6 * p99_s:.0f}",
             "steps_waiting": str(self._worker.waiting),
             "images_waiting": str(self.images_waiting),
             "estimates": str(self._estimates),
-            "lost": ", ".join(f"{name} {n}" for name, n in sorted(lost.items()))
-            or "none",
-            "dropped": ", ".join(
-                f"{name} {n} {why}" for (name, why), n in sorted(counts.dropped.items())
-            )
-            or "none",
-            "withheld": "; ".join(self._withheld) or "none",
+            **{name: text or "none" for name, text in lists.items()},
         }
-        is_well = not (lost or counts.dropped or self._withheld)
+        is_well = not any(lists.values())
         summary = "running" if is_well else "messages are lost, dropped or withheld"
-        self._put(
-            "/sonar_graph/state",
-            payload_of_state(self._newest_ns, is_well, summary, values),
-        )
+        state = payload_of_state(self._now.newest_ns, is_well, summary, values)
+        self._put("/sonar_graph/state", state)
         if self._status is not None:
-            line = self._now.line(
-                dropped=counts.dropped.total() + lost.total(),
-                latency_ms=self._latency_ns * 1e-6,
-                period_s=period_s,
+            gone = dropped.total() + sum(lost.values())
+            latency_ms = self._latency_ns * 1e-6
+            self._status(
+                self._now.line(dropped=gone, latency_ms=latency_ms, period_s=period_s)
             )
-            self._status(line)
         self._latency_ns = 0
         self._longest_update_s = 0.0
-        del self.predict_s[:-MOST_DURATIONS], self.predict_cpu_s[:-MOST_DURATIONS]
+        del self.predict_cpu_s[:-MOST_DURATIONS]
 
     def _put(self, topic: str, payload: bytes) -> None:
         for outlet in self._outlets:
@@ -435,7 +416,8 @@ class LiveRun:
 
 def warm_predictor(world: Sequence) -> None:
     """Compile what predictions and their messages need, over a gap of the Doppler log too."""
-    predictor, forms = Predictor(world.calibration), PoseForms()
+    predictor = Predictor(world.calibration)
+    forms = PoseForms()
     for k, step in enumerate(world.replay(world.instants(1.0))):
         predictor.add(step.imu, None if 10 < k < 15 else step.dvl)
         if k < 10:

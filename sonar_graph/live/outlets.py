@@ -13,13 +13,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from struct import Struct
 from typing import Any, Protocol
 
+import gtsam
 import numpy as np
 
 from sonar_graph.errors import LogError
@@ -27,9 +26,9 @@ from sonar_graph.live.foxglove_link import FoxgloveLink
 from sonar_graph.live.predictor import Prediction
 from sonar_graph.live.zenoh_link import Publisher, ZenohLink
 from sonar_graph.logs import detection_messages, landmark_map_message, landmark_markers
+from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Decoder, definition, encode, parse_definition
 from sonar_graph.measurements import NS_PER_S, Floats, LandmarkDetections
-from sonar_graph.numerics import Mat6, compiled, mat, mat6, quaternion, store6
 from sonar_graph.states import Estimate, LandmarkMap
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -47,7 +46,11 @@ TOPICS = {
     DETECTED: "sonar_graph_msgs/msg/LandmarkDetections",
 }
 OWN = "/sonar_graph/"
-WORLD_FRAME, ODOM_FRAME, BODY_FRAME = "map", "odom", "base_link"
+WORLD_FRAME = "map"
+ODOM_FRAME = "odom"
+BODY_FRAME = "base_link"
+STAMP = Struct("<iI")
+"""Seconds and nanoseconds."""
 COLOUR = (0.12, 0.47, 0.71, 0.9)
 TEXT_HEIGHT_M = 0.15
 
@@ -60,59 +63,91 @@ class Outlet(Protocol):
 
 
 class Form:
-    """A message of fixed layout whose numbers are replaced in place, since encoding anew takes ten times as long."""
+    """A message of fixed layout whose stamp and numbers are replaced, since encoding anew takes ten times as long.
+
+    ``stamp`` and ``numbers`` are the paths of the seconds and of the first of the numbers, which follow each other.
+    """
 
     def __init__(
         self,
         type_name: str,
         values: Mapping[str, Any],
+        numbers: str = "pose.pose.position.x",
+        stamp: str = "header.stamp.sec",
         lengths: Mapping[str, int] | None = None,
     ) -> None:
         struct = parse_definition(type_name, definition(type_name))
         encoded = encode(struct, 1, values, lengths)
         (messages,) = Decoder(struct).decode([(np.zeros(1, np.int64), encoded)]).groups
-        self._bytes, self._layout = bytearray(encoded.tobytes()), messages.layout
+        self._bytes = bytearray(encoded.tobytes())
+        self._stamp_at = messages.layout.column(stamp).starts[0]
+        self._numbers_at = messages.layout.column(numbers).starts[0]
 
-    def stamp(self, path: str) -> Callable[[int, int], None]:
-        """Function that writes seconds and nanoseconds of the stamp that is there."""
-        return partial(
-            Struct("<iI").pack_into, self._bytes, self._layout.column(path).starts[0]
-        )
-
-    def numbers(self, path: str, count: int) -> Floats:
-        """Successive numbers from a field on, in place, shape (count,)."""
-        return np.frombuffer(
-            self._bytes, "<f8", count, self._layout.column(path).starts[0]
-        )
-
-    def payload(self) -> bytes:
-        """The message as it is now."""
+    def payload(self, stamp_ns: int, *numbers: Floats) -> bytes:
+        """The message at a stamp."""
+        STAMP.pack_into(self._bytes, self._stamp_at, *divmod(stamp_ns, NS_PER_S))
+        # numbers in a message are not aligned, so that no array can be a view of them
+        content = np.concatenate([part.ravel() for part in numbers]).tobytes()
+        self._bytes[self._numbers_at : self._numbers_at + len(content)] = content
         return bytes(self._bytes)
 
 
-@compiled
-def write_pose(world_T_body: Floats, place: Floats) -> None:
-    """Fill in position and quaternion, scalar last, shape (7,)."""
-    v, w = quaternion(mat(world_T_body))
-    scale = 1.0 / math.sqrt(v @ v + w * w)
-    place[0], place[1], place[2] = (
-        world_T_body[0, 3],
-        world_T_body[1, 3],
-        world_T_body[2, 3],
-    )
-    place[3], place[4], place[5], place[6] = (
-        scale * v.x,
-        scale * v.y,
-        scale * v.z,
-        scale * w,
-    )
+def frame_form(parent: str, child: str) -> Form:
+    """``tf2_msgs/TFMessage`` of one frame in another."""
+    part = "transforms.header"
+    names = {f"{part}.frame_id": parent, "transforms.child_frame_id": child}
+    numbers = "transforms.transform.translation.x"
+    return Form(TF, names, numbers, f"{part}.stamp.sec", {"transforms": 1})
 
 
-@compiled
-def write_covariance(world_T_body: Floats, covariance: Floats, out: Floats) -> None:
-    """Fill in the covariance as `body_to_ros` has it: of [position, rotation] along the world's axes, shape (6, 6)."""
-    R, P = mat(world_T_body), mat6(covariance)
-    store6(Mat6(R @ P.d @ R.T, R @ P.c @ R.T, R @ P.b @ R.T, R @ P.a @ R.T), out)
+def place(world_T_body: Floats) -> Floats:
+    """Position and quaternion, scalar last, of a pose as a matrix, shape (7,)."""
+    turn: Any = gtsam.Rot3(world_T_body[:3, :3]).toQuaternion()
+    return np.concatenate([world_T_body[:3, 3], turn.coeffs()])
+
+
+class PoseForms:
+    """Messages of predictions and estimates."""
+
+    def __init__(self) -> None:
+        in_world = {"header.frame_id": WORLD_FRAME}
+        self._odometry = Form(ODOMETRY, in_world | {"child_frame_id": BODY_FRAME})
+        self._estimate = Form(TOPICS["/sonar_graph/pose"], in_world)
+        self._correction = frame_form(WORLD_FRAME, ODOM_FRAME)
+        self._body = frame_form(ODOM_FRAME, BODY_FRAME)
+
+    def odometry(self, at: Prediction) -> bytes:
+        """``nav_msgs/Odometry``."""
+        T = at.world_T_body
+        covariance = body_to_ros(at.covariance[None], T[None, :3, :3])
+        # velocities follow the covariance of the pose
+        return self._odometry.payload(
+            at.stamp_ns, place(T), covariance, at.velocity_m_s
+        )
+
+    def estimate(self, at: Estimate) -> bytes:
+        """``PoseWithCovarianceStamped``; zeros in place of a covariance that is not known."""
+        T = at.world_T_body.matrix()
+        covariance = body_to_ros(at.covariance[None], T[None, :3, :3])
+        return self._estimate.payload(at.stamp_ns, place(T), covariance)
+
+    def correction(self, stamp_ns: int, map_T_odom: Floats) -> bytes:
+        """``tf2_msgs/TFMessage`` of ``odom`` in ``map``."""
+        return self._correction.payload(stamp_ns, place(map_T_odom))
+
+    def body(self, at: Prediction) -> bytes:
+        """``tf2_msgs/TFMessage`` of the body in ``odom``."""
+        return self._body.payload(at.stamp_ns, place(at.odom_T_body))
+
+
+def encoded(
+    kind: str, stamp_ns: int, values: Mapping[str, Any], lengths: Any = None
+) -> bytes:
+    """A message with a header."""
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    stamp = {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds}
+    struct = parse_definition(kind, definition(kind))
+    return encode(struct, 1, {**stamp, **values}, lengths)[0].tobytes()
 
 
 def payload_of_detections(
@@ -121,125 +156,31 @@ def payload_of_detections(
     """``LandmarkDetections`` of a sonar image, also of one without any."""
     if detections is not None:
         return detection_messages("", detections)[0].payloads[0].tobytes()
-    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    struct = parse_definition(TOPICS[DETECTED], definition(TOPICS[DETECTED]))
-    return encode(
-        struct, 1, {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds}
-    )[0].tobytes()
+    return encoded(TOPICS[DETECTED], stamp_ns, {})
 
 
 def payloads_of_map(landmarks: LandmarkMap, stamp_ns: int) -> tuple[bytes, bytes]:
     """``LandmarkMap`` and ``MarkerArray`` of a map."""
-    markers = landmark_markers("", landmarks, stamp_ns, COLOUR, TEXT_HEIGHT_M)
-    return landmark_map_message("", landmarks, stamp_ns).payloads[
-        0
-    ].tobytes(), markers.payloads[0].tobytes()
-
-
-class PoseForm(Form):
-    """A message with a stamp, a pose and its covariance."""
-
-    def __init__(self, type_name: str, values: Mapping[str, Any]) -> None:
-        super().__init__(type_name, {"header.frame_id": WORLD_FRAME, **values})
-        self._stamp = self.stamp("header.stamp.sec")
-        self._in_message, self._numbers = (
-            self.numbers("pose.pose.position.x", 43),
-            np.empty(43),
-        )
-        self._place, self._covariance = (
-            self._numbers[:7],
-            self._numbers[7:].reshape(6, 6),
-        )
-
-    def write(self, stamp_ns: int, world_T_body: Floats, covariance: Floats) -> None:
-        """Write them; the covariance is known."""
-        write_pose(world_T_body, self._place)
-        write_covariance(world_T_body, covariance, self._covariance)
-        self._stamp(*divmod(stamp_ns, NS_PER_S))
-        # which numbers of a message are not aligned for
-        self._in_message[:] = self._numbers
-
-
-class FrameForm(Form):
-    """``tf2_msgs/TFMessage`` of one frame in another."""
-
-    def __init__(self, parent: str, child: str) -> None:
-        names = {
-            "transforms.header.frame_id": parent,
-            "transforms.child_frame_id": child,
-        }
-        super().__init__(TF, names, {"transforms": 1})
-        self._stamp = self.stamp("transforms.header.stamp.sec")
-        self._in_message, self._place = (
-            self.numbers("transforms.transform.translation.x", 7),
-            np.empty(7),
-        )
-
-    def of(self, stamp_ns: int, pose: Floats) -> bytes:
-        """The message at a stamp."""
-        write_pose(pose, self._place)
-        self._stamp(*divmod(stamp_ns, NS_PER_S))
-        self._in_message[:] = self._place
-        return self.payload()
-
-
-class PoseForms:
-    """Messages of predictions and estimates."""
-
-    def __init__(self) -> None:
-        self._odometry = PoseForm(ODOMETRY, {"child_frame_id": BODY_FRAME})
-        self._velocity = self._odometry.numbers("twist.twist.linear.x", 3)
-        self._estimate = PoseForm(TOPICS["/sonar_graph/pose"], {})
-        self._correction, self._body = (
-            FrameForm(WORLD_FRAME, ODOM_FRAME),
-            FrameForm(ODOM_FRAME, BODY_FRAME),
-        )
-
-    def odometry(self, at: Prediction) -> bytes:
-        """``nav_msgs/Odometry``."""
-        self._odometry.write(at.stamp_ns, at.world_T_body, at.covariance)
-        self._velocity[:] = at.velocity_m_s
-        return self._odometry.payload()
-
-    def estimate(self, at: Estimate) -> bytes:
-        """``PoseWithCovarianceStamped``; zeros in place of a covariance that is not known."""
-        covariance = np.ascontiguousarray(np.nan_to_num(at.covariance, nan=0.0))
-        self._estimate.write(
-            at.stamp_ns, np.ascontiguousarray(at.world_T_body.matrix()), covariance
-        )
-        return self._estimate.payload()
-
-    def correction(self, stamp_ns: int, map_T_odom: Floats) -> bytes:
-        """``tf2_msgs/TFMessage`` of ``odom`` in ``map``."""
-        return self._correction.of(stamp_ns, map_T_odom)
-
-    def body(self, at: Prediction) -> bytes:
-        """``tf2_msgs/TFMessage`` of the body in ``odom``."""
-        return self._body.of(at.stamp_ns, at.odom_T_body)
+    messages = (
+        landmark_map_message("", landmarks, stamp_ns),
+        landmark_markers("", landmarks, stamp_ns, COLOUR, TEXT_HEIGHT_M),
+    )
+    in_map, markers = (message.payloads[0].tobytes() for message in messages)
+    return in_map, markers
 
 
 def payload_of_state(
     stamp_ns: int, is_well: bool, summary: str, values: Mapping[str, str]
 ) -> bytes:
     """``DiagnosticArray`` with one status."""
-    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    said: dict[str, Any] = {
-        "header.stamp.sec": seconds,
-        "header.stamp.nanosec": nanoseconds,
-    }
-    said |= {
+    said = {
         "status.level": 0 if is_well else 1,
         "status.name": "sonar_graph",
         "status.message": summary,
-    }
-    said |= {
         "status.values.key": list(values),
         "status.values.value": list(values.values()),
     }
-    struct = parse_definition(STATE, definition(STATE))
-    return encode(struct, 1, said, {"status": 1, "status.values": len(values)})[
-        0
-    ].tobytes()
+    return encoded(STATE, stamp_ns, said, {"status": 1, "status.values": len(values)})
 
 
 @dataclass
@@ -256,6 +197,8 @@ class Status:
     """Stamp of the first prediction."""
     at: Prediction | None = None
     """Newest prediction."""
+    newest_ns: int = 0
+    """Stamp of the newest prediction since the estimator began."""
     predictions: int = 0
     estimates: int = 0
     landmarks: int = 0
@@ -266,21 +209,19 @@ class Status:
         """Count a prediction."""
         self.start_ns = self.start_ns or at.stamp_ns
         self.at = at
+        self.newest_ns = at.stamp_ns
         self.predictions += 1
 
     def line(self, *, dropped: int, latency_ms: float, period_s: float) -> str:
         """The line, and counts from zero again."""
         if self.at is None:
             return "no pose yet: it needs rows of IMU and Doppler log"
-        world_R_body = self.at.world_T_body[:3, :3]
-        of_position = world_R_body @ self.at.covariance[3:, 3:] @ world_R_body.T
-        sigmas_m = np.sqrt(np.diag(of_position))  # (3,), along the world's axes
-        place = ", ".join(
-            f"{axis} {value:.2f} ± {sigma:.2f}"
-            for axis, value, sigma in zip(
-                "xyz", self.at.world_T_body[:3, 3], sigmas_m, strict=True
-            )
-        )
+        T = self.at.world_T_body
+        C = body_to_ros(self.at.covariance[None], T[None, :3, :3])[0]
+        # of the position, along the world's axes
+        sigmas_m = np.sqrt(np.diag(C)[:3])
+        numbers = zip("xyz", T[:3, 3], sigmas_m, strict=True)
+        place = ", ".join(f"{axis} {x:.2f} ± {sigma:.2f}" for axis, x, sigma in numbers)
         age_s = (self.at.stamp_ns - self.detected_ns) / NS_PER_S
         seen = (
             f"last seen {age_s:.1f} s ago" if self.detected_ns else "no detection yet"

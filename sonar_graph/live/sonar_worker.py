@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,8 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 WARM_UP = "warm up"
-BEAMS, BINS = 96, 512
+BEAMS = 96
+BINS = 512
 MOST_FRAMES = 5
 """Number of images that may wait."""
 OVERTAKEN = "overload: newer images came before it was recognised"
@@ -124,12 +125,8 @@ class SonarWorker:
     """
 
     def __init__(self, seen: Callable[[SonarAnswer], None]) -> None:
-        self._process = OwnProcess(
-            (
-                "-c",
-                "from sonar_graph.live.sonar_worker import serve_recogniser; serve_recogniser()",
-            )
-        )
+        program = "from sonar_graph.live.sonar_worker import serve_recogniser; serve_recogniser()"
+        self._process = OwnProcess(("-c", program))
         self._seen = seen
         self._waiting: list[Waiting] = []
         self._changed = threading.Condition()
@@ -157,20 +154,21 @@ class SonarWorker:
                 i for i, one in enumerate(self._waiting) if one.rows.frame is not None
             ]
             dropped = []
-            for i in images[: max(len(images) - MOST_FRAMES, 0)]:
-                dropped.append(self._waiting[i])
-                rows = self._waiting[i].rows
-                self._waiting[i] = self._waiting[i]._replace(
-                    rows=SonarRows(rows.imu, rows.dvl, rows.depth, None)
-                )
+            # rows stay: tracks need the motion between the images that are left
+            for i in images[:-MOST_FRAMES]:
+                one = self._waiting[i]
+                dropped.append(one)
+                self._waiting[i] = one._replace(rows=replace(one.rows, frame=None))
             self._changed.notify()
         return dropped
 
     def end(self) -> None:
         """End the process."""
         with self._changed:
-            was_ended, self._is_ended = self._is_ended, True
+            was_ended = self._is_ended
+            self._is_ended = True
             self._changed.notify()
+        # outside the lock, which the thread that waits for an answer needs
         if not was_ended:
             self._process.end()
 
@@ -180,16 +178,12 @@ class SonarWorker:
             self._ask(WARM_UP)
             self.is_warm.set()
             with self._changed:
-                while self._begin is None and not self._is_ended:
-                    self._changed.wait()
-            if self._begin is None:
-                return
+                self._changed.wait_for(lambda: self._begin or self._is_ended)
             self._ask(self._begin)
             self.has_begun.set()
             while True:
                 with self._changed:
-                    while not self._waiting and not self._is_ended:
-                        self._changed.wait()
+                    self._changed.wait_for(lambda: self._waiting or self._is_ended)
                     if self._is_ended:
                         return
                     one = self._waiting.pop(0)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.estimator import (
@@ -27,9 +27,14 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, LandmarkMap, RefusedRow, Trajectory
 
+if TYPE_CHECKING:
+    from sonar_graph.live.engine import LiveOptions
+
 MAP_SHARE = 20.0
 """Time between two maps over the time that one takes."""
 LEAST_MAP_S = 1.0
+MOST_WAITING_S = 2.0
+"""Time of steps that may wait for the estimator before the oldest lose their detections."""
 MOST_AT_ONCE = 100
 """Number of steps in one request, so that estimates come while many wait."""
 
@@ -89,7 +94,7 @@ def serve_estimator() -> None:
 
 def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     if isinstance(request, Begin):
-        # loads numba
+        # loads numba, which the process that serves a robot has loaded already
         from sonar_graph.navigation import make_estimator
 
         kind = load_estimator(request.name)
@@ -97,43 +102,43 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
         _Served.estimator = make_estimator(
             partial(kind, params=params), request.calibration
         )
-        _Served.estimates, _Served.update_s, _Served.next_map_s = [], [], 0.0
+        _Served.estimates = []
+        _Served.update_s = []
+        _Served.next_map_s = 0.0
         return READY
     estimator = _Served.estimator
+    before_s = time.perf_counter()
     if request == FINISH:
-        before_s = time.perf_counter()
-        smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
+        smoothed = estimator.trajectory()
+        landmarks = estimator.landmarks()
         finish_s = time.perf_counter() - before_s
-        causal, refused = (
-            Trajectory.from_estimates(_Served.estimates),
-            refused_rows_of(estimator),
-        )
         return LiveOutcome(
-            causal,
+            Trajectory.from_estimates(_Served.estimates),
             smoothed,
             landmarks,
-            refused,
+            refused_rows_of(estimator),
             withheld_of(estimator),
             _Served.update_s,
             finish_s,
         )
-    found, longest_s, landmarks_now = [], 0.0, None
+    found = []
+    update_s = []
     for step in request:
-        before_s = time.perf_counter()
         estimate = estimator.process(step)
-        _Served.update_s.append(time.perf_counter() - before_s)
-        longest_s = max(longest_s, _Served.update_s[-1])
+        after_s = time.perf_counter()
+        update_s.append(after_s - before_s)
+        before_s = after_s
         if estimate is not None:
             found.append(estimate)
+    _Served.update_s += update_s
     _Served.estimates += found
-    before_s = time.perf_counter()
+    landmarks_now = None
+    # a map of thousands takes long: now and then is enough for viewers
     if found and before_s >= _Served.next_map_s:
         landmarks_now = newest_landmarks_of(estimator)
-        after_s = time.perf_counter()
-        _Served.next_map_s = after_s + max(
-            LEAST_MAP_S, MAP_SHARE * (after_s - before_s)
-        )
-    return Answer(found, landmarks_now, withheld_of(estimator), longest_s)
+        map_s = time.perf_counter() - before_s
+        _Served.next_map_s = before_s + map_s + max(LEAST_MAP_S, MAP_SHARE * map_s)
+    return Answer(found, landmarks_now, withheld_of(estimator), max(update_s))
 
 
 class Worker:
@@ -141,57 +146,51 @@ class Worker:
 
     Parameters
     ----------
-    name, overrides
-        Estimator and its settings.
+    options
+        Estimator with its settings, and its rate.
     warm_up
         Simulated run on which what is slow the first time is compiled, before anything is received.
     answered
         Called with each `Answer`, by a thread of the worker.
-    most_waiting
-        Number of waiting steps beyond which the oldest lose their detections.
     without_detections
         Gives a step without them.
     """
 
     def __init__(
         self,
-        name: str,
-        overrides: dict[str, Any],
+        options: LiveOptions,
         warm_up: Sequence,
-        rate_hz: float,
         answered: Callable[[Answer], None],
-        most_waiting: int,
         without_detections: Callable[[Measurements], Measurements],
     ) -> None:
-        self._process = OwnProcess(
-            (
-                "-c",
-                "from sonar_graph.live.worker import serve_estimator; serve_estimator()",
-            )
+        program = (
+            "from sonar_graph.live.worker import serve_estimator; serve_estimator()"
         )
-        self._name, self._overrides = name, overrides
-        self._answered, self._without_detections = answered, without_detections
-        self._most_waiting = most_waiting
+        self._process = OwnProcess(("-c", program))
+        self._begin = partial(Begin, options.estimator, dict(options.overrides))
+        self._answered = answered
+        self._without_detections = without_detections
+        self._most_waiting = max(1, round(MOST_WAITING_S * options.rate_hz))
         self._waiting: list[Measurements] = []
         self._begins: Begin | None = None
         self._is_catching_up = False
         self._changed = threading.Condition()
-        self._is_done = self.is_busy = False
+        self._is_done = False
+        self.is_busy = False
         self.error: Exception | None = None
         """Why the estimator failed, if it did."""
         self._process.answer()  # that it is ready
-        steps = list(warm_up.replay(warm_up.instants(rate_hz)))
-        for request in (Begin(name, overrides, warm_up.calibration), steps, FINISH):
+        steps = list(warm_up.replay(warm_up.instants(options.rate_hz)))
+        # what is compiled or loaded at the first use must not delay the first pose
+        for request in (self._begin(warm_up.calibration), steps, FINISH):
             self._ask(request)
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def begin(self, calibration: Calibration) -> None:
         """Begin the run, also anew: steps that wait are forgotten, and those that follow may be many for a while."""
         with self._changed:
-            self._begins, self._is_catching_up = (
-                Begin(self._name, self._overrides, calibration),
-                True,
-            )
+            self._begins = self._begin(calibration)
+            self._is_catching_up = True
             self._waiting.clear()
             self._changed.notify()
         if not self._thread.ident:
@@ -212,15 +211,12 @@ class Worker:
             return
         with self._changed:
             self._waiting.append(step)
-            late = len(self._waiting) - self._most_waiting
-            if (
-                late > 0
-                and not self._is_catching_up
-                and self._waiting[late - 1].detections is not None
-            ):
-                self._waiting[late - 1] = self._without_detections(
-                    self._waiting[late - 1]
-                )
+            # of the oldest, since the newest decide the pose
+            late = len(self._waiting) - self._most_waiting - 1
+            if late >= 0 and not self._is_catching_up:
+                oldest = self._waiting[late]
+                if oldest.detections is not None:
+                    self._waiting[late] = self._without_detections(oldest)
             self._changed.notify()
 
     def finish(self) -> LiveOutcome:
@@ -243,14 +239,15 @@ class Worker:
             while True:
                 with self._changed:
                     self.is_busy = False
-                    while not (self._waiting or self._begins or self._is_done):
-                        self._changed.wait()
-                    begin, self._begins = self._begins, None
-                    steps, self._waiting = (
-                        self._waiting[:MOST_AT_ONCE],
-                        self._waiting[MOST_AT_ONCE:],
+                    self._changed.wait_for(
+                        lambda: self._waiting or self._begins or self._is_done
                     )
+                    begin = self._begins
+                    self._begins = None
+                    steps = self._waiting[:MOST_AT_ONCE]
+                    del self._waiting[:MOST_AT_ONCE]
                     self.is_busy = True
+                # a run that begins again forgets the steps of the one before
                 if begin is not None:
                     self._ask(begin)
                 if steps:

@@ -6,7 +6,7 @@ from sonar_graph import at_first_use
 
 if TYPE_CHECKING:
     from sonar_graph.logs.amending import Amended, write_amended
-    from sonar_graph.logs.checks import gravity_warning, is_without_gravity, stuck_quantities, unfelt_zeros
+    from sonar_graph.logs.checks import OTHER_WAYS, STEPPED_BACK, axis_doubts, gravity_warning, is_without_gravity, stuck_quantities, unfelt_zeros  # noqa: E501
     from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
     from sonar_graph.logs.live_record import DROPPED_TOPIC, LATENESS, LIVE_RATE, LiveRecord, dropped_in, pinned
     from sonar_graph.logs.reading import Assembly, read_log, row_notes, rows_of
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from sonar_graph.logs.writing import detection_messages, landmark_map_message, sonar_image_messages, write_log
 else:
     __getattr__, __dir__ = at_first_use(__name__)
-
 __all__ = [
     "Amended", "Assembly", "Choice", "DETECTIONS", "DROPPED_TOPIC", "ImagesAlone", "LATENESS", "LIVE_RATE",
-    "LiveRecord", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "ROLES", "TopicSummary",
-    "Window", "choose_each", "choose_topics", "detection_messages", "dropped_in", "gravity_warning", "inspect_log",
-    "is_without_gravity", "joined_calibration", "lacking_navigation", "landmark_map_message", "landmark_markers",
-    "no_images", "pinned", "read_images_alone", "read_log", "read_sonar_frames", "row_notes", "rows_of", "sonar_frame",
-    "sonar_image_messages", "stuck_quantities", "unfelt_zeros", "wanted_types", "with_notes", "write_amended",
-    "write_landmarks_csv", "write_log", "write_result", "write_tum"]
+    "LiveRecord", "LogSummary", "METADATA", "OTHER_WAYS", "PICTURES", "PartialCalibration", "Picture", "ROLES",
+    "STEPPED_BACK", "TopicSummary", "Window", "axis_doubts", "choose_each", "choose_topics", "detection_messages",
+    "dropped_in", "gravity_warning", "inspect_log", "is_without_gravity", "joined_calibration", "lacking_navigation",
+    "landmark_map_message", "landmark_markers", "no_images", "pinned", "read_images_alone", "read_log",
+    "read_sonar_frames", "row_notes", "rows_of", "sonar_frame", "sonar_image_messages", "stuck_quantities",
+    "unfelt_zeros", "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result",
+    "write_tum"]

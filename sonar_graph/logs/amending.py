@@ -14,33 +14,32 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Header, Metadata
-from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
+from mcap.records import Attachment, Metadata
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
-from sonar_graph.logs.cdr import definition, short_name
+from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.mcap import (
-    LIBRARY,
     ChunkPart,
     Damage,
     Keep,
     LogFile,
+    LogWriter,
     Outgoing,
     Passage,
     Recording,
+    SchemaText,
+    by_time,
     content_of,
+    header_of,
     log_parts,
+    own_schema,
     parse,
-    seal,
 )
 
-_CHUNK_BYTES = 1 << 20
-_Message = tuple[int, int, str, bytes, int]
-"""Log time, publish time, topic, payload, sequence number."""
+_Message = tuple[int, int, int, bytes, int]
+"""Log time, channel, publish time, payload, sequence number."""
 
 
 @dataclass
@@ -117,9 +116,10 @@ class _AmendedCopy:
         self._passages = [
             (log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs
         ]
-        self._writer = Writer(out, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-        self._schemas: dict[tuple[str, str, bytes], int] = {("", "", b""): 0}
-        self._channels: dict[str, int] = {}
+        header = header_of(logs[0].path)
+        # the profile states to viewers of ROS what they read
+        profile = header.profile if header else ""
+        self._writer = LogWriter(out, profile, is_copy=True)
         self._amended = Amended()
         self._beginning_ns: int | None = None
 
@@ -130,18 +130,9 @@ class _AmendedCopy:
         metadata: Mapping[str, Mapping[str, str]],
         salvage: bool,
     ) -> Amended:
-        writer = self._writer
+        writer = self._writer.mcap
         amended = self._amended
         damage = Damage()
-        with self._passages[0][0].path.open("rb") as stream:
-            try:
-                # the profile tells viewers of ROS what they read
-                head = next(iter(StreamReader(stream).records), None)
-            except McapError:
-                head = None
-        writer.start(
-            profile=head.profile if isinstance(head, Header) else "", library=LIBRARY
-        )
         # those of ``more`` are asked first: their topic is taken before the log's are copied
         merged = heapq.merge(
             self._streamed(more),
@@ -149,11 +140,10 @@ class _AmendedCopy:
             self._added(added),
             key=lambda message: message[0],
         )
-        for log_time, publish_time, topic, payload, number in merged:
-            writer.add_message(
-                self._channels[topic], log_time, payload, publish_time, number
-            )
+        for log_time_ns, channel, sent_ns, payload, number in merged:
+            writer.add_message(channel, log_time_ns, payload, sent_ns, number)
         for log, passage in self._passages:
+            # known only when all messages have been read
             damage.extend(
                 passage.damage, log.path.name if len(self._passages) > 1 else ""
             )
@@ -189,8 +179,8 @@ class _AmendedCopy:
                     f"one at byte {record.at} is damaged and left out"
                 )
         for name, values in metadata.items():
-            writer.add_metadata(name, seal(values))
-        writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
+            self._writer.add_metadata(name, values)
+        self._writer.finish()
         notes = recording.notes()
         amended.notes |= {
             name: notes[name] for name in ("log.ending", "log.damage") if name in notes
@@ -203,10 +193,16 @@ class _AmendedCopy:
             yield from self._recorded_in(passage)
 
     def _recorded_in(self, passage: Passage) -> Iterator[_Message]:
+        # a chunk comes topic by topic, and its messages have to be merged by time
         for _, chunk in groupby(passage, key=lambda piece: id(piece.data)):
-            pieces = [piece for piece in chunk if self._is_copied(piece, passage)]
-            if not pieces:
+            copied = [
+                (piece, channel)
+                for piece in chunk
+                if (channel := self._channel(piece, passage)) is not None
+            ]
+            if not copied:
                 continue
+            pieces = [piece for piece, _ in copied]
             data = pieces[0].data
             columns = zip(*(piece.found for piece in pieces), strict=True)
             at, size, time_ns = (np.concatenate(column) for column in columns)
@@ -216,17 +212,17 @@ class _AmendedCopy:
             )
             for row in np.lexsort((at, time_ns)).tolist():
                 begin = int(at[row])
-                topic = pieces[of[row]].topic.name
+                channel = copied[of[row]][1]
                 payload = bytes(data[begin : begin + int(size[row])])
                 # before each payload is the head of its record
                 number, published_ns = (
                     int.from_bytes(data[begin - first : begin - end], "little")
                     for first, end in ((20, 16), (8, 0))
                 )
-                yield int(time_ns[row]), published_ns, topic, payload, number
+                yield int(time_ns[row]), channel, published_ns, payload, number
 
-    def _is_copied(self, piece: ChunkPart, passage: Passage) -> bool:
-        """Tell whether messages of a topic are copied; if so, the topic is made known to the writer."""
+    def _channel(self, piece: ChunkPart, passage: Passage) -> int | None:
+        """Channel of messages in the copy; None where their topic is written anew."""
         first_ns = int(piece.found.log_times_ns.min())
         self._beginning_ns = (
             first_ns
@@ -245,45 +241,22 @@ class _AmendedCopy:
             )
         if wanted is not None:
             self._amended.replaced[topic.name] += len(piece.found.sizes)
-            return False
+            return None
         channel, schema = passage.as_written[topic.name]
-        self._offer(
+        return self._writer.channel(
             topic.name,
-            (schema.name, schema.encoding, schema.data),
+            SchemaText(schema.name, schema.encoding, schema.data),
             topic.encoding,
             channel.metadata,
         )
-        return True
 
     def _added(self, added: Sequence[Outgoing]) -> Iterator[_Message]:
-        rows = sorted(
-            (at_ns, of, row)
-            for of, entry in enumerate(added)
-            for row, at_ns in enumerate(entry.log_times_ns.tolist())
-        )
-        for time_ns, of, row in rows:
-            entry = added[of]
-            text = definition(entry.type_name).encode()
-            self._offer(entry.topic, (entry.type_name, "ros2msg", text), "cdr", {})
-            yield time_ns, time_ns, entry.topic, entry.payloads[row].tobytes(), 0
+        for time_ns, entry, payload in by_time(added):
+            schema = own_schema(entry.type_name)
+            channel = self._writer.channel(entry.topic, schema)
+            yield time_ns, channel, time_ns, payload, 0
 
     def _streamed(self, more: Iterable[Outgoing]) -> Iterator[_Message]:
         for entry in more:
             self._taken.add(entry.topic)
             yield from self._added([entry])
-
-    def _offer(
-        self,
-        topic: str,
-        schema: tuple[str, str, bytes],
-        encoding: str,
-        metadata: Mapping[str, str],
-    ) -> None:
-        """Make a topic known to the writer, once; a schema is name, encoding and text."""
-        if topic in self._channels:
-            return
-        if schema not in self._schemas:
-            self._schemas[schema] = self._writer.register_schema(*schema)
-        self._channels[topic] = self._writer.register_channel(
-            topic, encoding, self._schemas[schema], dict(metadata)
-        )

@@ -26,6 +26,9 @@ MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
 LEAST_PART_UPWARDS = 0.7
 """Part of the typical specific force that must point up in the body."""
+OTHER_WAYS = "specific forces point another way from row to row"
+SAME_DIRECTION = 0.5
+"""Length of the typical force over the typical length, below which rows contradict each other."""
 MOST_OFF_GRAVITY = 0.2
 """Relative difference between specific force and gravity above which units are in doubt."""
 SPIKES = {
@@ -247,6 +250,13 @@ def gravity_warning(
     # the median forgets manoeuvres, which the mean keeps
     typical = mounting.pose().rotation().matrix() @ np.median(measured, axis=0)
     length = float(np.linalg.norm(typical))
+    size = float(np.median(np.linalg.norm(measured, axis=1)))
+    is_gravity = abs(size - gravity_m_s2) < MOST_OFF_GRAVITY * gravity_m_s2
+    if is_gravity and length < SAME_DIRECTION * size:
+        return (
+            f"{OTHER_WAYS}: two IMUs, or two drivers, on one topic; name another "
+            "`topic` under [imu] in the log configuration (--log-config FILE)"
+        )
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:
         return (
             f"the typical specific force is {length:.3g} m/s2 instead of {gravity_m_s2:.3g}: give its scale (9.80665 "
@@ -264,11 +274,13 @@ def gravity_warning(
     return f"gravity is felt along {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
 
 
-def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[str]:
+def row_doubts(
+    imu: Imu, dvl: Dvl | None, depth: Depth | None, calibration: Calibration
+) -> Iterator[str]:
     """Sentences about IMU and Doppler log with which no result is to be relied on, each after its role.
 
-    Axes of the accelerometers that gravity contradicts, quantities that are stuck, and axes of the gyros that are dead
-    or clipped.
+    Axes of the accelerometers that gravity contradicts, quantities that are stuck, and axes of gyros and Doppler log
+    that are dead or clipped.
     """
     gravity_m_s2 = calibration.gravity_m_s2
     mounting = calibration.imu.mounting
@@ -286,8 +298,31 @@ def row_doubts(imu: Imu, dvl: Dvl | None, calibration: Calibration) -> Iterator[
         stamps_ns = dvl.stamps_ns if role == "dvl" else imu.stamps_ns
         if doubt := stuck_doubt(stamps_ns, stuck, quantity):
             yield f"{role}: {doubt}"
-    for fault in axis_faults(imu.angular_velocity, "angular rate"):
+    yield from axis_doubts(imu, dvl, depth, calibration)
+
+
+def axis_doubts(
+    imu: Imu, dvl: Dvl, depth: Depth | None, calibration: Calibration
+) -> Iterator[str]:
+    """Sentences about dead and clipped axes of gyros and Doppler log, each after its role."""
+    if calibration.odometry_interpolation != "linear":
+        return
+    rate = imu.angular_velocity
+    for fault in (
+        *dead_axes(rate, "angular rate"),
+        *clipped_axes(rate, "angular rate"),
+    ):
         yield f"imu: {fault}: headings and positions are wrong from the first turn on"
+    faults = [*clipped_axes(dvl.velocity, "velocity"), *magnitudes(dvl.velocity)]
+    if is_measured_in_full(depth, calibration):
+        faults += dead_axes(dvl.velocity, "velocity", most=2)
+    yield from (f"dvl: {fault}: positions are wrong" for fault in faults)
+
+
+def is_measured_in_full(depth: Depth | None, calibration: Calibration) -> bool:
+    """True for velocities that should change along all axes: of a vehicle that dives, and not stated to be unsure."""
+    is_sure = max(calibration.dvl.velocity_sigma_m_s) < UNSURE_M_S
+    return depth is not None and calibration.planar is None and is_sure
 
 
 def row_oddities(
@@ -306,14 +341,24 @@ def row_oddities(
                 yield "imu", check(imu.stamps_ns, values, quantity)
     if dvl is not None and is_linear:
         yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
-        for fault in axis_faults(dvl.velocity, "velocity"):
-            yield "dvl", fault
+        if not is_measured_in_full(depth, calibration):
+            for fault in dead_axes(dvl.velocity, "velocity"):
+                yield "dvl", fault
     if imu is not None and dvl is not None and depth is not None:
         way_m = way_by("positions", imu, dvl, calibration, depth.stamps_ns)
         heights = depth.z_m[:, None]
         yield "depth", stuck_warning(depth.stamps_ns, heights, "height", way_m)
 
 
+NEAR_ZERO = 0.1
+"""Of the spread: so near 0 the least magnitude of a signal comes that changes its sign."""
+UNSURE_M_S = 0.5
+"""Sigma of a velocity from which on an axis is stated not to be measured."""
+UNMEASURED_AXIS = "; if it is not measured: `covariance = false` under [dvl], and 1.0 for it in `dvl.velocity_sigma_m_s`"
+STEPPED_BACK = "the clock of its stamps stepped back"
+BURST_SHARE = 0.1
+LONGEST_BURST_S = 0.2
+"""Stamps are off by half of it on average, more than a sensor's own delay."""
 FEWEST_FRESH = 100
 FEWEST_VALUES = 50
 """Number of different values below which a sensor is too coarse to show where it is clipped."""
@@ -322,26 +367,44 @@ CLIPPED_SHARE = 0.002
 CLIPPED_RATIO = 5
 
 
-def axis_faults(values: Floats, quantity: str) -> Iterator[str]:
-    """Faults of single axes of a quantity, shape (n, 3): one that never changes, and one that is clipped.
+def fresh_rows(values: Floats) -> Floats:
+    """Rows that differ from the row before, shape (m, 3); none where they are too few to show anything.
+
+    Rows of a sensor that is frozen are all alike, and have a finding of their own.
+    """
+    moves = np.any(values[1:] != values[:-1], axis=1)
+    fresh = values[1:][moves]
+    return fresh if len(fresh) >= FEWEST_FRESH else fresh[:0]
+
+
+def dead_axes(values: Floats, quantity: str, most: int = 1) -> Iterator[str]:
+    """Axes of a quantity, shape (n, 3), that never change; nothing where they are more than ``most``.
+
+    A robot on wheels has two axes that never change.
+    """
+    fresh = fresh_rows(values)
+    if not len(fresh):
+        return
+    dead = np.flatnonzero(np.ptp(fresh, axis=0) == 0)
+    if 1 <= len(dead) <= most:
+        names = " and ".join("xyz"[axis] for axis in dead)
+        text = (
+            f"{quantity} along {names} is {fresh[0, dead[0]] + 0.0:g} in every row, while the other axes change: not"
+            " filled by the driver, or dead"
+        )
+        if quantity == "velocity":
+            text += UNMEASURED_AXIS
+        yield text
+
+
+def clipped_axes(values: Floats, quantity: str) -> Iterator[str]:
+    """Axes of a quantity, shape (n, 3), that are clipped.
 
     Noise makes every value its own, so that the largest one comes once. Where it comes `FEWEST_CLIPPED` times, in
     `CLIPPED_SHARE` of the rows, and `CLIPPED_RATIO` times as often as the next, the sensor or its driver cuts there.
     """
-    # rows of a sensor that is frozen are all alike, and have a finding of their own
-    moves = np.any(values[1:] != values[:-1], axis=1)
-    fresh = values[1:][moves]
-    if len(fresh) < FEWEST_FRESH:
-        return
-    is_dead = np.ptp(fresh, axis=0) == 0
-    # a robot on wheels has two axes that never change
-    if np.count_nonzero(is_dead) == 1:
-        axis = int(np.argmax(is_dead))
-        yield (
-            f"{quantity} along {'xyz'[axis]} is {fresh[0, axis] + 0.0:g} in every row, while the other axes change: not"
-            " filled by the driver, or dead"
-        )
-    for axis in np.flatnonzero(~is_dead).tolist():
+    fresh = fresh_rows(values)
+    for axis in range(fresh.shape[1] if len(fresh) else 0):
         found, counts = np.unique(fresh[:, axis], return_counts=True)
         if len(found) < FEWEST_VALUES:
             continue
@@ -355,6 +418,46 @@ def axis_faults(values: Floats, quantity: str) -> Iterator[str]:
                     f"{quantity} along {'xyz'[axis]} is never beyond {limit:g}, its value in {often} rows: clipped by the"
                     " sensor's range or the driver"
                 )
+
+
+def magnitudes(velocity: Floats) -> Iterator[str]:
+    """Velocities, shape (n, 3), without a sign: no axis is ever negative, and those that come near 0 turn there."""
+    fresh = fresh_rows(velocity)
+    if not len(fresh) or (fresh < 0).any():
+        return
+    # a vehicle that only goes ahead has one such axis; to the side and up it goes both ways
+    is_near = fresh.min(axis=0) < NEAR_ZERO * fresh.std(axis=0)
+    if np.count_nonzero(is_near) >= 2:
+        yield "velocity is never negative along any axis: magnitudes without a sign"
+
+
+def stamp_doubts(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
+    """Faults of stamps, shape (n,), with which no result is to be relied on: a clock that steps back, and bursts.
+
+    A driver that stamps all samples of a read at once makes bursts: most intervals are far below the mean one.
+    """
+    if len(stamps_ns) < FEWEST_FRESH:
+        return
+    back_s = -float(np.diff(stamps_ns).min()) * 1e-9
+    if back_s > LARGEST_LAG_CHANGE_S and (np.diff(log_times_ns) >= 0).all():
+        yield f'{STEPPED_BACK} by {back_s:.3g} s: `stamp = "log"` uses the times of recording'
+    if (period_s := burst_period_s(stamps_ns)) > LONGEST_BURST_S:
+        way_out = (
+            '`stamp = "log"` uses the times of recording'
+            if burst_period_s(log_times_ns) <= LONGEST_BURST_S
+            else "let the driver stamp each sample"
+        )
+        yield f"stamps come in bursts every {period_s:.2g} s, as if all samples of a read had one time: {way_out}"
+
+
+def burst_period_s(stamps_ns: Ints) -> float:
+    """Time from burst to burst of stamps, shape (n,), s; 0 where they come one by one."""
+    intervals_s = np.diff(np.sort(stamps_ns)) * 1e-9
+    is_within = intervals_s < BURST_SHARE * intervals_s.mean()
+    if np.count_nonzero(is_within) < len(intervals_s) / 2:
+        return 0.0
+    # a hole is no usual pause
+    return float(np.median(intervals_s[~is_within]))
 
 
 def axes_warning(adapter: Adapter) -> str | None:
@@ -407,8 +510,7 @@ def stuck_warning(
     repeats the row before, come by chance less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    first, last = runs_of(differs)
     is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
         last - first + 1 >= STUCK_ROWS
     )
@@ -438,6 +540,13 @@ def stuck_warning(
     return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be sending without lock"
 
 
+def runs_of(differs: NDArray[np.bool_]) -> tuple[Ints, Ints]:
+    """First and last rows of runs of equal rows, of which ``differs`` tells each row but the first from the one before."""
+    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
+    last = np.concatenate([first[1:] - 1, [len(differs)]])
+    return first, last
+
+
 def _may_be_chance(differs: NDArray[np.bool_], repeated: Ints) -> NDArray[np.bool_]:
     """Stretches whose number of repeated rows comes by chance once in a thousand logs of a coarse sensor, shape (k,)."""
     if not differs.any():
@@ -461,8 +570,7 @@ def stuck_rows(
     ``others``: stamps and values of the other sensors, by name. ``may_rest``: zeros are a value at rest.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    first, last = runs_of(differs)
     chosen = (stamps_ns[last] - stamps_ns[first] > SURELY_STUCK_S * 1e9) & (
         last - first + 1 >= SURELY_STUCK_ROWS
     )
@@ -517,6 +625,7 @@ LEAST_STEP_M_S = 0.05
 LEAST_SHARE = 0.5
 """Of the speed of the row beside the zeros: a vehicle that brakes is off by less where stamps are late."""
 UNFELT = "with a velocity of 0 that the accelerometers contradict"
+UNLIKELY_ZEROS = "of exactly 0, far from the rows beside them"
 
 
 def unfelt_zeros(imu: Imu, dvl: Dvl, calibration: Calibration) -> NDArray[np.bool_]:
@@ -582,16 +691,38 @@ def _changes(stamps_ns: Ints, values: Floats, begin_ns: int, end_ns: int) -> boo
     return bool(differs.mean() >= LEAST_CHANGING)
 
 
+def unlikely_zeros(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
+    """Mask of rows of zeros, shape (n,), that are farther from the rows beside them than the vehicle moves.
+
+    ``values``, shape (n, k), ``moved`` and ``least`` as of `repeats`. Drivers send zeros where they have no value.
+    """
+    is_zero = ~values.any(axis=1)
+    others = np.flatnonzero(~is_zero)
+    rows = np.flatnonzero(is_zero)
+    mask = np.zeros(len(values), bool)
+    if not len(others) or not len(rows):
+        return mask
+    after = np.searchsorted(others, rows)
+    mask[rows] = True
+    for beside in (after - 1, after):
+        has_one = (beside >= 0) & (beside < len(others))
+        row = others[np.clip(beside, 0, len(others) - 1)]
+        distance = np.linalg.norm(values[row], axis=1)
+        way = np.abs(moved[row] - moved[rows])
+        mask[rows] &= ~has_one | (distance > least + way)
+    return mask
+
+
 def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
     """Mask of rows, shape (n,), that repeat the row before to the bit while the vehicle moves: a stuck sensor.
 
     ``values``, shape (n, k), and ``moved``, what the vehicle has moved until each row by other sensors, have one unit.
     A stretch counts where the vehicle moves in it by more than ``least`` and three steps of the sensor's resolution.
     """
-    # the smallest change of a sensor is its resolution
-    changes = np.linalg.norm(np.diff(values, axis=0), axis=1)
-    differs = changes > 0
-    resolution = float(np.min(changes[differs], initial=np.inf))
+    differs = np.any(np.diff(values, axis=0) != 0, axis=1)
+    # the smallest difference of any two values of a sensor is its resolution
+    gaps = [np.diff(np.unique(np.round(column, 6))) for column in values.T]
+    resolution = float(np.min(np.concatenate(gaps), initial=np.inf))
     if np.isfinite(resolution):
         least = max(least, RESOLUTIONS * resolution)
     return _repeated_while_moving(differs, moved, least)
@@ -639,8 +770,7 @@ def _repeated_while_moving(
     differs: NDArray[np.bool_], moved: Floats, least: float
 ) -> NDArray[np.bool_]:
     """Rows, shape (n,), that do not differ from the row before in a stretch over which the vehicle moves by a length."""
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(differs)]])
+    first, last = runs_of(differs)
     is_stuck = np.abs(moved[last] - moved[first]) > least
     mask = np.zeros(len(differs) + 1, bool)
     for begin, end in zip(
@@ -666,9 +796,10 @@ def way_by(
             @ calibration.imu.mounting.pose().rotation().matrix()[2]
         )
     else:
-        rows = dvl.rows(
-            np.flatnonzero(np.isfinite(dvl.velocity).all(axis=1) & ~is_partial(dvl))
-        )
+        whole = np.isfinite(dvl.velocity).all(axis=1) & ~is_partial(dvl)
+        if not whole.any():
+            return np.zeros(len(at_ns))
+        rows = dvl.rows(np.flatnonzero(whole))
         stamps_ns = rows.stamps_ns
         velocity = rows.velocity @ calibration.dvl.mounting.pose().rotation().matrix().T
         width = (

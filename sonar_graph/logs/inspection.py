@@ -4,7 +4,7 @@
 configuration that it begins makes, read back unchanged, the same choices (docs/tutorials/04_your_own_log.md).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Never
@@ -52,21 +52,21 @@ from sonar_graph.logs.sonar_images import (
     sonar_frame,
 )
 from sonar_graph.logs.vehicle_setup import (
-    GIVEN,
     PartialCalibration,
     as_calibration,
-    read_calibration,
     read_notes,
     recorded_name,
-    static_frames,
 )
 from sonar_graph.measurements import NS_PER_S, Ints
 
 TIME = "builtin_interfaces/msg/Time"
 _MOST_FIELDS = 24
 _EXAMPLES = {
-    "imu": 'angular_velocity = ["...", "...", "..."]\nlinear_acceleration = ["...", "...", "..."]',
-    "dvl": 'velocity = ["...", "...", "..."]',
+    "imu": (
+        'angular_velocity = ["...", "...", "..."]',
+        'linear_acceleration = ["...", "...", "..."]',
+    ),
+    "dvl": ('velocity = ["...", "...", "..."]',),
 }
 """Keys of a table to fill in, for the roles that are needed."""
 
@@ -130,7 +130,7 @@ class LogSummary:
     topics: tuple[TopicSummary, ...]
     roles: tuple[RoleSummary, ...]
     calibration: str
-    """Source of the calibration, or the reason why the one in the log cannot be used."""
+    """Source of the calibration, or the reason why the one in the log cannot be used; empty where `unusable` names it."""
     notes: dict[str, str]
     damage: tuple[str, ...]
     """Lost or unreadable parts; empty for a sound file."""
@@ -150,27 +150,26 @@ class LogSummary:
     @property
     def obstacles(self) -> tuple[str, ...]:
         """Needed roles that no topic plays, or several could, so that no estimator can run; such as ``no IMU``."""
-        needed = [
-            role
-            for role in self.roles
-            if ROLES[role.role].is_required and role.topic is None
-        ]
-        return tuple(
-            f"{len(role.candidates)} topics for {role.role} (choose: --topic {role.role}={role.candidates[0]})"
-            if role.candidates
-            else f"no {role.role.upper()}"
-            for role in needed
-        )
+        found = []
+        for role in self.roles:
+            count = len(role.candidates)
+            if role.topic is not None or not ROLES[role.role].is_required:
+                continue
+            if count:
+                choice = f"{role.role}={role.candidates[0]}"
+                found.append(
+                    f"{count} topics for {role.role} (choose: --topic {choice})"
+                )
+            else:
+                found.append(f"no {role.role.upper()}")
+        return tuple(found)
 
     @property
     def has_images_alone(self) -> bool:
         """True for a log with sonar images and nothing that may be an IMU or Doppler log."""
-        of = {role.role: role for role in self.roles}
-        needed = [role for role in self.roles if ROLES[role.role].is_required]
-        return (
-            of[SONAR].topic is not None
-            and not self.sonar_fault
-            and not any(role.topic or role.candidates for role in needed)
+        found = {role.role for role in self.roles if role.topic or role.candidates}
+        return self.sonar is not None and not (
+            self.sonar_fault or found & {"imu", "dvl"}
         )
 
     @property
@@ -179,16 +178,11 @@ class LogSummary:
         used = {role.topic for role in self.roles}
         # a log that was played has the recorder's clock of another day
         by_header = [topic for topic in self.topics if topic.stamps_from == "header"]
-        topics = (
-            [topic for topic in self.topics if topic.name in used]
-            or by_header
-            or self.topics
-        )
-        if not topics:
-            return 0.0
-        return (
-            max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)
-        ) * 1e-9
+        playing = [topic for topic in self.topics if topic.name in used]
+        topics = playing or by_header or self.topics
+        first_ns = min((topic.first_stamp_ns for topic in topics), default=0)
+        last_ns = max((topic.last_stamp_ns for topic in topics), default=0)
+        return (last_ns - first_ns) * 1e-9
 
 
 def inspect_log(
@@ -259,7 +253,7 @@ def inspect_log(
     if recording.ending:
         damage.insert(len(recording.corrupt), recording.ending)
     choices = choose_each(recording, wanted, config, ROLES)
-    mounted: dict[str, str] = {}
+    calibrated = ""
     try:
         notes = read_notes(recording)
     except SonarGraphError as error:
@@ -271,16 +265,12 @@ def inspect_log(
     unusable = list[str]()
     try:
         frame = sonar_frame(recording, choices[SONAR].topic, config)
-        assembly = Assembly(
-            recording,
-            {name: choices[name] for name in SEQUENCE_ROLES},
-            given,
-            frame,
-        )
-        mounted = assembly.mounted
+        measuring = {name: choices[name] for name in SEQUENCE_ROLES}
+        assembly = Assembly(recording, measuring, given, frame)
+        calibrated = assembly.source
         left_out, warnings = assembly.survey()
-    except CalibrationError:
-        pass  # `calibration` says so
+    except CalibrationError as error:
+        calibrated = f"unusable: {error}"
     except SonarGraphError as error:
         unusable.append(str(error))
     sonar = None
@@ -301,7 +291,7 @@ def inspect_log(
             RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
             for c in choices.values()
         ),
-        calibration=_calibration_source(recording, mounted, given),
+        calibration=calibrated,
         notes=notes,
         damage=tuple(damage),
         unusable=tuple(unusable),
@@ -377,39 +367,6 @@ def _header_stamps(topic: Topic) -> Ints | None:
     return stamps_ns
 
 
-def _calibration_source(
-    recording: Recording,
-    mounted: Mapping[str, str],
-    given: Calibration | PartialCalibration | None,
-) -> str:
-    """Source of the calibration, given the frame of each sensor whose mounting is from ``/tf_static``."""
-    if isinstance(given, Calibration):
-        return GIVEN
-    if given is not None:
-        return given.before(_calibration_source(recording, mounted, None))
-    try:
-        recorded = read_calibration(recording)
-        has_frames = bool(static_frames(recording))
-    except SonarGraphError as error:
-        return f"unusable: {error}"
-    of_sensors = ", ".join(
-        name if name == frame else f"{name}: {frame}" for name, frame in mounted.items()
-    )
-    mountings = (
-        f"mountings of /tf_static ({of_sensors})"
-        if mounted
-        else "no sensor's mounting in /tf_static"
-    )
-    if recorded is not None:
-        return f"in the log; {mountings}" if mounted else "in the log"
-    if has_frames:
-        return f"none in the log; defaults with {'the ' if mounted else ''}{mountings}"
-    return (
-        "none in the log and no /tf_static; defaults, with every sensor at base_link: sonar_graph/calibration.py lists "
-        "them with units, comparison.json with the results, and --calibration FILE gives others"
-    )
-
-
 def starting_config(
     recording: Recording, choices: list[Choice], config: LogConfig
 ) -> str:
@@ -419,65 +376,50 @@ def starting_config(
     ]
     for choice in choices:
         role = choice.role.name
-        table = config.table(choice.role.name)
+        table = config.table(role)
         named = choice.candidates or choice.could_be
         if choice.topic is not None and choice.adapter is not None:
             topic = recording.topics[choice.topic]
             base = shipped_like(role, topic.type_name, topic.definition())
             parts.append(table_text(role, choice.topic, choice.adapter, base))
         elif table:  # kept as it is, also where nothing in this log fits it
-            parts.append(
-                "\n".join([_comment(choice.reason), f"[{role}]", *plain_lines(table)])
-            )
+            lines = [_comment(choice.reason), f"[{role}]", *plain_lines(table)]
+            parts.append("\n".join(lines))
         elif named:
             topics = (f'topic = "{name}"' for name in named)
-            parts.append(_comment("\n".join([f"[{role}]  # one of", *topics])))
+            parts.append(_comment(f"[{role}]  # one of", *topics))
         elif choice.role.is_required:
-            parts.append(_comment(_to_fill_in(role, recording)))
+            parts.append(_comment(*_to_fill_in(role, recording)))
         else:
             parts.append(_comment(f"[{role}]  # nothing found"))
+    used = {choice.topic for choice in choices}
     if any(choice.topic is None and choice.role.is_required for choice in choices):
-        used = {choice.topic for choice in choices}
         for topic in recording.topics.values():
-            if (
-                topic.name in used
-                or not topic.is_ros2
-                or short_name(topic.type_name) == short_name(TF)
-            ):
+            is_tree = short_name(topic.type_name) == short_name(TF)
+            if topic.name in used or not topic.is_ros2 or is_tree:
                 continue
             fields = [f"  {path}{size}" for path, size in _leaves(topic).items()]
-            more = (
-                [f"  and {len(fields) - _MOST_FIELDS} more"]
-                if len(fields) > _MOST_FIELDS
-                else []
-            )
+            more = len(fields) - _MOST_FIELDS
+            fields[_MOST_FIELDS:] = [f"  and {more} more"] if more > 0 else []
             head = f"{topic.name} is a {topic.type_name} with the fields"
-            parts.append(_comment("\n".join([head, *fields[:_MOST_FIELDS], *more])))
+            parts.append(_comment(head, *fields))
     return "\n\n".join(parts) + "\n"
 
 
-def _to_fill_in(role: str, recording: Recording) -> str:
-    """Table for a topic of an unknown type whose name contains the role, or for any."""
-    lines = [
-        f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
-    ]
-    likely = [
-        topic
-        for topic in recording.topics.values()
-        if role in topic.name.lower() and topic.is_ros2
-    ]
-    name = likely[0].name if likely else "/..."
-    kind = likely[0].type_name if likely else "package/msg/Type"
-    lines += [f'topic = "{name}"', f'type = "{kind}"']
-    if likely and "header.stamp.sec" not in _leaves(likely[0]):
-        lines.append(
-            'stamp = "log"  # messages without a header: when they were recorded'
-        )
-    return "\n".join([*lines, _EXAMPLES[role]])
+def _to_fill_in(role: str, recording: Recording) -> Iterator[str]:
+    """Lines of a table for a topic of an unknown type whose name contains the role, or for any."""
+    yield f"[{role}]  # no topic of a known type; the fields of other topics are listed below"
+    likely = (t for t in recording.topics.values() if role in t.name.lower())
+    topic = next((topic for topic in likely if topic.is_ros2), None)
+    yield f'topic = "{topic.name if topic else "/..."}"'
+    yield f'type = "{topic.type_name if topic else "package/msg/Type"}"'
+    if topic and "header.stamp.sec" not in _leaves(topic):
+        yield 'stamp = "log"  # messages without a header: when they were recorded'
+    yield from _EXAMPLES[role]
 
 
-def _comment(text: str) -> str:
-    return "\n".join(f"# {line}".rstrip() for line in text.splitlines())
+def _comment(*lines: str) -> str:
+    return "\n".join(f"# {line}".rstrip() for line in lines)
 
 
 def _leaves(topic: Topic) -> dict[str, str]:

@@ -15,21 +15,20 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from mcap.writer import Writer
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import (
-    LIBRARY,
-    ROSBAG2_METADATA,
-    TRANSIENT_LOCAL,
     Keep,
+    LogWriter,
     Recording,
+    SchemaText,
     Topic,
+    latched,
+    own_schema,
     scan,
-    seal,
 )
 from sonar_graph.logs.roles import DROPPED, TF, Choice
 from sonar_graph.logs.vehicle_setup import (
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
     from sonar_graph.logs.reading import Assembly
 
 DROPPED_TOPIC = "/sonar_graph/dropped"
-CHUNK_BYTES = 1 << 20
 LIVE_RATE = "live.rate_hz"
 LATENESS = "live.lateness_s"
 """Notes that say how often the live estimator was asked, and its lateness budget."""
@@ -75,30 +73,18 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
     dropped = dropped_in(recording)
     newest_ns = read_notes(recording).get(NEWEST_FRAMES, "")
     for topic in recording.topics.values():
-        if (
-            newest_ns.isdecimal()
-            and topic.name.endswith("tf_static")
-            and short_name(topic.type_name) == short_name(TF)
-        ):
-            topic.leave_out(topic.log_times_ns[topic.log_times_ns > int(newest_ns)])
-    for name in {name for name, _ in dropped}:
-        if name in recording.topics:
-            # a message is named by topic and log time
-            times_ns = [log_time_ns for topic, log_time_ns in dropped if topic == name]
-            recording.topics[name].leave_out(np.array(times_ns, np.int64))
+        times_ns = topic.log_times_ns
+        # a message is named by topic and log time
+        gone_ns = [time_ns for name, time_ns in dropped if name == topic.name]
+        is_frames = short_name(topic.type_name) == short_name(TF) and topic.is_latched
+        if newest_ns.isdecimal() and is_frames:
+            gone_ns += times_ns[times_ns > int(newest_ns)].tolist()
+        if gone_ns:
+            topic.leave_out(np.array(gone_ns, np.int64))
     counts = Counter((name, reason) for (name, _), reason in dropped.items())
-    texts = [
-        f"{count} of {name}: {reason}"
-        for (name, reason), count in sorted(counts.items())
-    ]
-    return (
-        {
-            "log.live": "not given to the estimator live, so left out: "
-            + "; ".join(texts)
-        }
-        if texts
-        else {}
-    )
+    texts = [f"{n} of {name}: {why}" for (name, why), n in sorted(counts.items())]
+    note = f"not given to the estimator live, so left out: {'; '.join(texts)}"
+    return {"log.live": note} if texts else {}
 
 
 def recorded_config(recording: Recording) -> LogConfig | None:
@@ -126,6 +112,7 @@ def pinned(
     }
     for role, choice in choices.items():
         if choice.topic is None:
+            # a role that nothing played live must not be played by a topic that came later
             tables[role] = {"use": False}
         else:
             tables.setdefault(role, {})["topic"] = choice.topic
@@ -134,11 +121,11 @@ def pinned(
         # single messages must be read as all of the log are
         tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))
     for role in ("positions", "truth"):
-        if role in assembly.topics and assembly.adapters[role].geodetic is not None:
-            _, origin = assembly.axes_and_origin(role)
+        is_used = choices[role].topic is not None
+        if is_used and assembly.adapters[role].geodetic is not None:
             tables[role]["geodetic"] = {
                 **tables[role].get("geodetic", {}),
-                "origin_deg_m": origin,
+                "origin_deg_m": assembly.setup(role).origin,
             }
     return tables
 
@@ -163,11 +150,7 @@ class LiveRecord:
             ) from error
         except OSError as error:
             raise LogError(f"{path}: cannot be written: {error.strerror}") from error
-        self._writer = Writer(
-            self._stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True
-        )
-        self._writer.start(profile="ros2", library=LIBRARY)
-        self._schemas: dict[str, int] = {}
+        self._writer = LogWriter(self._stream)
         self._channels: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
         self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
@@ -210,7 +193,7 @@ class LiveRecord:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
+        self._writer.finish()
         self._stream.close()
 
     def describe(
@@ -231,21 +214,17 @@ class LiveRecord:
             "log_config": json.dumps(tables),
             "notes": json.dumps({**notes, NEWEST_FRAMES: str(newest_frames_ns)}),
         }
-        self._writer.add_metadata(METADATA, seal(content))
+        self._writer.add_metadata(METADATA, content)
+        # a run may be killed at any time, and without this record it cannot be repeated
         self.flush()
 
     def add_topic(self, topic: Topic) -> None:
         """State name, type and definition of a topic before its first message."""
-        key = f"{topic.type_name}\n{topic.schema_text}"
-        if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(
-                topic.type_name, topic.schema_encoding, topic.schema_text.encode()
-            )
-        if topic.is_latched:
-            self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
-        offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if topic.is_latched else {}
-        self._channels[topic.name] = self._writer.register_channel(
-            topic.name, topic.encoding, self._schemas[key], offers
+        schema = SchemaText(
+            topic.type_name, topic.schema_encoding, topic.schema_text.encode()
+        )
+        self._channels[topic.name] = self._writer.channel(
+            topic.name, schema, topic.encoding, latched(topic.is_latched)
         )
 
     def write(
@@ -262,7 +241,7 @@ class LiveRecord:
         self._newest_ns[topic] = log_time_ns
         # middleware without a time of sending gives 0
         sent_ns = sent_ns if 0 < sent_ns < 2**63 else log_time_ns
-        self._writer.add_message(
+        self._writer.mcap.add_message(
             self._channels[topic], log_time_ns, payload, sent_ns, sequence % 2**32
         )
         return log_time_ns
@@ -270,16 +249,9 @@ class LiveRecord:
     def drop(self, topic: str, log_time_ns: int, reason: str, arrival_ns: int) -> None:
         """Name a message that the estimator is not given."""
         if DROPPED_TOPIC not in self._channels:
-            own = Topic(
-                self.path,
-                DROPPED_TOPIC,
-                DROPPED,
-                "cdr",
-                "ros2msg",
-                definition(DROPPED),
-                Keep.ALL,
+            self._channels[DROPPED_TOPIC] = self._writer.channel(
+                DROPPED_TOPIC, own_schema(DROPPED)
             )
-            self.add_topic(own)
         values: dict[str, Value] = {
             "topic": topic,
             "log_time": log_time_ns,
@@ -291,4 +263,4 @@ class LiveRecord:
 
     def flush(self) -> None:
         """Give all that was written to the operating system, where the end of this process loses nothing of it."""
-        self._writer.flush()  # type: ignore[no-untyped-call]  # of the mcap package
+        self._writer.mcap.flush()  # type: ignore[no-untyped-call]  # of the mcap package

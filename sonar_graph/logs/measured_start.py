@@ -48,6 +48,7 @@ SOURCES = {
     "fixes": "heading and position by the first headings and fixes",
     "heading": "heading by the first headings, position by convention (x = y = 0)",
     "vehicle": "heading and position by convention: the world begins at the vehicle with x forward",
+    "map": "heading and position in the known map, from the landmarks that are seen",
 }
 
 
@@ -144,6 +145,8 @@ def with_measured_start(
             update={"source": "stated" if "position_m" in stated else "heading"}
         )
     start = start.model_copy(update=stated)
+    if calibration.map is not None:
+        start = start.in_map()
     height = (
         "height by the first depths"
         if blocks.get("depth") is not None

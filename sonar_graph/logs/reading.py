@@ -6,7 +6,7 @@ was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md
 """
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Never
 
@@ -18,14 +18,14 @@ from sonar_graph.files import as_path, spelt
 from sonar_graph.logs.adapters import (
     TIMES,
     Adapter,
-    DepthAdapter,
     Dropped,
-    DvlAdapter,
     FieldTable,
     GeodeticFields,
     LogConfig,
+    Mask,
     MessageTable,
     Origin,
+    Setup,
     as_log_config,
     changes_text,
     detection_warnings,
@@ -35,6 +35,7 @@ from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
     UNFELT,
+    UNLIKELY_ZEROS,
     axes_warning,
     gap_warnings,
     is_partial,
@@ -42,8 +43,10 @@ from sonar_graph.logs.checks import (
     repeats,
     row_doubts,
     row_oddities,
+    stamp_doubts,
     stamp_faults,
     unfelt_zeros,
+    unlikely_zeros,
     way_by,
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
@@ -70,6 +73,8 @@ from sonar_graph.logs.roles import (
 from sonar_graph.logs.sonar_images import sonar_frame
 from sonar_graph.logs.vehicle_setup import (
     GIVEN,
+    MOUNTING,
+    MOUNTING_FIELDS,
     PartialCalibration,
     as_calibration,
     gathered,
@@ -82,7 +87,7 @@ from sonar_graph.logs.vehicle_setup import (
     static_frames,
     unplaced,
 )
-from sonar_graph.measurements import Block, Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.measurements import Block, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 
 LOG = logging.getLogger("sonar_graph.logs")
@@ -109,6 +114,10 @@ FOUND_ANEW = frozenset(
 )
 """Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
+FEWEST_JUDGED = 10
+"""Rows from which a single one is judged by those beside it."""
+VALUES = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}
+"""Column of each block that repeats where the sensor is stuck."""
 NOISE_FIELDS = {
     "dvl": ("velocity_cov", "dvl.velocity_sigma_m_s"),
     "depth": ("variance_m2", "depth.sigma_m"),
@@ -251,12 +260,11 @@ def _scanned(
 
     types = wanted_types(config or LogConfig())
     recording = scanned(types)
-    if config is not None:
-        return recording, config
-    own = recorded_config(recording) or LogConfig()
+    used = config or recorded_config(recording) or LogConfig()
     # the types of its own topics are known only now
-    is_enough = wanted_types(own) <= types
-    return recording if is_enough else scanned(wanted_types(own)), own
+    if not wanted_types(used) <= types:
+        recording = scanned(wanted_types(used))
+    return recording, used
 
 
 class Assembly:
@@ -281,56 +289,54 @@ class Assembly:
         self.adapters: dict[str, Any] = {}
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
-        self._stuck: dict[str, str] = {}
+        self._left_out: dict[str, str] = {}
         self._tables: dict[str, MessageTable] = {}
         changes = []
         for role, choice in choices.items():
             if choice.topic is None or choice.adapter is None:
                 continue
             topic = self.topics[role] = recording.topics[choice.topic]
-            adapter = self.adapters[role] = choice.adapter
+            self.adapters[role] = choice.adapter
             self._read_table(role)
             shipped = shipped_like(role, topic.type_name, topic.definition())
-            if change := changes_text(adapter, shipped):
+            if change := changes_text(choice.adapter, shipped):
                 changes.append(f"{role}: {change}")
         recorded = read_notes(recording)
-        self._notes = {k: note for k, note in recorded.items() if k not in FOUND_ANEW}
         # the record of a live run has the rows that counted then, also stuck ones
-        self._is_live = LIVE_RATE in self._notes
-        used = (f"{role}: {topic.name}" for role, topic in self.topics.items())
-        self._notes["log.topics"] = "; ".join(used)
-        if changes:
-            self._notes["log.adapters"] = "; ".join(changes)
-        if "truth" in choices and choices["truth"].topic is None:
-            self._notes["log.truth"] = choices["truth"].reason
+        self._is_live = LIVE_RATE in recorded
+        found = {
+            "log.topics": "; ".join(
+                f"{k}: {one.name}" for k, one in self.topics.items()
+            ),
+            "log.adapters": "; ".join(changes),
+            "log.truth": "" if "truth" in self.topics else choices["truth"].reason,
+        }
+        self._notes = {k: note for k, note in recorded.items() if k not in FOUND_ANEW}
+        self._notes |= {subject: text for subject, text in found.items() if text}
         self._notes |= recording.notes()
-        self._is_mounting_known = True
+        self._missing: dict[str, str] = {}
+        self._unplaced: tuple[str, ...] = ()
+        self._has_tree = False
         self._is_start_stated = True
-        self._unplaced: list[str] = []
-        self.mounted: dict[str, str] = {}
-        """Frame in ``/tf_static`` of each sensor whose mounting is from there."""
+        is_described_ = is_described(recording)
         if isinstance(calibration, Calibration):
             self.calibration = calibration
             self._notes["log.calibration"] = GIVEN
         else:
-            self.calibration = self._gathered(calibration)
-        dvl = self.adapters.get("dvl")
-        # wheels stop and turn evenly, which would look like a Doppler log without lock
+            self._is_start_stated = is_described_
+            self._gather(calibration)
+        # wheels stop and turn evenly, which would look like a Doppler log without lock; rows of a log that this
+        # package wrote were chosen before
         is_held = self.calibration.odometry_interpolation == "hold-past"
-        # rows of a log that this package wrote were chosen before
-        is_chosen = is_held or is_described(recording)
-        self._may_lack_lock = (
-            isinstance(dvl, DvlAdapter)
-            and dvl.lock == "found"
-            and not (dvl.are_zeros_measured or is_chosen)
-        )
-        if isinstance(dvl, DvlAdapter) and is_chosen:
+        dvl = self.adapters.get("dvl")
+        self._may_lack_lock = False
+        if dvl is not None and (is_held or is_described_):
             self.adapters["dvl"] = dvl.with_marks_alone()
+        elif dvl is not None:
+            self._may_lack_lock = dvl.lock == "found" and not dvl.are_zeros_measured
 
     def _read_table(self, role: str) -> None:
         topic = self.topics[role]
-        if not self.adapters[role].reads_table:
-            return
         try:
             self._tables[role] = self.adapters[role].table(topic)
         except LogError:
@@ -340,32 +346,30 @@ class Assembly:
 
     def _frames(self) -> dict[str, str]:
         """Frame of each sensor that has a place on the vehicle."""
-        frames = {
-            role: self.adapters[role].frame_in(table.groups)
-            for role, table in self._tables.items()
-            if role not in ("truth", "heading")
-        }
-        for role in ("depth", "positions"):
-            if not frames.get(role, role):
-                del frames[role]  # in the world: there is no port or antenna to mount
-        detections = self.topics.get("detections")
-        if detections is not None and (messages := detections.messages()):
-            frames[SONAR] = self.adapters["detections"].frame_in(messages)
-        elif self._sonar is not None:
-            frames[SONAR] = self._sonar
+        frames = {}
+        for role, table in self._tables.items():
+            sensor = SONAR if role == "detections" else role
+            frame = self.adapters[role].frame_in(table.groups)
+            # a depth or a fix without a frame is in the world: there is no port or antenna to mount
+            if sensor in MOUNTING_FIELDS and (
+                frame or MOUNTING_FIELDS[sensor] == MOUNTING
+            ):
+                frames[sensor] = frame
+        if self._sonar is not None:
+            frames.setdefault(SONAR, self._sonar)
         return frames
 
-    def _gathered(self, given: PartialCalibration | None) -> Calibration:
-        """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
+    def _gather(self, given: PartialCalibration | None) -> None:
+        """Gather the calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
-        is_recorded = is_described(self._recording)
         values = {} if given is None else given.values
         stated = {} if recorded is None else recorded.model_dump(exclude_unset=True)
-        self._is_start_stated = is_recorded and not values.get("start")
-        in_record = mounted_by(stated)
-        by_hand = in_record | mounted_by(values)
+        is_recorded = self._is_start_stated
+        self._is_start_stated &= not values.get("start")
         frames = self._frames()
         tree = static_frames(self._recording)
+        in_record = mounted_by(stated)
+        by_hand = in_record | mounted_by(values)
         mountings = {}
         for name, frame in frames.items():
             try:
@@ -377,108 +381,101 @@ class Assembly:
                 raise LogError(f"{self._recording.path}: {name}: {error}") from error
             if mounting is not None:
                 mountings[name] = mounting
-        self.mounted = {k: frames[k] for k in mountings if k not in in_record}
         mounted = mountings.keys() | by_hand
-        self._is_mounting_known = "dvl" in mounted
-        missing = {name: frame for name, frame in frames.items() if name not in mounted}
-        if recorded is None:  # a record of this package states what is not zero
-            self._unplaced = [
-                unplaced(name, frame, has_tree=bool(tree))
-                for name, frame in missing.items()
-            ]
+        self._missing = {k: frame for k, frame in frames.items() if k not in mounted}
+        self._has_tree = bool(tree)
         source = "from the log"
         if not is_recorded:
-            said = ", ".join(sorted(stated))
-            source = f"{said} from the log; else defaults" if said else "defaults"
-            placed = ", ".join(self.mounted) or "none"
-            source += f"; mountings from /tf_static: {placed}"
-            if missing:
-                names = (f"{name} ({missing[name] or 'unnamed'})" for name in missing)
-                source += f"; not in the tree, taken as base_link: {', '.join(names)}"
-        if given:
-            source = given.before(source)
-        self._notes["log.calibration"] = source
-        return gathered(given, recorded, mountings)
+            source = f"{', '.join(sorted(stated))} {source}; else defaults"
+            placed = _framed({k: frames[k] for k in mountings if k not in in_record})
+            source = source if stated else "defaults"
+            source += f"; mountings from /tf_static: {placed or 'none'}"
+            if self._missing:
+                left = _framed(self._missing)
+                source += f"; not in the tree, taken as base_link: {left}"
+        self._notes["log.calibration"] = given.before(source) if given else source
+        # a record of this package states what is not zero
+        self._unplaced = () if recorded else tuple(self._missing)
+        self.calibration = gathered(given, recorded, mountings)
+
+    @property
+    def source(self) -> str:
+        """Source of the calibration."""
+        return self._notes["log.calibration"]
 
     def block(self, role: str) -> Any:
         """The measurements of a role; None where it has no topic, or none of its rows is fit."""
         if role in self._blocks or role not in self.topics:
             return self._blocks.get(role)
-        topic = self.topics[role]
         adapter = self.adapters[role]
-        source: Any = self._tables.get(role) if adapter.reads_table else topic
         rows = None
         dropped: Dropped = {}
-        if source is not None:
-            if isinstance(adapter, DepthAdapter) and (
-                said := adapter.assumption(self.calibration.gravity_m_s2)
-            ):
-                self._notes["log.depth"] = said
-            rows, dropped = rows_of(
-                adapter, source, self.calibration, *self.axes_and_origin(role)
-            )
-        if rows is not None and role in LEAST_MOVED and not self._is_live:
-            rows, stuck = self._without_repeats(role, rows)
-            dropped = dropped | stuck
-        if rows is not None and role == "dvl" and not self._is_live:
-            rows, unfelt = self._without_unfelt_zeros(rows)
-            dropped = dropped | unfelt
+        if role in self._tables:
+            if said := adapter.assumption(self.calibration.gravity_m_s2):
+                self._notes[f"log.{role}"] = said
+            rows, dropped = adapter.read(self._tables[role], self.setup(role))
+        if rows is not None and not self._is_live:
+            is_wrong, reason, advice = self._contradicted(role, rows)
+            count = int(np.count_nonzero(is_wrong))
+            if count:
+                text = f"{count} of {len(rows)} rows {reason}: left out{advice}"
+                self._left_out[role] = text
+                dropped = dropped | {reason: count}
+                rows = rows.rows(np.flatnonzero(~is_wrong))
         self._blocks[role] = rows
-        if dropped := topic.unsound | dropped:
+        if dropped := self.topics[role].unsound | dropped:
             self._dropped[role] = dropped
         return rows
 
-    def _without_repeats(self, role: str, rows: Any) -> tuple[Any, Dropped]:
-        """Rows without those of a sensor that is stuck while the vehicle moves, and their number."""
-        imu = self.block("imu")
+    def _contradicted(self, role: str, rows: Any) -> tuple[Mask, str, str]:
+        """Mask of rows that other sensors contradict, shape (n,), the reason, and a setting that uses them."""
+        none = np.zeros(len(rows), bool)
+        imu = self.block("imu") if role != "imu" else None
+        if role == "dvl" and imu is not None and self._may_lack_lock:
+            unfelt = (
+                none
+                if rows.velocity.any(axis=1).all()
+                else unfelt_zeros(imu, rows, self.calibration)
+            )
+            advice = "`are_zeros_measured = true` under [dvl] in a log configuration uses them"
+            return unfelt, UNFELT, f"; {advice}"
+        if role not in LEAST_MOVED or imu is None or len(rows) < 2:
+            return none, "", ""
         dvl = self.block("dvl")
-        if imu is None or dvl is None or len(rows) < 2:
-            return rows, {}
+        if dvl is None:
+            return none, "", ""
+        # a sensor is stuck where it repeats its value while the vehicle moves
         moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
         least = LEAST_MOVED[role]
-        if isinstance(rows, LandmarkDetections):
+        if role == "detections":
             seen = np.column_stack((rows.range_m, rows.azimuth_rad))
             stuck = repeated_sightings(rows.stamps_ns, seen, moved, least)
         else:
-            names = {"positions": "position_m", "heading": "yaw_rad", "depth": "z_m"}
-            values = getattr(rows, names[role]).reshape(len(rows), -1)
+            values = getattr(rows, VALUES[role]).reshape(len(rows), -1)
             stuck = repeats(values, moved, least)
-        count = int(np.count_nonzero(stuck))
-        if not count:
-            return rows, {}
+            # of a few rows none is beside enough others, and the first fix on the Earth is the origin, exactly 0
+            is_on_earth = getattr(self.adapters[role], "geodetic", None) is not None
+            if len(rows) >= FEWEST_JUDGED and not is_on_earth:
+                zeros = unlikely_zeros(values, moved, least)
+                if zeros.any():
+                    return zeros, UNLIKELY_ZEROS, ""
         # times are counted from where estimators begin
         start_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
         late_s = (rows.stamps_ns[np.argmax(stuck)] - start_ns) * 1e-9
-        text = f"repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
-        self._stuck[role] = f"{count} of {len(rows)} rows {text}: left out"
-        return rows.rows(np.flatnonzero(~stuck)), {f"that {text}": count}
+        reason = f"that repeat the same value while the vehicle moves, the first {late_s:.3f} s after the start"
+        return stuck, reason, ""
 
-    def _without_unfelt_zeros(self, dvl: Dvl) -> tuple[Dvl, Dropped]:
-        """Rows without those of zeros that were sent without bottom lock, and their number."""
-        imu = self.block("imu")
-        if imu is None or not self._may_lack_lock or dvl.velocity.any(axis=1).all():
-            return dvl, {}
-        unfelt = unfelt_zeros(imu, dvl, self.calibration)
-        count = int(np.count_nonzero(unfelt))
-        if not count:
-            return dvl, {}
-        self._stuck["dvl"] = (
-            f"{count} of {len(dvl)} rows {UNFELT}: left out; "
-            "`are_zeros_measured = true` under [dvl] in a log configuration uses them"
-        )
-        return dvl.rows(np.flatnonzero(~unfelt)), {UNFELT: count}
-
-    def axes_and_origin(self, role: str) -> tuple[Floats, Origin | None]:
-        """``body_R_sensor`` of an orientation, and the origin of positions on the Earth, for `rows_of`."""
-        R = np.eye(3)
+    def setup(self, role: str) -> Setup:
+        """What reading a role needs beside its messages."""
+        body_R_sensor = np.eye(3)
         if role == "heading":
-            R = self._heading_mounting().pose().rotation().matrix()
-        if role not in ("positions", "truth"):
-            return R, None
-        origin, said = common_origin(self.adapters, self._tables)
-        if said:
-            self._notes["log.origin"] = said
-        return R, origin
+            body_R_sensor = self._heading_mounting().pose().rotation().matrix()
+        origin = None
+        if role in ("positions", "truth"):
+            origin, said = common_origin(self.adapters, self._tables)
+            if said:
+                self._notes["log.origin"] = said
+        return Setup(self.calibration, body_R_sensor, origin)
 
     def _heading_mounting(self) -> Mounting:
         """Mounting of the sensor of an orientation: the IMU's where it is its topic, else that of its frame."""
@@ -499,10 +496,8 @@ class Assembly:
         imu = blocks["imu"]
         dvl = blocks["dvl"]
         require_use(str(self._recording.path), imu, dvl, OF_RECORDING)
-        from sonar_graph.logs.measured_start import (  # compiles
-            is_whole,
-            with_measured_start,
-        )
+        # compiles
+        from sonar_graph.logs.measured_start import is_whole, with_measured_start
 
         if not (self._is_start_stated or is_whole(self.calibration.start)):
             self.calibration, self._notes["log.start"] = with_measured_start(
@@ -511,6 +506,7 @@ class Assembly:
         stamps = [
             f"{role}: {text}"
             for role, table in self._tables.items()
+            if role not in ("detections", "true_landmarks")
             for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
         ]
         findings = {
@@ -521,27 +517,22 @@ class Assembly:
             "log.gaps": gap_warnings(imu, dvl, self.calibration),
             "log.noise": unsaid_noise(blocks),
         }
-        for subject, texts in findings.items():
-            if text := "; ".join(texts):
-                self._notes[subject] = text
-        own = recorded_name(self._recording)
+        self._notes |= _texts(findings)
+        own = recorded_name(self._recording) or spelt(self._recording.path.stem)
         return Sequence(
-            name=name or own or spelt(self._recording.path.stem),
-            calibration=self.calibration,
-            notes=self._notes,
-            **blocks,
+            name=name or own, calibration=self.calibration, notes=self._notes, **blocks
         )
 
     def _useless(self, role: str) -> LogError:
         """Refusal of a topic of which no message can be used."""
         topic = self.topics[role]
         faults = self._dropped.get(role, {})
-        keys = [key for fault in faults if (key := self.adapters[role].accepts(fault))]
-        way_out = ""
-        if keys:
-            way_out = (
-                f"; `{', '.join(keys)}` under [{role}] in a log configuration uses them"
-            )
+        keys = ", ".join(filter(None, map(self.adapters[role].accepts, faults)))
+        way_out = (
+            f"; `{keys}` under [{role}] in a log configuration uses them"
+            if keys
+            else ""
+        )
         return topic.error(
             f"none of its {len(topic)} messages can be used: {_counts(faults)}{way_out}"
         )
@@ -564,18 +555,31 @@ class Assembly:
         """Sentences of `row_doubts` about the rows that were chosen."""
         imu = self.block("imu")
         if imu is not None:
-            yield from row_doubts(imu, self.block("dvl"), self.calibration)
+            dvl = self.block("dvl")
+            depth = self.block("depth")
+            yield from row_doubts(imu, dvl, depth, self.calibration)
+        for role in ("imu", "dvl"):
+            if (table := self._tables.get(role)) is not None:
+                times_ns = table.topic.log_times_ns
+                for text in stamp_doubts(table.stamps_ns, times_ns):
+                    yield f"{role}: {text}"
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
-        yield from self._unplaced
+        for role in self._unplaced:
+            yield unplaced(role, self._missing[role], has_tree=self._has_tree)
         for role, table in self._tables.items():
             for text in self.adapters[role].warnings(table):
                 yield f"{role}: {text}"
-        yield from (f"{role}: {text}" for role, text in self._oddities() if text)
+        imu = self.block("imu")
+        dvl = self.block("dvl")
+        oddities = [*row_oddities(imu, dvl, self.block("depth"), self.calibration)]
+        if "dvl" in self._missing:
+            oddities.append(("dvl", axes_warning(self.adapters["dvl"])))
+        oddities += self._left_out.items()
+        yield from (f"{role}: {text}" for role, text in oddities if text)
         blocks = {role: self.block(role) for role in NOISE_FIELDS}
         yield from unsaid_noise(blocks, only_partly=True)
-        dvl = blocks["dvl"]
         sigmas = self.calibration.dvl.velocity_sigma_m_s
         if dvl is not None and np.isnan(dvl.velocity_cov).any() and 0 in sigmas:
             yield (
@@ -583,26 +587,29 @@ class Assembly:
                 "smoothers cannot use them; give [dvl] velocity_sigma_m_s above 0 in a file for --calibration"
             )
         detections = blocks["detections"]
-        if detections is not None and {"imu", "dvl"} <= self._tables.keys():
-            stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl")]
-            first_ns = max(int(ns.min()) for ns in stamps)
-            last_ns = min(int(ns.max()) for ns in stamps)
+        if detections is not None and imu is not None and dvl is not None:
+            stamps_ns = (imu.stamps_ns, dvl.stamps_ns)
+            first_ns = max(int(ns[0]) for ns in stamps_ns)
             # until the next row of odometry is due, the sensor that writes last is ahead
-            spare_ns = max(
-                (int(np.median(np.diff(np.sort(ns)))) for ns in stamps if len(ns) > 1),
-                default=0,
-            )
-            for text in detection_warnings(detections, first_ns, last_ns + spare_ns):
+            steps_ns = [np.median(np.diff(ns)) for ns in stamps_ns if len(ns) > 1]
+            due_ns = int(max(steps_ns, default=0))
+            last_ns = min(int(ns[-1]) for ns in stamps_ns) + due_ns
+            for text in detection_warnings(detections, first_ns, last_ns):
                 yield f"detections: {text}"
 
-    def _oddities(self) -> Iterator[tuple[str, str | None]]:
-        """Results of the checks of numbers by role; None: nothing is wrong."""
-        imu = self.block("imu")
-        dvl = self.block("dvl")
-        yield from row_oddities(imu, dvl, self.block("depth"), self.calibration)
-        if "dvl" in self._tables and not self._is_mounting_known:
-            yield "dvl", axes_warning(self.adapters["dvl"])
-        yield from self._stuck.items()
+
+def _framed(frames: Mapping[str, str]) -> str:
+    """Sensors with their frames, where these have other names."""
+    return ", ".join(
+        name if name == frame else f"{name} ({frame or 'unnamed'})"
+        for name, frame in frames.items()
+    )
+
+
+def _texts(findings: Mapping[str, Iterable[str]]) -> dict[str, str]:
+    """Notes of findings, one text a subject."""
+    joined = {subject: "; ".join(texts) for subject, texts in findings.items()}
+    return {subject: text for subject, text in joined.items() if text}
 
 
 def row_notes(sequence: Sequence) -> dict[str, str]:
@@ -611,7 +618,7 @@ def row_notes(sequence: Sequence) -> dict[str, str]:
     imu = sequence.imu
     dvl = sequence.dvl
     oddities = row_oddities(imu, dvl, sequence.depth, calibration)
-    doubts = list(row_doubts(imu, dvl, calibration))
+    doubts = list(row_doubts(imu, dvl, sequence.depth, calibration))
     is_held = calibration.odometry_interpolation == "hold-past"
     count = 0 if is_held else unfelt_zeros(imu, dvl, calibration).sum()
     if count:
@@ -621,8 +628,7 @@ def row_notes(sequence: Sequence) -> dict[str, str]:
         "log.warnings": (f"{role}: {text}" for role, text in oddities if text),
         "log.gaps": gap_warnings(imu, dvl, calibration),
     }
-    found = {subject: "; ".join(texts) for subject, texts in findings.items()}
-    return {subject: text for subject, text in found.items() if text}
+    return _texts(findings)
 
 
 def common_origin(
@@ -660,14 +666,8 @@ def rows_of(
 
     ``body_R_sensor`` is of the sensor of an orientation; ``origin`` of the world, in degrees and metres.
     """
-    known = {
-        "gravity_m_s2": calibration.gravity_m_s2,
-        "sigma_m": calibration.positions.sigma_m,
-        "body_R_sensor": body_R_sensor,
-        "origin": origin,
-    }
-    needed = {name: known[name] for name in adapter.NEEDS}
-    found: tuple[Any, Dropped] = adapter.read(source, **needed)
+    setup = Setup(calibration, body_R_sensor, origin)
+    found: tuple[Any, Dropped] = adapter.read(source, setup)
     return found
 
 
@@ -691,9 +691,11 @@ def require_use(file: str, imu: Imu, dvl: Dvl, advice: str = "") -> None:
             f"{_likely_unit(imu, dvl) or advice} See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
         )
     if is_partial(dvl).all():
+        largest_m2_s2 = float(np.nanmax(dvl.velocity_cov))
         raise LogError(
-            f"{file}: DVL: too few valid beams in all {len(dvl)} rows; at least one row needs three, for a velocity in "
-            f"all directions"
+            f"{file}: DVL: none of its {len(dvl)} rows measures a velocity in all directions: too few valid beams (three "
+            f"are needed), or variances of up to {largest_m2_s2:.3g} m²/s² in another unit: `covariance = false` under "
+            "[dvl] in a log configuration takes the calibration's noise"
         )
 
 

@@ -9,11 +9,10 @@ For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
 ``/NAME/smoothed``         the same type: what is known at the end about each instant; equal to it for a filter
 ``/NAME/path``             ``nav_msgs/Path``: the causal estimate so far, now and then; at the end the smoothed
 ``/NAME/landmarks``        ``visualization_msgs/MarkerArray`` at the end: 95 % ellipsoids and identities
-``/NAME/landmark_cloud``   ``sensor_msgs/PointCloud2`` at the end: position, identity, covariance
 ``/tf``                    ``map`` to ``NAME/base_link``, and to ``base_link``, which follows the first estimator
 ``/tf_static``             ``base_link`` to the sensors
-``/ground_truth/...``      ``odometry`` (of positions only ``point``), ``path``, ``landmarks``, ``landmark_cloud``
-                           from the start, and its frame in ``/tf``, where known
+``/ground_truth/...``      ``odometry`` (of positions only ``point``), ``path``, ``landmarks`` from the start,
+                           and its frame in ``/tf``, where known
 ``/sonar/recognised``      ``sensor_msgs/CompressedImage``: sonar images with the recognised identities drawn in
 =========================  ==============================================================================
 
@@ -96,6 +95,7 @@ def write_result(
     sources = dict(zip(source_names(estimates), estimates.values(), strict=True))
     truth = sequence.truth
     landmarks = sequence.true_landmarks
+    # the truth too: an estimate may cover a part of the run only
     drawn = [block.positions for estimate in estimates.values() for block in estimate]
     drawn += [block.positions for block in (truth, landmarks) if block is not None]
     scene = viewer.Scene.around(drawn)
@@ -121,6 +121,7 @@ def write_result(
     }
     records = {RESULT_RECORD: record | dict(about or {})}
     write_recording(Path(path), messages, records, attachments)
+    # one layer a topic, whatever the number of its entries
     layers = []
     for topic, entry in {entry.topic: entry for entry in messages}.items():
         colour = colours.get(topic.split("/")[1], viewer.GREY)
@@ -174,6 +175,7 @@ def _estimator(
         counts = np.searchsorted(thinned.stamps_ns, ends_ns, side="right")
         for count, end_ns in zip(counts.tolist(), ends_ns.tolist(), strict=True):
             messages.append(_path(f"/{name}/path", thinned.rows(slice(count)), end_ns))
+    # what is known at the end is published at the end, so that playing shows it then
     ends = [int(t.stamps_ns[-1]) for t in (causal, smoothed) if len(t)]
     if len(smoothed):
         messages.append(pose_messages(f"/{name}/smoothed", smoothed))
@@ -192,12 +194,9 @@ def _landmarks(
 ) -> list[Outgoing]:
     if not len(landmarks):
         return []
-    markers = viewer.landmark_markers(
-        f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m
-    )
+    topic = f"/{name}/landmarks"
     return [
-        markers,
-        viewer.landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns),
+        viewer.landmark_markers(topic, landmarks, stamp_ns, colour, scene.text_height_m)
     ]
 
 
@@ -237,6 +236,7 @@ def _bodies(
         if len(causal)
     }
     truth = sequence.true_poses
+    # a frame has one parent: the first estimator carries the sensors
     owner = next(iter(bodies.values()), truth)
     if truth is not None and len(truth):
         # viewers interpolate no frames: the truth needs the instants of the estimates
@@ -267,6 +267,7 @@ def body_transforms(topic: str, bodies: Mapping[str, Trajectory]) -> list[Outgoi
             bodies[name].rows(np.searchsorted(bodies[name].stamps_ns, at_ns))
             for name in chosen
         ]
+        # each transform has its own header
         instants_ns = np.tile(at_ns[:, None], len(rows))
         places = np.stack([row.positions for row in rows], axis=1)
         turns = np.stack([row.quaternions_xyzw for row in rows], axis=1)

@@ -33,17 +33,9 @@ TF = "tf2_msgs/msg/TFMessage"
 OTHER_WAYS = "record ROS 2 messages, or write tables for `sonar-graph convert csv`"
 SONAR = "sonar"
 """The role of sonar images."""
-BOTH = " (IMU and Doppler log must both be in the log)"
 LONGEST = 300
 """Characters of a refusal, without the names of files."""
-MOST_NAMED = 1
-"""Most types or topics that a reason names; docs/howto/your_driver.md has all types."""
 _DEFAULTS = LogConfig()
-
-
-def _some(types: list[str]) -> str:
-    more = len(types) - MOST_NAMED
-    return ", ".join(types[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass(frozen=True)
@@ -54,35 +46,18 @@ class Role:
     shipped: tuple[Shipped, ...]
     is_required: bool = False
 
-    def describe(self) -> str:
-        """Message types that can play the role, with the words that a topic's name needs."""
-        by_words: dict[tuple[str, ...], dict[str, None]] = {}
-        for offer in self.shipped:
-            by_words.setdefault(offer.words, {})[offer.adapter.type] = None
-        return ", or ".join(
-            _some(list(names))
-            + (
-                f" on a topic with {' or '.join(map(repr, words))} in its name"
-                if words
-                else ""
-            )
-            for words, names in by_words.items()
-        )
-
     def may_play(self, topic: Topic) -> bool:
         """Tell whether a topic's name allows the role: what is called truth is no measurement."""
-        return self.name in ("truth", "true_landmarks") or not any(
-            word in topic.name.lower() for word in TRUTH_WORDS
-        )
+        is_truth = any(word in topic.name.lower() for word in TRUTH_WORDS)
+        return self.name in ("truth", "true_landmarks") or not is_truth
 
     def fits(self, topic: Topic, *, general: bool) -> bool:
         """Tell whether a topic fits one of the shipped adapters, of those that are general or of the others."""
+        name = topic.name.lower()
+        kind = short_name(topic.type_name)
         return self.may_play(topic) and any(
-            short_name(offer.adapter.type) == short_name(topic.type_name)
-            and (
-                not offer.words
-                or any(word in topic.name.lower() for word in offer.words)
-            )
+            short_name(offer.adapter.type) == kind
+            and any(word in name for word in offer.words or ("",))
             for offer in self.shipped
             if offer.is_general == general
         )
@@ -183,72 +158,76 @@ def choose_topic(
     configuration that names fields which the messages do not have is refused.
     """
     table = config.table(role.name)
-    topics = recording.topics
+    topics = list(recording.topics.values())
     if table.get("use") is False and wanted is None:
         return Choice(role, None, f"switched off in {config.source}", is_off=True)
     named = wanted or table.get("topic")
     asked = table.get("type")
     if named:
-        meant = [topics[named]] if named in topics else []
-        adapter = adapter_for(role, meant[0], config) if meant else "is not in the log"
-        if isinstance(adapter, str):
-            choice = Choice(role, None, f"{named} was chosen but {adapter}")
-        else:
-            by = "by name" if wanted else f"in {config.source}"
-            choice = Choice(role, named, f"chosen {by}", adapter)
-    elif asked:
-        type_name = short_name(asked)
-        meant = [t for t in topics.values() if short_name(t.type_name) == type_name]
-        choice = _only(role, recording, config, meant) or Choice(
-            role, None, f"no {asked}, which {config.source} asks for"
-        )
+        searches = [[topic for topic in topics if topic.name == named]]
+        by = "by name" if wanted else f"in {config.source}"
+        choice = _chosen(role, named, searches[0], config, by)
     else:
-        special = [t for t in topics.values() if role.fits(t, general=False)]
-        general = [t for t in topics.values() if role.fits(t, general=True)]
-        meant = special + general
         # a type that any sensor may send counts only where no other fits
-        choice = (
-            _only(role, recording, config, special)
-            or _only(role, recording, config, general)
-            or _none_fits(role, recording, config)
-        )
+        searches = [
+            [t for t in topics if role.fits(t, general=g)] for g in (False, True)
+        ]
+        if asked:
+            kind = short_name(asked)
+            searches = [[t for t in topics if short_name(t.type_name) == kind]]
+        found = (_only(role, config, fitting) for fitting in searches)
+        choice = next(filter(None, found), None) or _none_fits(role, topics, config)
     if table and not choice.candidates:
-        for topic in [topics[choice.topic]] if choice.topic else meant:
-            if refusal(topic) is None:
+        for topic in [topic for fitting in searches for topic in fitting]:
+            if refusal(topic) is None and choice.topic in (None, topic.name):
                 config.require_fields(role.name, topic.type_name, topic.definition())
     return choice
 
 
-def _none_fits(role: Role, recording: Recording, config: LogConfig) -> Choice:
+def _chosen(
+    role: Role, name: str, found: list[Topic], config: LogConfig, by: str
+) -> Choice:
+    """Choice of the topic of a name, where the log has it and it can be read."""
+    adapter = adapter_for(role, found[0], config) if found else "is not in the log"
+    if isinstance(adapter, str):
+        return Choice(role, None, f"{name} was chosen but {adapter}")
+    return Choice(role, name, f"chosen {by}", adapter)
+
+
+def _none_fits(role: Role, topics: list[Topic], config: LogConfig) -> Choice:
     """Choice of no topic, with those that the user may choose by name."""
+    if asked := config.table(role.name).get("type"):
+        return Choice(role, None, f"no {asked}, which {config.source} asks for")
     others = tuple(
         topic.name
-        for topic in recording.topics.values()
+        for topic in topics
         if role.may_play(topic)
         and not isinstance(adapter_for(role, topic, config), str)
     )
-    reason = f"no {role.describe()}"
+    reason = f"no topic of a known type, such as {role.shipped[0].adapter.type}"
     if others:
-        reason += (
-            f"; {_some(list(others))} only if chosen: --topic {role.name}={others[0]}"
-        )
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        reason += f"; {others[0]}{more} only if chosen: --topic {role.name}={others[0]}"
     return Choice(role, None, reason, could_be=others)
 
 
-def _only(
-    role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]
-) -> Choice | None:
+def _only(role: Role, config: LogConfig, fitting: list[Topic]) -> Choice | None:
     """Choose the only usable topic of those that fit; None where none fits."""
-    adapters = {topic.name: adapter_for(role, topic, config) for topic in fitting}
-    usable = {k: one for k, one in adapters.items() if not isinstance(one, str)}
+    usable: dict[str, Adapter] = {}
+    reasons = []
+    for topic in fitting:
+        adapter = adapter_for(role, topic, config)
+        if isinstance(adapter, str):
+            reasons.append(f"{topic.name} {adapter}")
+        else:
+            usable[topic.name] = adapter
     if len(usable) > 1:
         reason = f"{len(usable)} topics fit: {', '.join(usable)}"
         return Choice(role, None, reason, candidates=tuple(usable))
     for name, adapter in usable.items():
         as_told = f", read as {config.source} says" if config.table(role.name) else ""
-        reason = f"the only {recording.topics[name].type_name} that fits{as_told}"
+        reason = f"the only {adapter.type} that fits{as_told}"
         return Choice(role, name, reason, adapter)
-    reasons = [f"{name} {reason}" for name, reason in adapters.items()]
     return Choice(role, None, "; ".join(reasons)) if reasons else None
 
 
@@ -281,13 +260,11 @@ _IN_PYTHON = {
 def refuse_unknown(unknown: Mapping[str, object], call: str) -> None:
     """Refuse arguments that a function does not have; those called like an option of a command are named."""
     for name in unknown:
-        meant = _IN_PYTHON.get(name)
-        advice = (
-            f"; `--{name.replace('_', '-')}` of the commands is {meant}="
-            if meant
-            else ""
-        )
-        raise ArgumentError(f"{call} has no argument {name}={advice}")
+        fault = f"{call} has no argument {name}="
+        if name in _IN_PYTHON:
+            option = name.replace("_", "-")
+            fault += f"; `--{option}` of the commands is {_IN_PYTHON[name]}="
+        raise ArgumentError(fault)
 
 
 def require_roles(wanted: Mapping[str, str]) -> None:
@@ -311,10 +288,7 @@ def require_topics(
     for role, topic in wanted.items():
         if topic not in recording.topics:
             reason = f"{topic} was chosen but is not in the log"
-            images = images_alone(recording, config)
-            raise MissingTopicError(
-                _missing(recording, role, reason, images, is_needed=False)
-            )
+            raise _missing(recording, role, reason, config)
 
 
 _OF_THE_DRIVER = (
@@ -386,46 +360,36 @@ def choose_topics(
                 f"{path}: has no messages: {recording.ending or 'see whether the recorder wrote any'}"
             )
         is_asked_for = name in wanted or {"topic", "type"} & config.table(name).keys()
-        if choice.topic is None and (
-            is_required or (is_asked_for and not choice.is_off)
-        ):
-            is_needed = not is_asked_for and "`" not in choice.reason
-            images = images_alone(recording, config)
-            raise MissingTopicError(
-                _missing(recording, name, choice.reason, images, is_needed=is_needed)
-            )
+        is_needed = is_required or (is_asked_for and not choice.is_off)
+        if choice.topic is None and is_needed:
+            raise _missing(recording, name, choice.reason, config)
     return choices
 
 
 def _missing(
-    recording: Recording, role: str, reason: str, images: str, *, is_needed: bool
-) -> str:
+    recording: Recording, role: str, reason: str, config: LogConfig
+) -> MissingTopicError:
     """Refusal of a log that lacks a role, with as many of its topics as `LONGEST` allows."""
     path = recording.path
-    faults = {topic.name: refusal(topic) for topic in recording.topics.values()}
-    topics = [
-        f"{topic.name} ({topic.type_name or 'no type'}"
-        f"{f', {fault}' if (fault := faults[topic.name]) and fault not in reason else ''})"
-        for topic in recording.topics.values()
-    ]
-    way_out = (
-        f"; `sonar-graph inspect {path} --toml` begins a log configuration{images}"
-    )
-    if any(fault and "`" in fault and fault in reason for fault in faults.values()):
-        way_out = images  # the reason has its own
-    counts = range(len(topics), 0, -1)
+    topics = []
+    way_out = f"; `sonar-graph inspect {path} --toml` begins a log configuration"
+    for topic in recording.topics.values():
+        fault = refusal(topic) or ""
+        if "`" in fault and fault in reason:
+            way_out = ""  # the reason has its own
+        said = f", {fault}" if fault and fault not in reason else ""
+        topics.append(f"{topic.name} ({topic.type_name or 'no type'}{said})")
+    way_out += images_alone(recording, config)
+    begin = f"{path.name}: nothing for {role}: {reason}"
+    spare = LONGEST - len(begin) - len(way_out.replace(str(path), path.name))
     # name as many topics as fit into one line
-    for both, count in [
-        (needed, count) for needed in (BOTH * is_needed, "") for count in counts
-    ]:
+    for count in range(len(topics), 0, -1):
         more = f" and {len(topics) - count} more" if count < len(topics) else ""
-        text = f"{path}: nothing for {role}: {reason}{both}; the log has {', '.join(topics[:count])}{more}{way_out}"
-        if (
-            len(text) - text.count(str(path)) * (len(str(path)) - len(path.name))
-            <= LONGEST
-        ):
-            return text
-    return f"{path}: nothing for {role}: {reason}{way_out}"
+        listed = f"; the log has {', '.join(topics[:count])}{more}"
+        if len(listed) <= spare:
+            way_out = listed + way_out
+            break
+    return MissingTopicError(f"{path}: nothing for {role}: {reason}{way_out}")
 
 
 def images_alone(recording: Recording, config: LogConfig) -> str:

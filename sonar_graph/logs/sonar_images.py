@@ -66,6 +66,7 @@ def lacking_navigation(
     Of several that fit, the user is asked when the log is read.
     """
     config = config or LogConfig()
+    # types are enough: nothing is decompressed
     recording = scan(path, lambda _: Keep.NONE, window)
     wanted = {role: topic for role, topic in topics.items() if role in NAVIGATION}
     choices = choose_each(recording, wanted, config, NAVIGATION)
@@ -103,6 +104,7 @@ def read_images_alone(
     recording = scan(path, lambda _: Keep.NONE)
     if not salvage:
         recording.require_sound()
+    # the first frame shows whether the images can be read, and when they begin
     first = next(
         read_sonar_frames(
             path, topic, config, window=window, salvage=salvage, refused=_passed_over
@@ -115,6 +117,7 @@ def read_images_alone(
     is_stated = SONAR in mounted_by(
         recorded.model_dump(exclude_unset=True) if recorded else {}
     )
+    # what the user states goes before the record, and the record before the frames of the log
     is_stated |= calibration is not None and SONAR in mounted_by(calibration.values)
     frame = None if is_stated else sonar_frame(recording, topic, config)
     mounting = None if frame is None else static_mounting(path, frame)
@@ -150,6 +153,7 @@ def sonar_frame(
         else stream(recording.path, _keeping(images.type_name), salvage=True)
     )
     found = (piece.messages() for piece in pieces if piece.name == choice.topic)
+    # the first piece may hold other topics only
     messages = next((groups for groups in found if groups), None)
     return choice.adapter.frame_in(messages) if messages else None
 
@@ -243,6 +247,7 @@ def read_sonar_frames(
     )[SONAR]
     if choice.topic is None or not isinstance(choice.adapter, SonarAdapter):
         return
+    # images of a dive do not fit into memory
     for piece in stream(
         path,
         _keeping(recording.topics[choice.topic].type_name),

@@ -4,7 +4,6 @@ TUM: one line a pose, ``t x y z qx qy qz qw``, seconds and metres
 (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
 """
 
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -29,19 +28,6 @@ LANDMARK_COLUMNS = (
 _UPPER = np.triu_indices(3)
 _LINE = "%s" + " %.17g" * 7 + "\n"
 """17 digits keep every bit of a double, in less than half the time that the shortest form takes."""
-
-
-def decimal_ns(seconds: str) -> int:
-    """Nanoseconds of a decimal number of seconds, rounded once.
-
-    A double cannot tell apart neighbouring nanoseconds of times counted from 1970; the text can.
-
-    Raises `ValueError` when the text is no finite number.
-    """
-    try:
-        return int((Decimal(seconds) * NS_PER_S).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as error:
-        raise ValueError(f"{seconds!r} is no finite decimal number") from error
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -89,6 +75,7 @@ def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
     id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz
     """
     lines = [",".join(LANDMARK_COLUMNS)]
+    # symmetric: the upper triangle is all
     triangles = landmarks.covariances[:, _UPPER[0], _UPPER[1]]
     numbers = np.hstack([landmarks.positions, triangles]).tolist()
     lines += [

@@ -17,7 +17,6 @@ from typing import Any
 import gtsam
 import numpy as np
 from pydantic import ValidationError
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import CalibrationError, LogError
@@ -40,6 +39,11 @@ METADATA = "sonar_graph"
 BODY_FRAME = "base_link"
 BODY_FRAMES = (BODY_FRAME, "base_footprint")
 """Names of the body's frame, of which the first counts that is there."""
+POSE_FIELDS = tuple(
+    f"transforms.transform.{part}.{axis}"
+    for part, axes in (("translation", "xyz"), ("rotation", "xyzw"))
+    for axis in axes
+)
 FrameTree = dict[str, tuple[str, gtsam.Pose3 | str]]
 """Parent and ``parent_T_frame`` of each frame; instead of a pose the fault of one that cannot be."""
 LARGEST_LEVER_M = 1000.0
@@ -49,12 +53,13 @@ OPTIONAL = {name for name, value in Calibration().model_dump().items() if value 
 """Fields of a calibration that may be absent."""
 GIVEN = "given by the caller"
 """Source of a calibration that replaces that of the log."""
+MOUNTING = "mounting"
 MOUNTING_FIELDS = {
-    "imu": "mounting",
-    "dvl": "mounting",
+    "imu": MOUNTING,
+    "dvl": MOUNTING,
     "depth": "port_m",
     "positions": "antenna_m",
-    "sonar": "mounting",
+    "sonar": MOUNTING,
 }
 """Field of each sensor's section that says where the sensor is."""
 
@@ -84,30 +89,29 @@ def _frames_in(recording: Recording) -> FrameTree:
         ):
             continue
         for group in topic.messages():
-            part = "transforms.transform"
-            translations = [group[f"{part}.translation.{axis}"] for axis in "xyz"]
-            rotations = [group[f"{part}.rotation.{axis}"] for axis in "wxyz"]
-            t = np.stack(translations, axis=-1)  # (messages, transforms, 3)
-            q = np.stack(rotations, axis=-1)  # (messages, transforms, 4)
+            # (messages, transforms, 7)
+            poses = np.stack([group[path] for path in POSE_FIELDS], axis=-1)
             children = group.strings("transforms.child_frame_id")
             parents = group.strings("transforms.header.frame_id")
             for message, names in enumerate(zip(children, parents, strict=True)):
                 for i, (child, parent) in enumerate(zip(*names, strict=True)):
-                    pose = _pose(t[message, i], q[message, i])
+                    pose = _pose(poses[message, i])
                     frames[child.lstrip("/")] = (parent.lstrip("/"), pose)
     return frames
 
 
-def _pose(translation_m: Floats, quaternion_wxyz: Floats) -> gtsam.Pose3 | str:
-    """Pose of a transform, or its fault."""
-    length = math.hypot(*quaternion_wxyz)
-    if not np.isfinite([*quaternion_wxyz, *translation_m]).all():
+def _pose(numbers: Floats) -> gtsam.Pose3 | str:
+    """Pose of a transform, from its `POSE_FIELDS`, or its fault."""
+    translation_m, quaternion_xyzw = np.split(numbers, [3])
+    length = math.hypot(*quaternion_xyzw)
+    if not np.isfinite(numbers).all():
         return "has numbers that are not finite"
     if not 0.5 < length < 2.0:
         return f"has a quaternion of length {length:g}, and one of a rotation has 1"
     if abs(length - 1) > 1e-6:  # unit quaternions keep every bit
-        quaternion_wxyz = quaternion_wxyz / length
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(*quaternion_wxyz), translation_m)
+        quaternion_xyzw = quaternion_xyzw / length
+    x, y, z, w = quaternion_xyzw
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), translation_m)
 
 
 def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
@@ -150,18 +154,13 @@ def _as_in_tree(frame: str, frames: FrameTree) -> str:
 
 
 def _body_T(frame: str, frames: FrameTree) -> gtsam.Pose3 | None:
-    """``body_T_frame`` of the first body above the frame, or beside it below a common ancestor; None without one."""
+    """``body_T_frame`` of the first body with which the frame shares an ancestor, or which is one; None without one."""
     above = _ancestors(frame, frames)
     for root in BODY_FRAMES:
-        for name in above:
-            if _last(name) == root:
-                return _pose_in(name, above, frames)
-        for name in frames:
-            if _last(name) != root:
-                continue
-            above_body = _ancestors(name, frames)
-            shared = next((one for one in above if one in above_body), None)
-            if shared is not None:
+        for body in (*above, *frames):
+            above_body = _ancestors(body, frames)
+            shared = next((name for name in above if name in above_body), None)
+            if _last(body) == root and shared is not None:
                 shared_T_frame = _pose_in(shared, above, frames)
                 shared_T_body = _pose_in(shared, above_body, frames)
                 return shared_T_body.inverse() * shared_T_frame
@@ -190,36 +189,22 @@ def _pose_in(ancestor: str, names: list[str], frames: FrameTree) -> gtsam.Pose3:
 
 def encode_mountings(calibration: Calibration) -> Bytes:
     """Encode the mountings of a calibration as one ``tf2_msgs/TFMessage``, shape (1, size), stamped zero."""
-    mountings = {
-        "imu": calibration.imu.mounting,
-        "dvl": calibration.dvl.mounting,
-        "depth": Mounting(translation_m=calibration.depth.port_m),
-        "sonar": calibration.sonar.mounting,
-        "positions": Mounting(translation_m=calibration.positions.antenna_m),
-    }
-    rotations = [mounting.pose().rotation().matrix() for mounting in mountings.values()]
-    quaternions = Rotation.from_matrix(rotations).as_quat()
-    translations = np.array([mounting.translation_m for mounting in mountings.values()])
-    values: dict[str, Value] = {
-        "transforms.header.frame_id": BODY_FRAME,
-        "transforms.child_frame_id": list(mountings),
-    }
-    for part, names, columns in (
-        ("translation", "xyz", translations),
-        ("rotation", "xyzw", quaternions),
-    ):
-        for i, axis in enumerate(names):
-            values[f"transforms.transform.{part}.{axis}"] = columns[None, :, i]
+    poses = []
+    for sensor, field in MOUNTING_FIELDS.items():
+        place = getattr(getattr(calibration, sensor), field)
+        mounting = place if field == MOUNTING else Mounting(translation_m=place)
+        quaternion_xyzw = mounting.pose().rotation().toQuaternion().coeffs()
+        poses.append([*mounting.translation_m, *quaternion_xyzw])
+    columns = np.array(poses).T[:, None]  # (7, 1, sensors)
+    values: dict[str, Value] = dict(zip(POSE_FIELDS, columns, strict=True))
+    values["transforms.header.frame_id"] = BODY_FRAME
+    values["transforms.child_frame_id"] = list(MOUNTING_FIELDS)
     definition_of_tf = parse_definition(TF, definition(TF))
-    return encode(definition_of_tf, 1, values, {"transforms": len(mountings)})
+    return encode(definition_of_tf, 1, values, {"transforms": len(poses)})
 
 
-OTHER_FILES = (
-    ({"ids", "matrix"}, "a model of recognition", "--model"),
-    ({"landmark"}, "a file of landmark designs", "--designs"),
-    ({"log", "labels"}, "a file of labels", "--labels"),
-)
-"""Fields by which other files of this package are known, what these are, and the option for them."""
+OTHER_FILES = {"matrix": "--model", "landmark": "--designs", "labels": "--labels"}
+"""Options for other files of this package, by a field by which these are known."""
 
 
 @dataclass(frozen=True)
@@ -284,11 +269,9 @@ class PartialCalibration:
         if not isinstance(values, dict):
             what = "expected an object with sections such as imu"
             raise CalibrationError(f"{path}: {what}, not {json.dumps(values):.40}")
-        for fields, what, option in OTHER_FILES:
-            if fields <= values.keys():
-                raise CalibrationError(
-                    f"{path}: is {what}, not a calibration; give it with {option}"
-                )
+        for field in OTHER_FILES.keys() & values.keys():
+            fault = f"is not a calibration; give it with {OTHER_FILES[field]}"
+            raise CalibrationError(f"{path}: {fault}")
         return cls.parse(values, str(path))
 
     def over(self, other: PartialCalibration) -> PartialCalibration:
@@ -330,11 +313,11 @@ def gathered(
     # a start that nobody states is not set
     values = Calibration().model_dump(exclude={"start"})
     for sensor, mounting in mountings.items():
+        field = MOUNTING_FIELDS[sensor]
         # a pressure port and an antenna have no axes
-        is_place = MOUNTING_FIELDS[sensor] != "mounting"
-        values[sensor][MOUNTING_FIELDS[sensor]] = (
-            mounting.translation_m if is_place else mounting.model_dump()
-        )
+        has_axes = field == MOUNTING
+        found = mounting.model_dump() if has_axes else mounting.translation_m
+        values[sensor][field] = found
     if recorded is not None:
         values = _over(values, recorded.model_dump(exclude_unset=True))
     if given is None:

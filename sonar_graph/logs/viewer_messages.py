@@ -1,4 +1,4 @@
-"""Messages and layouts for viewers: ellipsoids and landmarks, clouds, pictures, and the first look of a result.
+"""Messages and layouts for viewers: ellipsoids and landmarks, pictures, and the first look of a result.
 
 Viewers differ in how large they draw the covariance of a pose (RViz: one sigma; Lichtblick: half a sigma, without
 correlations); an ellipsoid marker looks the same in all of them. A viewer can switch markers by their namespace:
@@ -27,7 +27,7 @@ from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
-from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS, write_text
+from sonar_graph.logs.trajectory_files import write_text
 from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing, stamped
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
@@ -62,6 +62,7 @@ def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
     covariances[_unknown(covariances)] = (
         np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
     )
+    # C = R diag(variances) R^T: the axes of the ellipsoid are the columns of R
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
     # rounding may leave a variance below zero
@@ -87,6 +88,7 @@ def landmark_markers(
     is_unknown = _unknown(landmarks.covariances)
     diameters, quaternions = ellipsoids(landmarks.covariances)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    # above the landmark, where a small ellipsoid does not hide it
     above = landmarks.positions + np.array([0, 0, text_height_m])
     letters = np.full((count, 3), text_height_m)
     values = _marker_columns(
@@ -111,8 +113,10 @@ def landmark_markers(
 
 def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
     """``visualization_msgs/MarkerArray`` for each pose with a known covariance: the ellipsoid of its position."""
+    # the translation is the second half of a covariance in body axes
     is_known = ~_unknown(trajectory.covariances[:, 3:, 3:])
     known = trajectory.rows(np.flatnonzero(is_known))
+    # without a pose there is nothing to turn
     world_axes = known.covariances
     if len(known):
         world_axes = body_to_ros(known.covariances, known.matrices)
@@ -149,42 +153,6 @@ def _marker_columns(
     return values | {f"markers.color.{name}": part for name, part in parts}
 
 
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_FLOAT32 = 7
-_FLOAT64 = 8
-"""Types of a ``sensor_msgs/PointField``."""
-_NUMBERS = ("id", *LANDMARK_COLUMNS[4:])
-POINT = np.dtype([("xyz", "<f4", 3), ("", "<f4"), ("numbers", "<f8", len(_NUMBERS))])
-"""One point of `landmark_cloud`; the float64 numbers are aligned."""
-
-
-def landmark_cloud(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
-    """``sensor_msgs/PointCloud2``: positions, identities and covariances that a program can read.
-
-    A point has ``x y z`` as float32, because RViz reads nothing else, and as float64 ``id`` (exact up to 2^53) and the
-    upper triangle of the covariance, ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` (m²; NaN where unknown).
-    """
-    points = np.zeros(len(landmarks), POINT)
-    points["xyz"] = landmarks.positions
-    points["numbers"][:, 0] = landmarks.ids
-    points["numbers"][:, 1:] = landmarks.covariances[:, *np.triu_indices(3)]
-    at_ns = np.array([stamp_ns])
-    values = header(at_ns, WORLD_FRAME) | {
-        "height": 1,
-        "width": len(points),
-        "fields.name": ["x", "y", "z", *_NUMBERS],
-        "fields.offset": np.array([[0, 4, 8, *range(16, POINT.itemsize, 8)]]),
-        "fields.datatype": np.array([[_FLOAT32] * 3 + [_FLOAT64] * len(_NUMBERS)]),
-        "fields.count": np.ones((1, 3 + len(_NUMBERS))),
-        "point_step": POINT.itemsize,
-        "row_step": len(points) * POINT.itemsize,
-        "data": np.frombuffer(points.tobytes(), np.uint8)[None, :],
-        "is_dense": 1,
-    }
-    lengths = {"fields": 3 + len(_NUMBERS)}
-    return outgoing(topic, POINT_CLOUD, at_ns, values, lengths, is_latched=True)
-
-
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 PICTURES = "/sonar/recognised"
 """Topic of sonar images into which recognised landmarks are drawn."""
@@ -202,6 +170,7 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
     messages = []
     for picture in pictures:
         stamps_ns = np.array([picture.stamp_ns])
+        # pictures differ in their size, so that each is an entry
         content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
         values: dict[str, Value] = {"format": "jpeg", "data": content}
         lengths = {"data": content.shape[1]}
@@ -232,6 +201,7 @@ class Scene:
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return cls((0.0, 0.0, 0.0), 1.0)
+        # a box, not a sphere: surveys are long and flat
         low = points.min(axis=0)
         high = points.max(axis=0)
         x, y, z = np.round((low + high) / 2, 3).tolist()
@@ -260,6 +230,7 @@ class Scene:
     @property
     def cell_m(self) -> float:
         """Side of a cell of the grid: a power of ten."""
+        # a power of ten is read off without a legend
         return float(10.0 ** np.floor(np.log10(self.size_m)))
 
     @property
@@ -332,7 +303,6 @@ def _filled(template: str, layers: Sequence[Layer], scene: Scene) -> str:
         "MARKER_ARRAY": MARKER_ARRAY,
         "POSE_WITH_COVARIANCE": POSE_WITH_COVARIANCE,
         "ODOMETRY": ODOMETRY,
-        "POINT_CLOUD": POINT_CLOUD,
         "COMPRESSED_IMAGE": COMPRESSED_IMAGE,
     }
 

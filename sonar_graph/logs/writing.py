@@ -6,7 +6,6 @@ read back to the bit (docs/design/0004-logs.md).
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -104,6 +103,7 @@ def write_log(
     """
     path = as_path(path, "write_log(path, sequence)")
     require_sequence(sequence, "write_log(path, sequence)")
+    # latched messages come first: players send them before any sensor
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
     mountings = encode_mountings(sequence.calibration)
     messages = [static_message("/tf_static", TF, first_ns, mountings)]
@@ -124,30 +124,14 @@ def write_log(
         messages += detection_messages("/sonar/landmarks", sequence.detections)
     if sequence.truth is not None:
         messages.append(truth_messages(sequence.truth))
+    # what no ROS message holds: without it a reader would have to guess noise and start
     record = {
         "name": sequence.name,
         "calibration": recorded_calibration(sequence.calibration),
         "notes": json.dumps(sequence.notes),
     }
     with recording(path, {METADATA: record}) as out:
-        begins = [0] * len(messages)
-        for entry in more:  # with each, what comes up to its end
-            until_ns = int(entry.log_times_ns[-1])
-            ends = [
-                int(np.searchsorted(m.log_times_ns, until_ns, side="right"))
-                for m in messages
-            ]
-            out.write([*map(_rows, messages, begins, ends), entry])
-            begins = ends
-        out.write([_rows(m, first) for m, first in zip(messages, begins, strict=True)])
-
-
-def _rows(entry: Outgoing, first: int, end: int | None = None) -> Outgoing:
-    return replace(
-        entry,
-        log_times_ns=entry.log_times_ns[first:end],
-        payloads=entry.payloads[first:end],
-    )
+        out.write(messages, more)
 
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:
@@ -155,6 +139,7 @@ def imu_messages(topic: str, imu: Imu) -> Outgoing:
     # ROS marks an acceleration that was not measured by -1 in its covariance
     unmeasured = np.isnan(imu.specific_force).all(axis=1)
     values: dict[str, Value] = {
+        # not measured, but a quaternion of zeros is none and viewers refuse it
         "orientation.w": 1.0,
         "orientation_covariance": NOT_MEASURED[None, :],
         "linear_acceleration_covariance": np.outer(unmeasured, NOT_MEASURED),
@@ -166,6 +151,7 @@ def imu_messages(topic: str, imu: Imu) -> Outgoing:
 
 def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
     """``marine_acoustic_msgs/Dvl`` over the bottom, without single beams."""
+    # an unknown covariance is NaN here, and -1 in ROS
     covariances = dvl.velocity_cov.reshape(-1, 9).copy()
     covariances[np.isnan(covariances).any(axis=1)] = NOT_MEASURED
     values = fields("velocity", "xyz", dvl.velocity)
@@ -178,6 +164,7 @@ def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
 def depth_messages(topic: str, depth: Depth) -> Outgoing:
     """``PoseWithCovarianceStamped`` of which only z counts; it keeps every bit of a height, a pressure does not."""
     covariances = np.zeros((len(depth), 6, 6))
+    # zeros mean unknown in ROS
     covariances[:, 2, 2] = np.nan_to_num(depth.variance_m2, posinf=np.inf)
     values = {"pose.pose.position.z": depth.z_m}
     return _upright_poses(topic, depth.stamps_ns, values, covariances)
@@ -229,6 +216,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
         else np.empty((len(detections), 0), np.int64),
     }
     entries = []
+    # all messages of an entry have one size, which depends on the number of detections
     for count in np.unique(counts).tolist():
         frames = counts == count
         rows = first[frames][:, None] + np.arange(count)
@@ -242,6 +230,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
 
 def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
     """Columns of a ``PoseWithCovariance`` called ``pose``, with zeros for an unknown covariance."""
+    # covariances are in body axes here, in world axes in ROS
     covariances = body_to_ros(trajectory.covariances, trajectory.matrices)
     values = fields("pose.pose.position", "xyz", trajectory.positions)
     values |= fields("pose.pose.orientation", "xyzw", trajectory.quaternions_xyzw)

@@ -4,10 +4,11 @@ Every sighting of a landmark of the map is compared with its prediction, by the 
 azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. A wrong identity
 contradicts seldom and here and there; a landmark that has moved is contradicted each time. So a landmark is contradicted
 from `FEWEST` contradictions on, where they are more than half of its sightings. As long as fewer landmarks are contradicted
-than agree, it has moved, and the estimator maps it anew. Where as many are contradicted, the start may be wrong, or those
+than agree, it has moved, and the estimator maps it again. Where as many are contradicted, the start may be wrong, or those
 that agree have moved: then their sightings are refused, and a message names both.
 """
 
+import math
 from collections import Counter
 from enum import Enum
 
@@ -17,8 +18,8 @@ from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Floats
 from sonar_graph.states import LandmarkMap
 
-CONTRADICTS = 27.6
-"""Chi-square quantile of 1 - 1e-6, two degrees of freedom."""
+CONTRADICTS = 13.8
+"""Chi-square quantile of 99.9 %, two degrees of freedom."""
 FEWEST = 3
 """Number of contradictions from which on a landmark may have moved."""
 
@@ -47,20 +48,22 @@ class KnownLandmarks:
         self._agreeing: Counter[int] = Counter()
         self._contradicting: Counter[int] = Counter()
 
+    @property
+    def gate(self) -> float:
+        """Mahalanobis distance from which on a sighting contradicts the map."""
+        return math.sqrt(CONTRADICTS)
+
     def judge(self, landmark_id: int, squared: float) -> Verdict:
         """Treatment of a sighting at a squared Mahalanobis distance from its prediction."""
         if landmark_id not in self.held:
             return Verdict.USE
         self.seen.add(landmark_id)
-        if squared <= CONTRADICTS:
+        if squared <= self.gate**2:
             self._agreeing[landmark_id] += 1
             return Verdict.USE
         self._contradicting[landmark_id] += 1
         contradicted = self._contradicted()
-        agreeing = (self.held & self.seen).difference(contradicted, self.moved)
-        if landmark_id not in contradicted:
-            return Verdict.REFUSE
-        if len(self.moved) + len(contradicted) >= len(agreeing):
+        if landmark_id not in contradicted or not self._is_outvoted(contradicted):
             return Verdict.REFUSE
         self.moved.append(landmark_id)
         # what has left a bounded window cannot be taken out again
@@ -79,6 +82,11 @@ class KnownLandmarks:
             and self._contradicting[i] >= FEWEST
             and self._contradicting[i] > self._agreeing[i]
         ]
+
+    def _is_outvoted(self, contradicted: list[int]) -> bool:
+        """Check that fewer landmarks have moved or are contradicted than agree with the map."""
+        agreeing = (self.held & self.seen).difference(contradicted, self.moved)
+        return len(self.moved) + len(contradicted) < len(agreeing)
 
     def places(self) -> Floats:
         """Places of all landmarks of the map, shape (m, 3), m."""
@@ -117,16 +125,21 @@ class KnownLandmarks:
         if self.map is None:
             return []
         lines = []
-        if self.moved:
+        moved = self.moved
+        contradicted = self._contradicted()
+        # the landmarks that agree may have been seen after the last sighting of one that has moved
+        if self._is_outvoted(contradicted):
+            moved = [*moved, *contradicted]
+            contradicted = []
+        if moved:
             treated = (
-                "mapped anew; correct the map"
+                "mapped again; correct the map"
                 if self._may_release
-                else "their sightings are refused; correct the map, or give history.policy = whole to map them anew"
+                else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
             )
             lines.append(
-                f"landmarks {listed(self.moved)} no longer stand where the map has them: {treated}"
+                f"landmarks {listed(moved)} no longer stand where the map has them: {treated}"
             )
-        contradicted = self._contradicted()
         if contradicted:
             lines.append(
                 f"landmarks {listed(contradicted)} contradict the map, and too few others agree with it: they have moved,"

@@ -4,23 +4,25 @@ The level frame o has its origin at the body's first position, and its yaw is ze
 a sighting of landmark i gives a place ``q_k`` in o, with covariance ``S_k``; the landmark's height in the map gives the
 elevation. Heading psi and position t of the start are common to all sightings::
 
-    m_i = R(psi) q_k + t + e_k,    e_k ~ N(0, R(psi) S_k R(psi)^T + M_i)                                       (1)
+    m_i = R(psi) q_k + t + e_k,    cov(e_k, e_l) = M_ij + R(psi) S_k R(psi)^T where k = l                      (1)
 
 Two sightings of different landmarks give psi and t (two-point resection). Every pair proposes a start, refined by least
 squares over the landmarks that agree with it. A landmark agrees where most of its sightings lie within the 99.9 % ellipse
 of (1). One with a wrong identity lies anywhere in the area A of the map. The evidence of a start h, with the prior of a
 pose uniform over A and all headings, and its posterior covariance Sigma::
 
-    E(h) = prod_agreeing (1 - w) N(e_i) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
+    E(h) = N(e) prod_agreeing (1 - w) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
     E(one) = n (1 - w) / A (w / A)^(n - 1),    E(none) = (w / A)^n                                             (3)
 
-w is the probability of a wrong identity. Sightings of one landmark count once: a recogniser errs in the same way again.
-The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`. Arun, Huang and Blostein,
+w is the probability of a wrong identity. Sightings of one landmark count once, by their mean: a recogniser errs in the same
+way again. The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`, and when its
+heading is known well enough to linearise at it. Arun, Huang and Blostein,
 "Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory, Inference, and Learning
 Algorithms", 2003, chapter 28 (evidence).
 """
 
 import math
+from collections import Counter
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -60,10 +62,19 @@ ODDS = 1e4
 AGREES = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
 MOST_SIGHTINGS = 24
-"""Number of the newest sightings that propose starts."""
-LOOSER = 10.0
-"""Sigmas of the prior start over those found: the estimator weighs the same sightings itself."""
+"""Number of sightings that propose starts, the newest ones."""
+MOST_OF_LANDMARK = 4
+"""Of one landmark: their mean counts as one sighting, and more of them would share the errors of odometry."""
+LINEAR_SIGMAS = 3.0
+"""Error of the heading that is found, in sigmas, up to which a sighting must be linear in it within its own sigma."""
+LOOSER = 3.0
+"""Sigmas of the prior start over those found: the estimator weighs the same sightings itself, so that a ninth of their
+information counts twice. With a looser prior it would follow a moved landmark that it sees first."""
+SAME = 10.0
+"""Distance, in sigmas, of starts that are refined to the same one."""
 STEPS = 5
+CONVERGED = 1e-6
+"""Squared length of a step of least squares, in sigmas."""
 
 
 class MapSighting(NamedTuple):
@@ -112,7 +123,7 @@ class MapLocator:
             return
         for frame in measurements.detections.frames():
             if self.found is None and self._see(frame):
-                self.found = located(self._sightings[-MOST_SIGHTINGS:], self._map)
+                self.found = located(self._newest(), self._map)
 
     def _see(self, frame: LandmarkDetections) -> bool:
         """Add the sightings of a frame; True where there are any."""
@@ -162,6 +173,16 @@ class MapLocator:
             S = spread(o_T_body, o_T_sonar, point, R_z, C)
             self._sightings.append(MapSighting(row, point[:2], S))
         return True
+
+    def _newest(self) -> list[MapSighting]:
+        """The newest sightings, a few of each landmark, in the order of time."""
+        count: Counter[int] = Counter()
+        newest = []
+        for sighting in reversed(self._sightings):
+            count[sighting.row] += 1
+            if count[sighting.row] <= MOST_OF_LANDMARK:
+                newest.append(sighting)
+        return newest[:MOST_SIGHTINGS][::-1]
 
     def start(self) -> Start:
         """Prior start at the place that was found, `LOOSER` than it is known."""
@@ -216,27 +237,30 @@ def spread(
 def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     """The start that outweighs all others by `ODDS`; None without one."""
     places = np.array(known.positions_m)[:, :2]
-    M = known.joint()
-    place_cov = np.array(
-        [M[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] for k in range(len(places))]
-    )
+    m = len(places)
+    is_level = np.arange(3 * m) % 3 < 2
+    M = known.joint()[np.ix_(is_level, is_level)]  # (2 m, 2 m)
     q = np.array([s.q for s in sightings])
     S = np.array([s.S for s in sightings])
     rows = np.array([s.row for s in sightings])
-    n = len(np.unique(rows))
+    n = len(set(rows.tolist()))
     if n < 2:
         return None
     reach_m = float(np.linalg.norm(q, axis=1).max())
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
-    data = MapData(q, S, rows, places, place_cov, area_m2)
-    found = [refined(proposal, data) for proposal in proposals(data)]
-    by_evidence = sorted(
-        (start for start in found if start is not None),
-        key=lambda start: -start.log_evidence,
-    )
+    is_of = np.unique(rows)[:, None] == rows
+    data = MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2)
+    found: list[FoundStart] = []
+    for proposal in proposals(data):
+        # sightings of the same landmarks propose the same start many times
+        if any(is_same(proposal, start) for start in found):
+            continue
+        start = refined(proposal, data)
+        if start is not None and math.isfinite(start.log_evidence):
+            found.append(start)
     starts: list[FoundStart] = []
-    for start in by_evidence:
-        if not any(is_same(start, better) for better in starts):
+    for start in sorted(found, key=lambda start: -start.log_evidence):
+        if not any(is_same(start.parameters, better) for better in starts):
             starts.append(start)
     if not starts:
         return None
@@ -246,7 +270,8 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     best = starts[0]
     rivals = [start.log_evidence for start in starts[1:]] + [none, one]
     weight = float(np.logaddexp.reduce(rivals))
-    return best if best.log_evidence - weight >= math.log(ODDS) else None
+    is_ahead = best.log_evidence - weight >= math.log(ODDS)
+    return best if is_ahead and is_linear(best, data) else None
 
 
 class MapData(NamedTuple):
@@ -256,14 +281,24 @@ class MapData(NamedTuple):
     """Shape (k, 2)."""
     S: Floats
     """Shape (k, 2, 2)."""
+    S_inv: Floats
+    """Inverses of S."""
     rows: Any
     """Landmark of each sighting, shape (k,)."""
+    is_of: Any
+    """True for the sightings of each landmark that was seen, shape (l, k)."""
     places: Floats
     """Shape (m, 2)."""
-    place_cov: Floats
-    """Shape (m, 2, 2)."""
+    M: Floats
+    """Joint covariance of the places, shape (2 m, 2 m)."""
     area_m2: float
     """A."""
+
+    @property
+    def place_cov(self) -> Floats:
+        """Covariance of each place, shape (m, 2, 2)."""
+        m = len(self.places)
+        return self.M.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
 
 
 def proposals(data: MapData) -> list[Floats]:
@@ -297,55 +332,72 @@ def turn(psi: float) -> Floats:
 
 def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     """Least squares of (1) over the landmarks that agree, with the evidence (2)."""
-    agreeing: list[int] = []
+    seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
+    agreeing = np.zeros(len(seen), bool)
     information = np.zeros((3, 3))
     for _ in range(STEPS):
         R = turn(parameters[0])
         e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)
         W = R @ data.S @ R.T + data.place_cov[data.rows]  # (k, 2, 2)
         squared = np.einsum("ki,ki->k", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
-        agreeing = first_agreeing(squared <= AGREES, data.rows)
-        if len(agreeing) < 2:
+        agrees = data.is_of & (squared <= AGREES)  # (l, k)
+        agreeing = 2 * agrees.sum(axis=1) > data.is_of.sum(axis=1)
+        if np.count_nonzero(agreeing) < 2:
             return None
-        by_psi = data.q[agreeing] @ turn(parameters[0] + 0.5 * math.pi).T
-        J = np.concatenate(
-            [by_psi[:, :, None], np.broadcast_to(np.eye(2), (len(agreeing), 2, 2))],
-            axis=2,
-        )  # (a, 2, 3)
-        weighted = np.linalg.solve(W[agreeing], J)  # (a, 2, 3)
-        information = np.einsum("aij,aik->jk", J, weighted)
-        step = np.linalg.solve(
-            information, np.einsum("aij,ai->j", weighted, e[agreeing])
-        )
+        q, S = mean_sightings(agrees[agreeing], data)  # (a, 2), (a, 2, 2)
+        e = (data.places[seen[agreeing]] - q @ R.T - parameters[1:]).ravel()  # (2 a,)
+        W = joint_covariance(R @ S @ R.T, seen[agreeing], data.M)  # (2 a, 2 a)
+        by_psi = q @ turn(parameters[0] + 0.5 * math.pi).T
+        by_t = np.tile(np.eye(2), (len(q), 1))
+        J = np.column_stack([by_psi.ravel(), by_t])  # (2 a, 3)
+        weighted = np.linalg.solve(W, J)  # (2 a, 3)
+        information = J.T @ weighted
+        gradient = weighted.T @ e
+        step = np.linalg.solve(information, gradient)
         parameters = parameters + step
+        if float(step @ gradient) < CONVERGED:
+            break
     covariance = np.asarray(np.linalg.inv(information), np.float64)
-    log_density = -0.5 * squared[agreeing] - 0.5 * np.log(
-        np.linalg.det(2.0 * math.pi * W[agreeing])
-    )
-    n = len(np.unique(data.rows))
-    wrong = (n - len(agreeing)) * math.log(WRONG / data.area_m2)
-    right = float(log_density.sum()) + len(agreeing) * math.log(1.0 - WRONG)
+    _, log_det = np.linalg.slogdet(2.0 * math.pi * W)
+    log_density = -0.5 * float(e @ np.linalg.solve(W, e) + log_det)
+    wrong = np.count_nonzero(~agreeing) * math.log(WRONG / data.area_m2)
+    right = log_density + len(q) * math.log(1.0 - WRONG)
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
     prior = math.log(2.0 * math.pi * data.area_m2)
     return FoundStart(parameters, covariance, right + wrong + volume - prior)
 
 
-def first_agreeing(agrees: Any, rows: Any) -> list[int]:
-    """First agreeing sighting of each landmark most of whose sightings agree."""
-    found = []
-    for row in np.unique(rows).tolist():
-        of_landmark = np.flatnonzero(rows == row)
-        if 2 * np.count_nonzero(agrees[of_landmark]) > len(of_landmark):
-            found.append(int(of_landmark[np.argmax(agrees[of_landmark])]))
-    return found
+def joint_covariance(S: Floats, rows: Any, M: Floats) -> Floats:
+    """Covariance of (1) over some landmarks, whose places err together, shape (2 a, 2 a); ``S``: (a, 2, 2)."""
+    coordinates = np.add.outer(2 * rows, np.arange(2)).ravel()
+    W = M[np.ix_(coordinates, coordinates)]
+    for k, cov in enumerate(S):
+        W[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
+    return W
 
 
-def is_same(start: FoundStart, better: FoundStart) -> bool:
-    """Check that a start lies within the prior that `MapLocator.start` makes of a better one."""
-    d = start.parameters - better.parameters
+def mean_sightings(is_averaged: Any, data: MapData) -> tuple[Floats, Floats]:
+    """Weighted mean of some sightings of each landmark, shape (a, 2), and its covariance; ``is_averaged``: (a, k)."""
+    information = np.einsum("ak,kij->aij", is_averaged, data.S_inv)
+    weighted = np.einsum("ak,kij,kj->ai", is_averaged, data.S_inv, data.q)
+    S = np.linalg.inv(information)
+    return np.einsum("aij,aj->ai", S, weighted), S
+
+
+def is_linear(start: FoundStart, data: MapData) -> bool:
+    """Check that the heading is known well enough for an estimator that is linearised at the start."""
+    squared_rad2 = LINEAR_SIGMAS**2 * start.covariance[0, 0]
+    second_order_m = 0.5 * squared_rad2 * np.linalg.norm(data.q, axis=1)
+    sigma_m = np.sqrt(0.5 * np.trace(data.S, axis1=1, axis2=2))
+    return float(second_order_m.mean()) <= float(sigma_m.mean())
+
+
+def is_same(parameters: Floats, better: FoundStart) -> bool:
+    """Check that (psi, t_x, t_y) is a better start, within `SAME` sigmas of it."""
+    d = parameters - better.parameters
     d[0] = math.remainder(d[0], 2.0 * math.pi)
     squared = float(d @ np.linalg.solve(better.covariance, d))
-    return squared <= LOOSER**2
+    return squared <= SAME**2
 
 
 class StartInMap:
@@ -360,7 +412,6 @@ class StartInMap:
         self._locator = MapLocator(calibration)
         self._waiting: list[Measurements] = []
         self._inner: Estimator | None = None
-        self._from_ns = 0
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Causal estimate at the end of the measurements; None as long as the vehicle is not located in the map."""
@@ -372,7 +423,6 @@ class StartInMap:
             return None
         started = self._calibration.model_copy(update={"start": self._locator.start()})
         self._inner = self._make(started, Odometry(started))
-        self._from_ns = measurements.end_ns
         estimate = None
         for each in self._waiting:
             estimate = self._inner.process(each)
@@ -380,11 +430,10 @@ class StartInMap:
         return estimate
 
     def trajectory(self) -> Trajectory:
-        """Estimates from the instant on at which the vehicle was located."""
+        """Poses at all instants, also those before the vehicle was located; none until then."""
         if self._inner is None:
             return Trajectory.from_estimates([])
-        whole = self._inner.trajectory()
-        return whole.rows(np.flatnonzero(whole.stamps_ns >= self._from_ns))
+        return self._inner.trajectory()
 
     def landmarks(self) -> LandmarkMap:
         """Best present estimate of every landmark; none before the vehicle is located."""

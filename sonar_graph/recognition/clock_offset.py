@@ -38,7 +38,8 @@ LEAST_STEPS = 50
 """Measured steps within the navigation that an offset needs."""
 LEAST_SHARE = 0.5
 """The same as a share of those of the offset with the most."""
-LEAST_NATS, APART_S = 5.0, 1.0
+LEAST_NATS = 5.0
+APART_S = 1.0
 LARGEST_SIGMA_S = 0.5
 CLIPPED_AT = 0.98
 """Quantile of the size of the images' motions beyond which they are clipped: a wrong fit must not outweigh the rest."""
@@ -176,10 +177,8 @@ def estimate_offset(
             f"{CANNOT_TELL}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; give a longer "
             f"--search SECONDS, or {AS_STATED}"
         )
-    seconds, near = (
-        _top(offsets_s, found),
-        np.abs(offsets_s - offsets_s[best]) <= APART_S,
-    )
+    seconds = _top(offsets_s, found)
+    near = np.abs(offsets_s - offsets_s[best]) <= APART_S
     sigma_s = _jackknife(z, moved, offsets_s[near])
     nats = float(found[best]) - float(
         found[np.abs(offsets_s - seconds) > APART_S].max(initial=0.0)
@@ -251,7 +250,8 @@ def _jackknife(z: Floats, moved: Callable[[float], Floats], offsets_s: Floats) -
 def _correlation(z: Floats, f: Floats) -> float:
     """Correlation of two columns where both are known; 0 where one of them does not change."""
     known = np.isfinite(z + f)
-    z, f = z[known] - np.mean(z[known]), f[known] - np.mean(f[known])
+    z = z[known] - np.mean(z[known])
+    f = f[known] - np.mean(f[known])
     scale = float(np.sqrt(np.sum(z**2) * np.sum(f**2)))
     return float(np.sum(z * f)) / scale if scale > 1e-12 else 0.0
 

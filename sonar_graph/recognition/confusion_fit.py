@@ -40,7 +40,8 @@ from sonar_graph.sonar import (
     soft_scores,
 )
 
-SAME_M, APART_M = 0.08, 0.40
+SAME_M = 0.08
+APART_M = 0.40
 NO_LABEL = -2
 NONE = -1
 LEAST_FRAMES = 3
@@ -118,7 +119,8 @@ class LabelledSightings:
     ) -> None:
         """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
-        known, fit = label != NONE, sighting.fit
+        known = label != NONE
+        fit = sighting.fit
         place = sighting.bound_m, sighting.moved_m
         if (
             fit is None
@@ -149,7 +151,8 @@ class LabelledSightings:
 
     def add_frame(self, recogniser: Recogniser, run: Run, log: int) -> None:
         """Add what a recogniser saw in its last frame, of a log with truth; nothing at times that the truth lacks."""
-        stamp_ns, truth = recogniser.stamp_ns, run.true_poses
+        stamp_ns = recogniser.stamp_ns
+        truth = run.true_poses
         assert truth is not None
         assert run.true_landmarks is not None
         if (
@@ -402,7 +405,8 @@ def without_height(fits: LabelledFits) -> tuple[float, Floats]:
     A face that is higher by b seems nearer by ``b h / r``, with h the height of the sonar: where sound arrives first.
     Each track counts once.
     """
-    error, rise = fits.error_m.copy(), fits.range_per_height
+    error = fits.error_m.copy()
+    rise = fits.range_per_height
     known = np.isfinite(error[:, 0]) & (rise > 0)
     if not known.any():
         return 0.0, error
@@ -429,14 +433,14 @@ def accuracy(
     count as ``1 / (2 PRIOR_SHARE^2)`` further ones, from which a sigma is known to `PRIOR_SHARE` of itself.
     """
     known = np.isfinite(error).all(axis=1) & np.isfinite(bound).all(axis=1)
-    error, bound, (_, track) = (
-        error[known],
-        bound[known],
-        np.unique(track_of[known], return_inverse=True),
-    )
-    once, tracks = 1.0 / np.bincount(track)[track], int(track.max()) + 1
+    error = error[known]
+    bound = bound[known]
+    (_, track) = np.unique(track_of[known], return_inverse=True)
+    once = 1.0 / np.bincount(track)[track]
+    tracks = int(track.max()) + 1
     usual = np.exp(np.average(np.log(bound), axis=0, weights=once))
-    growth, tiny = np.log(bound / usual), np.finfo(float).tiny
+    growth = np.log(bound / usual)
+    tiny = np.finfo(float).tiny
 
     def variances(power: float) -> Floats:
         return np.asarray(
@@ -451,13 +455,12 @@ def accuracy(
         )
 
     power = float(minimize_scalar(loss, bounds=powers, method="bounded").x)
-    squares, samples = tracks * variances(power), np.array([tracks - 1.0, tracks])
+    squares = tracks * variances(power)
+    samples = np.array([tracks - 1.0, tracks])
     if prior:
         before = 1 / (2 * PRIOR_SHARE**2)
-        squares, samples = (
-            squares + before * prior.sigmas_m(usual) ** 2,
-            samples + before,
-        )
+        squares = squares + before * prior.sigmas_m(usual) ** 2
+        samples = samples + before
     return Accuracy(usual, np.sqrt(squares / np.maximum(samples, 1.0)), power)
 
 
@@ -471,19 +474,16 @@ def report_interval_s(
     coordinates. The given time counts as some tracks (`PRIOR_SHARE`), and c is at least 0.
     """
     known = np.isfinite(error).all(axis=1)
-    seconds, tracks = prior_s / PRIOR_SHARE**2, 1 / PRIOR_SHARE**2
+    seconds = prior_s / PRIOR_SHARE**2
+    tracks = 1 / PRIOR_SHARE**2
     for track in np.unique(track_of[known]):
-        own, stamps = (
-            error[known & (track_of == track)],
-            stamp_ns[known & (track_of == track)],
-        )
+        own = error[known & (track_of == track)]
+        stamps = stamp_ns[known & (track_of == track)]
         n = len(own)
         if n > 1:
             common = (own.sum(axis=0) ** 2 - (own**2).sum(axis=0)) / (n * (n - 1))
-            seconds, tracks = (
-                seconds + float(common.mean() * np.ptp(stamps) * 1e-9),
-                tracks + 1,
-            )
+            seconds = seconds + float(common.mean() * np.ptp(stamps) * 1e-9)
+            tracks = tracks + 1
     return max(seconds / tracks, 0.0)
 
 
@@ -512,10 +512,8 @@ def fit_weights(
     scale = PRIOR_SHARE * np.abs(prior)
 
     def loss(unbounded: Floats) -> float:
-        weights, looks = (
-            prior + scale * unbounded[:-1],
-            prior_looks * np.exp(PRIOR_SHARE * unbounded[-1]),
-        )
+        weights = prior + scale * unbounded[:-1]
+        looks = prior_looks * np.exp(PRIOR_SHARE * unbounded[-1])
         odds = np.pad(sums @ weights, ((0, 0), (0, 1))) / (counted + looks)[:, None]
         log_posterior = log_softmax(odds + log_birth, axis=1)
         return float(
@@ -534,7 +532,9 @@ def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
 
     A track that was of several classes is one of each. Landmarks and none of them have the shares of the prior in sum.
     """
-    sums, counted, label = [], [], []
+    sums = []
+    counted = []
+    label = []
     for track, k in np.unique(np.stack([fits.track, fits.label]), axis=1).T.tolist():
         rows = np.flatnonzero(
             (fits.track == track) & (fits.label == k) & (fits.news > 0)

@@ -29,18 +29,23 @@ from sonar_graph.sonar import SLANT_PLANE, FloorView, SonarStep, with_lens
 MotionFrom = Literal["navigation", "images", "fixed"]
 PIXELS_AHEAD = 128
 BLUR_PIXELS = 2.0
-LOWEST_DB, HIGHEST_DB = -15.0, 25.0
+LOWEST_DB = -15.0
+HIGHEST_DB = 25.0
 """Limits of a level over its beam and range: single echoes do not outweigh the floor."""
-MOST_ROUNDS, LEAST_CHANGE = 30, 1e-4
+MOST_ROUNDS = 30
+LEAST_CHANGE = 1e-4
 LEAST_CORRELATION = 0.3
 """Two frames that agree less are of other scenes, or of nothing."""
 LONGEST_STEP_NS = 2 * NS_PER_S
 """Longest time between frames that can be laid upon each other."""
-FASTEST_RAD_S, FASTEST_M_S = math.radians(60.0), 2.0
+FASTEST_RAD_S = math.radians(60.0)
+FASTEST_M_S = 2.0
 """A vehicle with an imaging sonar neither turns nor drives faster: what says so is a wrong fit."""
-UNKNOWN_RAD_S, UNKNOWN_M_S = math.radians(10.0), 0.3
+UNKNOWN_RAD_S = math.radians(10.0)
+UNKNOWN_M_S = 0.3
 """Standard deviations of a motion that was not measured, about that of the step before."""
-UNSEEN_RAD_S, UNSEEN_M_S = math.radians(2.0), 0.05
+UNSEEN_RAD_S = math.radians(2.0)
+UNSEEN_M_S = 0.05
 """Standard deviations of roll and pitch rates, and of the speed up and down."""
 Picture = NDArray[np.float32]
 
@@ -79,7 +84,8 @@ class FloorPicture:
                 f"the sonar is {view.height_m:.4g} m above the floor and sees nothing of it up to its range of "
                 f"{ranges_m.max():.4g} m: check floor.z_m and start.position_m (metres) and sonar.mounting (radians)"
             )
-        low, high = np.nanmin(seen[:, :2], axis=0), np.nanmax(seen[:, :2], axis=0)
+        low = np.nanmin(seen[:, :2], axis=0)
+        high = np.nanmax(seen[:, :2], axis=0)
         self.pixel_m = float(high[0] - low[0]) / PIXELS_AHEAD
         self.corner_m = low
         """Level (x, y) of the first pixel."""
@@ -93,7 +99,8 @@ class FloorPicture:
         )
         q = q @ view.level_R_sonar
         order = np.argsort(azimuths_rad)
-        azimuth, beams = np.arctan2(q[..., 1], q[..., 0]), order.astype(float)
+        azimuth = np.arctan2(q[..., 1], q[..., 0])
+        beams = order.astype(float)
         self._beam = np.interp(azimuth, azimuths_rad[order], beams, -1, -1).astype(
             np.float32
         )
@@ -132,7 +139,8 @@ class FloorPicture:
             MOST_ROUNDS,
             LEAST_CHANGE,
         )
-        best, correlation = None, LEAST_CORRELATION
+        best = None
+        correlation = LEAST_CORRELATION
         for start in (guess, np.zeros(3)):
             try:
                 rho, warp = cv2.findTransformECC(
@@ -149,7 +157,8 @@ class FloorPicture:
             ):  # it did not converge, or there is nothing in the pictures
                 continue
             if rho > correlation:
-                best, correlation = self._motion(np.asarray(warp, float)), float(rho)
+                best = self._motion(np.asarray(warp, float))
+                correlation = float(rho)
         if best is None:
             return None
         information = self._information(now) / (
@@ -173,8 +182,10 @@ class FloorPicture:
 
     def _warp(self, motion: Floats) -> Picture:
         """Pixel (column, row) now from that before, as OpenCV has it, shape (2, 3): the inverse motion."""
-        yaw, place = motion[0], motion[1:]
-        c, s = math.cos(yaw), math.sin(yaw)
+        yaw = motion[0]
+        place = motion[1:]
+        c = math.cos(yaw)
+        s = math.sin(yaw)
         R = np.array([[c, -s], [s, c]]).T
         shift = (R @ (self.corner_m - place) - self.corner_m) / self.pixel_m
         return np.ascontiguousarray(
@@ -182,7 +193,8 @@ class FloorPicture:
         )
 
     def _motion(self, warp: Floats) -> Floats:
-        R, shift = warp[::-1, 1::-1], warp[::-1, 2]
+        R = warp[::-1, 1::-1]
+        shift = warp[::-1, 2]
         place = self.corner_m - R.T @ (shift * self.pixel_m + self.corner_m)
         return np.array([math.atan2(R[0, 1], R[0, 0]), *place])
 
@@ -203,7 +215,8 @@ class ImageMotions:
     """
 
     def __init__(self, calibration: Calibration, *, is_fixed: bool = False) -> None:
-        self._calibration, self._is_fixed = calibration, is_fixed
+        self._calibration = calibration
+        self._is_fixed = is_fixed
         self.view: FloorView | None = None
         """Height and tilt, which are taken to stay; None: not stated."""
         if calibration.floor is not None and "start" in calibration.model_fields_set:
@@ -233,23 +246,26 @@ class ImageMotions:
     def look(self, frame: SonarFrames) -> PlanarStep | None:
         """Lay a block of one frame upon the frame before."""
         stamp_ns = int(frame.stamps_ns[0])
-        self.step, self._stamp_ns = None, stamp_ns
+        self.step = None
+        self._stamp_ns = stamp_ns
         if self._is_fixed:
             return None
         frame = with_lens(frame, self._calibration.sonar.lens)
         if self._floor is None or not is_alike(self._floor[0], frame):
             view = self.view or SLANT_PLANE
-            self._floor, self._before = (
-                (frame, FloorPicture(frame.ranges_m, frame.azimuths_rad, view)),
-                None,
+            self._floor = (
+                frame,
+                FloorPicture(frame.ranges_m, frame.azimuths_rad, view),
             )
+            self._before = None
         raster = self._floor[1]
         picture = raster.of(
             decibels(
                 np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image
             )
         )
-        before, self._before = self._before, (stamp_ns, picture)
+        before = self._before
+        self._before = (stamp_ns, picture)
         if before is None or stamp_ns <= before[0]:
             return None
         seconds = (stamp_ns - before[0]) * 1e-9
@@ -266,7 +282,8 @@ class ImageMotions:
             covariance = np.diag(
                 np.square(seconds * np.array([UNKNOWN_RAD_S, UNKNOWN_M_S, UNKNOWN_M_S]))
             )
-        self.steps, self.measured = self.steps + 1, self.measured + is_measured
+        self.steps = self.steps + 1
+        self.measured = self.measured + is_measured
         self.step = PlanarStep(before[0], stamp_ns, motion, covariance, is_measured)
         return self.step
 

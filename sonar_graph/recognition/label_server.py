@@ -87,7 +87,9 @@ class LabelDesk:
         self, frames: Sequence[ShownFrame], labels: Labels, path: Path
     ) -> None:
         self.frames = frames
-        self._labels, self._path, self._lock = labels, path, Lock()
+        self._labels = labels
+        self._path = path
+        self._lock = Lock()
 
     @property
     def labels(self) -> tuple[Label, ...]:
@@ -165,7 +167,9 @@ class LabelServer(ThreadingHTTPServer):
         ids: Sequence[int],
         port: int = 0,
     ) -> None:
-        self.desk, self.ids, self._page = desk, frozenset(ids), page
+        self.desk = desk
+        self.ids = frozenset(ids)
+        self._page = page
         self.word = secrets.token_urlsafe(16)
         super().__init__((HOST, port), _LabelRequest)
 
@@ -217,7 +221,9 @@ class _LabelRequest(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND)
 
     def do_POST(self) -> None:
-        desk, asked, content = self.server.desk, self._asked(), self._content()
+        desk = self.server.desk
+        asked = self._asked()
+        content = self._content()
         number = None if content is None else self._frame_of(str(content.get("frame")))
         if asked not in ("label", "take-back"):
             self._refuse(HTTPStatus.NOT_FOUND)

@@ -55,18 +55,14 @@ CLICK_SIGMA_M = 0.01
 """Standard deviation of a label along each axis, where labels do not tell it."""
 MOST_ROWS = 8
 """Rows of labels that a message lists."""
-OUTSIDE, NO_FRAME, UNUSED = (
-    "outside of the image",
-    "no such frame",
-    "of a frame that was not used",
-)
+OUTSIDE = "outside of the image"
+NO_FRAME = "no such frame"
+UNUSED = "of a frame that was not used"
 IN_DEGREES = (
     "outside of the image, but not if the azimuth is in degrees; expected radians"
 )
-NO_TRACK, CONTRADICTED = (
-    "no track there",
-    "contradicts other labels of its track, so left out",
-)
+NO_TRACK = "no track there"
+CONTRADICTED = "contradicts other labels of its track, so left out"
 """Why labels tell nothing."""
 NOWHERE = np.array([-1]), np.array([1e9]), np.array([0.0])
 """True landmarks around what is none: one that is far away."""

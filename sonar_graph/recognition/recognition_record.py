@@ -25,7 +25,8 @@ from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sonar import Fan
 from sonar_graph.states import LandmarkMap
 
-RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
+RECOGNITION = "recognition.json"
+PICTURE_FOLDER = "recognised"
 MOST_SHOWN = 6
 NONE = -1
 LEAST_NAMED = 0.5
@@ -40,7 +41,8 @@ OFF_FLOOR = (
 )
 LACKS = "detections.floor"
 """Note of what is lacking for a known floor."""
-FEWEST_TRACKS, MOSTLY = 10, 0.9
+FEWEST_TRACKS = 10
+MOSTLY = 0.9
 """Number of reported tracks, and share of them without a landmark, from which images are doubted."""
 SEE_TRACKS = "`sonar-graph recognise --report PAGE.html` shows the tracks"
 """Line after that doubt; not for that page itself."""
@@ -247,7 +249,8 @@ Picture = NDArray[np.uint8]
 MARGIN = 6
 SURE = 0.9
 """Posterior from which on an identity is drawn as certain."""
-RECOGNISED, DOUBTFUL = (60, 220, 255), (190, 190, 190)
+RECOGNISED = (60, 220, 255)
+DOUBTFUL = (190, 190, 190)
 """Blue, green, red."""
 JPEG_QUALITY = 85
 TEXT_SIZE = 0.85
@@ -276,7 +279,8 @@ def draw_fan(
             place = fan.pixel(
                 float(detections.range_m[i]), float(detections.azimuth_rad[i])
             )
-            radius, is_sure = round(0.23 * fan.pixels_per_m), probability >= SURE
+            radius = round(0.23 * fan.pixels_per_m)
+            is_sure = probability >= SURE
             colour = RECOGNISED if is_sure else DOUBTFUL
             text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
             cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)

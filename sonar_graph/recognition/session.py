@@ -245,10 +245,12 @@ def without_leaps(
     A frame ahead of the next one is refused if that one is ahead of all before. One of the two stamps is wrong, and
     this way only one frame is lost.
     """
-    latest_ns, held = -1, None
+    latest_ns = -1
+    held = None
     for frame in frames:
         if held is not None:
-            stamp_ns, next_ns = int(held.stamps_ns[0]), int(frame.stamps_ns[0])
+            stamp_ns = int(held.stamps_ns[0])
+            next_ns = int(frame.stamps_ns[0])
             if stamp_ns > next_ns > latest_ns:
                 refuse(stamp_ns, LEAPT)
             else:
@@ -273,7 +275,8 @@ class RecognitionSession:
         motion: MotionFrom = "navigation",
         seen: Callable[[SonarFrames], None] | None = None,
     ) -> None:
-        self._draws, self._seen = pictures, seen
+        self._draws = pictures
+        self._seen = seen
         self.result = Recognition()
         self.recogniser = recogniser or Recogniser(
             sequence.calibration, designs, params
@@ -425,7 +428,8 @@ class RecognitionSession:
 
     def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
         """Draw one frame a period, rather one with detections; of too many drop every second and double the period."""
-        pictures, stamp_ns = self.result.pictures, int(frame.stamps_ns[0])
+        pictures = self.result.pictures
+        stamp_ns = int(frame.stamps_ns[0])
         if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
             if found is None or pictures[-1].landmark_ids:
                 return

@@ -26,7 +26,8 @@ class _Tilt:
 
     def __init__(self, sequence: Sequence, odometry: MotionSource) -> None:
         calibration = sequence.calibration
-        self._calibration, self._odometry = calibration, odometry
+        self._calibration = calibration
+        self._odometry = odometry
         self.epoch_ns = sequence.start_ns
         self.up: Floats = calibration.start.pose().rotation().matrix()[2]
         self.variance = float(np.max(np.square(calibration.start.rpy_sigma_rad[:2])))
@@ -85,7 +86,8 @@ class _Height:
         self._port = np.array(sequence.calibration.depth.port_m)
         self._default = sequence.calibration.depth.sigma_m**2
         start = sequence.calibration.start
-        self.z_m, self.variance = start.position_m[2], start.position_sigma_m[2] ** 2
+        self.z_m = start.position_m[2]
+        self.variance = start.position_sigma_m[2] ** 2
         self.is_measured = (
             depth is not None and start.position_sigma_m[2] <= KNOWN_HEIGHT_M
         )
@@ -138,7 +140,8 @@ class SonarMotions:
         self._height = _Height(sequence.depth, sequence)
         self._floor = calibration.floor
         self._body_T_sonar = calibration.sonar.mounting.pose()
-        self._start_ns, self._end_ns = sequence.start_ns, sequence.end_ns
+        self._start_ns = sequence.start_ns
+        self._end_ns = sequence.end_ns
         self._stamp_ns = sequence.start_ns
         self._is_first = True
 
@@ -166,11 +169,9 @@ class SonarMotions:
 
         The motion of the first frame is None, and so is the view where the height is not known or not positive.
         """
-        motion, step, view = (
-            self._odometry.motion(self._stamp_ns, stamp_ns, _NO_BIAS),
-            None,
-            None,
-        )
+        motion = self._odometry.motion(self._stamp_ns, stamp_ns, _NO_BIAS)
+        step = None
+        view = None
         self._tilt.reach(stamp_ns)
         up, tilt_variance = self._tilt.after(
             self._odometry.motion(self._tilt.epoch_ns, stamp_ns, _NO_BIAS)
@@ -188,7 +189,8 @@ class SonarMotions:
                 self._body_T_sonar
             )
             step = SonarStep(previous_T_sonar, adjoint @ motion.covariance @ adjoint.T)
-        self._stamp_ns, self._is_first = stamp_ns, False
+        self._stamp_ns = stamp_ns
+        self._is_first = False
         if self._floor is not None and self._height.is_measured:
             height_m = float(
                 self._height.z_m

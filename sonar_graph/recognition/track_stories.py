@@ -61,10 +61,8 @@ class TrackStories:
 
     def see(self, frame: SonarFrames, recogniser: Recogniser) -> None:
         """Take in what a recogniser made of a block of one frame."""
-        stamp_ns, views = (
-            int(frame.stamps_ns[0]),
-            _Views(frame, self._image, self._fan_of(frame)),
-        )
+        stamp_ns = int(frame.stamps_ns[0])
+        views = _Views(frame, self._image, self._fan_of(frame))
         if recogniser.stamp_ns != stamp_ns:
             return
         rows = zip(
@@ -78,13 +76,12 @@ class TrackStories:
             story.beliefs = beliefs
             if sighting is None:
                 continue
-            story.last_ns, story.frames = stamp_ns, story.frames + 1
+            story.last_ns = stamp_ns
+            story.frames = story.frames + 1
             visible = 0.0 if sighting.fit is None else sighting.fit.visible
             if visible > story.visible + BETTER:
-                story.visible, story.jpeg = (
-                    visible,
-                    views.around(sighting.range_m, sighting.azimuth_rad),
-                )
+                story.visible = visible
+                story.jpeg = views.around(sighting.range_m, sighting.azimuth_rad)
         for fate in recogniser.fates:
             if fate.track in self.tracks:
                 self.tracks[fate.track].outcomes[fate.outcome] += 1
@@ -121,7 +118,9 @@ class _Views:
     """Pictures of places in one frame, drawn when the first is asked for."""
 
     def __init__(self, frame: SonarFrames, image: SonarImage, fan: Fan) -> None:
-        self._frame, self._image, self._fan = frame, image, fan
+        self._frame = frame
+        self._image = image
+        self._fan = fan
         self._whole: np.ndarray | None = None
 
     def around(self, range_m: float, azimuth_rad: float) -> bytes:
@@ -136,10 +135,8 @@ class _Views:
             self._whole, half, half, half, half, cv2.BORDER_CONSTANT
         )
         height, width = self._whole.shape[:2]
-        column, row = (
-            int(np.clip(column, 0, width - 1)),
-            int(np.clip(row, 0, height - 1)),
-        )
+        column = int(np.clip(column, 0, width - 1))
+        row = int(np.clip(row, 0, height - 1))
         square = padded[row : row + 2 * half, column : column + 2 * half]
         return as_jpeg(
             np.asarray(cv2.resize(square, (SIDE_PIXELS, SIDE_PIXELS)), np.uint8)

@@ -25,16 +25,16 @@ from sonar_graph.report.rendering import csv_text
 
 ROW_IN = 0.36
 PANEL_IN = 0.95
+# largest number of logs below each other; more make small multiples
 STACKED = 2
-"""Largest number of logs below each other; more make small multiples."""
 MOST_COLUMNS = 3
+# width of names beside and headings above small panels
 NAME_LETTERS, HEADING_LETTERS = 18, 20
-"""Width of names beside and headings above small panels."""
 KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
 FILLED = {"": True, "Causal": True, "Smoothed": False}
 SMALL = 9.0
+# consistency is drawn from a quarter to four times its expected value, or farther: small deviations look small
 LEAST_SPAN = 4.0
-"""Consistency is drawn from a quarter to four times its expected value, or farther: small deviations look small."""
 Rows = list[list[str]]
 
 
@@ -43,6 +43,7 @@ def log_panels(
 ) -> tuple[Figure, list[Axes]]:
     """A panel a log with a scale of its own; in each a line for each contestant, the first on top."""
     names = batch.contestants
+    # two logs below each other use the width, of many small panels show more at once
     columns = 1 if len(logs) <= STACKED else min(MOST_COLUMNS, len(logs) - 1)
     rows = -(-len(logs) // columns)
     height_in = rows * (PANEL_IN + ROW_IN * len(names))
@@ -60,9 +61,11 @@ def log_panels(
         panel.set(
             ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels
         )
+        # lines of contestants are no scale
         panel.grid(False, axis="y")
         for place, label in enumerate(panel.get_yticklabels()):
             label.set_color(style.colour(place))
+            # folded names stand closer than lines of contestants
             label.set_linespacing(0.95)
         style.head_panel(panel, folded(log, HEADING_LETTERS) if narrow else log)
     figure.supxlabel(x_label, color=style.INK, fontsize="medium")
@@ -107,6 +110,8 @@ def spread_drawing(batch: RecordedBatch, metric: Metric) -> style.Illustration |
         values = np.concatenate(
             [_finite(batch, log, name, metric) for name in batch.contestants]
         )
+        # a logarithmic scale for errors that differ by a power of ten, where a linear one would hide the
+        # small ones
         if values.min() > 0 and values.max() > SMALL * values.min():
             spread_out(panel)
         for place, contestant in enumerate(batch.contestants):
@@ -151,6 +156,7 @@ def difference_drawing(
         batch, logs, f"difference to {batch.reference}{unit_of(metric)}"
     )
     for panel, log in zip(panels, logs, strict=True):
+        # left of it the contestant is better
         panel.axvline(0, color=style.TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
             for over, key in metric.keys.items():
@@ -232,10 +238,12 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> style.Illustration |
         for low, high in bands[log]:
             if math.isfinite(low):
                 panel.axvspan(low, high, color=style.TRUTH, alpha=0.25, linewidth=0)
+        # what a consistent estimator has on average
         panel.axvline(1, color=style.TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
             for over, mean in known.get((log, contestant), []):
                 _draw_point(panel, mean, place, over)
+        # a scale that is too narrow would make small deviations look large
         low, high = panel.get_xlim()
         panel.set_xlim(min(low, 1 / LEAST_SPAN), max(high, LEAST_SPAN))
     caption = (
@@ -311,11 +319,13 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
     own = style.colour(place)
     if not known.size:
         return
+    # an infinite end would draw a bar to the edge, which looks like a value
     inside = [quantile(values, share) for share in (0.1, 0.9)]
     if all(map(math.isfinite, inside)) and len(values) > 1:
         panel.plot(
             inside, [row, row], color=own, alpha=0.3, linewidth=7, solid_capstyle="butt"
         )
+    # dots of equal values stand beside each other
     shifts = row + 0.05 * np.cos(2.4 * np.arange(len(known)))
     panel.plot(
         known,
@@ -330,6 +340,7 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
         panel.plot(
             middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6
         )
+    # a dot that is missing must not look like a run that is missing
     if len(known) < len(values):
         across = panel.get_yaxis_transform()
         note = f"{len(values) - len(known)} without"

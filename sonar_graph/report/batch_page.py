@@ -6,23 +6,31 @@ from typing import Any
 
 from sonar_graph.batch import LEAST_PAIRS, RESULTS, RecordedBatch, metrics_of
 from sonar_graph.evaluation import ESTIMATES
-from sonar_graph.files import BATCH, replacing, result_written
+from sonar_graph.files import BATCH, result_written
 from sonar_graph.report import batch_figures as figures
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.figure_style import sized
-from sonar_graph.report.rendering import render, write_tables
+from sonar_graph.report.rendering import Section, html_of, write_html, write_tables
 
+# Tables with more rows are folded on the screen: figures above them show the same
 FOLDED_ROWS = 24
-"""Tables with more rows are folded on the screen: figures above them show the same."""
-FEW_LOGS = 2
-TEMPLATE = "batch.html"
 PAGE = "report.html"
+SECTIONS = (
+    Section("reading", "How to read this page"),
+    Section("ended", "Runs that ended"),
+    Section("errors", "Errors"),
+    Section("consistency", "Consistency"),
+    Section("cost", "Time and memory"),
+    Section("runs", "Every run"),
+    Section("protocol", "Protocol"),
+    Section("provenance", "Provenance"),
+)
+# columns of the results that are normally the same for all runs
 ORIGINS = (
     *("machine", "versions", "sonar_graph", "source", "estimator_source"),
     *("gtsam", "numpy", "scipy", "numba", "python"),
 )
-"""Columns of the results that are normally the same for all runs."""
 
 
 def write_batch_report(
@@ -40,21 +48,26 @@ def write_batch_report(
         content = batch_content(batch)
     with result_written(folder, BATCH, overwrite=overwrite):
         write_tables(content["tables"], folder)
-        with replacing(folder / PAGE) as partial:
-            partial.write_text(render(TEMPLATE, content), "utf-8")
-    return folder / PAGE
+        return write_html(folder / PAGE, "batch", sections_of(content), content)
+
+
+def sections_of(content: dict[str, Any]) -> list[Section]:
+    """The sections of the page: without that of errors where no run has any."""
+    return [one for one in SECTIONS if content["chapters"] or one.anchor != "errors"]
 
 
 def render_batch(batch: RecordedBatch) -> str:
     """The page as text."""
     with sized():
-        return render(TEMPLATE, batch_content(batch))
+        content = batch_content(batch)
+    return html_of("batch", sections_of(content), content)
 
 
 def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     """Values by the names that the template uses."""
     metrics = metrics_of(batch.metrics)
     tests = tables.all_tests(batch, metrics)
+    # a metric is a chapter only where some run can have it
     groups = [(log, name) for log in batch.logs for name in batch.contestants]
     chapters: list[dict[str, Any]] = []
     for metric in metrics:
@@ -90,19 +103,23 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         tables.consistency_table(batch),
         tables.cost_table(batch),
     )
+    # tables leave the page as files, and must state there too what is missing
     failures, consistency, costs = (summary.marked(batch, table) for table in others)
     anees = [figures.consistency_drawing(batch, what) for what in ("position", "yaw")]
+    # logs may have different numbers of seeds
     seeds = max(len(batch.group(log, name)) for log, name in groups)
     settings: dict[str, str] = {}
     for column, name in (
         ("options", "log {0.log}"),
         ("params", "estimator {0.contestant}"),
     ):
+        # the first run of each log and estimator is enough: all of one have the same settings
         for run in batch.runs:
             if run.texts.get(column):
                 settings.setdefault(name.format(run), run.texts[column])
     origins = {}
     for name in ORIGINS:
+        # a batch that was resumed on another machine has several values
         counts = Counter(run.texts[name] for run in batch.runs if name in run.texts)
         if counts:
             many = len(counts) > 1
@@ -132,8 +149,6 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         ],
         "headlines": summary.headlines(batch, head, tests) if head else [],
         "overview": overview[0] if overview else None,
-        "log_findings": summary.errors_told(batch, metrics, tests),
-        "few_logs": len(batch.logs) <= FEW_LOGS,
         "folded_rows": FOLDED_ROWS,
         "estimates": [f"{sentence}." for sentence in ESTIMATES.values()],
         "failures": failures,

@@ -17,8 +17,6 @@ from sonar_graph.batch import (
     RecordedBatch,
     holm,
     least_p,
-    quantile,
-    quantile_error,
     summarise,
 )
 from sonar_graph.evaluation import quantile_text
@@ -26,14 +24,13 @@ from sonar_graph.report.batch_tables import (
     GROUP_COLUMNS,
     SIGNIFICANT,
     Tests,
-    p_text,
     unit_of,
 )
 from sonar_graph.table import Cell, Column, Table, absent, number, words
 
 SCORED = "scored_instants"
+# largest number of logs that a warning names; others are counted
 NAMED = 3
-"""Largest number of logs that a warning names; others are counted."""
 LOWER = "\N{DOWNWARDS ARROW}"
 HIGHER = "\N{UPWARDS ARROW}"
 DIFFERENT = "\N{NOT EQUAL TO}"
@@ -46,6 +43,7 @@ def failures_told(batch: RecordedBatch) -> list[str]:
     for contestant in batch.contestants:
         runs = [run for run in batch.runs if run.contestant == contestant]
         failed = [run for run in runs if not run.ended]
+        # by contestant: a failure is first of all its own
         if failed:
             logs = _few(list(dict.fromkeys(run.log for run in failed)))
             sentences.append(
@@ -56,6 +54,7 @@ def failures_told(batch: RecordedBatch) -> list[str]:
 
 def reference_told(batch: RecordedBatch) -> list[str]:
     """A warning where the reference never ended: differences then show its failure and nothing else."""
+    # a reference that failed makes every difference infinite
     groups = {log: batch.group(log, batch.reference) for log in batch.logs}
     lost = [
         log
@@ -70,73 +69,6 @@ def reference_told(batch: RecordedBatch) -> list[str]:
     ]
 
 
-def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
-    """A sentence for each log on the first error that it has: medians, then significant differences."""
-    columns = [
-        (metric, over, key)
-        for metric in metrics
-        if metric.is_error
-        for over, key in metric.keys.items()
-    ]
-    sentences = []
-    for log in batch.logs:
-        known = (
-            one
-            for one in columns
-            if any(batch.is_asked(log, name, one[2]) for name in batch.contestants)
-        )
-        found = next(known, None)
-        if found is None:
-            sentences.append(f"{log}: no run has an error to compare.")
-            continue
-        metric, over, key = found
-        values = {name: batch.values(log, name, key) for name in batch.contestants}
-        medians = sorted(
-            (quantile(own, 0.5), name, quantile_error(own, 0.5) * metric.factor)
-            for name, own in values.items()
-            if len(own)
-        )
-        listed = ", ".join(
-            f"{name} {quantile_text(value * metric.factor, error)}"
-            for value, name, error in medians
-            if value < math.inf
-        )
-        unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
-        which = f"{over.lower()} " if over else ""
-        told = [f"{log}, median {which}error{unit} ({metric.label}): {listed}."]
-        alike = []
-        for contestant in batch.contestants:
-            if (key, log, contestant) not in tests:
-                continue
-            test, p_value = tests[key, log, contestant]
-            if p_value < SIGNIFICANT:
-                p = p_text(p_value)
-                sign = "" if p.startswith("<") else "= "
-                told.append(
-                    f"{contestant} {_side_told(batch, metric, test)} (p {sign}{p})."
-                )
-            else:
-                alike.append(contestant)
-        if alike:
-            told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
-        sentences.append(" ".join(told))
-    return sentences
-
-
-def _side_told(batch: RecordedBatch, metric: Metric, test: PairedDifference) -> str:
-    """The side of most differences, which the rank test is about; their mean can be turned by one run."""
-    counted = f"smaller in {test.smaller} of {test.counted}"
-    if math.isnan(test.median) or test.median == 0:
-        return f"differs from {batch.reference}, {counted}"
-    side = f"is {'below' if test.median < 0 else 'above'} {batch.reference}"
-    if math.isinf(test.median):
-        return f"{side}, {counted}"
-    size = quantile_text(
-        abs(test.median) * metric.factor, test.median_error * metric.factor
-    )
-    return f"{side} by {size} in the median, {counted}"
-
-
 def instants_told(batch: RecordedBatch) -> list[str]:
     """A warning where runs with the same log and seed are scored at different instants."""
     uneven = []
@@ -144,6 +76,7 @@ def instants_told(batch: RecordedBatch) -> list[str]:
         counts: dict[int | None, set[float]] = {}
         for run in batch.runs:
             if run.log == log and run.ended and SCORED in run.values:
+                # other instants are another question: easy stretches may be missing in one run
                 counts.setdefault(run.seed, set()).add(run.values[SCORED])
         if any(len(known) > 1 for known in counts.values()):
             uneven.append(log)
@@ -158,10 +91,12 @@ def power_told(tests: Tests) -> list[str]:
     """A warning where there are too few pairs for any finding, even if every test of the family were at its best."""
     families: dict[str, dict[tuple[str, int], PairedDifference]] = {}
     for (key, log, _), (test, _) in tests.items():
+        # the correction counts all tests of a metric, over logs and estimators
         families.setdefault(key.rpartition(".")[2], {})[log, id(test)] = test
     blind: dict[str, str] = {}
     for family in families.values():
         pairs = [test.pairs for test in family.values()]
+        # the smallest p values that so many pairs can have at all
         best = holm(
             np.array(
                 [
@@ -200,6 +135,7 @@ def head_metric(batch: RecordedBatch, metrics: list[Metric]) -> Metric | None:
             for name in batch.contestants
         )
 
+    # an error that one log has is no headline for many
     logs = {
         metric.name: sum(has(log, metric) for log in batch.logs)
         for metric in metrics
@@ -220,7 +156,9 @@ def headlines(batch: RecordedBatch, metric: Metric, tests: Tests) -> list[str]:
         for place, test in tests.items()
         if place[0] in metric.keys.values() and place[1] in batch.logs
     }
+    # of one log a count of logs would be noise
     several = len(batch.logs) > 1
+    # one sentence in place of a list of names that are all the same
     if own and not any(map(mark_of, own.values())):
         place = " on any one log" if several else ""
         return [
@@ -267,6 +205,7 @@ def mark_of(found: tuple[PairedDifference, float] | None) -> str:
     """An arrow to the side of most differences to the reference where these are significant; else nothing."""
     if found is None or not found[1] < SIGNIFICANT:
         return ""
+    # the rank test is about the side of most differences; one lost run can turn the mean
     median = found[0].median
     return (
         DIFFERENT
@@ -286,6 +225,7 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
     ]
     columns = [GROUP_COLUMNS[0]]
     for over, key, name in shown:
+        # arrows are against this column
         heading = f"{name} (reference)" if name == batch.reference else name
         run = batch.contestants.index(name)
         columns.append(Column(f"{key} {name}", heading, over, ("", "p_holm"), run=run))
@@ -296,6 +236,7 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             if not batch.is_asked(log, name, key):
                 rows[-1].append(absent(2))
                 continue
+            # medians, because a mean over a group with a lost run does not exist
             told = summarise(batch.values(log, name, key))
             found = tests.get((key, log, name))
             text = quantile_text(
@@ -332,6 +273,7 @@ def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:
         for name in batch.contestants
         if any(batch.is_asked(log, name, key) for log in batch.logs)
     ]
+    # the causal estimate is always shown: a vehicle acts on it
     if key == first:
         return asked
     return [
@@ -348,6 +290,7 @@ def missing_told(batch: RecordedBatch) -> list[str]:
     """The missing runs by contestant and log, and the way to complete the batch; nothing where it is complete."""
     if not batch.missing:
         return []
+    # a reader needs to see whose numbers may change
     by_contestant = Counter(run.contestant for run in batch.missing)
     planned = by_contestant + Counter(run.contestant for run in batch.runs)
     names = [name for name in batch.contestants if by_contestant[name]]
@@ -364,6 +307,7 @@ def missing_told(batch: RecordedBatch) -> list[str]:
 
 def sensors_told(batch: RecordedBatch) -> list[str]:
     """What the sensors of each log contradict, grave findings first."""
+    # grave findings first: they put all numbers of the log in doubt
     words = {"doubtful": "Doubtful", "sensors": "Warning"}
     found = {
         (subject, run.log): run.texts[subject]
@@ -386,6 +330,7 @@ def absent_told(batch: RecordedBatch) -> list[str]:
 
 def lost_told(batch: RecordedBatch) -> list[str]:
     """The number of runs that are rows of the table but whose folders are gone."""
+    # folders are removed to save space, while their rows stay
     lost = [run.key for run in batch.runs if not run.log_file]
     if not lost:
         return []

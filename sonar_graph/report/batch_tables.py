@@ -35,8 +35,8 @@ from sonar_graph.evaluation import (
 from sonar_graph.table import Cell, Column, Table, absent, count, number, words
 
 SIGNIFICANT = 0.05
+# by column, log and contestant: the differences, and their p value corrected over the tests of the metric
 Tests = dict[tuple[str, str, str], tuple[PairedDifference, float]]
-"""By column, log and contestant: the differences, and their p value corrected over the tests of the metric."""
 FAILURES = ("failed", "timeout", "memory", "killed")
 COSTS = {
     "update_p50_ms": "Update, median (ms)",
@@ -46,10 +46,10 @@ COSTS = {
     "peak_memory_mb": "Memory, rise (MB)",
 }
 QUANTILES = ("10_percent", "90_percent")
+# end of the names of columns with the normalised squared error at a run's last instant
 LATEST = "_end"
-"""End of the names of columns with the normalised squared error at a run's last instant."""
+# relative difference of a smoothed ANEES to the causal one up to which it is the same evidence, shown once
 SAME_AT_END = 0.1
-"""Relative difference of a smoothed ANEES to the causal one up to which it is the same evidence, shown once."""
 SAME_EVIDENCE = (
     "At the last instant a smoothed estimate has seen no more than the causal one: it is no second evidence, and is "
     "shown only where it differs by more than a tenth."
@@ -99,8 +99,11 @@ def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
     """
     tests: Tests = {}
     for metric in metrics:
+        # times depend on the load of the machine, so a test of them would judge the machine
         if not metric.is_error:
             continue
+        # a filter's smoothed numbers are its causal ones: a second test of them would cost others
+        # significance
         distinct: dict[tuple[str, str, bytes, bytes], PairedDifference] = {}
         same = {}
         for key in metric.keys.values():
@@ -153,6 +156,7 @@ def failure_table(batch: RecordedBatch) -> Table:
             not_run = missing[log, contestant]
             if not group and not not_run:
                 continue
+            # a group that is planned and not begun has a row, or it would be overlooked
             cells = [count(0), *[absent()] * (1 + len(FAILURES)), absent(3)]
             if group:
                 counts = Counter(run.status for run in group)
@@ -191,6 +195,7 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
         ]
     rows = []
     for log, contestant, group in groups_of(batch):
+        # beside the count, because the mean is missing for this reason
         failed = sum(not run.ended for run in group)
         row = [
             *group_cells(batch, log, contestant),
@@ -215,6 +220,7 @@ def summary_cells(told: SampleSummary, factor: float = 1.0) -> list[Cell]:
     median = number(
         told.median, quantile_text(told.median * factor, told.median_error * factor)
     )
+    # one run has no spread
     if told.runs == 1:
         return [mean, median, absent(2)]
     low = quantile_text(told.low * factor, told.low_error * factor)
@@ -236,6 +242,7 @@ def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Tabl
     for log in _compared_logs(batch):
         for contestant in batch.contestants:
             own = [tests.get((key, log, contestant)) for key in metric.keys.values()]
+            # the first error that there is gives the number of pairs, which is the same for all
             known = [found[0] for found in own if found is not None]
             if not known:
                 continue
@@ -262,6 +269,7 @@ def _difference_cells(
     error, (low, high) = test.rounding_error * factor, test.interval
     note = "" if math.isnan(low) else between(low * factor, high * factor, error)
     median = quantile_text(test.median * factor, test.median_error * factor)
+    # half of the pairs have no value on one side: a word is clearer than an infinite number
     if math.isinf(test.median):
         median = (
             "worse: no value" if test.median > 0 else "better: reference has no value"
@@ -276,10 +284,12 @@ def _difference_cells(
 
 def p_text(p_value: float) -> str:
     """A p value with two digits, down to one in a thousand; with more where it would else look like 5 % and is not."""
+    # more digits would claim a precision that few seeds do not give
     if p_value < 1e-3:
         return "< 0.001"
     if not p_value < 0.995:
         return "1.0"
+    # two digits of 0.0496 are 0.05, which looks like no finding
     texts = [f"{p_value:.{digits}g}" for digits in range(2, 18)]
     return next(
         text
@@ -318,6 +328,7 @@ def anees_of(
     if not batch.is_asked(log, contestant, key):
         return None
     group = batch.group(log, contestant)
+    # runs of one log have the same freedom; else no band is right for their average
     dofs = {run.values[f"{key}_dof"] for run in group if f"{key}_dof" in run.values}
     return anees(
         batch.values(log, contestant, key), dofs.pop() if len(dofs) == 1 else math.nan
@@ -334,6 +345,7 @@ def is_evidence(told: dict[str, Anees | None], kind: str) -> bool:
     own = told[kind]
     if own is None or causal is None or kind == "causal":
         return own is not None
+    # NaN is the mean of a group with a failed run, which compares as unequal to itself
     if math.isnan(causal.mean):
         return not math.isnan(own.mean)
     return not abs(own.mean - causal.mean) <= SAME_AT_END * causal.mean
@@ -400,6 +412,7 @@ def consistency_table(batch: RecordedBatch) -> Table:
 def cost_table(batch: RecordedBatch) -> Table:
     """Time and memory: median and the range of the middle 80 % of runs."""
     columns = [*GROUP_COLUMNS]
+    # columns that no run has are left out
     known = [key for key in COSTS if any(key in run.values for run in batch.runs)]
     for key in known:
         columns.append(Column(f"{key}_median", "Median", COSTS[key]))
@@ -430,6 +443,7 @@ def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[tuple[str, Ta
             (metric, over, key)
             for metric in metrics
             for over, key in metric.keys.items()
+            # a column of dashes would hide those with numbers
             if any(math.isfinite(run.value(key)) for run in group)
         ]
         columns = [

@@ -31,26 +31,38 @@ from sonar_graph.evaluation import (
     write_comparison,
     write_viewer_files,
 )
-from sonar_graph.files import COMPARISON, as_path, replacing, result_written
+from sonar_graph.files import COMPARISON, as_path, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
 from sonar_graph.report.figure_style import inline_svg, sized
 from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
+from sonar_graph.report.given_map import given_map_table
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
-from sonar_graph.report.rendering import data_address, render
+from sonar_graph.report.rendering import Section, data_address, html_of, write_html
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
 from sonar_graph.table import ABSENT, Column, Table, text_table, words
 
 PAGE = "report.html"
-TEMPLATE = "comparison.html"
+SECTIONS = (
+    Section("over-time", "Errors"),
+    Section("consistency", "Consistency and time"),
+    Section("detections", "Detections"),
+    Section("recognition", "Sonar images"),
+    Section("landmarks", "Landmarks"),
+    Section("tables", "Tables"),
+    Section("method", "Method"),
+    Section("protocol", "Protocol", is_folded=True),
+    Section("provenance", "Provenance", is_folded=True),
+    Section("files", "Files"),
+)
+# files of a run, and the field of `RunResult` without which a file is absent
 RUN_FILES = {
     "trajectory.tum": "smoothed",
     "causal.tum": "causal",
     "landmarks.csv": "landmarks",
     "result.json": "params",
 }
-"""Files of a run, and the field of `RunResult` without which a file is absent."""
 
 
 def write_report(
@@ -117,8 +129,8 @@ def write_report(
 def write_page(comparison: Comparison, folder: Path) -> Path:
     """Write only ``report.html``, beside the other files of a comparison, and return its path.
 
-    The page needs nothing but itself: figures are inline SVG in the page's colours, style is inline, there is no
-    script. Links lead to the files beside it (``comparison.json``, ``result.mcap``, ``runs/NAME/``).
+    The page needs nothing but itself, and has no script. Links lead to the files beside it (``comparison.json``,
+    ``result.mcap``, ``runs/NAME/``).
 
     Examples
     --------
@@ -131,20 +143,24 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
     ...     write_page(compare(small_world(), ["dead-reckoning"]), Path(folder)).name
     'report.html'
     """
-    with result_written(folder, COMPARISON), replacing(folder / PAGE) as partial:
-        partial.write_text(render_report(comparison), encoding="utf-8")
-    return folder / PAGE
+    with result_written(folder, COMPARISON):
+        return write_html(folder / PAGE, "comparison", *_page(comparison))
 
 
 def render_report(comparison: Comparison) -> str:
     """The page as text."""
+    return html_of("comparison", *_page(comparison))
+
+
+def _page(comparison: Comparison) -> tuple[list[Section], dict[str, Any]]:
+    """The sections of the page, and the values that their macros use."""
     sequence = comparison.sequence
     runs = comparison.runs
     detections = len(sequence.detections) if sequence.detections else 0
+    # None without errors: then figures and tables have one view
     aligned = aligned_to_truth(comparison)
-    found = sentences.finding(comparison)
-    told = [line for line in found if line not in sentences.grave_lines(comparison)]
-    content = {
+    outcomes = outcome_table(comparison)
+    content: dict[str, Any] = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
         "beside_the_paper": sentences.beside_the_paper(comparison),
@@ -154,13 +170,13 @@ def render_report(comparison: Comparison) -> str:
             f"{_counted(detections, 'landmark detection')}."
         ),
         "headlines": {
-            "aligned": sentences.headline(comparison) or told[0],
+            "aligned": sentences.headline(comparison),
             "raw": ""
             if aligned is None
             else sentences.headline(comparison, aligned=False),
         },
         "published": sentences.published_filters(comparison),
-        "finding": told,
+        "remarks": sentences.remarks(comparison),
         "doubts": sentences.doubts(comparison),
         "failed": text_table(
             "failed",
@@ -183,11 +199,11 @@ def render_report(comparison: Comparison) -> str:
             landmark_table(comparison),
         ),
         "left_out": landmarks_left_out(comparison),
+        "given_map": given_map_table(comparison),
         "has_true_landmarks": sequence.true_landmarks is not None,
         "nameless": sentences.nameless_landmarks(comparison),
         "paper": PAPER if repeats_published(sequence) else "",
-        "has_detections": detections > 0 or bool(outcome_table(comparison).rows),
-        "outcomes": outcome_table(comparison),
+        "outcomes": outcomes,
         "refused": refused_table(comparison),
         "recognition": recognition_content(comparison),
         "files": {
@@ -203,7 +219,12 @@ def render_report(comparison: Comparison) -> str:
         "notes": sequence.notes,
         "environment": comparison.environment,
     }
-    return render(TEMPLATE, content)
+    is_shown = {
+        "detections": detections > 0 or bool(outcomes.rows),
+        "recognition": content["recognition"] is not None,
+        "landmarks": content["landmarks"] or content["figures"]["growth"].svg,
+    }
+    return [one for one in SECTIONS if is_shown.get(one.anchor, True)], content
 
 
 def _views(name: str, aligned: Table | None, raw: Table | None) -> dict[str, Table]:
@@ -242,13 +263,16 @@ def protocols(
 
     The runs are left out where one rule is of all.
     """
+    # labels and their order are those of the table
     table = score_table(comparison)
     found: dict[str, list[tuple[str, str, list[tuple[str, str]]]]] = {}
     for place, (key, row) in enumerate(
         zip(score_keys(comparison), table.rows, strict=True)
     ):
+        # the place of a row is also the place of its block's heading
         if place in table.sections:
             told = found.setdefault(table.sections[place], [])
+        # runs may be measured by different rules, as where one has no covariance
         rules: dict[str, list[str]] = {}
         for name in (run.estimator for run in comparison.runs):
             if key in (scores := comparison.scores.get(name, {})):
@@ -274,6 +298,7 @@ def outcome_table(comparison: Comparison) -> Table:
     ]
     rows = []
     for outcome in Outcome:
+        # outcomes that no run has would be most of the table
         if any(count and count[outcome] for count in counts):
             shares = [_share(count, outcome) for count in counts]
             rows.append([outcome.value.capitalize(), *shares])
@@ -402,6 +427,7 @@ def naming_table(sequence: Sequence) -> Table | None:
         or sequence.true_landmarks is None
     ):
         return None
+    # by place, since identities are what is judged
     labels = true_identities(sequence, sequence.detections)
     _, named = confidences(sequence.detections)
 

@@ -6,6 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonar_graph.evaluation import (
+    RAW,
     Comparison,
     headline_metric,
     label,
@@ -16,6 +17,7 @@ from sonar_graph.report import sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
 from sonar_graph.table import ABSENT
 
+# columns after the two position errors; those that no run has are left out
 COLUMNS = {
     "causal.own_map_m": "on own\nmap",
     "causal.yaw_rmse_rad": "yaw",
@@ -24,7 +26,6 @@ COLUMNS = {
     "time.update_median_ms": "median",
     "time.update_max_ms": "longest",
 }
-"""Columns after the two position errors; those that no run has are left out."""
 NEES_LEGEND = (
     "NEES: 1 fits; ▲ over-confident, ▼ over-cautious: outside what 95 % of consistent runs with as many independent "
     "samples have (the report has the bands)"
@@ -37,13 +38,20 @@ PUBLISHED_LEGEND = (
     f"{PAPER}: landmarks from its Table I, of which the errors are, and last minus first position from section III. "
     "It measured in a real basin and did not know the true path.\nAll else: this run."
 )
+# one draw of a chi-square of three, over three, is above 5.4 once in a thousand times
 FAR_FROM_FITTING = 6.0
-"""One draw of a chi-square of three, over three, is above 5.4 once in a thousand times."""
+# advice, with what the log says of its own reference: where that lacks something, inspect cannot mend it
 ASK_INSPECT = (
     "NEES far above 1 without landmarks at work: stamps, start or reference{} may be off; "
     "sonar-graph inspect LOG compares reference, clocks and sensors"
 )
-"""Advice, with what the log says of its own reference: where that lacks something, inspect cannot mend it."""
+
+
+def shown_metric(comparison: Comparison) -> str | None:
+    """The position error of the table: not aligned where a given map states the world."""
+    metric = headline_metric(comparison)
+    is_in_map = comparison.sequence.calibration.map is not None
+    return RAW if metric and is_in_map else metric
 
 
 def summary(comparison: Comparison) -> Group:
@@ -52,12 +60,13 @@ def summary(comparison: Comparison) -> Group:
     The numbers are those of the report. NEES is 1 for a consistent estimator and marked by `Score.verdict`. The lines
     below the table may be as wide as the terminal.
     """
-    metric = headline_metric(comparison)
+    metric = shown_metric(comparison)
     errors = (
         {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"}
         if metric
         else {}
     )
+    # columns that no run has would take the place of names
     present = score_keys(comparison)
     mapped = {} if metric else {"landmarks.se2_m": "map"}
     columns = {
@@ -98,6 +107,7 @@ def summary(comparison: Comparison) -> Group:
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     """Failures, doubts of the log, what runs say that may follow from these, and the meaning of the columns."""
     lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    # first, as the numbers above are not to be relied on
     doubtful = sentences.doubtful_lines(comparison)
     lines += doubtful
     lines += [

@@ -16,12 +16,10 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as MarkPath
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
-from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
 from sonar_graph.evaluation import Comparison
@@ -31,46 +29,46 @@ INK = "#1c2024"
 MUTED = "#5d656d"
 RULE = "#d5d9dd"
 TRUTH = "#8b9198"
+# after Okabe and Ito, told apart with any colour vision; darkened where white paper asks for more contrast
 ESTIMATOR_COLOURS = ("#0072b2", "#d55e00", "#00805e", "#a8508a", "#7a6a00", "#5b53b0")
-"""After Okabe and Ito, told apart with any colour vision; darkened where white paper asks for more contrast."""
 LINE_STYLES: tuple[Any, ...] = (
     "-",
     (0, (5, 1.6)),
     (0, (4, 1.4, 1, 1.4)),
     (0, (1.2, 1.2)),
 )
+TRUTH_LOOK: dict[str, Any] = {"color": TRUTH, "linewidth": 3.2, "alpha": 0.6}
 TIME_LABEL = "time since start (s)"
 PAGE_WIDTH_IN = 7.4
+# 610 px: two figures stand beside each other on a screen of 1280 px
 HALF_WIDTH_IN = 6.35
-"""610 px: two figures stand beside each other on a screen of 1280 px."""
+# width of the content of a page on a phone, 357 of 390 px
 PHONE_WIDTH_IN = 3.72
-"""Width of the content of a page on a phone, 357 of 390 px."""
+# 12.3 px on a page that shows figures at their natural width or wider
 PAGE_TEXT_PT = 9.2
-"""12.3 px on a page that shows figures at their natural width or wider."""
+# points that a drawn series keeps: more cannot be seen at the width of a page
 SERIES_POINTS = 700
-"""Points that a drawn series keeps: more cannot be seen at the width of a page."""
-LETTERS = {"STIXGeneral": 0.48}
-LETTER, LINE, LEGEND_LINE = 0.62, 1.3, 1.5
-"""Mean width of a letter (in `LETTERS` by font) and distance of lines, in sizes of the text."""
-TICK_IN, EDGE_IN, GAP_IN, HANDLE_IN = 0.13, 0.1, 0.16, 0.6
-"""A tick with its distance to the number, the outer margin, the gap between panels, a line in the legend, inches."""
+# mean width of a letter, in sizes of the text
+LETTER = 0.62
+# width of a line in the legend
+HANDLE_IN = 0.6
+# lowest and highest panel of a map, in its widths
 SHAPES = (0.45, 1.25)
-"""Lowest and highest panel of a map, in its widths."""
+# custom property of the page that replaces each colour, so that figures follow dark and light
 PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"} | {
     own: f"--run-{index}" for index, own in enumerate(ESTIMATOR_COLOURS)
 }
-"""Custom property of the page that replaces each colour, so that figures follow dark and light."""
 POINTS_PER_INCH = 72
 CSS_PIXELS_PER_INCH = 96
 LEAST_TICKS = 3
+# width of a bold letter or digit, in sizes of the text
 BOLD_LETTER = 0.72
-"""Width of a bold letter or digit, in sizes of the text."""
+# height of a name with what hangs below its line, in sizes of the text
 NAME_HEIGHT = 1.25
-"""Height of a name with what hangs below its line, in sizes of the text."""
+# half the size of the mark of a landmark, inches
 MARK_IN = 0.07
-"""Half the size of the mark of a landmark, inches."""
+# directions from a point in which its name may stand, best first
 NAME_PLACES = ((1, 1), (-1, 1), (1, -1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
-"""Directions from a point in which its name may stand, best first."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +98,15 @@ def line_style(index: int) -> Any:
     return LINE_STYLES[index % len(LINE_STYLES)]
 
 
+def run_look(index: int, width: float) -> dict[str, Any]:
+    """Colour, line style and line width (points) of the comparison's run with this index."""
+    return {
+        "color": colour(index),
+        "linestyle": line_style(index),
+        "linewidth": width,
+    }
+
+
 @contextmanager
 def sized(
     width_in: float = PAGE_WIDTH_IN,
@@ -107,6 +114,7 @@ def sized(
     font: str = "sans-serif",
 ) -> Iterator[None]:
     """Let all figures that are drawn in the block have this width and size of text."""
+    # settings, not arguments: the same functions then draw for a page and for a paper
     settings: Any = {
         "figure.figsize": (width_in, width_in),
         "font.size": text_pt,
@@ -125,17 +133,18 @@ def sized(
 
 
 def width_in() -> float:
-    """Width of figures, as the block of `sized` says."""
+    """Width of figures, as the block of `sized` sets it."""
     return float(mpl.rcParams["figure.figsize"][0])
 
 
 def text_pt() -> float:
-    """Size of text, as the block of `sized` says."""
+    """Size of text, as the block of `sized` sets it."""
     return float(mpl.rcParams["font.size"])
 
 
 def size_in(rows: int, row_in: float = 1.75) -> tuple[float, float]:
     """Width and height of a figure of rows, inches; on a narrow one they are lower."""
+    # a phone shows a figure as wide as itself: as high as on a page it would fill the screen
     narrow = min(1.0, 0.55 + 0.45 * width_in() / PAGE_WIDTH_IN)
     return width_in(), ((row_in if rows > 1 else 2.3) * rows + 0.8) * narrow
 
@@ -144,13 +153,17 @@ def blank_panels(
     rows: int, columns: int, size_in: tuple[float, float], **sharing: Any
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure of styled, empty panels, shape (rows, columns), without any state of pyplot."""
+    # not by pyplot, whose figures stay in memory until they are closed
     figure = Figure(figsize=size_in, facecolor="none")
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
     for panel in axes.flat:
         panel.set_facecolor("none")
         panel.grid(True, color=RULE, linewidth=0.6)
+        # grid lines behind the data
         panel.set_axisbelow(True)
         panel.tick_params(which="both", color=RULE, labelcolor=MUTED)
+        panel.xaxis.label.set_color(INK)
+        panel.yaxis.label.set_color(INK)
         for axis, most in ((panel.xaxis, 8 if columns == 1 else 5), (panel.yaxis, 5)):
             axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
         for side, spine in panel.spines.items():
@@ -159,113 +172,49 @@ def blank_panels(
     return figure, axes
 
 
-def arrange(figure: Figure) -> None:
-    """Set margins, places of labels and the height of maps, from what the figure holds.
+def one_panel() -> tuple[Figure, Axes]:
+    """A figure of one styled, empty panel."""
+    figure, axes = blank_panels(1, 1, size_in(1))
+    return figure, axes[0, 0]
 
-    What matplotlib's constrained layout does, in a fraction of its time: numbers at the ticks are counted in letters
-    instead of being drawn. A figure that has a layout engine keeps it.
+
+def arrange(figure: Figure) -> None:
+    """Set margins below the legend, and the height of maps, from what the figure holds.
+
+    A figure that has a layout engine keeps it.
     """
     if figure.get_layout_engine() is not None:
         return
-    panels: list[Axes] = [
-        panel for panel in figure.axes if panel.get_subplotspec() is not None
-    ]
-    grid = figure.axes[0].get_subplotspec().get_gridspec()  # type: ignore[union-attr]
-    width, height = map(float, figure.get_size_inches())
-    size = float(panels[0].xaxis.label.get_fontsize()) / POINTS_PER_INCH
-    line = LINE * size
-    letter = LETTERS.get(panels[0].xaxis.label.get_fontfamily()[0], LETTER) * size
-    titles = line if any(panel.get_title(loc="left") for panel in panels) else 0.0
-    labels = [
-        text.get_text() for legend in figure.legends for text in legend.get_texts()
-    ]
-    # rows of the legend, by a division that rounds up
-    above = -(
-        -len(labels) // _legend_columns(width, labels, letter)
-    ) * LEGEND_LINE * size + (EDGE_IN if labels else 0.0)
-    numbers = {panel: TICK_IN + letter * _letters(panel) for panel in panels}
-    outer = [panel for panel in panels if panel.get_subplotspec().is_first_col()]  # type: ignore[union-attr]
-    inner = [panel for panel in panels if panel not in outer]
-    lines = max(
-        panel.get_ylabel().count("\n") + 1 if panel.get_ylabel() else 0
-        for panel in panels
-    )
-    left = EDGE_IN / 2 + line * lines + max(numbers[panel] for panel in outer)
-    across = GAP_IN + max(
-        (numbers[panel] for panel in inner if _has_numbers(panel.yaxis, "left")),
-        default=0.0,
-    )
-    below = EDGE_IN / 2 + 2 * line + TICK_IN
-    is_stacked = any(
-        _has_numbers(panel.xaxis, "bottom")
-        for panel in panels
-        if not panel.get_subplotspec().is_last_row()  # type: ignore[union-attr]
-    )
-    down = GAP_IN + (2 * line + TICK_IN + titles if is_stacked else 0.0)
-    panel_width = (width - left - EDGE_IN - across * (grid.ncols - 1)) / grid.ncols
-    # a map: a metre is as long in x as in y, so the height follows from what is drawn
-    if panels[0].get_aspect() == 1:
-        (low, high), (bottom, top) = panels[0].get_xlim(), panels[0].get_ylim()
-        shape = float(np.clip((top - bottom) / (high - low), *SHAPES))
-        height = (
-            above
-            + titles
-            + EDGE_IN
-            + below
-            + grid.nrows * shape * panel_width
-            + (grid.nrows - 1) * down
-        )
-        figure.set_size_inches(width, height)
-    panel_height = (
-        height - above - titles - EDGE_IN - below - down * (grid.nrows - 1)
-    ) / grid.nrows
-    # matplotlib takes gaps as fractions of a panel, and margins as fractions of the figure
-    figure.subplots_adjust(
-        left=left / width,
-        right=1 - EDGE_IN / width,
-        bottom=below / height,
-        top=1 - (above + titles + EDGE_IN) / height,
-        wspace=across / panel_width,
-        hspace=down / panel_height,
-    )
-    for panel in panels:
-        # by the widest numbers of all rows, so that labels under each other are in line
-        beside = ScaledTranslation(
-            -max(numbers[one] for one in outer), 0, figure.dpi_scale_trans
-        )
-        under = ScaledTranslation(0, -TICK_IN - line, figure.dpi_scale_trans)
-        panel.yaxis.set_label_coords(0, 0.5, panel.transAxes + beside)
-        panel.xaxis.set_label_coords(0.5, 0, panel.transAxes + under)
+    panel = figure.axes[0]
+    is_map = panel.get_aspect() == 1
+    for one in figure.axes if is_map else ():
+        # panels that shrink to their scale would leave room that the fit does not see
+        one.set_aspect("auto")
+    _fit(figure)
+    # on a map a metre is as long in x as in y, so the height follows from what is drawn
+    if is_map:
+        place = panel.get_subplotspec()
+        assert place is not None, "maps stand in a grid"
+        room = place.get_position(figure)
+        width, height = map(float, figure.get_size_inches())
+        shape = np.clip(np.ptp(panel.get_ylim()) / np.ptp(panel.get_xlim()), *SHAPES)
+        missing_in = shape * room.width * width - room.height * height
+        rows = place.get_gridspec().nrows
+        figure.set_size_inches(width, height + rows * missing_in)
+        _fit(figure)
+        for one in figure.axes:
+            one.set_aspect("equal", adjustable="box")
+            # names are placed before matplotlib draws, which would apply the scale later
+            one.apply_aspect()
 
 
-def _has_numbers(axis: Axis, side: str) -> bool:
-    """True where numbers stand at the ticks, which panels that share an axis do once."""
-    return bool(axis.get_tick_params(which="major").get(f"label{side}", True))
-
-
-def _legend_columns(width: float, labels: list[str], letter: float) -> int:
-    """Columns of a legend for which there is room; all in inches."""
-    return max(
-        1, min(4, int(width / (HANDLE_IN + letter * max(map(len, labels), default=0))))
-    )
-
-
-def _letters(panel: Axes) -> int:
-    """Letters of the longest number beside a panel."""
-    axis = panel.yaxis
-    low, high = sorted(panel.get_ylim())
-    shown = [place for place in axis.get_majorticklocs() if low <= place <= high]
-    return (
-        max(map(len, axis.get_major_formatter().format_ticks(shown)), default=0)
-        if len(shown)
-        else 0
-    )
-
-
-def name_axes(panel: Axes, x: str = "", y: str = "") -> None:
-    """Label the axes; an empty label is left out."""
-    panel.set_xlabel(x, color=INK)
-    panel.set_ylabel(y, color=INK)
+def _fit(figure: Figure) -> None:
+    """Fit the panels into the figure, below its legend, which matplotlib leaves out of account."""
+    # tight_layout leaves a figure's legend out of account
+    legend_px = sum(legend.get_window_extent().height for legend in figure.legends)
+    top = 1.0 - legend_px / figure.bbox.height
+    figure.tight_layout(pad=0.5, rect=(0.0, 0.0, 1.0, top))
+    figure.align_ylabels()
 
 
 def head_panel(panel: Axes, title: str, own_colour: str = INK) -> None:
@@ -281,6 +230,7 @@ def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
     panel.set(**{f"{direction}scale": "log"})
     axis.set_major_locator(SeveralTicks())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    # minor ticks between labelled ones are clutter at this size
     axis.set_minor_locator(NullLocator())
 
 
@@ -310,6 +260,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
     frame = np.array([[edges.x0, edges.y0], [edges.x1, edges.y1]]) * scale
     size_in = text_pt() / POINTS_PER_INCH
     height = NAME_HEIGHT * size_in
+    # names must not cover the marks of other landmarks
     taken = [(at - MARK_IN, at + MARK_IN) for at in places_in]
     for name, at, point in zip(names, places_in, points, strict=True):
         width = size_in * BOLD_LETTER * len(name)
@@ -319,6 +270,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
             if x == 0:
                 low[0] -= width / 2
             high = low + np.array([width, height])
+            # two boxes are apart where they are apart in one direction
             is_free = all(
                 np.any((high <= other_low) | (low >= other_high))
                 for other_low, other_high in taken
@@ -343,18 +295,15 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
 def legend_above(figure: Figure, panel: Axes) -> None:
     """One legend for the figure, outside the data, in as many columns as there is room for."""
     handles, labels = panel.get_legend_handles_labels()
-    letter = (
-        LETTERS.get(mpl.rcParams["font.family"][0], LETTER)
-        * text_pt()
-        / POINTS_PER_INCH
-    )
+    longest_in = LETTER * text_pt() / POINTS_PER_INCH * max(map(len, labels), default=0)
+    room = int(figure.get_figwidth() / (HANDLE_IN + longest_in))
     figure.legend(
         handles,
         labels,
         loc="upper left",
         bbox_to_anchor=(0.0, 1.0),
         borderaxespad=0.1,
-        ncols=_legend_columns(figure.get_figwidth(), labels, letter),
+        ncols=min(max(room, 1), 4),
         frameon=False,
         labelcolor=INK,
         handlelength=2.4,
@@ -399,6 +348,7 @@ def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
     n = len(values)
     if n <= points:
         return np.arange(n)
+    # two rows a stretch: its lowest and its highest
     edges = np.linspace(0, n, points // 2 + 1).astype(np.int64)
     stretches = list(pairwise(edges.tolist()))
     # argmin and argmax give the first NaN of a stretch that has one, which keeps the gap
@@ -416,6 +366,11 @@ def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
     )
 
 
+def evenly_with_extremes(values: Floats, points: int) -> Ints:
+    """At most three times so many rows: equally spaced ones, and those of `thinned`."""
+    return np.union1d(evenly(len(values), 2 * points), thinned(values, points))
+
+
 def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> str:
     """The figure as an ``<svg>`` element for an HTML page.
 
@@ -425,6 +380,7 @@ def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> 
     ``description``: content of the figure in words, for those who cannot see it. ``width``: "phone" for the narrow one
     of two drawings of a figure.
     """
+    # here and not by the caller, so that no figure can reach a page without margins
     arrange(figure)
     buffer = io.StringIO()
     # with a fixed salt and no date the same result gives the same page, byte for byte

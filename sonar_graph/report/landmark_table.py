@@ -24,8 +24,8 @@ from sonar_graph.states import LandmarkMap, Trajectory, landmark_name
 from sonar_graph.table import ABSENT, Column, Table, words
 
 PAPER = "2014 paper"
+# largest number of landmarks in rows; others are left to ``landmarks.csv``
 MOST_LANDMARKS = 30
-"""Largest number of landmarks in rows; others are left to ``landmarks.csv``."""
 DECIMALS = 3
 PAPER_DECIMALS = 2
 PAPER_RETURN_DECIMALS = 4
@@ -59,6 +59,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
     true = comparison.sequence.true_landmarks
     repeats = repeats_published(comparison.sequence)
     mapped = {}
+    # a map may also be aligned because its world is not that of the truth
     is_aligned = comparison.is_aligned
     for run in runs:
         if run.landmarks is not None and len(run.landmarks):
@@ -68,6 +69,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
             )
             is_aligned |= scored is not None and scored.alignment is not None
     columns = {name: MapColumn(landmarks) for name, landmarks in mapped.items()}
+    # beside the paper also runs with a path only count: it compares returns too
     if repeats:
         walked = {
             run.estimator: run.causal
@@ -85,6 +87,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
         return None
     rows: list[list[str]] = []
     for id_ in mapped_ids(comparison, known)[:MOST_LANDMARKS]:
+        # the paper gives x and y
         for axis in (0, 1):
             at = coordinate(true, id_, axis)
             found = [
@@ -101,6 +104,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
             )
     sections = {}
     if true is not None:
+        # below the last landmark
         sections[len(rows)] = "In all"
         errors = [
             None if one.landmarks is None else landmark_errors(one.landmarks, true)
@@ -123,6 +127,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
             )
     heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
     heads += [Column(name, name) for name in columns]
+    # without a truth its column would be empty
     if true is None:
         heads, rows = [heads[0], *heads[2:]], [[row[0], *row[2:]] for row in rows]
     caption = "Positions in the map at the end, metres" + (
@@ -180,6 +185,7 @@ def _return_rows(
                 continue
             at = None
             if truth is not None:
+                # a truth that begins later or ends earlier has a displacement between its own ends
                 ends_ns = np.clip(
                     path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1]
                 )

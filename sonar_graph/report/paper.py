@@ -92,6 +92,7 @@ def write_paper(
         figures, tables, protocol = _of_batch(result)
     try:
         with result_written(folder, PAPER, overwrite=overwrite) as written:
+            # figures of an earlier result would be included by hand and be wrong
             written.remove(written.names)
             for one in figures:
                 _write_figure(one, folder)
@@ -114,6 +115,7 @@ def _of_comparison(
 ) -> tuple[list[PaperFigure], list[Table], str]:
     figures = []
     for name, (shown, drawing) in drawings(comparison).items():
+        # drawn anew at this width: a scaled figure has scaled text
         with sized(PAGE_IN if drawing.columns > 1 else COLUMN_IN, TEXT_PT, FONT):
             figure = drawing.draw(shown)
         if figure is not None:
@@ -159,6 +161,7 @@ def _rules(comparison: Comparison) -> list[str]:
 def _of_batch(batch: RecordedBatch) -> tuple[list[PaperFigure], list[Table], str]:
     with sized(PAGE_IN, TEXT_PT, FONT):
         content = batch_content(batch)
+    # in the order of the page
     drawn = [
         content["failure_drawing"],
         *(one for chapter in content["chapters"] for one in chapter["drawings"]),
@@ -188,6 +191,7 @@ def _of_batch(batch: RecordedBatch) -> tuple[list[PaperFigure], list[Table], str
 
 def _write_figure(one: PaperFigure, folder: Path) -> None:
     """The figure as SVG and PDF, and its data where it has any; the same result gives the same bytes."""
+    # margins depend on the size of the text, which is the paper's
     arrange(one.figure)
     with mpl.rc_context(EMBEDDED):
         for suffix, about in (

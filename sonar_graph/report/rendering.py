@@ -7,6 +7,7 @@ import base64
 import csv
 import io
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,43 @@ def render(template: str, content: dict[str, Any]) -> str:
     return spelt(environment.get_template(template).render(**content))
 
 
+@dataclass(frozen=True)
+class Section:
+    """A section of a page; the template of the page's kind has a macro of its name."""
+
+    anchor: str
+    title: str
+    is_folded: bool = False
+
+
+def write_html(
+    path: Path, kind: str, sections: list[Section], content: dict[str, Any]
+) -> Path:
+    """Write a page from its sections, whole or not at all, and return its path.
+
+    The page needs nothing but itself: figures are inline SVG in the page's colours, and style is inline.
+
+    Parameters
+    ----------
+    path
+        Path of the page, which is replaced.
+    kind
+        ``comparison``, ``batch`` or ``recognition``: the template with the macros of the sections.
+    sections
+        Sections in their order; links to them stand above.
+    content
+        Values by the names that the macros use; ``name`` and ``names`` make the title.
+    """
+    with replacing(path) as partial:
+        partial.write_text(html_of(kind, sections, content), "utf-8")
+    return path
+
+
+def html_of(kind: str, sections: list[Section], content: dict[str, Any]) -> str:
+    """The text of a page, as of `write_html`."""
+    return render("page.html", content | {"kind": kind, "sections": sections})
+
+
 def data_address(text: str | bytes, kind: str) -> str:
     """Content as an address within the page itself: ``data:KIND;base64,...``."""
     content = text if isinstance(text, bytes) else text.encode()
@@ -91,6 +129,7 @@ def as_csv(table: Table) -> str:
     ]
     rows = [["section", *head] if table.sections else head]
     section = ""
+    # a section is a heading between rows on a page, and a column in a file
     for place, row in enumerate(table.rows):
         section = table.sections.get(place, section)
         texts = [section] if table.sections else []
@@ -121,6 +160,7 @@ def _plain_cell(text: str) -> str:
     if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
         return text
     try:
+        # a negative number also begins with a minus
         float(text)
     except ValueError:
         return f"'{text}"

@@ -5,7 +5,6 @@ squared innovations, exceed `ABSURD`; where covariances hold, that has a probabi
 too small it has 1e-9 to the power of 1/f².
 """
 
-import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -31,32 +30,33 @@ from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, landmark_name
 
+# the filter with the robust kernel and the gyro bias that filters as published lack
 FAIR = "invariant-ekf"
-"""The filter with the robust kernel and the gyro bias that filters as published lack."""
+# relative difference below which one run says nothing about which of two errors is the smaller one
 TOO_CLOSE = 0.05
-"""Relative difference below which one run says nothing about which of two errors is the smaller one."""
 CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
 NO_DETECTIONS = (
     "The log has no landmark detections; without them nothing corrects the drift."
 )
+# 41.4: the chi-square quantile of two degrees of freedom at 1 - 1e-9
 ABSURD = chi_square_quantile(1 - 1e-9, 2)
-"""41.4: the chi-square quantile of two degrees of freedom at 1 - 1e-9."""
+# above this share of innovations above `ABSURD` the sightings of a landmark contradict each other; below it
+# they are outliers, which a robust estimator outvotes
 CONTRADICTING_SHARE = 0.2
-"""Above this share of innovations above `ABSURD` the sightings of a landmark contradict each other; below it they are
-outliers, which a robust estimator outvotes."""
+# above this share of innovations above `ABSURD` outliers are named
 OUTLYING_SHARE = 0.05
-"""Above this share of innovations above `ABSURD` outliers are named."""
 MOST_NAMED = 5
+# outcomes of detections whose landmark an estimator does not know
 NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT}
-"""Outcomes of detections whose landmark an estimator does not know."""
+# outcomes of detections that were refused before their landmark mattered
 UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
-"""Outcomes of detections that were refused before their landmark mattered."""
 POLICY = "identity.policy"
 UNKNOWN = "identity.unknown.policy"
 WARNING = "Warning"
 DOUBTFUL = "Doubtful"
+# ratio of squared innovations to their covariance, typical of a sensor, that no noise makes
 BEYOND_DOUBT = 100.0
-"""Ratio of squared innovations to their covariance, typical of a sensor, that no noise makes."""
+# notes that the terminal shows, and the word before each, causes first; the report has all notes
 SAID_NOTES = {
     "log.doubtful": DOUBTFUL,
     "log.sensors": WARNING,
@@ -72,125 +72,24 @@ SAID_NOTES = {
     "log.warnings": WARNING,
     "log.gaps": WARNING,
 }
-"""Notes that the terminal shows, and the word before each, causes first; the report has all notes."""
 
 
-def finding(comparison: Comparison) -> list[str]:
-    """The findings of the comparison, a sentence each: failures first, then errors, then consistency.
-
-    A log without detections, and runs that lost their way, are mentioned after the failures.
-    """
-    runs = comparison.runs
-    sentences = [
-        f"{run.estimator} failed: {run.reason.rstrip('.')}."
-        for run in comparison.failed_runs
-    ]
-    if FITTED in comparison.sequence.notes:
-        fitted = comparison.sequence.notes[FITTED]
-        sentences.append(f"{fitted[0].upper()}{fitted[1:]}.")
+def remarks(comparison: Comparison) -> list[str]:
+    """Sentences about the whole comparison that put nothing in doubt: where the truth is, and the lack of detections."""
+    fitted = comparison.sequence.notes.get(FITTED)
+    sentences = [f"{fitted[0].upper()}{fitted[1:]}."] if fitted else []
     if not comparison.sequence.detections:
         sentences.append(no_detections(comparison))
-    sentences += lost_runs(comparison)
-    metric = headline_metric(comparison)
-    if metric is None:
-        if len(comparison.failed_runs) == len(runs):
-            sentences.append(
-                "No estimator came to an end, so there is nothing to compare."
-            )
-        elif mapped := _map_sentence(comparison):
-            sentences.append(mapped)
-        elif comparison.sequence.truth is None:
-            sentences.append(
-                "The log has no ground truth, so paths, maps and times can be compared, but no errors given."
-            )
-        else:
-            sentences.append(
-                "No position error could be computed against the log's ground truth."
-            )
-        nis = {
-            run.estimator: comparison.score_of(run.estimator, "detections.nis")
-            for run in runs
-        }
-        told = [
-            f"{name} {score.text()} ({score.verdict})"
-            for name, score in nis.items()
-            if score and score.verdict
-        ]
-        return [
-            *sentences,
-            *(
-                [f"NIS, 1 where innovations fit their covariances: {', '.join(told)}."]
-                if told
-                else []
-            ),
-        ]
-    sentences.append(_causal_sentence(comparison, metric))
-    improved = []
-    judged = []
-    for name in (run.estimator for run in runs):
-        causal, smoothed = (
-            comparison.score_of(name, f"{kind}.{metric}")
-            for kind in ("causal", "smoothed")
-        )
-        if (
-            causal
-            and smoothed
-            and not math.isclose(causal.value, smoothed.value, rel_tol=1e-3)
-        ):
-            improved.append(f"{name} {smoothed.with_unit}")
-        scores = {
-            what: score
-            for what, key in CONSISTENCY_KEYS.items()
-            if (score := comparison.score_of(name, key))
-        }
-        if scores:
-            what = max(scores, key=lambda what: _doubt(scores[what]))
-            said = [what, scores[what].verdict]
-            if (interval := scores[what].interval) is not None:
-                low, high = map(scores[what].text, interval)
-                said.append(f"{low} to {high} expected")
-            judged.append(
-                f"{name} {scores[what].text()} ({', '.join(filter(None, said))})"
-            )
-    own = {
-        run.estimator: comparison.score_of(run.estimator, "causal.own_map_m")
-        for run in runs
-    }
-    on_map = sorted(
-        ((name, score) for name, score in own.items() if score),
-        key=lambda item: item[1].value,
-    )
-    if on_map:
-        listed = ", ".join(f"{name} {score.with_unit}" for name, score in on_map)
-        sentences.append(
-            f"Position on its own map, as each knew it at that instant: {listed}."
-        )
-    if improved:
-        sentences.append(
-            f"Looking back from the end of the run (smoothed): {', '.join(improved)}."
-        )
-    if judged:
-        sentences.append(
-            "NEES, of position or yaw whichever is the more doubtful (1: a fitting uncertainty), with what 95 % of "
-            f"consistent runs with as many independent samples have: {', '.join(judged)}."
-        )
     return sentences
-
-
-def _doubt(score: Score) -> tuple[int, float]:
-    """Rank of a NEES by its doubtfulness: over-confident, over-cautious, within its interval; then by its logarithm."""
-    rank = (
-        ("over-cautious", "over-confident").index(score.verdict) + 1
-        if score.verdict.startswith("over")
-        else 0
-    )
-    return rank, abs(math.log(max(score.value, math.ulp(0.0))))
 
 
 def grave_lines(comparison: Comparison) -> list[str]:
     """Sentences on runs that failed or lost their way."""
-    failed = len(comparison.failed_runs)
-    return [*finding(comparison)[:failed], *lost_runs(comparison)]
+    failed = [
+        f"{run.estimator} failed: {run.reason.rstrip('.')}."
+        for run in comparison.failed_runs
+    ]
+    return [*failed, *lost_runs(comparison)]
 
 
 def doubts(comparison: Comparison) -> list[str]:
@@ -212,7 +111,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
 
     Before that, where sensors contradict each other beyond doubt, that the results are doubtful.
 
-    Empty where no run has a position error: then `finding` begins with what can be said.
+    Where no run has a position error, the reason, or the errors of maps.
 
     Parameters
     ----------
@@ -221,14 +120,16 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     aligned
         Errors after alignment to the truth, where the runs have them, instead of before.
     """
+    # numbers of sensors that contradict each other are no finding
     if doubtful := doubtful_lines(comparison):
         return doubtful[0]
     metric = headline_metric(comparison)
     if metric is None:
-        return ""
+        return _without_errors(comparison)
     if not aligned:
         metric = RAW
-    (name, least), *others = _in_order(comparison, metric)
+    (name, least), *others = _in_order(comparison, f"causal.{metric}")
+    # one run is too little to separate such errors
     close = [
         other
         for other, score in others
@@ -237,6 +138,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     equals = f", {' and '.join(close)} equally near" if close else ""
     what = label(metric, comparison, HEADLINES)
     opening = f"{name} is nearest to the truth{equals}: {least.with_unit} off ({what}, causal)"
+    # a wrong map can come with a small error by luck
     is_in_doubt = any(
         name in line
         for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]
@@ -246,10 +148,10 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     return f"{opening}. {_worth_of_covariances(comparison, name)}".strip()
 
 
-def _in_order(comparison: Comparison, metric: str) -> list[tuple[str, Score]]:
-    """Runs with their causal error, smallest first."""
+def _in_order(comparison: Comparison, key: str) -> list[tuple[str, Score]]:
+    """Runs with an error, smallest first."""
     errors = {
-        run.estimator: comparison.score_of(run.estimator, f"causal.{metric}")
+        run.estimator: comparison.score_of(run.estimator, key)
         for run in comparison.runs
     }
     known = [(name, score) for name, score in errors.items() if score]
@@ -259,31 +161,29 @@ def _in_order(comparison: Comparison, metric: str) -> list[tuple[str, Score]]:
 def _worth_of_covariances(comparison: Comparison, name: str) -> str:
     """One sentence on whether the covariances of a run fit its errors; empty where it has no NEES."""
     judged = {
-        what: score
-        for what, key in CONSISTENCY_KEYS.items()
-        if (score := comparison.score_of(name, key))
+        what: comparison.score_of(name, key) for what, key in CONSISTENCY_KEYS.items()
     }
-    if not judged:
+    known = {what: score for what, score in judged.items() if score}
+    if not known:
         return ""
-    far = {
-        what: score
-        for what, score in judged.items()
-        if score.verdict.startswith("over")
-    }
-    if far:
+    verdicts = {score.verdict for score in known.values()}
+    if verdicts & {"over-confident", "over-cautious"}:
         listed = " and ".join(
-            f"of {what} {score.text()}" for what, score in far.items()
+            f"of {what} {score.text()}"
+            for what, score in known.items()
+            if score.verdict.startswith("over")
         )
-        is_small = any(score.verdict == "over-confident" for score in far.values())
+        is_small = "over-confident" in verdicts
         fault = "too small: do not rely on them" if is_small else "too large"
         return f"Its covariances are {fault} (NEES {listed}, 1 fits)."
-    if any(score.verdict for score in judged.values()):
+    if any(verdicts):
         return "Its covariances fit its errors."
     return "One run is too short to judge its covariances."
 
 
 def published_filters(comparison: Comparison) -> str:
     """Which filters have the settings of their publication, with their fair neighbour; empty without any."""
+    # a reader must not take the filter of a paper for a poor implementation
     names = [run.estimator for run in comparison.runs if run.is_as_published]
     if not names:
         return ""
@@ -295,16 +195,18 @@ def published_filters(comparison: Comparison) -> str:
     )
 
 
-def _map_sentence(comparison: Comparison) -> str:
-    """Errors of maps against true landmarks where no path is known; empty without any."""
-    errors = {
-        run.estimator: comparison.score_of(run.estimator, "landmarks.se2_m")
-        for run in comparison.runs
-    }
-    listed = [f"{name} {score.with_unit}" for name, score in errors.items() if score]
-    if not listed:
-        return ""
-    return f"No true path is known, but the landmarks are; maps after SE(2) alignment (RMS): {', '.join(listed)}."
+def _without_errors(comparison: Comparison) -> str:
+    """The headline where no run has a position error."""
+    if len(comparison.failed_runs) == len(comparison.runs):
+        return "No estimator came to an end, so there is nothing to compare."
+    # maps can be judged where paths cannot
+    maps = _in_order(comparison, "landmarks.se2_m")
+    listed = ", ".join(f"{name} {score.with_unit}" for name, score in maps)
+    if listed:
+        return f"No true path is known, but the landmarks are; maps after SE(2) alignment (RMS): {listed}."
+    if comparison.sequence.truth is None:
+        return "The log has no ground truth, so paths, maps and times can be compared, but no errors given."
+    return "No position error could be computed against the log's ground truth."
 
 
 def no_detections(comparison: Comparison) -> str:
@@ -321,40 +223,13 @@ def no_detections(comparison: Comparison) -> str:
     return f"The part of the log that was chosen ({part}) has no landmark detections; nothing corrects the drift in it."
 
 
-def _causal_sentence(comparison: Comparison, metric: str) -> str:
-    """Causal errors in order of size, and the distance of the smallest from the others."""
-    scored = _in_order(comparison, metric)
-    listed = ", ".join(f"{name} {score.with_unit}" for name, score in scored)
-    opening = (
-        f"Causal position error ({label(metric, comparison, HEADLINES)}): {listed}"
-    )
-    if len(scored) == 1:
-        return opening + "."
-    (first, least), *others = scored
-    below = {
-        name: 1 - least.value / score.value if score.value > 0 else 0.0
-        for name, score in others
-    }
-    far = [
-        f"{100 * share:.0f} % below {name}"
-        for name, share in below.items()
-        if share >= TOO_CLOSE
-    ]
-    close = [name for name, share in below.items() if share < TOO_CLOSE]
-    said = [f"{first} is {' and '.join(far)}"] if far else []
-    if close:
-        said.append(
-            f"{first} and {' and '.join(close)} differ by less than 5 %, too little for one run to tell them apart"
-        )
-    return f"{opening}; {'; '.join(said)}."
-
-
 def lost_runs(comparison: Comparison) -> list[str]:
     """A sentence on each run whose gate refused more than `GATED_SHARE` of the detections."""
     said = []
     for run in comparison.runs:
         outcomes = run.detections.outcomes if run.detections else []
         gated = outcomes.count(Outcome.GATED)
+        # a gate that refuses so much refuses the truth
         if gated > GATED_SHARE * max(len(outcomes), 1):
             is_smoother = flattened(run.params).get(POLICY) == "gate"
             advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
@@ -380,6 +255,7 @@ def beside_the_paper(comparison: Comparison) -> str | None:
     sequence = comparison.sequence
     calibration = sequence.calibration
     params = flattened(run.params)
+    # bridged by accelerometers, which the paper does not do
     longest_s = float(np.diff(sequence.dvl.stamps_ns).max(initial=0)) * 1e-9
     is_held = calibration.odometry_interpolation == "hold-past"
     has_gaps = longest_s > calibration.dvl.gap_s and not is_held
@@ -415,6 +291,7 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
             if run.detections
             else []
         )
+        # no identity can be used, so nothing is mapped
         if outcomes and set(outcomes) <= NAMELESS:
             blind[run.estimator] = len(outcomes)
     if blind:
@@ -434,6 +311,7 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
             scored = scored_map(run.landmarks, comparison.sequence)
             if scored is None:
                 continue
+            # with a truth the errors show which landmark is wrong
             errors = landmark_errors(scored.landmarks, true)
             squares = normalised_squares(
                 errors.horizontal_m, errors.horizontal_covs
@@ -612,6 +490,7 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
 
 def refused_by(comparison: Comparison) -> dict[RefusedRows, list[str]]:
     """Refused rows of IMU and Doppler log, with the names of the runs that refused them."""
+    # runs mostly refuse the same rows: one line for all
     names: dict[RefusedRows, list[str]] = {}
     for run in comparison.runs:
         for refused in gathered(run.refused):

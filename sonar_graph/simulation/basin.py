@@ -78,7 +78,9 @@ RAMP_S = 3.0
 TURN_S = 8.0
 FASTEST_M_S = 0.45
 KNOT_S = 0.5
-PAPER_DURATION_S, PAPER_LAPS, PAPER_SPEED_M_S = 2039.0, 3, 0.15
+PAPER_DURATION_S = 2039.0
+PAPER_LAPS = 3
+PAPER_SPEED_M_S = 0.15
 UNKNOWN_OBJECTS = "unknown objects"
 """Note of a log with strangers: each thing on the floor that is no landmark, and where it lies."""
 NOTES = {
@@ -227,9 +229,9 @@ def _world_and_path(
         world,
         landmark_ids=np.array([design.id for design in designs_laid(options.image)]),
     )
-    rng, seconds = (
-        streams.path,
-        np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1),
+    rng = streams.path
+    seconds = np.linspace(
+        0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1
     )
     x, y, yaw = follow((0.0, 0.0, 0.0), route(options, rng), seconds).T
     level = np.zeros_like(seconds)
@@ -278,7 +280,9 @@ def objects_on_floor(
         weathered(one, image, own)
         for one, own in zip(landmarks, wear_rng.spawn(len(landmarks)), strict=True)
     ]
-    spots, beside, corner = [], [], np.zeros(2)
+    spots = []
+    beside = []
+    corner = np.zeros(2)
     for heading_rad in -math.pi / 2 * np.arange(SIDES):
         ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
         left = np.array([-ahead[1], ahead[0]])
@@ -373,7 +377,8 @@ def route(options: BasinOptions, rng: np.random.Generator) -> list[RouteLeg]:
 
     Driving and turning leave some time, which is spent watching, unequally.
     """
-    speed, sides = cruise_speed(options), SIDES * options.laps
+    speed = cruise_speed(options)
+    sides = SIDES * options.laps
     spare_s = max(
         0.0, options.duration_s - sides * (SIDE_M / speed + 2 * RAMP_S + TURN_S)
     )

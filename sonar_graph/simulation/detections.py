@@ -194,7 +194,8 @@ def simulate_detections(
     False detections belong to no track. Path and world are the truth; there is one stamp a frame, shape (n,).
     """
     true_rng, false_rng = rng.spawn(2)
-    frames, landmarks = len(stamps_ns), len(world.landmark_ids)
+    frames = len(stamps_ns)
+    landmarks = len(world.landmark_ids)
     sigmas = np.array([sonar.range_sigma_m, sonar.azimuth_sigma_rad])
 
     points = landmarks_in_sonar(path, stamps_ns, sonar, world)
@@ -207,11 +208,9 @@ def simulate_detections(
     true_views = true_views + sigmas * true_rng.standard_normal((len(true_frame), 2))
     if recogniser.tracks:
         watched = Watched.of(landmark, stamps_ns[true_frame])
-        true_track, delay_s, share = (
-            watched.track,
-            recogniser.id_delay_s,
-            recogniser.wrong_id_share,
-        )
+        true_track = watched.track
+        delay_s = recogniser.id_delay_s
+        share = recogniser.wrong_id_share
         first_taken_for = _mistaken(
             watched.landmark, landmarks, recogniser.wrong_id_rate, true_rng
         )
@@ -224,10 +223,8 @@ def simulate_detections(
         true_posterior[watched.age_s < delay_s] = 1 / (landmarks + 1)
     else:
         taken_for = _mistaken(landmark, landmarks, recogniser.wrong_id_rate, true_rng)
-        true_posterior, true_track = (
-            _confident(taken_for, landmarks),
-            np.full(len(true_frame), NO_TRACK),
-        )
+        true_posterior = _confident(taken_for, landmarks)
+        true_track = np.full(len(true_frame), NO_TRACK)
 
     false_frame = np.repeat(
         np.arange(frames),

@@ -101,7 +101,8 @@ def add_landmarks(
     """
     options = options or LandmarkOptions()
     for low, high in (("range_min_m", "range_max_m"), ("side_min_m", "side_max_m")):
-        least, most = getattr(options, low), getattr(options, high)
+        least = getattr(options, low)
+        most = getattr(options, high)
         if least >= most:
             raise SimulationError(
                 f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}"
@@ -118,10 +119,8 @@ def add_landmarks(
         azimuth_sigma_rad=options.azimuth_sigma_rad,
         elevation_aperture_rad=options.elevation_aperture_rad,
     )
-    azimuth_half_rad, elevation_half_rad = (
-        options.azimuth_aperture_rad / 2,
-        options.elevation_aperture_rad / 2,
-    )
+    azimuth_half_rad = options.azimuth_aperture_rad / 2
+    elevation_half_rad = options.elevation_aperture_rad / 2
     fan = FieldOfView(
         options.range_min_m, options.range_max_m, azimuth_half_rad, elevation_half_rad
     )
@@ -171,7 +170,8 @@ def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
             f"expected {LEAST_POSES} or more"
         )
     stamps_ns = stamps_ns[inside]
-    seconds, knots = (stamps_ns - stamps_ns[0]) * 1e-9, [0.0]
+    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
+    knots = [0.0]
     for instant in seconds[1:].tolist():
         if instant - knots[-1] >= KNOT_S - 1e-6:
             knots.append(instant)

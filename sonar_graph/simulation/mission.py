@@ -73,10 +73,8 @@ def simulate_mission(options: MissionOptions | None = None) -> Sequence:
     streams = Streams.of(options.seed)
     # the sunflower's spiral: evenly over a disc, without rows
     index = np.arange(options.landmarks)
-    radius, angle = (
-        FIELD_RADIUS_M * np.sqrt((index + 0.5) / options.landmarks),
-        GOLDEN_ANGLE_RAD * index,
-    )
+    radius = FIELD_RADIUS_M * np.sqrt((index + 0.5) / options.landmarks)
+    angle = GOLDEN_ANGLE_RAD * index
     landmarks_xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     world = world_on_floor(
         landmarks_xy, FLOOR_Z_M, options.floor_sigma_m, streams.world

@@ -172,10 +172,8 @@ def true_calibration(
     rng: np.random.Generator,
 ) -> Calibration:
     """The noise that is simulated, and a start drawn about the true one, so that its error is as large as it says."""
-    preset, sigma_m_s = (
-        IMU_PRESETS[options.imu],
-        DVL_PRESETS[options.dvl].velocity_sigma_m_s,
-    )
+    preset = IMU_PRESETS[options.imu]
+    sigma_m_s = DVL_PRESETS[options.dvl].velocity_sigma_m_s
     imu = preset.model_copy(
         update={
             "gyro_bias_sigma": preset.gyro_bias_sigma * options.gyro_bias_scale,

@@ -51,7 +51,8 @@ def imu_readings(
     Shapes (n, 3), rad/s and m/s²; at rest and level the force is (0, 0, +gravity).
     """
     imu_R_body = body_R_sensor(mounting).inv()
-    lever, omega = np.array(mounting.translation_m), motion.angular_velocity
+    lever = np.array(mounting.translation_m)
+    omega = motion.angular_velocity
     from_gravity = motion.world_R_body.inv().apply(
         motion.acceleration + np.array([0.0, 0.0, gravity_m_s2])
     )

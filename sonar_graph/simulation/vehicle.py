@@ -106,8 +106,10 @@ def smooth_noise(
 
 def angular_motion(rpy: Floats, rate: Floats, change: Floats) -> tuple[Floats, Floats]:
     """Angular velocity and acceleration in the body frame from angles and their two time derivatives."""
-    (sin_r, sin_p, _), (cos_r, cos_p, _) = np.sin(rpy).T, np.cos(rpy).T
-    (roll, pitch, yaw), (roll2, pitch2, yaw2) = rate.T, change.T
+    (sin_r, sin_p, _) = np.sin(rpy).T
+    (cos_r, cos_p, _) = np.cos(rpy).T
+    (roll, pitch, yaw) = rate.T
+    (roll2, pitch2, yaw2) = change.T
     velocity = (
         roll - yaw * sin_p,
         pitch * cos_r + yaw * sin_r * cos_p,
@@ -152,7 +154,8 @@ def follow(start: PlanarPose, legs: list[RouteLeg], seconds: Floats) -> Floats:
         pairwise([start, *(leg.goal for leg in legs)]), legs, strict=True
     ):
         first = np.searchsorted(seconds, begin_s)
-        elapsed_s, full_speed_s = seconds[first:] - begin_s, leg.duration_s - leg.ramp_s
+        elapsed_s = seconds[first:] - begin_s
+        full_speed_s = leg.duration_s - leg.ramp_s
         progress = np.ones_like(elapsed_s)
         if full_speed_s > 0:
             covered = _distance(elapsed_s, leg.ramp_s) - _distance(

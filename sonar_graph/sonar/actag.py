@@ -124,7 +124,8 @@ class AcTagRecogniser:
         """
         del view
         check_block(frame)
-        stamp_ns, settings = int(frame.stamps_ns[0]), self.settings
+        stamp_ns = int(frame.stamps_ns[0])
+        settings = self.settings
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
@@ -148,7 +149,8 @@ class AcTagRecogniser:
             Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist())
             for id_, _, range_azimuth in decoded
         ]
-        self.fates, reported = [], []
+        self.fates = []
+        reported = []
         for n, tag in enumerate(tags):
             outcome = REPORTED
             if tag.id in [other.id for other in tags[:n]]:
@@ -215,7 +217,8 @@ def evenly_sampled(
     Levels are averaged over the bins of a pixel, and interpolated between beams. Returned are the picture, shape (rows,
     columns), the range of each row, farthest first, and the azimuth of each column, leftmost first and 0 in the middle.
     """
-    first_m, last_m = float(ranges_m[0]), float(ranges_m[-1])
+    first_m = float(ranges_m[0])
+    last_m = float(ranges_m[-1])
     widest_rad = float(np.abs(azimuths_rad).max())
     rows_m = np.linspace(last_m, first_m, max(2, round((last_m - first_m) / pixel_m)))
     columns = max(2, round(2 * widest_rad * 0.5 * (first_m + last_m) / pixel_m))
@@ -243,8 +246,10 @@ def _import_actag(module: str, activity: str) -> Any:
         ) from error
 
 
-BITS_ACROSS, PIXELS_A_BIT = 7, 20
-FOAM_DB, PLATE_DB = 12.0, -8.0
+BITS_ACROSS = 7
+PIXELS_A_BIT = 20
+FOAM_DB = 12.0
+PLATE_DB = -8.0
 """Over the floor: as of the landmarks that ship."""
 RING = (
     *((0, column) for column in range(7)),

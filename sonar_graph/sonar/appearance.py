@@ -23,7 +23,7 @@ from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.evidence import Figures
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.place import LONGEST_SHADOW, SHADE_FINE, Relief
+from sonar_graph.sonar.place import LONGEST_SHADOW, SHADE_FINE, Grid, Lit, Relief
 from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import (
     ASSUMED_SLOPE,
@@ -82,6 +82,8 @@ class DesignFit:
 class Search(NamedTuple):
     """Templates whose best place in a patch is searched for."""
 
+    patch_side: int
+    """Cells along the side of the patch."""
     cells: Ints
     """Cells that are compared, in a patch row by row, with the templates at their first place, shape (cells,)."""
     pictures: Floats32
@@ -96,6 +98,30 @@ class Search(NamedTuple):
     """Number of each place, one a cell along x and y; first those from which the search climbs. Shape (n, n)."""
 
 
+class BestPlaces(NamedTuple):
+    """Best template of each design in a patch, and its place."""
+
+    visible: float
+    """Share of the cells in view at the best place of all before the climb."""
+    template: Ints
+    """Shape (designs,)."""
+    cell: Ints
+    """Place of the best correlation, in cells, shape (designs, 2)."""
+    top: Floats
+    """Top of the parabolas through it and its neighbours, in cells, shape (designs, 2)."""
+
+
+class Placed(NamedTuple):
+    """Place of a design on the floor; all x and y."""
+
+    centre_m: Floats
+    """Shape (2,)."""
+    bound_m: Floats
+    """Cramer-Rao bound of its standard deviations, shape (2,)."""
+    moved_m: Floats
+    """By what else it may be off, shape (2, 2)."""
+
+
 class Appearance:
     """Comparison of patches with the templates of designs, as a sonar of one resolution sees them."""
 
@@ -106,117 +132,107 @@ class Appearance:
         params: AppearanceParams | None = None,
     ) -> None:
         self.params = params or AppearanceParams()
-        self.templates = templates = Templates.of(
+        self.designs = len(designs)
+        self._designs = tuple(designs)
+        self._blur_m = blur_m
+        templates = Templates.of(
             designs, self.params.cell_m, self.params.margin_m, blur_m
         )
-        self.designs = len(designs)
+        self.templates = templates
         self._steps = math.ceil(self.params.search_m / self.params.cell_m)
         self.figures = Figures.of(designs, templates, blur_m, 2 * self._steps)
         self.patch_side = self.figures.patch_side
         self._rim = (self.patch_side - templates.side) // 2 - self._steps
-        self._designs, self._blur_m = tuple(designs), blur_m
         drawn = zip(
             templates.design.tolist(), templates.heading_rad.tolist(), strict=True
         )
         self._to_middle_m = np.array(
             [middle_m(designs[index], heading_rad) for index, heading_rad in drawn]
         )
-        self._compared = x, y = np.divmod(templates.cells, templates.side)
+        x, y = np.divmod(templates.cells, templates.side)
+        self._compared = (x, y)
         self._reliefs: dict[tuple[int, int], Relief] = {}
         pictures = templates.pictures
+        squares = pictures**2
         self._search = Search(
-            (x + self._rim) * self.patch_side + y + self._rim,
-            pictures,
-            pictures**2,
-            np.stack([pictures.sum(axis=1), (pictures**2).sum(axis=1)]),
-            np.searchsorted(templates.design, np.arange(self.designs + 1)),
-            numbered_places(2 * self._steps + 1),
+            patch_side=self.patch_side,
+            cells=(x + self._rim) * self.patch_side + y + self._rim,
+            pictures=pictures,
+            squares=squares,
+            sums=np.stack([pictures.sum(axis=1), squares.sum(axis=1)]),
+            first=np.searchsorted(templates.design, np.arange(self.designs + 1)),
+            row=numbered_places(2 * self._steps + 1),
         )
 
     def fit(self, patch: Patch) -> DesignFit | None:
         """Fit of the designs, each at its best heading and shift; None where too little is in view."""
-        params, search, template = (
-            self.params,
-            self._search,
-            self._search.first[:-1].copy(),
-        )
-        cell, top = np.zeros((self.designs, 2), np.int64), np.zeros((self.designs, 2))
-        visible = find_places(
-            patch.level_db.ravel(), patch.seen.ravel(), self.patch_side,
-            search.cells, search.pictures, search.squares, search.sums, search.first, search.row,
-            params.least_searched, template, cell, top,
-        )  # fmt: skip
-        if (
-            visible < params.least_visible
-            or (found := self.figures.evidence(patch, template, cell)) is None
-        ):
+        best = find_places(patch, self._search, self.params.least_searched)
+        if best.visible < self.params.least_visible:
+            return None
+        found = self.figures.evidence(patch, best.template, best.cell)
+        if found is None:
             return None
         evidence, edge = found
-        centre_m = (
-            patch.centre_m
-            + params.cell_m * (top - self._steps)
-            + self._to_middle_m[template]
-        )
+        shift_m = self.params.cell_m * (best.top - self._steps)
         return DesignFit(
-            evidence,
-            visible,
-            self.templates.heading_rad[template],
-            centre_m,
-            template,
-            edge,
+            evidence=evidence,
+            visible=best.visible,
+            heading_rad=self.templates.heading_rad[best.template],
+            centre_m=patch.centre_m + shift_m + self._to_middle_m[best.template],
+            template=best.template,
+            edge=edge,
         )
 
     def place(
         self, patch: Patch, fit: DesignFit, design: int, grazing_slope: float
-    ) -> tuple[Floats, Floats, Floats]:
+    ) -> Placed:
         """Place of a design that fits a patch, the bound of its standard deviations, and by what else it may be off.
 
-        All are x and y on the floor, m, shapes (2,), (2,) and (2, 2). ``grazing_slope`` is the height of the sonar over
-        the distance along the floor. Only so many cells count for the bound as are independent. Where a part seems
-        covered, the place is that of the rest. What else: the way between the places with and without that part, and by
-        how much an error of the heading moves the middle of a design whose figure lies beside it.
+        ``grazing_slope`` is the height of the sonar over the distance along the floor. Only so many cells count for the
+        bound as are independent. Where a part seems covered, the place is that of the rest. What else: the way between
+        the places with and without that part, and by how much an error of the heading moves the middle of a design
+        whose figure lies beside it.
         """
-        cell_m, relief_m, origin = (
-            self.params.cell_m,
-            self._designs[design].standing_m,
-            self._rim + self._steps,
-        )
+        cell_m = self.params.cell_m
+        relief_m = self._designs[design].standing_m
+        row = int(fit.template[design])
+        edge = int(fit.edge[design])
+        to_middle_m = self._to_middle_m[row]
+        origin = self._rim + self._steps
         shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
         shade = min(shadow_m / cell_m * FINE / SHADE_FINE, LONGEST_SHADOW)
-        drawn = row, steps = int(fit.template[design]), int(shade)
-        side, to_middle_m = self.templates.side, self._to_middle_m[row]
-        if drawn not in self._reliefs:
-            heading_rad = float(self.templates.heading_rad[row])
-            self._reliefs[drawn] = Relief.of(
-                self._designs[design], heading_rad, side, cell_m, self._blur_m, steps
-            )
+        relief = self._relief(design, row, int(shade))
+        lit = Lit(relief_m * grazing_slope, shade - int(shade))
         start = (fit.centre_m[design] - to_middle_m - patch.centre_m) / cell_m + origin
-        cells, relief, side_m, moved = (
-            self._compared,
-            self._reliefs[drawn],
-            relief_m * grazing_slope,
-            np.zeros(2),
-        )
-        place, bound = relief.place(
-            patch.level_db, patch.seen, cells, start, side_m, shade - steps
-        )
-        if (edge := int(fit.edge[design])) >= 0:
-            is_kept = self.figures.is_kept(
-                row, edge, *(cell_m * (one - side // 2) for one in cells)
-            )
-            kept = cells[0][is_kept], cells[1][is_kept]
-            of_kept, bound_of_kept = relief.place(
-                patch.level_db, patch.seen, kept, place, side_m, shade - steps
-            )
+        place, bound = relief.place(patch, self._compared, start, lit)
+        moved_m = np.zeros(2)
+        if edge >= 0:
+            half = self.templates.side // 2
+            x_m, y_m = (cell_m * (one - half) for one in self._compared)
+            is_kept = self.figures.is_kept(row, edge, x_m, y_m)
+            kept = (self._compared[0][is_kept], self._compared[1][is_kept])
+            of_kept, bound_of_kept = relief.place(patch, kept, place, lit)
             if np.isfinite(bound_of_kept).all():
-                moved, place, bound = cell_m * (of_kept - place), of_kept, bound_of_kept
-        bound_m = cell_m / math.sqrt(self.figures.independent) * bound
+                moved_m = cell_m * (of_kept - place)
+                place = of_kept
+                bound = bound_of_kept
         turned_m = HEADING_SIGMA_RAD * np.array([-to_middle_m[1], to_middle_m[0]])
-        return (
-            patch.centre_m + cell_m * (place - origin) + to_middle_m,
-            bound_m,
-            np.stack([moved, turned_m]),
+        return Placed(
+            centre_m=patch.centre_m + cell_m * (place - origin) + to_middle_m,
+            bound_m=cell_m / math.sqrt(self.figures.independent) * bound,
+            moved_m=np.stack([moved_m, turned_m]),
         )
+
+    def _relief(self, design: int, row: int, steps: int) -> Relief:
+        """Relief of a design at the heading of a template, with shadows of so many steps and one more."""
+        if (row, steps) not in self._reliefs:
+            self._reliefs[row, steps] = Relief.of(
+                self._designs[design],
+                float(self.templates.heading_rad[row]),
+                Grid(self.templates.side, self.params.cell_m, self._blur_m),
+                steps,
+            )
+        return self._reliefs[row, steps]
 
 
 def numbered_places(side: int) -> Ints:
@@ -226,146 +242,192 @@ def numbered_places(side: int) -> Ints:
     return np.argsort(order).reshape(side, side)
 
 
-@compiled
-def find_places(
-    level_db: Floats32, seen: Floats32, side: int, cells: Ints, pictures: Floats32, squares: Floats32, sums: Floats32,
-    first: Ints, row_of: Ints, least_searched: float, template: Ints, cell: Ints, top: Floats,
-) -> float:  # fmt: skip
-    """Fill in which template of each design correlates best with a patch, at which cell, and the top beside it.
+class Laid(NamedTuple):
+    """What lies in a patch under the templates, at the places where they were laid; rows as in `Search.row`."""
 
-    A patch comes row by row, each ``side`` cells; templates as in `Search`. At first templates are the first of their
-    designs, and places 0. The share of the cells in view at the best place of all before the climb.
+    patch_db: Floats32
+    """Levels of the patch less their mean, 0 where not seen, shape (side * side,)."""
+    seen: Floats32
+    """Shape (side * side,)."""
+    is_cut: bool
+    """Whether a cell of the patch is not seen."""
+    level_db: Floats32
+    """Shape (places, cells)."""
+    held: Floats32
+    """1 where seen, shape (places, cells), or (1, cells) of a patch that is not cut."""
+    sums: Floats32
+    """Number of the cells seen, sum of their levels and of the squares, 0 where nothing was laid, shape (places, 3)."""
+
+
+@compiled
+def find_places(patch: Patch, search: Search, least_searched: float) -> BestPlaces:
+    """Which template of each design correlates best with a patch, and where.
+
+    All templates are laid at every `COARSE` place; each design's best one climbs from there.
     """
-    places, is_cut, total, count = len(row_of), False, 0.0, 0.0
-    for at in range(len(seen)):
-        total, count, is_cut = (
-            total + level_db[at],
-            count + seen[at],
-            is_cut or seen[at] < 1,
-        )
-    levels, mean = np.empty(len(seen), np.float32), np.float32(total / max(count, 1.0))
-    for at in range(len(seen)):
-        levels[at] = (level_db[at] - mean) * seen[at]
-    # what lies under the templates, at the places where they are laid
-    level = np.empty((places * places, len(cells)), np.float32)
-    held = np.ones((places * places if is_cut else 1, len(cells)), np.float32)
-    of_level = np.zeros((places * places, 3), np.float32)
+    places = len(search.row)
+    designs = len(search.first) - 1
+    cells = len(search.cells)
+    laid = unlaid(patch, search)
     for x in range(0, places, COARSE):
         for y in range(0, places, COARSE):
-            row = row_of[x, y]
-            lay(
-                levels,
-                seen,
-                cells,
-                x * side + y,
-                is_cut,
-                level[row],
-                held[row if is_cut else 0],
-                of_level[row],
-            )
-    rows, step = (
-        ((places + COARSE - 1) // COARSE) ** 2,
-        max(1, MOST_MULTIPLICATIONS // pictures.size),
-    )
-    found = np.empty((rows, len(pictures)), np.float32)
-    for begin in range(0, rows, step):
-        end = min(begin + step, rows)
-        ab, b, bb = np.dot(level[begin:end], pictures.T), sums[:1], sums[1:]
-        if is_cut:
-            b, bb = (
-                np.dot(held[begin:end], pictures.T),
-                np.dot(held[begin:end], squares.T),
-            )
-        for row in range(begin, end):
-            w = row - begin
-            for t in range(len(pictures)):
-                found[row, t] = correlation(
-                    of_level[row], b[w % len(b), t], bb[w % len(b), t], ab[w, t]
-                )
-    best, highest, visible = np.full(len(template), -1.0), -1.0, 0.0
+            lay(laid, search, x, y)
+    found = coarse_correlations(laid, search)
+    template = search.first[:-1].copy()
+    cell = np.zeros((designs, 2), np.int64)
+    top = np.zeros((designs, 2))
+    best = np.full(designs, -1.0)
+    highest = -1.0
+    visible = 0.0
+    first = search.first
     for x in range(0, places, COARSE):
         for y in range(0, places, COARSE):
-            row = row_of[x, y]
-            if of_level[row, 0] < least_searched * len(cells):
+            row = search.row[x, y]
+            if laid.sums[row, 0] < least_searched * cells:
                 continue
-            for k in range(len(template)):
+            for k in range(designs):
                 for t in range(first[k], first[k + 1]):
                     if found[row, t] > best[k]:
-                        best[k], template[k], cell[k, 0], cell[k, 1] = (
-                            found[row, t],
-                            t,
-                            x,
-                            y,
-                        )
+                        best[k] = found[row, t]
+                        template[k] = t
+                        cell[k, 0] = x
+                        cell[k, 1] = y
                 if best[k] > highest:
-                    highest, visible = best[k], of_level[row, 0] / len(cells)
-    # uphill from there
-    for k in range(len(template)):
-        x, y, moved, known = cell[k, 0], cell[k, 1], True, np.full(row_of.shape, np.nan)
-        picture, square, b_k, bb_k = (
-            pictures[template[k]],
-            squares[template[k]],
-            sums[0, template[k]],
-            sums[1, template[k]],
-        )
-        while moved:
-            moved = False
-            for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
-                i, j = x + dx, y + dy
-                if not (0 <= i < places and 0 <= j < places and np.isnan(known[i, j])):
-                    continue
-                row = row_of[i, j]
-                if of_level[row, 0] == 0:
-                    lay(
-                        levels,
-                        seen,
-                        cells,
-                        i * side + j,
-                        is_cut,
-                        level[row],
-                        held[row if is_cut else 0],
-                        of_level[row],
-                    )
-                if is_cut:
-                    b_k, bb_k = np.dot(held[row], picture), np.dot(held[row], square)
-                known[i, j] = correlation(
-                    of_level[row], b_k, bb_k, np.dot(level[row], picture)
-                )
-            for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-                i, j = x + dx, y + dy
-                if 0 <= i < places and 0 <= j < places and known[i, j] > known[x, y]:
-                    x, y, moved = i, j, True
-                    break
-        cell[k, 0], cell[k, 1], top[k, 0], top[k, 1] = x, y, x, y
-        if 0 < x < places - 1:
-            top[k, 0] += parabola_top(known[x - 1, y], known[x, y], known[x + 1, y])
-        if 0 < y < places - 1:
-            top[k, 1] += parabola_top(known[x, y - 1], known[x, y], known[x, y + 1])
-    return visible
+                    highest = best[k]
+                    visible = laid.sums[row, 0] / cells
+    for k in range(designs):
+        climb(laid, search, template[k], cell[k], top[k])
+    return BestPlaces(visible, template, cell, top)
 
 
 @compiled
-def lay(
-    levels: Floats32, seen: Floats32, cells: Ints, shift: int, is_cut: bool,
-    level: Floats32, held: Floats32, sums: Floats32,
-) -> None:  # fmt: skip
-    """Fill in levels, and whether they are seen, in cells so far on; their number, sum and sum of squares."""
+def unlaid(patch: Patch, search: Search) -> Laid:
+    """Levels of a patch, with room for what lies under the templates."""
+    level_db = patch.level_db.ravel()
+    seen = patch.seen.ravel()
+    total = 0.0
+    count = 0.0
+    is_cut = False
+    for at in range(len(seen)):
+        total += level_db[at]
+        count += seen[at]
+        is_cut = is_cut or seen[at] < 1
+    mean = np.float32(total / max(count, 1.0))
+    patch_db = np.empty(len(seen), np.float32)
+    for at in range(len(seen)):
+        patch_db[at] = (level_db[at] - mean) * seen[at]
+    places = search.row.size
+    cells = len(search.cells)
+    return Laid(
+        patch_db,
+        seen,
+        is_cut,
+        np.empty((places, cells), np.float32),
+        np.ones((places if is_cut else 1, cells), np.float32),
+        np.zeros((places, 3), np.float32),
+    )
+
+
+@compiled
+def lay(laid: Laid, search: Search, x: int, y: int) -> None:
+    """Fill in the row of one place."""
+    row = search.row[x, y]
+    shift = x * search.patch_side + y
+    cells = search.cells
+    patch_db = laid.patch_db
+    seen = laid.seen
+    level_db = laid.level_db[row]
+    held = laid.held[row if laid.is_cut else 0]
     for c in range(len(cells)):
-        level[c] = levels[np.uint32(cells[c] + shift)]
-    if is_cut:
+        level_db[c] = patch_db[np.uint32(cells[c] + shift)]
+    if laid.is_cut:
         for c in range(len(cells)):
             held[c] = seen[np.uint32(cells[c] + shift)]
-    sums[0], sums[1], sums[2] = (
-        np.dot(held, held),
-        np.dot(held, level),
-        np.dot(level, level),
-    )
+    laid.sums[row, 0] = np.dot(held, held)
+    laid.sums[row, 1] = np.dot(held, level_db)
+    laid.sums[row, 2] = np.dot(level_db, level_db)
+
+
+@compiled
+def coarse_correlations(laid: Laid, search: Search) -> Floats32:
+    """Correlations of all templates at the places from which the search climbs, shape (places, templates)."""
+    rows = ((len(search.row) + COARSE - 1) // COARSE) ** 2
+    templates = len(search.pictures)
+    most = max(1, MOST_MULTIPLICATIONS // search.pictures.size)
+    found = np.empty((rows, templates), np.float32)
+    sums = laid.sums
+    for begin in range(0, rows, most):
+        end = min(begin + most, rows)
+        ab = np.dot(laid.level_db[begin:end], search.pictures.T)
+        b = search.sums[:1]
+        bb = search.sums[1:]
+        if laid.is_cut:
+            b = np.dot(laid.held[begin:end], search.pictures.T)
+            bb = np.dot(laid.held[begin:end], search.squares.T)
+        for row in range(begin, end):
+            w = row - begin
+            held = w if laid.is_cut else 0
+            for t in range(templates):
+                found[row, t] = correlation(
+                    sums[row], b[held, t], bb[held, t], ab[w, t]
+                )
+    return found
+
+
+@compiled
+def climb(laid: Laid, search: Search, template: int, cell: Ints, top: Floats) -> None:
+    """Move a template's place uphill, cell by cell, and fill in the top beside it."""
+    places = len(search.row)
+    known = np.full(search.row.shape, np.nan)
+    x = cell[0]
+    y = cell[1]
+    has_moved = True
+    while has_moved:
+        has_moved = False
+        for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+            i = x + dx
+            j = y + dy
+            if 0 <= i < places and 0 <= j < places and np.isnan(known[i, j]):
+                known[i, j] = correlation_at(laid, search, template, i, j)
+        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            i = x + dx
+            j = y + dy
+            if 0 <= i < places and 0 <= j < places and known[i, j] > known[x, y]:
+                x = i
+                y = j
+                has_moved = True
+                break
+    cell[0] = x
+    cell[1] = y
+    top[0] = x
+    top[1] = y
+    if 0 < x < places - 1:
+        top[0] += parabola_top(known[x - 1, y], known[x, y], known[x + 1, y])
+    if 0 < y < places - 1:
+        top[1] += parabola_top(known[x, y - 1], known[x, y], known[x, y + 1])
+
+
+@compiled
+def correlation_at(laid: Laid, search: Search, template: int, x: int, y: int) -> float:
+    """Correlation of one template at one place."""
+    row = search.row[x, y]
+    if laid.sums[row, 0] == 0:
+        lay(laid, search, x, y)
+    picture = search.pictures[template]
+    b = search.sums[0, template]
+    bb = search.sums[1, template]
+    if laid.is_cut:
+        b = np.dot(laid.held[row], picture)
+        bb = np.dot(laid.held[row], search.squares[template])
+    return correlation(laid.sums[row], b, bb, np.dot(laid.level_db[row], picture))
 
 
 @compiled
 def correlation(sums: Floats32, b: float, bb: float, ab: float) -> float:
-    """Correlation from `lay`'s sums, sums over a template and its squares, and over both; -1 where one is flat."""
-    n, a, aa = sums[0], sums[1], sums[2]
+    """Correlation from `Laid.sums`, sums over a template and its squares, and over both; -1 where one is flat."""
+    n = sums[0]
+    a = sums[1]
+    aa = sums[2]
     scale2 = (n * aa - a * a) * (n * bb - b * b)
     return (n * ab - a * b) / math.sqrt(scale2) if scale2 > 0 else -1.0
 
@@ -405,15 +467,10 @@ class ObjectSighting:
 
 
 class Fitted(NamedTuple):
-    """Fit of all designs to a patch, and the place of the best one on the floor."""
+    """Fit of all designs to a patch, and the place of the best one, x away from the sonar through the patch's middle."""
 
     of_designs: DesignFit
-    centre_m: Floats
-    """(x, y), x away from the sonar through the middle of the patch, shape (2,)."""
-    bound_m: Floats
-    """Cramer-Rao bound of its standard deviations, shape (2,)."""
-    moved_m: Floats
-    """By what else it may be off (`Appearance.place`), shape (2, 2)."""
+    place: Placed
 
 
 @lru_cache(maxsize=64)
@@ -443,11 +500,13 @@ class CandidateFit:
         confusion: Confusion,
         elevation_aperture_rad: float,
     ) -> None:
-        self._designs, self._params, self._confusion = tuple(designs), params, confusion
+        self._designs = tuple(designs)
+        self._params = params
+        self._confusion = confusion
         self._weights = np.array(confusion.weights)
         self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
-        self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
+        self._shape: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
 
     def at(
         self,
@@ -458,45 +517,59 @@ class CandidateFit:
         rows: Ints,
     ) -> list[ObjectSighting | None]:
         """Sightings of the candidates in these rows; None for a row of -1."""
+        grid = self._grid_of(frame)
+        plane = view or SLANT_PLANE
+        seen = rows[rows >= 0]
+        range_m = candidates.range_m[seen]
+        azimuth_rad = candidates.azimuth_rad[seen]
+        points_m = plane.floor_points(range_m, azimuth_rad) @ plane.level_R_sonar.T
+        bearing_rad = np.arctan2(points_m[:, 1], points_m[:, 0])
+        away_m = np.hypot(points_m[:, 0], points_m[:, 1])
+        fits = [
+            self._fit(grid, image_db, plane, *row)
+            for row in zip(away_m.tolist(), bearing_rad.tolist(), strict=True)
+        ]
+        of_seen = iter(self._sightings(view, range_m, azimuth_rad, bearing_rad, fits))
+        return [None if row < 0 else next(of_seen) for row in rows.tolist()]
+
+    def _grid_of(self, frame: SonarFrames) -> PolarGrid:
+        """Grid of a frame; that of the frame before where ranges and azimuths are the same."""
         shape = (frame.ranges_m, frame.azimuths_rad)
         is_same = (
             one is other or np.array_equal(one, other)
             for one, other in zip(self._shape, shape, strict=True)
         )
         if self._grid is None or not all(is_same):
-            self._grid, self._shape = PolarGrid.of(*shape, self._aperture_rad), shape
-        plane, seen = view or SLANT_PLANE, rows[rows >= 0]
-        range_m, azimuth_rad = candidates.range_m[seen], candidates.azimuth_rad[seen]
-        points_m = plane.floor_points(range_m, azimuth_rad) @ plane.level_R_sonar.T
-        bearing_rad, away_m = (
-            np.arctan2(points_m[:, 1], points_m[:, 0]),
-            np.hypot(points_m[:, 0], points_m[:, 1]),
-        )
-        fits = [
-            self._fit(image_db, plane, *row)
-            for row in zip(away_m.tolist(), bearing_rad.tolist(), strict=True)
-        ]
-        sightings = iter(self._sightings(view, range_m, azimuth_rad, bearing_rad, fits))
-        return [None if row < 0 else next(sightings) for row in rows.tolist()]
+            self._grid = PolarGrid.of(*shape, self._aperture_rad)
+            self._shape = shape
+        return self._grid
 
     def _fit(
-        self, image_db: Floats32, plane: FloorView, away_m: float, bearing_rad: float
+        self,
+        grid: PolarGrid,
+        image_db: Floats32,
+        plane: FloorView,
+        away_m: float,
+        bearing_rad: float,
     ) -> Fitted | None:
         """Fit of the designs to what lies at a distance and bearing on the floor; NaN: the ray does not reach it."""
-        assert self._grid is not None
         if math.isnan(away_m):
             return None
-        steps = self._grid.blur_steps(away_m, math.hypot(away_m, plane.height_m))
+        steps = grid.blur_steps(away_m, math.hypot(away_m, plane.height_m))
         appearance = appearance_at(self._designs, self._params, *steps)
-        ahead, centre_m = plane.turned(bearing_rad), np.array([away_m, 0.0])
-        patch = self._grid.patch(
-            image_db, ahead, centre_m, appearance.patch_side, self._params.cell_m
+        patch = grid.patch(
+            image_db,
+            plane.turned(bearing_rad),
+            np.array([away_m, 0.0]),
+            appearance.patch_side,
+            self._params.cell_m,
         )
-        if (fit := appearance.fit(patch)) is None:
+        fit = appearance.fit(patch)
+        if fit is None:
             return None
         best = int((fit.evidence @ self._weights).argmax())
         slope = ASSUMED_SLOPE if plane is SLANT_PLANE else plane.height_m / away_m
-        return Fitted(fit, *appearance.place(patch, fit, best, slope))
+        return Fitted(fit, appearance.place(patch, fit, best, slope))
 
     def prepare(
         self,
@@ -509,9 +582,10 @@ class CandidateFit:
         Candidates are seen from so far to so far below the horizon.
         """
         grid = PolarGrid.of(ranges_m, azimuths_rad, self._aperture_rad)
-        for steps in grid.steps_in_view(
+        in_view = grid.steps_in_view(
             float(ranges_m[0]), float(ranges_m[-1]), depressions_rad
-        )[:MOST_PREPARED]:
+        )
+        for steps in in_view[:MOST_PREPARED]:
             appearance_at(self._designs, self._params, *steps)
 
     def _sightings(
@@ -519,59 +593,54 @@ class CandidateFit:
         fits: list[Fitted | None],
     ) -> list[ObjectSighting]:  # fmt: skip
         """Sightings where the centre of the best design is; without a fit where the candidate's centroid is."""
-        model, fitted = self._confusion, [fit for fit in fits if fit is not None]
-        covariance, rise = np.zeros((len(fits), 2, 2)), np.zeros(len(fits))
-        covariance[:, 0, 0], covariance[:, 1, 1] = (
-            CENTROID_SIGMA_M**2,
-            (CENTROID_SIGMA_M / range_m) ** 2,
-        )
-        bounds: list[Floats | None] = [None] * len(fits)
-        moves: list[Floats | None] = [None] * len(fits)
-        if fitted:
-            rows = np.flatnonzero([fit is not None for fit in fits])
-            xy, bound, moves_m = (
-                np.array([getattr(fit, name) for fit in fitted])
-                for name in Fitted._fields[1:]
+        covariance = np.zeros((len(fits), 2, 2))
+        covariance[:, 0, 0] = CENTROID_SIGMA_M**2
+        covariance[:, 1, 1] = (CENTROID_SIGMA_M / range_m) ** 2
+        sightings = [
+            ObjectSighting(None, *row)
+            for row in zip(
+                range_m.tolist(), azimuth_rad.tolist(), covariance, strict=True
             )
-            cos, sin = np.cos(bearing_rad[rows]), np.sin(bearing_rad[rows])
-            places = np.concatenate([xy[:, None], xy[:, None] + moves_m], axis=1)
-            level_xy = np.einsum(
-                "ijn,nkj->nki", np.array([[cos, -sin], [sin, cos]]), places
+        ]
+        rows = [row for row, fit in enumerate(fits) if fit is not None]
+        fitted = [fit for fit in fits if fit is not None]
+        if not fitted:
+            return sightings
+        model = self._confusion
+        xy_m = np.array([fit.place.centre_m for fit in fitted])
+        moved_xy_m = np.array([fit.place.moved_m for fit in fitted])
+        bound_xy_m = np.array([fit.place.bound_m for fit in fitted])
+        # the place and those to which it may have moved, from the axes of each patch into level ones
+        places_m = np.concatenate([xy_m[:, None], xy_m[:, None] + moved_xy_m], axis=1)
+        cos = np.cos(bearing_rad[rows])
+        sin = np.sin(bearing_rad[rows])
+        level_R_patch = np.array([[cos, -sin], [sin, cos]])
+        level_xy_m = np.einsum("ijn,nkj->nki", level_R_patch, places_m).reshape(-1, 2)
+        all_range_m, all_azimuth_rad = (view or SLANT_PLANE).range_azimuth(level_xy_m)
+        ranges_m = all_range_m.reshape(-1, 3)
+        azimuths_rad = all_azimuth_rad.reshape(-1, 3)
+        r = ranges_m[:, 0]
+        along_m = ranges_m - r[:, None]
+        across_m = r[:, None] * (azimuths_rad - azimuths_rad[:, :1])
+        moved_m = np.sqrt((np.stack([along_m, across_m], axis=-1) ** 2).sum(axis=1))
+        range_per_height = np.zeros(len(r)) if view is None else view.height_m / r
+        away_m = np.hypot(xy_m[:, 0], xy_m[:, 1])
+        bound_m = bound_xy_m * np.array([away_m / r, r / away_m]).T
+        of_place = model.range_azimuth_cov(bound_m, r)
+        to_range_azimuth = np.column_stack([np.ones_like(r), r])
+        of_place[:, [0, 1], [0, 1]] += (moved_m / to_range_azimuth) ** 2
+        for n, row in enumerate(rows):
+            rise = float(range_per_height[n])
+            sightings[row] = ObjectSighting(
+                fit=fitted[n].of_designs,
+                range_m=float(r[n] + model.height_bias_m * rise),
+                azimuth_rad=float(azimuths_rad[n, 0]),
+                covariance=np.minimum(of_place[n], covariance[row]),
+                range_per_height=rise,
+                bound_m=bound_m[n],
+                moved_m=moved_m[n],
             )
-            r, azimuth = (
-                one.reshape(-1, 3)
-                for one in (view or SLANT_PLANE).range_azimuth(level_xy.reshape(-1, 2))
-            )
-            off = np.stack(
-                [r - r[:, :1], r[:, :1] * (azimuth - azimuth[:, :1])], axis=-1
-            )
-            moved, r, azimuth_rad[rows] = (
-                np.sqrt((off**2).sum(axis=1)),
-                r[:, 0],
-                azimuth[:, 0],
-            )
-            rise[rows] = 0.0 if view is None else view.height_m / r
-            range_m[rows] = r + model.height_bias_m * rise[rows]
-            away_m = np.hypot(*xy.T)
-            bound = bound * np.array([away_m / r, r / away_m]).T
-            of_place = model.range_azimuth_cov(bound, r)
-            of_place[:, [0, 1], [0, 1]] += (
-                moved / np.column_stack([np.ones_like(r), r])
-            ) ** 2
-            covariance[rows] = np.minimum(of_place, covariance[rows])
-            for row, *one in zip(rows.tolist(), bound, moved, strict=True):
-                bounds[row], moves[row] = one
-        of = [None if fit is None else fit.of_designs for fit in fits]
-        columns = (
-            of,
-            range_m.tolist(),
-            azimuth_rad.tolist(),
-            covariance,
-            rise.tolist(),
-            bounds,
-            moves,
-        )
-        return [ObjectSighting(*row) for row in zip(*columns, strict=True)]
+        return sightings
 
     def log_odds(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
         """Log odds of each design against none of them, last 0 for these, shape (M, designs + 1).

@@ -191,7 +191,8 @@ class Beliefs:
     def _news(self, ids: Ints, place: Floats, sideways: Floats) -> Floats:
         """Independent share of a look from here at each track, shape (M,); places of other tracks are forgotten."""
         look, row = np.nonzero(self._looked[:, None] == ids)
-        self._looked, self._places = self._looked[look], self._places[look]
+        self._looked = self._looked[look]
+        self._places = self._places[look]
         moved = place - self._places
         aside = np.vecdot(moved, sideways[row])
         ahead = np.sqrt(np.maximum(np.vecdot(moved, moved) - aside**2, 0.0))
@@ -206,8 +207,6 @@ class Beliefs:
         if len(self._looked) <= self.params.most_looks:
             return
         _, first, count = np.unique(self._looked, return_index=True, return_counts=True)
-        if (too_many := first[count > self.params.most_looks]).size:
-            self._looked, self._places = (
-                np.delete(self._looked, too_many),
-                np.delete(self._places, too_many, axis=0),
-            )
+        too_many = first[count > self.params.most_looks]
+        self._looked = np.delete(self._looked, too_many)
+        self._places = np.delete(self._places, too_many, axis=0)

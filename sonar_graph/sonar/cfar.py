@@ -74,7 +74,8 @@ def select_candidates(
 
     Raises `MeasurementError` when the shapes do not belong together, or a level is not finite.
     """
-    params, shape = params or DetectionParams(), (len(azimuths_rad), len(ranges_m))
+    params = params or DetectionParams()
+    shape = (len(azimuths_rad), len(ranges_m))
     if image_db.shape != shape or min(shape) < 2:
         raise MeasurementError(
             f"sonar frame: shape {image_db.shape}; beams and bins are {shape}, 2 or more"
@@ -91,10 +92,8 @@ def select_candidates(
         odd_counts(length_m, cell_m)
         for length_m in (params.smoothing_m, params.background_m, params.closing_m)
     )
-    smoothing, wide = (
-        np.maximum(smoothing, LEAST_COUNT).tolist(),
-        np.maximum(closing, LEAST_COUNT).tolist(),
-    )
+    smoothing = np.maximum(smoothing, LEAST_COUNT).tolist()
+    wide = np.maximum(closing, LEAST_COUNT).tolist()
     closing = wide if params.closing_m > 0 else closing
     smooth = np.asarray(
         cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101),
@@ -111,10 +110,8 @@ def select_candidates(
     count, found, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
         closed, 8, cv2.CV_32S, cv2.CCL_GRANA
     )
-    labels, boxes = (
-        np.asarray(found, dtype=np.int32),
-        stats[1:count].astype(np.int64)[:, [1, 0, 3, 2]],
-    )
+    labels = np.asarray(found, dtype=np.int32)
+    boxes = stats[1:count].astype(np.int64)[:, [1, 0, 3, 2]]
     regions = measure_regions(
         contrast, labels, len(boxes), ranges_m, azimuths_rad, view
     )

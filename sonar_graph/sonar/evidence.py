@@ -10,10 +10,10 @@ shade, and e the residual::
 
 H is 1 on one side of a straight edge and 0 beyond it, where sediment or weed lies: `EDGES` directions, `OFFSETS` from
 the middle. No level is given, so that neither gain nor contrast nor a plate that cannot be seen makes a fit bad. R is
-the sum of squares that a model leaves, and sigma^2 the mean square of `design` without S. `EVIDENCE` names what comes
-of it, the columns of `Figures.evidence`. Of Gaussian e a likelihood ratio is ``n / 2 ln R' / R`` with n independent
-cells: logarithms of ratios count by the share of cells that are independent. How much each column counts is measured
-(`Confusion.weights`). Derivation: docs/theory/recognition.md.
+the sum of squares that a model leaves, and sigma^2 the mean square of `design` without S. `Evidence` names what comes
+of it. Of Gaussian e a likelihood ratio is ``n / 2 ln R' / R`` with n independent cells: logarithms of ratios count by
+the share of cells that are independent. How much each piece counts is measured (`Confusion.weights`). Derivation:
+docs/theory/recognition.md.
 """
 
 from __future__ import annotations
@@ -40,69 +40,107 @@ from sonar_graph.sonar.templates import (
 
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
-EVIDENCE = (
-    "prior",
-    "outline",
-    "figure",
-    "contrast",
-    "beyond",
-    "floor",
-    "behind",
-    "plate",
-    "bare",
-    "rival",
-    "covered",
-)
-"""prior: 1; outline: ln R(otherwise) / R(design); figure: the same without S and D; contrast: ln beta / sigma; beyond:
-ln mean square of what is brighter than the design says, next to the figure; floor: ln mean square of what is darker,
-farther out; behind: level next to the figure on its far side, dB; plate: root of ln R(without D) / R(design), or of ln
-R(without B) / R(design) where that is less, since a plate alone is none; bare: 1 for a design without dark parts, which
-no plate can speak for; rival: ln of the least R(covered) of all designs over that of this one, as shares of what one
-level leaves; covered: ln R(design without S) / R(covered)."""
-POWER_OF_CELLS = np.array(
-    [
-        1.0 if name in ("outline", "figure", "rival", "covered") else 0.0
-        for name in EVIDENCE
-    ]
-)
-POWER_OF_CELLS[EVIDENCE.index("plate")] = 0.5
-"""Power of the share of independent cells by which columns count: logarithms of ratios of two R, and a root of one."""
+
+
+class Evidence(NamedTuple):
+    """What speaks for a design, one number a piece."""
+
+    prior: float
+    """1."""
+    outline: float
+    """``ln R(otherwise) / R(design)``."""
+    figure: float
+    """The same without S and D."""
+    contrast: float
+    """``ln beta / sigma``."""
+    beyond: float
+    """Logarithm of the mean square of what is brighter than the design, next to the figure."""
+    floor: float
+    """Logarithm of the mean square of what is darker than the design, farther out."""
+    behind: float
+    """Level next to the figure on its far side, dB."""
+    plate: float
+    """Root of ``ln R(without D) / R(design)``, or of ``ln R(without B) / R(design)`` where that is less: a plate alone
+    is no landmark."""
+    bare: float
+    """1 for a design without dark parts, which no plate can speak for."""
+    rival: float
+    """Logarithm of the least R(covered) of all designs over that of this one, as shares of what one level leaves."""
+    covered: float
+    """``ln R(design without S) / R(covered)``."""
+
+
+EVIDENCE = Evidence._fields
+"""Names of the pieces, the columns of `Figures.evidence`."""
+RATIOS_OF_SQUARES = ("outline", "figure", "rival", "covered")
+"""Pieces that count by the share of independent cells; `plate`, a root, counts by its root."""
+RIVAL = EVIDENCE.index("rival")
 COVERED = EVIDENCE.index("covered")
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))
 """Width at half of the power over the standard deviation."""
 STRETCHES = (
-    *(
-        (1.0, 1.0),
-        (0.78, 0.78),
-        (0.87, 0.87),
-        (0.94, 0.94),
-        (1.07, 1.07),
-        (1.15, 1.15),
-        (1.27, 1.27),
-    ),
-    *((1.2, 0.83), (0.83, 1.2)),
+    (1.0, 1.0),
+    (0.78, 0.78),
+    (0.87, 0.87),
+    (0.94, 0.94),
+    (1.07, 1.07),
+    (1.15, 1.15),
+    (1.27, 1.27),
+    (1.2, 0.83),
+    (0.83, 1.2),
 )
 """Of the figures of what is no landmark, along the design's axes x and y; the first is the design's own."""
-EDGES, OFFSETS = 12, (0.15, 0.4, 0.65)
-"""Edges of what covers a part of a figure: directions, and distances from its middle, in radii of the disc that has the
-figure's second moment."""
+FLOOR = 0
+DARK = 1
+FIGURE = 2
+"""Columns of the models: 1, D, and the first of the figures; the shadows S_q follow the figures."""
+SHADOW = FIGURE + len(STRETCHES)
+EDGES = 12
+"""Directions of the edges of what covers a part of a figure."""
+OFFSETS = (0.15, 0.4, 0.65)
+"""Their distances from its middle, in radii of the disc that has the figure's second moment."""
 REACH_M = 0.06
 """Width of the ring around the largest design that is explained."""
 SHADOW_M = 0.09
 """The same behind it; longest shadow that is looked for is a little more."""
-SHADOW_CELLS, OWN_SHADOW_CELLS, NEAR_CELLS, BEHIND_CELLS = 7, 2, 4, 3
-"""Lengths of S, of the shadow of a design's own height, of the surroundings of a figure, and of its far side."""
+SHADOW_CELLS = 7
+"""Length of S."""
+OWN_SHADOW_CELLS = 2
+"""Length of the shadow of a design's own height."""
+NEAR_CELLS = 4
+"""Width of the surroundings of a figure."""
+BEHIND_CELLS = 3
+"""Depth of its far side."""
 LEAST_CELLS = 60
-LEAST_BETA_DB, LEAST_DB2 = 0.5, 0.3
+LEAST_BETA_DB = 0.5
+LEAST_DB2 = 0.3
 """Floors of logarithms."""
+LEAST_LEFT_DB2 = 1e-3
+"""Floor of a sum of squares."""
 LEAST_VARIANCE_DB2 = 0.1
 """Variance of a patch up to which it shows no speckle and nothing else: 5.57 dB squared over 300 looks."""
 STEP = np.float32(1 / 64)
 """In which models are kept, as bytes: a fit reads thousands of cells, and memory is what it waits for."""
-OUT, PART = 0.12, 0.5
-"""Shares of a cell in a figure: up to the first it lies outside, from the second on inside."""
-NEAR, BEHIND, FAR = 1, 2, 4
+OUT = 0.12
+"""Share of a cell in a figure up to which it lies outside."""
+PART = 0.5
+"""Share of a cell in a figure from which on it lies inside."""
+NEAR = 1
+BEHIND = 2
+FAR = 4
 """Zones of the floor; a cell may lie in more than one."""
+
+
+class FigureOfTemplate(NamedTuple):
+    """The models of a patch for one template, over the n cells that are compared; fields as in `Figures`."""
+
+    cells: NDArray[np.int32]
+    values: Bytes
+    smooth: Floats32
+    zones: Bytes
+    uncovered: Bytes
+    has_dark: bool
+    radius_m: float
 
 
 class Figures(NamedTuple):
@@ -136,7 +174,7 @@ class Figures(NamedTuple):
     independent: float
     """Share of the cells that are independent: cells are not where the sonar resolves less."""
     counts: Floats
-    """By how much each column of `EVIDENCE` counts, shape (11,)."""
+    """By how much each piece of `Evidence` counts, shape (11,)."""
 
     @classmethod
     def of(
@@ -147,268 +185,438 @@ class Figures(NamedTuple):
         last: int,
     ) -> Figures:
         """Models of designs at the headings of their templates, for places 0 to ``last`` along each axis."""
-        cell_m, material_m = templates.cell_m, max(map(material_radius_m, designs))
-        half = math.ceil((material_m + SHADOW_M) / cell_m)
-        side = 2 * half + 1
-        x_m, y_m = np.meshgrid(
-            *2 * [cell_m * np.arange(-half, half + 1)], indexing="ij"
-        )
-        away_m = np.hypot(x_m, y_m)
-        area = (away_m <= material_m + REACH_M) | (
-            (away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m)
-        )
-        kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
-        beyond_m = np.stack(
-            [along_edge(x_m, y_m, edge) for edge in range(EDGES)], axis=-1
-        )
-        columns = []
-        for index, heading in zip(
-            templates.design.tolist(), templates.heading_rad.tolist(), strict=True
-        ):
-            design = designs[index]
-            parts = [
-                drawn(design, heading, side, cell_m, blur_m, stretch)
-                for stretch in STRETCHES
-            ]
-            figures = [bright / float(np.nanmax(design.mask)) for bright, _ in parts]
-            figure, dark = (
-                figures[0],
-                parts[0][1] / min(float(np.nanmin(design.mask)), -1.0),
-            )
-            has_dark = bool((dark > PART).any())
-            own_shadow = behind(figure + dark, OWN_SHADOW_CELLS) > PART
-            compared = area & ~(own_shadow & ((away_m > material_m) | (not has_dark)))
-            is_out = (figure < OUT) & compared
-            is_near = cv2.dilate((figure > PART).astype(np.uint8), kernel) > 0
-            zones = NEAR * (is_out & is_near) + BEHIND * (
-                is_out & (behind(figure, BEHIND_CELLS) > PART)
-            )
-            zones += FAR * (is_out & ~is_near & (dark < OUT))
-            shades = [behind(one, SHADOW_CELLS) for one in figures]
-            exact = np.stack([np.ones_like(figure), dark, *figures, *shades])[
-                :, compared
-            ].T
-            values = np.clip(np.rint(exact / STEP), 0, 255).astype(np.uint8)
-            smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])[
-                :, compared
-            ].T.astype(np.float32)
-            kept, in_steps = np.empty((EDGES * len(OFFSETS), 3)), values.astype(float)
-            gram = float(STEP) ** 2 * (in_steps.T @ in_steps)
-            x, y = np.nonzero(compared)
-            radius_m = math.sqrt(
-                2 * float(np.average(away_m**2, weights=np.maximum(figure, 0.0)))
-            )
-            uncovered = beyond_m[compared][:, :, None] <= radius_m * np.array(OFFSETS)
-            at = (x * (side + last) + y).astype(np.int32)
-            own = (
-                at,
-                values,
-                smooth,
-                zones[compared].astype(np.uint8),
-                uncovered.reshape(len(at), -1).astype(np.uint8),
-            )
-            kept_sums(values, np.ones(len(values), np.float32), own[-1], kept)
-            columns.append((*own, gram, has_dark, kept, radius_m))
-        *rows, grams, darks, sums, radii_m = zip(*columns, strict=True)
-        first = np.cumsum([0, *map(len, rows[0])])
-        cells, values, smooth, zones, uncovered = (
-            np.ascontiguousarray(np.concatenate(of)) for of in rows
-        )
+        grid = _Grid.of(designs, templates.cell_m)
+        side = len(grid.x_m)
+        patch_side = side + last
+        pairs = zip(templates.design, templates.heading_rad, strict=True)
+        figures = [
+            _figure(designs[index], float(heading_rad), grid, blur_m, patch_side)
+            for index, heading_rad in pairs
+        ]
+        gram = []
+        kept = []
+        for one in figures:
+            in_steps = one.values.astype(float)
+            gram.append(float(STEP) ** 2 * (in_steps.T @ in_steps))
+            all_seen = np.ones(len(one.values), np.float32)
+            kept.append(kept_sums(one.values, all_seen, one.uncovered))
         independent = math.prod(
-            min(cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m
+            min(templates.cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m
         )
-        of_templates = (
-            np.array(grams),
-            np.array(darks),
-            uncovered,
-            np.array(sums),
-            np.array(radii_m),
-        )
-        counts = independent**POWER_OF_CELLS
         return cls(
-            side + last,
-            first,
-            cells,
-            values,
-            smooth,
-            zones,
-            *of_templates,
-            independent,
-            counts,
+            patch_side=patch_side,
+            first=np.cumsum([0, *(len(one.cells) for one in figures)]),
+            cells=np.concatenate([one.cells for one in figures]),
+            values=np.concatenate([one.values for one in figures]),
+            smooth=np.concatenate([one.smooth for one in figures]),
+            zones=np.concatenate([one.zones for one in figures]),
+            gram=np.array(gram),
+            has_dark=np.array([one.has_dark for one in figures]),
+            uncovered=np.concatenate([one.uncovered for one in figures]),
+            kept=np.array(kept),
+            radius_m=np.array([one.radius_m for one in figures]),
+            independent=independent,
+            counts=_counts(independent),
         )
 
     def evidence(
         self, patch: Patch, template: Ints, cell: Ints
     ) -> tuple[Floats, Ints] | None:
-        """`EVIDENCE` of templates on the parts of a patch that begin at some cells, and the edges that cover them.
+        """`Evidence` of templates on the parts of a patch that begin at some cells, and the edges that cover them.
 
         Shapes (n,), (n, 2), (n, 11) and (n,). None where too little of one is in view, or where it has one level. An
         edge is numbered by direction and offset; -1: the whole figure is at least as probable as that with the best
         edge, with prior probabilities of 1/2 for the whole and 1/72 for each of 36 edges.
         """
-        found, edge = (
-            np.empty((len(template), len(EVIDENCE))),
-            np.full(len(template), -1),
-        )
-        is_measured = fill_evidence(
-            patch.level_db.ravel(), patch.seen.ravel(), patch.smooth_db.ravel(), patch.held.ravel(), self.patch_side,
-            self.first, self.cells, self.values, self.smooth, self.zones, self.gram, self.has_dark, self.uncovered,
-            self.kept, self.counts, template, cell, found, edge,
-        )  # fmt: skip
-        return (found, edge) if is_measured else None
+        found = np.empty((len(template), len(EVIDENCE)))
+        edge = np.full(len(template), -1)
+        if not fill_evidence(self, patch, template, cell, found, edge):
+            return None
+        found[:, RIVAL] = found[:, RIVAL].min() - found[:, RIVAL]
+        return found * self.counts, edge
 
     def is_kept(self, template: int, edge: int, x_m: Floats, y_m: Floats) -> Bools:
         """Whether places about the middle of a template lie on the uncovered side of an edge."""
         direction, offset = divmod(edge, len(OFFSETS))
-        return np.asarray(
-            along_edge(x_m, y_m, direction) <= OFFSETS[offset] * self.radius_m[template]
-        )
+        reach_m = OFFSETS[offset] * self.radius_m[template]
+        return np.asarray(along_edge(x_m, y_m, direction) <= reach_m)
+
+
+class _Grid(NamedTuple):
+    """Places about the middle of a template, shapes (side, side)."""
+
+    x_m: Floats
+    """Away from the sonar."""
+    y_m: Floats
+    away_m: Floats
+    """From the middle."""
+    material_m: float
+    """Reach of the largest design."""
+    cell_m: float
+    is_explained: Bools
+    """Within `REACH_M` of the largest design, or `SHADOW_M` behind it."""
+
+    @classmethod
+    def of(cls, designs: Sequence[LandmarkDesign], cell_m: float) -> _Grid:
+        material_m = max(map(material_radius_m, designs))
+        half = math.ceil((material_m + SHADOW_M) / cell_m)
+        places_m = cell_m * np.arange(-half, half + 1)
+        x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
+        away_m = np.hypot(x_m, y_m)
+        is_around = away_m <= material_m + REACH_M
+        is_behind = (away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m)
+        return cls(x_m, y_m, away_m, material_m, cell_m, is_around | is_behind)
+
+
+def _figure(
+    design: LandmarkDesign,
+    heading_rad: float,
+    grid: _Grid,
+    blur_m: Blur,
+    patch_side: int,
+) -> FigureOfTemplate:
+    """Models for one design at one heading."""
+    side = len(grid.x_m)
+    parts = [
+        drawn(design, heading_rad, side, grid.cell_m, blur_m, stretch)
+        for stretch in STRETCHES
+    ]
+    brightest_db = float(np.nanmax(design.mask))
+    darkest_db = min(float(np.nanmin(design.mask)), -1.0)
+    figures = [bright / brightest_db for bright, _ in parts]
+    figure = figures[0]
+    dark = parts[0][1] / darkest_db
+    has_dark = bool((dark > PART).any())
+    # the design's own shadow is explained by nothing; a plate hides the part that falls on it
+    own_shadow = behind(figure + dark, OWN_SHADOW_CELLS) > PART
+    is_off_plate = (grid.away_m > grid.material_m) | (not has_dark)
+    is_compared = grid.is_explained & ~(own_shadow & is_off_plate)
+    shades = [behind(one, SHADOW_CELLS) for one in figures]
+    exact = np.stack([np.ones_like(figure), dark, *figures, *shades])
+    steps = np.clip(np.rint(exact[:, is_compared].T / STEP), 0, 255)
+    smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])
+    weights = np.maximum(figure, 0.0)
+    second_moment_m2 = float(np.average(grid.away_m**2, weights=weights))
+    radius_m = math.sqrt(2 * second_moment_m2)
+    beyond_m = np.stack(
+        [along_edge(grid.x_m, grid.y_m, one)[is_compared] for one in range(EDGES)], -1
+    )
+    uncovered = beyond_m[:, :, None] <= radius_m * np.array(OFFSETS)
+    row, column = np.nonzero(is_compared)
+    zones = _zones(figure, dark, is_compared)
+    return FigureOfTemplate(
+        cells=(row * patch_side + column).astype(np.int32),
+        values=np.ascontiguousarray(steps.astype(np.uint8)),
+        smooth=np.ascontiguousarray(smooth[:, is_compared].T.astype(np.float32)),
+        zones=zones[is_compared].astype(np.uint8),
+        uncovered=uncovered.reshape(len(row), -1).astype(np.uint8),
+        has_dark=has_dark,
+        radius_m=radius_m,
+    )
+
+
+def _zones(figure: Floats32, dark: Floats32, is_compared: Bools) -> Ints:
+    """Zone of each cell about a figure, shape as given."""
+    kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
+    is_out = (figure < OUT) & is_compared
+    is_near = cv2.dilate((figure > PART).astype(np.uint8), kernel) > 0
+    is_behind = behind(figure, BEHIND_CELLS) > PART
+    near = NEAR * (is_out & is_near)
+    back = BEHIND * (is_out & is_behind)
+    far = FAR * (is_out & ~is_near & (dark < OUT))
+    return np.asarray(near + back + far)
+
+
+def _counts(independent: float) -> Floats:
+    """By how much each piece of `Evidence` counts, shape (11,)."""
+    counts = np.ones(len(EVIDENCE))
+    for name in RATIOS_OF_SQUARES:
+        counts[EVIDENCE.index(name)] = independent
+    counts[EVIDENCE.index("plate")] = math.sqrt(independent)
+    return counts
+
+
+class PatchPart(NamedTuple):
+    """Cells of a patch row by row from one on; fields as in `Patch`."""
+
+    level_db: Floats32
+    seen: Floats32
+    smooth_db: Floats32
+    held: Floats32
+
+
+class View(NamedTuple):
+    """Levels of a patch in the cells of one template, n of them."""
+
+    level_db: Floats32
+    """z less their mean, 0 where not seen, shape (n,)."""
+    is_seen: Floats32
+    """1 or 0, shape (n,)."""
+    mean_db: np.float32
+    cells: float
+    """Number of the cells in view."""
+    total: float
+    """``z^T z``: what one level leaves."""
+
+
+class Products(NamedTuple):
+    """What least squares needs of a view."""
+
+    gram: Floats
+    """``values^T values`` over the cells in view, shape (2 + 2 figures, 2 + 2 figures)."""
+    levels: Floats32
+    """``values^T z``, shape (2 + 2 figures,)."""
+    total: float
+    """``z^T z``."""
+    room: Floats
+    """Room for the elimination, shape (4, 5)."""
+
+
+class Left(NamedTuple):
+    """What a model leaves."""
+
+    squares: float
+    """Sum of squares, R."""
+    without_last: float
+    """R without the last column."""
+    levels: Floats
+    """Levels of the columns, shape (4,)."""
+
+
+class DesignFitted(NamedTuple):
+    """Sums of squares R that the models of a design leave, and its levels."""
+
+    plain: float
+    """R(floor, B)."""
+    design: float
+    """R(design without S)."""
+    shaded: float
+    """R(floor, B, S)."""
+    both: float
+    """R(design)."""
+    without_figure: float
+    """R(floor, D), or R(floor) where D is not dark."""
+    dark_product: float
+    """Product of D, without its mean, and z."""
+    floor_db: float
+    beta: float
+    delta: float
+
+
+class Surroundings(NamedTuple):
+    """What is left next to the figure, farther out, and behind."""
+
+    near_db2: float
+    far_db2: float
+    behind_db: float
 
 
 @compiled
 def fill_evidence(
-    level_db: Floats32, seen: Floats32, smooth_db: Floats32, held: Floats32, side: int,
-    first_of: Ints, all_cells: NDArray[np.int32], all_values: Bytes, all_smooth: Floats32, all_zones: Bytes,
-    grams: Floats, has_dark: Bools, all_uncovered: Bytes, all_kept: Floats, counts: Floats, template: Ints, cell: Ints,
-    found: Floats, edge: Ints,
-) -> bool:  # fmt: skip
-    """Fill in `EVIDENCE` of templates on the parts of a patch that begin at some cells, shape (n, 11), and edges.
+    figures: Figures,
+    patch: Patch,
+    template: Ints,
+    cell: Ints,
+    found: Floats,
+    edge: Ints,
+) -> bool:
+    """Fill in `Evidence` of templates, of `rival` the logarithm for this design alone, shape (n, 11), and edges.
 
-    A patch comes row by row, each ``side`` cells; what is known of templates as in `Figures`. False where too little is
-    in view, or where it has one level.
+    False where too little is in view, or where it has one level.
     """
-    least = np.inf
     for k in range(len(template)):
-        begin, end, shift = (
-            first_of[template[k]],
-            first_of[template[k] + 1],
-            cell[k, 0] * side + cell[k, 1],
-        )
-        cells, values, rows = all_cells[begin:end], all_values[begin:end], end - begin
-        smooth, zones = all_smooth[begin:end], all_zones[begin:end]
-        level, is_seen = np.empty(rows, np.float32), np.empty(rows, np.float32)
-        for n in range(rows):
-            level[n], is_seen[n] = level_db[cells[n] + shift], seen[cells[n] + shift]
-        count = float(np.dot(is_seen, is_seen))
-        if count < LEAST_CELLS:
+        begin = figures.first[template[k]]
+        end = figures.first[template[k] + 1]
+        shift = cell[k, 0] * figures.patch_side + cell[k, 1]
+        part = part_from(patch, shift)
+        cells = figures.cells[begin:end]
+        values = figures.values[begin:end]
+        uncovered = figures.uncovered[begin:end]
+        view = viewed(part, cells)
+        if view.cells < LEAST_CELLS:
             return False
-        mean = np.float32(np.dot(level, is_seen) / count)
-        for n in range(rows):
-            level[n] = (level[n] - mean) * is_seen[n]
-        total = float(np.dot(level, level))
-        if total < LEAST_VARIANCE_DB2 * count:
+        if view.total < LEAST_VARIANCE_DB2 * view.cells:
             return False
-        # products of the columns with each other and with the levels
-        gram, products = grams[template[k]].copy(), products_of(level, values)
-        for n in range(rows if count < rows else 0):
-            if is_seen[n] == 0:
-                for i in range(len(gram)):
-                    for j in range(len(gram)):
-                        gram[i, j] -= (STEP * values[n, i]) * (STEP * values[n, j])
-        c, work, dark, first, kinds = (
-            np.zeros(4),
-            np.empty((4, 5)),
-            1,
-            2,
-            (len(products) - 2) // 2,
+        products = products_in_view(figures.gram[template[k]], values, view)
+        has_dark = figures.has_dark[template[k]]
+        fit = design_fitted(products, view.cells, has_dark)
+        other = otherwise(products, fit)
+        smooth = figures.smooth[begin:end]
+        zones = figures.zones[begin:end]
+        around = surroundings(part, cells, view, fit, smooth, zones)
+        kept = figures.kept[template[k]]
+        if view.cells < len(cells):
+            kept = kept_sums(values, view.is_seen, uncovered)
+        covered = least_covered(view, values, uncovered, kept, products, fit)
+        whole = fit.design if fit.beta > 0 else fit.without_figure
+        cells_count = 0.5 * view.cells * figures.counts[COVERED]
+        gain = cells_count * math.log(max(whole / covered.squares, 1.0))
+        if gain > math.log(EDGES * len(OFFSETS)):
+            edge[k] = covered.edge
+        left = min(covered.squares, whole)
+        sigma = math.sqrt(fit.design / view.cells)
+        plate = math.log(fit.shaded / fit.both)
+        foam = math.log(max(fit.without_figure, LEAST_LEFT_DB2) / fit.design)
+        plate_and_foam = max(min(plate, foam), 0.0)
+        pieces = Evidence(
+            1.0,
+            math.log(other.squares / fit.both),
+            math.log(other.without_last / fit.plain),
+            math.log(max(fit.beta, LEAST_BETA_DB) / sigma),
+            math.log(around.near_db2 + LEAST_DB2),
+            math.log(around.far_db2 + LEAST_DB2),
+            around.behind_db,
+            math.sqrt(plate_and_foam) if fit.delta < 0 else 0.0,
+            0.0 if has_dark else 1.0,
+            math.log(left / view.total),
+            math.log(max(fit.design / left, 1.0)),
         )
-        # the design: with its dark parts where they are dark, with and without a shadow
-        plain, _ = least_squares(gram, products, total, (0, first), c, work)
-        design, floor, beta, delta = plain, c[0], c[1], 0.0
-        if has_dark[template[k]]:
-            with_dark, _ = least_squares(
-                gram, products, total, (0, first, dark), c, work
-            )
-            if c[2] < 0:
-                design, floor, beta, delta = with_dark, c[0], c[1], c[2]
-        dz = products[dark] - gram[0, dark] / count * products[0]
-        only_dark = total - (
-            dz**2 / (gram[dark, dark] - gram[0, dark] ** 2 / count)
-            if delta < 0
-            else 0.0
-        )
-        shaded, _ = least_squares(
-            gram, products, total, (0, first, first + kinds), c, work
-        )
-        shaded = shaded if c[2] < 0 else plain
-        both = min(design, shaded)
-        if delta < 0 and shaded < plain:
-            with_both, _ = least_squares(
-                gram, products, total, (0, first, dark, first + kinds), c, work
-            )
-            both = with_both if c[2] < 0 and c[3] < 0 else both
-        # otherwise: the best of all figures
-        other, other_plain = shaded, plain
-        for q in range(first + 1, first + kinds):
-            shaded_q, plain_q = least_squares(
-                gram, products, total, (0, q, q + kinds), c, work
-            )
-            other_plain = min(other_plain, plain_q)
-            other = min(other, shaded_q if c[2] < 0 else plain_q)
-        # what is left next to the figure, farther out, and behind
-        mean_square = design / count
-        near, near_cells, far, far_cells, back, back_cells = 0.0, 0, 0.0, 0, 0.0, 0
-        for n in range(rows):
-            at = cells[n] + shift
-            if zones[n] == 0 or held[at] <= 0.5:
-                continue
-            off = (
-                smooth_db[at]
-                - mean
-                - floor
-                - beta * smooth[n, 1]
-                - delta * smooth[n, 0]
-            )
-            if zones[n] & NEAR:
-                near, near_cells = near + max(off, 0.0) ** 2, near_cells + 1
-            if zones[n] & FAR:
-                far, far_cells = far + min(off, 0.0) ** 2, far_cells + 1
-            if zones[n] & BEHIND and is_seen[n] > 0:
-                back, back_cells = back + level[n] - floor, back_cells + 1
-        found[k, 0] = 1.0
-        found[k, 1] = math.log(other / both)
-        found[k, 2] = math.log(other_plain / plain)
-        found[k, 3] = math.log(max(beta, LEAST_BETA_DB) / math.sqrt(mean_square))
-        found[k, 4] = math.log(
-            (near / near_cells if near_cells > 8 else mean_square / 3) + LEAST_DB2
-        )
-        found[k, 5] = math.log(
-            (far / far_cells if far_cells > 8 else mean_square / 3) + LEAST_DB2
-        )
-        found[k, 6] = back / back_cells if back_cells > 5 else 0.0
-        plate, foam = math.log(shaded / both), math.log(max(only_dark, 1e-3) / design)
-        found[k, 7] = math.sqrt(max(min(plate, foam), 0.0)) if delta < 0 else 0.0
-        found[k, 8] = 0.0 if has_dark[template[k]] else 1.0
-        uncovered, kept = all_uncovered[begin:end], all_kept[template[k]]
-        if count < rows:
-            kept = np.empty(kept.shape)
-            kept_sums(values, is_seen, uncovered, kept)
-        whole = design if beta > 0 else only_dark
-        covered, best = least_covered(
-            level, values, uncovered, kept, count, gram, only_dark, dz, delta < 0
-        )
-        if 0.5 * count * counts[COVERED] * math.log(
-            max(whole / covered, 1.0)
-        ) > math.log(EDGES * len(OFFSETS)):
-            edge[k] = best
-        covered = min(covered, whole)
-        found[k, 9], found[k, 10] = (
-            math.log(covered / total),
-            math.log(max(design / covered, 1.0)),
-        )
-        least = min(least, found[k, 9])
-    for k in range(len(template)):
-        found[k, 9] = least - found[k, 9]
-        found[k] *= counts
+        for column in range(len(pieces)):
+            found[k, column] = pieces[column]
     return True
+
+
+@compiled
+def part_from(patch: Patch, first: int) -> PatchPart:
+    """A patch from one of its cells on."""
+    return PatchPart(
+        patch.level_db.ravel()[first:],
+        patch.seen.ravel()[first:],
+        patch.smooth_db.ravel()[first:],
+        patch.held.ravel()[first:],
+    )
+
+
+@compiled
+def viewed(part: PatchPart, cells: NDArray[np.int32]) -> View:
+    """The levels of a part of a patch in some cells."""
+    part_db = part.level_db
+    part_seen = part.seen
+    level_db = np.empty(len(cells), np.float32)
+    is_seen = np.empty(len(cells), np.float32)
+    for n in range(len(cells)):
+        level_db[n] = part_db[cells[n]]
+        is_seen[n] = part_seen[cells[n]]
+    count = float(np.dot(is_seen, is_seen))
+    mean_db = np.float32(np.dot(level_db, is_seen) / max(count, 1.0))
+    for n in range(len(cells)):
+        level_db[n] = (level_db[n] - mean_db) * is_seen[n]
+    total = float(np.dot(level_db, level_db))
+    return View(level_db, is_seen, mean_db, count, total)
+
+
+@compiled
+def products_in_view(gram: Floats, values: Bytes, view: View) -> Products:
+    """Products of the columns with each other and with the levels, without the cells that are not in view."""
+    levels = products_of(view.level_db, values)
+    room = np.empty((4, 5))
+    if view.cells == len(values):
+        return Products(gram, levels, view.total, room)
+    in_view = gram.copy()
+    for n in range(len(values)):
+        if view.is_seen[n] == 0:
+            for i in range(len(gram)):
+                for j in range(len(gram)):
+                    in_view[i, j] -= (STEP * values[n, i]) * (STEP * values[n, j])
+    return Products(in_view, levels, view.total, room)
+
+
+@compiled
+def design_fitted(products: Products, count: float, has_dark: bool) -> DesignFitted:
+    """The design: with its dark parts where they are dark, with and without a shadow."""
+    gram = products.gram
+    plain = least_squares(products, (FLOOR, FIGURE))
+    design = plain.squares
+    floor_db = plain.levels[0]
+    beta = plain.levels[1]
+    delta = 0.0
+    if has_dark:
+        with_dark = least_squares(products, (FLOOR, FIGURE, DARK))
+        if with_dark.levels[2] < 0:
+            design = with_dark.squares
+            floor_db = with_dark.levels[0]
+            beta = with_dark.levels[1]
+            delta = with_dark.levels[2]
+    dark_mean = gram[FLOOR, DARK] / count
+    dark_product = products.levels[DARK] - dark_mean * products.levels[FLOOR]
+    without_figure = products.total
+    if delta < 0:
+        dark_square = gram[DARK, DARK] - gram[FLOOR, DARK] ** 2 / count
+        without_figure = products.total - dark_product**2 / dark_square
+    with_shadow = least_squares(products, (FLOOR, FIGURE, SHADOW))
+    shaded = with_shadow.squares if with_shadow.levels[2] < 0 else plain.squares
+    both = min(design, shaded)
+    if delta < 0 and shaded < plain.squares:
+        with_both = least_squares(products, (FLOOR, FIGURE, DARK, SHADOW))
+        if with_both.levels[2] < 0 and with_both.levels[3] < 0:
+            both = with_both.squares
+    return DesignFitted(
+        plain.squares, design, shaded, both, without_figure, dark_product, floor_db, beta, delta
+    )  # fmt: skip
+
+
+@compiled
+def otherwise(products: Products, fit: DesignFitted) -> Left:
+    """Least that any figure of `STRETCHES` leaves, with a shadow where it is dark, and without one."""
+    squares = fit.shaded
+    without_shadow = fit.plain
+    for q in range(1, len(STRETCHES)):
+        one = least_squares(products, (FLOOR, FIGURE + q, SHADOW + q))
+        without_shadow = min(without_shadow, one.without_last)
+        is_dark = one.levels[2] < 0
+        squares = min(squares, one.squares if is_dark else one.without_last)
+    return Left(squares, without_shadow, np.zeros(0))
+
+
+@compiled
+def surroundings(
+    part: PatchPart, cells: NDArray[np.int32], view: View, fit: DesignFitted, smooth: Floats32, zones: Bytes
+) -> Surroundings:  # fmt: skip
+    """Mean squares of what is brighter than the design next to it and darker farther out, and the level behind it."""
+    smooth_db = part.smooth_db
+    held = part.held
+    level_db = view.level_db
+    is_seen = view.is_seen
+    near = 0.0
+    far = 0.0
+    back = 0.0
+    near_cells = 0
+    far_cells = 0
+    back_cells = 0
+    for n in range(len(cells)):
+        at = cells[n]
+        if zones[n] == 0 or held[at] <= 0.5:
+            continue
+        of_floor = smooth_db[at] - view.mean_db - fit.floor_db
+        off_db = of_floor - fit.beta * smooth[n, 1] - fit.delta * smooth[n, 0]
+        if zones[n] & NEAR:
+            near += max(off_db, 0.0) ** 2
+            near_cells += 1
+        if zones[n] & FAR:
+            far += min(off_db, 0.0) ** 2
+            far_cells += 1
+        if zones[n] & BEHIND and is_seen[n] > 0:
+            back = back + level_db[n] - fit.floor_db
+            back_cells += 1
+    # of smooth speckle, where too few cells are in view
+    speckle_db2 = fit.design / view.cells / 3
+    return Surroundings(
+        near / near_cells if near_cells > 8 else speckle_db2,
+        far / far_cells if far_cells > 8 else speckle_db2,
+        back / back_cells if back_cells > 5 else 0.0,
+    )
 
 
 @compiled
 def products_of(level: Floats32, values: Bytes) -> Floats32:
     """``values^T level``, values in `STEP`. Four cells at a time: a sum that waits for each takes twice as long."""
-    found, last = np.zeros(values.shape[1], np.float32), len(level) // 4 * 4
+    found = np.zeros(values.shape[1], np.float32)
+    last = len(level) // 4 * 4
     for n in range(0, last, 4):
-        a, b, c, d = level[n], level[n + 1], level[n + 2], level[n + 3]
+        a = level[n]
+        b = level[n + 1]
+        c = level[n + 2]
+        d = level[n + 3]
         for i in range(len(found)):
             found[i] += a * np.float32(values[n, i]) + b * np.float32(values[n + 1, i])
             found[i] += c * np.float32(values[n + 2, i]) + d * np.float32(
@@ -421,55 +629,63 @@ def products_of(level: Floats32, values: Bytes) -> Floats32:
 
 
 @compiled
-def kept_sums(values: Bytes, seen: Floats32, uncovered: Bytes, kept: Floats) -> None:
-    """Fill in sums of b, b^2 and b D over the cells of a figure up to each edge, shape (edges, 3)."""
-    kept[:] = 0.0
+def kept_sums(values: Bytes, seen: Floats32, uncovered: Bytes) -> Floats:
+    """Sums of b, b^2 and b D over the cells of a figure up to each edge, shape (edges, 3)."""
+    kept = np.zeros((uncovered.shape[1], 3))
     for n in range(len(values)):
-        b = STEP * values[n, 2] * seen[n]
+        b = STEP * values[n, FIGURE] * seen[n]
         if b > OUT:
             for edge in range(len(kept)):
                 is_kept = uncovered[n, edge]
                 kept[edge, 0] += b * is_kept
                 kept[edge, 1] += b * b * is_kept
-                kept[edge, 2] += b * (STEP * values[n, 1]) * is_kept
+                kept[edge, 2] += b * (STEP * values[n, DARK]) * is_kept
+    return kept
+
+
+class Covered(NamedTuple):
+    """The figure that is covered beyond the best edge."""
+
+    squares: float
+    edge: int
+    """-1: no part of the figure is brighter than the floor."""
 
 
 @compiled
 def least_covered(
-    level: Floats32, values: Bytes, uncovered: Bytes, kept: Floats, count: float, gram: Floats,
-    only_dark: float, dz: float, has_dark: bool,
-) -> tuple[float, int]:  # fmt: skip
+    view: View, values: Bytes, uncovered: Bytes, kept: Floats, products: Products, fit: DesignFitted
+) -> Covered:  # fmt: skip
     """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, and that edge.
 
-    With D or without; edge -1: no part of the figure is brighter than the floor. The floor and D are taken out of the
-    figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``. ``only_dark`` is R(floor, D), ``dz`` the product of D,
-    without its mean, and z.
+    The floor and D are taken out of the figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``.
     """
-    products = np.zeros(len(kept), np.float32)
-    for n in range(len(level)):
-        b_n = STEP * values[n, 2]
+    bright = np.zeros(len(kept), np.float32)  # b^T z
+    level_db = view.level_db
+    for n in range(len(level_db)):
+        b_n = STEP * values[n, FIGURE]
         if b_n > OUT:
-            bz_n = b_n * level[n]
-            for edge in range(len(products)):
-                products[edge] += bz_n * np.float32(uncovered[n, edge])
-    dark_mean, dd, least, best = (
-        gram[0, 1] / count,
-        gram[1, 1] - gram[0, 1] ** 2 / count,
-        only_dark,
-        -1,
-    )
+            bz_n = b_n * level_db[n]
+            for edge in range(len(bright)):
+                bright[edge] += bz_n * np.float32(uncovered[n, edge])
+    gram = products.gram
+    dark_mean = gram[FLOOR, DARK] / view.cells
+    dd = gram[DARK, DARK] - gram[FLOOR, DARK] ** 2 / view.cells
+    least = fit.without_figure
+    best = -1
     for edge in range(len(kept)):
-        b, bb, bz = (
-            kept[edge, 0],
-            kept[edge, 1] - kept[edge, 0] ** 2 / count,
-            float(products[edge]),
-        )
-        if has_dark:
+        b = kept[edge, 0]
+        bb = kept[edge, 1] - b**2 / view.cells
+        bz = float(bright[edge])
+        if fit.delta < 0:
             bd = kept[edge, 2] - b * dark_mean
-            bb, bz = bb - bd**2 / dd, bz - bd * dz / dd
-        if bb > 0 and bz > 0 and only_dark - bz**2 / bb < least:
-            least, best = only_dark - bz**2 / bb, edge
-    return max(least, 1e-3), best
+            bb -= bd**2 / dd
+            bz -= bd * fit.dark_product / dd
+        if bb > 0 and bz > 0:
+            left = fit.without_figure - bz**2 / bb
+            if left < least:
+                least = left
+                best = edge
+    return Covered(max(least, LEAST_LEFT_DB2), best)
 
 
 def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
@@ -479,45 +695,40 @@ def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
 
 
 @compiled
-def least_squares(
-    gram: Floats,
-    products: Floats32,
-    total: float,
-    at: tuple[int, ...],
-    c: Floats,
-    a: Floats,
-) -> tuple[float, float]:
-    """Sums of squares that the columns ``at`` leave, all of them and all but the last; fills in coefficients of all.
-
-    ``a`` is room to work in, shape (4, 5). By elimination: with ``G = L D L^T`` and ``L y = products`` column i takes
-    ``y_i^2 / D_i``.
-    """
-    n, left, before = len(at), total, total
+def least_squares(products: Products, columns: tuple[int, ...]) -> Left:
+    """What some columns leave, by elimination: with ``G = L D L^T``, ``L y = g`` column i takes ``y_i^2 / D_i``."""
+    n = len(columns)
+    a = products.room
     for i in range(n):
         for j in range(n):
-            a[i, j] = gram[at[i], at[j]]
+            a[i, j] = products.gram[columns[i], columns[j]]
         a[i, i] += 1e-3
-        a[i, n] = products[at[i]]
+        a[i, n] = products.levels[columns[i]]
+    left = products.total
+    without_last = products.total
     for i in range(n):
-        before, left = left, left - a[i, n] ** 2 / a[i, i]
+        without_last = left
+        left -= a[i, n] ** 2 / a[i, i]
         for k in range(i + 1, n):
             factor = a[k, i] / a[i, i]
             for j in range(i, n + 1):
                 a[k, j] -= factor * a[i, j]
+    levels = np.zeros(4)
     for i in range(n - 1, -1, -1):
-        c[i] = a[i, n] / a[i, i]
+        levels[i] = a[i, n] / a[i, i]
         for k in range(i):
-            a[k, n] -= a[k, i] * c[i]
-    return max(left, 1e-3), max(before, 1e-3)
+            a[k, n] -= a[k, i] * levels[i]
+    return Left(
+        max(left, LEAST_LEFT_DB2),
+        max(without_last, LEAST_LEFT_DB2),
+        levels,
+    )
 
 
 def behind(figure: Floats32, cells: int) -> Floats32:
     """Share of each cell that lies within so many cells behind a figure, and not in it, shape as given."""
-    # the near side of foam is brighter than 1
-    inside, shaded = (
-        np.minimum(figure, 1.0),
-        np.zeros_like(figure),
-    )
+    inside = np.minimum(figure, 1.0)  # the near side of foam is brighter than 1
+    shaded = np.zeros_like(figure)
     for step in range(1, cells + 1):
         shaded[step:] = np.maximum(shaded[step:], inside[:-step])
     return np.clip(shaded - inside, 0.0, 1.0)

@@ -21,7 +21,8 @@ SATURATED_SHARE = 0.5
 """Share of samples at the largest value from which on a frame is saturated."""
 SAME_PLACE = 0.5
 """Largest offset of bins and beams of one window, as a share of the distance between two."""
-LEAST_BEAMS, LEAST_BINS = 8, 32
+LEAST_BEAMS = 8
+LEAST_BINS = 32
 """Smaller images show no landmark."""
 MOST_WINDOWS = 64
 """Windows remembered."""
@@ -58,7 +59,8 @@ class RangeWindow(NamedTuple):
             return f"wrong size: {size}, expected at least {LEAST_BEAMS} beams and {LEAST_BINS} bins"
         if not (np.isfinite(ranges_m).all() and np.isfinite(azimuths_rad).all()):
             return "ranges or azimuths that are not finite"
-        steps_m, steps_rad = np.diff(ranges_m), np.diff(azimuths_rad)
+        steps_m = np.diff(ranges_m)
+        steps_rad = np.diff(azimuths_rad)
         is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(
             steps_m.mean()
         )
@@ -101,7 +103,8 @@ class FrameCheck:
 
     def fault(self, frame: SonarFrames) -> str | None:
         """Reason not to use a frame (a block of one); None for a good one, with which later ones are compared."""
-        stamp_ns, image = int(frame.stamps_ns[0]), frame.intensity[0]
+        stamp_ns = int(frame.stamps_ns[0])
+        image = frame.intensity[0]
         window = RangeWindow(frame.ranges_m, frame.azimuths_rad)
         self.change = None
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
@@ -126,12 +129,15 @@ class FrameCheck:
                 return f"wrong size or window: {window}; used if it comes again"
         if is_change:
             self.change = f"window changed: {window}; tracks that lie in it go on"
-        self._stamp_ns, self._image, self._window = stamp_ns, image, window
+        self._stamp_ns = stamp_ns
+        self._image = image
+        self._window = window
         return None
 
     def _fault_of_samples(self, image: NDArray[np.generic]) -> str | None:
         """Reason not to use these samples."""
-        low, high = image.min(), image.max()
+        low = image.min()
+        high = image.max()
         if (
             np.issubdtype(image.dtype, np.floating)
             and not max(abs(low), abs(high)) < np.finfo(np.float32).max

@@ -87,7 +87,8 @@ class FloorView:
 
     def turned(self, bearing_rad: float) -> FloorView:
         """The same view with level axes whose x axis points to this bearing."""
-        cos, sin = math.cos(bearing_rad), math.sin(bearing_rad)
+        cos = math.cos(bearing_rad)
+        sin = math.sin(bearing_rad)
         ahead_R_level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return FloorView(
             ahead_R_level @ self.level_R_sonar,
@@ -161,15 +162,18 @@ class Fan:
     @classmethod
     def of(cls, ranges_m: Floats, azimuths_rad: Floats, pixels_high: int = 420) -> Fan:
         """The fan of a sonar's beams and bins."""
-        r0, r1 = float(ranges_m.min()), float(ranges_m.max())
+        r0 = float(ranges_m.min())
+        r1 = float(ranges_m.max())
         widest = float(np.abs(azimuths_rad).max())
-        lowest, half_width = r0 * np.cos(widest), r1 * np.sin(min(widest, np.pi / 2))
+        lowest = r0 * np.cos(widest)
+        half_width = r1 * np.sin(min(widest, np.pi / 2))
         scale = pixels_high / (r1 - lowest)
         ahead = lowest + (np.arange(pixels_high)[::-1, None] + 0.5) / scale
         across = (
             half_width - (np.arange(int(2 * half_width * scale))[None] + 0.5) / scale
         )
-        distance, azimuth = np.hypot(ahead, across), np.arctan2(across, ahead)
+        distance = np.hypot(ahead, across)
+        azimuth = np.arctan2(across, ahead)
         order = np.argsort(azimuths_rad)
         place = np.interp(azimuth, azimuths_rad[order], np.arange(len(order)), -1, -1)
         inside = (place >= 0) & (distance >= r0) & (distance <= r1)
@@ -185,7 +189,8 @@ class Fan:
 
     def pixel(self, range_m: float, azimuth_rad: float) -> tuple[int, int]:
         """Column and row of a point."""
-        ahead, across = range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)
+        ahead = range_m * np.cos(azimuth_rad)
+        across = range_m * np.sin(azimuth_rad)
         column = (self.half_width_m - across) * self.pixels_per_m
         return round(column), round(
             len(self.beam) - (ahead - self.lowest_m) * self.pixels_per_m
@@ -295,7 +300,8 @@ def floor_lift(
     ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to the
     centre beam.
     """
-    across, lift = up[0] * cos_a + up[1] * sin_a, up[2]
+    across = up[0] * cos_a + up[1] * sin_a
+    lift = up[2]
     norm2 = across * across + lift * lift
     with np.errstate(divide="ignore", invalid="ignore"):
         k = -height_m / ranges_m

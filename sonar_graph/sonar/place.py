@@ -25,6 +25,7 @@ from sonar_graph.sonar.templates import (
     FINE,
     Blur,
     Floats32,
+    Patch,
     echo_power,
     seen_db,
     seen_share,
@@ -33,11 +34,32 @@ from sonar_graph.sonar.templates import (
 
 SIDE_M = 0.006
 """Width of the side for which it is drawn, to a fine point."""
-SHADE_FINE, LONGEST_SHADOW = FINE // 2, 12
-"""Step of the lengths of shadows that are drawn, in points of the fine grid, and the longest one in such steps."""
+SHADE_FINE = FINE // 2
+"""Step of the lengths of shadows that are drawn, in points of the fine grid."""
+LONGEST_SHADOW = 12
+"""In such steps."""
 STEPS = 2
 """Gauss-Newton steps from the best cell on."""
-LEAST_BETA_DB, LEAST_CELLS = 0.05, 20
+LEAST_BETA_DB = 0.05
+LEAST_CELLS = 20
+
+
+class Grid(NamedTuple):
+    """Grid on which a design is drawn, and the resolution of the sonar on the floor."""
+
+    side: int
+    """Cells along its side."""
+    cell_m: float
+    blur_m: Blur
+
+
+class Lit(NamedTuple):
+    """What the height of a design adds as the sonar lights it from the side."""
+
+    side_m: float
+    """Width of the face that the near side covers."""
+    longer: float
+    """Share of a step by which the shadow is longer than `Relief.shorter`."""
 
 
 class Relief(NamedTuple):
@@ -49,109 +71,111 @@ class Relief(NamedTuple):
     """W, dB for each metre of the face that the side covers."""
     dark: Floats32
     """D, dB."""
-    shades: tuple[Floats32, Floats32]
-    """Shares of the cells in a shadow of so many steps, and of one more."""
+    shorter: Floats32
+    """Shares of the cells in a shadow of so many steps."""
+    longer: Floats32
+    """The same of one step more."""
 
     @classmethod
     def of(
-        cls,
-        design: LandmarkDesign,
-        heading_rad: float,
-        side: int,
-        cell_m: float,
-        blur_m: Blur,
-        shade_steps: int,
+        cls, design: LandmarkDesign, heading_rad: float, grid: Grid, shade_steps: int
     ) -> Relief:
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
-        of_bright, power = echo_power(design, heading_rad, side, cell_m)
+        of_bright, power = echo_power(design, heading_rad, grid.side, grid.cell_m)
         is_bright = power > 1
-        width = max(1, round(SIDE_M / cell_m * FINE))
-        shaded, raised_power = is_bright.copy(), with_side(power, width)
-        bright, whole, raised = (
-            seen_db(one, cell_m, blur_m) for one in (of_bright, power, raised_power)
+        width = max(1, round(SIDE_M / grid.cell_m * FINE))
+        bright_db, whole_db, raised_db = (
+            seen_db(one, grid.cell_m, grid.blur_m)
+            for one in (of_bright, power, with_side(power, width))
         )
+        is_shaded = is_bright.copy()
         for _ in range(shade_steps * SHADE_FINE):
-            shaded[1:] |= shaded[:-1]
-        shorter = seen_share(shaded & ~is_bright, cell_m, blur_m)
+            is_shaded[1:] |= is_shaded[:-1]
+        shorter = seen_share(is_shaded & ~is_bright, grid.cell_m, grid.blur_m)
         for _ in range(SHADE_FINE):
-            shaded[1:] |= shaded[:-1]
-        shades = shorter, seen_share(shaded & ~is_bright, cell_m, blur_m)
+            is_shaded[1:] |= is_shaded[:-1]
         return cls(
-            bright, (raised - whole) / (width * cell_m / FINE), whole - bright, shades
+            figure=bright_db,
+            side=(raised_db - whole_db) / (width * grid.cell_m / FINE),
+            dark=whole_db - bright_db,
+            shorter=shorter,
+            longer=seen_share(is_shaded & ~is_bright, grid.cell_m, grid.blur_m),
         )
 
     def place(
-        self,
-        level_db: Floats32,
-        seen: Floats32,
-        cells: tuple[Ints, Ints],
-        start: Floats,
-        side_m: float,
-        longer: float,
+        self, patch: Patch, cells: tuple[Ints, Ints], start: Floats, lit: Lit
     ) -> tuple[Floats, Floats]:
         """Place of the first cell of the figure's square in a patch, and the bound of its standard deviation, in cells.
 
         Parameters
         ----------
-        level_db, seen
-            Of the patch, shapes (n, n).
+        patch
+            The image around the landmark.
         cells
             Rows and columns of the square that are compared.
         start
             Place at which to begin, shape (2,).
-        side_m
-            Width of the face that the side covers.
-        longer
-            Share of a step by which the shadow is longer than the first of `shades`.
+        lit
+            What the height adds.
         """
-        place, bound = start.astype(float), np.full(2, np.inf)
-        fit_place(
-            level_db, seen, *cells, self.figure, self.side, self.dark, *self.shades, side_m, longer, place, bound
-        )  # fmt: skip
+        place = start.astype(float)
+        bound = np.full(2, np.inf)
+        rows, columns = cells
+        fit_place(self, patch, ComparedCells(rows, columns), lit, place, bound)
         return place, bound
+
+
+class ComparedCells(NamedTuple):
+    """Cells of the figure's square that are compared."""
+
+    rows: Ints
+    columns: Ints
 
 
 @compiled
 def fit_place(
-    level_db: Floats32, seen: Floats32, rows: Ints, columns: Ints, face: Floats32, side_of: Floats32, plate: Floats32,
-    shorter: Floats32, longest: Floats32, side_m: float, longer: float, place: Floats, bound: Floats,
+    relief: Relief, patch: Patch, cells: ComparedCells, lit: Lit, place: Floats, bound: Floats
 ) -> None:  # fmt: skip
     """Move a place to the least squares, and fill in the Cramer-Rao bound of its standard deviations, in cells.
-
-    Parts of the landmark, and their shadows, are those of `Relief`.
 
     ``M = [1, B, D, S, dz/dx, dz/dy]`` with ``dz/dp = -(beta grad B + delta grad D + gamma grad S)``; the bound is the
     root of the last two on the diagonal of ``s^2 (M^T M)^-1``, s^2 the mean square of what is left.
     """
-    shade = shorter + np.float32(longer) * (longest - shorter)
-    figure, dark = face + np.float32(side_m) * side_of, plate * (1 - shade)
-    beta, delta, gamma = np.float32(0), np.float32(0), np.float32(0)
-    last, count = len(level_db) - 1, np.float32(0)
-    mean = np.float32(np.sum(level_db * seen) / max(np.sum(seen), 1.0))
-    along, across, M = (
-        np.zeros_like(figure),
-        np.zeros_like(figure),
-        np.empty((7, len(rows)), np.float32),
-    )
+    S = relief.shorter + np.float32(lit.longer) * (relief.longer - relief.shorter)
+    B = relief.figure + np.float32(lit.side_m) * relief.side
+    D = relief.dark * (1 - S)
+    beta = np.float32(0)
+    delta = np.float32(0)
+    gamma = np.float32(0)
+    along = np.zeros_like(B)
+    across = np.zeros_like(B)
+    seen_cells = max(np.sum(patch.seen), 1.0)
+    mean_db = np.float32(np.sum(patch.level_db * patch.seen) / seen_cells)
+    level_db = patch.level_db
+    seen = patch.seen
+    rows = cells.rows
+    columns = cells.columns
+    last = len(level_db) - 1
+    M = np.empty((7, len(rows)), np.float32)
     for step in range(STEPS + 1):
-        size, x0, y0 = 4 if step == 0 else 6, round(place[0]), round(place[1])
+        size = 4 if step == 0 else 6  # the levels alone at first: slopes need them
+        x0 = round(place[0])
+        y0 = round(place[1])
         if step > 0:
-            slopes(beta * figure + delta * dark + gamma * shade, along, across)
+            slopes(beta * B + delta * D + gamma * S, along, across)
         for n in range(len(rows)):
-            i, j = rows[n], columns[n]
-            x, y = x0 + i, y0 + j
+            i = rows[n]
+            j = columns[n]
+            x = x0 + i
+            y = y0 + j
             if 0 <= x <= last and 0 <= y <= last and seen[x, y] > 0:
-                M[0, n], M[1, n], M[2, n], M[3, n] = (
-                    1,
-                    figure[i, j],
-                    dark[i, j],
-                    shade[i, j],
-                )
-                M[4, n], M[5, n], M[6, n] = (
-                    along[i, j],
-                    across[i, j],
-                    level_db[x, y] - mean,
-                )
+                M[0, n] = 1
+                M[1, n] = B[i, j]
+                M[2, n] = D[i, j]
+                M[3, n] = S[i, j]
+                M[4, n] = along[i, j]
+                M[5, n] = across[i, j]
+                M[6, n] = level_db[x, y] - mean_db
             else:
                 M[:, n] = 0
         products = np.dot(M, M.T).astype(np.float64)
@@ -159,16 +183,16 @@ def fit_place(
         if count < LEAST_CELLS:
             return
         c, inverse = solved(products, size)
-        beta, delta, gamma = (
-            np.float32(max(c[1], LEAST_BETA_DB)),
-            np.float32(max(c[2], 0)),
-            np.float32(min(c[3], 0)),
-        )
+        beta = np.float32(max(c[1], LEAST_BETA_DB))
+        delta = np.float32(max(c[2], 0))
+        gamma = np.float32(min(c[3], 0))
         if size == 6:
-            variance = max(products[6, 6] - np.dot(c, products[6, :6]), 0.0) / count
-            for a in range(2):
-                place[a] = (x0, y0)[a] + min(max(c[4 + a], -1.0), 1.0)
-                bound[a] = math.sqrt(variance * inverse[a])
+            left = products[6, 6] - np.dot(c, products[6, :6])
+            variance = max(left, 0.0) / count
+            place[0] = x0 + min(max(c[4], -1.0), 1.0)
+            place[1] = y0 + min(max(c[5], -1.0), 1.0)
+            bound[0] = math.sqrt(variance * inverse[0])
+            bound[1] = math.sqrt(variance * inverse[1])
 
 
 @compiled
@@ -176,17 +200,15 @@ def slopes(picture: Floats32, along: Floats32, across: Floats32) -> None:
     """Fill in by how much a picture falls from cell to cell, along its rows and along its columns."""
     last = len(picture) - 1
     for i in range(last + 1):
-        before, after = max(i - 1, 0), min(i + 1, last)
+        before = max(i - 1, 0)
+        after = min(i + 1, last)
+        cells = np.float32(after - before)
         for j in range(last + 1):
-            along[i, j] = (picture[before, j] - picture[after, j]) / np.float32(
-                after - before
-            )
+            along[i, j] = (picture[before, j] - picture[after, j]) / cells
         for j in range(1, last):
             across[i, j] = (picture[i, j - 1] - picture[i, j + 1]) / np.float32(2)
-        across[i, 0], across[i, last] = (
-            picture[i, 0] - picture[i, 1],
-            picture[i, last - 1] - picture[i, last],
-        )
+        across[i, 0] = picture[i, 0] - picture[i, 1]
+        across[i, last] = picture[i, last - 1] - picture[i, last]
 
 
 @compiled
@@ -195,7 +217,9 @@ def solved(products: Floats, size: int) -> tuple[Floats, tuple[float, float]]:
 
     G and g are the first ``size`` rows of the products, g their last column.
     """
-    a, c, second = products.copy(), np.zeros(size), 0.0
+    a = products.copy()
+    c = np.zeros(size)
+    second = 0.0
     for i in range(size):
         a[i, i] += 1e-6
     for i in range(size - 1):
@@ -210,7 +234,6 @@ def solved(products: Floats, size: int) -> tuple[Floats, tuple[float, float]]:
         for j in range(i + 1, size):
             c[i] -= a[i, j] * c[j]
         c[i] /= a[i, i]
-    return c, (
-        second / (a[size - 2, size - 2] * a[size - 1, size - 1]),
-        1 / a[size - 1, size - 1],
-    )
+    d_before_last = a[size - 2, size - 2]
+    d_last = a[size - 1, size - 1]
+    return c, (second / (d_before_last * d_last), 1 / d_last)

@@ -83,7 +83,8 @@ class Fate(NamedTuple):
     """Words; `REPORTED` for a detection."""
 
 
-PITCH_RAD, STEEPEST_RAD = 0.15, 1.3
+PITCH_RAD = 0.15
+STEEPEST_RAD = 1.3
 """Tilt of a vehicle, and steepest view, for which templates are drawn in advance."""
 ACCEPTED_FROM = (0.5, 0.7)
 """Posteriors from which an identity is likelier than not, and from which estimators accept it by default."""
@@ -176,10 +177,8 @@ class Recogniser:
     def prepare(self, frame: SonarFrames) -> None:
         """Draw the templates that frames with these ranges and beams may need, while nobody waits."""
         sonar = self._calibration.sonar
-        tilt_rad, half_rad = (
-            abs(sonar.mounting.rpy_rad[1]),
-            sonar.elevation_aperture_rad / 2 + PITCH_RAD,
-        )
+        tilt_rad = abs(sonar.mounting.rpy_rad[1])
+        half_rad = sonar.elevation_aperture_rad / 2 + PITCH_RAD
         depressions_rad = (
             max(tilt_rad - half_rad, 0.0),
             min(tilt_rad + half_rad, STEEPEST_RAD),
@@ -216,11 +215,9 @@ class Recogniser:
         """
         check_block(frame)
         self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
-        self.sightings, self.track_ids, self.news = (
-            [],
-            np.empty(0, dtype=np.int64),
-            np.empty(0),
-        )
+        self.sightings = []
+        self.track_ids = np.empty(0, dtype=np.int64)
+        self.news = np.empty(0)
         self.beliefs = np.empty((0, len(self.ids) + 1))
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
@@ -261,7 +258,8 @@ class Recogniser:
         self, candidates: Candidates, association: Association, beliefs: Floats
     ) -> LandmarkDetections | None:
         """Rows for the tracks that are seen and trusted; fates of all candidates and tracks."""
-        stamp_ns, params = association.stamp_ns, self.params
+        stamp_ns = association.stamp_ns
+        params = self.params
         columns = (
             candidates.verdicts.tolist(),
             candidates.range_m.tolist(),
@@ -282,7 +280,8 @@ class Recogniser:
         for row, sighting in enumerate(self.sightings):
             if sighting is None:
                 continue
-            outcome, track = REPORTED, int(association.ids[row])
+            outcome = REPORTED
+            track = int(association.ids[row])
             best = int(np.argmax(beliefs[row]))
             said = (
                 best,
@@ -354,7 +353,8 @@ def each_once(beliefs: Floats) -> Floats:
     The most probable assignment of tracks to landmarks (or to none) decides; a track that loses its most probable
     landmark to another one believes in "none of them" instead.
     """
-    tracks, known = beliefs.shape[0], beliefs.shape[1] - 1
+    tracks = beliefs.shape[0]
+    known = beliefs.shape[1] - 1
     best = np.argmax(beliefs, axis=1)
     named = best[best < known]
     if len(np.unique(named)) == len(named):

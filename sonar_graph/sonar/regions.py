@@ -42,7 +42,8 @@ def background_of(
     """
     beams, bins = smoothing
     nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
-    ordered, count = np.sort(nodes, axis=0), len(nodes)
+    ordered = np.sort(nodes, axis=0)
+    count = len(nodes)
     medians = (
         ordered[[(count - 1) // 2]] + ordered[[count // 2]]
     ) / 2  # np.median takes three times as long
@@ -88,16 +89,21 @@ def running_median(counts: Bytes, window: int) -> Bytes:
     By the histogram of a square that moves along a row (Huang, Yang, Tang 1979): of a few thousand nodes it is faster
     than opencv's median. ``below`` of the square's bytes are less than the median.
     """
-    rows, columns = counts.shape[0] - window + 1, counts.shape[1] - window + 1
-    medians, middle = np.empty((rows, columns), np.uint8), window * window // 2
+    rows = counts.shape[0] - window + 1
+    columns = counts.shape[1] - window + 1
+    medians = np.empty((rows, columns), np.uint8)
+    middle = window * window // 2
     for i in range(rows):
-        histogram, median, below = np.zeros(256, np.int64), 0, 0
+        histogram = np.zeros(256, np.int64)
+        median = 0
+        below = 0
         for k in range(window):
             for j in range(window):
                 histogram[counts[i + k, j]] += 1
         for j in range(columns):
             for k in range(window if j else 0):
-                gone, come = counts[i + k, j - 1], counts[i + k, j + window - 1]
+                gone = counts[i + k, j - 1]
+                come = counts[i + k, j + window - 1]
                 histogram[gone] -= 1
                 histogram[come] += 1
                 below += int(come < median) - int(gone < median)
@@ -154,12 +160,11 @@ def measure_regions(
         height_m,
     )
     weight = np.maximum(sums[:, AREA], 1e-12)
-    x, y = sums[:, X] / weight, sums[:, Y] / weight
-    xx, xy, yy = (
-        sums[:, XX] / weight - x * x,
-        sums[:, XY] / weight - x * y,
-        sums[:, YY] / weight - y * y,
-    )
+    x = sums[:, X] / weight
+    y = sums[:, Y] / weight
+    xx = sums[:, XX] / weight - x * x
+    xy = sums[:, XY] / weight - x * y
+    yy = sums[:, YY] / weight - y * y
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
     points = np.stack([x, y, np.full(count, -height_m)], axis=1) @ level_R_sonar
     r, a, e = ranges_azimuths_elevations(points)
@@ -184,10 +189,12 @@ def floor_cell(
     ``de/da = -(u . dq/da) / (u . dq/de)``.
     """
     (xx, xy, xz), (yx, yy, yz), (up_x, up_y, up_z) = R
-    across, k = up_x * cos_a + up_y * sin_a, -height_m / r
+    across = up_x * cos_a + up_y * sin_a
+    k = -height_m / r
     norm2 = across * across + up_z * up_z
     w = math.copysign(math.sqrt(norm2 - k * k), up_z)
-    cos_e, sin_e = (across * k + up_z * w) / norm2, (up_z * k - across * w) / norm2
+    cos_e = (across * k + up_z * w) / norm2
+    sin_e = (up_z * k - across * w) / norm2
     ratio = (up_y * cos_a - up_x * sin_a) * cos_e / (up_z * cos_e - sin_e * across)
     area = (
         r
@@ -196,7 +203,9 @@ def floor_cell(
     )
     if not (area > 0 and r > height_m):
         return 0.0, 0.0, 0.0
-    px, py, pz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
+    px = r * cos_e * cos_a
+    py = r * cos_e * sin_a
+    pz = r * sin_e
     return xx * px + xy * py + xz * pz, yx * px + yy * py + yz * pz, area
 
 
@@ -206,34 +215,34 @@ def pixel_sums(
     level_R_sonar: Floats, height_m: float,
 ) -> Floats:  # fmt: skip
     """Sums over the pixels of each region, shape (count, 8); on the floor, or for a height of 0 in the slant plane."""
-    sums, (beams, bins) = np.zeros((count, 8)), labels.shape
+    sums = np.zeros((count, 8))
+    (beams, bins) = labels.shape
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = level_R_sonar
     R = (xx, xy, xz), (yx, yy, yz), (zx, zy, zz)
     dr = abs(ranges_m[-1] - ranges_m[0]) / max(bins - 1, 1)
     da = abs(azimuths_rad[-1] - azimuths_rad[0]) / max(beams - 1, 1)
     for beam in range(beams):
-        cos_a, sin_a = math.cos(azimuths_rad[beam]), math.sin(azimuths_rad[beam])
+        cos_a = math.cos(azimuths_rad[beam])
+        sin_a = math.sin(azimuths_rad[beam])
         for n in range(bins):
             if labels[beam, n] == 0:
                 continue
-            r, row = ranges_m[n], sums[labels[beam, n] - 1]
+            r = ranges_m[n]
+            row = sums[labels[beam, n] - 1]
             x, y, area = (
                 floor_cell(r, cos_a, sin_a, R, height_m)
                 if height_m > 0
                 else (r * cos_a, r * sin_a, r)
             )
             area *= dr * da
-            row[AREA], row[LEVEL], row[PIXELS] = (
-                row[AREA] + area,
-                row[LEVEL] + contrast_db[beam, n],
-                row[PIXELS] + 1,
-            )
-            row[X], row[Y], row[XX] = (
-                row[X] + area * x,
-                row[Y] + area * y,
-                row[XX] + area * x * x,
-            )
-            row[XY], row[YY] = row[XY] + area * x * y, row[YY] + area * y * y
+            row[AREA] += area
+            row[LEVEL] += contrast_db[beam, n]
+            row[PIXELS] += 1
+            row[X] += area * x
+            row[Y] += area * y
+            row[XX] += area * x * x
+            row[XY] += area * x * y
+            row[YY] += area * y * y
     return sums
 
 

@@ -47,7 +47,8 @@ SEARCHED_DARK = 0.5
 """Share of the dark parts' level in the templates of the search: a plate may be as its design or not be seen."""
 SAME_SHARE = 0.05
 """Largest squared difference of headings that share a template, as a share of their variance."""
-TURNED_RAD, CHECKED_CELL_M = math.radians(30.0), 0.01
+TURNED_RAD = math.radians(30.0)
+CHECKED_CELL_M = 0.01
 """Least turn after which designs must look otherwise (`check_headings`), and the cells in which that is seen."""
 
 
@@ -157,8 +158,10 @@ def echo_power(
     """
     fine_m = cell_m / FINE * (np.arange(side * FINE) - side * FINE / 2 + 0.5)
     x_m, y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    (x0, y0), (x_share, y_share) = design.figure_m, stretch
+    cos = math.cos(heading_rad)
+    sin = math.sin(heading_rad)
+    (x0, y0) = design.figure_m
+    (x_share, y_share) = stretch
     level = design.level_db(
         x0 + (cos * x_m + sin * y_m) / x_share, y0 + (-sin * x_m + cos * y_m) / y_share
     )
@@ -210,7 +213,9 @@ def material_radius_m(design: LandmarkDesign) -> float:
 
 def middle_m(design: LandmarkDesign, heading_rad: float) -> Floats:
     """Way on the grid from the middle of a design's figure to the middle of its square, shape (2,)."""
-    (x, y), cos, sin = design.figure_m, math.cos(heading_rad), math.sin(heading_rad)
+    (x, y) = design.figure_m
+    cos = math.cos(heading_rad)
+    sin = math.sin(heading_rad)
     return -np.array([cos * x - sin * y, sin * x + cos * y])
 
 
@@ -401,9 +406,11 @@ def smooth_levels(
 ) -> None:
     """Fill in means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
     side = len(level)
-    total, count = np.empty(side + 2, np.float32), np.empty(side + 2, np.float32)
+    total = np.empty(side + 2, np.float32)
+    count = np.empty(side + 2, np.float32)
     for i in range(side):
-        before, after = abs(i - 1), side - 1 - abs(side - 2 - i)
+        before = abs(i - 1)
+        after = side - 1 - abs(side - 2 - i)
         for j in range(side):
             total[j + 1] = level[before, j] + level[i, j] + level[after, j]
             count[j + 1] = seen[before, j] + seen[i, j] + seen[after, j]
@@ -431,25 +438,26 @@ def sample_floor(
     Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
     between the two nearest; linear between beams. R is ``level_R_sonar``.
     """
-    (beams, bins), side, nodes = image_db.shape, len(level), grid.beam_of_azimuth
-    per_bin, per_step = 1 / grid.bin_m, 1 / grid.azimuth_step_rad
-    half_bins, half, z = 0.5 * cell_m * per_bin, 0.5 * (side - 1), -height_m
+    (beams, bins) = image_db.shape
+    side = len(level)
+    nodes = grid.beam_of_azimuth
+    per_bin = 1 / grid.bin_m
+    per_step = 1 / grid.azimuth_step_rad
+    half_bins = 0.5 * cell_m * per_bin
+    half = 0.5 * (side - 1)
+    z = -height_m
     is_fine = half_bins < 0.5
-    reach, places, middles = (
-        1.0 if is_fine else half_bins,
-        np.empty(side),
-        np.empty(side),
-    )
+    reach = 1.0 if is_fine else half_bins
+    places = np.empty(side)
+    middles = np.empty(side)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
     for i in range(side):
         x = centre[0] + cell_m * (i - half)
         for j in range(side):
             y = centre[1] + cell_m * (j - half)
-            q0, q1, q2 = (
-                xx * x + yx * y + zx * z,
-                xy * x + yy * y + zy * z,
-                xz * x + yz * y + zz * z,
-            )
+            q0 = xx * x + yx * y + zx * z
+            q1 = xy * x + yy * y + zy * z
+            q2 = xz * x + yz * y + zz * z
             distance = math.sqrt(x * x + y * y + z * z)
             places[j] = (azimuth(q0, q1) - grid.first_azimuth_rad) * per_step
             is_lit = abs(q2) <= grid.highest_sine * distance
@@ -457,24 +465,32 @@ def sample_floor(
                 (distance - grid.first_range_m) * per_bin if is_lit else -2.0 * reach
             )
         for j in range(side):
-            place, middle = places[j], middles[j]
-            first, last = math.floor(middle - reach + 1), math.floor(middle + reach)
+            place = places[j]
+            middle = middles[j]
+            first = math.floor(middle - reach + 1)
+            last = math.floor(middle + reach)
             if first < 0 or last >= bins or not 0 <= place < len(nodes) - 1:
                 continue
-            k, first, last = np.uint32(place), np.uint32(first), np.uint32(last)
+            k = np.uint32(place)
+            first = np.uint32(first)
+            last = np.uint32(last)
             beam = nodes[k] + (place - k) * (nodes[k + np.uint32(1)] - nodes[k])
             if beam < 0 or beam > beams - 1:
                 continue
             b = np.uint32(min(beam, beams - 2))
-            share, one, other = beam - b, image_db[b], image_db[b + np.uint32(1)]
+            share = beam - b
+            one = image_db[b]
+            other = image_db[b + np.uint32(1)]
             if is_fine:
                 near = (1 - share) * one[first] + share * other[first]
                 far = (1 - share) * one[last] + share * other[last]
                 level[i, j] = near + (middle - first) * (far - near)
             else:
-                of_one, of_other = 0.0, 0.0
+                of_one = 0.0
+                of_other = 0.0
                 for n in range(first, last + np.uint32(1)):
-                    of_one, of_other = of_one + one[n], of_other + other[n]
+                    of_one = of_one + one[n]
+                    of_other = of_other + other[n]
                 level[i, j] = (of_one + share * (of_other - of_one)) / (
                     last - first + np.uint32(1)
                 )

@@ -118,12 +118,12 @@ class TrackStates:
 
     def moved(self, step: SonarStep, drift_m: float) -> TrackStates:
         """Prediction: the tracks in the sonar frame after a step."""
-        R, t = (
-            step.previous_T_sonar.rotation().matrix(),
-            step.previous_T_sonar.translation(),
-        )
-        q, J = (self.position_m - t) @ R, np.empty((len(self), 3, 6))
-        J[:, :, :3], J[:, :, 3:] = (q @ SKEW).reshape(-1, 3, 3), -np.eye(3)
+        R = step.previous_T_sonar.rotation().matrix()
+        t = step.previous_T_sonar.translation()
+        q = (self.position_m - t) @ R
+        J = np.empty((len(self), 3, 6))
+        J[:, :, :3] = (q @ SKEW).reshape(-1, 3, 3)
+        J[:, :, 3:] = -np.eye(3)
         P = (
             R.T @ self.position_cov @ R
             + J @ step.covariance @ J.mT
@@ -171,7 +171,8 @@ def corrected(
     """Update by the measurement that each track took (-1: none), with the covariance in Joseph's form."""
     if not (took >= 0).any():
         return tracks
-    P, H = tracks.position_cov, expected.H
+    P = tracks.position_cov
+    H = expected.H
     K = P @ H.mT @ expected.information * (took >= 0)[:, None, None]
     q = tracks.position_m + (K @ expected.innovations(z[took])[:, :, None])[:, :, 0]
     rest = np.eye(3) - K @ H
@@ -256,7 +257,8 @@ class Tracker:
             raise MeasurementError(
                 f"sonar frame at {stamp_ns} ns is not later than the one before, {self._stamp_ns} ns; leave it out"
             )
-        params, rows = self.params, candidates.accepted
+        params = self.params
+        rows = candidates.accepted
         elapsed_s = (
             0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         )
@@ -266,16 +268,16 @@ class Tracker:
         before = replace(
             moved, existence=moved.existence * np.exp(-elapsed_s / params.lifetime_s)
         )
-        self._stamp_ns, self._skipped = stamp_ns, None
+        self._stamp_ns = stamp_ns
+        self._skipped = None
 
         z = np.array([candidates.range_m[rows], candidates.azimuth_rad[rows]]).T
-        expected, window = Expected.of(before, self._noise), candidates.window
+        expected = Expected.of(before, self._noise)
+        window = candidates.window
         sigma = np.sqrt(np.diagonal(expected.S, axis1=1, axis2=2))
         # standard deviations from the lower and upper limits of range and azimuth, positive inside, shapes (M', 2)
-        above, below = (
-            (expected.z - window[:, 0]) / sigma,
-            (window[:, 1] - expected.z) / sigma,
-        )
+        above = (expected.z - window[:, 0]) / sigma
+        below = (window[:, 1] - expected.z) / sigma
         in_image = (ndtr(above) - ndtr(-below)).prod(axis=1)
         detection = params.detection_probability * in_image
         densities = expected.densities(z, self._gate)
@@ -287,7 +289,8 @@ class Tracker:
         matrix = np.asarray(weights / weights.sum(axis=1, keepdims=True))
         took = most_probable_assignment(matrix)
 
-        likelihood, seen = 1.0 - detection, np.flatnonzero(took >= 0)
+        likelihood = 1.0 - detection
+        seen = np.flatnonzero(took >= 0)
         likelihood[seen] += (
             detection[seen]
             * densities[took[seen], seen]
@@ -327,7 +330,8 @@ class Tracker:
         new = np.array(
             sorted(set(range(len(matrix))).difference(took.tolist())), dtype=np.int64
         )
-        rows, previous_ids = np.append(took[stay], new), after.ids
+        rows = np.append(took[stay], new)
+        previous_ids = after.ids
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
         own = np.vstack([itself, np.zeros((len(new), len(previous_ids) + 1))])
         own[rows >= 0] = matrix[rows[rows >= 0]]
@@ -337,7 +341,9 @@ class Tracker:
         own[old, -1] = 0.0
         tracks = after.rows(stay)
         if len(new):
-            params, start, n = self.params, candidates.accepted[new], len(new)
+            params = self.params
+            start = candidates.accepted[new]
+            n = len(new)
             position = points(
                 candidates.range_m[start],
                 candidates.azimuth_rad[start],
@@ -372,7 +378,8 @@ class Tracker:
 
 def most_probable_assignment(matrix: Floats) -> Ints:
     """Candidate of each track in the most probable assignment, -1: none, shape (M',)."""
-    candidates, tracks = matrix.shape[0], matrix.shape[1] - 1
+    candidates = matrix.shape[0]
+    tracks = matrix.shape[1] - 1
     if not candidates or not tracks:
         return np.full(tracks, -1)
     cost = np.full((candidates, tracks + candidates), NEVER)

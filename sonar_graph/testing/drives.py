@@ -36,7 +36,12 @@ YAW_RATE_RAD_S = 0.05
 HEIGHT_M = -0.5
 LANDMARKS_M = {4: (7.0, 3.0), 9: (3.0, 7.0), 11: (5.5, 5.5)}
 STILL_START = Start(position_m=(1.0, -2.0, HEIGHT_M), rpy_rad=(0.1, -0.05, 0.7))
-IMU_HZ, DVL_HZ, DEPTH_HZ, FRAME_HZ, HEADING_HZ, FIX_HZ = 50, 5, 5, 2, 5, 1
+IMU_HZ = 50
+DVL_HZ = 5
+DEPTH_HZ = 5
+FRAME_HZ = 2
+HEADING_HZ = 5
+FIX_HZ = 1
 SEED = 20
 TRACK_FRAMES = 4
 MISNAMED_FRAMES = 8
@@ -68,11 +73,10 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
     )
     calibration = Calibration(start=start, imu=ImuCalibration(gyro_bias_sigma=1e-5))
     imu = _turning_imu(calibration, noise)
-    dvl_ns, depth_ns = (
-        _stamps(dvl_delay_s, DVL_HZ, DURATION_S),
-        _stamps(0, DEPTH_HZ, DURATION_S),
-    )
-    n, m = len(dvl_ns), len(depth_ns)
+    dvl_ns = _stamps(dvl_delay_s, DVL_HZ, DURATION_S)
+    depth_ns = _stamps(0, DEPTH_HZ, DURATION_S)
+    n = len(dvl_ns)
+    m = len(depth_ns)
     velocity = np.array(
         [SPEED_M_S, 0.0, 0.0]
     ) + calibration.dvl.velocity_sigma_m_s * noise.standard_normal((n, 3))
@@ -104,7 +108,8 @@ def aided_world() -> Sequence:
     >>> len(world.heading), len(world.positions)
     (101, 21)
     """
-    world, noise = small_world(), np.random.default_rng(SEED)
+    world = small_world()
+    noise = np.random.default_rng(SEED)
     calibration = world.calibration.model_copy(
         update={
             "positions": PositionCalibration(
@@ -112,11 +117,10 @@ def aided_world() -> Sequence:
             )
         }
     )
-    heading_ns, fixes_ns = (
-        _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7,
-        _stamps(0, FIX_HZ, DURATION_S),
-    )
-    m, n = len(heading_ns), len(fixes_ns)
+    heading_ns = _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7
+    fixes_ns = _stamps(0, FIX_HZ, DURATION_S)
+    m = len(heading_ns)
+    n = len(fixes_ns)
     yaw_rad = YAW_RATE_RAD_S * (
         heading_ns - START_NS
     ) * 1e-9 + calibration.heading.sigma_rad * noise.standard_normal(m)
@@ -154,7 +158,8 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     >>> said[:2], int((said < 0).sum())
     (array([ 9, 11]), 6)
     """
-    world, noise = small_world(), np.random.default_rng(SEED)
+    world = small_world()
+    noise = np.random.default_rng(SEED)
     rows = world.detections
     assert rows is not None
     frame, place = np.divmod(np.arange(len(rows)), len(LANDMARKS_M))
@@ -183,7 +188,8 @@ def still_world() -> Sequence:
     (60.00000000000001, True)
     """
     calibration = Calibration(start=STILL_START)
-    imu_stamps, slow_stamps = _stamps(0, IMU_HZ, STILL_S), _stamps(0, DVL_HZ, STILL_S)
+    imu_stamps = _stamps(0, IMU_HZ, STILL_S)
+    slow_stamps = _stamps(0, DVL_HZ, STILL_S)
     up_in_body = (
         Rotation.from_euler("xyz", STILL_START.rpy_rad)
         .inv()
@@ -221,7 +227,8 @@ def _circle(stamps_ns: Ints) -> Trajectory:
     """Truth: x = (v/ω) sin ωt, y = (v/ω)(1 - cos ωt), yaw = ωt."""
     yaw_rad = YAW_RATE_RAD_S * (stamps_ns - START_NS) * 1e-9
     radius_m = SPEED_M_S / YAW_RATE_RAD_S
-    x, y = radius_m * np.sin(yaw_rad), radius_m * (1 - np.cos(yaw_rad))
+    x = radius_m * np.sin(yaw_rad)
+    y = radius_m * (1 - np.cos(yaw_rad))
     positions = np.column_stack([x, y, np.full(len(x), HEIGHT_M)])
     return Trajectory.without_covariances(
         stamps_ns, positions, Rotation.from_euler("z", yaw_rad[:, None]).as_quat()
@@ -231,7 +238,8 @@ def _circle(stamps_ns: Ints) -> Trajectory:
 def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
     """Constant yaw rate; the specific force is centripetal acceleration v ω to the left, and gravity."""
     stamps_ns = _stamps(0, IMU_HZ, DURATION_S)
-    shape, root_hz = (len(stamps_ns), 3), np.sqrt(IMU_HZ)
+    shape = (len(stamps_ns), 3)
+    root_hz = np.sqrt(IMU_HZ)
     force = np.array([0.0, SPEED_M_S * YAW_RATE_RAD_S, calibration.gravity_m_s2])
     rate_sigma = calibration.imu.gyro_noise_density * root_hz
     force_sigma = calibration.imu.accel_noise_density * root_hz
@@ -250,10 +258,8 @@ def _detections(
     n = len(stamps_ns)
     there = np.tile(_true_landmarks().positions, (len(frames_ns), 1))
     body = _circle(frames_ns)
-    here, facing = (
-        np.repeat(body.positions, len(LANDMARKS_M), axis=0),
-        np.repeat(body.quaternions_xyzw, 3, axis=0),
-    )
+    here = np.repeat(body.positions, len(LANDMARKS_M), axis=0)
+    facing = np.repeat(body.quaternions_xyzw, 3, axis=0)
     seen: Floats = Rotation.from_quat(facing).inv().apply(there - here)
     ids = np.tile(np.array(list(LANDMARKS_M), dtype=np.int64), len(frames_ns))[:, None]
     return LandmarkDetections(

@@ -131,7 +131,8 @@ def _answer(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
 
 
 def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
-    first, second = _answer(estimator, estimates), _answer(estimator, estimates)
+    first = _answer(estimator, estimates)
+    second = _answer(estimator, estimates)
     differing = unlike(first, second)
     require(not differing, f"asked twice, {', '.join(differing)} differ")
     return second
@@ -369,7 +370,8 @@ def every_detection_has_an_outcome(make: MakeEstimator) -> None:
     world = small_world()
     assert world.detections is not None
     log = run(make, world).detections
-    given, told = world.detections.stamps_ns.tolist(), sorted(log.stamps_ns.tolist())
+    given = world.detections.stamps_ns.tolist()
+    told = sorted(log.stamps_ns.tolist())
     require(
         told == given,
         f"{len(given)} detections were given, {len(told)} are accounted for",
@@ -387,7 +389,8 @@ def every_detection_has_an_outcome(make: MakeEstimator) -> None:
 
 def same_input_gives_same_output(make: MakeEstimator) -> None:
     """Two estimators that are fed alike agree to the last bit."""
-    first, second = run(make, small_world()), run(make, small_world())
+    first = run(make, small_world())
+    second = run(make, small_world())
     require(
         difference(first, second) == 0.0, "two runs on the same measurements differ"
     )
@@ -417,7 +420,8 @@ def live_agrees_with_replay(make: MakeEstimator) -> None:
     deviation, or another covariance, shows that something was counted twice or lost.
     """
     world = aided_world()
-    windows, live = run(make, world), run(make, world, every_stamp(world))
+    windows = run(make, world)
+    live = run(make, world, every_stamp(world))
     mean, covariance = deviation(windows, live)
     require(
         mean < LIVE_SIGMAS,
@@ -438,7 +442,8 @@ def live_equals_replay(make: MakeEstimator) -> None:
 
 def input_stays_as_it_was(make: MakeEstimator) -> None:
     """No array of the measurements is written to."""
-    world, untouched = aided_world(), aided_world()
+    world = aided_world()
+    untouched = aided_world()
     run(make, world)
     for block, before in zip(
         world.blocks().values(), untouched.blocks().values(), strict=True

@@ -22,7 +22,8 @@ def central_differences(
 
     Arguments as of `check_derivative`; shape that of the value, followed by (n,).
     """
-    x, columns = np.asarray(at, np.float64), []
+    x = np.asarray(at, np.float64)
+    columns = []
     for direction in np.eye(len(x)):
         change = np.subtract(
             function(x + step * direction),
@@ -81,10 +82,8 @@ def check_derivative(
         ...
     AssertionError: derivative of row 1 by direction 0: stated 0.16, by differences -0.16
     """
-    stated, numeric = (
-        np.asarray(jacobian, np.float64),
-        central_differences(function, at, angles=angles, step=step),
-    )
+    stated = np.asarray(jacobian, np.float64)
+    numeric = central_differences(function, at, angles=angles, step=step)
     if stated.shape != numeric.shape:
         raise ValueError(
             f"expected a Jacobian of shape {numeric.shape}, not {stated.shape}"
@@ -162,7 +161,8 @@ def check_jacobians(
     whitened = np.asarray(factor.linearize(values).jacobian()[0])
     # linearize gives R J, R^T R the information
     jacobians = np.linalg.solve(np.asarray(noise.R()), whitened)
-    zeros, column = values.zeroVectors(), 0
+    zeros = values.zeroVectors()
+    column = 0
     for key in factor.keys():  # noqa: SIM118  # no dictionary
 
         def error_after(change: Floats, key: int = key) -> Floats:

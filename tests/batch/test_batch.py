@@ -30,14 +30,11 @@ from sonar_graph.batch.store import (
 )
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
-from sonar_graph.evaluation import comparison
 from sonar_graph.files import (
     deferred_interrupt,
     noticed_interrupts,
     terminations_as_interrupts,
 )
-from sonar_graph.logs import write_log
-from sonar_graph.testing import small_world
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
@@ -114,31 +111,6 @@ def test_a_run_alone_in_another_folder_gives_the_same_bytes(
         BatchError, match="none of its 4 runs has the key 0123; keys stand in the"
     ):
         run_suite(suite, tmp_path / "again", only=["0123"])
-
-
-def test_what_a_large_log_takes_is_said_before_its_first_run(
-    write_suite, in_this_process, monkeypatch, tmp_path
-):
-    write_log(tmp_path / "a.mcap", small_world())
-    suite = write_suite(
-        HEADER, '[[logs]]\nname = "a"\nlog = "a.mcap"\n', DEAD_RECKONING
-    )
-    said: list[str] = []
-
-    def do_and_say(runs: list[PlannedRun], *given: Any) -> None:
-        said.extend("run" for _ in runs)
-        do_here(runs, *given)
-
-    monkeypatch.setattr(cluster, "run_batch", do_and_say)
-    run_suite(suite, tmp_path / "small", timeout_s=60.0, notice=said.append)
-    monkeypatch.setattr(comparison, "LONG_S", 0.0)
-    for _ in range(2):  # a batch that is done takes nothing
-        run_suite(suite, tmp_path / "large", timeout_s=60.0, notice=said.append)
-    rows = len(small_world().imu)
-    assert said[0] == said[2] == "run"
-    assert said[1].startswith(f"A large log, a, for each estimator: {rows} IMU rows")
-    assert said[1].endswith("; a run is ended after 60 s")
-    assert len(said) == 3
 
 
 def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:

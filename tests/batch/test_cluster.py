@@ -212,23 +212,6 @@ def wait_a_second(_run: PlannedRun, limits: Limits) -> RunOutcome:
     return RunOutcome({"status": "ok"})
 
 
-def test_scheduler_and_workers_of_this_machine_listen_to_it_alone():
-    with execution._local_client(1) as client:
-        addresses = [client.scheduler.address, client.dashboard_link]
-        workers = client.scheduler_info()["workers"]
-        addresses += [*workers, *(worker["nanny"] for worker in workers.values())]
-        children = [psutil.Process(), *psutil.Process().children(recursive=True)]
-        listening = [
-            c.laddr.ip
-            for p in children
-            for c in p.net_connections("inet")
-            if c.status == psutil.CONN_LISTEN
-        ]
-    assert len(workers) == 1
-    assert all("://127.0.0.1:" in address for address in addresses)
-    assert set(listening) == {"127.0.0.1"}
-
-
 def test_missing_scheduler_is_one_line(write_suite, tmp_path):
     with bench(
         write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9"
@@ -237,29 +220,3 @@ def test_missing_scheduler_is_one_line(write_suite, tmp_path):
     assert process.returncode == 2
     assert len(said.splitlines()) == 1
     assert "no Dask scheduler at tcp://127.0.0.1:9" in said
-
-
-def test_a_script_that_workers_cannot_import_is_told_what_to_write(
-    write_suite, tmp_path
-):
-    """Without a guard of its main part each worker would begin the batch again."""
-    script = tmp_path / "script.py"
-    script.write_text(f"""
-from pathlib import Path
-from sonar_graph.batch.batch import Batch, limits_of
-from sonar_graph.batch.store import Where
-from sonar_graph.batch.suite import read_suite
-from sonar_graph.errors import BatchError
-
-file = read_suite(Path({str(write_suite())!r}))
-with Batch.opened(file, Path({str(tmp_path / "batch")!r})) as batch:
-    try:
-        batch.run(Where(1), limits_of(file, None), lambda *_: None)
-    except BatchError as error:
-        print(error)
-""")
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=120
-    )
-    assert "no worker could be started" in done.stdout
-    assert '`if __name__ == "__main__":`' in done.stdout

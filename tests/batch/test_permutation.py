@@ -82,27 +82,6 @@ def test_all_logs_have_one_ratio_a_seed_and_logs_without_seeds_are_cases():
     assert tested.groups == [(ALL_LOGS, "isam2", "error")]
 
 
-def test_families_by_signs_and_by_rotations_of_the_same_cases_share_what_there_is():
-    def of(name: str, *cases: int) -> dict[Group, dict[int, float]]:
-        return {("a", name, "error"): dict.fromkeys(cases, 0.1)}
-
-    tested = families(
-        of("isam2", *range(6)) | of("ekf-slam", *range(4)) | of("other", 0, 1)
-    )
-    assert [(one.cases, one.share) for one in tested] == [(6, 0.5), (4, 0.5)]
-    assert ("a", "other", "error") not in [
-        group for one in tested for group in one.groups
-    ]
-    tested = families(
-        of("isam2", 0, 1, 2) | of("other", 0, 1, 2) | of("ekf-slam", 2, 3, 4)
-    )
-    assert [(len(one.groups), one.cases, one.share) for one in tested] == [
-        (2, 3, 0.5),
-        (1, 3, 0.5),
-    ]
-    assert not any(np.isnan(one.beyond).any() for one in tested)
-
-
 def drawn(rng: np.random.Generator, seeds: int, *, lost: float, worse: float = 0.0):
     errors = rng.normal(0, 0.1, (2, 3, 2, seeds)) + math.log(100) * (
         rng.random((2, 3, 2, seeds)) < lost
@@ -144,26 +123,6 @@ def test_half_as_large_again_is_found_with_few_seeds(seeds, least):
     assert share_of_failures(seeds, lost=0.0, worse=0.5, batches=60) >= least
 
 
-def test_the_statistic_is_students_with_a_variance_that_like_groups_support():
-    beyond = np.random.default_rng(3).normal(0.1, 0.2, (6, 4))
-    groups = [
-        ("a", "isam2", "error"),
-        ("b", "isam2", "error"),
-        (ALL_LOGS, "isam2", "error"),
-        ("a", "isam2", "other"),
-    ]
-    scored = clipped(beyond)
-    squares = (scored**2).mean(axis=0)
-    supporting = np.array(
-        [math.sqrt(squares[0] * squares[1])] * 2 + [squares[2], squares[3]]
-    )
-    mean = scored.mean(axis=0)
-    spread = (2.0 * supporting + ((scored - mean) ** 2).sum(axis=0)) / (2.0 + 6 - 1)
-    assert Family(groups, beyond, 1.0).statistics[0] == pytest.approx(
-        math.sqrt(6) * mean / np.sqrt(spread)
-    )
-
-
 def noise(scatter: float, seed: int, cases: int = 8) -> np.ndarray:
     return np.random.default_rng(seed).normal(0, scatter, cases)
 
@@ -179,50 +138,3 @@ def found(
         list(columns),
         limit,
     )
-
-
-ALONE = {("a", "isam2", "error"): noise(0.1, 0)}
-
-
-def test_a_worsening_must_be_larger_beside_what_scatters_shares_or_is_allowed():
-    alone = found(ALONE, "error")["isam2"]
-    others = {(f"{n}", f"other {n}", "error"): noise(0.5, n + 1) for n in range(40)}
-    assert found(ALONE | others, "error")["isam2"] > alone
-    assert found(ALONE, "error", share=0.2)["isam2"] > alone
-    assert found(ALONE, "error", limit=math.log(1.5))["isam2"] > 0.5 > alone
-
-
-def test_a_contestant_is_told_of_its_errors_alone_of_median_scatter_and_over_all_logs():
-    assert found(ALONE, "other") == {}
-    scatters = {"small": 0.01, "middle": 0.2, "large": 1.5}
-    groups = {
-        ("a", "isam2", column): noise(scatter, 3)
-        for column, scatter in scatters.items()
-    }
-    assert found(groups, *scatters) == found(groups, "middle")
-    assert (
-        found(groups, "small")["isam2"]
-        < found(groups, "middle")["isam2"]
-        < found(groups, "large")["isam2"]
-    )
-    logs = {(log, "isam2", "error"): noise(1.0, n) for n, log in enumerate("abc")}
-    together = {(ALL_LOGS, "isam2", "error"): noise(0.02, 5)}
-    assert (
-        found(logs | together, "error")["isam2"] < 0.3 < found(logs, "error")["isam2"]
-    )
-
-
-@pytest.mark.parametrize("scatter", [0.05, 0.2])
-def test_what_is_said_to_be_found_is_found_in_four_of_five(scatter):
-    own = noise(scatter, 9, 6)
-    worsening = found({("a", "isam2", "error"): own}, "error")["isam2"]
-    rng = np.random.default_rng(10)
-    left = (own - own.mean()) * math.sqrt(6 / 5)
-    batches = rng.choice(left, (200, 6)) * rng.choice(
-        [1.0, -1.0], (200, 6)
-    ) + math.log1p(worsening)
-    shares = [
-        Family([("a", "isam2", "error")], batch[:, None], 1.0).p_values[0] <= 0.05
-        for batch in batches
-    ]
-    assert np.mean(shares) > 0.7

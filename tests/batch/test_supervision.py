@@ -22,9 +22,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(autouse=True)
 def no_process_left() -> Iterator[None]:
     yield
-    for runner in supervision._idle:
-        runner.end()
-    supervision._idle.clear()
+    supervision._runners.end()
+    supervision._runners = supervision.Runners()
     time.sleep(0.1)  # the thread that listens to it ends
 
 

@@ -77,7 +77,7 @@ MISTAKES = {
     "compare notes.txt -o out": r"notes\.txt",
     "compare basin.mcap -o notes.txt": "is a file; give a folder",
     "compare basin.mcap -o notes.txt/deeper": "cannot be written",
-    "simulate basin -o empty": "is a folder; give the name of a file",
+    "simulate basin -o empty": "expected the name of a file that ends in .mcap",
     "simulate basin -o basin.bag": r"ends in \.mcap",
     "compare basin.mcap -o out --estimators isam3": "no estimator is called 'isam3'; did you mean isam2[?] installed",
     "compare basin.mcap -o out --estimators ,": "expected names such as",
@@ -86,8 +86,8 @@ MISTAKES = {
     "recognise images.mcap -o out.mcap --calibration millimetres.toml": (
         r"1000 m above the floor and sees nothing of it up to its range of .* \(metres\)"
     ),
-    "recognise lane.mcap -o out.mcap --calibration strange.toml": "is a file of landmark designs, .*with --designs",
-    "recognise lane.mcap -o out.mcap --calibration labels.json": "is a file of labels, not a calibration; .*--labels",
+    "recognise lane.mcap -o out.mcap --calibration strange.toml": "is not a calibration; .*--designs",
+    "recognise lane.mcap -o out.mcap --calibration labels.json": "is not a calibration; .*--labels",
     "compare basin.mcap -o out --rate-hz 0": "--rate-hz",
     "compare basin.mcap -o out --rate-hz inf": "--rate-hz",
     "compare basin.mcap -o out --rate-hz nan": "--rate-hz",

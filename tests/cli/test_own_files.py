@@ -111,11 +111,11 @@ WRONG = {
     "convert csv imu.csv --config good.toml -o new.mcap": r"dvl\.csv is not among the tables; add dvl\.csv to the comm",
     f"{CSV} no_dvl.toml": r"no_dvl\.toml: has no table \[dvl\]; every estimator needs IMU and Doppler log",
     f"{CSV} truth.toml": r"truth\.csv is not among the tables; add truth\.csv to the command",
-    f"{CSV} upper.toml": r"DVL\.csv is not among the tables; did you mean 'dvl\.csv'[?]",
-    f"{CSV} number.toml": r"dvl\.csv: has no column 44 \(\[dvl\] velocity\); it has 4, numbered from 1$",
+    f"{CSV} upper.toml": r"DVL\.csv is not among the tables; .*put the name right; given: .*dvl\.csv",
+    f"{CSV} number.toml": r"dvl\.csv: has no column '44' \(\[dvl\]\); it has time, .* numbered from 1$",
     f"{CSV} close_unit.toml": r"\[dvl\] scale: did you mean cm/s[?] expected a factor or one of the units m/s, cm/s",
     f"{CSV} half.toml": r"half\.toml: \[dvl\] velocity: expected 3 values",
-    f"{CSV} column.toml": r"imu\.csv: has no column 'gyro_x' \(\[imu\] angular_velocity\); it has time, wx, wy, wz",
+    f"{CSV} column.toml": r"imu\.csv: has no column 'gyro_x' \(\[imu\]\); it has time, wx, wy, wz",
     f"{CSV} role.toml": r"there is no role \[dlv\]; did you mean \[dvl\][?]",
     f"{CSV} key.toml": r"key\.toml: \[dvl\] units: there is no such field",
     f"{CSV} unit.toml": r"unit\.toml: \[dvl\] scale: expected a factor or one of the units m/s, cm/s, mm/s",
@@ -123,13 +123,13 @@ WRONG = {
     f"{CSV} word.toml": r"word\.csv, line 8: column wx: 'fast' is no number; expected one, or nothing where",
     f"{CSV} short.toml": r"short\.csv, line 10: has 6 cells; expected 7",
     f"{CSV} noon.toml": r"noon\.csv, line 6: column time: 'noon' is no time; expected a number",
-    f"{CSV} header.toml": r"header\.csv: has no line with numbers after the header 'time,wx,.*it is empty",
-    f"{CSV} empty.toml": r"empty\.csv: has no line with numbers; expected a table",
+    f"{CSV} header.toml": r"header\.csv: has no line with numbers like 1\.5; expected a table",
+    f"{CSV} empty.toml": r"empty\.csv: has no line with numbers like 1\.5; expected a table",
     f"{CSV} image.toml": r"image\.csv, line 1: is no text",
     f"{CSV} comma.toml": r'comma\.csv: has no line with numbers like 1\.5; .* need decimal = ","',
     f"{CSV} gap.toml": "no common time; of another clock or unit[?] See stamp",
     "convert csv . --config good.toml -o wall/new.mcap": r"wall/new\.mcap: cannot be written: .*choose another place",
-    "convert csv . --config good.toml -o new.csv": r"logs are MCAP files",
+    "convert csv . --config good.toml -o new.csv": r"expected the name of a file that ends in .mcap",
     "inspect dive.mcap --log-config good.toml": r"good\.toml: says which text tables .* csv TABLES --config good\.toml",
     "compare imu.csv -o out": r"a text that begins with 'time,wx.*text tables by `sonar-graph convert csv`",
     "view dive.mcap --viewer browser": r"dive\.mcap: is a log, .* `sonar-graph compare dive\.mcap -o DIR` makes",
@@ -291,6 +291,6 @@ def test_a_json_file_of_others_does_not_become_a_model(
     mine = tmp_path / "mine.json"
     mine.write_text(content)
     assert run("calibrate", basin, "-o", mine) == 2
-    said = "holds something else than a model; choose another name, or give --overwrite"
+    said = "and sonar-graph did not write it; choose another name, or give --overwrite"
     assert said in capsys.readouterr().err
     assert mine.read_text() == content

@@ -4,7 +4,6 @@ import json
 import re
 import sys
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,7 @@ from mcap.reader import make_reader
 from sonar_graph import devices
 from sonar_graph.logs.mcap.writer import recording
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import sonar_image_messages, write_log
+from sonar_graph.logs.writing import sonar_image_messages
 from sonar_graph.recognition import confusion_fit
 from sonar_graph.sonar.confusion import read_confusion
 from tests.recognition.imaged_lane import TOPIC
@@ -87,43 +86,6 @@ def test_recognise_says_what_became_of_everything(
     rest = np.count_nonzero(probability <= 0.5)
     assert f"Most probable: {', '.join(counts)}, none of them: {rest}\n" in said
     assert "Warning" not in said
-
-
-def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(
-    lane_log, run, tmp_path, capsys
-):
-    strange = tmp_path / "strange.toml"  # of a landmark that is not in the log
-    bar = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
-    text = DESIGNS.replace("size_m = 0.3", "size_m = 0.6").replace(
-        "circle_m = [0.0, 0.0, 0.15]", bar
-    )
-    strange.write_text(text.replace("id = 4", "id = 9"))
-    for command, out, more in (
-        ("recognise", "out.mcap", ()),
-        ("compare", "out", QUICK),
-    ):
-        assert (
-            run(command, lane_log, "-o", tmp_path / out, "--designs", strange, *more)
-            == 0
-        )
-        said = capsys.readouterr().out
-        assert (
-            "Warning: no landmark was recognised; looked for 9: plate; --designs gives others"
-            in said
-        )
-
-
-def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
-    log = tmp_path / "mine.mcap"
-    options = {"options": '{"image":{"designs":"mine.toml"}}'}
-    made = replace(lane, sequence=replace(lane.sequence, notes=options))
-    made.write(log, [lane.one(k) for k in range(3)])
-    assert run("recognise", log, "-o", tmp_path / "out.mcap") == 0
-    said = capsys.readouterr().out
-    assert (
-        "Warning: the log was made with the designs of mine.toml; give them with --designs"
-        in said
-    )
 
 
 def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, capsys):
@@ -208,7 +170,7 @@ def test_a_model_that_calibrate_wrote_is_used(
     assert f"{sigmas}{of_errors}" in said
     assert run("label", lane_log, "-o", tmp_path / "model.json") == 2
     assert (
-        "model.json: exists, and holds something else than labels; choose"
+        "model.json: exists, and sonar-graph did not write it; choose"
         in capsys.readouterr().err
     )
     assert model.provenance["logs"] == "lane.mcap"
@@ -242,32 +204,6 @@ def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(
     assert (
         f"Next: sonar-graph calibrate {lane_log} --labels {labels} --designs {designs} -o model.json"
         in said
-    )
-
-
-def test_label_says_whether_a_log_or_a_part_of_it_has_no_images(
-    lane, lane_log, run, tmp_path, capsys
-):
-    assert (
-        run(
-            "label",
-            lane_log,
-            "-o",
-            tmp_path / "labels.json",
-            "--start",
-            "3600",
-            "--no-browser",
-        )
-        == 2
-    )
-    assert (
-        f"{lane_log}: has no sonar images between --start and --end"
-        in capsys.readouterr().err
-    )
-    write_log(blind := tmp_path / "blind.mcap", lane.sequence)
-    assert run("label", blind, "-o", tmp_path / "labels.json", "--no-browser") == 2
-    assert (
-        f"{blind}: has no sonar images; `sonar-graph inspect" in capsys.readouterr().err
     )
 
 
@@ -383,48 +319,6 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(
             channel.topic for _, channel, _ in make_reader(stream).iter_messages()
         }
     assert topics == {TOPIC, "/sonar/landmarks"}
-
-
-def test_who_recognises_without_a_floor_or_past_it_is_told(
-    lane, lane_log, run, tmp_path, capsys
-):
-    out, given = tmp_path / "out.mcap", tmp_path / "given.toml"
-    for text in ("floor = false", "[sonar.mounting]\nrpy_rad = [0.0, 0.0, 0.0]", ""):
-        given.write_text(text)
-        assert run("recognise", lane_log, "-o", out, "--calibration", given) == 0
-        lines = capsys.readouterr().out
-        assert ("floor is not known: landmarks" in lines) == text.startswith("floor")
-        assert (
-            "looks past the floor: check [sonar.mounting]" in lines
-        ) == text.startswith("[sonar")
-    assert run("recognise", lane_log, "-o", out, "--motion", "fixed") == 0
-    lines = capsys.readouterr().out
-    assert "the log's IMU and Doppler log are not used, as --motion fixed asks" in lines
-    assert "sonar-graph join" not in lines
-
-
-def test_labels_in_the_place_of_a_model_and_a_log_without_truth_are_told_the_way(
-    lane_log, run, tmp_path, capsys
-):
-    labels, log = tmp_path / "labels.json", tmp_path / "bare.mcap"
-    labels.write_text('{"log": "x.mcap", "labels": []}')
-    assert (
-        run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", labels) == 2
-    )
-    assert (
-        f"`sonar-graph calibrate LOG --labels {labels} -o model.json` makes a model"
-        in capsys.readouterr().err
-    )
-    write_log(log, replace(read_log(lane_log), truth=None, true_landmarks=None))
-    assert run("calibrate", log, "-o", tmp_path / "model.json") == 2
-    assert (
-        "`calibrate --labels labels.json` measure the model" in capsys.readouterr().err
-    )
-    labels.write_text(
-        '{"log": "bare.mcap", "labels": [{"stamp_ns": 1, "range_m": 2, "azimuth_rad": 9, "id": 1}]}'
-    )
-    assert run("calibrate", log, "-o", tmp_path / "model.json", "--labels", labels) == 2
-    assert "these seem to be in degrees" in capsys.readouterr().err
 
 
 def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(

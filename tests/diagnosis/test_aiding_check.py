@@ -349,18 +349,19 @@ def at_no_stated_start(run: Sequence, source: str) -> Sequence:
 
 
 @pytest.mark.parametrize(
-    ("off_m", "source", "is_named"),
-    [(40.0, "fixes", True), (0.1, "fixes", False), (40.0, "stated", False)],
+    ("off_m", "source", "line"),
+    [(40.0, "fixes", "use = false"), (0.1, "fixes", ""), (40.0, "stated", "origin_m")],
 )
-def test_depths_at_another_height_than_the_fixes_are_named_where_no_start_decides(
-    off_m: float, source: str, is_named: bool
+def test_depths_at_another_height_than_the_fixes_are_wrong_unless_they_begin_at_a_stated_start(
+    off_m: float, source: str, line: str
 ):
     run = at_no_stated_start(fixed(RIGHT, sigma_m=0.3), source)
     assert run.depth is not None
     run = replace(run, depth=replace(run.depth, z_m=run.depth.z_m - off_m))
-    found = list(aiding_check.fix_height_findings(run))
-    assert [finding.grave for finding in found] == [True] * is_named
-    if is_named:
+    found = list(aiding_check.fix_height_findings(run, NO_CONFIG))
+    assert [finding.grave for finding in found] == [True] * bool(line)
+    if line:
+        assert line in found[0].line
         assert found[0].estimate.value == pytest.approx(off_m, abs=0.2)
 
 
@@ -394,6 +395,7 @@ def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: 
         0 * t,
         height_m,
         0j * t,
+        0 * t,
     )
     expected = (2 * np.sin(w / 2)) ** 2 / 12
     assert motion.sampling_error(height_m) == pytest.approx(expected, rel=0.02)

@@ -145,6 +145,7 @@ def by_hand(seconds: np.ndarray, parts: list[int], height_m: np.ndarray) -> Body
         yaw_rad=np.zeros(n),
         height_m=height_m,
         path_m=0.5 * seconds + 0j,
+        ahead_m=0.5 * seconds,
     )
 
 

@@ -12,7 +12,7 @@ from sonar_graph.evaluation.metrics import Alignment
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.tables import FITTED
 from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.sentences import doubt_lines, finding
+from sonar_graph.report.sentences import doubt_lines, remarks
 from sonar_graph.states import Trajectory
 from tests.synthetic import basin_comparison
 
@@ -76,7 +76,7 @@ def test_errors_of_an_unknown_world_are_those_of_a_known_one(known, orientation)
     )
     assert (
         "no start, so the truth was brought into the world of the estimates: turned by -140"
-        in finding(found)[0]
+        in remarks(found)[0]
     )
     assert any(
         line.startswith("Truth: the log states no start")

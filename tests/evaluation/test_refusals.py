@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -23,7 +22,6 @@ from sonar_graph.measurements import Dvl, Heading, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.states import Estimate, Outcome, Refusal, RefusedRow
 from tests.synthetic import late, outlier, refusing, with_run
 
@@ -393,54 +391,6 @@ def test_rows_recorded_late_are_placed_by_their_stamps_and_said(
         assert "refused" not in said
     one, other = (read_comparison(tmp_path / name).runs[0] for name in ("log", "late"))
     np.testing.assert_array_equal(one.causal.positions, other.causal.positions)
-
-
-def test_run_and_compare_name_what_was_refused_in_a_log(straight, tmp_path, capsys):
-    """Two velocities are wrong."""
-    write_log(tmp_path / "log.mcap", with_outliers(straight, [20, 60]))
-    for arguments in (
-        ["run", "--estimator", "dead-reckoning"],
-        ["compare", "--estimators", "dead-reckoning,ekf-slam"],
-    ):
-        out = tmp_path / arguments[0]
-        said = told_by(
-            capsys, arguments[0], tmp_path / "log.mcap", "-o", out, *arguments[1:]
-        )
-        for seconds in ("2.000", "6.000"):
-            assert (
-                f"Warning: dvl, {seconds} s: {Refusal.OUTLIER} (squared distance"
-                in said
-            )
-        index = json.loads((out / "comparison.json").read_text())
-        for entry in index["runs"].values():
-            assert [(rows["sensor"], rows["count"]) for rows in entry["refused"]] == [
-                ("dvl", 1),
-                ("dvl", 1),
-            ]
-
-
-def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatch):
-    sequence = simulate_mission(MissionOptions(duration_s=20.0, imu="mti1"))
-    make = SightingFactors.make
-    first = {int(sequence.detections.most_probable()[0][0])}
-
-    def without(
-        self: SightingFactors, sighting: Any, key: int, *, is_first: bool
-    ) -> Any:
-        made = make(self, sighting, key, is_first=is_first)
-        unplaced = (
-            {}
-            if {key} != {L(id_) for id_ in first}
-            else {"first direction", "floor prior"}
-        )
-        return {
-            label: factor for label, factor in made.items() if label not in unplaced
-        }
-
-    monkeypatch.setattr(SightingFactors, "make", without)
-    (line, *_) = run_estimator(sequence, "isam2").withheld
-    assert line.startswith("landmark ")
-    assert line.endswith("; withheld")
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

@@ -1,15 +1,19 @@
 """Live equals log, to the bit: messages in the order of arrival against the record of them, read as a log."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sonar_graph import Odometry, load_estimator, read_log, write_log
+from sonar_graph.calibration import Calibration, KnownMap
 from sonar_graph.errors import LogError
-from sonar_graph.live import Engine, Message, recorded_messages
+from sonar_graph.live import Engine, LiveOptions, Message, recorded_messages
 from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.logs import PartialCalibration
 from sonar_graph.logs.live_record import LiveRecord
+from sonar_graph.navigation import make_estimator
 from sonar_graph.testing import aided_world, small_world
 from tests.live.traffic import messages_of
 
@@ -18,7 +22,8 @@ NS = 1_000_000_000
 
 def live(path: Path, messages: list[Message], **options):
     with LiveRecord(path) as record:
-        engine, generation, steps = Engine(record, definition_of, **options), 0, []
+        engine = Engine(record, definition_of, LiveOptions(**options))
+        generation, steps = 0, []
         for message in messages:
             engine.take(message)
             if engine.generation != generation:
@@ -79,6 +84,36 @@ def test_estimates_of_a_record_are_those_of_the_live_run_to_the_bit(tmp_path, na
     assert bits[0]
 
 
+@pytest.mark.parametrize("name", ["isam2", "ekf-slam"])
+def test_a_start_is_found_in_a_map_live_as_from_the_record_to_the_bit(tmp_path, name):
+    """No pose before; the record keeps the map."""
+    world = small_world()
+    truth = world.true_landmarks
+    known = KnownMap.of(truth.ids, truth.positions, sigma_m=0.02)
+    given = PartialCalibration({"map": known.model_dump(mode="json")}, "map.toml")
+    nowhere = world.calibration.model_dump(mode="json", exclude={"start"})
+    unplaced = replace(world, calibration=Calibration.model_validate(nowhere))
+    write_log(tmp_path / "log.mcap", unplaced)
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.2)
+    engine, steps = live(tmp_path / "record.mcap", messages, calibration=given)
+    assert engine.calibration.start.source == "map"
+    record = read_log(tmp_path / "record.mcap")
+    assert record.calibration == engine.calibration
+    runs = []
+    for run in (steps, record.replay(record.instants(10.0))):
+        estimator = make_estimator(load_estimator(name), record.calibration)
+        runs.append([estimator.process(step) for step in run])
+    assert runs[0][0] is None
+    assert runs[0][-1] is not None
+    for mine, theirs in zip(*runs, strict=True):
+        assert (mine is None) == (theirs is None)
+        if mine is not None:
+            np.testing.assert_array_equal(
+                mine.world_T_body.matrix(), theirs.world_T_body.matrix()
+            )
+            np.testing.assert_array_equal(mine.covariance, theirs.covariance)
+
+
 def test_a_record_whose_writer_was_killed_goes_on_as_if_nothing_had_been(tmp_path):
     """Half a record, cut within its last chunk, and the rest of the messages: the same steps as of one record."""
     write_log(tmp_path / "log.mcap", small_world())
@@ -134,103 +169,17 @@ def test_gaps_of_sequence_numbers_are_losses_by_topic(tmp_path):
     assert +engine.counts.lost == {"/dvl/data": 10}
 
 
-def test_a_sensor_whose_first_message_comes_late_is_in_all_steps(tmp_path):
-    """Detections begin after five seconds: all steps are given anew, and the record gives the last ones."""
-    world = small_world()
-    write_log(tmp_path / "log.mcap", world)
-    late_ns = world.start_ns + 5 * NS
-    messages = [
-        message
-        for message in messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.4)
-        if message.topic != "/sonar/landmarks" or message.arrival_ns > late_ns
-    ]
-    engine, steps = live(tmp_path / "record.mcap", messages)
-    assert engine.generation == 1
-    replayed = read_log(tmp_path / "record.mcap")
-    assert replayed.detections.stamps_ns[0] > late_ns - NS
-    assert replayed.calibration == engine.calibration
-    assert engine.calibration.sonar.mounting.translation_m == pytest.approx(
-        world.calibration.sonar.mounting.translation_m
-    )
-    for mine, theirs in zip(
-        steps, replayed.replay(replayed.instants(10.0)), strict=True
-    ):
-        for name in ("imu", "dvl", "depth", "detections"):
-            same_blocks(getattr(mine, name), getattr(theirs, name))
-
-
-def damaged(message: Message, noise: np.random.Generator) -> Message:
-    """A message that is cut, empty, of random bytes, or without a stamp."""
-    payload, kind = message.payload, noise.integers(4)
-    if kind == 0:
-        payload = payload[: noise.integers(1, len(payload))]
-    elif kind == 1:
-        payload = bytes(noise.integers(0, 256, len(payload), dtype=np.uint8))
-    elif kind == 2:
-        payload = b""
-    else:
-        payload = payload[:4] + bytes(8) + payload[12:]
-    return message._replace(payload=payload)
-
-
-@pytest.mark.parametrize("fault", ["damaged", "twice", "in any order"])
-@pytest.mark.parametrize("world", [small_world, aided_world])
-def test_whatever_arrives_a_record_gives_the_steps_that_were_live(
-    tmp_path, world, fault
-):
-    noise = np.random.default_rng(7)
-    write_log(tmp_path / "log.mcap", world())
-    messages = messages_of(tmp_path / "log.mcap", noise, 0.1)
-    if fault == "damaged":
-        messages = [
-            m if m.topic == "/tf_static" or noise.uniform() > 0.2 else damaged(m, noise)
-            for m in messages
-        ]
-    elif fault == "twice":
-        messages = [
-            again for m in messages for again in [m] * (1 + (noise.uniform() < 0.1))
-        ]
-    else:
-        order = np.argsort([m.arrival_ns + noise.uniform(0, 1e9) for m in messages])
-        times_ns = [m.arrival_ns for m in messages]
-        messages = [
-            messages[i]._replace(arrival_ns=at_ns)
-            for i, at_ns in zip(order, times_ns, strict=True)
-        ]
-    engine, steps = live(tmp_path / "record.mcap", messages)
-    assert engine.counts.dropped
-    record = read_log(tmp_path / "record.mcap")
-    replayed = list(record.replay(record.instants(10.0)))
-    assert len(steps) > 100
-    for mine, theirs in zip(steps, replayed, strict=True):
-        for name in record.blocks():
-            same_blocks(getattr(mine, name), getattr(theirs, name))
-
-
-def test_a_second_topic_of_a_sensor_that_comes_later_changes_nothing(tmp_path):
-    """Nor when detections come after it, so that all steps begin anew."""
-    write_log(tmp_path / "log.mcap", small_world())
-    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
-    middle = len(messages) // 2
-    first = [m for m in messages[:middle] if m.topic != "/sonar/landmarks"]
-    second_imu = next(m for m in first if m.topic == "/imu/data")._replace(
-        topic="/imu/other"
-    )
-    later = second_imu._replace(arrival_ns=messages[middle].arrival_ns)
-    engine, _ = live(tmp_path / "record.mcap", [*first, later, *messages[middle:]])
-    assert engine.generation == 1
-    record = read_log(tmp_path / "record.mcap")
-    assert "imu: /imu/data" in record.notes["log.topics"]
-    assert record.detections is not None
-
-
 def test_a_topic_that_was_chosen_may_come_late(tmp_path):
     write_log(tmp_path / "log.mcap", small_world())
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
     late_ns = messages[0].arrival_ns + 5 * NS
     with LiveRecord(tmp_path / "record.mcap") as record:
         engine, waited_for = (
-            Engine(record, definition_of, wanted={"detections": "/sonar/landmarks"}),
+            Engine(
+                record,
+                definition_of,
+                LiveOptions(topics={"detections": "/sonar/landmarks"}),
+            ),
             set(),
         )
         for message in messages:
@@ -262,7 +211,7 @@ def test_several_topics_for_one_role_are_recorded_with_advice_and_resumed_with_a
     assert "--resume" in engine.waits_for
     assert sum(engine.counts.received.values()) == len(both)
     kept = list(recorded_messages(tmp_path / "first.mcap"))
-    engine, steps = live(tmp_path / "second.mcap", kept, wanted={"imu": "/imu/data"})
+    engine, steps = live(tmp_path / "second.mcap", kept, topics={"imu": "/imu/data"})
     assert len(steps) > 100
     assert engine.in_use["imu"] == "/imu/data"
 

@@ -7,7 +7,7 @@ import pytest
 
 from sonar_graph.live.message_reader import PlainImu
 from sonar_graph.live.zenoh_link import definition_of
-from sonar_graph.logs.adapters import shipped_for
+from sonar_graph.logs.adapters import Setup, shipped_for
 from sonar_graph.logs.cdr import encode, parse_definition
 from sonar_graph.logs.mcap import Keep, Topic
 
@@ -20,6 +20,7 @@ CHANGES = {
         "linear_acceleration_scale": -9.80665,
     },
     "forward, right, down": {"rotation": "frd"},
+    "rates with axes of their own": {"angular_velocity_axes": ("x", "y", "-z")},
     "turned": {"rotation": (10.0, 20.0, 30.0)},
     "stamped at arrival": {"stamp_offset_s": -0.0123456789},
 }
@@ -66,7 +67,7 @@ def test_rows_are_those_of_the_adapter_to_the_bit(change):
                 "orientation.w": 0.3,
             },
         )
-        expected, _ = adapter.read(adapter.table(topic_of(payload)))
+        expected, _ = adapter.read(adapter.table(topic_of(payload)), Setup())
         row = form.row(payload)
         for name, column in vars(expected).items():
             assert getattr(row, name).tobytes() == column.tobytes(), name
@@ -97,10 +98,3 @@ def test_a_message_that_is_cut_or_in_another_byte_order_is_left_to_the_adapter()
     form, payload = form_of(adapter_of()), payload_of()
     assert form.row(payload[:-8]) is None
     assert form.row(b"\0\0" + payload[2:]) is None
-
-
-def test_rates_with_axes_of_their_own_are_left_to_the_adapter():
-    adapter = adapter_of().model_copy(
-        update={"angular_velocity_axes": ("x", "y", "-z")}
-    )
-    assert form_of(adapter) is None

@@ -166,7 +166,20 @@ def scrambled(messages, from_s):
     return found
 
 
+def out_of_order(messages):
+    """Messages that change places within a second."""
+    noise = np.random.default_rng(7)
+    times_ns = [message.arrival_ns for message in messages]
+    order = np.argsort([at_ns + noise.uniform(0, 1e9) for at_ns in times_ns])
+    return [
+        messages[i]._replace(arrival_ns=at)
+        for i, at in zip(order, times_ns, strict=True)
+    ]
+
+
 CASES: dict[str, Callable[[list[Message]], list[Message]]] = {
+    "every message twice": lambda m: [again for x in m for again in (x, x)],
+    "messages in any order": lambda m: out_of_order(m),
     "a first stamp an hour ahead": lambda m: [
         stamped(first_imu(m), stamp_of(first_imu(m)) + 3600 * NS),
         *m,
@@ -337,6 +350,9 @@ def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):
     assert (
         sum(len(step.detections) for step in steps if step.detections is not None) > 50
     )
+    # its mounting counts too
+    stated = small_world().calibration.sonar.mounting.translation_m
+    assert engine.calibration.sonar.mounting.translation_m == pytest.approx(stated)
 
 
 def test_a_late_sensor_that_cannot_be_used_is_named_and_costs_nothing(

@@ -13,7 +13,6 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.cdr import layout as plan
 from sonar_graph.logs.cdr.definitions import (
     DEFINITIONS,
     STRING,
@@ -21,7 +20,6 @@ from sonar_graph.logs.cdr.definitions import (
     definition,
     parse_definition,
 )
-from sonar_graph.logs.cdr.layout import Layout
 from sonar_graph.logs.cdr.messages import Decoder, decode, encode
 
 from .random_schemas import Tally, check, stacked
@@ -29,7 +27,6 @@ from .random_schemas import Tally, check, stacked
 NAME = "test_msgs/msg/Root"
 RULE = "=" * 80
 START = bytes([0, 1, 0, 0])
-TEXTS = st.text(st.characters(codec="utf-8"), max_size=9)
 
 
 def parsed(text: str, **used: str) -> Struct:
@@ -149,14 +146,6 @@ def test_a_definition_that_cannot_be_understood_is_refused_and_named() -> None:
 # ---- columns
 
 
-@pytest.fixture
-def fresh_plans() -> Any:
-    """Plans are remembered; those made with a deliberate fault must not be."""
-    plan.plan_of.cache_clear()
-    yield
-    plan.plan_of.cache_clear()
-
-
 @pytest.mark.parametrize(
     ("schemas", "messages", "seed"),
     [(40, 5, 1000), pytest.param(300, 10, 0, marks=pytest.mark.slow)],
@@ -166,127 +155,6 @@ def test_random_messages_decode_and_encode_as_with_two_other_libraries(
 ) -> None:
     tally = check(schemas, messages, seed)
     assert tally == Tally(schemas * messages * 2)  # in both byte orders
-
-
-RIGHT = Layout.column
-
-
-def swapped(layout: Layout, path: str) -> Any:
-    found = RIGHT(layout, path)
-    return found._replace(starts=found.starts[::-1])
-
-
-@pytest.mark.usefixtures("fresh_plans")
-@pytest.mark.parametrize(
-    ("where", "name", "wrong"),
-    [
-        (
-            plan,
-            "padding",
-            lambda at, size: -(at - plan.HEADER_BYTES) % min(size, 4),
-        ),  # the rule of XCDR2
-        (
-            plan,
-            "padding",
-            lambda at, size: -at % size,
-        ),  # counted from before the header
-        (plan, "padding", lambda *_: 0),
-        (Layout, "column", swapped),
-    ],
-    ids=["of-XCDR2", "with-header", "none", "swapped column"],
-)
-def test_the_comparison_catches_a_wrong_layout(
-    monkeypatch: pytest.MonkeyPatch, where: Any, name: str, wrong: Any
-) -> None:
-    monkeypatch.setattr(where, name, wrong)
-    tally = check(schemas=20, messages=2, seed=1000)
-    assert tally.decoded_differently or (tally.unsound and name == "padding")
-
-
-@given(st.data())
-def test_writing_then_reading_is_the_identity_to_the_bit(data: st.DataObject) -> None:
-    text = "int8 a\nstring s\nfloat64[] v\nstring[] names\nPart[] parts\nbool[2] z"
-    definition = parsed(text, Part="string name\nfloat32[] d\nuint8 e")
-    n, count = data.draw(st.integers(1, 4)), data.draw(st.integers(0, 3))
-    each = data.draw(st.lists(st.integers(0, 3), min_size=count, max_size=count))
-    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
-    bits = rng.integers(0, 1 << 63, (n, count), dtype=np.uint64)
-    values = {
-        "a": rng.integers(-128, 128, n),
-        "s": data.draw(TEXTS),
-        "v": bits.view(np.float64),  # any bits, NaN with a payload among them
-        "names": data.draw(st.lists(TEXTS, max_size=3)),
-        "parts.name": data.draw(st.lists(TEXTS, min_size=count, max_size=count)),
-        "parts.d": rng.normal(size=(n, sum(each))).astype(np.float32),
-        "z": rng.integers(0, 2, (n, 2)).astype(bool),
-    }
-    payloads = encode(definition, n, values, {"parts": count, "parts.d": each})
-    (group,) = decode(definition, [(np.arange(n), payloads)]).groups
-    np.testing.assert_array_equal(group["v"].view(np.uint64), bits)
-    for path in ("a", "parts.d", "z"):
-        np.testing.assert_array_equal(group[path], values[path])
-    assert group["z"].dtype == bool
-    for path, texts in (
-        ("s", [values["s"]]),
-        ("names", values["names"]),
-        ("parts.name", values["parts.name"]),
-    ):
-        assert group.strings(path) == [texts] * n
-    assert group.lengths("parts.d") == each
-    assert not group["parts.e"].any()
-
-
-LITTLE, BIG = START, bytes(4)
-# fmt: off
-BY_HAND: dict[str, tuple[str, bytes, dict[str, Any]]] = {
-    "alignment counts from after the encapsulation header": (
-        "uint8 a\nfloat64 b\nstring s\nuint16 c",
-        LITTLE + struct.pack("<B7xdI3sxH", 7, 1.5, 3, b"ab\0", 9), {"a": 7, "b": 1.5, "s": "ab", "c": 9}),
-    "a type without fields takes one byte": (
-        "Nothing[3] n\nuint16 a", LITTLE + struct.pack("<3sxH", b"\0\0\0", 9), {"a": 9}),
-    "big endian": (
-        "uint8 a\nfloat64 b\nint32[] c", BIG + struct.pack(">B7xdI2i", 7, 1.5, 2, -3, 4), {"a": 7, "b": 1.5}),
-}
-# fmt: on
-
-
-@pytest.mark.parametrize("case", BY_HAND)
-def test_messages_written_by_hand_are_read_and_those_in_little_endian_written_the_same(
-    case: str,
-) -> None:
-    text, by_hand, values = BY_HAND[case]
-    definition = parsed(text, Nothing="# no fields")
-    (group,) = decode(definition, stacked([by_hand, by_hand])).groups
-    for path, value in values.items():
-        found = group.strings(path) if isinstance(value, str) else group[path].tolist()
-        assert found == [[value] if isinstance(value, str) else value] * 2
-    if by_hand.startswith(LITTLE):
-        assert encode(definition, 1, values)[0].tobytes() == by_hand
-    else:
-        assert group["c"].tolist() == [[-3, 4]] * 2
-
-
-def test_messages_of_one_length_but_another_layout_or_byte_order_are_kept_apart() -> (
-    None
-):
-    payloads = [
-        START + struct.pack("<d", 1.5),
-        bytes(4) + struct.pack(">d", 2.5),
-        START + struct.pack("<d", 3.5),
-    ]
-    groups = decode(parsed("float64 a"), stacked(payloads)).groups
-    assert column(groups, "a") == {0: 1.5, 1: 2.5, 2: 3.5}
-    assert len(groups) == 2
-    # 1 + 5 and 5 + 1 bytes make payloads of the same length with the second length word elsewhere
-    first = START + struct.pack("<IB3xI5s", 1, 9, 5, b"abcde")
-    second = START + struct.pack("<I5s3xIB", 5, b"abcde", 1, 9)
-    groups = decode(
-        parsed("uint8[] a\nuint8[] b"), stacked([first, second, first])
-    ).groups
-    assert sorted((group.rows.tolist(), group["a"].shape[1]) for group in groups) == [
-        ([0, 2], 1),
-        ([1], 5),
-    ]
 
 
 def test_messages_with_a_layout_each_are_read_like_those_that_share_one_and_byte_orders_told_apart() -> (

@@ -13,16 +13,21 @@ from sonar_graph.calibration import (
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
 from sonar_graph.logs.checks import (
-    axis_faults,
+    axis_doubts,
+    clipped_axes,
+    dead_axes,
     gap_warnings,
+    magnitudes,
     repeated_sightings,
     repeats,
     row_doubts,
     spike_warning,
+    stamp_doubts,
     stamp_faults,
     stuck_doubt,
     stuck_rows,
     stuck_warning,
+    unlikely_zeros,
 )
 from sonar_graph.logs.reading import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
@@ -257,7 +262,7 @@ def test_forces_without_gravity_are_named_until_the_calibration_says_so(
     n = len(EVEN)
     values = rng.standard_normal((2, n, 3))
     imu = Imu(EVEN, 0.01 * values[0], 0.1 * values[1])
-    found = list(row_doubts(imu, None, Calibration(use_gravity=use_gravity)))
+    found = list(row_doubts(imu, None, None, Calibration(use_gravity=use_gravity)))
     assert bool(found) is use_gravity
     assert all("`use_gravity = false` in the calibration" in text for text in found)
 
@@ -405,7 +410,8 @@ def test_measurements_with_which_no_estimator_could_begin_are_refused() -> None:
     with pytest.raises(LogError, match=spans):
         require_use("log.mcap", imu(five), dvl(five + 3600))
     with pytest.raises(
-        LogError, match=r"log\.mcap: DVL: too few valid beams in all 5 rows"
+        LogError,
+        match=r"log\.mcap: DVL: none of its 5 rows measures a velocity in all directions",
     ):
         require_use("log.mcap", imu(five), dvl(five, True))
 
@@ -454,9 +460,9 @@ def rates(seed: int, clip: float = np.inf, dead: int | None = None, step: float 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_axis_that_is_dead_or_clipped_is_named_and_no_other(seed):
-    (dead,) = axis_faults(rates(seed, dead=2), "angular rate")
+    (dead,) = dead_axes(rates(seed, dead=2), "angular rate")
     assert dead.startswith("angular rate along z is 0 in every row")
-    low, high = axis_faults(rates(seed, clip=0.2), "angular rate")
+    low, high = clipped_axes(rates(seed, clip=0.2), "angular rate")
     assert low.startswith("angular rate along z is never beyond -0.2")
     assert high.startswith("angular rate along z is never beyond 0.2")
 
@@ -464,10 +470,78 @@ def test_an_axis_that_is_dead_or_clipped_is_named_and_no_other(seed):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("step", [0.0, 1e-3, 0.05])
 def test_no_axis_of_a_whole_sensor_is_named_however_coarse_it_is(seed, step):
-    assert not list(axis_faults(rates(seed, step=step), "angular rate"))
+    whole = rates(seed, step=step)
+    for check in (dead_axes, clipped_axes):
+        assert not list(check(whole, "angular rate"))
+    assert not list(magnitudes(whole))
 
 
 def test_wheels_have_axes_that_never_change():
     on_wheels = rates(0)
     on_wheels[:, :2] = 0.0
-    assert not list(axis_faults(on_wheels, "angular rate"))
+    assert not list(dead_axes(on_wheels, "angular rate"))
+
+
+def test_magnitudes_without_a_sign_are_named_and_a_vehicle_that_only_goes_ahead_is_not():
+    velocity = rates(1)
+    assert len(list(magnitudes(np.abs(velocity)))) == 1
+    velocity[:, 0] = np.abs(velocity[:, 0]) + 1.0
+    assert not list(magnitudes(velocity))
+
+
+@pytest.mark.parametrize(
+    ("has_depth", "sigma_m_s", "is_named"),
+    [(True, 0.01, True), (False, 0.01, False), (True, 1.0, False)],
+)
+def test_a_velocity_without_a_vertical_part_is_wrong_where_the_vehicle_dives(
+    has_depth: bool, sigma_m_s: float, is_named: bool
+):
+    t = np.arange(2000) * 0.02
+    imu = Imu(stamps(t), rates(0), np.tile([0.0, 0.0, 9.8], (2000, 1)))
+    dvl = Dvl(stamps(t), rates(1, dead=2), np.tile(1e-4 * np.eye(3), (2000, 1, 1)))
+    depth = Depth(stamps(t), -5 + np.sin(t), np.full(2000, 1e-4)) if has_depth else None
+    of_dvl = DvlCalibration(velocity_sigma_m_s=(0.01, 0.01, sigma_m_s))
+    found = list(axis_doubts(imu, dvl, depth, Calibration(dvl=of_dvl)))
+    assert [text.startswith("dvl: velocity along z is 0") for text in found] == [
+        True
+    ] * is_named
+
+
+def test_stamps_in_bursts_and_a_clock_that_steps_back_are_named_with_the_way_out():
+    even_ns = np.arange(300) * 200_000_000
+    burst_ns = even_ns // 10**9 * 10**9 + np.arange(300) % 5 * 100_000
+    assert not list(stamp_doubts(even_ns, even_ns))
+    (in_bursts,) = stamp_doubts(burst_ns, even_ns)
+    assert "bursts every 1 s" in in_bursts
+    assert '`stamp = "log"`' in in_bursts
+    (both,) = stamp_doubts(burst_ns, burst_ns)
+    assert "let the driver stamp" in both
+    stepped_ns = even_ns - np.where(even_ns > 30 * 10**9, 2 * 10**9, 0)
+    (back,) = stamp_doubts(stepped_ns, even_ns)
+    assert "stepped back by 1.8 s" in back
+
+
+def test_zeros_far_from_the_rows_beside_them_are_no_measurements():
+    t = np.arange(100) * 0.2
+    height = -8 + 0.1 * t
+    moved = 0.1 * t
+    zeroed = np.where(np.arange(100) % 3 == 1, 0.0, height)
+    assert (unlikely_zeros(zeroed[:, None], moved, 0.5) == (zeroed == 0)).all()
+    # a dive from the surface begins with zeros
+    dive = np.minimum(0.0, 1.0 - 0.1 * t)
+    assert not unlikely_zeros(dive[:, None], moved, 0.5).any()
+
+
+def test_a_fix_that_is_held_is_stuck_however_far_the_next_one_is():
+    rng = np.random.default_rng(0)
+    way = np.column_stack([np.arange(60.0), np.zeros(60), np.zeros(60)])
+    held = (way + rng.normal(size=(60, 3)))[np.arange(60) // 5 * 5]
+    assert repeats(held, np.arange(60.0), 1.0).sum() == 48
+
+
+def test_two_imus_on_one_topic_are_named_and_gravity_is_not_missing():
+    force = np.tile([0.0, 0.0, 9.8], (len(EVEN), 1))
+    force[::2] *= -1.0
+    both = Imu(EVEN, np.zeros_like(force), force)
+    (found,) = row_doubts(both, None, None, Calibration())
+    assert "two IMUs" in found

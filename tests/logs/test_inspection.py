@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from sonar_graph.cli.main import main
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.planar import read_victoria_park
@@ -62,7 +61,7 @@ def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(
         "header",
         "log",
     )
-    assert "mountings of /tf_static (imu: imu_link)" in summary.calibration
+    assert "mountings from /tf_static: imu (imu_link)" in summary.calibration
 
 
 def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
@@ -78,8 +77,7 @@ def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
     assert role(summary, "truth")[0] is None
     assert "/odom only if chosen: --topic truth=/odom" in role(summary, "truth")[1]
     assert summary.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
-    assert summary.calibration.startswith("none in the log and no /tf_static")
-    assert "sonar_graph/calibration.py lists them" in summary.calibration
+    assert summary.calibration.startswith("defaults; mountings from /tf_static: none")
     assert '# [imu]  # one of\n# topic = "/imu"\n# topic = "/second"' in summary.toml
     assert '# [truth]  # one of\n# topic = "/odom"' in summary.toml
     assert 'rotation = "flu"' in summary.toml
@@ -108,7 +106,7 @@ def test_the_roles_are_those_that_reading_uses(
     used = read_log(tmp_path / "a.mcap").notes["log.topics"]
     assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles if r.topic)
     assert (summary.calibration, summary.name, summary.notes) == (
-        "in the log",
+        "from the log",
         sequence.name,
         sequence.notes,
     )
@@ -165,23 +163,6 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> No
     faults = {topic.name: topic.stamp_faults for topic in summary.topics}
     assert faults["/dvl"] == ()
     assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
-
-
-def test_stuck_sensors_are_named(bench: Bench) -> None:
-    """The bench's rows are all alike."""
-    assert not any(
-        "as measured" in text
-        for text in inspect_log(bench.write(*bench.basics(10))).warnings
-    )
-    warnings = inspect_log(bench.write(*bench.basics(30), name="long.mcap")).warnings
-    for start in (
-        "dvl: velocity the same to the last bit",
-        "imu: angular rate the same to the last bit",
-    ):
-        assert any(
-            text.startswith(f"{start} in 30 rows, 0.000 to 2.900 s")
-            for text in warnings
-        )
 
 
 def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
@@ -436,16 +417,3 @@ def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench) -> None:
     )
     sequence = read_log(path, config=LogConfig.parse(tomllib.loads(table), "x"))
     assert sequence.dvl.velocity.tolist() == [[1, 2, 3]] * 3
-
-
-def test_the_command_prints_what_the_option_takes(
-    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, config = bench.write(*bench.basics()), tmp_path / "log.toml"
-    for arguments in (["--toml"], ["--log-config", str(config)]):
-        with pytest.raises(SystemExit) as done:
-            main(["inspect", str(path), *arguments])
-        assert done.value.code in (0, 3)  # five samples leave something in doubt
-        printed = capsys.readouterr().out
-        config.write_text(printed)
-    assert f"chosen in {config}" in printed

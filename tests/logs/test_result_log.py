@@ -1,13 +1,8 @@
 """Results, their messages and layouts for viewers, as other libraries decode them."""
 
 import json
-import os
 import re
-import struct
-import subprocess
-import sys
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -34,7 +29,6 @@ from sonar_graph.logs.viewer_messages import (
     Scene,
     ellipsoids,
     foxglove_layout,
-    landmark_cloud,
     landmark_markers,
     picture_messages,
     position_ellipsoids,
@@ -99,13 +93,9 @@ def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_an
         "smoothed",
         "path",
         "landmarks",
-        "landmark_cloud",
     )
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
-    expected |= {
-        f"/ground_truth/{kind}"
-        for kind in ("odometry", "path", "landmarks", "landmark_cloud")
-    }
+    expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks")}
     assert set(result.messages) == expected | {"/tf", "/tf_static"}
     (array,) = result.messages["/isam2/landmarks"]
     spheres = [m for m in array.markers if m.type == 2]
@@ -298,48 +288,7 @@ def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(
     ]
 
 
-def test_the_command_of_evo_reads_every_trajectory(result, tmp_path):
-    kinds = ("odometry", "pose", "smoothed")
-    topics = [f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in kinds]
-    command = [
-        Path(sys.executable).with_name("evo_traj"),
-        "mcap",
-        result.path.name,
-        *topics,
-    ]
-    home = {**os.environ, "HOME": str(tmp_path)}
-    done = subprocess.run(
-        command,
-        cwd=result.path.parent,
-        capture_output=True,
-        text=True,
-        env=home,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert re.findall(r"name:\s+(\S+)", done.stdout) == topics
-    assert re.findall(r"infos:\s+(\d+) poses, ([\d.]+)m", done.stdout) == [
-        ("100", "99.000")
-    ] * len(topics)
-
-
 # --- ellipsoids -----------------------------------------------------------------------------------------------------
-
-
-@given(st.integers(0, 10_000))
-def test_points_on_the_drawn_ellipsoid_have_the_same_mahalanobis_distance(
-    seed: int,
-) -> None:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(1, 3, 3)) + 2 * np.eye(3)
-    covariances = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
-    diameters, quaternions = ellipsoids(covariances)
-    sphere = rng.normal(size=(50, 3))
-    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    points = Rotation.from_quat(quaternions[0]).apply(sphere * diameters[0] / 2)
-    squared = np.einsum("ni,ij,nj->n", points, np.linalg.inv(covariances[0]), points)
-    # chi-square table: 3 degrees of freedom, 0.95
-    np.testing.assert_allclose(squared, 7.814727903251179)
 
 
 def test_unknown_covariances_are_small_spheres_and_landmarks_known_exactly_can_still_be_seen() -> (
@@ -435,61 +384,7 @@ def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(
         assert abs(np.mean(np.sum(within**2, axis=1) < 1) - 0.95) < 0.005
 
 
-# --- cloud and pictures ----------------------------------------------------------------------------------------------
-
-FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
-"""By sensor_msgs/PointField."""
-
-
-def test_a_reader_of_the_fields_finds_position_identity_and_covariance(
-    tmp_path: Path,
-) -> None:
-    ids, positions = [3, 2**40 + 1], np.array([[1.5, -2.25, 0.1], [4000.0, 5.0, -6.0]])
-    covariances = np.array(
-        [[[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 3]], np.full((3, 3), np.nan)]
-    )
-    (cloud,) = drawn(
-        tmp_path,
-        landmark_cloud("/cloud", LandmarkMap(np.array(ids), positions, covariances), 5),
-    )
-    places = {
-        f.name: (f.offset, f.offset + struct.calcsize(FORMATS[f.datatype]))
-        for f in cloud.fields
-    }
-    first, second = (
-        {
-            f.name: struct.unpack_from(
-                "<" + FORMATS[f.datatype], bytes(cloud.data), start + f.offset
-            )[0]
-            for f in cloud.fields
-        }
-        for start in (0, cloud.point_step)
-    )
-    upper = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-    assert list(first.values()) == [
-        1.5,
-        -2.25,
-        np.float32(0.1),
-        3,
-        1,
-        0.1,
-        0.2,
-        2,
-        0.3,
-        3,
-    ]
-    assert list(second.values())[:4] == [4000, 5, -6, ids[1]]
-    assert all(np.isnan(second[name]) for name in upper)
-    assert list(first) == ["x", "y", "z", "id", *upper]
-    assert {f.datatype for f in cloud.fields if f.name in "xyz"} == {7}, (
-        "RViz reads float32 only"
-    )
-    # the rules of the type
-    assert (cloud.height, cloud.width, cloud.is_bigendian) == (1, 2, False)
-    assert cloud.row_step == cloud.width * cloud.point_step == len(cloud.data)
-    assert all(end <= start for (_, end), (start, _) in pairwise(places.values()))
-    assert places["cov_zz"][1] <= cloud.point_step
-    assert {f.count for f in cloud.fields} == {1}
+# --- pictures ----------------------------------------------------------------------------------------------
 
 
 def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) -> None:
@@ -529,11 +424,11 @@ def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) 
 
 # --- layouts ---------------------------------------------------------------------------------------------------------
 
-SAME_NAME = ("Path", "Odometry", "MarkerArray", "PointCloud2")
+SAME_NAME = ("Path", "Odometry", "MarkerArray")
 DRAWN_BY_RVIZ = {f"rviz_default_plugins/{kind}": kind for kind in SAME_NAME}
 DRAWN_BY_RVIZ["rviz_default_plugins/PoseWithCovariance"] = "PoseWithCovarianceStamped"
 """By plugins_description.xml of rviz_default_plugins."""
-DRAWN_BY_FOXGLOVE = {"Path", "PoseWithCovarianceStamped", "MarkerArray", "PointCloud2"}
+DRAWN_BY_FOXGLOVE = {"Path", "PoseWithCovarianceStamped", "MarkerArray"}
 """Of the types that we write; nav_msgs/Odometry is not drawn by Lichtblick 1.28."""
 COLOUR = re.compile(r"#[0-9a-f]{6}([0-9a-f]{2})?")
 
@@ -614,13 +509,9 @@ def test_an_estimator_has_one_colour_everywhere(result: Any) -> None:
         colour = "#" + "".join(
             f"{round(255 * part):02x}" for part in (marker.r, marker.g, marker.b)
         )
-        of_layers = [
-            topics[f"/{name}/path"]["gradient"][0],
-            topics[f"/{name}/landmark_cloud"]["flatColor"],
-        ]
-        assert all(
-            COLOUR.fullmatch(layer) and layer[:7] == colour for layer in of_layers
-        )
+        layer = topics[f"/{name}/path"]["gradient"][0]
+        assert COLOUR.fullmatch(layer)
+        assert layer[:7] == colour
         seen.add(colour)
     assert len(seen) == 3
 
@@ -694,13 +585,6 @@ def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(
     assert all(0.01 < height_m / camera["distance"] < 0.05 for height_m in heights)
 
 
-def test_a_grid_has_few_cells_and_reaches_over_the_scene() -> None:
-    for size_m in (1.0, 9.9, 10.0, 320.0, 4000.0):
-        scene = Scene((0, 0, 0), size_m)
-        assert 2 <= scene.cells <= 12
-        assert scene.cells * scene.cell_m >= size_m
-
-
 def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_truth_is_left(
     make_sequence: Any, tmp_path: Path
 ) -> None:
@@ -714,7 +598,6 @@ def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_trut
     topics = {
         "/ground_truth/path",
         "/ground_truth/landmarks",
-        "/ground_truth/landmark_cloud",
     }
     assert set(layout["configById"]["3D!result"]["topics"]) == topics
     children = {

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from sonar_graph.batch.recorded import RecordedBatch, read_batch
-from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.errors import EvaluationError
-from sonar_graph.report.batch_figures import folded, log_panels, spread_out
+from sonar_graph.report.batch_figures import log_panels
 from sonar_graph.report.batch_page import render_batch, write_batch_report
 from sonar_graph.report.batch_summary import (
     absent_told,
@@ -20,7 +19,7 @@ from sonar_graph.report.batch_summary import (
     marked,
     missing_told,
 )
-from sonar_graph.report.batch_tables import all_tests, failure_table
+from sonar_graph.report.batch_tables import failure_table
 from sonar_graph.report.figure_style import PAGE_WIDTH_IN, colour, sized
 from tests.recorded_batches import (
     ESTIMATORS,
@@ -106,7 +105,7 @@ def test_few_runs_and_runs_that_all_failed_make_a_page(count):
     assert "Every run ended well." in html
     assert "not complete" not in html.lower()
     html = render_batch(replace(batch, runs=[failed(run) for run in batch.runs]))
-    assert "no run has an error to compare" in html
+    assert "No run has an error to compare" in html
     assert (
         "nan"
         not in re.sub(r"<svg.*?</svg>|base64,[^\"]*", "", html, flags=re.DOTALL)
@@ -166,20 +165,6 @@ def test_logs_whose_data_was_absent_are_named_with_their_source():
         absent_told(replace(batch, suite=""))
         == absent_told(replace(batch, suite="no toml ["))
         == []
-    )
-
-
-def test_missing_runs_make_no_pairs_and_no_values(incomplete):
-    assert len(incomplete.values(LOGS[0], "isam2", ATE)) == 6
-    assert len(incomplete.pairs(LOGS[0], "isam2", ATE)[0]) == 6
-    assert not incomplete.is_asked(LOGS[0], "ekf-slam", ATE)
-    complete = with_failures(drawn_batch(10), "isam2", LOGS[0], 1)
-    dropped = replace(incomplete, missing=[])
-    metrics = metrics_of(complete.metrics)
-    assert (
-        str(all_tests(incomplete, metrics))
-        == str(all_tests(dropped, metrics))
-        != str(all_tests(complete, metrics))
     )
 
 
@@ -246,19 +231,6 @@ def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone):
     assert f"({gone} 6 of 6)" in html
 
 
-@pytest.mark.parametrize(
-    ("count", "named"),
-    [(3, "log 0; log 1; log 2."), (5, "log 0; log 1; log 2 and 2 more.")],
-)
-def test_the_warning_names_three_logs_and_counts_the_others(count, named):
-    logs = tuple(f"log {place}" for place in range(count))
-    batch = drawn_batch(2, logs=logs)
-    for log in logs:
-        batch = with_missing(batch, "isam2", log, 1)
-    (told,) = missing_told(batch)
-    assert f", on {named} All numbers" in told
-
-
 def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
     batch = drawn_batch(2)
     write_batch(batch, tmp_path)
@@ -307,24 +279,3 @@ def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_hea
     assert len(set(colours)) == 3
     bottom, top = panels[0].get_ylim()
     assert top < 0 < 2 < bottom, "the first contestant is on top"
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["isam2/identity.policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40],
-)
-def test_folding_loses_no_letter(name):
-    lines = folded(name, 18).split("\n")
-    assert "".join(lines).replace(" ", "") == name.replace(" ", "")
-    assert all(
-        len(line) <= 18 or not any(sign in line[:-1] for sign in "/=,")
-        for line in lines
-    )
-
-
-def test_a_spread_out_scale_has_numbers_at_one_two_and_five():
-    _, (panel, *_) = log_panels(drawn_batch(1), ["basin"], "")
-    spread_out(panel)
-    panel.set_xlim(0.9, 11)
-    shown = [place for place in panel.xaxis.get_majorticklocs() if 0.9 < place < 11]
-    assert shown == pytest.approx([1, 2, 5, 10])

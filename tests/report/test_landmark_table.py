@@ -138,19 +138,6 @@ def test_only_the_repeated_experiment_has_the_papers_column():
     )
 
 
-def test_the_return_is_told_without_a_truth_that_has_no_time_in_common_with_the_run():
-    comparison = repeated()
-    path = comparison.sequence.truth
-    later = Trajectory.without_covariances(
-        path.stamps_ns + 10**15, path.positions, path.quaternions_xyzw
-    )
-    *_, x_row, _ = rows_of(
-        with_run(comparison, replace(comparison.runs[0], causal=later))
-    )
-    way = path.positions[-1, 0] - path.positions[0, 0]
-    assert x_row[1:3] == ["-", f"{way:.3f}".replace("-0.000", "0.000")]
-
-
 @pytest.mark.parametrize("begins_later", [0, 3])
 def test_the_return_is_told_against_the_truth_at_the_runs_own_ends(begins_later):
     """A path that keeps a distance from the truth returns as the truth does; one that drifts by 0.3 m does not."""

@@ -25,7 +25,7 @@ from sonar_graph.sonar.appearance import (
 )
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.place import Relief
+from sonar_graph.sonar.place import Grid, Lit, Relief
 from sonar_graph.sonar.templates import Patch, check_headings, drawn
 
 from .polar_images import candidates_at
@@ -34,12 +34,12 @@ CELL_M, SIDE, BLUR_M = 0.015, 37, (0.008, 0.01)
 SIDE_M, SHADE_STEPS, LONGER = 0.007, 3, 0.6
 """The shadow is 3.6 steps of half a cell long."""
 ROWS_COLUMNS = tuple(np.indices((SIDE, SIDE)).reshape(2, -1))
-RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, SIDE, CELL_M, BLUR_M, SHADE_STEPS)
+RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, Grid(SIDE, CELL_M, BLUR_M), SHADE_STEPS)
 
 
 def columns(relief: Relief = RELIEF) -> list[Floats]:
     """B with its side, D where no shadow lies on it, and S, written out."""
-    shade = relief.shades[0] * (1 - LONGER) + relief.shades[1] * LONGER
+    shade = relief.shorter * (1 - LONGER) + relief.longer * LONGER
     return [relief.figure + SIDE_M * relief.side, relief.dark * (1 - shade), shade]
 
 
@@ -62,7 +62,12 @@ def place_in(
     patch: Floats, start: tuple[float, float], seen: Floats | None = None
 ) -> tuple[Floats, Floats]:
     held = np.ones_like(patch) if seen is None else seen
-    return RELIEF.place(patch, held, ROWS_COLUMNS, np.array(start), SIDE_M, LONGER)
+    return RELIEF.place(
+        Patch.of(patch, held, np.zeros(2)),
+        ROWS_COLUMNS,
+        np.array(start),
+        Lit(SIDE_M, LONGER),
+    )
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (0.4, -0.3), (-0.45, 0.45)])
@@ -305,7 +310,8 @@ def test_a_shadow_is_as_long_as_its_steps():
     """Of foam with a straight far edge: so many half cells behind it are dark, wholly with little blur."""
     square = LandmarkDesign(1, "square", 0.3, np.full((150, 150), 12.0))
     for steps in (0, 1, 4, 11):
-        shades = Relief.of(square, 0.0, SIDE, CELL_M, (1e-4, 1e-4), steps).shades
+        relief = Relief.of(square, 0.0, Grid(SIDE, CELL_M, (1e-4, 1e-4)), steps)
+        shades = (relief.shorter, relief.longer)
         lengths = [one[:, SIDE // 2].sum() for one in shades]
         np.testing.assert_allclose(lengths, [steps / 2, (steps + 1) / 2], atol=0.02)
 
@@ -468,10 +474,9 @@ def test_side_and_shadow_of_a_place_are_those_of_the_slope_at_which_the_sonar_lo
     for other in (0.9, slope):
         length = relief_m * (other + 1 / other) / (cell_m / 2)
         steps = int(length)
-        drawn_now = Relief.of(tall, heading_rad, side, cell_m, BLUR_M, steps)
-        shade = drawn_now.shades[0] + (length - steps) * (
-            drawn_now.shades[1] - drawn_now.shades[0]
-        )
+        drawn_now = Relief.of(tall, heading_rad, Grid(side, cell_m, BLUR_M), steps)
+        a_step = drawn_now.longer - drawn_now.shorter
+        shade = drawn_now.shorter + (length - steps) * a_step
         face = drawn_now.figure + relief_m * other * drawn_now.side
         level = np.full((appearance.patch_side, appearance.patch_side), 40.0)
         inset = (appearance.patch_side - side) // 2 + np.array([1, -2])

@@ -8,17 +8,18 @@ and conventions. A message type is added without code, as an instance of that su
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from sonar_graph.calibration import Section
+from sonar_graph.calibration import Calibration, Section
+from sonar_graph.logs.adapters.geodesy import Origin
 from sonar_graph.logs.adapters.message_table import (
     SAME_STAMP,
     FieldTable,
+    Mask,
     MessageTable,
     field_of,
     share,
@@ -45,21 +46,19 @@ of ``ours_R_driver = Rz(yaw) Ry(pitch) Rx(roll)``, or the driver's axis along ea
 mirrored."""
 
 
+_ALONG = dict(zip(get_args(Axis), [*np.eye(3), *-np.eye(3)], strict=True))
+
+
 def axes_matrix(rotation: Rotation) -> Floats:
     """``ours_R_driver``, shape (3, 3)."""
-    if rotation == "flu":
-        return np.eye(3)
-    if rotation == "frd":
-        return np.diag([1.0, -1.0, -1.0])
+    if isinstance(rotation, str):
+        signs = [1.0, 1.0, 1.0] if rotation == "flu" else [1.0, -1.0, -1.0]
+        return np.diag(signs)
+    # written as rows of a matrix, a mirrored driver needs no angles
     if isinstance(rotation[0], str):
-        signs = [-1.0 if str(axis).startswith("-") else 1.0 for axis in rotation]
-        return (
-            np.eye(3)[["xyz".index(str(axis)[-1]) for axis in rotation]]
-            * np.array(signs)[:, None]
-        )
-    return np.asarray(
-        SpatialRotation.from_euler("xyz", rotation, degrees=True).as_matrix()
-    )
+        return np.array([_ALONG[axis] for axis in rotation])
+    angles = np.array(rotation, float)
+    return SpatialRotation.from_euler("xyz", angles, degrees=True).as_matrix()
 
 
 def turn(rotation: Rotation, vectors: Floats) -> Floats:
@@ -69,7 +68,7 @@ def turn(rotation: Rotation, vectors: Floats) -> Floats:
 
 def turned(R: Floats, vectors: Floats) -> Floats:
     """Product of a matrix with each vector, shape (n, 3), whose bits do not depend on the other vectors."""
-    return np.asarray((R @ vectors[:, :, None])[:, :, 0])
+    return (R @ vectors[:, :, None])[:, :, 0]
 
 
 def turn_covariances(rotation: Rotation, covariances: Floats) -> Floats:
@@ -115,11 +114,13 @@ def _from_units(units: Mapping[str, float]) -> BeforeValidator:
     """Validator that takes the name of a unit for its factor."""
 
     def factor(value: object) -> object:
-        if isinstance(value, str) and value not in units:
-            raise ValueError(
-                f"{did_you_mean(value, units)}expected a factor or one of the units {', '.join(units)}"
-            )
-        return units[value] if isinstance(value, str) else value
+        if not isinstance(value, str):
+            return value
+        if value not in units:
+            known = ", ".join(units)
+            meant = did_you_mean(value, units)
+            raise ValueError(f"{meant}expected a factor or one of the units {known}")
+        return units[value]
 
     return BeforeValidator(factor)
 
@@ -136,19 +137,27 @@ TimeUnit = Annotated[float, Field(gt=0, allow_inf_nan=False), _from_units(TIMES)
 """A scale, or the name of a unit such as "deg/s"."""
 
 
+class Setup(NamedTuple):
+    """Quantities that reading needs beside the messages."""
+
+    calibration: Calibration = Calibration()
+    body_R_sensor: Floats = np.eye(3)
+    """Axes of the sensor of an orientation, shape (3, 3)."""
+    origin: Origin | None = None
+    """Latitude and longitude (degrees) and height (m) of the world's origin, for positions on the Earth."""
+
+
 class Adapter(Section):
     """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
 
     A subclass adds the attributes of its role, names those that hold paths in `PATHS`, and gives the measurements, with
-    the number of rows left out by reason, in ``read``.
+    the number of rows left out by reason, in ``read(table, setup)``.
     """
 
     PATHS: ClassVar[tuple[str, ...]] = ()
     """Attributes with paths that a message must have."""
-    NEEDS: ClassVar[tuple[str, ...]] = ()
-    """Arguments of ``read`` beside the messages (`rows_of`)."""
-    reads_table: ClassVar[bool] = True
-    """False where ``read`` takes the topic, because its messages have lists of different lengths."""
+    LISTS: ClassVar[tuple[str, ...]] = ()
+    """Further paths, whose fields differ in length from message to message."""
     type: str
     """Message type, such as sensor_msgs/msg/Imu."""
     topic: str | None = None
@@ -161,10 +170,8 @@ class Adapter(Section):
     """Unit of a stamp that is a number; 1e-6 or "us" for microseconds."""
     stamp_offset_s: float = Field(0.0, allow_inf_nan=False)
     """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
-    frame_id_field: str | None = "header.frame_id"
-    """Field with the name of the sensor's frame in /tf_static."""
-    other_frame_id_field: str | None = None
-    """Field with that name, where `frame_id_field` is empty."""
+    frame_id_field: str | tuple[str, ...] | None = "header.frame_id"
+    """Field with the name of the sensor's frame in /tf_static; of several the first that is not empty."""
     frame_id: str | None = None
     """Name of the sensor's frame, where the message has none or a wrong one."""
     rotation: Rotation = "flu"
@@ -172,7 +179,7 @@ class Adapter(Section):
 
     def changed(self, table: Mapping[str, Any]) -> Self:
         """The adapter with the settings of a table in TOML; pydantic's ValidationError where one cannot be."""
-        values = self.model_dump()
+        values = self.model_dump() | dict(table)
         for key, value in table.items():
             old = getattr(self, key, None)
             # false takes away a field, and is a value where a switch is meant
@@ -180,18 +187,17 @@ class Adapter(Section):
                 values[key] = None
             elif isinstance(old, BaseModel) and isinstance(value, Mapping):
                 values[key] = {**old.model_dump(), **value}
-            else:
-                values[key] = value
-        return type(self).model_validate(values)
+        return self.model_validate(values)
 
     def fields(self) -> Iterator[str]:
-        """Paths that a message must have, except for the stamp's."""
+        """Paths that a message must have, except for the stamp's; their fields have the same size in all messages."""
         return field_paths(*(getattr(self, name) for name in self.PATHS))
 
     def missing_in(self, definition: Struct) -> list[str]:
-        """Paths of `fields` that a message type does not have."""
+        """Paths that a message type must have and does not."""
         known = dict(leaf_fields(definition))
-        return [path for path in self.fields() if field_of(path)[0] not in known]
+        paths = (*self.fields(), *self.LISTS)
+        return [path for path in paths if field_of(path)[0] not in known]
 
     def refusal(self, topic: Topic) -> str | None:  # noqa: ARG002  # for subclasses
         """Reason why messages with all fields play no role, which completes "/imu ..."; None: there is none."""
@@ -203,16 +209,19 @@ class Adapter(Section):
 
     def frame_in(self, messages: Sequence[Messages]) -> str:
         """Frame of the sensor; empty where the messages do not name one."""
-        if self.frame_id is not None or self.frame_id_field is None:
-            return self.frame_id or ""
-        named = messages[0].first_string(self.frame_id_field)
-        if named or self.other_frame_id_field is None:
-            return named
-        return messages[0].first_string(self.other_frame_id_field)
+        if self.frame_id is not None:
+            return self.frame_id
+        # one sensor fills a topic, so that the first message is enough
+        named = map(messages[0].first_string, field_paths(self.frame_id_field))
+        return next(filter(None, named), "")
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
         return 'stamp = "log"' if fault == SAME_STAMP else None
+
+    def assumption(self, gravity_m_s2: float) -> str | None:  # noqa: ARG002  # for subclasses
+        """Note about what is taken for granted; None: nothing is."""
+        return None
 
     def pinned(self, table: FieldTable) -> dict[str, Any]:  # noqa: ARG002  # for subclasses
         """Settings by which single messages are read as all messages of a table are together."""
@@ -276,7 +285,7 @@ class CovarianceFields(PathSection):
     zero: Reading = "unknown"
     """Meaning of a covariance of zeros."""
 
-    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
         is_negative = matrices[:, 0, 0] < 0
@@ -284,12 +293,13 @@ class CovarianceFields(PathSection):
         is_invalid = is_negative & (self.of_negative(is_negative) == "invalid")
         is_invalid |= is_zero & (self.zero == "invalid")
         is_finite = np.isfinite(matrices).all(axis=(1, 2))
+        # estimators would take a matrix that is no covariance for certainty
         is_unknown = is_negative | is_zero | ~is_finite | _is_impossible(matrices)
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
         return np.where(is_unknown[:, None, None], np.nan, matrices), is_invalid
 
-    def of_negative(self, is_negative: NDArray[np.bool_]) -> Reading:
+    def of_negative(self, is_negative: Mask) -> Reading:
         """Meaning of negative first elements, given which messages have one."""
         if self.negative != "found":
             return self.negative
@@ -316,33 +326,26 @@ class CovarianceFields(PathSection):
     def read_variance(self, table: FieldTable) -> Floats:
         """Variances from one field, shape (n,); NaN: unknown (zero, negative, not finite)."""
         value = table.column(self.fields[0]).astype(float)
-        known = np.isfinite(value) & (value > 0)
-        return np.where(
-            known, value**2 if self.meaning == "standard deviation" else value, np.nan
-        )
+        is_known = np.isfinite(value) & (value > 0)
+        power = 2 if self.meaning == "standard deviation" else 1
+        return np.where(is_known, value**power, np.nan)
 
     def _matrices(self, table: FieldTable) -> Floats:
         columns = [table.column(path).astype(float) for path in self.fields]
-        if len(columns) > 1:
-            stacked = np.stack(columns, axis=-1)
-            if stacked.ndim == 2:
-                return _diagonal(stacked)
-            return (
-                stacked
-                if stacked.shape[1:] == (3, 3)
-                else np.full((len(stacked), 3, 3), np.nan)
-            )
-        (column,) = columns
-        if column.ndim == 1:
-            return _diagonal(np.repeat(column[:, None], 3, axis=1))
-        if column.shape[1] not in (9, 36):
-            table.refuse(
-                self.fields[0],
-                f"has {column.shape[1]} numbers; a covariance has 1, 9 or 36",
-            )
+        numbers = np.stack(columns, axis=1).reshape(
+            len(table), -1
+        )  # (n, 1, 3, 9 or 36)
+        count = numbers.shape[1]
+        if count in (1, 3):
+            return numbers[:, :, None] * np.eye(3)
+        if count == 0:
+            return np.full((len(table), 3, 3), np.nan)
+        if count not in (9, 36):
+            fault = f"has {count} numbers; a covariance has 1, 9 or 36"
+            table.refuse(self.fields[0], fault)
         # of a pose the translation comes first
-        side = 3 if column.shape[1] == 9 else 6
-        return column.reshape(-1, side, side)[:, :3, :3]
+        side = 3 if count == 9 else 6
+        return numbers.reshape(-1, side, side)[:, :3, :3]
 
 
 def variances(fields: CovarianceFields | None, table: FieldTable) -> Floats:
@@ -350,15 +353,10 @@ def variances(fields: CovarianceFields | None, table: FieldTable) -> Floats:
     return fields.read_variance(table) if fields else np.full(len(table), np.nan)
 
 
-def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:
+def _is_impossible(matrices: Floats) -> Mask:
     """Matrices with a zero on the diagonal or a negative eigenvalue beyond rounding, shape (n,); False for NaN."""
-    is_finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    is_finite = np.all(np.isfinite(matrices), axis=(1, 2))
     finite = np.where(is_finite[:, None, None], matrices, np.eye(3))
-    variances: Floats = np.linalg.eigvalsh(finite + np.swapaxes(finite, 1, 2))
+    variances: Floats = np.linalg.eigvalsh(finite + finite.transpose(0, 2, 1))
     is_negative = variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1)
-    is_zero = (np.einsum("nii->ni", finite) == 0).any(axis=1)
-    return np.asarray(is_negative | is_zero)
-
-
-def _diagonal(values: Floats) -> Floats:
-    return values[:, :, None] * np.eye(3)
+    return is_negative | (np.einsum("nii->ni", finite) == 0).any(axis=1)

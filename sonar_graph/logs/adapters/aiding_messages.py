@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
@@ -21,14 +20,17 @@ from sonar_graph.logs.adapters.adapter import (
     CovarianceFields,
     LengthScale,
     PathSection,
+    Setup,
     axes_matrix,
+    turned,
     variances,
 )
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
+    Mask,
     fit_block,
     not_finite,
     share,
@@ -44,6 +46,9 @@ from sonar_graph.measurements import (
 )
 
 ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+World = Literal["enu", "ned"]
+ENU_R = {"enu": np.eye(3), "ned": ENU_R_NED}
+"""``enu_R_world`` of each kind of world."""
 STEEPEST_RAD = np.radians(80.0)
 """Pitch above which roll and yaw are hardly told apart."""
 NO_MEASUREMENT = "whose orientation is no measurement"
@@ -54,7 +59,6 @@ class HeadingAdapter(Adapter):
     """Yaw of the body, from an orientation or from one angle."""
 
     PATHS = ("orientation", "yaw", "variance", "status")
-    NEEDS = ("body_R_sensor",)
 
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w: the sensor in the world."""
@@ -62,7 +66,7 @@ class HeadingAdapter(Adapter):
     """Field with an angle instead: of the body, positive to the left from the world's x."""
     scale: AngleScale = 1.0
     """Turns the angle into rad; 0.017453292519943295 or "deg" from degrees."""
-    world: Literal["enu", "ned"] = "enu"
+    world: World = "enu"
     """"enu" (any world with z up), or "ned": an angle then is a bearing, clockwise from north."""
     yaw_offset_rad: float = Field(0.0, allow_inf_nan=False)
     """Added to every yaw: minus the declination (positive to the east) where north is magnetic."""
@@ -81,74 +85,56 @@ class HeadingAdapter(Adapter):
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
-        return (
-            "needs_variance = false, status = false"
-            if fault == NO_MEASUREMENT
-            else super().accepts(fault)
-        )
+        if fault == NO_MEASUREMENT:
+            return "needs_variance = false, status = false"
+        return super().accepts(fault)
 
     def refusal(self, topic: Topic) -> str | None:
         """Reason why no message has a heading, which completes "/imu ..."."""
-        if (
-            topic.keep is not Keep.ALL
-            or not topic.messages()
-            or self.is_measured(self.table(topic)).any()
-        ):
+        # an inspection may hold the stamps alone, which do not show it
+        is_read = topic.keep is Keep.ALL and topic.messages()
+        if not is_read or self.is_measured(self.table(topic)).any():
             return None
-        field = (
-            self.variance.fields[0]
-            if self.variance and self.needs_variance
-            else self.status
-        )
+        needs = self.variance is not None and self.needs_variance
+        field = self.variance.fields[0] if self.variance and needs else self.status
         return (
             f"says of no orientation that it is measured ({field}); to use it all the same: needs_variance = false and "
             "status = false under [heading] in a log configuration"
         )
 
-    def is_measured(self, table: FieldTable) -> NDArray[np.bool_]:
+    def is_measured(self, table: FieldTable) -> Mask:
         """Mask of messages that say that yaw is measured, shape (n,)."""
-        measured = (
-            np.ones(len(table), bool)
-            if self.status is None
-            else table.column(self.status) != -1
-        )
+        is_measured = np.ones(len(table), bool)
+        if self.status is not None:
+            is_measured &= table.column(self.status) != -1
         if self.variance is not None and self.needs_variance:
-            measured &= np.isfinite(self.variance.read_variance(table))
-        return measured
+            is_measured &= np.isfinite(self.variance.read_variance(table))
+        return is_measured
 
-    def read(
-        self, table: FieldTable, body_R_sensor: Floats
-    ) -> tuple[Heading | None, Dropped]:
-        """Yaw of the body with its sigma; NaN: unknown. ``body_R_sensor``, shape (3, 3), counts for an orientation."""
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Heading]:
+        """Yaw of the body with its sigma; NaN: unknown."""
         faults = {NO_MEASUREMENT: ~self.is_measured(table)}
         if self.orientation is not None:
-            # drivers without an attitude send zeros
             quaternions = table.beside(self.orientation).astype(float)
-            lengths = np.linalg.norm(quaternions, axis=1)
-            is_rotation = np.isfinite(lengths) & (lengths > 0.5)
-            sensor = SpatialRotation.from_quat(
-                np.where(is_rotation[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
-            )
-            enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
-            R = (
-                enu_R_world
-                @ sensor.as_matrix()
-                @ (body_R_sensor @ axes_matrix(self.rotation)).T
-            )
+            # drivers without an attitude send zeros
+            is_rotation = not_zero(quaternions)
+            some = np.where(is_rotation[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
+            world_R_sensor = SpatialRotation.from_quat(some).as_matrix()
+            body_R_driver = setup.body_R_sensor @ axes_matrix(self.rotation)
+            R = ENU_R[self.world] @ world_R_sensor @ body_R_driver.T  # (n, 3, 3)
             yaw_rad = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-            faults |= {
-                "without an orientation": ~is_rotation,
-                "with the nose too steep for a heading": np.abs(R[:, 2, 0])
-                > np.sin(STEEPEST_RAD),
-            }
+            # near the vertical the yaw is that of rounding
+            is_steep = np.abs(R[:, 2, 0]) > np.sin(STEEPEST_RAD)
+            faults["without an orientation"] = ~is_rotation
+            faults["with the nose too steep for a heading"] = is_steep
         else:
             yaw_rad = table.column(str(self.yaw)) * self.scale
             # a bearing turns clockwise from north
             yaw_rad = np.pi / 2 - yaw_rad if self.world == "ned" else yaw_rad
             faults[NOT_FINITE] = not_finite(yaw_rad)
-        variance = variances(self.variance, table)
+        sigma_rad = np.sqrt(variances(self.variance, table))
         yaw_rad = yaw_rad + self.yaw_offset_rad if self.yaw_offset_rad else yaw_rad
-        return fit_block(Heading, table.stamps_ns, faults, yaw_rad, np.sqrt(variance))
+        return fit_block(Heading, table.stamps_ns, faults, yaw_rad, sigma_rad)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about a sigma beyond a full turn, and an angle that looks like degrees."""
@@ -172,6 +158,22 @@ class HeadingAdapter(Adapter):
                 )
 
 
+def not_zero(quaternions: Floats) -> Mask:
+    """Mask of quaternions that are rotations, shape (n,)."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    return np.isfinite(lengths) & (lengths > 0.5)
+
+
+class Places(NamedTuple):
+    """Positions in the world, a row each."""
+
+    position_m: Floats
+    """Shape (n, 3), z up; a height that was not measured is 0."""
+    faults: dict[str, Mask]
+    """Masks of rows without a position, by reason."""
+    has_height: Mask
+
+
 class GeodeticFields(PathSection):
     """Fields of a position on the Earth, and the origin of the world."""
 
@@ -190,35 +192,28 @@ class GeodeticFields(PathSection):
     origin_deg_m: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
 
-    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
 
         Drivers without a fix send latitude and longitude 0; a height that is not measured is NaN.
         """
-        place = np.column_stack(
-            [table.column(self.latitude), table.column(self.longitude)]
-        ).astype(float)
+        place = table.beside((self.latitude, self.longitude)).astype(float)
         if self.unit == "ddmm.mmmm":
             # 4807.038 is 48 degrees and 7.038 minutes
             degrees = np.trunc(place / 100)
             place = degrees + (place - 100 * degrees) / 60
         elif self.unit == "rad":
             place = np.degrees(place)
-        height = (
-            table.column(self.height).astype(float)
-            if self.height
-            else np.full(len(table), np.nan)
-        )
-        is_fix = (
-            np.isfinite(place).all(axis=1)
-            & place.any(axis=1)
-            & (np.abs(place) <= [90.0, 360.0]).all(axis=1)
-        )
+        height = np.full(len(table), np.nan)
+        if self.height:
+            height = table.column(self.height).astype(float)
+        # receivers without satellites send zeros
+        is_fix = np.isfinite(place).all(axis=1) & place.any(axis=1)
+        is_fix &= (np.abs(place) <= [90.0, 360.0]).all(axis=1)
         if self.status is not None:
             is_fix &= table.column(self.status) >= 0
-        return np.column_stack(
-            [place, np.where(np.isfinite(height), height, np.nan)]
-        ), is_fix
+        height[~np.isfinite(height)] = np.nan
+        return np.column_stack([place, height]), is_fix
 
     def beyond(self, table: FieldTable) -> str:
         """Remark about latitudes that are none, for rows without a fix; empty where there are few."""
@@ -228,76 +223,45 @@ class GeodeticFields(PathSection):
         return f' ({self.latitude} is up to {np.nanmax(latitude):.6g}: unit = "ddmm.mmmm" inside geodetic?)'
 
     def first_fix(self, table: FieldTable) -> Origin | None:
-        """Latitude and longitude in degrees, and height in metres, of the first fix by its stamp; None without one."""
+        """Place of the first fix by its stamp, with the first height that was measured; None without a fix."""
         places, is_fix = self.read(table)
-        rows = np.flatnonzero(is_fix)
-        if not rows.size:
+        order = np.argsort(table.stamps_ns, kind="stable")
+        fixes = places[order[is_fix[order]]]
+        if not len(fixes):
             return None
-        latitude, longitude, height = places[
-            rows[np.argmin(table.stamps_ns[rows])]
-        ].tolist()
-        heights = places[is_fix & np.isfinite(places[:, 2]), 2]
-        return (
-            latitude,
-            longitude,
-            height
-            if np.isfinite(height)
-            else float(heights[0])
-            if heights.size
-            else 0.0,
-        )
+        # some receivers give heights later than places
+        heights = fixes[np.isfinite(fixes[:, 2]), 2].tolist()
+        latitude, longitude, _ = fixes[0].tolist()
+        return latitude, longitude, next(iter(heights), 0.0)
 
-    def positions(
-        self, table: FieldTable, origin: Origin | None
-    ) -> tuple[Floats, np.ndarray, NDArray[np.bool_]]:
-        """Metres east, north, up of an origin in degrees and metres, shape (n, 3), and masks of fixes and of heights.
-
-        A height that is not measured is 0.
-        """
+    def positions(self, table: FieldTable, origin: Origin | None) -> Places:
+        """Metres east, north, up of an origin."""
         places, is_fix = self.read(table)
-        latitude_deg, longitude_deg, height_m = origin or (0.0, 0.0, 0.0)
+        start = origin or (0.0, 0.0, 0.0)
         has_height = np.isfinite(places[:, 2])
-        heights_m = np.where(has_height, places[:, 2], height_m)
-        degrees = np.where(
-            is_fix[:, None], places[:, :2], [latitude_deg, longitude_deg]
+        # rows without a fix are left out, and a height that was not measured counts as 0
+        is_known = np.column_stack([is_fix, is_fix, has_height])
+        latitude, longitude, height_m = np.where(is_known, places, start).T
+        from_rad = (*np.radians(start[:2]).tolist(), start[2])
+        position_m = east_north_up(
+            np.radians(latitude), np.radians(longitude), height_m, from_rad
         )
-        origin_rad = (
-            float(np.radians(latitude_deg)),
-            float(np.radians(longitude_deg)),
-            height_m,
-        )
-        metres = east_north_up(
-            np.radians(degrees[:, 0]), np.radians(degrees[:, 1]), heights_m, origin_rad
-        )
-        return (
-            np.where(has_height[:, None], metres, metres * [1.0, 1.0, 0.0]),
-            is_fix,
-            has_height,
-        )
-
-
-class Places(NamedTuple):
-    """Positions in the world, a row each."""
-
-    position_m: Floats
-    """Shape (n, 3), z up; a height that was not measured is 0."""
-    faults: dict[str, NDArray[np.bool_]]
-    """Masks of rows without a position, by reason."""
-    has_height: NDArray[np.bool_]
+        position_m[~has_height, 2] = 0.0
+        fault = f"without a fix{self.beyond(table)}"
+        return Places(position_m, {fault: ~is_fix}, has_height)
 
 
 class PlaceAdapter(Adapter):
     """Positions, in latitude and longitude or in metres of the world."""
 
     PATHS: ClassVar[tuple[str, ...]] = ("position", "geodetic")
-    NEEDS: ClassVar[tuple[str, ...]] = ("origin",)
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
     """Fields of x, y, z in the world instead, metres."""
     scale: LengthScale = 1.0
     """Turns `position` into metres, and its covariance by the square; 0.001 or "mm" from millimetres."""
-    world: Literal["enu", "ned"] = "enu"
+    world: World = "enu"
     """"enu" (any world with z up), or "ned"; of `position`."""
 
     @model_validator(mode="after")
@@ -315,21 +279,18 @@ class PlaceAdapter(Adapter):
     def places(self, table: FieldTable, origin: Origin | None) -> Places:
         """Positions of all rows; ``origin`` in degrees and metres is for positions on the Earth."""
         if self.geodetic is not None:
-            position_m, is_fix, has_height = self.geodetic.positions(table, origin)
-            fault = f"without a fix{self.geodetic.beyond(table)}"
-            return Places(position_m, {fault: ~is_fix}, has_height)
+            return self.geodetic.positions(table, origin)
         position_m = self.scaled(table)
         faults = {NOT_FINITE: not_finite(position_m)}
-        if self.world == "ned":
-            position_m = position_m @ ENU_R_NED.T
-        return Places(position_m, faults, np.ones(len(table), bool))
+        in_enu_m = turned(ENU_R[self.world], position_m)
+        return Places(in_enu_m, faults, np.ones(len(table), bool))
 
 
 class PositionAdapter(PlaceAdapter):
     """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
 
     PATHS = ("geodetic", "position", "covariance", "covariance_type")
-    NEEDS = ("origin", "sigma_m")
+
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
     covariance: CovarianceFields | None = None
@@ -341,37 +302,28 @@ class PositionAdapter(PlaceAdapter):
         """Values of `position` in metres from the origin, along the driver's axes, shape (n, 3)."""
         return super().scaled(table) - self.origin_m
 
-    def read(
-        self,
-        table: FieldTable,
-        origin: Origin | None,
-        sigma_m: tuple[float, float, float],
-    ) -> tuple[PositionFixes | None, Dropped]:
-        """Fixes with covariances, NaN: unknown.
-
-        ``origin``, in degrees and metres, is for positions on the Earth, the calibration's ``sigma_m`` for fixes
-        without height and covariance.
-        """
-        positions, faults, has_height = self.places(table, origin)
+    def read(self, table: FieldTable, setup: Setup) -> Fit[PositionFixes]:
+        """Fixes with covariances, NaN: unknown; the calibration's noise counts for fixes without height and covariance."""
+        places = self.places(table, setup.origin)
         C = np.full((len(table), 3, 3), np.nan)
         if self.covariance is not None:
-            C, faults["with a covariance that says invalid"] = self.covariance.read(
-                table
-            )
+            C, is_invalid = self.covariance.read(table)
+            places.faults["with a covariance that says invalid"] = is_invalid
         if self.covariance_type is not None:
             C[table.column(self.covariance_type) == 0] = np.nan
         if self.position is not None:
-            C = C * self.scale**2
-            if self.world == "ned":
-                C = ENU_R_NED @ C @ ENU_R_NED.T
+            W = ENU_R[self.world]
+            C = W @ (C * self.scale**2) @ W.T
         # without a height, x and y keep their noise and z gets none that counts
-        is_flat = ~has_height
-        flat = np.where(np.isnan(C), np.diag(np.square(sigma_m)), C)[is_flat]
+        is_flat = ~places.has_height
+        noise = np.diag(np.square(setup.calibration.positions.sigma_m))
+        flat = np.where(np.isnan(C), noise, C)[is_flat]
         flat[:, 2, :] = 0.0
         flat[:, :, 2] = 0.0
         flat[:, 2, 2] = UNMEASURED_M2
         C[is_flat] = flat
-        return fit_block(PositionFixes, table.stamps_ns, faults, positions, C)
+        found = (places.position_m, C)
+        return fit_block(PositionFixes, table.stamps_ns, places.faults, *found)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about matrices that are no covariances, and places that are not on the Earth."""

@@ -11,7 +11,7 @@ import numpy as np
 from sonar_graph.measurements import Floats
 
 Origin = tuple[float, float, float]
-"""Latitude and longitude in rad, and height in m."""
+"""Latitude, longitude and height in m; in rad here, in degrees where a log or its configuration states an origin."""
 SEMI_MAJOR_AXIS_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
@@ -48,4 +48,4 @@ def east_north_up(
     )
     from_centre = earth_centred(latitude_rad, longitude_rad, height_m) - centre
     # row by row: a message alone gives the same bits
-    return np.asarray((enu_R_earth @ from_centre[:, :, None])[:, :, 0])
+    return (enu_R_earth @ from_centre[:, :, None])[:, :, 0]

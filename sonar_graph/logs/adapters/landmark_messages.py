@@ -1,4 +1,4 @@
-"""Adapters for landmark detections and maps: the messages of this package, and ``vision_msgs/Detection3DArray``.
+"""Adapters for landmark detections and maps: messages of this package, ``vision_msgs/Detection3DArray``, and tables.
 
 A position p in the sonar's frame with the covariance C becomes range and azimuth with the covariance ``J C J^T``::
 
@@ -8,28 +8,32 @@ Impossible identities are refused, impossible rows are left out, and unlikely on
 (docs/design/0004-logs.md).
 """
 
-from collections.abc import Iterator, Mapping
-from typing import Literal, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
+from pydantic import model_validator
 
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
     LengthScale,
+    Setup,
     turn,
     turn_covariances,
+    turned,
 )
+from sonar_graph.logs.adapters.aiding_messages import ENU_R, World
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
+    FieldTable,
+    Fit,
+    MessageTable,
     fit_block,
-    header_stamps_ns,
     not_finite,
     share,
 )
 from sonar_graph.logs.cdr import Messages
-from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
     FULL_TURN_RAD,
@@ -61,113 +65,119 @@ class _Rows(NamedTuple):
     """Columns that do not depend on the candidates."""
 
 
-def _joined(topic: Topic, parts: list[_Rows]) -> _Rows:
+def _joined(table: MessageTable, parts: list[_Rows]) -> _Rows:
     """Rows of all layouts in the order of messages, padded to the most candidates with -1 and probability 0."""
     most = max(1, *(part.ids.shape[1] for part in parts))
-    ids = np.concatenate([_padded(part.ids, most, -1) for part in parts])
-    probabilities = np.concatenate(
-        [_padded(part.probabilities, most, 0) for part in parts]
-    )
+
+    def stacked(columns: Iterable[np.ndarray], filling: int) -> np.ndarray:
+        widths = ((0, 0), (0, most))
+        padded = (np.pad(c, widths, constant_values=filling)[:, :most] for c in columns)
+        return np.concatenate(list(padded))
+
+    ids = stacked((part.ids for part in parts), -1)
     message = np.concatenate([part.message for part in parts])
-    stamps_ns = np.concatenate([part.stamps_ns for part in parts])
-    values = zip(*(part.values for part in parts), strict=True)
     is_large = (ids >= FIRST_TOO_LARGE_ID).any(axis=1)
     if is_large.any():
-        where = f"message {message[int(np.argmax(is_large))]} has an identity of 2^56 or more"
-        raise topic.error(
+        where = (
+            f"message {message[np.argmax(is_large)]} has an identity of 2^56 or more"
+        )
+        raise table.topic.error(
             f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false"
         )
     # rows of one stamp keep the order in which they were sent
     order = np.argsort(message, kind="stable")
+    values = zip(*(part.values for part in parts), strict=True)
     return _Rows(
         message[order],
-        stamps_ns[order],
+        np.concatenate([part.stamps_ns for part in parts])[order],
         ids[order],
-        probabilities[order],
+        stacked((part.probabilities for part in parts), 0)[order],
         tuple(np.concatenate(columns)[order] for columns in values),
-    )
-
-
-def _padded(columns: np.ndarray, count: int, filling: int) -> np.ndarray:
-    return np.pad(
-        columns, ((0, 0), (0, count - columns.shape[1])), constant_values=filling
     )
 
 
 class DetectionListsAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkDetections``: range, azimuth, covariance and posterior, in flat lists."""
 
-    reads_table = False
     range_scale: LengthScale = 1.0
     """Turns ranges into metres; 0.001 or "mm" from millimetres, a ratio of sound speeds where that is wrong."""
     azimuth_scale: AngleScale = 1.0
     """Turns azimuths into rad, positive to the left; -1 where they are positive to the right."""
 
-    def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
+    def read(
+        self,
+        table: MessageTable,
+        setup: Setup,  # noqa: ARG002  # of all adapters
+    ) -> Fit[LandmarkDetections]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
-        groups = [group for group in topic.messages() if group["range_m"].shape[1]]
-        log_times_ns = topic.log_times_ns  # of sound messages, which are known now
+        groups = [group for group in table.groups if group["range_m"].shape[1]]
         if not groups:
             return None, {}
-        parts = [self._rows(topic, group, log_times_ns) for group in groups]
-        rows = _joined(topic, parts)
+        rows = _joined(table, [self._rows(table, group) for group in groups])
         ranges, azimuths, covariances, tracks = rows.values
         scales = np.array([self.range_scale, self.azimuth_scale])
         ranges = ranges * self.range_scale
         azimuths = azimuths * self.azimuth_scale
-        covariances = covariances * np.outer(scales, scales)
         faults = {
             NOT_FINITE: not_finite(ranges, azimuths, rows.probabilities),
             NO_POSTERIOR: no_posterior(rows.probabilities),
         }
-        measured = (ranges, azimuths, covariances)
-        named = (rows.ids, rows.probabilities, tracks)
-        return fit_block(
-            LandmarkDetections, rows.stamps_ns, faults, *measured, *named, unique=False
-        )
+        measured = (ranges, azimuths, covariances * np.outer(scales, scales))
+        return _fit(rows, faults, measured, tracks)
 
-    def _rows(self, topic: Topic, group: Messages, log_times_ns: Ints) -> _Rows:
+    def _rows(self, table: MessageTable, group: Messages) -> _Rows:
         frames, count = group["range_m"].shape
         ids = group["candidate_ids"]
-        probabilities = group["id_probability"]
-        # not in old logs
-        tracks = (
-            group["track"] if "track" in group.layout.columns else np.empty((frames, 0))
-        )
+        sizes = {
+            "azimuths": group["azimuth_rad"].shape[1] - count,
+            "covariance elements": group["covariance"].shape[1] - 4 * count,
+            "identities": ids.shape[1] % count,
+            "probabilities": group["id_probability"].shape[1] - ids.shape[1],
+        }
         where = f"message {group.rows[0]} has {count} ranges"
-        azimuths = group["azimuth_rad"].shape[1]
-        covariances = group["covariance"].shape[1]
-        if (azimuths, covariances, ids.shape[1] % count) != (
-            count,
-            4 * count,
-            0,
-        ) or probabilities.shape != ids.shape:
-            raise topic.error(
-                f"{where}, {azimuths} azimuths, {covariances} covariance elements, {ids.shape[1]} identities, "
-                f"{probabilities.shape[1]} probabilities; expected n, n, 4n, kn and kn"
-            )
-        if tracks.shape[1] not in (0, count):
-            raise topic.error(
-                f"{where} and {tracks.shape[1]} tracks; expected as many, or none"
+        if any(sizes.values()):
+            raise table.topic.error(
+                f"{where}, {group['azimuth_rad'].shape[1]} azimuths, {group['covariance'].shape[1]} covariance elements, "
+                f"{ids.shape[1]} identities, {group['id_probability'].shape[1]} probabilities; expected n, n, 4n, kn and kn"
             )
         total = frames * count
-        candidates = ids.shape[1] // count
-        track = np.full(total, NO_TRACK, np.int64)
-        if tracks.size:
-            track = tracks.astype(np.int64).reshape(total)
+        tracks = np.full(total, NO_TRACK, np.int64)
+        # not in old logs
+        if "track" in group.layout.columns and group["track"].size:
+            if group["track"].shape[1] != count:
+                raise table.topic.error(
+                    f"{where} and {group['track'].shape[1]} tracks; expected as many, or none"
+                )
+            tracks = group["track"].astype(np.int64).reshape(total)
         values = (
             group["range_m"].reshape(total),
             group["azimuth_rad"].reshape(total),
             group["covariance"].reshape(total, 2, 2),
-            track,
+            tracks,
         )
         return _Rows(
-            np.repeat(group.rows, count),
-            np.repeat(header_stamps_ns(group, log_times_ns), count),
-            ids.reshape(total, candidates),
-            probabilities.reshape(total, candidates),
+            *_places(table, group, count),
+            ids.reshape(total, -1),
+            group["id_probability"].reshape(total, -1),
             values,
         )
+
+
+def _places(table: MessageTable, group: Messages, count: int) -> tuple[Ints, Ints]:
+    """Number and stamp of the message of each detection, ``count`` to a message."""
+    stamps_ns = table.stamps_ns[group.rows]
+    return np.repeat(group.rows, count), np.repeat(stamps_ns, count)
+
+
+def _fit(
+    rows: _Rows,
+    faults: Mapping[str, np.ndarray],
+    measured: tuple[Floats, Floats, Floats],
+    tracks: Floats | Ints,
+) -> Fit[LandmarkDetections]:
+    """Rows fit for use, from ranges, azimuths and covariances."""
+    columns = (*measured, rows.ids, rows.probabilities, tracks)
+    return fit_block(LandmarkDetections, rows.stamps_ns, faults, *columns, unique=False)
 
 
 _SCORE = "detections.results.hypothesis.score"
@@ -182,99 +192,101 @@ class DetectionArrayAdapter(Adapter):
     Identities are integers here: a class that is a number stands for itself, others are given in `ids`.
     """
 
-    reads_table = False
+    LISTS = (
+        f"{_CENTRE}.x",
+        _SCORE,
+        _CLASS,
+        f"{_RESULT}.pose.position.x",
+        f"{_RESULT}.covariance",
+    )
     position: Literal["results", "bbox"] = "results"
     """Source of the position: a detection's first result, with its covariance, or the centre of its box, without."""
     ids: Mapping[str, int] = {}
     """Integer identity of each class that is no number: {"buoy" = 1, "ladder" = 2}."""
 
-    def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
+    def read(
+        self,
+        table: MessageTable,
+        setup: Setup,  # noqa: ARG002  # of all adapters
+    ) -> Fit[LandmarkDetections]:
         """One row a detection that has a result; the scores are the posterior, in the order of the results."""
         groups = [
-            group for group in topic.messages() if group.lengths("detections.results")
+            group for group in table.groups if group.lengths("detections.results")
         ]
         if not groups:
             return None, {}
-        rows = _joined(topic, [self._rows(topic, group) for group in groups])
+        rows = _joined(table, [self._rows(table, group) for group in groups])
         scores = rows.probabilities
         # scores that are no probabilities would be taken for certainty
         worst = float(np.nanmax(scores.sum(axis=1), initial=0.0))
         if worst > 1 + ROUNDING or (scores < 0).any():
-            raise topic.error(
+            raise table.topic.error(
                 f"scores of one detection add up to {worst:g}; the posterior over identities must be between 0 and 1 "
                 f"in sum: normalise the scores where the log is made"
             )
         positions, covariances = rows.values
-        ranges, azimuths, spread = range_and_azimuth(
+        measured = range_and_azimuth(
             turn(self.rotation, positions), turn_covariances(self.rotation, covariances)
         )
+        ranges, azimuths, _ = measured
+        # a detection that is nothing in particular has no results
         faults = {
             "without a result": rows.ids[:, 0] < 0,
             NOT_FINITE: not_finite(ranges, azimuths, scores),
             "at the sonar itself": ranges == 0,
         }
-        tracks = np.full(len(ranges), NO_TRACK, np.int64)
-        measured = (ranges, azimuths, spread)
-        named = (rows.ids, scores, tracks)
-        return fit_block(
-            LandmarkDetections, rows.stamps_ns, faults, *measured, *named, unique=False
-        )
+        return _fit(rows, faults, measured, np.full(len(ranges), NO_TRACK))
 
-    def _rows(self, topic: Topic, group: Messages) -> _Rows:
+    def _rows(self, table: MessageTable, group: Messages) -> _Rows:
         """Every detection, with the results of each at its own places; NaN: unknown."""
         counts = np.array(group.lengths("detections.results"), np.int64)
+        begins = np.cumsum(counts) - counts
         n = len(group)
         m = len(counts)
         k = max(1, int(counts.max()))
         detection = np.repeat(np.arange(m), counts)
-        result = np.concatenate([np.arange(c) for c in counts]).astype(int)
+        result = np.arange(len(detection)) - np.repeat(begins, counts)
         scores = np.zeros((n, m, k))
-        ids = np.full((n, m, k), -1, np.int64)
         scores[:, detection, result] = group[_SCORE]
+        ids = np.full((n, m, k), -1, np.int64)
         names = group.strings(_CLASS)
         ids[:, detection, result] = [
-            [self._identity(topic, name) for name in message] for message in names
+            [self._identity(table, name) for name in message] for message in names
         ]
         positions = np.full((n, m, 3), np.nan)
         covariances = np.full((n, m, 3, 3), np.nan)
         if self.position == "bbox":
-            positions[:] = np.stack(
-                [group[f"{_CENTRE}.{axis}"] for axis in "xyz"], axis=-1
-            )
+            positions[:] = _vectors(group, _CENTRE)
         else:
-            some = np.flatnonzero(counts)
-            first = (np.cumsum(counts) - counts)[some]
-            found = np.stack(
-                [group[f"{_RESULT}.pose.position.{axis}"] for axis in "xyz"], axis=-1
-            )
-            positions[:, some] = found[:, first]
+            some = counts > 0
+            first = begins[some]
+            positions[:, some] = _vectors(group, f"{_RESULT}.pose.position")[:, first]
             pose = group[f"{_RESULT}.covariance"].reshape(n, -1, 6, 6)[:, first, :3, :3]
             # zeros and a negative variance are unknown
             known = pose.any(axis=(2, 3)) & (pose[..., 0, 0] >= 0)
             covariances[:, some] = np.where(known[..., None, None], pose, np.nan)
         return _Rows(
-            np.repeat(group.rows, m),
-            np.repeat(header_stamps_ns(group, topic.log_times_ns), m),
+            *_places(table, group, m),
             ids.reshape(-1, k),
             scores.reshape(-1, k),
             (positions.reshape(-1, 3), covariances.reshape(-1, 3, 3)),
         )
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        pose = (f"{_RESULT}.pose.position.x", f"{_RESULT}.covariance")
-        return iter((f"{_CENTRE}.x", _SCORE, _CLASS, *pose))
-
-    def _identity(self, topic: Topic, name: str) -> int:
+    def _identity(self, table: MessageTable, name: str) -> int:
         try:
             identity = self.ids[name] if name in self.ids else int(name)
             # beyond int64 is refused as too large as well
             return max(-1, min(identity, FIRST_TOO_LARGE_ID))
         except ValueError:
-            raise topic.error(
+            raise table.topic.error(
                 f"class {name!r} is no integer identity; say in a log configuration which it is: [detections] ids = "
                 f'{{"{name}" = 1}}, or do not use them: use = false'
             ) from None
+
+
+def _vectors(group: Messages, path: str) -> Floats:
+    """Vectors at a path, shape (messages, places, 3)."""
+    return np.stack([group[f"{path}.{axis}"] for axis in "xyz"], axis=-1)
 
 
 def range_and_azimuth(
@@ -296,22 +308,21 @@ def range_and_azimuth(
 class LandmarkMapAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkMap``: true positions of landmarks."""
 
-    reads_table = False
-
-    def read(self, topic: Topic) -> tuple[LandmarkMap | None, Dropped]:
-        """The last sound map of a topic; None where none is."""
-        groups = topic.messages()
-        if not groups:
-            return None, {}
+    def read(
+        self,
+        table: MessageTable,
+        setup: Setup,  # noqa: ARG002  # of all adapters
+    ) -> Fit[LandmarkMap]:
+        """The last map of a topic."""
         # a map is latched: the newest counts
-        last = max(groups, key=lambda group: int(group.rows[-1]))
+        last = max(table.groups, key=lambda group: int(group.rows[-1]))
         ids, position, covariance = (
             last[name][-1] for name in ("ids", "position", "covariance")
         )
         count = len(ids)
         different = len(np.unique(ids))
         if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
-            raise topic.error(
+            raise table.topic.error(
                 f"{count} ids ({different} different), {len(position)} position and {len(covariance)} covariance "
                 f"elements; expected n different, 3n and 9n"
             )
@@ -358,3 +369,143 @@ def detection_warnings(
             f" frames: a track is of one object, and one row is used; give rows of no track {NO_TRACK}, not 0 or a "
             f"place in a list"
         )
+
+
+class DetectionRowsAdapter(Adapter):
+    """Range, azimuth and identity of one detection a row; rows of one sonar frame share a stamp."""
+
+    PATHS = (
+        "range",
+        "azimuth",
+        "ids",
+        "probabilities",
+        "range_sigma",
+        "azimuth_sigma",
+        "track",
+    )
+
+    range: str
+    """Field with the slant range."""
+    range_scale: LengthScale = 1.0
+    """Turns it into metres; 0.001 or "mm" from millimetres."""
+    azimuth: str
+    """Field with the azimuth in the sonar's frame, positive to the left; with rotation = "frd" to the right."""
+    azimuth_scale: AngleScale = 1.0
+    """Turns it into rad; 0.017453292519943295 or "deg" from degrees."""
+    ids: tuple[str, ...] | None
+    """Fields with the identities that the recogniser considers: integers; empty, or -1: unknown; false: no field."""
+    probabilities: tuple[str, ...] = ()
+    """Fields with the posterior of each identity, at most 1 in sum; without it, or where empty, 1 for the first."""
+    range_sigma: str | None = None
+    """Field with the range's standard deviation, before its scale; without it the calibration's noise holds."""
+    azimuth_sigma: str | None = None
+    """The same of the azimuth."""
+    track: str | None = None
+    """Field with the number of the track; none, or -1: no track."""
+
+    @model_validator(mode="after")
+    def _has_pairs(self) -> Self:
+        if self.ids is not None and not self.ids:
+            raise ValueError("give ids = [...], at least one field, or ids = false")
+        if self.probabilities and len(self.probabilities) != len(self.ids or ()):
+            raise ValueError(
+                f"give as many probabilities as ids: {len(self.ids or ())}, not {len(self.probabilities)}"
+            )
+        if (self.range_sigma is None) != (self.azimuth_sigma is None):
+            raise ValueError("give range_sigma and azimuth_sigma, or neither")
+        if self.rotation not in ("flu", "frd"):
+            raise ValueError(
+                'give rotation = "flu" (azimuth to the left) or "frd" (to the right)'
+            )
+        return self
+
+    def read(
+        self,
+        table: FieldTable,
+        setup: Setup,  # noqa: ARG002  # of all adapters
+    ) -> Fit[LandmarkDetections]:
+        """Detections in the order of their stamps."""
+        range_m = table.column(self.range) * self.range_scale
+        to_the_left = -1.0 if self.rotation == "frd" else 1.0
+        azimuth_rad = table.column(self.azimuth) * self.azimuth_scale * to_the_left
+        ids = np.full((len(table), 1), -1)
+        if self.ids:
+            ids = np.column_stack([_whole(table, path) for path in self.ids])
+        if (ids >= FIRST_TOO_LARGE_ID).any():
+            fault = f"has an identity of 2^56 or more; {ID_ADVICE}"
+            table.refuse(", ".join(self.ids or ()), fault)
+        # without probabilities the recogniser is sure
+        probability = np.eye(1, ids.shape[1]).repeat(len(table), axis=0)
+        if self.probabilities:
+            given = table.beside(self.probabilities)
+            is_given = ~np.isnan(given).all(axis=1)
+            probability[is_given] = np.nan_to_num(given[is_given])
+        # an unknown landmark takes no share of the posterior
+        probability[ids < 0] = 0.0
+        covariance = np.full((len(table), 2, 2), np.nan)
+        if self.range_sigma is not None and self.azimuth_sigma is not None:
+            scales = [self.range_scale, self.azimuth_scale]
+            sigmas = table.beside((self.range_sigma, self.azimuth_sigma)) * scales
+            known = (sigmas > 0).all(axis=1)
+            covariance[known] = (sigmas[known] ** 2)[:, :, None] * np.eye(2)
+        track = np.full(len(table), NO_TRACK, np.int64)
+        if self.track is not None:
+            track = _whole(table, self.track)
+        faults = {
+            NOT_FINITE: not_finite(range_m, azimuth_rad),
+            NO_POSTERIOR: no_posterior(probability),
+        }
+        columns = (range_m, azimuth_rad, covariance, ids, probability, track)
+        return fit_block(
+            LandmarkDetections, table.stamps_ns, faults, *columns, unique=False
+        )
+
+
+class LandmarkRowsAdapter(Adapter):
+    """Identity and true position of one landmark a row; without stamps."""
+
+    PATHS = ("id", "position")
+
+    id: str
+    """Field with the identity, an integer."""
+    position: tuple[str, str, str]
+    """Fields of x, y, z in the world."""
+    scale: LengthScale = 1.0
+    """Turns them into metres; 0.001 or "mm" from millimetres."""
+    world: World = "enu"
+    """"enu" (any world with z up), or "ned"."""
+
+    def read(
+        self,
+        table: FieldTable,
+        setup: Setup,  # noqa: ARG002  # of all adapters
+    ) -> Fit[LandmarkMap]:
+        """Map of the rows, of which each has another identity."""
+        ids = _whole(table, self.id)
+        positions = table.beside(self.position) * self.scale
+        fit = np.flatnonzero((ids >= 0) & ~not_finite(positions))
+        left_out = len(ids) - len(fit)
+        dropped = {"without identity or position": left_out} if left_out else {}
+        names, counts = np.unique(ids[fit], return_counts=True)
+        if (counts > 1).any():
+            twice = names[counts > 1][0]
+            table.refuse(
+                self.id, f"has {twice} more than once; a landmark has one place"
+            )
+        if not len(fit):
+            return None, dropped
+        # maps are compared by identity
+        order = fit[np.argsort(ids[fit])]
+        in_enu_m = turned(ENU_R[self.world], positions[order])
+        unknown = np.full((len(order), 3, 3), np.nan)
+        return LandmarkMap(ids[order], in_enu_m, unknown), dropped
+
+
+def _whole(table: FieldTable, path: str) -> Ints:
+    """A column of integers; -1 where there is none."""
+    values = np.nan_to_num(table.column(path), nan=-1.0)
+    wrong = values[values != np.floor(values)]
+    if len(wrong):
+        fault = f"has {wrong[0]:g}, and identities and tracks are integers; {ID_ADVICE}"
+        table.refuse(path, fault)
+    return values.astype(np.int64)

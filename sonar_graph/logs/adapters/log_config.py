@@ -58,36 +58,30 @@ class LogConfig:
                     f"give it to `sonar-graph convert csv TABLES --config {source} -o OUT.mcap`; a log made by it "
                     f"needs a log configuration only for what is still to be changed"
                 )
+        config = cls(values, source)
+        # what a table means depends on the type, which only the log may have
         for role, table in values.items():
             if role not in ADAPTERS:
                 raise LogError(
                     f"{source}: there is no role [{role}]; tables are for {', '.join(ADAPTERS)}"
                 )
             if not isinstance(table, Mapping):
-                raise LogError(
-                    f"{source}: {role}: expected a table, [{role}], not {table!r}"
-                )
-        config = cls(values, source)
-        for role, table in values.items():
-            if "type" in table and not isinstance(table["type"], str):
-                example = SHIPPED[role][0].adapter.type
-                raise LogError(
-                    f"{source}: [{role}] type: expected a text such as {example!r}"
-                )
+                fault = f"expected a table, [{role}], not {table!r}"
+                raise LogError(f"{source}: {role}: {fault}")
+            shipped = [one.adapter.type for one in SHIPPED[role]]
             if "type" in table:
-                config.adapters(role, table["type"])
-                continue
-            faults = []  # without a type, the table must fit one of the shipped types
-            for type_name in dict.fromkeys(
-                shipped.adapter.type for shipped in SHIPPED[role]
-            ):
+                if not isinstance(table["type"], str):
+                    fault = f"expected a text such as {shipped[0]!r}"
+                    raise LogError(f"{source}: [{role}] type: {fault}")
+                shipped = [table["type"]]
+            # without a type, the table must fit one of the shipped types
+            faults = []
+            for type_name in shipped:
                 try:
                     config.adapters(role, type_name)
                 except LogError as error:
                     faults.append(error)
-                else:
-                    break
-            else:
+            if len(faults) == len(shipped):
                 raise faults[0]
         return config
 
@@ -114,24 +108,16 @@ class LogConfig:
         bases = shipped_for(role, type_name)
         if not bases and "type" in table:
             bases = [ADAPTERS[role].model_construct(type=type_name)]
-        found = []
-        for base in bases:
-            try:
-                found.append(base.changed({**table, "type": type_name}))
-            except ValidationError as error:
-                # a type that is not shipped needs all of its fields
-                is_incomplete = any(
-                    fault["type"] == "missing" for fault in error.errors()
-                )
-                why = (
-                    f"; no adapter is shipped for {type_name}, so its fields must be named"
-                    if is_incomplete
-                    else ""
-                )
-                raise LogError(
-                    f"{self.source}: [{role}] {faults_in(error, type(base))}{why}"
-                ) from error
-        return found
+        try:
+            return [base.changed({**table, "type": type_name}) for base in bases]
+        except ValidationError as error:
+            # a type that is not shipped needs all of its fields
+            is_incomplete = any(one["type"] == "missing" for one in error.errors())
+            why = ""
+            if is_incomplete:
+                why = f"; no adapter is shipped for {type_name}, so its fields must be named"
+            fault = faults_in(error, type(bases[0]))
+            raise LogError(f"{self.source}: [{role}] {fault}{why}") from error
 
     def require_fields(self, role: str, type_name: str, definition: Struct) -> None:
         """Refuse a table that names fields which the messages do not have; naming those that they have."""
@@ -141,20 +127,18 @@ class LogConfig:
             missing = adapter.missing_in(definition)
             faults = []
             for key, path in _field_names(self.table(role)):
+                is_absent = path in missing
                 if key == "stamp":
-                    is_absent = (
-                        path != LOG_TIME
-                        and not {field_of(path)[0], f"{path}.sec"} & known.keys()
-                    )
-                else:
-                    is_absent = path in missing or (
-                        key == "frame_id_field" and path not in known
-                    )
+                    names = {field_of(path)[0], f"{path}.sec"}
+                    is_absent = path != LOG_TIME and not names & known.keys()
+                elif key == "frame_id_field":
+                    is_absent = path not in known
                 if is_absent:
                     # a misspelt field is the usual fault
-                    names = ", ".join(name + size for name, size in known.items())
+                    meant = did_you_mean(path, known)
+                    has = ", ".join(name + size for name, size in known.items())
                     faults.append(
-                        f"{key}: {definition.name} has no field {path}; {did_you_mean(path, known)}it has: {names}"
+                        f"{key}: {definition.name} has no field {path}; {meant}it has: {has}"
                     )
             if not faults:
                 return
@@ -162,22 +146,19 @@ class LogConfig:
             raise LogError(f"{self.source}: [{role}] {'; '.join(faults)}")
 
 
-def _field_names(
-    table: Mapping[str, Any], prefix: str = ""
-) -> Iterator[tuple[str, str]]:
+def _field_names(values: object, key: str = "") -> Iterator[tuple[str, str]]:
     """Keys of a table with the texts in them that may be names of fields."""
-    for key, value in table.items():
-        if isinstance(value, str):
-            yield prefix + key, value
-        elif isinstance(value, Mapping):
-            yield from (
-                (f"{prefix}{key}", path) for path in value if key == "valid_where"
+    if isinstance(values, str):
+        yield key, values
+    elif isinstance(values, Mapping):
+        for name, value in values.items():
+            path = f"{key}.{name}" if key else name
+            yield from _field_names(
+                list(value) if name == "valid_where" else value, path
             )
-            yield from _field_names(value, f"{prefix}{key}.")
-        elif isinstance(value, list):
-            yield from (
-                (f"{prefix}{key}", item) for item in value if isinstance(item, str)
-            )
+    elif isinstance(values, list):
+        for value in values:
+            yield from _field_names(value, key)
 
 
 def shipped_for(role: str, type_name: str) -> list[Adapter]:
@@ -252,20 +233,13 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
 def changes_text(adapter: Adapter, shipped: Adapter | None) -> str:
     """Differences from the shipped adapter, or all settings where none is shipped; empty: nothing differs."""
     base = shipped or type(adapter).model_construct(type="")
-    said = {
-        name: getattr(adapter, name)
-        for name in type(adapter).model_fields
-        if name not in ("topic", "use")
-    }
-    changed = {
-        name: value
-        for name, value in said.items()
-        if value != getattr(base, name, None)
-    }
-    return ", ".join(
-        f"{name} = {'false' if value is None else toml_value(value)}"
-        for name, value in changed.items()
-    )
+    # the topic is in a note of its own
+    changed = {}
+    for name in type(adapter).model_fields:
+        value = getattr(adapter, name)
+        if name not in ("topic", "use") and value != getattr(base, name, None):
+            changed[name] = False if value is None else value
+    return ", ".join(plain_lines(changed))
 
 
 def plain_lines(table: Mapping[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
@@ -19,6 +20,8 @@ from sonar_graph.measurements import Floats, Ints
 SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """Type of a sample, as numpy names it, for each number in marine_acoustic_msgs/SonarImageData."""
 GAIN_BYTES = 4
+KINDS = ("sample_type", "sample_bytes", "big_endian", "row_gains", "row_bytes")
+"""Attributes with the fields that say what samples are, and how they lie."""
 Refused = Callable[[int, str], None]
 """Called with the stamp of a message and the reason why it is no image."""
 
@@ -54,19 +57,7 @@ def samples_of_rows(
 class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
-    PATHS = (
-        "data",
-        "ranges",
-        "range_resolution",
-        "bearings",
-        "sample_type",
-        "sample_bytes",
-        "big_endian",
-        "row_gains",
-        "row_bytes",
-        "directions",
-    )
-    reads_table = False
+    PATHS = ("data", "ranges", "range_resolution", "bearings", "directions", *KINDS)
     data: str
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"
@@ -111,17 +102,13 @@ class SonarAdapter(Adapter):
         A block ends where the next frame differs in these, or has an earlier stamp. A message that is no image is given
         to ``refused`` with its stamp and the reason, or else is an error.
         """
-        recorded_ns = topic.log_times_ns
+        recorded_ns = Counter(topic.log_times_ns.tolist())
         # from here on the topic knows its sound messages
         is_any_sound = bool(topic.messages())
         if refused is not None:
-            instants, counts = np.unique(recorded_ns, return_counts=True)
             # unsound messages are known by their times alone
-            sound_ns = np.sort(topic.log_times_ns)
-            sound = np.searchsorted(sound_ns, instants, "right") - np.searchsorted(
-                sound_ns, instants
-            )
-            for stamp_ns in np.repeat(instants, counts - sound).tolist():
+            unsound = recorded_ns - Counter(topic.log_times_ns.tolist())
+            for stamp_ns in sorted(unsound.elements()):
                 refused(stamp_ns, f"message {' or '.join(topic.unsound)}")
         if not is_any_sound:
             return
@@ -134,76 +121,54 @@ class SonarAdapter(Adapter):
         if not blocks:
             return
         rows = np.concatenate([images.rows for images in blocks])
-        block = np.repeat(
-            np.arange(len(blocks)), [len(images.rows) for images in blocks]
-        )
-        within = np.concatenate([np.arange(len(images.rows)) for images in blocks])
+        counts = [len(images.rows) for images in blocks]
+        block = np.repeat(np.arange(len(blocks)), counts)
+        within = np.concatenate([np.arange(count) for count in counts])
         order = np.argsort(rows)
-        rows = rows[order]
-        block = block[order]
-        within = within[order]
-        begins = (
-            np.flatnonzero((np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0))
-            + 1
-        )
-        for run in np.split(np.arange(len(rows)), begins):
+        is_other = np.diff(block[order]) != 0
+        is_earlier = np.diff(table.stamps_ns[rows[order]]) < 0
+        for run in np.split(order, np.flatnonzero(is_other | is_earlier) + 1):
             images = blocks[block[run[0]]]
             is_whole = len(run) == len(images.rows)  # then without a copy
             samples = images.samples if is_whole else images.samples[within[run]]
-            yield SonarFrames(
-                table.stamps_ns[rows[run]],
-                samples,
-                images.ranges_m,
-                images.azimuths_rad,
-            )
+            stamps_ns = table.stamps_ns[rows[run]]
+            yield SonarFrames(stamps_ns, samples, images.ranges_m, images.azimuths_rad)
 
     def _images(
         self, table: MessageTable, group: Messages, refused: Refused | None
     ) -> Iterator[_Images]:
         """Images of messages of one layout, apart where beams, bins or samples differ."""
         count = len(group)
-        flags = (
-            self.sample_type,
-            self.sample_bytes,
-            self.big_endian,
-            self.row_gains,
-            self.row_bytes,
-        )
-        kinds = np.column_stack(
-            [
-                np.full(count, -1) if f is None else group[f].astype(np.int64)
-                for f in flags
-            ]
-        )
-        bins_m = np.asarray(
-            group[str(self.ranges or self.range_resolution)], float
-        ).reshape(count, -1)
+        flags = [
+            np.full(count, -1) if path is None else group[path].astype(np.int64)
+            for path in (getattr(self, name) for name in KINDS)
+        ]
+        kinds = np.column_stack(flags)
+        bins = group[str(self.ranges or self.range_resolution)]
+        bins_m = np.asarray(bins, float).reshape(count, -1)
         if self.directions is not None:
             _, y, z = (group[path].astype(float) for path in self.directions)
             azimuths_rad = np.arctan2(-y, z)
         else:
             sign = 1 if self.bearing_positive == "left" else -1
-            azimuths_rad = sign * np.radians(
-                group[str(self.bearings)].astype(float) * self.bearing_unit_deg
-            )
+            bearings = group[str(self.bearings)].astype(float)
+            azimuths_rad = sign * np.radians(bearings * self.bearing_unit_deg)
         # a sonar changes range or gain between pings: each setting is a block
         same = np.column_stack([kinds, bins_m, azimuths_rad])
-        _, first, block = np.unique(
-            same, axis=0, return_index=True, return_inverse=True
-        )
+        settings = np.unique(same, axis=0, return_index=True, return_inverse=True)
+        _, first, block = settings
         for number, at in enumerate(first.tolist()):
             rows = np.flatnonzero(block.reshape(-1) == number)
+            data = group[self.data][rows]
             try:
-                samples = self._samples(
-                    group[self.data][rows], azimuths_rad.shape[1], kinds[at]
-                )
+                samples = self._samples(data, azimuths_rad.shape[1], kinds[at])
+                bins_seen = samples.shape[2]
+                ranges_m = bins_m[at]
                 if self.ranges is None:
-                    ranges_m = (np.arange(samples.shape[2]) + 0.5) * bins_m[at, 0]
-                else:
-                    ranges_m = bins_m[at]
-                    if len(ranges_m) != samples.shape[2]:
-                        fault = f"has {samples.shape[2]} bins a beam; {self.ranges} has {len(ranges_m)}"
-                        raise _NoImageError(self.data, fault)
+                    ranges_m = (np.arange(bins_seen) + 0.5) * ranges_m[0]
+                elif len(ranges_m) != bins_seen:
+                    fault = f"has {bins_seen} bins a beam; {self.ranges} has {len(ranges_m)}"
+                    raise _NoImageError(self.data, fault)
             except _NoImageError as error:
                 if refused is None:
                     table.refuse(*error.args)
@@ -217,42 +182,31 @@ class SonarAdapter(Adapter):
     ) -> NDArray[np.generic]:
         """Intensities, shape (n, beams, bins), from the bytes of n images."""
         sample_type, sample_bytes, big_endian, row_gains, row_bytes = kind.tolist()
+        name = f"u{sample_bytes if self.sample_bytes is not None else 1}"
         if self.sample_type is not None:
             if not 0 <= sample_type < len(SAMPLE_TYPES):
                 fault = f"is {sample_type}; kinds of samples are 0 to {len(SAMPLE_TYPES) - 1}"
                 raise _NoImageError(self.sample_type, fault)
             name = SAMPLE_TYPES[sample_type]
-        else:
-            name = f"u{sample_bytes if self.sample_bytes is not None else 1}"
-            if name not in ("u1", "u2", "u4"):
-                raise _NoImageError(
-                    str(self.sample_bytes),
-                    f"is {sample_bytes}; samples have 1, 2 or 4 bytes",
-                )
+        elif name not in ("u1", "u2", "u4"):
+            fault = f"is {sample_bytes}; samples have 1, 2 or 4 bytes"
+            raise _NoImageError(str(self.sample_bytes), fault)
         dtype = np.dtype((">" if big_endian > 0 else "<") + name)
         data_bytes: NDArray[np.uint8] = np.ascontiguousarray(data).view(np.uint8)
         size = data_bytes.shape[1]
+        is_by_range = self.image_order == "range-major"
         head = GAIN_BYTES if row_gains > 0 else 0
-        if self.image_order == "range-major":
-            used = head + beams * dtype.itemsize
-            # rows may be padded
-            row_bytes = row_bytes if row_bytes > 0 else used
-            row_count = size // max(row_bytes, 1)
-        else:
-            row_count = beams
-            row_bytes = used = row_bytes if row_bytes > 0 else size // max(beams, 1)
-        if (
-            beams == 0
-            or row_count == 0
-            or row_count * row_bytes != size
-            or used > row_bytes
-        ):
-            raise _NoImageError(
-                self.data,
-                f"has {size} bytes; that is no image of {beams} beams of {dtype} samples",
-            )
+        used = head + beams * dtype.itemsize if is_by_range else size // max(beams, 1)
+        if row_bytes <= 0:
+            row_bytes = used
+        elif not is_by_range:
+            used = row_bytes
+        # rows may be padded
+        row_count = size // max(row_bytes, 1) if is_by_range else beams
+        is_whole = row_count * row_bytes == size and used <= row_bytes
+        if not (beams and row_count and is_whole):
+            fault = f"has {size} bytes; that is no image of {beams} beams of {dtype} samples"
+            raise _NoImageError(self.data, fault)
         image = data_bytes.reshape(len(data), row_count, row_bytes)
-        values = samples_of_rows(image[:, :, :used], dtype, has_gains=row_gains > 0)
-        return (
-            values.transpose(0, 2, 1) if self.image_order == "range-major" else values
-        )
+        values = samples_of_rows(image[:, :, :used], dtype, has_gains=head > 0)
+        return values.transpose(0, 2, 1) if is_by_range else values

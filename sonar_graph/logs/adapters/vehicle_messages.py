@@ -3,7 +3,7 @@
 Height from a pressure p is ``z = -(p - atmosphere) / (density g)``.
 
 A pose covariance is of ``[theta, rho]`` in the body frame in this package, and in ``geometry_msgs/PoseWithCovariance``
-of translation, then rotation, along the fixed axes of the header's frame. With ``R = world_R_body``:
+of translation, then rotation, along the fixed axes of the header's frame. With ``R = world_R_body``, for what is written:
 
     [rho_world; theta_world] = [[0, R], [R, 0]] [theta; rho]
 """
@@ -11,8 +11,7 @@ of translation, then rotation, along the fixed axes of the header's frame. With 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -25,18 +24,18 @@ from sonar_graph.logs.adapters.adapter import (
     DepthScale,
     ForceScale,
     RateScale,
+    Setup,
     SignedAxes,
     axes_matrix,
     turn,
     variances,
 )
-from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, PlaceAdapter
-from sonar_graph.logs.adapters.geodesy import Origin
+from sonar_graph.logs.adapters.aiding_messages import ENU_R, PlaceAdapter, not_zero
 from sonar_graph.logs.adapters.message_table import (
-    LARGEST,
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
+    Mask,
     fit_block,
     fit_rows,
     not_finite,
@@ -51,15 +50,27 @@ LEAST_MOVE_M = 1.0
 """A vehicle that moved less may not have turned."""
 
 
+STATUSES = ("angular_velocity_status", "linear_acceleration_status")
+
+
+class _Signals(NamedTuple):
+    """Rates in rad/s and forces in m/s² along the driver's axes, a row each."""
+
+    rate: Floats
+    """Shape (n, 3)."""
+    force: Floats
+    """Shape (n, 3); NaN without accelerometers."""
+    no_rate: Mask
+    """Rows whose status calls the rate not measured, shape (n,)."""
+    no_force: Mask
+    denied: list[str]
+    """Statuses that do so in all rows, although the values change."""
+
+
 class ImuAdapter(Adapter):
     """Angular rate and specific force."""
 
-    PATHS = (
-        "angular_velocity",
-        "linear_acceleration",
-        "angular_velocity_status",
-        "linear_acceleration_status",
-    )
+    PATHS = ("angular_velocity", "linear_acceleration", *STATUSES)
 
     angular_velocity: Paths
     """Fields of the rates about x, y, z."""
@@ -80,22 +91,18 @@ class ImuAdapter(Adapter):
     unfilled: Literal["all", "each"] = "all"
     """"all": zeros are not measured where all messages have them; "each": wherever a message has them."""
 
-    def read(self, table: FieldTable) -> tuple[Imu | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Imu]:  # noqa: ARG002  # of all adapters
         """The rows with an angular rate; specific force is NaN where it was not measured."""
-        rate = table.beside(self.angular_velocity) * self.angular_velocity_scale
-        force = self._force(table)
-        # NaN is what estimators take as not measured
-        unmeasured = _is_marked(
-            table, self.linear_acceleration_status, force
-        ) | self._is_force_unfilled(table, force)
+        found = self._signals(table)
+        force = found.force
+        is_forceless = found.no_force | not_finite(force)
+        is_forceless |= self._is_force_unfilled(found)
         if self.unfilled == "each":
-            unmeasured |= ~force.any(axis=1)
-        force = np.where(
-            unmeasured[:, None] | ~(np.abs(force) < LARGEST), np.nan, force
-        )
-        is_unmeasured = _is_marked(table, self.angular_velocity_status, rate)
-        faults = {WITHOUT_RATE: is_unmeasured, NOT_FINITE: not_finite(rate)}
-        rate = turn(self.rotation, rate)
+            is_forceless |= ~force.any(axis=1)
+        # NaN is what estimators take as not measured
+        force[is_forceless] = np.nan
+        rate = turn(self.rotation, found.rate)
+        faults = {WITHOUT_RATE: found.no_rate, NOT_FINITE: not_finite(rate)}
         if self.angular_velocity_axes is not None:
             rate = turn(self.angular_velocity_axes, rate)
         force = turn(self.rotation, force)
@@ -103,87 +110,71 @@ class ImuAdapter(Adapter):
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warnings about values that the driver does not fill, or fills with what is no number."""
-        force = self._force(table)
-        if denied := self._denied(table, force):
-            fields = " and ".join(str(getattr(self, key)) for key in denied)
-            keys = ", ".join(f"{key} = false" for key in denied)
+        found = self._signals(table)
+        if found.denied:
+            fields = " and ".join(str(getattr(self, key)) for key in found.denied)
+            keys = ", ".join(f"{key} = false" for key in found.denied)
             yield (
                 f"{fields} are -1 (not measured) in every message, and yet the values change: used as measured; "
                 f"`{keys}` under [imu] in a log configuration confirms it"
             )
-        if self.linear_acceleration is None:
-            return
-        names = ", ".join(self.linear_acceleration)
-        bad = not_finite(force)
-        if self._is_force_unfilled(table, force):
+        names = ", ".join(self.linear_acceleration or ())
+        bad = not_finite(found.force)
+        if self._is_force_unfilled(found):
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
         elif bad.any() and not bad.all():
             yield f"{names} are not finite in {share(bad)} messages: taken as not measured there"
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None: there is none."""
-        return (
-            "angular_velocity_status = false"
-            if fault == WITHOUT_RATE
-            else super().accepts(fault)
-        )
+        if fault == WITHOUT_RATE:
+            return "angular_velocity_status = false"
+        return super().accepts(fault)
 
     def pinned(self, table: FieldTable) -> dict[str, Any]:
         """Settings by which single messages are read as all messages of a table are together."""
-        imu, _ = self.read(table)
+        imu, _ = self.read(table, Setup())
+        # what no message fills now may be filled later, message by message
         has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
-        settings: dict[str, Any] = (
-            {"are_zeros_measured": True} if has_force else {"unfilled": "each"}
-        )
-        force = self._force(table)
-        return settings | dict.fromkeys(self._denied(table, force), False)
+        settings: dict[str, Any] = {"unfilled": "each"}
+        if has_force:
+            settings = {"are_zeros_measured": True}
+        return settings | dict.fromkeys(self._signals(table).denied, False)
 
-    def _denied(self, table: FieldTable, force: Floats) -> list[str]:
-        """Keys of the statuses by which a driver calls all rows not measured, although the values change."""
-        rate = table.beside(self.angular_velocity)
-        found = []
-        for key, values in (
-            ("angular_velocity_status", rate),
-            ("linear_acceleration_status", force),
-        ):
-            status = getattr(self, key)
-            if status is not None and _is_denied(table.column(status), values):
-                found.append(key)
-        return found
+    def _signals(self, table: FieldTable) -> _Signals:
+        """What a driver sends, and what it calls not measured."""
+        rate = table.beside(self.angular_velocity) * self.angular_velocity_scale
+        force = np.full((len(table), 3), np.nan)
+        if self.linear_acceleration is not None:
+            sent = table.beside(self.linear_acceleration)
+            force = sent * self.linear_acceleration_scale
+        marks: list[Mask] = []
+        denied = []
+        for key, values in zip(STATUSES, (rate, force), strict=True):
+            path = getattr(self, key)
+            is_marked = np.zeros(len(table), bool)
+            if path is not None:
+                is_marked = table.column(path) == -1
+            # a driver that fills in -1 everywhere would lose its whole log
+            if is_marked.all() and _changes(values):
+                denied.append(key)
+                is_marked = ~is_marked
+            marks.append(is_marked)
+        no_rate, no_force = marks
+        return _Signals(rate, force, no_rate, no_force, denied)
 
-    def _force(self, table: FieldTable) -> Floats:
-        """Specific force in m/s², shape (n, 3); NaN without accelerometers."""
-        if self.linear_acceleration is None:
-            return np.full((len(table), 3), np.nan)
-        force = table.beside(self.linear_acceleration)
-        return np.asarray(force * self.linear_acceleration_scale)
-
-    def _is_force_unfilled(self, table: FieldTable, force: Floats) -> bool:
+    def _is_force_unfilled(self, found: _Signals) -> bool:
         """Tell whether the force is zero in all messages, which not even free fall gives."""
-        if self.are_zeros_measured:
-            return False
-        measured = force[~_is_marked(table, self.linear_acceleration_status, force)]
-        return bool(len(measured)) and not measured.any()
+        measured = found.force[~found.no_force]
+        is_zero = bool(len(measured)) and not measured.any()
+        return is_zero and not self.are_zeros_measured
 
 
-def _is_marked(table: FieldTable, path: str | None, values: Floats) -> np.ndarray:
-    """Mask of rows whose status says that the values, shape (n, 3), were not measured, shape (n,)."""
-    if path is None:
-        return np.zeros(len(table), bool)
-    status = table.column(path)
-    if _is_denied(status, values):
-        return np.zeros(len(table), bool)
-    return np.asarray(status == -1)
-
-
-def _is_denied(status: np.ndarray, values: Floats) -> bool:
-    """Tell whether a driver calls all rows not measured, although the values change as measured ones do."""
-    if not (status == -1).all():
-        return False
-    # a driver that fills in -1 everywhere would lose its whole log
+def _changes(values: Floats) -> bool:
+    """Tell whether values, shape (n, 3), change from row to row, as measured ones do."""
     finite = values[np.isfinite(values).all(axis=1)]
     return len(finite) > 1 and bool(
-        np.any(finite[1:] != finite[:-1], axis=1).mean() > 0.5
+        (finite[1:] != finite[:-1]).any(axis=1).mean() > 0.5
     )
 
 
@@ -191,7 +182,6 @@ class DepthAdapter(Adapter):
     """Height of the pressure port, from a pressure or from a field in metres."""
 
     PATHS = ("pressure", "height", "variance")
-    NEEDS = ("gravity_m_s2",)
 
     pressure: str | None = None
     """Field with a pressure."""
@@ -212,21 +202,21 @@ class DepthAdapter(Adapter):
             raise ValueError("give either pressure or height")
         return self
 
-    def read(
-        self, table: FieldTable, gravity_m_s2: float
-    ) -> tuple[Depth | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Depth]:
         """Heights with variances; NaN: unknown."""
-        variance_m2 = variances(self.variance, table) * self.scale**2
-        if self.pressure is not None:
-            pascals_per_metre = self.water_density_kg_m3 * gravity_m_s2
-            z_m = (
-                self.atmosphere_pa - table.column(self.pressure) * self.scale
-            ) / pascals_per_metre
-            variance_m2 = variance_m2 / pascals_per_metre**2
-        else:
-            z_m = table.column(str(self.height)) * self.scale
-        faults = {NOT_FINITE: not_finite(z_m)}
-        return fit_block(Depth, table.stamps_ns, faults, z_m, variance_m2)
+        scale = self.scale
+        above = table.column(str(self.height)) * scale if self.height else None
+        if above is None:
+            # a pressure grows downwards
+            pascals_per_metre = (
+                self.water_density_kg_m3 * setup.calibration.gravity_m_s2
+            )
+            pressure_pa = table.column(str(self.pressure)) * scale
+            above = (self.atmosphere_pa - pressure_pa) / pascals_per_metre
+            scale /= pascals_per_metre
+        variance_m2 = variances(self.variance, table) * scale**2
+        faults = {NOT_FINITE: not_finite(above)}
+        return fit_block(Depth, table.stamps_ns, faults, above, variance_m2)
 
     def assumption(self, gravity_m_s2: float) -> str | None:
         """Formula from pressure to height for the notes; None where the message gives a height."""
@@ -250,12 +240,12 @@ class DepthAdapter(Adapter):
 
 
 class TruthAdapter(PlaceAdapter):
-    """Poses of the body; a twist is not used.
+    """Poses of the body; twists and covariances are not used.
 
     From world and body axes of the driver (``w``, ``b``) to those of this package: ``R = enu_R_w w_R_b ours_R_b^T``.
     """
 
-    PATHS = ("position", "geodetic", "orientation", "rpy", "covariance")
+    PATHS = ("position", "geodetic", "orientation", "rpy")
 
     frame_id_field: str | None = None
     orientation: tuple[str, str, str, str] | None = None
@@ -264,10 +254,6 @@ class TruthAdapter(PlaceAdapter):
     """Fields of roll, pitch, yaw instead: world_R_body = Rz(yaw) Ry(pitch) Rx(roll), along the driver's axes."""
     rpy_scale: AngleScale = 1.0
     """Turns them into rad; 0.017453292519943295 or "deg" from degrees."""
-    covariance: str | None = None
-    """Array field of 36: position, then rotation, along the world's axes, as ROS has it."""
-    covariance_meaning: Literal["variance", "standard deviation"] = "variance"
-    """"variance", or "standard deviation" where the driver puts those on the diagonal."""
 
     @model_validator(mode="after")
     def _has_one_turn(self) -> TruthAdapter:
@@ -277,69 +263,47 @@ class TruthAdapter(PlaceAdapter):
             )
         return self
 
-    def read(
-        self, table: FieldTable, origin: Origin | None = None
-    ) -> tuple[Trajectory | None, Dropped]:
-        """Poses with covariances, NaN: unknown; ``origin`` in degrees and metres, of positions on the Earth."""
-        positions, faults, _ = self.places(table, origin)
-        if self.orientation is None and self.rpy is None:
-            rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-            if not rows.size:
-                return None, dropped
-            stamps_ns = table.stamps_ns[rows]
-            return Trajectory.of_positions(stamps_ns, positions[rows]), dropped
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Trajectory]:
+        """Poses; quaternions are NaN where only positions are known."""
+        positions, faults, _ = self.places(table, setup.origin)
         quaternions = self._quaternions(table)
-        lengths = np.linalg.norm(quaternions, axis=1)
-        faults[NOT_FINITE] = not_finite(positions, quaternions)
-        faults["without an orientation"] = lengths < 0.5
+        if quaternions is not None:
+            faults[NOT_FINITE] = not_finite(positions, quaternions)
+            faults["without an orientation"] = ~not_zero(quaternions)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         if not rows.size:
             return None, dropped
-        # unit quaternions keep every bit
+        stamps_ns = table.stamps_ns[rows]
+        if quaternions is None:
+            return Trajectory.of_positions(stamps_ns, positions[rows]), dropped
+        chosen = quaternions[rows]
+        lengths = np.linalg.norm(chosen, axis=1)
+        # of drivers that round to four digits; unit quaternions keep every bit
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
-        quaternions = (quaternions / scale[:, None])[rows]
-        enu_R_world = ENU_R_NED if self.world == "ned" else np.eye(3)
+        chosen = chosen / scale[:, None]
         if self.world != "enu" or self.rotation != "flu":
-            world_R_driver = SpatialRotation.from_quat(quaternions).as_matrix()
+            world_R_driver = SpatialRotation.from_quat(chosen).as_matrix()
             driver_R_body = axes_matrix(self.rotation).T
-            quaternions = SpatialRotation.from_matrix(
-                enu_R_world @ world_R_driver @ driver_R_body
-            ).as_quat()
-        truth = Trajectory.without_covariances(
-            table.stamps_ns[rows], positions[rows], quaternions
-        )
-        if self.covariance is None:
-            return truth, dropped
-        C = table.column(self.covariance)
-        if C.shape[1:] != (36,):
-            table.refuse(self.covariance, "is no array of 36 numbers")
-        C = C.reshape(-1, 6, 6)[rows]
-        if self.covariance_meaning == "standard deviation":
-            C = np.where(C < 0, C, C**2) * np.eye(6)
-        if self.world != "enu":
-            W = np.kron(np.eye(2), enu_R_world)
-            C = W @ C @ W.T
-        return replace(truth, covariances=ros_to_body(C, truth.matrices)), dropped
+            R = ENU_R[self.world] @ world_R_driver @ driver_R_body
+            chosen = SpatialRotation.from_matrix(R).as_quat()
+        poses = Trajectory.without_covariances(stamps_ns, positions[rows], chosen)
+        return poses, dropped
 
-    def _quaternions(self, table: FieldTable) -> np.ndarray:
-        """Orientations x, y, z, w, shape (n, 4); zeros where an angle is not finite."""
+    def _quaternions(self, table: FieldTable) -> Floats | None:
+        """Orientations x, y, z, w, shape (n, 4), zeros where an angle is not finite; None where none is stated."""
         if self.rpy is None:
-            return table.beside(self.orientation or ())
+            return table.beside(self.orientation) if self.orientation else None
         angles = table.beside(self.rpy) * self.rpy_scale
-        is_finite = np.asarray(np.isfinite(angles).all(axis=1))
-        found = SpatialRotation.from_euler(
-            "xyz", np.where(is_finite[:, None], angles, 0.0)
-        ).as_quat()
-        return np.where(is_finite[:, None], found, 0.0)
+        is_finite = np.all(np.isfinite(angles), axis=1)[:, None]
+        turns = SpatialRotation.from_euler("xyz", np.where(is_finite, angles, 0.0))
+        return np.where(is_finite, turns.as_quat(), 0.0)
 
     def warnings(self, table: FieldTable) -> Iterator[str]:
         """Warning about an orientation that never changes while the vehicle moves."""
-        has_turns = self.orientation is not None or self.rpy is not None
-        if not has_turns or self.position is None or len(table) < 2:
-            return
         quaternions = self._quaternions(table)
-        positions = self.scaled(table)
-        moved_m = float(np.linalg.norm(np.ptp(positions, axis=0)))
+        if quaternions is None or self.position is None or len(table) < 2:
+            return
+        moved_m = float(np.linalg.norm(np.ptp(self.scaled(table), axis=0)))
         is_turning = (quaternions != quaternions[0]).any()
         # False for a NaN
         if LEAST_MOVE_M < moved_m < np.inf and not is_turning:
@@ -354,24 +318,7 @@ def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
 
     From those of ``[theta, rho]`` in the body frame, shape (n, 6, 6), NaN: unknown, and ``world_R_body``, (n, 3, 3).
     """
-    swap = _swap(rotations)
-    return np.nan_to_num(swap @ covariances @ swap.transpose(0, 2, 1), nan=0.0)
-
-
-def ros_to_body(covariances: Floats, rotations: Floats) -> Floats:
-    """Inverse of `body_to_ros`; all zeros, or a negative variance, mean unknown and become NaN."""
-    swap = _swap(rotations).transpose(0, 2, 1)
-    # ROS has no other mark for unknown
-    known = np.any(covariances != 0, axis=(1, 2)) & (
-        np.diagonal(covariances, axis1=1, axis2=2) >= 0
-    ).all(axis=1)
-    return np.where(
-        known[:, None, None], swap @ covariances @ swap.transpose(0, 2, 1), np.nan
-    )
-
-
-def _swap(rotations: Floats) -> Floats:
     swap = np.zeros((len(rotations), 6, 6))
     swap[:, :3, 3:] = rotations
     swap[:, 3:, :3] = rotations
-    return swap
+    return np.nan_to_num(swap @ covariances @ swap.transpose(0, 2, 1), nan=0.0)

@@ -17,9 +17,8 @@ Other messages are left out and counted by their fault.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from collections.abc import Callable, Iterator
+from functools import cached_property, lru_cache
 from struct import Struct as Packing
 from typing import Any, NamedTuple
 
@@ -67,6 +66,8 @@ class PayloadWalk:
 class DecodingStep(ABC):
     """Part of a message type."""
 
+    is_text = False
+
     def __init__(self, index: int, path: str) -> None:
         self.index = index
         self.path = path
@@ -76,14 +77,13 @@ class DecodingStep(ABC):
         """Note the place of the part at byte ``at``; returns the byte after it."""
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """Field with a fixed number of values within a block."""
 
     path: str
     kind: str
     """Type in numpy, without the byte order."""
-    count: int
+    number: int
     is_single: bool
     """True without an array or sequence on the path: one value a message."""
 
@@ -95,15 +95,16 @@ class FieldBlock(DecodingStep):
         super().__init__(index, values[0].path)
         self.offsets = {value.path: [0] * _PHASES for value in values}
         """Offsets from the start of the block, by that start modulo 8."""
-        self.counts = {value.path: value.count for value in values}
+        self.counts = {value.path: value.number for value in values}
         self._sizes = [0] * _PHASES
+        # alignment depends on where the block begins, so that there are eight sets of offsets
         for phase in range(_PHASES):
             start = at = _PHASES + phase
             for value in values:
                 size = np.dtype(value.kind).itemsize
                 at += padding(at, size)
                 self.offsets[value.path][phase] = at - start
-                at += size * value.count
+                at += size * value.number
             self._sizes[phase] = at - start
 
     def take(self, at: int, walk: PayloadWalk) -> int:
@@ -112,30 +113,22 @@ class FieldBlock(DecodingStep):
         return at + self._sizes[at % _PHASES]
 
 
-class Numbers(DecodingStep):
-    """Sequence of numbers."""
+class Counted(DecodingStep):
+    """Values whose count is in the payload: a string, or a sequence of numbers."""
 
-    def __init__(self, index: int, path: str, kind: str) -> None:
+    def __init__(self, index: int, path: str, kind: str, *, is_text: bool) -> None:
         super().__init__(index, path)
+        self.is_text = is_text
         self._size = np.dtype(kind).itemsize
 
     def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note the place of the first number and their count."""
+        """Note the place of the first value and their count; the NUL that closes a string is one."""
         at, count = walk.length(self, at)
+        # numbers are aligned where there is one
         if count:
             at += padding(at, self._size)
         walk.found[self.index] += (at, count)
         return at + count * self._size
-
-
-class Text(DecodingStep):
-    """String."""
-
-    def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note the place of the characters and their count, with the closing NUL."""
-        at, count = walk.length(self, at)
-        walk.found[self.index] += (at, count)
-        return at + count
 
 
 class Repeated(DecodingStep):
@@ -150,6 +143,7 @@ class Repeated(DecodingStep):
 
     def take(self, at: int, walk: PayloadWalk) -> int:
         """Note the start and count of the elements, and walk through them."""
+        # a fixed array has no length word
         at, count = walk.length(self, at) if self._count is None else (at, self._count)
         walk.found[self.index] += (at, count)
         if walk.most_elements is not None and count > walk.most_elements:
@@ -165,15 +159,10 @@ class Leaf(NamedTuple):
     """Field that holds values."""
 
     step: DecodingStep
-    dtypes: Mapping[str, np.dtype[Any]]
-    """Type of one value by byte order; for a string, one byte."""
+    kind: str
+    """Type of one value in numpy, without the byte order; of a string, one byte."""
     is_single: bool
     """True without an array or sequence on the path: one value a message."""
-
-
-@cache
-def _dtypes(kind: str) -> Mapping[str, np.dtype[Any]]:
-    return {order: np.dtype(order + kind) for order in "<>"}
 
 
 class Plan:
@@ -187,12 +176,8 @@ class Plan:
         """Arrays and sequences by path, without arrays of numbers."""
         self._parts = 0
         self._steps = self._compile(definition, "", is_single=True)
-        self.texts = [
-            path for path, leaf in self.leaves.items() if isinstance(leaf.step, Text)
-        ]
-        self.booleans = [
-            path for path, leaf in self.leaves.items() if leaf.dtypes["<"] == np.bool_
-        ]
+        self.texts = [path for path, leaf in self.leaves.items() if leaf.step.is_text]
+        self.booleans = [path for path, leaf in self.leaves.items() if leaf.kind == "?"]
 
     def walk(
         self,
@@ -230,6 +215,7 @@ class Plan:
         for entry in definition.fields:
             path = prefix + entry.name
             single = is_single and not entry.is_array
+            # a nested type is part of the block: CDR has no mark where it begins
             if isinstance(entry.kind, Struct) and not entry.is_array:
                 self._add(entry.kind, path + ".", single, steps, values)
             elif (
@@ -245,20 +231,17 @@ class Plan:
     def _step(self, entry: Field, path: str, is_single: bool) -> DecodingStep:
         if isinstance(entry.kind, Struct):
             inner = self._compile(entry.kind, path + ".", is_single=False)
-        elif entry.kind == STRING:
-            text = Text(self._next(), path)
-            self.leaves[path] = Leaf(text, _dtypes("u1"), is_single)
-            if not entry.is_array:
-                return text
-            inner = [text]
         else:
-            kind = PRIMITIVES[entry.kind]
-            self.sequences[path] = numbers = Numbers(self._next(), path, kind)
-            self.leaves[path] = Leaf(numbers, _dtypes(kind), is_single)
-            return numbers
-        self.sequences[path] = repeated = Repeated(
-            self._next(), path, entry.length, inner
-        )
+            is_text = entry.kind == STRING
+            kind = PRIMITIVES.get(entry.kind, "u1")
+            counted = Counted(self._next(), path, kind, is_text=is_text)
+            self.leaves[path] = Leaf(counted, kind, is_single)
+            # strings in an array or sequence have a length word each
+            if not is_text or not entry.is_array:
+                return counted
+            inner = [counted]
+        repeated = Repeated(self._next(), path, entry.length, inner)
+        self.sequences[path] = repeated
         return repeated
 
     def _close(self, steps: list[DecodingStep], values: list[Value]) -> None:
@@ -266,13 +249,10 @@ class Plan:
         if values:
             block = FieldBlock(self._next(), values)
             steps.append(block)
-            for value in values:
-                if value.path and not value.path.endswith(
-                    "."
-                ):  # else it is the byte of a type without fields
-                    self.leaves[value.path] = Leaf(
-                        block, _dtypes(value.kind), value.is_single
-                    )
+            for path, kind, _, is_single in values:
+                # a type without fields has a byte that is no field
+                if path and not path.endswith("."):
+                    self.leaves[path] = Leaf(block, kind, is_single)
             values.clear()
 
     def _next(self) -> int:
@@ -325,51 +305,37 @@ class Layout:
         return place
 
     def _place(self, path: str) -> PayloadColumn:
-        step, dtypes, is_single = self.columns[path]
+        step, kind, is_single = self.columns[path]
+        dtype = np.dtype(self.byte_order + kind)
         found = self._found[step.index]
-        if isinstance(step, FieldBlock):
-            offsets = step.offsets[path]
-            starts = [start + offsets[start % len(offsets)] for start in found]
-            return PayloadColumn(
-                dtypes[self.byte_order],
-                is_single,
-                starts,
-                [step.counts[path]] * len(found),
-            )
-        return PayloadColumn(
-            dtypes[self.byte_order], is_single, found[::2], found[1::2]
-        )
+        if not isinstance(step, FieldBlock):
+            return PayloadColumn(dtype, is_single, found[::2], found[1::2])
+        offsets = step.offsets[path]
+        starts = [start + offsets[start % _PHASES] for start in found]
+        counts = [step.counts[path]] * len(found)
+        return PayloadColumn(dtype, is_single, starts, counts)
 
     def lengths(self, path: str) -> list[int]:
         """Number of elements of an array or sequence, one each time it occurs."""
-        sequence = self.plan.sequences.get(path)
-        return (
-            self.column(path).counts
-            if sequence is None
-            else self._found[sequence.index][1::2]
-        )
+        if path not in self.plan.sequences:
+            return self.column(path).counts
+        return self._found[self.plan.sequences[path].index][1::2]
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
         places, expected = self._distinction
-        some = (
-            payloads[:, places]
-            if len(rows) == len(payloads)
-            else payloads[np.ix_(rows, places)]
-        )
+        every = len(rows) == len(payloads)
+        some = payloads[:, places] if every else payloads[np.ix_(rows, places)]
         return np.asarray((some == expected).all(axis=1))
 
     @cached_property
     def _distinction(self) -> tuple[Ints, Bytes]:
         """Places and values of the bytes of the encapsulation and of all length words."""
         words = np.array(self.words, np.int64).reshape(-1, 2)
-        places = np.concatenate(
-            [[0, 1], (words[:, :1] + np.arange(LENGTH_BYTES)).reshape(-1)]
-        )
+        at = words[:, :1] + np.arange(LENGTH_BYTES)
         lengths = words[:, 1].astype(f"{self.byte_order}u{LENGTH_BYTES}").view(np.uint8)
-        return places, np.concatenate(
-            [np.frombuffer(ENCAPSULATIONS[self.byte_order], np.uint8), lengths]
-        )
+        start = np.frombuffer(ENCAPSULATIONS[self.byte_order], np.uint8)
+        return np.append([0, 1], at), np.append(start, lengths)
 
 
 MOST_PADDING = 3
@@ -410,6 +376,7 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
     walk = plan.walk(read_length, most_elements=size)
     if walk.end > size:
         raise UnsoundMessageError("that end before their definition does")
+    # a definition that is too short would read as sound
     if walk.end < size - MOST_PADDING:
         raise UnsoundMessageError("that are longer than their definition says")
     return Layout(plan, order, walk)
@@ -425,29 +392,17 @@ def unsound_contents(
             has_it = np.asarray((payloads[:, start : start + count] > 1).any(axis=1))
             if has_it.any():
                 yield f"with a boolean {path} that is neither 0 nor 1", has_it
-    many = len(payloads) > 1
-    first = payloads[0].data
     for path in layout.plan.texts:
         column = layout.column(path)
         for start, length in zip(column.starts, column.counts, strict=True):
-            end = start + length
-            characters = (
-                payloads[:, start:end].tobytes() if many else bytes(first[start:end])
-            )
-            if length and (
-                any(characters[length - 1 :: length]) or not characters.isascii()
-            ):
-                has_it = np.array(
-                    [
-                        not _is_text(characters[i : i + length])
-                        for i in range(0, len(characters), length)
-                    ]
-                )
+            # bytes as one object: numpy would take longer for single messages
+            text = payloads[:, start : start + length].tobytes()
+            if length and (any(text[length - 1 :: length]) or not text.isascii()):
+                texts = [text[i : i + length] for i in range(0, len(text), length)]
+                has_it = np.array([not _is_text(one) for one in texts])
                 if has_it.any():
-                    yield (
-                        f"with a string {path} that is not UTF-8 closed by a NUL",
-                        has_it,
-                    )
+                    fault = f"with a string {path} that is not UTF-8 closed by a NUL"
+                    yield fault, has_it
 
 
 def _is_text(characters: bytes) -> bool:

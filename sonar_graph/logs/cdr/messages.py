@@ -8,6 +8,7 @@ finds the place of each column.
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,6 @@ from sonar_graph.logs.cdr.layout import (
     DecodingStep,
     Layout,
     PayloadColumn,
-    Text,
     UnsoundMessageError,
     layout_of,
     plan_of,
@@ -54,6 +54,7 @@ class Messages:
     def __getitem__(self, path: str) -> NDArray[Any]:
         """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays; a KeyError where none is."""
         column = self.layout.column(path)
+        # a copy only where the values do not lie evenly
         values = _view(self.payloads, column)
         if values is None:
             values = np.ascontiguousarray(self.payloads[:, _places(column)]).view(
@@ -72,25 +73,18 @@ class Messages:
             (start, start + count - 1)
             for start, count in zip(column.starts, column.counts, strict=True)
         ]
-        contents = (payload.tobytes() for payload in self.payloads)
+        # an empty string may lack its NUL
         return [
-            [
-                str(content[start:end], "utf-8") if end > start else ""
-                for start, end in runs
-            ]
-            for content in contents
+            [str(content[a:b], "utf-8") if b > a else "" for a, b in runs]
+            for content in (payload.tobytes() for payload in self.payloads)
         ]
 
     def first_string(self, path: str) -> str:
         """A string field's value in the first message; empty where there is none."""
         if path not in self.layout.columns:
             return ""
-        return next(
-            iter(
-                Messages(self.rows[:1], self.payloads[:1], self.layout).strings(path)[0]
-            ),
-            "",
-        )
+        first = Messages(self.rows[:1], self.payloads[:1], self.layout)
+        return next(iter(first.strings(path)[0]), "")
 
 
 class Decoded(NamedTuple):
@@ -120,6 +114,7 @@ class Decoder:
 
     def decode(self, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
         """Messages grouped by layout, as by the function `decode`."""
+        # the decoder is shared by all pieces of a topic
         self._unsound.clear()
         groups = []
         for rows, stack in payloads:
@@ -127,22 +122,18 @@ class Decoder:
                 first = int(members[0])
                 last = int(members[-1])
                 # a view where they lie side by side
-                found = (
-                    stack[first : last + 1]
-                    if last - first + 1 == len(members)
-                    else stack[members]
-                )
+                is_run = last - first + 1 == len(members)
+                found = stack[first : last + 1] if is_run else stack[members]
                 is_sound = np.ones(len(members), bool)
                 for fault, has_it in unsound_contents(layout, found):
                     if (has_it & is_sound).any():
                         self._unsound[fault].append(rows[members[has_it & is_sound]])
                     is_sound &= ~has_it
-                if is_sound.all():
+                if not is_sound.all():
+                    members = members[is_sound]
+                    found = found[is_sound]
+                if len(members):
                     groups.append(Messages(rows[members], found, layout))
-                elif is_sound.any():
-                    groups.append(
-                        Messages(rows[members[is_sound]], found[is_sound], layout)
-                    )
         return Decoded(
             groups,
             {fault: np.concatenate(parts) for fault, parts in self._unsound.items()},
@@ -216,19 +207,19 @@ def encode(
     ValueError
         For a field that the type does not have, and a number that does not fit into its field.
     """
+    # a misspelt field would be written as zeros
     plan = plan_of(definition)
     unknown = values.keys() - plan.leaves.keys()
     if unknown:
         raise ValueError(f"{definition.name} has no field {', '.join(sorted(unknown))}")
-    layout = Layout(plan, "<", plan.walk(_given_lengths(values, lengths or {})))
+    order = "<"
+    length_of = _given_lengths(values, lengths or {})
+    layout = Layout(plan, order, plan.walk(length_of))
     payloads = np.zeros((n, layout.size), np.uint8)
-    payloads[:, : len(ENCAPSULATIONS["<"])] = np.frombuffer(
-        ENCAPSULATIONS["<"], np.uint8
-    )
+    payloads[:, :2] = np.frombuffer(ENCAPSULATIONS[order], np.uint8)
     for at, length in layout.words:
-        payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(
-            length.to_bytes(LENGTH_BYTES, "little"), np.uint8
-        )
+        word = length.to_bytes(LENGTH_BYTES, "little")
+        payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(word, np.uint8)
     for path, value in values.items():
         column = layout.column(path)
         if isinstance(value, str | list):
@@ -242,11 +233,8 @@ def encode(
             numbers = given.astype(column.dtype)
         if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
             raise ValueError(f"{path}: a number does not fit into {column.dtype}")
-        numbers = (
-            numbers.reshape(-1, 1)
-            if numbers.ndim == 1 and column.is_single
-            else numbers
-        )
+        if numbers.ndim == 1 and column.is_single:
+            numbers = numbers.reshape(-1, 1)
         numbers = np.broadcast_to(numbers, (n, sum(column.counts)))
         view = _view(payloads, column)
         if view is None:
@@ -260,32 +248,23 @@ def _given_lengths(
     values: Mapping[str, Value], lengths: Lengths
 ) -> Callable[[DecodingStep, int], int]:
     """Length of each string and sequence in turn, from the values and lengths to be written."""
-    texts = {
-        path: iter(value) for path, value in values.items() if isinstance(value, list)
-    }
-    each = {
-        path: iter(length)
-        for path, length in lengths.items()
-        if not isinstance(length, int)
-    }
+    texts: dict[str, Iterator[int]] = {}
+    each: dict[str, Iterator[int]] = {}
+    for path, value in values.items():
+        if isinstance(value, str):
+            texts[path] = repeat(len(value.encode()) + 1)
+        elif isinstance(value, list):
+            # the number of strings, where it is not given, and each with its closing NUL
+            each[path] = repeat(len(value))
+            texts[path] = (len(str(text).encode()) + 1 for text in value)
+        elif isinstance(value, np.ndarray) and value.ndim > 1:
+            each[path] = repeat(value.shape[1])
+    for path, given in lengths.items():
+        each[path] = repeat(given) if isinstance(given, int) else iter(given)
 
     def length_of(step: DecodingStep, _: int) -> int:
-        value = values.get(step.path)
-        if isinstance(step, Text):
-            text = next(texts[step.path]) if step.path in texts else value or ""
-            return len(str(text).encode()) + 1
-        if step.path in each:
-            return next(each[step.path])
-        given = lengths.get(step.path)
-        if isinstance(given, int):
-            return given
-        return (
-            value.shape[1]
-            if isinstance(value, np.ndarray)
-            else len(value)
-            if isinstance(value, list)
-            else 0
-        )
+        found = (texts if step.is_text else each).get(step.path)
+        return next(found) if found else int(step.is_text)
 
     return length_of
 

@@ -21,7 +21,7 @@ from sonar_graph.calibration import (
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.adapters import ENU_R_NED, east_north_up
 from sonar_graph.logs.convert.text_tables import numbered_run, read_table
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, Ints
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
@@ -132,19 +132,19 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     DatasetError
         When the folder or the trajectory does not exist, or a file is missing or malformed.
     """
-    folder = numbered_run(dataset_dir, "TrajectoryN", trajectory, "trajectory", FILES)
+    folder = numbered_run(dataset_dir, "TrajectoryN", trajectory, FILES)
 
-    def rows_of(
-        kind: str, columns: tuple[str, ...], period_ns: int
-    ) -> tuple[Ints, Floats]:
-        """Stamps and rows of a file; its own times are rounded, so that rows count by their number."""
+    # the times in the files are rounded: rows count by their number
+    def rows_of(kind: str, columns: tuple[str, ...]) -> Floats:
         path = folder / f"{kind}_trajectory{trajectory}.csv"
-        rows = read_table(path, columns, delimiter=",", header_lines=1).values
-        return np.arange(len(rows), dtype=np.int64) * period_ns, rows
+        return read_table(path, columns, delimiter=",").values
 
-    imu_ns, imu_rows = rows_of("IMU", IMU_COLUMNS, IMU_PERIOD_NS)
-    dvl_ns, dvl_rows = rows_of("DVL", DVL_COLUMNS, DVL_PERIOD_NS)
-    reference_ns, reference_rows = rows_of("GT", REFERENCE_COLUMNS, DVL_PERIOD_NS)
+    imu_rows = rows_of("IMU", IMU_COLUMNS)
+    dvl_rows = rows_of("DVL", DVL_COLUMNS)
+    reference_rows = rows_of("GT", REFERENCE_COLUMNS)
+    imu_ns = np.arange(len(imu_rows), dtype=np.int64) * IMU_PERIOD_NS
+    dvl_ns = np.arange(len(dvl_rows), dtype=np.int64) * DVL_PERIOD_NS
+    reference_ns = np.arange(len(reference_rows), dtype=np.int64) * DVL_PERIOD_NS
     to_flu = FLU_OF_FRD * IMU_FRD_SIGNS
     imu = Imu(imu_ns, imu_rows[:, 4:7] * to_flu, imu_rows[:, 1:4] * to_flu)
     velocity = dvl_rows[:, 1:] * FLU_OF_FRD

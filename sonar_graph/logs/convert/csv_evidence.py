@@ -1,12 +1,13 @@
 """What the values in text tables prove: the units of times, and which mark a valid row has."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.logs.adapters import LAST_S, TIMES
+from sonar_graph.logs.convert.csv_table import CsvFile
 from sonar_graph.measurements import Floats
 
 UNITS = ("s", "ms", "us", "ns")
@@ -16,8 +17,8 @@ FEWEST_ROWS = 10
 """Rows from which a rate, and a column that never changes, are known."""
 _SIMILAR = 30.0
 """Ratio of two spans up to which tables are of one dive; units differ by a factor of 1000, more than its square."""
-VALIDITY = r"valid|lock|flag|status|good"
-"""Names of columns that may mark valid rows."""
+VALIDITY = ("valid", "lock", "flag", "status", "good")
+"""Words in the names of columns that may mark valid rows, the likeliest first."""
 _DATES_S = (6.3e8, 4.1e9)
 """Seconds since 1970 of the years 1990 and 2100."""
 
@@ -115,6 +116,22 @@ def _of_one_dive(
         # a logger of depths may run all day, a sonar for a minute; a Doppler log runs as long as the IMU
         chosen &= as_long
     return [unit for unit in units if unit in chosen]
+
+
+def marked_valid(
+    file: CsvFile, names: Iterable[str], velocity: Floats
+) -> Iterator[tuple[str, int, Floats]]:
+    """Columns, among some, that mark valid rows, with the mark and the values; the likeliest name first.
+
+    ``velocity`` are the velocities of all rows, shape (n, 3).
+    """
+    likely = [n for word in VALIDITY for n in names if word in n.lower()]
+    # a name may hold two of the words
+    for name in dict.fromkeys(likely):
+        (marks,) = file.numbers(name)
+        mark = valid_mark(name, marks, velocity)
+        if mark is not None:
+            yield name, mark, marks
 
 
 def valid_mark(name: str, marks: Floats, velocity: Floats) -> int | None:

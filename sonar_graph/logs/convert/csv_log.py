@@ -14,7 +14,6 @@ of fields, and with the keys of `CsvForm`. What stands before the first table ho
     rotation = "frd"
 """
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +37,7 @@ from sonar_graph.logs.adapters import (
     read_toml,
 )
 from sonar_graph.logs.checks import stamp_faults
-from sonar_graph.logs.convert.csv_evidence import VALIDITY, time_units, valid_mark
+from sonar_graph.logs.convert.csv_evidence import marked_valid, time_units
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
 from sonar_graph.logs.reading import common_origin, require_use, rows_of
 from sonar_graph.measurements import Floats
@@ -71,8 +70,6 @@ class CsvRole:
     role: str
     form: CsvForm
     adapter: Adapter
-    keys: dict[str, str]
-    """Key of the configuration by column."""
 
 
 def read_csv_config(path: Path) -> dict[str, CsvRole]:
@@ -93,11 +90,9 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
         elif key in SHARED:
             shared[key] = value
         else:
-            place = "it belongs into the table of a role"
-            if key in CSV_ADAPTERS:
-                place = f"expected a table, [{key}]"
             raise LogError(
-                f"{source}: {key}: stands before the first table and so for all of them; {place}"
+                f"{source}: {key}: stands before the first table and so for all of them; a role is a table such as "
+                "[imu], and other keys belong into one"
             )
     for role in tables:
         if role not in CSV_ADAPTERS:
@@ -127,11 +122,13 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
         # the form of the file, a setting of the adapter, or false: the vehicle does not have it
         if key in CsvForm.model_fields:
             form[key] = value
-        elif value is not False or isinstance(getattr(defaults, key, None), bool):
+        # an unknown key is kept for the error that names it
+        elif (
+            value is not False
+            or field is None
+            or isinstance(getattr(defaults, key, None), bool)
+        ):
             stated[key] = _as_names(kind, key, value)
-        elif field is None:
-            # kept for the error that names the unknown key
-            stated[key] = value
         elif field.is_required():
             # a sensor without it, such as an IMU without accelerometers
             stated[key] = None
@@ -141,11 +138,7 @@ def _role(role: str, table: dict[str, Any], source: str) -> CsvRole:
         )
     place = f"{source}: [{role}]"
     adapter = _checked(kind, {"type": "csv", "stamp": STAMP} | stated, place)
-    # errors about a column name the key under which it stands
-    columns = list(adapter.fields())
-    paths = dict(_paths(stated))
-    keys = {column: paths.get(column, column) for column in columns}
-    return CsvRole(role, _checked(CsvForm, form, place), adapter, keys)
+    return CsvRole(role, _checked(CsvForm, form, place), adapter)
 
 
 def _checked(model: type[BaseModel], values: dict[str, Any], place: str) -> Any:
@@ -164,16 +157,6 @@ def _as_names(kind: type[Adapter], key: str, value: Any) -> Any:
     if isinstance(value, list):
         return [_as_names(kind, key, item) for item in value]
     return str(value) if type(value) is int else value
-
-
-def _paths(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Each text in a configuration, with the key under which it stands."""
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from ((path, prefix + key) for path in value)
-            yield from _paths(value, f"{prefix}{key}.")
-        for item in value if isinstance(value, list) else [value]:
-            yield str(item), prefix + key
 
 
 def read_csv(
@@ -270,7 +253,10 @@ def _measurements(
         if role == "dvl":
             warnings += _unused_validity(roles[role], table)
         doubts += [f"{role}: {text}" for text in warnings]
-        settings = "; ".join(_settings(roles[role]))
+        stated = adapter.model_dump(
+            include=adapter.model_fields_set - {"type"}, exclude_none=True
+        )
+        settings = "; ".join(plain_lines(stated))
         notes[f"csv.{role}"] = f"{table.file.path.name}: {settings}"
     notes |= {"csv.left_out": "; ".join(left_out)} if left_out else {}
     notes |= {"csv.warnings": "; ".join(doubts)} if doubts else {}
@@ -318,27 +304,15 @@ def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
     if not isinstance(dvl.adapter, DvlAdapter) or dvl.adapter.velocity is None:
         return
     velocity = table.beside(dvl.adapter.velocity)
-    for name in table.file.layout.names:
-        if name in dvl.keys or not re.search(VALIDITY, name.lower()):
-            continue
-        (marks,) = table.file.numbers(name)
-        mark = valid_mark(name, marks, velocity)
+    used = set(dvl.adapter.fields())
+    unused = [name for name in table.file.names if name not in used]
+    for name, mark, marks in marked_valid(table.file, unused, velocity):
         invalid = int(np.count_nonzero(marks != mark))
-        if mark is not None and invalid:
+        if invalid:
             yield (
                 f"column {name} is {1 - mark} in {invalid} of {len(marks)} rows and not used: "
                 f"`valid_where = {{{toml_key(name)} = {mark}}}` under [dvl] leaves them out"
             )
-
-
-def _settings(one: CsvRole) -> list[str]:
-    """Settings of a role other than the defaults, for the notes."""
-    model = type(one.adapter)
-    base = model.model_construct(type="csv", stamp=STAMP)
-    values = {key: getattr(one.adapter, key) for key in model.model_fields}
-    return plain_lines(
-        {k: value for k, value in values.items() if value != getattr(base, k, None)}
-    )
 
 
 def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
@@ -352,21 +326,18 @@ def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
             )
         (wanted,) = files
     if wanted not in files:
-        # a file that only the command forgot
+        # a file that only the command forgot, or a slip
         beside = [path.parent / wanted for path in files.values()]
         add = next((path for path in beside if path.is_file()), wanted)
-        hint = f"add {add} to the command;"
-        for name in files:
-            if name.lower() == wanted.lower():
-                hint = f"did you mean {name!r}?"
         raise LogError(
-            f"{place} {wanted} is not among the tables; {hint} given: {', '.join(files)}"
+            f"{place} {wanted} is not among the tables; add {add} to the command, or put the name right; "
+            f"given: {', '.join(files)}"
         )
     adapter = one.adapter
     return CsvTable(
         CsvFile(files[wanted], one.form),
         one.role,
-        one.keys,
+        one.adapter.fields(),
         adapter.stamp if one.role != "true_landmarks" else None,
         adapter.stamp_unit_s,
         adapter.stamp_offset_s,

@@ -6,10 +6,11 @@ line with a number: its own lines, or else the last comment, where that names as
 
 import csv
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from datetime import UTC, date, datetime, timedelta
 from decimal import Decimal, InvalidOperation
+from functools import lru_cache
 from pathlib import Path
 from typing import NoReturn
 
@@ -31,8 +32,9 @@ _WORDS = {
 }
 """Numbers of the cells that are words, in small letters."""
 _MOST_NAMED = 40
-_DATE_FORMS = ("%Y/%m/%d", "%d.%m.%Y", "%d-%b-%Y")
-"""Dates besides ISO 8601 whose day cannot be taken for the month: of loggers, of Excel in German, of MATLAB."""
+_DATE = re.compile(r"(\d+[-./]\w+[-./]\d+)[T ]+(\d\d:\d\d:\d\d)([.,]\d+)?\s*(\D.*)?")
+_DATE_FORMS = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%d-%b-%Y")
+"""Dates, of ISO 8601 and others whose day cannot be taken for the month: of loggers, of Excel in German, of MATLAB."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -60,36 +62,29 @@ class CsvForm(Section):
         return is_number(cell.replace(self.decimal, ".")) or is_date(cell)
 
 
-@dataclass(frozen=True)
-class CsvLayout:
-    """Delimiter and columns of a text file, from its first lines."""
-
-    delimiter: str
-    first_line: int
-    """Number of the first line with values."""
-    first: tuple[str, ...]
-    """Cells of that line."""
-    names: tuple[str, ...]
-    """Names of all columns; numbers from 1 where nothing names them."""
-    remark: str = ""
-    """Names that do not fit, and so do not count."""
-
-    @property
-    def is_named(self) -> bool:
-        """True where a header names the columns."""
-        return self.names[:1] != ("1",)
-
-
 class CsvFile:
     """A text file that holds a table.
 
     Raises LogError where it cannot be read, or has no line with numbers.
     """
 
+    delimiter: str
+    first_line: int
+    """Number of the first line with values."""
+    first: list[str]
+    """Cells of that line."""
+    names: list[str]
+    """Names of all columns; numbers from 1 where nothing names them."""
+
     def __init__(self, path: Path, form: CsvForm | None = None) -> None:
         self.path = path
         self.form = form or CsvForm()
-        self.layout = self._find_layout()
+        self._find_layout()
+
+    @property
+    def is_named(self) -> bool:
+        """True where a header names the columns."""
+        return self.names[:1] != ["1"]
 
     def _fault(self, text: str, line: int | None = None) -> LogError:
         place = "" if line is None else f", line {line}"
@@ -125,120 +120,82 @@ class CsvFile:
             start = stream.read(START_BYTES)
         if kind := foreign_kind(self.path, start):
             return f"is no text but {kind}"
-        if b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
-            return "is no text"
-        other = "cp1252" if b"\0" not in start else "utf-16"
-        return f'is no text in {self.form.encoding}, perhaps encoding = "{other}"'
+        return f'is no text in {self.form.encoding}, perhaps encoding = "cp1252" or "utf-16"'
 
     def is_comment(self, line: str) -> bool:
         """True for a line that is no row."""
         return line.lstrip().startswith(self.form.comment)
 
-    def _find_layout(self) -> CsvLayout:
+    def _find_layout(self) -> None:
+        """Find delimiter and names from the lines up to the first with values."""
         form = self.form
-        heads: list[str] = []
-        comments: list[str] = []
+        heads: list[list[str]] = []
+        comments: list[list[str]] = []
         for number, line in self._lines():
-            if self.is_comment(line):
-                comments.append(line.strip().lstrip("".join(form.comment)).strip())
-                continue
             # each line by itself: a title above the table may have other marks
             stated = _DELIMITERS.get(form.delimiter or "", form.delimiter)
             delimiter = stated or _delimiter_of(line, form.decimal)
-            count = len(form.columns or ())
-            if heads:
-                count = len(split(heads[-1], delimiter))
+            if self.is_comment(line):
+                text = line.strip().lstrip("".join(form.comment)).strip()
+                comments.append(split(text, _delimiter_of(text)))
+                continue
+            count = len(heads[-1] if heads else form.columns or ())
             cells = split(line, delimiter, count)
             if any(map(form.is_value, cells)):
-                start = CsvLayout(delimiter, number, tuple(cells), ())
-                return self._named(start, heads, comments)
-            heads.append(line)
-        if heads:
-            cells = split(heads[-1], _delimiter_of(heads[-1], ","))
-            if any(is_number(cell.replace(",", ".")) for cell in cells):
-                raise self._fault(
-                    "has no line with numbers like 1.5; numbers like 1,5 need "
-                    'decimal = ","'
-                )
-            raise self._fault(
-                f"has no line with numbers after the header {heads[0]!r:.80}: "
-                "it is empty"
-            )
-        raise self._fault("has no line with numbers; expected a table, one row a line")
+                self.delimiter = delimiter
+                self.first_line = number
+                self.first = cells
+                self.names = self._names(heads, comments)
+                return
+            heads.append(cells)
+        raise self._fault(
+            "has no line with numbers like 1.5; expected a table, one row a line; numbers like 1,5 need "
+            'decimal = ","'
+        )
 
-    def _named(
-        self, start: CsvLayout, heads: list[str], comments: list[str]
-    ) -> CsvLayout:
-        """Layout with the names that fit the number of cells in its first line."""
-        count = len(start.first)
-        names = list(self.form.columns or ())
-        remark = ""
-        if names and len(names) != count:
-            raise self._fault(
-                f"has {count} cells, and `columns` names {len(names)}", start.first_line
-            )
+    def _names(self, heads: list[list[str]], comments: list[list[str]]) -> list[str]:
+        """Names of all columns, as many as the first line has cells."""
+        count = len(self.first)
+        stated = self.form.columns
+        names = list(stated or ())
         if heads and not names:
             # a second line of the header holds the units
-            rows = [split(head, start.delimiter) for head in heads]
             names = [
-                " ".join(filter(None, parts)) for parts in zip(*rows, strict=False)
+                " ".join(filter(None, parts)) for parts in zip(*heads, strict=False)
             ]
-            if len(names) != count:
-                raise self._fault(
-                    f"has {count} cells, and the header names {len(names)} columns; put "
-                    "the header right, or leave it out and name the columns by number",
-                    start.first_line,
-                )
-        if not names:
-            named = (
-                split(comment, _delimiter_of(comment)) for comment in comments[::-1]
+        if names and len(names) != count:
+            which = "`columns`" if stated else "the header"
+            raise self._fault(
+                f"has {count} cells, and {which} names {len(names)} columns; put the names right, or leave them out "
+                "and give the columns by number",
+                self.first_line,
             )
-            found = next((cells for cells in named if len(cells) > 1), [])
+        if not names and comments:
+            found = next((cells for cells in comments[::-1] if len(cells) > 1), [])
             # "[idSensor]": may be absent
             without = [name for name in found if not name.startswith("[")]
             names = next((some for some in (found, without) if len(some) == count), [])
-            if found and not names:
-                text = comments[-1] if len(comments) == 1 else ", ".join(found)
-                remark = (
-                    f"its comment names {len(found)} columns, the lines have {count}: "
-                    f"{text}"
-                )
-        if not self.form.columns:
-            # a repeated or empty name is replaced by the column's number
-            names = [
-                name if name and names.count(name) == 1 else str(k)
-                for k, name in enumerate(names or [""] * count, 1)
-            ]
-        return CsvLayout(
-            start.delimiter, start.first_line, start.first, tuple(names), remark
-        )
+        # a repeated or empty name is replaced by the column's number
+        return [
+            name if stated or (name and names.count(name) == 1) else str(k)
+            for k, name in enumerate(names or [""] * count, 1)
+        ]
 
-    def index(self, name: str, key: str) -> int:
-        """Place of a column by its name or its number from 1; a LogError that names the ``key`` and those there are."""
-        names = self.layout.names
-        without_units = [plain_name(known) for known in names]
+    def index(self, name: str, use: str) -> int:
+        """Place of a column by its name or its number from 1; a LogError that names its ``use`` and those there are."""
+        names = self.names
         # the whole name first: two columns may differ in their units alone
-        for known in (list(names), without_units):
+        for known in (names, [plain_name(other) for other in names]):
             if known.count(name) == 1:
                 return known.index(name)
-        if name.isdecimal():
-            if 1 <= int(name) <= len(names):
-                return int(name) - 1
-            raise self._fault(
-                f"has no column {name} ({key}); it has {len(names)}, numbered from 1"
-            )
+        if name.isdecimal() and 1 <= int(name) <= len(names):
+            return int(name) - 1
         # wide tables have hundreds of columns: the message names the first of them
-        hint = did_you_mean(name, names, "{!r}")
         rest = len(names) - _MOST_NAMED
         more = f" and {rest} more" if rest > 0 else ""
-        without = (
-            ""
-            if self.layout.is_named
-            else ": without a header they are numbered from 1"
-        )
         raise self._fault(
-            f"has no column {name!r} ({key}); {hint}it has "
-            f"{', '.join(names[:_MOST_NAMED])}{more}{without}"
+            f"has no column {name!r} ({use}); {did_you_mean(name, names, '{!r}')}it has "
+            f"{', '.join(names[:_MOST_NAMED])}{more}, by name or numbered from 1"
         )
 
     def numbers(self, *names: str) -> list[Floats]:
@@ -260,13 +217,13 @@ class CsvFile:
 
         A LogError names the first line with another number of cells; with ``skip_broken`` such lines are left out.
         """
-        count = len(self.layout.names)
+        count = len(self.names)
         lines: list[int] = []
         found: list[list[str]] = [[] for _ in indices]
         for number, line in self._lines():
-            if number < self.layout.first_line or self.is_comment(line):
+            if number < self.first_line or self.is_comment(line):
                 continue
-            cells = split(line, self.layout.delimiter, count)
+            cells = split(line, self.delimiter, count)
             if len(cells) != count:
                 if skip_broken:
                     continue
@@ -287,24 +244,22 @@ class CsvTable(FieldTable):
         self,
         file: CsvFile,
         role: str,
-        keys: dict[str, str],
+        paths: Iterable[str],
         stamp: str | None,
         unit_s: float = 1.0,
         offset_s: float = 0.0,
     ) -> None:
-        """``keys``: key of the configuration by column; ``stamp``: None where rows have no time."""
+        """``paths``: columns; ``stamp``: that of the time, None where rows have none."""
         self.file = file
         self.source = file.path.name
         self._role = role
-        wanted = {
-            path: file.index(path, f"[{role}] {key}") for path, key in keys.items()
-        }
+        wanted = {path: file.index(path, f"[{role}]") for path in paths}
         at = [] if stamp is None else [file.index(stamp, f"[{role}] stamp")]
-        self._lines, cells = file.columns([*wanted.values(), *at])
+        self.lines, cells = file.columns([*wanted.values(), *at])
         self._cells = dict(zip(wanted, cells, strict=False))
         # converted when an adapter reads them
         self._values: dict[str, Floats] = {}
-        self.stamps_ns = np.zeros(len(self._lines), np.int64)
+        self.stamps_ns = np.zeros(len(self.lines), np.int64)
         self.has_dates = False
         if stamp is not None:
             offset_ns = round(offset_s * NS_PER_S)
@@ -322,7 +277,7 @@ class CsvTable(FieldTable):
                 is_comma = "," in plain[row]
                 decimal = '; decimal = "," where numbers are written so' * is_comma
                 raise LogError(
-                    f"{self.file.path}, line {self._lines[row]}: column {path}: "
+                    f"{self.file.path}, line {self.lines[row]}: column {path}: "
                     f"{cells[row]!r} is no number; expected one, or nothing where it was "
                     f"not measured{decimal}"
                 ) from None
@@ -348,7 +303,7 @@ class CsvTable(FieldTable):
                     stamps[row] = int((number * unit_ns).to_integral_value())
             except (InvalidOperation, ValueError, OverflowError):
                 raise LogError(
-                    f"{self.file.path}, line {self._lines[row]}: column {name}: {cell!r} "
+                    f"{self.file.path}, line {self.lines[row]}: column {name}: {cell!r} "
                     "is no time; expected a number (unit: stamp_unit_s) or a date such "
                     "as 2026-05-01T12:30:00.25Z"
                 ) from None
@@ -401,31 +356,24 @@ def date_ns(text: str) -> int:
 
     A ValueError for any other text.
     """
-    parts = re.fullmatch(
-        r"(\d+[-./]\w+[-./]\d+)[T ]+(\d\d:\d\d:\d\d)([.,]\d+)?\s*(\D.*)?", text.strip()
-    )
+    parts = _DATE.fullmatch(text.strip())
     if parts is None:
         raise ValueError(f"{text!r} is no date with a time")
-    date, clock, fraction, zone = parts.groups()
-    zone = "" if zone in (None, "UTC") else zone
-    if re.fullmatch(r"\d{4}-\d\d-\d\d", date):
-        when = datetime.fromisoformat(f"{date}T{clock}{zone}")
-    else:
-        when = _other_date(f"{date}T{clock}", zone)
-    since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - _EPOCH
-    seconds = since.days * 86_400 + since.seconds
+    day, clock, fraction, zone = parts.groups(default="")
+    when = datetime.fromisoformat(
+        f"{_day(day)}T{clock}{zone.replace('UTC', '') or '+00:00'}"
+    )
     # datetime itself has microseconds only
-    fraction_ns = Decimal((fraction or "0").replace(",", ".")) * NS_PER_S
-    return seconds * NS_PER_S + int(fraction_ns.to_integral_value())
+    fraction_ns = Decimal(f"0{fraction.replace(',', '.')}") * NS_PER_S
+    return (when - _EPOCH) // timedelta(seconds=1) * NS_PER_S + round(fraction_ns)
 
 
-def _other_date(text: str, zone: str) -> datetime:
+@lru_cache
+def _day(text: str) -> date:
+    """Date in one of `_DATE_FORMS`; the days of one dive are few."""
     for form in _DATE_FORMS:
-        try:
-            when = datetime.strptime(text, f"{form}T%H:%M:%S")
-        except ValueError:
-            continue
-        return datetime.fromisoformat(f"{when.isoformat()}{zone}")
+        with suppress(ValueError):
+            return datetime.strptime(text, form).date()
     raise ValueError(f"{text!r} is no date whose order of day and month is known")
 
 

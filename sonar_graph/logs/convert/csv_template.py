@@ -9,9 +9,8 @@ listed.
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.resources import files
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +33,8 @@ from sonar_graph.logs.convert.csv_evidence import (
     UNITS,
     VALIDITY,
     is_absent,
+    marked_valid,
     time_units,
-    valid_mark,
 )
 from sonar_graph.logs.convert.csv_log import table_files
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, is_date, plain_name
@@ -62,6 +61,11 @@ _LISTS = ("ids", "probabilities")
 _OF_IMU = "in the table of an IMU, without a unit: places, or angles (the third is then the yaw of [heading])?"
 
 
+_INTRODUCTION = """\
+# Columns of text tables, for `sonar-graph convert csv --config`. A guess by names and values: check every line.
+# Columns are given by name or by number, counted from 1. Axes: rotation = "frd" for x forward, y right, z
+# down, or [roll, pitch, yaw] in degrees of ours_R_driver. Units: a factor, or a name such as "deg/s".
+# All keys: docs/tutorials/11_tables.md#the-keys"""
 _UNITS = {
     "rates": RATES,
     "forces": FORCES,
@@ -139,16 +143,8 @@ class _Guess:
     lines: list[str]
     doubt: str = ""
     """Question for the user, where the table is to be commented out."""
-
-    @property
-    def rank(self) -> tuple[bool, bool, bool]:
-        """Order of guesses at one role, the best first: without doubt, of the better source, named by the file."""
-        text = "\n".join(self.lines)
-        is_weak = (self.role == "positions" and "geodetic" not in text) or (
-            self.role == "depth" and "pressure" in text
-        )
-        is_named = bool(re.search(PARTS[self.role].files, self.file.lower()))
-        return bool(self.doubt), is_weak, not is_named
+    rank: tuple[bool, int, bool] = (True, 0, True)
+    """Order of guesses at one role, the best first: without doubt, of the better quantity, named by the file."""
 
 
 def csv_template(tables: list[Path]) -> str:
@@ -175,36 +171,25 @@ def csv_template(tables: list[Path]) -> str:
         raise LogError(faults[0])
     guesses = [guess for table in found.values() for guess in table.guesses()]
     stamps = _stamps(found, {guess.file: guess.role for guess in reversed(guesses)})
-    parts = [
-        "# Columns of text tables, for `sonar-graph convert csv --config`. A guess by names and values: check every line.\n"
-        '# Columns are given by name or by number, counted from 1. Axes: rotation = "frd" for x forward, y right, z\n'
-        '# down, or [roll, pitch, yaw] in degrees of ours_R_driver. Units: a factor, or a name such as "deg/s".\n'
-        "# All keys: docs/tutorials/11_tables.md#the-keys"
-    ]
-    parts += [table.listing() for table in found.values()]
+    parts = [_INTRODUCTION, *(table.listing() for table in found.values())]
     for role, part in PARTS.items():
-        options = sorted(
-            (guess for guess in guesses if guess.role == role),
-            key=lambda guess: guess.rank,
-        )
-        best = [guess for guess in options if guess.rank == options[0].rank]
+        options = [guess for guess in guesses if guess.role == role]
+        least = min((guess.rank for guess in options), default=None)
+        best = [guess for guess in options if guess.rank == least]
         if not best:
             likely = next((name for name in found if role in name.lower()), "...")
             best = [_Guess(role, likely, part.empty.splitlines(), "nothing found")]
-        choice = ""
-        if len(best) > 1:
-            choice = (
-                f"which of {', '.join(guess.file for guess in best)}? uncomment one"
-            )
+        names = ", ".join(guess.file for guess in best)
+        choice = f"which of {names}? uncomment one" if len(best) > 1 else ""
         for guess in best:
             form = found[guess.file].form_lines if guess.file in found else []
             stamp = stamps.get(guess.file, []) if role != "true_landmarks" else []
             lines = [f"file = {toml_value(guess.file)}", *form, *stamp, *guess.lines]
+            head = f"[{role}]"
             if doubt := guess.doubt or choice:
-                lines = [f"# {line}" for line in (f"[{role}]  # {doubt}", *lines)]
-            else:
-                lines = [f"[{role}]", *lines]
-            parts.append("\n".join(lines))
+                head = f"# [{role}]  # {doubt}"
+                lines = [f"# {line}" for line in lines]
+            parts.append("\n".join([head, *lines]))
     parts += [f"# not a table: {fault}" for fault in faults]
     return "\n\n".join(parts) + "\n"
 
@@ -215,7 +200,7 @@ class _Table:
     def __init__(self, name: str, path: Path) -> None:
         self.name = name
         self.file, self.form_lines = _file(path)
-        names = self.file.layout.names
+        names = self.file.names
         self.columns = [_column(given, names) for given in names]
         self._values: dict[str, Floats] = {}
         self.time = self._time()
@@ -230,28 +215,31 @@ class _Table:
 
     def first(self, column: _Column) -> str:
         """First cell of a column."""
-        return self.file.layout.first[self.columns.index(column)]
+        return self.file.first[self.columns.index(column)]
 
     def listing(self) -> str:
         """Comment with all columns and their first values."""
-        layout = self.file.layout
-        remark = f"; {layout.remark}" if layout.remark else ""
-        lines = [f"# {self.name}: {len(layout.names)} columns{remark}"]
-        for number, column in enumerate(layout.names, 1):
-            named = f"{column} = " if layout.is_named else ""
-            lines.append(f"#   {number:2d}  {named}{layout.first[number - 1]}")
+        file = self.file
+        lines = [f"# {self.name}: {len(file.names)} columns"]
+        cells = zip(file.names, file.first, strict=True)
+        for number, (column, cell) in enumerate(cells, 1):
+            named = f"{column} = " if file.is_named else ""
+            lines.append(f"#   {number:2d}  {named}{cell}")
         return "\n".join(lines)
 
     def find(self, keys: str, columns: list[_Column]) -> "_Match | None":
         """Columns that hold one of some quantities, the first without doubt if there is one."""
         matches = []
-        for key in keys.split():
-            fitting = (
-                _Match(self, quantity, options)
-                for quantity in QUANTITIES[key]
-                if (options := _fitting(quantity, columns))
-            )
-            matches += [match.moving() for match in islice(fitting, 1)]
+        for rank, key in enumerate(keys.split()):
+            fitting = ((one, _fitting(one, columns)) for one in QUANTITIES[key])
+            quantity, options = next((f for f in fitting if f[1]), (None, []))
+            # zeros of a driver without accelerometers
+            if key == "linear_acceleration":
+                options = [one for one in options if np.any(self.values(one))]
+            # those that never change do not count where others do
+            moving = [one for one in options if not self.is_constant(one)]
+            if quantity and options:
+                matches.append(_Match(self, quantity, moving or options, rank))
         return min(matches, key=lambda match: bool(match.doubt()), default=None)
 
     def is_constant(self, columns: list[_Column]) -> bool:
@@ -329,44 +317,33 @@ class _Table:
         """Guess at a role where the table has all that it needs; the first question about a quantity counts."""
         lines: list[str] = []
         part = PARTS[role]
+        rank = 0
         for keys in (*part.needs, *part.may):
             match = self.find(keys, columns)
-            if (
-                match
-                and keys == "linear_acceleration"
-                and not np.any(match.table.values(match.chosen))
-            ):
-                # zeros of a driver without accelerometers
-                match = None
-                doubt = doubt or "no accelerometer: is this the IMU?"
             if match:
                 lines += match.lines()
                 doubt = doubt or match.doubt()
+                if keys in part.needs:
+                    rank += match.rank
                 if role == "dvl":
                     lines += self._validity(match)
             elif keys in part.needs:
                 return
             elif part.may[keys]:
                 lines.append(part.may[keys])
-        yield _Guess(role, self.name, lines, doubt)
+        is_named = bool(re.search(part.files, self.name.lower()))
+        yield _Guess(role, self.name, lines, doubt, (bool(doubt), rank, not is_named))
 
     def _validity(self, velocity: "_Match") -> list[str]:
         """Line that leaves out invalid rows; in use where the valid mark is known."""
-        marks = [
-            column
-            for word in VALIDITY.split("|")
-            for column in self.columns
-            if word in column.name and column not in velocity.chosen
-        ]
-        for column in marks:
-            mark = valid_mark(
-                column.name, self.values([column])[:, 0], self.values(velocity.chosen)
-            )
-            if mark is not None:
-                return [f"valid_where = {{{toml_value(column.given)} = {mark}}}"]
+        names = [c.given for c in self.columns if c not in velocity.chosen]
+        values = self.values(velocity.chosen)
+        for name, mark, _ in marked_valid(self.file, names, values):
+            return [f"valid_where = {{{toml_value(name)} = {mark}}}"]
+        unclear = [n for n in names if any(word in n.lower() for word in VALIDITY)]
         return [
-            f"# valid_where = {{{toml_value(column.given)} = 1}}  # which value is valid?"
-            for column in marks[:1]
+            f"# valid_where = {{{toml_value(name)} = 1}}  # which value is valid?"
+            for name in unclear[:1]
         ]
 
 
@@ -377,6 +354,8 @@ class _Match:
     table: _Table
     quantity: Quantity
     options: list[list[_Column]]
+    rank: int
+    """Number of better quantities that the role could have instead."""
 
     @property
     def chosen(self) -> list[_Column]:
@@ -387,11 +366,6 @@ class _Match:
         """Numbers of the chosen columns, shape (n, components), without empty rows."""
         values = self.table.values(self.chosen)
         return values[~is_absent(values)]
-
-    def moving(self) -> "_Match":
-        """The same without columns that never change, where others do."""
-        moving = [one for one in self.options if not self.table.is_constant(one)]
-        return replace(self, options=moving or self.options)
 
     def is_without_unit(self) -> bool:
         """True for places of an unknown unit."""
@@ -504,24 +478,21 @@ class _Match:
 
 def _file(path: Path) -> tuple[CsvFile, list[str]]:
     """A file read in the form in which most cells of its first row have values, and the lines that state it."""
-    # a file that no form fits keeps the error of the usual form
     best: tuple[int, CsvFile, dict[str, Any]] | None = None
     fault: LogError | None = None
     for form in _FORMS:
-        if best:
-            # another encoding is needed only where the usual one fails, a decimal comma where cells have no value
-            is_read = form.get("encoding") != best[2].get("encoding")
-            if is_read or best[0] == len(best[1].layout.first):
-                break
         try:
             file = CsvFile(path, CsvForm(**form))
         except LogError as error:
+            # a file that no form fits keeps the error of the usual form
             fault = fault or error
             continue
-        count = sum(map(file.form.is_value, file.layout.first))
+        count = sum(map(file.form.is_value, file.first))
         # numbers like 1,5 have no value with a decimal point, so the wrong form has fewer
         if best is None or count > best[0]:
             best = (count, file, form)
+        if count == len(file.first):
+            break
     if best is None:
         raise fault or LogError(f"{path}: holds no table")
     _, file, stated = best
@@ -533,7 +504,7 @@ def _file(path: Path) -> tuple[CsvFile, list[str]]:
 
 def _is_tum(file: CsvFile) -> bool:
     """True for poses without a header in the format of TUM, whose last four numbers are a unit quaternion."""
-    if file.layout.is_named or len(file.layout.names) != len(TUM_COLUMNS):
+    if file.is_named or len(file.names) != len(TUM_COLUMNS):
         return False
     quaternions = np.column_stack(file.numbers("5", "6", "7", "8"))
     lengths = np.linalg.norm(quaternions, axis=1)
@@ -585,7 +556,7 @@ def _stamps(
     return lines
 
 
-def _column(given: str, names: tuple[str, ...]) -> _Column:
+def _column(given: str, names: list[str]) -> _Column:
     """Column with its unit, from ``[...]``, ``(...)`` or the end of its name."""
     bare = plain_name(given)
     unit = given[len(bare) :].strip(" []()").lower() or None

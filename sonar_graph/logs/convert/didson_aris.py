@@ -13,8 +13,8 @@ Echoview's description of the format. No file of a real DIDSON was at hand.
 import struct
 from abc import abstractmethod
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from sonar_graph.logs.convert.sonar_file import (
     SonarConversion,
     SonarFormat,
     convert_sonar_file,
+    refuse_header,
 )
 from sonar_graph.logs.mcap import Progress
 
@@ -62,10 +63,8 @@ def convert_didson(
     LogError
         When the log cannot be written.
     """
-    with ByteSource(Path(path)) as source:
-        return convert_sonar_file(
-            source, DidsonFormat(source, sound_speed_m_s), Path(output), progress
-        )
+    open_format = partial(DidsonFormat, sound_speed_m_s=sound_speed_m_s)
+    return convert_sonar_file(path, open_format, output, progress)
 
 
 def convert_aris(
@@ -80,22 +79,13 @@ def convert_aris(
     LogError
         When the log cannot be written.
     """
-    with ByteSource(Path(path)) as source:
-        return convert_sonar_file(source, ArisFormat(source), Path(output), progress)
+    return convert_sonar_file(path, ArisFormat, output, progress)
 
 
 class LensSonarFormat(SonarFormat):
     """Frames with a number in the first four bytes of their header, and a signature at byte 12."""
 
     signature_at = 12
-    readings_at: ClassVar = {
-        "depth": 128,
-        "altitude": 132,
-        "pitch": 136,
-        "roll": 144,
-        "heading": 152,
-    }
-    """Offsets in the header of the readings of other sensors."""
 
     def head(self, content: bytes, at: int) -> FrameHead:
         """Header of a frame."""
@@ -107,12 +97,8 @@ class LensSonarFormat(SonarFormat):
             raise DamagedFrameError("no frame begins here")
         (number,) = struct.unpack_from("<I", content, 0)
         clock_ns, samples, settings = self.fields(content, number)
-        readings = {
-            name: float(struct.unpack_from("<f", content, where)[0])
-            for name, where in self.readings_at.items()
-        }
         size = self.head_bytes + self.beams(settings) * samples
-        return FrameHead(at, size, number, clock_ns, settings, readings)
+        return FrameHead(at, size, number, clock_ns, settings)
 
     @abstractmethod
     def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
@@ -165,12 +151,6 @@ LONG_RANGE_SERIAL = 15
 
 class DidsonFormat(LensSonarFormat):
     """Headers, samples and geometry of a ``.ddf`` file."""
-
-    readings_at = LensSonarFormat.readings_at | {
-        "pan": 160,
-        "tilt": 164,
-        "sonar roll": 168,
-    }
 
     def __init__(
         self, source: ByteSource, sound_speed_m_s: float | None = None
@@ -302,12 +282,6 @@ class ArisFormat(LensSonarFormat):
 
     first_at = head_bytes = 1024
     signature = b"DDF\x05"
-    readings_at = LensSonarFormat.readings_at | {
-        "compass heading": 160,
-        "compass pitch": 164,
-        "compass roll": 168,
-    }
-    readings_at |= {"water temperature": 224, "pan": 244, "tilt": 248}
 
     def __init__(self, source: ByteSource) -> None:
         start = source.read(0, len(self.signature))
@@ -351,10 +325,7 @@ class ArisFormat(LensSonarFormat):
             <= SOUND_SPEEDS_M_S[1],
             "samples that are not in order": in_order == 0,
         }
-        if any(faults.values()):
-            raise DamagedFrameError(
-                f"a header with {', '.join(text for text, wrong in faults.items() if wrong)}"
-            )
+        refuse_header("a header", faults)
         if clock_us > LAST_US:
             raise DamagedFrameError(f"frame {number} with a time of {clock_us} us")
         settings = (

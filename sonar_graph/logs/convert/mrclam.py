@@ -68,29 +68,24 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     DatasetError
         When the folder or the robot does not exist, or a file is missing or malformed.
     """
-    prefix = str(
-        numbered_run(dataset_dir, "RobotN_Odometry.dat", robot, "robot", FILES)
-    ).removesuffix("_Odometry.dat")
+    odometry = numbered_run(dataset_dir, "RobotN_Odometry.dat", robot, FILES)
     imu, dvl = _odometry(
-        read_table(
-            Path(f"{prefix}_Odometry.dat"),
-            ("time", "forward velocity", "angular velocity"),
-        )
+        read_table(odometry, ("time", "forward velocity", "angular velocity"))
     )
     detections, left_out = _detections(
         read_table(
-            Path(f"{prefix}_Measurement.dat"), ("time", "bar code", "range", "bearing")
+            dataset_dir / f"Robot{robot}_Measurement.dat",
+            ("time", "bar code", "range", "bearing"),
         ),
         read_table(dataset_dir / "Barcodes.dat", ("subject", "bar code")),
     )
     truth = None
     start = None
-    if Path(f"{prefix}_Groundtruth.dat").exists():
-        table = read_table(
-            Path(f"{prefix}_Groundtruth.dat"), ("time", "x", "y", "orientation")
-        )
+    true_poses = dataset_dir / f"Robot{robot}_Groundtruth.dat"
+    if true_poses.exists():
+        table = read_table(true_poses, ("time", "x", "y", "orientation"))
         # motion capture repeats some stamps; the first row of each counts
-        stamps_ns, rows = np.unique(table.stamps_ns(), return_index=True)
+        stamps_ns, rows = np.unique(table.stamps_ns, return_index=True)
         x_m, y_m, heading_rad = table.values[rows, 1:].T
         quaternions = Rotation.from_euler("z", heading_rad[:, None]).as_quat()
         truth = Trajectory.without_covariances(
@@ -152,7 +147,7 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
 
 def _odometry(table: NumberTable) -> tuple[Imu, Dvl]:
     """Sensor rows of the commanded velocities; of several commands at one stamp the last counts."""
-    stamps_ns, first_from_end = np.unique(table.stamps_ns()[::-1], return_index=True)
+    stamps_ns, first_from_end = np.unique(table.stamps_ns[::-1], return_index=True)
     commands = table.values[len(table.values) - 1 - first_from_end, 1:]
     # a command holds until the next, a row of a sequence over the interval before it
     in_force = np.concatenate([commands[:1], commands[:-1]])
@@ -169,7 +164,7 @@ def _detections(
 ) -> tuple[LandmarkDetections | None, str]:
     """Detections of landmarks in the order of time, and a note about those left out."""
     subjects = {int(barcode): int(subject) for subject, barcode in barcodes.values}
-    stamps_ns = table.stamps_ns()
+    stamps_ns = table.stamps_ns
     # stable: detections of one image keep their order
     order = np.argsort(stamps_ns, kind="stable")
     seen = np.array(

@@ -26,6 +26,7 @@ from sonar_graph.logs.convert.sonar_file import (
     SonarFormat,
     convert_sonar_file,
     plausible_headers,
+    refuse_header,
 )
 from sonar_graph.logs.mcap import Progress
 from sonar_graph.measurements import Floats
@@ -70,8 +71,7 @@ def convert_oculus(
     LogError
         When the log cannot be written.
     """
-    with ByteSource(Path(path)) as source:
-        return convert_sonar_file(source, OculusFormat(source), Path(output), progress)
+    return convert_sonar_file(path, OculusFormat, output, progress)
 
 
 class OculusFormat(SonarFormat):
@@ -131,13 +131,11 @@ class OculusFormat(SonarFormat):
                 f"a ping cut off, {len(content)} of {total} bytes are there"
             )
         mode, _, _, gamma, flags, *_ = FIRE.unpack_from(content, HEADER.size)
-        number, _, frequency_hz, temperature, pressure, *others = layout.unpack_from(
-            content, start
-        )
-        # version 2 alone has an attitude, before the speed of sound
-        attitude = others[:3] if version == 2 else ()
-        sound_speed, clock, size_code, bin_m, ranges, beams = others[len(attitude) :][
-            :6
+        number, _, frequency_hz, *others = layout.unpack_from(content, start)
+        # the speed of sound follows temperature and pressure, in version 2 also an attitude
+        at_sound_speed = 5 if version == 2 else 2
+        sound_speed, clock, size_code, bin_m, ranges, beams, *_ = others[
+            at_sound_speed:
         ]
         offset, image_bytes, message_bytes = others[-3:]
         size = size_code + 1
@@ -167,18 +165,12 @@ class OculusFormat(SonarFormat):
             f"a sound speed of {sound_speed:g} m/s": not 1300 <= sound_speed <= 1700,
             f"a time of {clock:g}": not 0 <= clock < 1 << 32,
         }
-        if any(faults.values()):
-            raise DamagedFrameError(
-                f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}"
-            )
+        refuse_header("a ping", faults)
         layout_of_image = version, mode, gamma, flags, size, offset, ranges, beams
         # bearings as bytes: frames of one fan compare equal at once
         settings = (*layout_of_image, bin_m, sound_speed, frequency_hz, bearings)
         clock_ns = round(clock * 1e9) if version == 2 else clock
-        readings = dict(zip(("heading", "pitch", "roll"), attitude, strict=False))
-        if version == 2:
-            readings |= {"temperature": temperature, "pressure": pressure}
-        return FrameHead(at, total, number, clock_ns, settings, readings)
+        return FrameHead(at, total, number, clock_ns, settings)
 
     def may_follow(self, content: bytes, earlier: FrameHead) -> bool:  # noqa: ARG002
         """True where some bytes can begin the message after."""

@@ -31,7 +31,6 @@ Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import gtsam
@@ -47,8 +46,8 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import DatasetError
+from sonar_graph.files import text_of
 from sonar_graph.logs.adapters import range_and_azimuth
-from sonar_graph.logs.convert.text_tables import numbers, read_lines
 from sonar_graph.measurements import (
     NS_PER_S,
     Dvl,
@@ -152,70 +151,87 @@ def planar_calibration(
     )
 
 
-@dataclass(frozen=True, eq=False)
 class StepRun:
-    """Steps of a planar robot, and landmarks seen between them."""
+    """Steps of a planar robot, and landmarks seen between them, gathered line by line.
 
-    steps: Floats
-    """(dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians."""
-    step_covs: Floats
-    """Covariances of the steps, shape (n, 3, 3)."""
-    poses: list[int]
-    """Number of steps before each landmark, length m."""
-    points: Floats
-    """Landmarks in the body frame (x forward, y left), shape (m, 2), metres."""
-    point_covs: Floats
-    """Their covariances, shape (m, 2, 2)."""
-    ids: list[list[int]]
-    """Equally probable identities of each landmark, length m; negative ones are left out."""
-
-
-def stepped_sequence(name: str, run: StepRun, notes: Mapping[str, str]) -> Sequence:
-    """Sequence of a run; rows at the end of each step, and at rest at 0.
-
-    The turn's noise is one density whose integral over a step has the mean variance of dθ, ``sqrt(mean(c_θθ) / T)``;
-    that of the velocity is in the rows, and in the calibration their root mean square. The gyro has no bias.
+    ``step_cov_places`` are the columns of the elements of a step's covariance among its last six numbers, ``body_R_file``
+    body axes (x forward, y left) from those of the file.
     """
-    velocity, velocity_cov, rate_rad_s = twists_of_steps(run.steps, run.step_covs)
-    stamps_ns = np.arange(len(run.steps) + 1, dtype=np.int64) * NS_PER_S
-    # before the first step the robot rests, as uncertain as in that step
-    velocities = np.vstack([np.zeros(2), velocity])
-    velocity_covs = np.concatenate([velocity_cov[:1], velocity_cov])
-    dvl = planar_dvl(stamps_ns, velocities, velocity_covs)
-    variances = np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
-    x, y, z = np.sqrt(variances).tolist()
-    gyro_noise_density = float(np.sqrt(np.mean(run.step_covs[:, 2, 2])))
-    return Sequence(
-        name=name,
-        calibration=planar_calibration((gyro_noise_density, 0.0, 0.0), (x, y, z)),
-        imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
-        dvl=dvl,
-        detections=_detections(run, stamps_ns) if run.ids else None,
-        notes={
-            "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
-            "truth": "none",
-            "odometry": "each step as the constant twist that makes it in one second",
-        }
-        | dict(notes),
-    )
 
+    def __init__(self, step_cov_places: list[list[int]], body_R_file: Floats) -> None:
+        self._step_cov_places = step_cov_places
+        self._body_R_file = body_R_file
+        self._steps: list[list[float]] = []
+        self._seen: list[list[float]] = []
+        self._poses: list[int] = []
+        self.ids: list[list[int]] = []
+        """Equally probable identities of each landmark, length m; negative ones are left out."""
 
-def _detections(run: StepRun, stamps_ns: Ints) -> LandmarkDetections:
-    """Landmarks as ranges and azimuths, at the end of the step before."""
-    most = max(map(len, run.ids))
-    candidate_ids = np.full((len(run.ids), most), -1, dtype=np.int64)
-    for row, found in enumerate(run.ids):
-        known = [identity for identity in found if identity >= 0]
-        candidate_ids[row, : len(known)] = known
-    # no identity is more probable than another
-    is_known = candidate_ids >= 0
-    id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
-    # the sonar is in the plane of the landmarks
-    points = np.pad(run.points, ((0, 0), (0, 1)))
-    polar = range_and_azimuth(points, np.pad(run.point_covs, ((0, 0), (0, 1), (0, 1))))
-    return LandmarkDetections(
-        stamps_ns[run.poses], *polar, candidate_ids, id_probability
-    )
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def add_step(self, row: list[float]) -> None:
+        """Add (dx, dy, dθ) in the frame before the step, and six elements of its covariance."""
+        self._steps.append(row)
+
+    def add_landmark(self, row: list[float], ids: list[int]) -> None:
+        """Add (x, y) in the frame of the newest pose, and three elements of its covariance."""
+        self._seen.append(row)
+        self._poses.append(len(self))
+        self.ids.append(ids)
+
+    def sequence(self, name: str, notes: Mapping[str, str]) -> Sequence:
+        """Sequence of the run; rows at the end of each step, and at rest at 0.
+
+        The turn's noise is one density whose integral over a step has the mean variance of dθ,
+        ``sqrt(mean(c_θθ) / T)``; that of the velocity is in the rows, and in the calibration their root mean square.
+        The gyro has no bias.
+        """
+        rows = np.array(self._steps)  # (n, 9)
+        body_R_file = self._body_R_file
+        covs = body_R_file @ rows[:, 3:][:, self._step_cov_places] @ body_R_file.T
+        velocity, velocity_cov, rate_rad_s = twists_of_steps(
+            rows[:, :3] @ body_R_file.T, covs
+        )
+        stamps_ns = np.arange(len(rows) + 1, dtype=np.int64) * NS_PER_S
+        # before the first step the robot rests, as uncertain as in that step
+        velocities = np.vstack([np.zeros(2), velocity])
+        velocity_covs = np.concatenate([velocity_cov[:1], velocity_cov])
+        dvl = planar_dvl(stamps_ns, velocities, velocity_covs)
+        variances = np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
+        x, y, z = np.sqrt(variances).tolist()
+        gyro_noise_density = float(np.sqrt(np.mean(covs[:, 2, 2])))
+        return Sequence(
+            name=name,
+            calibration=planar_calibration((gyro_noise_density, 0.0, 0.0), (x, y, z)),
+            imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
+            dvl=dvl,
+            detections=self._detections(stamps_ns) if self.ids else None,
+            notes={
+                "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
+                "truth": "none",
+                "odometry": "each step as the constant twist that makes it in one second",
+            }
+            | dict(notes),
+        )
+
+    def _detections(self, stamps_ns: Ints) -> LandmarkDetections:
+        """Landmarks as ranges and azimuths, at the end of the step before."""
+        most = max(map(len, self.ids))
+        candidate_ids = np.array([ids + [-1] * (most - len(ids)) for ids in self.ids])
+        # no identity is more probable than another
+        is_known = candidate_ids >= 0
+        id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
+        seen = np.array(self._seen)  # (m, 5)
+        # a reflection in the plane turns the sense of angles
+        plane = self._body_R_file[:2, :2]
+        point_covs = plane @ seen[:, 2:][:, POINT_COV_PLACES] @ plane.T
+        # the sonar is in the plane of the landmarks
+        points = np.pad(seen[:, :2] @ plane.T, ((0, 0), (0, 1)))
+        polar = range_and_azimuth(points, np.pad(point_covs, ((0, 0), (0, 1), (0, 1))))
+        return LandmarkDetections(
+            stamps_ns[self._poses], *polar, candidate_ids, id_probability
+        )
 
 
 def read_dlr(path: Path) -> Sequence:
@@ -243,44 +259,33 @@ def read_dlr(path: Path) -> Sequence:
                 f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself"
             )
         path = path / DLR_FILE
-    steps: list[list[float]] = []
-    points: list[list[float]] = []
-    ids: list[list[int]] = []
-    poses: list[int] = []
-    for number, kind, rest in _lines(path, DLR_LINES, "STEP", "LANDMARK", "LANDMARK_C"):
+    run = StepRun(DLR_STEP_COV_PLACES, BODY_OF_FILE)
+    for place, kind, rest in _lines(path, DLR_LINES, "STEP", "LANDMARK", "LANDMARK_C"):
         if kind == "STEP":
             # the first number is that of an image
-            steps.append(numbers(path, number, rest[1:], DLR_STEP))
+            run.add_step(_numbers(place, rest[1:], DLR_STEP))
             continue
-        place = f"{path}, line {number}:"
-        if not steps:
+        if not len(run):
             raise DatasetError(
-                f"{place} a landmark before the first STEP; expected {DLR_LINES}"
+                f"{place}: a landmark before the first STEP; expected {DLR_LINES}"
             )
-        x, y, _, *cov = numbers(path, number, rest[: len(DLR_POINT)], DLR_POINT)
-        try:
-            found = [int(text) for text in rest[len(DLR_POINT) :]]
-        except ValueError as error:
+        x, y, _, *cov = _numbers(place, rest[: len(DLR_POINT)], DLR_POINT)
+        ids = rest[len(DLR_POINT) :]
+        if not ids or not all(text.lstrip("-").isdecimal() for text in ids):
             raise DatasetError(
-                f"{place} {error}; expected whole numbers as landmark IDs"
-            ) from error
-        if not found:
-            raise DatasetError(
-                f"{place} no landmark ID after the covariances; expected {DLR_LINES}"
+                f"{place}: {ids} are no landmark IDs; expected whole numbers after the covariances"
             )
-        points.append([x, y, *cov])
-        ids.append(found)
-        poses.append(len(steps))
-    if not steps:
+        run.add_landmark([x, y, *cov], list(map(int, ids)))
+    if not len(run):
         raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
-    return stepped_sequence(
+    without = sum(found == [-1] for found in run.ids)
+    return run.sequence(
         "dlr_spatial_cognition",
-        _run(steps, DLR_STEP_COV_PLACES, poses, points, ids, BODY_OF_FILE),
         {
             "data set": "DLR Spatial Cognition; Kurlbaum, Frese, SFB/TR 8 report, 2009",
             "licence": "none stated",
             "noise": "the file's covariances; of the turn their mean, and not their correlation with the displacement",
-            "detections": f"{sum(found == [-1] for found in ids)} of {len(ids)} have no identity (-1)",
+            "detections": f"{without} of {len(run.ids)} have no identity (-1)",
         },
     )
 
@@ -313,31 +318,25 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     (6968, 3640)
     """
     path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
-    steps: list[list[float]] = []
-    points: list[list[float]] = []
-    ids: list[list[int]] = []
-    poses: list[int] = []
+    run = StepRun(PARK_STEP_COV_PLACES, np.eye(3))
     newest = 0
-    for number, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
-        start, end, *values = numbers(path, number, rest, PARK_COLUMNS[kind])
+    for place, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
+        start, end, *values = _numbers(place, rest, PARK_COLUMNS[kind])
         # a loop closure between poses would be an odometry edge too: the format has none
         if start != newest:
             raise DatasetError(
-                f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"
+                f"{place}: starts at pose {rest[0]}, but the newest pose is {newest};"
                 " expected one chain of poses from 0, with landmarks seen from the newest"
             )
         if kind == "ODOMETRY":
             newest = int(end)
-            steps.append(values)
+            run.add_step(values)
         else:
-            points.append(values)
-            ids.append([int(end)])
-            poses.append(len(steps))
-    if not steps:
+            run.add_landmark(values, [int(end)])
+    if not len(run):
         raise DatasetError(f"{path}: holds no ODOMETRY line; expected {PARK_LINES}")
-    return stepped_sequence(
+    return run.sequence(
         "victoria_park",
-        _run(steps, PARK_STEP_COV_PLACES, poses, points, ids, np.eye(3)),
         {
             "data set": "Victoria Park; Guivant, Nebot, IEEE T-RA 17(3), 2001; edge list of GTSAM's examples",
             "noise": "the file's covariances",
@@ -347,36 +346,34 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
 
 def _lines(
     path: Path, expected: str, *kinds: str
-) -> Iterator[tuple[int, str, list[str]]]:
-    """Number, kind and other fields of each line; a `DatasetError` for other kinds."""
-    for number, (kind, *rest) in read_lines(path, expected):
-        if kind not in kinds:
+) -> Iterator[tuple[str, str, list[str]]]:
+    """Place, kind and other fields of each line with content; a `DatasetError` for other kinds."""
+    try:
+        lines = text_of(path).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error}); expected {expected}"
+        ) from error
+    for number, line in enumerate(lines, 1):
+        kind, *rest = line.split() or [""]
+        if kind in kinds:
+            yield f"{path}, line {number}", kind, rest
+        elif kind and not kind.startswith("#"):
             raise DatasetError(
                 f"{path}, line {number}: begins with {kind!r}; expected {expected}"
             )
-        yield number, kind, rest
 
 
-def _run(
-    steps: list[list[float]],
-    step_cov_places: list[list[int]],
-    poses: list[int],
-    points: list[list[float]],
-    ids: list[list[int]],
-    body_R_file: Floats,
-) -> StepRun:
-    """Steps and landmarks in body axes; the rows of the file hold a displacement, then elements of its covariance."""
-    rows = np.array(steps)  # (n, 9)
-    seen = np.array(points).reshape(-1, 5)  # (m, 5)
-    step_covs = rows[:, 3:][:, step_cov_places]
-    point_covs = seen[:, 2:][:, POINT_COV_PLACES]
-    # a reflection in the plane, which turns the sense of angles
-    plane = body_R_file[:2, :2]
-    return StepRun(
-        steps=rows[:, :3] @ body_R_file.T,
-        step_covs=body_R_file @ step_covs @ body_R_file.T,
-        poses=poses,
-        points=seen[:, :2] @ plane.T,
-        point_covs=plane @ point_covs @ plane.T,
-        ids=ids,
-    )
+def _numbers(place: str, texts: list[str], columns: tuple[str, ...]) -> list[float]:
+    """Fields of one line as finite numbers, as many as there are columns."""
+    try:
+        values = [float(text) for text in texts]
+    except ValueError:
+        values = []
+    # "nan" is a number to Python, and no measurement in these data sets
+    if len(values) != len(columns) or not np.isfinite(values).all():
+        raise DatasetError(
+            f"{place}: {len(texts)} fields, {' '.join(texts)!r}; "
+            f"expected {len(columns)} finite numbers: {', '.join(columns)}"
+        )
+    return values

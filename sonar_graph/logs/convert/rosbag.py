@@ -2,7 +2,7 @@
 
 Every topic is converted. Payloads become CDR. Types get the definition of ROS 2 Jazzy where it has them, with fields
 mapped where the two differ, and otherwise the definition in the bag. Stamps, in messages and of recording, stay the
-same to the nanosecond. The types and MD5 sums of a ROS 1 bag are kept in a metadata record.
+same to the nanosecond.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import lz4.frame
-from mcap.writer import Writer
 
 from sonar_graph.errors import LogError, SonarGraphError
 from sonar_graph.files import regular, written_whole
@@ -30,11 +29,11 @@ from sonar_graph.logs.mcap import (
     ALREADY_MCAP,
     LARGEST_BYTES,
     LARGEST_RATIO,
-    LIBRARY,
-    ROSBAG2_METADATA,
     START_BYTES,
-    TRANSIENT_LOCAL,
+    LogWriter,
     Progress,
+    SchemaText,
+    latched,
     why_no_bag,
 )
 
@@ -45,10 +44,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 
-SOURCE_METADATA = "rosbag"
-"""Metadata record of the type and MD5 sum of each topic in the bag."""
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-_CHUNK_BYTES = _PIECE_BYTES = 1 << 20
+_PIECE_BYTES = 1 << 20
 _METADATA = "metadata.yaml"
 # that of rosbags
 _ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
@@ -109,7 +106,7 @@ def convert_rosbag(
     """
     with _open_bag(Path(source)) as bag, written_whole(output) as stream:
         _define(bag, _own_definitions(definitions) if definitions else {})
-        return _BagCopy(bag, Writer(stream, chunk_size=_CHUNK_BYTES)).run(progress)
+        return _BagCopy(bag, LogWriter(stream)).run(progress)
 
 
 @contextmanager
@@ -179,13 +176,15 @@ _ADVICE = {
 
 def limited_bz2(packed: bytes) -> bytes:
     """Content of a bz2 chunk; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
-    chunk = bz2.BZ2Decompressor()
-    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
+    return _unpacked(bz2.BZ2Decompressor(), packed)
 
 
 def limited_zstd(packed: bytes) -> bytes:
-    """Content of a zstd chunk or message; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
-    chunk = import_module(_ZSTD).ZstdDecompressor()
+    """Content of a zstd chunk or message; a LogError as of `limited_bz2`."""
+    return _unpacked(import_module(_ZSTD).ZstdDecompressor(), packed)
+
+
+def _unpacked(chunk: Any, packed: bytes) -> bytes:
     return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
 
 
@@ -341,7 +340,8 @@ class Ros1InMcap:
                     channel.topic,
                     kind,
                     MessageDefinition(MessageDefinitionFormat.MSG, text),
-                    self.typestore.generate_msgdef(kind)[1],
+                    # the sum over the definition, which nothing here needs
+                    "",
                     counts.get(number, 0),
                     # the file does not state which topics were latched
                     ConnectionExtRosbag1(
@@ -364,7 +364,7 @@ class Ros1InMcap:
 class _BagCopy:
     """Copy of the messages of a bag to a log."""
 
-    def __init__(self, bag: AnyReader | Ros1InMcap, writer: Writer) -> None:
+    def __init__(self, bag: AnyReader | Ros1InMcap, writer: LogWriter) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self._bag = bag
@@ -372,7 +372,6 @@ class _BagCopy:
         self._store = get_typestore(Stores.ROS2_JAZZY)
         # of types that both define, that of Jazzy counts: readers of the log know it
         _add_types(self._store, bag.typestore.fielddefs)
-        self._schemas: dict[str, int] = {}
         self._recoders: dict[str, Recode] = {}
 
     def run(self, progress: Progress | None) -> BagConversion:
@@ -380,13 +379,6 @@ class _BagCopy:
 
         bag = self._bag
         writer = self._writer
-        writer.start(profile="ros2", library=LIBRARY)
-        writer.add_metadata("rosbag2", ROSBAG2_METADATA)
-        stated = {
-            c.topic: f"{c.msgtype.replace('/msg/', '/')} {c.digest}"
-            for c in bag.connections
-        }
-        writer.add_metadata(SOURCE_METADATA, stated)
         known = bag.typestore.fielddefs
         connections = [c for c in bag.connections if c.msgtype in known]
         missing = {
@@ -411,7 +403,7 @@ class _BagCopy:
             except SerdeError:
                 broken[connection.topic] = broken.get(connection.topic, 0) + 1
                 continue
-            writer.add_message(
+            writer.mcap.add_message(
                 channels[connection.id, id(connection.owner)], time_ns, payload, time_ns
             )
             conversion.messages += 1
@@ -420,7 +412,7 @@ class _BagCopy:
         conversion.left_out |= {
             topic: f"{n} messages are not of their type" for topic, n in broken.items()
         }
-        writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
+        writer.finish()
         return conversion
 
     def _channel(self, connection: Connection) -> int:
@@ -434,19 +426,15 @@ class _BagCopy:
         self._recoders[connection.msgtype] = self._recoder(
             connection.msgtype, type_name
         )
-        if type_name not in self._schemas:
-            text, _ = self._store.generate_msgdef(type_name, ros_version=2)
-            self._schemas[type_name] = self._writer.register_schema(
-                type_name, "ros2msg", text.encode()
-            )
+        text, _ = self._store.generate_msgdef(type_name, ros_version=2)
         if isinstance(connection.ext, ConnectionExtRosbag2):
             profiles = connection.ext.offered_qos_profiles
             is_latched = any(one.durability.value == 1 for one in profiles)
         else:
             is_latched = bool(connection.ext.latching)
-        offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if is_latched else {}
-        return self._writer.register_channel(
-            connection.topic, "cdr", self._schemas[type_name], offers
+        schema = SchemaText(type_name, "ros2msg", text.encode())
+        return self._writer.channel(
+            connection.topic, schema, metadata=latched(is_latched)
         )
 
     def _recoder(self, own: str, type_name: str) -> Recode:

@@ -10,7 +10,7 @@ that were overwritten in place, and missing or additional bytes of exactly the l
 import json
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, combinations, repeat
 from pathlib import Path
@@ -48,6 +48,13 @@ class DamagedFrameError(Exception):
     """Bytes that cannot be the header of a frame, with the reason."""
 
 
+def refuse_header(kind: str, faults: Mapping[str, bool]) -> None:
+    """Refuse a header of which some faults, by their texts, are true."""
+    if any(faults.values()):
+        texts = ", ".join(text for text, is_true in faults.items() if is_true)
+        raise DamagedFrameError(f"{kind} with {texts}")
+
+
 @dataclass(frozen=True)
 class FrameHead:
     """Header of a frame."""
@@ -62,8 +69,6 @@ class FrameHead:
     """Time of the frame by the sonar's own clock."""
     settings: Settings
     """All on which samples and geometry depend; settings that may drift are floats."""
-    readings: Mapping[str, float] = field(default_factory=dict)
-    """Readings of other sensors, such as depth."""
     has_image: bool = True
     """False for messages of other kinds between the frames."""
 
@@ -233,7 +238,9 @@ def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead |
                 )
         except DamagedFrameError as error:
             # bytes may be missing from the frame before, or from the file's header
-            start = pending.at + 1 if pending else 0 if at == kind.first_at else at + 1
+            start = 0 if at == kind.first_at else at + 1
+            if pending:
+                start = pending.at + 1
             headers = plausible_headers(source, kind, start)
             found = next((other for other in headers if other.at != at), None)
             end = found.at if found else source.size
@@ -346,8 +353,6 @@ class SonarConversion:
     """Frame numbers without a frame, either lost or never recorded."""
     promised: int = 0
     """Number of frames by the file's header; 0: not stated."""
-    readings: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Lowest and highest reading of other sensors in the frames' headers."""
 
     @property
     def duration_s(self) -> float:
@@ -378,12 +383,19 @@ class SonarConversion:
 
 
 def convert_sonar_file(
-    source: ByteSource,
-    kind: SonarFormat,
+    path: Path,
+    open_format: Callable[[ByteSource], SonarFormat],
     output: Path,
     progress: Progress | None = None,
 ) -> SonarConversion:
     """Write all whole frames to an MCAP log; memory holds a few of them at a time."""
+    with ByteSource(Path(path)) as source:
+        return _convert(source, open_format(source), Path(output), progress)
+
+
+def _convert(
+    source: ByteSource, kind: SonarFormat, output: Path, progress: Progress | None
+) -> SonarConversion:
     conversion = SonarConversion(promised=kind.frames_promised)
     calibration = Calibration(sonar=SonarCalibration(image=kind.image))
     record = {
@@ -422,10 +434,6 @@ def convert_sonar_file(
                 f"{source.path}: holds no whole frame{first}; is it a recording of this sonar?"
             )
         notes = dict(kind.notes)
-        for name, (low, high) in conversion.readings.items():
-            # sonars without such a sensor write zeros
-            if low or high:
-                notes[f"sonar.{name}"] = f"{low:g} to {high:g}"
         shortcomings = conversion.shortcomings()
         if shortcomings:
             notes["sonar.shortcomings"] = "; ".join(shortcomings)
@@ -458,10 +466,6 @@ def _blocks(
             conversion.first_ns = stamp_ns
         conversion.last_ns = stamp_ns
         conversion.frames += 1
-        for name, value in head.readings.items():
-            if np.isfinite(value):
-                low, high = conversion.readings.get(name, (value, value))
-                conversion.readings[name] = min(low, value), max(high, value)
         earlier = head
         if block:
             last, last_ns = block[-1]

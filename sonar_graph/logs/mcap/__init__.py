@@ -10,14 +10,14 @@ from sonar_graph.logs.mcap.scanning import scan, stream
 from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
 from sonar_graph.logs.mcap.topic import STAMP_BYTES, Damage, Keep, Topic
 from sonar_graph.logs.mcap.writer import (
-    LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL, Attachment, Outgoing, RecordingWriter, is_own_log, recording,
-    write_recording,
+    Attachment, LogWriter, Outgoing, SchemaText, by_time, header_of, is_own_log, latched,
+    own_schema, recording, write_recording,
 )
 
 __all__ = [
-    "ALREADY_MCAP", "Attachment", "ChunkPart", "Damage", "Instant", "Keep", "LARGEST_BYTES", "LARGEST_RATIO",
-    "LIBRARY", "LogFile", "Outgoing", "Passage", "Progress", "ROSBAG2_METADATA", "Recording", "RecordingWriter",
-    "STAMP_BYTES", "START_BYTES", "TRANSIENT_LOCAL", "TimeWindow", "Topic", "content_of", "earlier_parts",
-    "foreign_kind", "is_own_log", "log_parts", "parse", "recording", "scan", "seal", "stream", "why_no_bag",
+    "ALREADY_MCAP", "Attachment", "ChunkPart", "Damage", "Instant", "Keep", "LARGEST_BYTES", "LARGEST_RATIO", "LogFile",
+    "LogWriter", "Outgoing", "Passage", "Progress", "Recording", "STAMP_BYTES", "START_BYTES", "SchemaText",
+    "TimeWindow", "Topic", "by_time", "content_of", "earlier_parts", "foreign_kind", "header_of", "is_own_log",
+    "latched", "log_parts", "own_schema", "parse", "recording", "scan", "seal", "stream", "why_no_bag",
     "write_recording",
 ]

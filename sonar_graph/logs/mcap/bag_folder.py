@@ -80,13 +80,11 @@ def _named_parts(folder: Path) -> list[Path]:
             f"{folder}: is a ROS 2 bag of the {storage[1]} kind; `sonar-graph convert rosbag {folder} -o "
             f"{folder.name}.mcap` makes a log of it"
         )
-    # two forms of a list; a YAML parser would be a dependency for two lines
-    listed = re.search(r"relative_file_paths:[ \t]*\n((?:[ \t]*-[^\n]*\n?)+)", text)
-    flow = re.search(r"relative_file_paths:[ \t]*\[(.*?)\]", text, re.DOTALL)
-    rows = listed[1].split("\n") if listed else flow[1].split(",") if flow else []
-    names = [
-        name for row in rows if (name := row.strip().removeprefix("-").strip(" '\""))
-    ]
+    # a YAML parser would be a dependency for one list, which has two forms
+    _, _, listed = text.partition("relative_file_paths:")
+    names = re.findall(
+        r"[^\s'\"\[\],]+\.(?:mcap|db3)[^\s'\"\[\],]*", re.split(r"\n\s*\w+:", listed)[0]
+    )
     if not names:
         raise LogError(
             f"{folder / METADATA_FILE}: names no files under relative_file_paths; `ros2 bag reindex` does"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from typing import NamedTuple
 
 from sonar_graph.errors import LogError
 
 _NS_PER_S = 1_000_000_000
-_FIRST_NS, _LAST_NS = -(1 << 63), (1 << 63) - 1
+_FIRST_NS = -(1 << 63)
+_LAST_NS = (1 << 63) - 1
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,8 @@ class Instant:
                 raise LogError(
                     f"{text!r} is no time in a log: give {expected}"
                 ) from None
-            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - datetime(
-                1970, 1, 1, tzinfo=UTC
-            )
-            return cls(
-                absolute_ns=(since.days * 86_400 + since.seconds) * _NS_PER_S
-                + since.microseconds * 1000
-            )
+            since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - _EPOCH
+            return cls(absolute_ns=since // timedelta(microseconds=1) * 1000)
         if not 0 <= seconds < _LAST_NS / _NS_PER_S:
             raise LogError(
                 f"{text!r} is no time in a log: give seconds from its beginning, 0 or more"
@@ -54,6 +52,17 @@ class Instant:
         if self.absolute_ns is not None:
             return self.absolute_ns
         return beginning_ns + round((self.seconds or 0.0) * _NS_PER_S)
+
+
+class Limits(NamedTuple):
+    """Times of recording of a part of a log, nanoseconds since 1970."""
+
+    first_ns: int
+    """First instant within the part."""
+    after_ns: int
+    """First instant after it."""
+    text: str
+    """The same in seconds after the log's beginning."""
 
 
 @dataclass(frozen=True)
@@ -75,32 +84,20 @@ class TimeWindow:
     @classmethod
     def parse(cls, start: str | None, end: str | None) -> TimeWindow:
         """Window between two times in text, as `Instant.parse` takes them; None: no limit."""
-        first, last = (
+        limits = [
             None if text is None else Instant.parse(text) for text in (start, end)
-        )
-        return cls(first, last)
+        ]
+        return cls(*limits)
 
-    def describe(self, beginning_ns: int) -> str:
-        """Text with the limits in seconds after the log's beginning."""
-        start_ns, end_ns = self.resolve(beginning_ns)
-        start = (
-            "the beginning"
-            if self.start is None
-            else f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        )
-        end = (
-            "the end"
-            if self.end is None
-            else f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        )
-        return f"{start} to {end} of the recording"
-
-    def resolve(self, beginning_ns: int) -> tuple[int, int]:
-        """First instant within and first instant after the window, nanoseconds since 1970."""
-        start_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
-        end_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
-        if start_ns >= end_ns:
+    def resolve(self, beginning_ns: int) -> Limits:
+        """The window of a log whose earliest message was recorded at an instant."""
+        first_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
+        after_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
+        if first_ns >= after_ns:
             raise LogError(
                 "the wanted part of the log ends before it starts: its start must be less than its end"
             )
-        return start_ns, end_ns
+        start = f"{(first_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        end = f"{(after_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        text = f"{start if self.start else 'the beginning'} to {end if self.end else 'the end'} of the recording"
+        return Limits(first_ns, after_ns, text)

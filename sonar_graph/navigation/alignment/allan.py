@@ -11,7 +11,7 @@ white noise (W. J. Riley, Handbook of Frequency Stability Analysis, NIST SP 1065
     edf = [3 (N' - 1) / (2 m) - 2 (N' - 2) / N'] 4 m^2 / (4 m^2 + 5),    N' = N + 1
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from sonar_graph.measurements import Floats, Imu, Ints
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 
 TAU_S = 1.0
+SHORT_TAU_S = 0.25
+LARGEST_SLOW = 1.5
+"""Ratio of the densities at both times beyond which the slower part is motion; 1 for white noise."""
 LEAST_STILL_S = 30.0
 WINDOW_S = 1.0
 GYRO_MOTION_RAD_S = 0.005
@@ -65,7 +68,8 @@ def degrees_of_freedom(count: int, together: int) -> float:
 def density(samples: Floats, rate_hz: float) -> Estimate1D:
     """Root spectral density at one second of the noisiest of (n, columns) readings of a still sensor.
 
-    Unknown where all are equal: no sensor is without noise, and an estimator would trust such a density.
+    Unknown where all are equal: no sensor is without noise, and an estimator would trust such a density. Unknown too
+    where the density at `SHORT_TAU_S` is clearly smaller: a vehicle that floats moves slowly, and noise is white.
     """
     if not np.ptp(samples, axis=0).any():
         return Estimate1D(
@@ -73,13 +77,18 @@ def density(samples: Floats, rate_hz: float) -> Estimate1D:
             np.inf,
             "the same to the last bit while still: commanded, or too coarse for its noise",
         )
-    together = max(1, round(TAU_S * rate_hz))
-    tau_s = together / rate_hz
-    # white noise of density N has the deviation N / sqrt(tau)
-    value = float(allan_deviation(samples, together).max()) * np.sqrt(tau_s)
-    return Estimate1D(
-        value, value / np.sqrt(2 * degrees_of_freedom(len(samples), together))
-    )
+    found = dict[float, Estimate1D]()
+    for tau_s in (TAU_S, SHORT_TAU_S):
+        together = max(1, round(tau_s * rate_hz))
+        # white noise of density N has the deviation N / sqrt(tau)
+        deviation = float(allan_deviation(samples, together).max())
+        value = deviation * np.sqrt(together / rate_hz)
+        freedom = degrees_of_freedom(len(samples), together)
+        found[tau_s] = Estimate1D(value, value / np.sqrt(2 * freedom))
+    whole = found[TAU_S]
+    if whole.value > LARGEST_SLOW * found[SHORT_TAU_S].value:
+        return replace(whole, reason="never quite still: slow motion, not noise")
+    return whole
 
 
 def noise_densities(imu: Imu) -> NoiseDensities:

@@ -31,6 +31,7 @@ from sonar_graph.report.figures.maps import (
     map_figure,
     paths_cut_off,
 )
+from sonar_graph.report.given_map import located_line
 
 ALIGNED = "aligned to the truth"
 
@@ -52,6 +53,7 @@ class Drawing:
     """The figure has a second view, after alignment to the truth."""
 
 
+# in reading order
 DRAWINGS = {
     "map": Drawing("Map", map_figure, columns=1, is_aligned_too=True),
     "growth": Drawing(
@@ -123,13 +125,12 @@ DRAWINGS = {
         columns=1,
     ),
 }
-"""In reading order."""
 
 
+# marks the narrow one of two drawings of a figure
 PHONE = "phone"
-"""Marks the narrow one of two drawings of a figure."""
+# ends the name of a figure or table before alignment, where there is one after it too
 RAW_VIEW = "-raw"
-"""Ends the name of a figure or table before alignment, where there is one after it too."""
 
 
 def drawings(comparison: Comparison) -> dict[str, tuple[Comparison, Drawing]]:
@@ -138,6 +139,7 @@ def drawings(comparison: Comparison) -> dict[str, tuple[Comparison, Drawing]]:
     Where errors are known, a figure of paths or errors has two views: after alignment under its name, and before it
     under its name with `RAW_VIEW`.
     """
+    # once for all figures: each alignment is a fit over the whole path
     aligned = aligned_to_truth(comparison)
     found = {}
     for name, drawing in DRAWINGS.items():
@@ -173,11 +175,12 @@ def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]
 
 def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
     """One figure of the page; a map is drawn in two widths, of which the page shows the one that fits."""
+    # a map is drawn twice, because its names cannot be shrunk to a phone
     widths_in = {"": HALF_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
     numbers = _read_out(comparison, drawing)
     if drawing.draw is map_figure:
         widths_in = {"": HALF_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
-        numbers = " ".join(sentences.finding(comparison))
+        numbers = sentences.headline(comparison, aligned=comparison.is_aligned)
     described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
     svg = ""
     for width, width_in in widths_in.items():
@@ -208,6 +211,7 @@ def _instead(comparison: Comparison, drawing: Drawing) -> str:
 
 def _captions(comparison: Comparison) -> dict[str, str]:
     """Captions that depend on the comparison."""
+    # only the repeated experiment may name the paper's figures
     is_repeated = repeats_published(comparison.sequence)
     world = ALIGNED if comparison.is_aligned else unaligned(comparison.sequence)
     counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
@@ -230,11 +234,12 @@ def _captions(comparison: Comparison) -> dict[str, str]:
         run.landmarks is not None and len(run.landmarks) for run in comparison.runs
     )
     landmarks = f" Ellipses hold 95 %{as_large}."
+    located = "" if comparison.is_aligned else located_line(comparison)
     gone = paths_cut_off(comparison)
     far = error_figures.errors_cut_off(comparison)
     return {
         "map": (
-            f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)}"
+            f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)} {located}".rstrip()
         ),
         "growth": growth,
         "errors": DRAWINGS["errors"].caption.format(

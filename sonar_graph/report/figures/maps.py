@@ -15,6 +15,7 @@ from sonar_graph.evaluation import Comparison, RunResult, map_instants, scored_m
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
+from sonar_graph.report.given_map import draw_given_map
 from sonar_graph.states import (
     FIRST_ANONYMOUS_ID,
     LandmarkMap,
@@ -23,17 +24,17 @@ from sonar_graph.states import (
 )
 
 ELLIPSE_PROBABILITY = 0.95
+# distance, in sizes of the truth, to which the map follows estimates that leave it
 MARGIN = 0.3
-"""Distance, in sizes of the truth, to which the map follows estimates that leave it."""
+# a smoothed path nowhere farther than this from the causal one is not drawn a second time
 SAME_M = 1e-3
-"""A smoothed path nowhere farther than this from the causal one is not drawn a second time."""
 PATH_POINTS = 2500
+# height of the view of the map over its width, at most
 HIGHEST = 0.72
-"""Height of the view of the map over its width, at most."""
+# factors by which ellipses may be enlarged
 ENLARGED = (1, 2, 5, 10, 20, 50)
-"""Factors by which ellipses may be enlarged."""
+# largest half length of an enlarged ellipse, relative to the view's size
 LARGEST_ELLIPSE = 0.09
-"""Largest half length of an enlarged ellipse, relative to the view's size."""
 
 
 def map_figure(comparison: Comparison) -> Figure | None:
@@ -45,64 +46,41 @@ def map_figure(comparison: Comparison) -> Figure | None:
     view = map_view(comparison)
     if view is None:
         return None
+    # one factor for all landmarks, so that ellipses can be compared
     factor = enlargement(comparison)
     view = view if factor == 1 else with_room(view)
     figure, axes = style.blank_panels(1, 1, (style.width_in(), style.width_in()))
     panel: Axes = axes[0, 0]
     truth = comparison.sequence.truth
+    # in the world of the estimates, as paths are
     true_landmarks = true_landmarks_drawn(comparison)
+    look: dict[str, Any]
     if truth is not None and len(truth):
-        look: dict[str, Any] = {
-            "color": style.TRUTH,
-            "linewidth": 3.2,
-            "alpha": 0.6,
-            "solid_capstyle": "round",
-        }
-        panel.plot(*horizontal(truth), label="truth", zorder=1, **look)
+        panel.plot(*horizontal(truth), label="truth", zorder=1, **style.TRUTH_LOOK)
     if true_landmarks is not None and len(true_landmarks):
         look = {"color": style.INK, "markersize": 9, "markeredgewidth": 1.4}
-        panel.plot(
-            *true_landmarks.positions.T[:2],
-            "+",
-            label="true landmarks",
-            zorder=5,
-            **look,
-        )
+        x_y = true_landmarks.positions.T[:2]
+        panel.plot(*x_y, "+", label="true landmarks", zorder=5, **look)
     for index, run in enumerate(comparison.runs):
         own = style.colour(index)
         if run.causal is not None and len(run.causal):
-            look = {"linestyle": style.line_style(index), "linewidth": 1.3}
-            panel.plot(
-                *horizontal(run.causal),
-                color=own,
-                label=run.estimator,
-                zorder=3,
-                **look,
-            )
+            look = style.run_look(index, 1.3)
+            panel.plot(*horizontal(run.causal), label=run.estimator, zorder=3, **look)
         if run.smoothed is not None and smoothed_differs(run):
             look = {"linestyle": (0, (1, 1)), "linewidth": 1.9, "alpha": 0.75}
-            panel.plot(
-                *horizontal(run.smoothed),
-                color=own,
-                label=f"{run.estimator}, smoothed",
-                zorder=2,
-                **look,
-            )
+            look |= {"label": f"{run.estimator}, smoothed", "color": own, "zorder": 2}
+            panel.plot(*horizontal(run.smoothed), **look)
         if run.landmarks is not None and len(run.landmarks):
-            look = {"markersize": 3.5, "markerfacecolor": "none"}
-            panel.plot(
-                *run.landmarks.positions.T[:2],
-                "os^Dv<"[index % 6],
-                color=own,
-                zorder=4,
-                **look,
-            )
+            look = {"markersize": 3.5, "markerfacecolor": "none", "zorder": 4}
+            x_y = run.landmarks.positions.T[:2]
+            panel.plot(*x_y, "os^Dv<"[index % 6], color=own, **look)
             for ellipse in ellipses(run.landmarks, own, factor):
                 panel.add_patch(ellipse)
+    draw_given_map(panel, comparison)
     view = landscape(view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
-    style.name_axes(panel, "world x (m)", "world y (m)")
+    panel.set(xlabel="world x (m)", ylabel="world y (m)")
     style.legend_above(figure, panel)
     # the room for names is measured on the figure as it will be
     style.arrange(figure)
@@ -120,6 +98,7 @@ def landscape(view: Floats) -> Floats:
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
     """The true landmarks in the world of the start pose: where they are surveyed in another, the first map tells."""
     true = comparison.sequence.true_landmarks
+    # the first map decides, so that all are drawn in one world
     maps = [
         run.landmarks
         for run in comparison.runs
@@ -147,9 +126,12 @@ def smoothed_differs(run: RunResult) -> bool:
     """True where the smoothed path is not the causal one."""
     if run.smoothed is None or not len(run.smoothed):
         return False
-    if run.causal is None or len(run.causal) != len(run.smoothed):
+    # paths of different lengths are different paths
+    if run.causal is None or len(run.causal) > len(run.smoothed):
         return True
-    return bool(np.abs(run.smoothed.positions - run.causal.positions).max() > SAME_M)
+    # a start that is found in a map gives smoothed poses before the first causal one
+    later = run.smoothed.positions[len(run.smoothed) - len(run.causal) :]
+    return bool(np.abs(later - run.causal.positions).max(initial=0.0) > SAME_M)
 
 
 def _paths(run: RunResult) -> list[Floats]:
@@ -242,6 +224,7 @@ def label_landmarks(panel: Axes, comparison: Comparison) -> None:
     ids = np.concatenate([own for own, _ in shown])
     points = np.concatenate([positions[:, :2] for _, positions in shown])
     low, high = np.array([panel.get_xlim(), panel.get_ylim()]).T
+    # a name outside the view would stand at the edge of the paper
     rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     names = [landmark_name(identity) for identity in ids[rows].tolist()]
     style.label_points(panel, names, points[rows])
@@ -267,53 +250,33 @@ def growth_figure(comparison: Comparison) -> Figure | None:
         len(runs), len(stamps_ns), size, sharex=True, sharey=True
     )
     true = true_landmarks_drawn(comparison)
-    for row, (index, run) in enumerate(runs):
-        for column, stamp_ns in enumerate(stamps_ns.tolist()):
-            panel: Axes = axes[row, column]
-            own = style.colour(index)
-            truth = comparison.sequence.truth
-            _draw_until(
-                panel,
-                stamp_ns,
-                truth,
-                color=style.TRUTH,
-                linewidth=2.6,
-                alpha=0.6,
-                label="truth",
-            )
-            _draw_until(
-                panel,
-                stamp_ns,
-                run.causal,
-                color=own,
-                linewidth=1.0,
-                label="causal estimate",
-            )
+    truth = comparison.sequence.truth
+    marks = {"markersize": 7, "markeredgewidth": 1.2, "color": style.INK}
+    for panels, (index, run) in zip(axes, runs.items(), strict=True):
+        own = style.colour(index)
+        panels[0].set_ylabel(f"{run.estimator}\nworld y (m)")
+        # a run may have kept its map at other instants too
+        known_at = {known.stamp_ns: known.landmarks for known in run.maps}
+        for panel, stamp_ns in zip(panels, stamps_ns.tolist(), strict=True):
+            look = style.TRUTH_LOOK | {"linewidth": 2.6}
+            _draw_until(panel, stamp_ns, truth, label="truth", **look)
+            look = {"color": own, "linewidth": 1.0}
+            _draw_until(panel, stamp_ns, run.causal, label="causal estimate", **look)
             if true is not None:
-                look: dict[str, Any] = {
-                    "color": style.INK,
-                    "markersize": 7,
-                    "markeredgewidth": 1.2,
-                }
-                panel.plot(*true.positions.T[:2], "+", label="true landmarks", **look)
-            for known in (
-                known.landmarks for known in run.maps if known.stamp_ns == stamp_ns
-            ):
-                panel.plot(
-                    *known.positions.T[:2],
-                    "o",
-                    color=own,
-                    markersize=2.5,
-                    label="estimated landmarks",
-                )
-                for ellipse in ellipses(known, own, enlarged):
+                x_y = true.positions.T[:2]
+                panel.plot(*x_y, "+", label="true landmarks", **marks)
+            if stamp_ns in known_at:
+                x_y = known_at[stamp_ns].positions.T[:2]
+                look = {"color": own, "markersize": 2.5}
+                panel.plot(*x_y, "o", label="estimated landmarks", **look)
+                for ellipse in ellipses(known_at[stamp_ns], own, enlarged):
                     panel.add_patch(ellipse)
             panel.set(xlim=view[:, 0], ylim=view[:, 1])
             panel.set_aspect("equal", adjustable="box")
-            label = "" if column else f"{run.estimator}\nworld y (m)"
-            style.name_axes(panel, "world x (m)" if row == len(runs) - 1 else "", label)
-    for column, seconds in enumerate(style.seconds_since_start(comparison, stamps_ns)):
-        style.head_panel(axes[0, column], f"T = {seconds:.1f} s")
+    seconds = style.seconds_since_start(comparison, stamps_ns)
+    for top, bottom, at_s in zip(axes[0], axes[-1], seconds, strict=True):
+        style.head_panel(top, f"T = {at_s:.1f} s")
+        bottom.set_xlabel("world x (m)")
     style.legend_above(figure, axes[0, 0])
     style.arrange(figure)
     for panel in axes.flat:
@@ -323,47 +286,46 @@ def growth_figure(comparison: Comparison) -> Figure | None:
 
 def grown_at(comparison: Comparison) -> Ints:
     """Stamps at which the growing map is drawn, shape (n,)."""
-    kept = [
-        known.stamp_ns for _, run in _runs_with_maps(comparison) for known in run.maps
-    ]
-    return np.intersect1d(
-        kept, map_instants(comparison.instants_ns, comparison.sequence.start_ns)
-    )
+    runs = _runs_with_maps(comparison).values()
+    kept = [known.stamp_ns for run in runs for known in run.maps]
+    asked = map_instants(comparison.instants_ns, comparison.sequence.start_ns)
+    return np.intersect1d(kept, asked)
 
 
 def enlargement(comparison: Comparison) -> int:
     """The factor by which ellipses are enlarged, so that they can be seen and do not cover each other."""
     view = map_view(comparison)
     grown_ns = grown_at(comparison)
-    sigmas = [
-        np.sqrt(np.linalg.eigvalsh(cov).max())
-        for _, run in _runs_with_maps(comparison)
+    variances = [
+        np.linalg.eigvalsh(cov).max()
+        for run in _runs_with_maps(comparison).values()
         for known in run.maps
         if known.stamp_ns in grown_ns
         for cov in known.landmarks.covariances[:, :2, :2]
         if np.isfinite(cov).all()
     ]
-    if view is None or not sigmas:
+    if view is None or not variances:
         return 1
-    room_m = LARGEST_ELLIPSE * float((view[1] - view[0]).max())
-    half_m = float(max(sigmas)) * math.sqrt(chi_square_quantile(ELLIPSE_PROBABILITY, 2))
+    # relative to the view: what can be seen depends on the size of the picture
+    room_m = LARGEST_ELLIPSE * float(np.ptp(view, axis=0).max())
+    radius = chi_square_quantile(ELLIPSE_PROBABILITY, 2)
+    half_m = math.sqrt(max(variances) * radius)
     return max((factor for factor in ENLARGED if factor * half_m <= room_m), default=1)
 
 
-def _runs_with_maps(comparison: Comparison) -> list[tuple[int, RunResult]]:
-    return [
-        (i, run)
-        for i, run in enumerate(comparison.runs)
+def _runs_with_maps(comparison: Comparison) -> dict[int, RunResult]:
+    """Runs that kept a map with landmarks, by their index."""
+    return {
+        index: run
+        for index, run in enumerate(comparison.runs)
         if any(len(known.landmarks) for known in run.maps)
-    ]
+    }
 
 
 def _draw_until(
     panel: Axes, stamp_ns: int, path: Trajectory | None, **look: Any
 ) -> None:
     """The path until an instant."""
-    until = (
-        None if path is None else path.rows(np.flatnonzero(path.stamps_ns <= stamp_ns))
-    )
-    if until is not None and len(until):
+    if path is not None and (path.stamps_ns <= stamp_ns).any():
+        until = path.rows(np.flatnonzero(path.stamps_ns <= stamp_ns))
         panel.plot(*horizontal(until), **look)

@@ -6,16 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.files import replacing
 from sonar_graph.recognition import SEE_TRACKS, Recognition, TrackStories, TrackStory
-from sonar_graph.report.rendering import render
+from sonar_graph.report.rendering import Section, write_html
 from sonar_graph.sonar import REPORTED
 
+# tracks with a picture; of more those with the most frames
 MOST_TRACKS = 400
-"""Tracks with a picture; of more those with the most frames."""
+# probability below which an identity is not listed
 LEAST_SHOWN = 0.005
-"""Probability below which an identity is not listed."""
 NONE = "none of them"
+SECTIONS = [
+    Section("tracks", "Tracks"),
+    Section("rejected", "Candidates that were rejected"),
+    Section("frames", "Frames"),
+]
 
 
 def write_track_page(
@@ -34,7 +38,6 @@ def write_track_page(
         longest, key=lambda story: (REPORTED not in story.outcomes, story.first_ns)
     )
     content: dict[str, Any] = {
-        "kind": "recognition",
         "name": name,
         "extent": f"{_number_of(recognition.frames, 'frame')}, {_number_of(len(stories.tracks), 'track')}",
         "names": [_number_of(len(stories.tracks), "track")],
@@ -45,8 +48,7 @@ def write_track_page(
         "start_ns": start_ns,
         "lines": [line for line in recognition.naming() if line != SEE_TRACKS],
     }
-    with replacing(path) as partial:
-        partial.write_text(render("tracks.html", content), "utf-8")
+    write_html(path, "recognition", SECTIONS, content)
 
 
 def _number_of(count: int, what: str) -> str:

@@ -133,8 +133,10 @@ def add_echo(
     """One echo with its phase, spread over the bins that the pulse reaches."""
     waves = range_m * tables.waves_per_m
     step = int((waves - np.floor(waves)) * PHASE_STEPS)
-    cos, sin = tables.phasor[step, 0] * amplitude, tables.phasor[step, 1] * amplitude
-    real, imaginary = re * cos - im * sin, re * sin + im * cos
+    cos = tables.phasor[step, 0] * amplitude
+    sin = tables.phasor[step, 1] * amplitude
+    real = re * cos - im * sin
+    imaginary = re * sin + im * cos
     place = (range_m - tables.range_start_m) * tables.bins_per_m - 0.5 * TAPS + 0.5
     first = int(np.floor(place))
     within = int((place - first) * PULSE_STEPS)
@@ -211,7 +213,8 @@ def sum_echoes(
     echoes: Floats32,
 ) -> None:
     """Add every echo in view to ``echoes``, shape (columns, TAPS + bins + TAPS, 2), real and imaginary part."""
-    cell_m, cells = tables.cell_m, points.shape[0]
+    cell_m = tables.cell_m
+    cells = points.shape[0]
     has_objects = surface.amplitude.shape[0] > 0
     has_shadows = horizon.tangent.shape[0] > 0
     least_m2 = (tables.range_start_m - TAPS * tables.bin_m) ** 2
@@ -230,7 +233,11 @@ def sum_echoes(
             point = points[point_row, point_column]
             x = column * cell_m - view.position_m[0] + cell_m * point[2]
             y = y_row + cell_m * point[3]
-            gain, relief, slope_x, slope_y, area = texture[i, j], 0.0, 0.0, 0.0, 1.0
+            gain = texture[i, j]
+            relief = 0.0
+            slope_x = 0.0
+            slope_y = 0.0
+            area = 1.0
             if has_objects:
                 at = column - surface.first_column
                 relief = surface.relief_m[row, at]
@@ -239,7 +246,8 @@ def sum_echoes(
                     gain = surface.amplitude[row, at]
                 area = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
             z = relief - height_m
-            range_m2, toward = x * x + y * y + z * z, x * slope_x + y * slope_y - z
+            range_m2 = x * x + y * y + z * z
+            toward = x * slope_x + y * slope_y - z
             if range_m2 < least_m2 or range_m2 > most_m2 or toward <= 0:
                 continue
             if has_shadows and is_blocked(view, horizon, x, y, z):
@@ -284,8 +292,10 @@ def through_beams(
     samples = echoes.shape[1]
     for beam in range(beam_matrix.shape[0]):
         for column in range(bands[beam, 0], bands[beam, 1], 4):
-            a, b = beam_matrix[beam, column], beam_matrix[beam, column + 1]
-            c, d = beam_matrix[beam, column + 2], beam_matrix[beam, column + 3]
+            a = beam_matrix[beam, column]
+            b = beam_matrix[beam, column + 1]
+            c = beam_matrix[beam, column + 2]
+            d = beam_matrix[beam, column + 3]
             for k in range(samples):
                 seen[beam, k] += (a * echoes[column, k] + b * echoes[column + 1, k]) + (
                     c * echoes[column + 2, k] + d * echoes[column + 3, k]

@@ -66,7 +66,8 @@ RAISED_M = 0.003
 """Cells that are this much higher than the lowest floor cast a shadow."""
 SCOUR_M = 0.05
 """Distance from an object over which ripples reach their height."""
-BEARINGS, DISTANCE_STEP_M = 256, 0.006
+BEARINGS = 256
+DISTANCE_STEP_M = 0.006
 
 
 class FrameSimulator:
@@ -124,7 +125,8 @@ class FrameSimulator:
         offset = middles[None, :] - sonar.azimuths_rad()[:, None]
         pattern = sonar.two_way_pattern(offset, options.side_lobes)
         matters = pattern > LEAST_AMPLITUDE
-        first, last = matters.argmax(axis=1), columns - matters[:, ::-1].argmax(axis=1)
+        first = matters.argmax(axis=1)
+        last = columns - matters[:, ::-1].argmax(axis=1)
         self._bands = np.column_stack([first // 4 * 4, -(-last // 4) * 4])
         self._beam_matrix: Floats32 = pattern.astype(np.float32)
 
@@ -211,10 +213,8 @@ class FrameSimulator:
             world_R_sonar, height_m, window, half_azimuth_rad, HALF_LIFT_RAD
         )
         if sector is not None:
-            cells, is_fixed = (
-                cells_of(sector, position_m),
-                self.options.speckle == "world",
-            )
+            cells = cells_of(sector, position_m)
+            is_fixed = self.options.speckle == "world"
             shift = (
                 np.zeros(2, np.int64)
                 if is_fixed
@@ -229,7 +229,8 @@ class FrameSimulator:
                 cells.spans,
                 shift,
             )
-            surface, horizon = echoes.no_surface(), echoes.no_horizon()
+            surface = echoes.no_surface()
+            horizon = echoes.no_horizon()
             near = within(
                 self.objects,
                 position_m,
@@ -295,11 +296,10 @@ def with_surface_path(
     of = source[arrives]
     turn = 2 * np.pi * (2 / sonar.wavelength_m) * (late_m - ranges_m)[of]
     level = 10 ** (level_db / 20) * (ranges_m / late_m)[of] ** 2
-    cos, sin = (
-        (level * np.cos(turn)).astype(np.float32),
-        (level * np.sin(turn)).astype(np.float32),
-    )
-    real, imaginary = signal[:, of, 0], signal[:, of, 1]
+    cos = (level * np.cos(turn)).astype(np.float32)
+    sin = (level * np.sin(turn)).astype(np.float32)
+    real = signal[:, of, 0]
+    imaginary = signal[:, of, 1]
     result = signal.copy()
     result[:, arrives, 0] += real * cos - imaginary * sin
     result[:, arrives, 1] += real * sin + imaginary * cos
@@ -333,11 +333,9 @@ def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
     """Error of the time-varied gain: a tilt over the window and a slow wave of a third of it, shape (bins,)."""
     rng = np.random.default_rng([seed, 1])
     along = np.linspace(-0.5, 0.5, bins)
-    tilt, wave, phase = (
-        rng.standard_normal(),
-        rng.standard_normal(),
-        rng.uniform(0, 2 * np.pi),
-    )
+    tilt = rng.standard_normal()
+    wave = rng.standard_normal()
+    phase = rng.uniform(0, 2 * np.pi)
     return sigma_db * (tilt * along + wave / 3 * np.sin(3 * np.pi * along + phase))
 
 
@@ -348,26 +346,18 @@ def laid_out(
 
     Ripples end within `SCOUR_M` around an object.
     """
-    first_column, end_column = (
-        int(cells.spans[:, 0].min()),
-        int(cells.spans[:, 1].max()),
-    )
+    first_column = int(cells.spans[:, 0].min())
+    end_column = int(cells.spans[:, 1].max())
     shape = len(cells.spans), end_column - first_column
-    amplitude, relief_m = (
-        np.full(shape, np.nan, np.float32),
-        np.zeros(shape, np.float32),
-    )
+    amplitude = np.full(shape, np.nan, np.float32)
+    relief_m = np.zeros(shape, np.float32)
     if ripples_m is not None:
-        rows, columns = (
-            cells.first_row + np.arange(shape[0]),
-            first_column + np.arange(shape[1]),
-        )
+        rows = cells.first_row + np.arange(shape[0])
+        columns = first_column + np.arange(shape[1])
         relief_m = ripples_m[np.ix_(rows % CELLS, columns % CELLS)]
         for item in objects:
-            y, x = (
-                (rows + 0.5) * CELL_M - item.position_m[1],
-                (columns + 0.5) * CELL_M - item.position_m[0],
-            )
+            y = (rows + 0.5) * CELL_M - item.position_m[1]
+            x = (columns + 0.5) * CELL_M - item.position_m[0]
             away_m = np.hypot(x, y[:, None]) - item.extent_m
             relief_m *= np.clip(away_m / SCOUR_M, 0, 1).astype(np.float32)
     for item in objects:
@@ -387,7 +377,8 @@ def laid_out(
 
 def _overlap(first: int, length: int, size: int) -> tuple[slice, slice]:
     """Slice of an axis of a size that a patch of a length from ``first`` on covers, and the slice of the patch."""
-    begin, end = min(max(first, 0), size), max(min(first + length, size), 0)
+    begin = min(max(first, 0), size)
+    end = max(min(first + length, size), 0)
     end = max(begin, end)
     return slice(begin, end), slice(begin - first, end - first)
 
@@ -478,7 +469,8 @@ def frame_truth(
     positions: Floats, world_R_sonar: Rotation, simulator: FrameSimulator
 ) -> FrameTruth:
     """Position of every object in the sonar's frame, for positions (n, 3) and n rotations of the sonar."""
-    sonar, objects = simulator.sonar, simulator.objects
+    sonar = simulator.sonar
+    objects = simulator.objects
     far_m = sonar.range_start_m + sonar.range_length_m
     half_azimuth_rad = float(np.abs(sonar.azimuths_rad()).max())
     fan = FieldOfView(

@@ -24,9 +24,12 @@ from sonar_graph.measurements import Floats, Ints
 Floats32 = NDArray[np.float32]
 CELL_M = 0.0032
 CELLS = 1250
-MEANDER_RAD, MEANDER_LENGTHS = 0.8, 3.0
+MEANDER_RAD = 0.8
+MEANDER_LENGTHS = 3.0
 """Wandering of ripples' crests: standard deviation of the phase, and over how many ripples it is correlated."""
-JOINT_SPACING_M, JOINT_WIDTH_M, JOINT_DB = 0.5, 0.008, 6.0
+JOINT_SPACING_M = 0.5
+JOINT_WIDTH_M = 0.008
+JOINT_DB = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,14 +168,16 @@ def place(
     x = (first[0] + np.arange(cells) + 0.5) * CELL_M - position_m[0]
     y = (first[1] + np.arange(cells) + 0.5) * CELL_M - position_m[1]
     world_x, world_y = np.meshgrid(x, y)
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    cos = np.cos(yaw_rad)
+    sin = np.sin(yaw_rad)
     level_db, height_m = shape(
         cos * world_x + sin * world_y, cos * world_y - sin * world_x
     )
     amplitude = (10 ** (level_db / 20)).astype(np.float32)
     position_m = np.asarray(position_m, float)
     relief = height_m.astype(np.float32)
-    row, column = int(first[1]), int(first[0])
+    row = int(first[1])
+    column = int(first[0])
     return SeabedObject(
         id_,
         kind,
@@ -264,13 +269,12 @@ def scattered_objects(
     for number, spot in enumerate(spots_m):
         if number < stones:
             radius_m = rng.uniform(0.08, 0.16)
-            kind, shape = (
-                "stone",
-                stone(radius_m, rng.uniform(0.02, 0.06), rng.uniform(4, 10)),
-            )
+            kind = "stone"
+            shape = stone(radius_m, rng.uniform(0.02, 0.06), rng.uniform(4, 10))
         else:
             mean_radius_m = rng.uniform(0.10, 0.16)
-            kind, shape = "patch", ragged_patch(mean_radius_m, rng.uniform(9, 13), rng)
+            kind = "patch"
+            shape = ragged_patch(mean_radius_m, rng.uniform(9, 13), rng)
             radius_m = 1.7 * mean_radius_m
         objects.append(
             place(-1 - number, kind, shape, radius_m, spot, rng.uniform(-np.pi, np.pi))
@@ -353,23 +357,25 @@ def cells_of(sector: Sector, foot_m: Floats) -> Cells:
     bearing = sector.half_bearing_rad * np.array([1, 1, 0, -1, -1])
     far_m = sector.farthest_m / np.cos(sector.half_bearing_rad / 2)
     reach_m = np.array([sector.nearest_m, far_m, far_m, far_m, sector.nearest_m])
-    ahead, aside = reach_m * np.cos(bearing), reach_m * np.sin(bearing)
+    ahead = reach_m * np.cos(bearing)
+    aside = reach_m * np.sin(bearing)
     x = (foot_m[0] + sector.heading[0] * ahead - sector.heading[1] * aside) / CELL_M
     y = (foot_m[1] + sector.heading[1] * ahead + sector.heading[0] * aside) / CELL_M
-    first_row, end_row = int(np.floor(y.min())), int(np.ceil(y.max()))
+    first_row = int(np.floor(y.min()))
+    end_row = int(np.ceil(y.max()))
     middle = np.arange(first_row, end_row) + 0.5
-    left, right = np.full(len(middle), np.inf), np.full(len(middle), -np.inf)
+    left = np.full(len(middle), np.inf)
+    right = np.full(len(middle), -np.inf)
     for x1, y1, x2, y2 in zip(x, y, np.roll(x, -1), np.roll(y, -1), strict=True):
         if abs(y2 - y1) < 1e-9:
             continue
         crosses = (middle >= min(y1, y2)) & (middle <= max(y1, y2))
         at = x1 + (middle[crosses] - y1) * (x2 - x1) / (y2 - y1)
-        left[crosses], right[crosses] = (
-            np.minimum(left[crosses], at),
-            np.maximum(right[crosses], at),
-        )
+        left[crosses] = np.minimum(left[crosses], at)
+        right[crosses] = np.maximum(right[crosses], at)
     empty = left > right
-    left[empty], right[empty] = x[0], x[0]
+    left[empty] = x[0]
+    right[empty] = x[0]
     return Cells(
         first_row, np.column_stack([np.floor(left), np.ceil(right)]).astype(np.int64)
     )

@@ -36,7 +36,8 @@ class Drawn(NamedTuple):
 
 def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> Shape:
     """A regular plate; the radius is that of its corners."""
-    apothem_m, step = radius_m * np.cos(np.pi / corners), 2 * np.pi / corners
+    apothem_m = radius_m * np.cos(np.pi / corners)
+    step = 2 * np.pi / corners
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         from_side = np.arctan2(y_m, x_m) % step - step / 2
@@ -73,11 +74,9 @@ def boulder(
     """A stone of random outline and lumpy top: half an ellipsoid whose radius varies with direction."""
     order = np.arange(1, 5)
     waves = rng.normal(0, 0.16 / np.sqrt(order), (2, len(order)))
-    flattened, lumps, lump_m = (
-        rng.uniform(0.6, 1.0),
-        rng.uniform(0, 2 * np.pi, 2),
-        0.5 * radius_m,
-    )
+    flattened = rng.uniform(0.6, 1.0)
+    lumps = rng.uniform(0, 2 * np.pi, 2)
+    lump_m = 0.5 * radius_m
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         angle = np.arctan2(y_m, x_m)[..., None] * order
@@ -103,21 +102,19 @@ def tuft(
     rng: np.random.Generator,
 ) -> Shape:
     """Weed: narrow fronds from one root, which lie over the floor and between which it shows."""
-    angle, length_m = (
-        rng.uniform(-np.pi, np.pi, fronds),
-        radius_m * rng.uniform(0.4, 1.0, fronds),
-    )
-    bend, width_m = rng.normal(0, 2.5, fronds), rng.uniform(0.004, 0.010, fronds)
+    angle = rng.uniform(-np.pi, np.pi, fronds)
+    length_m = radius_m * rng.uniform(0.4, 1.0, fronds)
+    bend = rng.normal(0, 2.5, fronds)
+    width_m = rng.uniform(0.004, 0.010, fronds)
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-        level, top = np.full(np.shape(x_m), np.nan), np.zeros(np.shape(x_m))
+        level = np.full(np.shape(x_m), np.nan)
+        top = np.zeros(np.shape(x_m))
         for turn, reach_m, curve, wide_m in zip(
             angle, length_m, bend, width_m, strict=True
         ):
-            along, aside = (
-                np.cos(turn) * x_m + np.sin(turn) * y_m,
-                np.cos(turn) * y_m - np.sin(turn) * x_m,
-            )
+            along = np.cos(turn) * x_m + np.sin(turn) * y_m
+            aside = np.cos(turn) * y_m - np.sin(turn) * x_m
             covers = (
                 (along > 0)
                 & (along < reach_m)
@@ -156,7 +153,8 @@ def _boulder(rng: np.random.Generator) -> Drawn:
 
 
 def _stick(rng: np.random.Generator) -> Drawn:
-    length_m, width_m = rng.uniform(0.3, 0.5), rng.uniform(0.015, 0.04)
+    length_m = rng.uniform(0.3, 0.5)
+    width_m = rng.uniform(0.015, 0.04)
     return Drawn(
         block(length_m, width_m, 0.8 * width_m, rng.uniform(4, 10)), length_m / 2
     )

@@ -15,7 +15,8 @@ from sonar_graph.simulation.sonar_image.scene import CELL_M, SeabedObject
 
 PATCH_M = 0.06
 """Distance over which the correlation of the field falls to 1/e."""
-FOULING_DB, GROWTH_M = 3.0, 0.008
+FOULING_DB = 3.0
+GROWTH_M = 0.008
 """Level over the floor of what grows, and its greatest height."""
 DRAPE_M = 0.015
 """Sigma with which sediment rounds edges off."""
@@ -41,11 +42,10 @@ def weathered(
 ) -> SeabedObject:
     """The landmark after wear: levels of its bright and dark parts changed, then overgrown, then drowned."""
     fouling_rng, sediment_rng = rng.spawn(2)
-    amplitude, relief_m = (
-        landmark.amplitude.astype(float),
-        landmark.relief_m.astype(float),
-    )
-    is_material, is_bright = ~np.isnan(amplitude), amplitude > 1
+    amplitude = landmark.amplitude.astype(float)
+    relief_m = landmark.relief_m.astype(float)
+    is_material = ~np.isnan(amplitude)
+    is_bright = amplitude > 1
     amplitude[is_bright] *= 10 ** (conditions.contrast_db / 20)
     if conditions.plate_db is not None:
         amplitude[is_material & ~is_bright] = 10 ** (conditions.plate_db / 20)

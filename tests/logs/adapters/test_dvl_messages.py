@@ -120,7 +120,6 @@ TABLE = '[dvl]\ntopic = "/pd0"\ntype = "provider_dvl/msg/PD0Packet"\n'
 OF_ARRAY = TABLE + 'velocity = ["velocity[0]", "velocity[1]", "velocity[2]"]\n'
 GEOMETRY = "tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]"
 OF_BEAMS = TABLE + f'beams = {{velocity = "velocity", {GEOMETRY}}}\nstamp = "log"'
-OF_SURE_BEAMS = OF_BEAMS.replace("tilt_deg", "sigma_m_s = 0.02, tilt_deg")
 PAIR = janus(30, 45, -45, -135, 135) @ VELOCITY
 MICROSECONDS = '"timestamp"\nstamp_unit_s = 1e-6\nstamp_offset_s = 3e8'
 FRD = '[dvl]\nrotation = "frd"\n'
@@ -130,7 +129,6 @@ valid_where = {}
 [dvl.beams]
 velocity = "beams.velocity"
 valid = "beams.valid"
-sigma_m_s = 0.01
 tilt_deg = 22.5
 azimuth_deg = [45, -45, -135, 135]"""
 SOLVED = np.linalg.pinv(janus(22.5, 45, -45, -135, 135)) @ [0.0, 0.1, 0.2, 0.3]
@@ -161,6 +159,9 @@ CASES: dict[str, Case] = {
         [twists("/odom", "nav_msgs/msg/Odometry", child_frame_id="child"), tree("child", (0.5, 0, 0), z=1.0)],
         '[dvl]\ntopic = "/odom"',
         {"dvl.velocity": [VELOCITY] * 3, "calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
+    "twist of odometry without a child, in the frame of the header": (
+        [twists("/dvl/odom", "nav_msgs/msg/Odometry"), tree("dvl_link", (0.5, 0, 0), z=1.0)], "",
+        {"calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
     # units and meanings
     "millimetres": (
         [dvl(velocity=vector(1e3, 2e3, 3e3), velocity_covar=(np.array(KNOWN) * 1e6).tolist())], "[dvl]\nscale = 0.001",
@@ -197,6 +198,9 @@ CASES: dict[str, Case] = {
     "beams before a velocity": (
         [water_linked(*[{"velocity": vector(9, 9, 9), "beams": [beam(i) for i in range(4)]}] * 3)], WATER_LINKED_BEAMS,
         {"dvl.velocity": [SOLVED] * 3}, {}),
+    "beams that a driver calls invalid": (
+        [water_linked(*[{"beams": [beam(i) | {"valid": i >= bad} for i in range(4)]} for bad in (0, 1, 2, 4)])],
+        WATER_LINKED_BEAMS, {"dvl.stamps_ns": ROWS[:2]}, {"log.dropped": "dvl: 2 with fewer than 3 valid beams"}),
     # directions and ranges of beams that are wrong change nothing, and nothing is warned of
     "z down": ([dvl()], "", {}, {"log.warnings": "marine_acoustic_msgs/msg/Dvl has z downwards"}),
     "z down, mounted": ([dvl(), tree("sensor", x=1.0)], "", {}, {"log.warnings": None}),
@@ -242,8 +246,8 @@ def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_n
         ),
         (
             packets([PAIR * [1, *[np.nan] * 3]] * 5),
-            OF_SURE_BEAMS,
-            "DVL: too few valid beams in all 5 rows",
+            OF_BEAMS,
+            "none of its 5 messages can be used: 5 with fewer than 3 valid beams",
         ),
         (twists("/wheels"), "", "/wheels only if chosen: --topic dvl=/wheels"),
     ],
@@ -278,36 +282,3 @@ def test_the_axes_of_a_driver_are_turned_into_ours(
     ]
     R = np.column_stack(units)
     np.testing.assert_allclose(sequence.dvl.velocity_cov[0], R @ COV @ R.T, atol=1e-15)
-
-
-def test_beams_of_known_noise_count_even_alone(foreign: Any) -> None:
-    """What one or two beams measured is measured, and nothing else is claimed."""
-    directions = janus(30, 45, -45, -135, 135)
-    rows = np.tile(2 * directions @ VELOCITY, (5, 1))
-    kept = [[0, 1, 2, 3], [0, 1, 3], [1, 2], [3], []]
-    for row, beams in zip(rows, kept, strict=True):
-        row[np.setdiff1d(range(4), beams)] = np.nan
-    sequence = foreign.read(
-        imu(), packets(rows.tolist()), toml=f"{OF_SURE_BEAMS}\nscale = 0.5"
-    )
-    assert sequence.notes["log.dropped"] == "dvl: 1 without a valid beam"
-    np.testing.assert_allclose(sequence.dvl.velocity[:2], [VELOCITY] * 2, atol=1e-12)
-    for beams, velocity, cov in zip(
-        kept[:4], sequence.dvl.velocity, sequence.dvl.velocity_cov, strict=True
-    ):
-        along = directions[beams]
-        np.testing.assert_allclose(along @ velocity, along @ VELOCITY, atol=1e-12)
-        np.testing.assert_allclose(
-            np.linalg.inv(cov), along.T @ along / 0.02**2, atol=2e-4, rtol=1e-5
-        )
-
-
-def test_beams_that_a_driver_calls_invalid_do_not_count(foreign: Any) -> None:
-    rows = [{"beams": [beam(i) for i in range(4)]} for _ in range(3)]
-    rows[1]["velocity_valid"] = rows[1]["beams"][2]["valid"] = rows[1]["beams"][3][
-        "valid"
-    ] = False
-    cov = foreign.read(
-        imu(), water_linked(*rows), toml=WATER_LINKED_BEAMS
-    ).dvl.velocity_cov
-    assert (np.trace(cov, axis1=1, axis2=2) > 1).tolist() == [False, True, False]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.errors import LogError
 from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.landmark_messages import range_and_azimuth
-from sonar_graph.logs.adapters.vehicle_messages import body_to_ros, ros_to_body
+from sonar_graph.logs.adapters.vehicle_messages import body_to_ros
 
 from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
 
@@ -51,8 +51,6 @@ def poses(
 
 
 TURN = Rotation.from_euler("z", 1)
-DEVIATIONS = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
-ROTATION_FIRST = np.diag(DEVIATIONS[[3, 4, 5, 0, 1, 2]] ** 2)
 SEA = "[depth]\nwater_density_kg_m3 = 1025\n"
 NED = '[truth]\nworld = "ned"\nrotation = "frd"\n'
 HEIGHT = 'type = "std_msgs/msg/Float64"\nheight = "data"\nscale = -1\nstamp = "log"\nframe_id_field = false'
@@ -148,23 +146,15 @@ CASES: dict[str, Case] = {
         [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
         {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3}, {"log.depth": None}),
     # reference poses
-    **{f"truth by its name, unknown covariance {covariance and covariance[0]}": (
-        [poses(TURN, covariance)], "",
-        {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3,
-         "truth.covariances": np.full((3, 6, 6), NAN)}, {})
-       for covariance in (None, [0.0] * 36, [-1.0] + [0.0] * 35)},
+    "truth by its name": (
+        [poses(TURN)], "", {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3}, {}),
     **{f"odometry {chosen or 'by its name'}": (
-        [poses(TURN, np.diag([4.0] * 3 + [1] * 3).ravel(), topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
-        chosen, {"truth.positions": [(1, 2, 3)] * 3, "truth.covariances": [np.diag([1] * 3 + [4] * 3)] * 3},
-        {"log.truth": None})
+        [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
+        chosen, {"truth.positions": [(1, 2, 3)] * 3}, {"log.truth": None})
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
     "odometry of another name": (
         [poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry")], "", {}, {"log.truth": "/odom only if chosen"}),
     "pose of another name": ([poses(TURN, topic="/pose")], "", {}, {"log.truth": "/pose only if chosen"}),
-    **{f"{meaning} in NED, where body x is north, y (left) west, z up": (
-        [poses(Rotation.identity(), np.diag(given).ravel().tolist())], f'{NED}covariance_meaning = "{meaning}"',
-        {"truth.covariances": [ROTATION_FIRST] * 3}, {})  # signs drop out of a diagonal
-       for meaning, given in {"variance": DEVIATIONS**2, "standard deviation": DEVIATIONS}.items()},
     # landmarks
     "positions as range and azimuth, results as the posterior": (
         [arrays(*FRAMES)], "",
@@ -274,16 +264,6 @@ def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(n, 6, 6))
     return root @ root.transpose(0, 2, 1), Rotation.random(n, rng).as_matrix()
-
-
-@given(st.integers(0, 1000))
-def test_ros_to_body_undoes_body_to_ros(seed: int) -> None:
-    covariances, rotations = random_covariances(seed, 3)
-    np.testing.assert_allclose(
-        ros_to_body(body_to_ros(covariances, rotations), rotations),
-        covariances,
-        atol=1e-12,
-    )
 
 
 def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:

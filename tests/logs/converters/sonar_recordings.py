@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
@@ -71,7 +71,6 @@ class Ddf(Recorded):
     flags: int = 0
     promised: int | None = None
     frame_version: bytes | None = None
-    readings: dict[int, float] = field(default_factory=dict)
 
     def file_header(self) -> bytes:
         count, beams, samples = self.frames.shape
@@ -118,8 +117,6 @@ class Ddf(Recorded):
             moment.microsecond // 10_000,
         )
         put(header, 48, "3i", 3, self.start_code, self.length_code)
-        for at, value in self.readings.items():
-            put(header, at, "f", value + i)
         put(header, 192, "i", self.flags)
         return bytes(header) + self.frames[i].T.tobytes()  # beams fastest
 

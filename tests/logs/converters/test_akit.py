@@ -1,21 +1,14 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Slerp
 
-from sonar_graph.calibration import Mounting
-from sonar_graph.diagnosis.start import find_start_heading
-from sonar_graph.logs.adapters.geodesy import earth_centred, east_north_up
+from sonar_graph.logs.adapters.geodesy import east_north_up
 from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
-from sonar_graph.navigation import Odometry
-from sonar_graph.navigation.alignment import match_reference_to_imu
 
 LATITUDE = 0.5733
-EARTH_RATE_RAD_S = 7.292115e-5
 
 
 @pytest.fixture
@@ -88,16 +81,6 @@ def test_attitude_by_hand():
         )
 
 
-def test_earth_centred_reproduces_known_points():
-    """Equator and pole, by the semi-axes that define WGS-84."""
-    points = earth_centred(
-        np.array([0.0, np.pi / 2]), np.array([0.0, 0.0]), np.array([10.0, 0.0])
-    )
-    assert np.allclose(
-        points, [[6378147.0, 0, 0], [0, 0, 6356752.3142]], rtol=0, atol=1e-4
-    )
-
-
 @given(st.floats(-1.3, 1.3), st.floats(-3, 3))
 def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, longitude):
     e2, a, d = 6.69437999014e-3, 6378137.0, 1e-6
@@ -163,28 +146,6 @@ def test_the_start_is_where_a_reference_that_is_late_turns_as_the_gyros_do(tmp_p
     assert read_akit(tmp_path, 2).truth.stamps_ns[0] == 0
 
 
-@pytest.mark.recording
-@pytest.mark.parametrize("trajectory", [1, 4, 5, 6, 7])
-def test_inspect_does_not_call_the_start_heading_wrong(unpacked, trajectory):
-    sea = read_akit(
-        next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, trajectory
-    )
-    offset = match_reference_to_imu(sea.imu, sea.truth, sea.calibration).offset
-    assert not find_start_heading(sea, sea.truth, offset).acts
-    assert abs(offset.value) < 1e-3
-    half_later = (
-        sea.truth.at(np.array([sea.start_ns + 450_000_000]))
-        .rotations()
-        .as_euler("ZYX")[0, 0]
-    )
-    start = sea.calibration.start.model_copy(update={"rpy_rad": (0.0, 0.0, half_later)})
-    spoilt = replace(
-        sea, calibration=sea.calibration.model_copy(update={"start": start})
-    )
-    # which starts without turning
-    assert find_start_heading(spoilt, sea.truth, offset).acts == (trajectory != 7)
-
-
 @pytest.fixture(scope="module", params=[1, 3, 7])
 def sequence(request, unpacked):
     return read_akit(
@@ -196,60 +157,12 @@ def sequence(request, unpacked):
 class TestRecording:
     """Against the reference, which lags the IMU by a time that differs between trajectories."""
 
-    @pytest.mark.slow
-    def test_gyros_follow_the_reference_once_the_earths_rotation_is_removed(
-        self, sequence
-    ):
-        latitude = sequence.calibration.earth_rate_latitude_rad
-        removed = best_drift(
-            sequence,
-            EARTH_RATE_RAD_S * np.array([0, np.cos(latitude), np.sin(latitude)]),
-        )
-        kept = best_drift(sequence, np.zeros(3))
-        assert np.linalg.norm(removed) < 3e-6
-        assert np.linalg.norm(kept) > 6e-5
-
     def test_dvl_measures_the_references_velocity_behind_its_origin(self, sequence):
         lever = np.array(sequence.calibration.dvl.mounting.translation_m)
         right = sideways_error(sequence, lever)
         assert right < 0.06
         assert right < 0.6 * sideways_error(sequence, np.zeros(3))
         assert right < 0.6 * sideways_error(sequence, lever, dvl_delay_s=-1.0)
-
-    def test_accelerometers_carry_the_dvls_velocity_through_half_a_minute(
-        self, sequence
-    ):
-        """With the IMU where the calibration has it, and hardly with it at the reference's point.
-
-        The stated bias of the accelerometers, 10 mm/s², gives a steady velocity a share of the motion.
-        """
-        assert lost_in_gaps(sequence, sequence.calibration) < 0.6
-        imu = sequence.calibration.imu.model_copy(update={"mounting": Mounting()})
-        elsewhere = sequence.calibration.model_copy(update={"imu": imu})
-        assert lost_in_gaps(sequence, elsewhere) > 1.0
-
-
-WAITING = 2
-"""Rows after a gap that are not used, at 2 m/s: a third one confirms them."""
-
-
-def lost_in_gaps(sequence, calibration, gap_s=30):
-    """Root mean square of what motion over a gap differs by from that over all samples, m."""
-    lost, dvl = [], sequence.dvl
-    attitude = Slerp(sequence.truth.stamps_ns, sequence.truth.rotations())
-    for first in range(20, 340, 20):
-        ends = [int(dvl.stamps_ns[k]) for k in (first, first + gap_s)]
-        displacements = []
-        for kept in (
-            slice(None),
-            np.r_[: first + 1, first + gap_s - WAITING : len(dvl)],
-        ):
-            odometry, rows = Odometry(calibration), dvl.rows(kept)
-            odometry.add(sequence.imu, rows)
-            known = attitude(ends[0]).as_matrix(), sequence.end_ns
-            displacements.append(odometry.motion(*ends, np.zeros(3), *known).i_T_j)
-        lost.append(displacements[0].translation() - displacements[1].translation())
-    return np.sqrt(np.mean(np.sum(np.square(lost), axis=1)))
 
 
 def sideways_error(sequence, lever, dvl_delay_s=0.0):
@@ -286,23 +199,3 @@ def reference_delay(sequence):
         for d in np.arange(-0.7, 0.71, 0.02)
     ]
     return min(errors)[1]
-
-
-def best_drift(sequence, earth_rate):
-    """Slope of the reference's attitude over the integrated gyro, rad/s, east north up, at the delay that fits."""
-    rates, truth = sequence.imu.angular_velocity, sequence.truth.rotations()
-    attitude = truth[0]
-    integrated = [attitude]
-    for rate in 0.5 * (rates[1:] + rates[:-1]).reshape(-1, 3):
-        attitude = attitude * Rotation.from_rotvec(
-            (rate - attitude.inv().apply(earth_rate)) * 0.01
-        )
-        integrated.append(attitude)
-    integrated = Rotation.concatenate(integrated)
-    seconds, best = np.arange(1, 399), (np.inf, None)
-    for delay in range(-60, 61, 4):
-        error = (truth[seconds] * integrated[seconds * 100 + delay].inv()).as_rotvec()
-        slope, offset = np.polyfit(seconds, error, 1)
-        residual = np.std(error[:, 2] - offset[2] - slope[2] * seconds)
-        best = min(best, (residual, slope), key=lambda found: found[0])
-    return best[1]

@@ -227,6 +227,8 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
     assert "imu" not in config
     assert "# [imu]  # no accelerometer: is this the IMU?" in text
     assert config["heading"]["scale"] == "deg"
+    # the battery has an identity
+    assert "true_landmarks" not in config
     with pytest.raises(LogError, match=r"has no table \[imu\]"):
         guessed(folder, tmp_path)
     taken = uncommented(text, "imu").replace(
@@ -267,17 +269,9 @@ def test_an_imu_that_may_be_of_1_hz_or_of_1_khz_is_asked_about(folder, tmp_path)
         guessed(folder, tmp_path)
     stated = guessed(folder, tmp_path, 'stamp_unit_s = "s"\n' + text)
     assert stated.duration_s == pytest.approx(ROWS, abs=20)
-
-
-def test_tables_may_count_time_in_different_units(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", scale=1e6)
-    plain(folder, d, "dvl", scale=1e3)
-    plain(folder, d, "depth")
-    _, config = template(folder)
-    units = [config[r].get("stamp_unit_s") for r in ("imu", "dvl", "depth")]
-    assert units == ["us", "ms", None]
-    assert_is(guessed(folder, tmp_path), d)
+    d.s += EPOCH_S
+    plain(folder, d, "imu", "dvl", "depth")
+    assert "which unit?" not in template(folder)[0]
 
 
 def test_depths_in_another_unit_of_time_are_refused_where_nothing_states_it(folder):
@@ -489,3 +483,40 @@ def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
         LogError, match=r"depth\.csv, line 2: .*'4,000\.0' is no number"
     ):
         guessed(folder, tmp_path)
+
+
+@pytest.mark.parametrize("filled", [0, 59, None])
+def test_a_last_cell_may_be_empty_in_any_row(folder, tmp_path, filled):
+    d = dive()
+    plain(folder, d, "imu", "dvl")
+    k = d.slow
+    cells = ["12.5" if row == filled else "" for row in range(len(d.s[k]))]
+    header = "time,depth,temperature"
+    write(folder / "depth.csv", header, d.s[k], d.depth[k], cells)
+    assert_is(guessed(folder, tmp_path), d)
+
+
+def test_a_column_of_validity_is_proposed_and_missed_where_it_is_not_used(
+    folder, tmp_path
+):
+    d = dive()
+    plain(folder, d, "imu", "depth")
+    k = d.slow
+    marks = ["false" if 10 <= row < 20 else "true" for row in range(len(d.s[k]))]
+    header = "time,vel_x,vel_y,vel_z,velocity_valid"
+    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T, marks)
+    config = template(folder)[1]
+    assert config["dvl"]["valid_where"] == {"velocity_valid": 1}
+    assert len(guessed(folder, tmp_path).dvl) == len(marks) - 10
+    del config["dvl"]["valid_where"]
+    warning = read_csv(folder, config).notes["csv.warnings"]
+    assert "column velocity_valid is 0 in 10 of 60 rows and not used" in warning
+    assert "`valid_where = {velocity_valid = 1}`" in warning
+
+
+def test_a_sonar_without_identities_states_it_by_false(folder):
+    plain(folder, dive(), "imu", "dvl")
+    (folder / "seen.csv").write_text("time,range,azimuth\n1.0,3.0,0.1\n2.0,3.0,0.2\n")
+    config = template(folder)[1]
+    assert config["detections"]["ids"] is False
+    assert (read_csv(folder, config).detections.candidate_ids == -1).all()

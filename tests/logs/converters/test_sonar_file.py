@@ -302,19 +302,6 @@ def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frame
         convert_didson(source, log / "dive.mcap")
 
 
-def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path):
-    result = converted(tmp_path, b"".join(PIECES["aris"]), "aris")
-    assert result.recording.metadata["sonar_graph"]["name"] == "dive"
-    assert result.notes["source"] == "ARIS recording dive.aris"
-    assert "sonar.shortcomings" not in result.notes
-    assert (
-        "cut off"
-        in converted(tmp_path, b"".join(PIECES["aris"])[:-5], "aris").notes[
-            "sonar.shortcomings"
-        ]
-    )
-
-
 def run(*arguments: object, code: int = 0) -> str:
     done = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert done.exit_code == code, done.output

@@ -191,9 +191,3 @@ class TestRecording:
         assert reckoned_error(run, integrated(rate - 0.0116)) > 40  # as logged
         off = np.unwrap(run.heading.yaw_rad) - integrated(rate)
         assert np.ptp(off) < 1.0  # rad, in 56 minutes
-
-    def test_the_vehicle_drives_forward_mostly(self, run):
-        mounting = run.calibration.dvl.mounting.pose().rotation().matrix()
-        x, y, _ = np.median(run.dvl.velocity @ mounting.T, axis=0)
-        assert abs(np.arctan2(y, x)) < np.radians(10)
-        assert len(run.dvl) == 4961

@@ -1,0 +1,304 @@
+"""Causes that a gain and a delay do not show: steps, drifts, a pitched sensor, a compass among iron, a current.
+
+A cause is a set of columns A of what the sensor has beyond its reference, ``y - x = a + A q + e`` with one q for the
+whole log. It is named where q is sure, e is clearly smaller than ``y - x - a``, and no gain or delay fits as well.
+docs/theory/sensor_check.md.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration, Mounting
+from sonar_graph.diagnosis.findings import (
+    IN_CALIBRATION,
+    IN_LOG_CONFIG,
+    Finding,
+    Gravity,
+    in_degrees,
+    numbers,
+    unknown,
+)
+from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.signals import (
+    Explained,
+    Match,
+    SignalStretch,
+    Values,
+    explained,
+    steps,
+)
+from sonar_graph.diagnosis.start import turned_mounting
+from sonar_graph.diagnosis.turn_rate import integral_of, residual
+from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.sequence import Sequence
+
+AS_GOOD = 1.1
+"""Ratio of the scatter to that of the best gain and delay, up to which a cause fits as well."""
+LEAST_DRIFT_M_S = 0.03
+"""Of a height: the vertical velocity of a Doppler log that is turned by two degrees at 1 m/s."""
+LEAST_PITCH_RAD = np.radians(3.0)
+LEAST_DEVIATION_RAD = np.radians(3.0)
+LEAST_CURRENT_M_S = 0.05
+BEST_NOISE_M_S = 0.01
+"""Of a row of a good Doppler log."""
+JUMPING = 2.0
+"""Ratio of a change to that of the path beyond which it shows no direction."""
+LONGEST_LIST = 3
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What may be wrong, and the line that mends it."""
+
+    cause: str
+    line: str
+
+
+def scale_line(role: str, key: str, config: LogConfig, gain: float) -> str:
+    """Line that divides a configured scale by a gain."""
+    scale = config.number(role, key, 1.0) / gain
+    return f"`{key} = {scale:.4g}` under [{role}] {IN_LOG_CONFIG}"
+
+
+def unused(role: str) -> str:
+    """Line that leaves a sensor out."""
+    return f"`use = false` under [{role}] {IN_LOG_CONFIG}"
+
+
+def other_world(config: LogConfig, role: str) -> str:
+    """The world that is not the configured one, as a setting."""
+    is_ned = config.table(role).get("world", "enu") == "ned"
+    return f'`world = "{"enu" if is_ned else "ned"}"` under [{role}] {IN_LOG_CONFIG}'
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Columns of one cause, and what to write where they explain a sensor."""
+
+    name: str
+    unit: str
+    """Of q: degrees for an angle in radians."""
+    columns: Callable[[SignalStretch], Values]
+    """Shape (n, q)."""
+    wanted: int
+    """Number of the columns, the first ones, that are the cause; the others may count without it."""
+    least: Callable[[Calibration], float]
+    """Length of q from which on the cause matters."""
+    advice: Callable[[Values, Calibration], Advice]
+    """By q."""
+
+
+def since_middle(stretch: SignalStretch) -> Values:
+    """Time as a column, shape (n, 1), s."""
+    return np.asarray((stretch.seconds - stretch.seconds.mean())[:, None])
+
+
+def of_way(stretch: SignalStretch) -> Values:
+    """What the table of checks has beside the reference, at the rows, shape (n, q)."""
+    assert stretch.beside is not None
+    return stretch.beside(stretch.seconds)
+
+
+def of_turn(stretch: SignalStretch) -> Values:
+    """Direction of the heading, and a drift of the gyros, shape (n, 3)."""
+    yaw_rad = stretch.y.real
+    return np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), since_middle(stretch)])
+
+
+def of_current(stretch: SignalStretch) -> Values:
+    """Time, and the path itself, whose turn and scale are other findings, shape (n, 2)."""
+    x = stretch.shifted(np.zeros(1))[0]
+    return np.column_stack([since_middle(stretch), x])
+
+
+def of_scale(stretch: SignalStretch) -> Values:
+    """Changes of ranges themselves, and what heights of landmarks take off them, shape (n, 2)."""
+    x = stretch.shifted(np.zeros(1))[0]
+    return np.column_stack([x, of_way(stretch)[:, 2]])
+
+
+def drift_advice(q: Values, _: Calibration) -> Advice:
+    """A height that drifts."""
+    return Advice(
+        f"it changes by {float(q[0].real):+.2g} m/s more than the Doppler log's vertical velocity all the time: the depths "
+        "drift, or that velocity is wrong",
+        f"{unused('depth')} leaves the depths out; or a larger `dvl.velocity_sigma_m_s` {IN_CALIBRATION}",
+    )
+
+
+def pitch_advice(q: Values, calibration: Calibration) -> Advice:
+    """A height that changes with the way ahead: which of both is pitched, only a stated start shows."""
+    pitch_rad = float(np.arcsin(np.clip(q[0].real, -1.0, 1.0)))
+    of_dvl = pitched_line("dvl", calibration, -pitch_rad)
+    of_imu = pitched_line("imu", calibration, pitch_rad)
+    return Advice(
+        f"it changes with the way ahead: the Doppler log or the IMU is pitched by {abs(np.degrees(pitch_rad)):.2g}° on the "
+        "vehicle",
+        f"{of_dvl} {IN_CALIBRATION} or, if that mounting is sure, {of_imu}",
+    )
+
+
+def pitched_line(role: str, calibration: Calibration, pitch_rad: float) -> str:
+    """Setting of a mounting after a turn about the body's y axis."""
+    mounting: Mounting = getattr(calibration, role).mounting
+    rpy_rad = turned_mounting(mounting, pitch_rad, "y")
+    return f"`{role}.mounting.rpy_rad = {numbers(rpy_rad, 4)}`"
+
+
+def pitched_one(
+    findings: list[Finding], off: Estimate1D, calibration: Calibration
+) -> tuple[list[Finding], bool]:
+    """Findings with the line for the one that is pitched, and whether it is the IMU.
+
+    ``off``: pitch at a stated start by gravity, less the stated one, rad: that of the IMU's mounting, or none.
+    """
+    found = next((f for f in findings if f.quantity.endswith(PITCH.name)), None)
+    if found is None or not off.is_known:
+        return findings, False
+    # the height changes by the sine for each metre ahead
+    pitch_rad = float(np.radians(found.estimate.value))
+    is_imu = abs(off.value - pitch_rad) < abs(off.value)
+    role = "imu" if is_imu else "dvl"
+    line = pitched_line(role, calibration, pitch_rad if is_imu else -pitch_rad)
+    right = replace(found, line=f"{line} {IN_CALIBRATION}")
+    return [right if f is found else f for f in findings], is_imu
+
+
+def deviation_advice(q: Values, _: Calibration) -> Advice:
+    """A compass whose error depends on its heading."""
+    largest_deg = float(np.degrees(np.linalg.norm(q)))
+    return Advice(
+        f"it is off by up to {largest_deg:.2g}° one way and the other as the vehicle turns: a compass among iron of the "
+        "vehicle, or a wrong calibration of it",
+        f"calibrate the compass on the vehicle, or {unused('heading')}",
+    )
+
+
+def current_advice(q: Values, _: Calibration) -> Advice:
+    """Velocities over something that moves."""
+    return Advice(
+        f"the path moves away by {float(np.linalg.norm(q)):.2g} m/s in one direction: the Doppler log measures the water, "
+        "not the bottom",
+        f"name a `topic` with its bottom track under [dvl] {IN_LOG_CONFIG}",
+    )
+
+
+PITCH = Cause(
+    "pitch of Doppler log or IMU",
+    "°",
+    of_way,
+    wanted=1,
+    least=lambda _: LEAST_PITCH_RAD,
+    advice=pitch_advice,
+)
+DRIFT = Cause(
+    "drift",
+    "m/s",
+    since_middle,
+    wanted=1,
+    least=lambda _: LEAST_DRIFT_M_S,
+    advice=drift_advice,
+)
+DEVIATION = Cause(
+    "deviation with the heading",
+    "°",
+    of_turn,
+    wanted=2,
+    # its owner knows of a bias, which may change with the heading
+    least=lambda known: max(LEAST_DEVIATION_RAD, 2.0 * known.heading.bias_sigma_rad),
+    advice=deviation_advice,
+)
+CURRENT = partial(
+    Cause, "current", "m/s", least=lambda _: LEAST_CURRENT_M_S, advice=current_advice
+)
+OF_FIXES = CURRENT(columns=of_current, wanted=1)
+OF_RANGES = CURRENT(columns=of_way, wanted=2)
+
+
+def cause_of(
+    name: str, causes: tuple[Cause, ...], found: Match, calibration: Calibration
+) -> Finding | None:
+    """The cause that explains a sensor best; None: none does, or one that is too small to matter does as well."""
+    fits = list[tuple[Explained, Cause]]()
+    for cause in causes:
+        result = explained(found.stretches, cause.columns, cause.wanted)
+        if result is not None and result.is_clear:
+            fits.append((result, cause))
+    if not fits:
+        return None
+    result, cause = min(fits, key=lambda fit: fit[0].after)
+    if result.after > AS_GOOD * found.scatter:
+        return None
+    for rival, other in fits:
+        is_small = float(np.linalg.norm(rival.q)) < other.least(calibration)
+        if is_small and rival.after < AS_GOOD * result.after:
+            return None
+    is_signed = len(result.q) == 1 and not np.iscomplexobj(result.q)
+    value = float(result.q[0].real if is_signed else np.linalg.norm(result.q))
+    estimate = Estimate1D(value, float(np.max(result.sigmas)))
+    advice = cause.advice(result.q, calibration)
+    return Finding(
+        f"{name}: {cause.name}",
+        in_degrees(estimate) if cause.unit == "°" else estimate,
+        cause.unit,
+        cause=advice.cause,
+        line=advice.line,
+        gravity=Gravity.GRAVE,
+    )
+
+
+def step_text(found: Match, sigma: float, unit: str) -> str:
+    """Size and times of steps of a sensor beyond its reference; empty: there are none."""
+    texts = list[str]()
+    for whole in found.whole:
+        x = turned_to(whole.y, whole.shifted(np.zeros(1))[0])
+        for step in steps(whole.seconds, whole.y, x, sigma):
+            size = np.degrees(step.size) if unit == "°" else step.size
+            texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
+    return " and ".join(texts[:LONGEST_LIST])
+
+
+def velocity_steps(sequence: Sequence) -> Finding | None:
+    """Steps of the Doppler log that the accelerometers do not feel; None: there are none, or they cannot be told."""
+    motion = BodyMotion.of(sequence)
+    if motion is None or motion.felt is None:
+        return None
+    felt = motion.felt
+    gravity = felt.gravity_m_s2 - residual(motion, felt.gravity_m_s2)  # (n, 3)
+    texts = list[str]()
+    for part in np.unique(motion.parts):
+        rows = np.flatnonzero(motion.parts == part)
+        t = motion.seconds[rows]
+        by_forces = felt.impulse_m_s[rows] - integral_of(t, gravity[rows])
+        # a wrong unit of velocities was found before
+        found = steps(t, felt.velocity_m_s[rows], by_forces, BEST_NOISE_M_S, ratio=1.0)
+        for step in found:
+            texts.append(f"by {step.size:.2g} m/s at {step.seconds:.1f} s")
+    if not texts:
+        return None
+    return Finding(
+        "DVL: steps",
+        unknown("wrong velocities"),
+        cause=f"velocities change {' and '.join(texts[:LONGEST_LIST])} while the accelerometers feel nothing: bottom lock "
+        "lost, such as a change to the water, or values repeated",
+        line=f"leave the rows without bottom lock out (`lock` under [dvl] {IN_LOG_CONFIG}), or that part by --start and "
+        "--end",
+        gravity=Gravity.GRAVE,
+    )
+
+
+def turned_to(y: Values, x: Values) -> Values:
+    """A level path turned, and mirrored if that is nearer, as a signal y changes apart from jumps; others as they are."""
+    if not np.iscomplexobj(y):
+        return x
+    of_y = np.diff(y)
+    of_x = np.diff(x)
+    # changes that the path cannot have are no part of its direction
+    is_usual = np.abs(of_y) < JUMPING * np.abs(of_x)
+    turns = [np.vdot(way[is_usual], of_y[is_usual]) for way in (of_x, of_x.conj())]
+    best = int(np.argmax(np.abs(turns)))
+    return (x, x.conj())[best] * np.exp(1j * np.angle(turns[best]))

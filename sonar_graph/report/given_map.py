@@ -1,0 +1,114 @@
+"""A map of known landmarks beside what the dive made of it: what moved, what was not seen, where the start was found."""
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from sonar_graph.evaluation import Comparison, RunResult, fixed
+from sonar_graph.report import figure_style as style
+from sonar_graph.states import ABSENT, Outcome
+from sonar_graph.table import Table, text_table
+
+MOST_LANDMARKS = 30
+DECIMALS = 3
+MOVED = "moved"
+
+
+def moved_landmarks(run: RunResult) -> set[int]:
+    """Landmarks of the given map that the run has taken out of it, and initialised again."""
+    if run.detections is None:
+        return set()
+    ids = run.detections.landmark_ids.tolist()
+    outcomes = run.detections.outcomes
+    return {i for i, each in zip(ids, outcomes, strict=True) if each is Outcome.NEW}
+
+
+def seen_landmarks(run: RunResult) -> set[int]:
+    """Landmarks with a detection."""
+    return set() if run.detections is None else set(run.detections.landmark_ids)
+
+
+def located_line(comparison: Comparison) -> str:
+    """When and where each run was located in the map; empty where the start was not to be found in it."""
+    sequence = comparison.sequence
+    if sequence.calibration.start.source != "map":
+        return ""
+    parts = []
+    for run in comparison.runs:
+        if run.causal is None or not len(run.causal):
+            parts.append(f"{run.estimator}: not located")
+            continue
+        seconds = (run.causal.stamps_ns[0] - sequence.start_ns) * 1e-9
+        x, y, _ = run.causal.positions[0].tolist()
+        parts.append(f"{run.estimator}: after {seconds:.1f} s at ({x:.2f}, {y:.2f}) m")
+    return f"Located in the map (star): {', '.join(parts)}."
+
+
+def draw_given_map(panel: Axes, comparison: Comparison) -> None:
+    """Draw the given places of landmarks, a line to where each moved, and a star where each run was located.
+
+    The world is that of the given map, so that nothing is drawn after an alignment to the truth.
+    """
+    known = comparison.sequence.calibration.map
+    if known is None or comparison.is_aligned:
+        return
+    places = np.array(known.positions_m)[:, :2]
+    look: dict[str, Any] = {"markersize": 10, "markerfacecolor": "none", "zorder": 3}
+    panel.plot(*places.T, "s", color=style.MUTED, label="map that was given", **look)
+    row = {landmark_id: k for k, landmark_id in enumerate(known.ids)}
+    for index, run in enumerate(comparison.runs):
+        own = style.colour(index)
+        for landmark_id in sorted(moved_landmarks(run) & row.keys()):
+            found = place_of(run, landmark_id)
+            if found is not None:
+                ends = np.array([places[row[landmark_id]], found[:2]])
+                panel.plot(*ends.T, color=own, linewidth=2.5, zorder=6)
+        is_found = comparison.sequence.calibration.start.source == "map"
+        if is_found and run.causal is not None and len(run.causal):
+            first = run.causal.positions[0]
+            panel.plot(first[0], first[1], "*", color=own, markersize=13, zorder=7)
+
+
+def place_of(run: RunResult, landmark_id: int) -> Any:
+    """Estimated place of a landmark at the end, shape (3,), m; None where the run has none."""
+    if run.landmarks is None or landmark_id not in run.landmarks.ids:
+        return None
+    return run.landmarks.positions[run.landmarks.ids == landmark_id][0]
+
+
+def given_map_table(comparison: Comparison) -> Table | None:
+    """The map before and after: each landmark as given, and how far each run has it from there; None without a map."""
+    known = comparison.sequence.calibration.map
+    runs = [run for run in comparison.runs if run.landmarks is not None]
+    if known is None or not runs:
+        return None
+    sigmas_m = np.sqrt(np.diag(known.joint()).reshape(-1, 3)[:, :2].mean(axis=1))
+    rows = []
+    for k, landmark_id in enumerate(known.ids):
+        given = np.array(known.positions_m[k])
+        cells = []
+        for run in runs:
+            found = place_of(run, landmark_id)
+            if landmark_id not in seen_landmarks(run):
+                cells.append("not seen")
+            elif found is None:
+                cells.append(ABSENT)
+            else:
+                away_m = fixed(math.hypot(*(found - given)[:2]), DECIMALS)
+                is_moved = landmark_id in moved_landmarks(run)
+                cells.append(f"{away_m}, {MOVED}" if is_moved else away_m)
+        place = f"{fixed(given[0], DECIMALS)}, {fixed(given[1], DECIMALS)}"
+        rows.append([str(landmark_id), place, fixed(sigmas_m[k], DECIMALS), *cells])
+    # what moved first, then what was seen
+    rows.sort(key=lambda cells: (MOVED not in " ".join(cells), "not seen" in cells))
+    found_ids = {int(i) for run in runs if run.landmarks for i in run.landmarks.ids}
+    added = sorted(found_ids.difference(known.ids))
+    caption = "The map before and after: places as given, and the horizontal distance of each run's map from them, metres"
+    if len(rows) > MOST_LANDMARKS:
+        caption += f"; {len(rows) - MOST_LANDMARKS} more landmarks are in map.toml"
+    if added:
+        caption += f"; new: {', '.join(map(str, added[:MOST_LANDMARKS]))}"
+    heads = ["Landmark", "given x, y", "sigma", *(run.estimator for run in runs)]
+    return text_table("given_map", caption, heads, rows[:MOST_LANDMARKS])

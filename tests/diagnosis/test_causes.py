@@ -1,0 +1,177 @@
+"""What makes a sensor differ from its reference is named, of a vehicle made by hand: each fault x its name and size."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration, PositionCalibration
+from sonar_graph.diagnosis import check_sensors
+from sonar_graph.diagnosis.signals import SignalStretch, explained, steps
+from sonar_graph.measurements import Depth, Floats, Heading, PositionFixes
+from sonar_graph.sequence import Sequence
+
+from .test_turn_rate import T, level_drive
+
+NOISE = np.random.default_rng(3).standard_normal((len(T), 3))
+EVERY = {"depth": 10, "heading": 10, "positions": 50}
+"""Rows of the IMU from one to the next."""
+
+
+def integral(values: np.ndarray) -> np.ndarray:
+    return np.append(0.0, np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(T)))
+
+
+YAW = integral(0.3 * np.sin(0.4 * T) + 0.1)
+AHEAD = integral(0.9 + 0.25 * np.sin(0.7 * T))
+PATH = integral((0.9 + 0.25 * np.sin(0.7 * T)) * np.exp(1j * YAW))
+DIVE = 0.5 * np.sin(0.5 * T) + 0.3 * np.sin(0.21 * T)
+
+
+def observed(
+    height: Floats = DIVE, yaw_rad: Floats = YAW, path: np.ndarray = PATH
+) -> Sequence:
+    """A drive with depth, heading and fixes, as they are or spoilt."""
+    run = level_drive(0)
+    climb = np.gradient(DIVE, T)[::10]
+    velocity = run.dvl.velocity + climb[:, None] * [0.0, 0.0, 1.0]
+    force = run.imu.specific_force + np.gradient(np.gradient(DIVE, T), T)[:, None] * [
+        0.0,
+        0.0,
+        1.0,
+    ]
+    ns = run.imu.stamps_ns
+    places = np.column_stack([path.real, path.imag, DIVE]) + 0.2 * NOISE
+    rows = {role: slice(0, len(T), every) for role, every in EVERY.items()}
+    of_fixes = rows["positions"]
+    unknown = np.full(len(ns[rows["heading"]]), np.nan)
+    of_antenna = PositionCalibration(sigma_m=(0.3, 0.3, 0.5))
+    return replace(
+        run,
+        calibration=Calibration(positions=of_antenna),
+        imu=replace(run.imu, specific_force=force),
+        dvl=replace(run.dvl, velocity=velocity),
+        depth=Depth(
+            ns[rows["depth"]], (height + 0.01 * NOISE[:, 0])[rows["depth"]], unknown
+        ),
+        heading=Heading(
+            ns[rows["heading"]],
+            (yaw_rad + 0.01 * NOISE[:, 1])[rows["heading"]],
+            unknown,
+        ),
+        positions=PositionFixes(
+            ns[of_fixes],
+            places[of_fixes],
+            np.full((len(ns[of_fixes]), 3, 3), np.nan),
+        ),
+    )
+
+
+FAULTS: dict[str, tuple[Callable[[], Sequence], str, float]] = {
+    "depth that drifts": (
+        lambda: observed(height=DIVE + 0.1 * T),
+        "depth: drift",
+        0.1,
+    ),
+    "log or IMU pitched by 8 degrees": (
+        lambda: observed(height=DIVE + np.sin(np.radians(8.0)) * AHEAD),
+        "depth: pitch of Doppler log or IMU",
+        8.0,
+    ),
+    "compass among iron": (
+        lambda: observed(yaw_rad=YAW + np.radians(10.0) * np.sin(YAW + 0.4)),
+        "heading: deviation with the heading",
+        10.0,
+    ),
+    "current": (
+        lambda: observed(path=PATH + (0.3 + 0.2j) * T),
+        "position fixes: current",
+        np.hypot(0.3, 0.2),
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_cause_is_named_with_its_size_and_nothing_else_is_blamed(fault: str):
+    make, quantity, size = FAULTS[fault]
+    acting = [found for found in check_sensors(make()) if found.grave]
+    assert [found.quantity for found in acting] == [quantity]
+    estimate = acting[0].estimate
+    assert estimate.value == pytest.approx(
+        size, abs=max(0.15 * size, 4 * estimate.sigma)
+    )
+
+
+JUMPS = {
+    "depth": (lambda: observed(height=DIVE + 3.0 * (T > 31.0)), "by 3 m at 31"),
+    "heading": (lambda: observed(yaw_rad=YAW + 0.5 * (T > 31.0)), "by 29 ° at 31"),
+    "position fixes": (
+        lambda: observed(path=PATH + 13.0 * (T > 31.0)),
+        "by 13 m at 31",
+    ),
+}
+
+
+@pytest.mark.parametrize("sensor", JUMPS)
+def test_a_jump_is_called_one_and_no_unit_axes_or_delay(sensor: str):
+    make, text = JUMPS[sensor]
+    (found,) = (found for found in check_sensors(make()) if found.grave)
+    assert found.quantity.startswith(sensor)
+    assert f"{text}" in found.advice
+    assert "jumps" in found.advice
+    assert "`use = false`" in found.line
+
+
+def test_velocities_that_jump_without_a_force_have_lost_the_bottom():
+    run = observed()
+    is_water = (run.dvl.stamps_ns > 20e9) & (run.dvl.stamps_ns < 40e9)
+    velocity = run.dvl.velocity + is_water[:, None] * [0.3, 0.1, 0.0]
+    (found,) = (
+        found
+        for found in check_sensors(
+            replace(run, dvl=replace(run.dvl, velocity=velocity))
+        )
+        if found.grave
+    )
+    assert found.quantity == "DVL: steps"
+    times_s = [float(text) for text in re.findall(r"at ([0-9.]+) s", found.cause)]
+    assert times_s == pytest.approx([20.2, 40.0], abs=0.4)
+
+
+def test_right_sensors_have_no_cause():
+    assert not [found.quantity for found in check_sensors(observed()) if found.acts]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_a_walk_and_the_wrong_scale_of_a_vehicle_that_stops_and_goes_are_no_steps(
+    seed: int,
+):
+    rng = np.random.default_rng(seed)
+    t = np.arange(600) * 0.2
+    x = np.cumsum(np.where((t // 20) % 3 == 1, 0.2, 0.0))
+    noise = 0.02 * rng.standard_normal(600)
+    walk = np.cumsum(0.01 * rng.standard_normal(600))
+    assert not steps(t, x + noise + walk, x, 0.02)
+    assert not steps(t, 1.5 * x + noise, x, 0.02)
+    (step,) = steps(t, x + noise + walk + 1.0 * (t >= 50.0), x, 0.02)
+    assert step.seconds == pytest.approx(50.0, abs=0.4)
+    assert step.size == pytest.approx(1.0, abs=0.2)
+
+
+def test_what_a_column_explains_is_found_beside_another_that_counts_in_any_case():
+    t = np.arange(600) * 0.2
+    rng = np.random.default_rng(0)
+    y = np.sin(t) + 0.03 * t + 0.5 * np.cos(0.3 * t) + 0.02 * rng.standard_normal(600)
+
+    def columns(stretch: SignalStretch) -> Floats:
+        return np.column_stack([np.cos(0.3 * stretch.seconds), stretch.seconds])
+
+    found = explained([SignalStretch(t, y, np.sin)], columns, 1)
+    assert found is not None
+    assert found.q[0] == pytest.approx(0.5, abs=4 * found.sigmas[0])
+    assert found.is_clear
+    of_nothing = explained([SignalStretch(t, np.sin(t), np.sin)], columns, 1)
+    assert of_nothing is not None
+    assert not of_nothing.is_clear
