@@ -6,6 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.calibration import Calibration, Start
+from sonar_graph.models import RobustKernel
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import (
     Sightline,
@@ -15,6 +16,7 @@ from sonar_graph.slam.smoother import (
 )
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import FactorGroup
+from sonar_graph.slam.smoother.factor_store import graph_of as graph_of_groups
 from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
 
 from .fed import (
@@ -476,6 +478,60 @@ def test_a_factor_in_python_is_handed_no_copy_of_all_values():
     window.update({}, gtsam.Values(), removed=(), relinearises=True)
     assert len(handed) > 1
     assert all(handed)
+
+
+def seen_from_origin(landmark: int, z: np.ndarray) -> FactorGroup:
+    """One robust sighting from the first keyframe, with a prior that keeps the landmark determined."""
+    key = L(landmark)
+    noise = np.diag(np.square([0.1, 0.02]))
+    made = factors.landmark_sighting(
+        X(0), key, gtsam.Pose3(), z, noise, RobustKernel().robust()
+    )
+    made["prior"] = point_prior(key, np.array([10.0, 0.0, 0.0]), 5.0)
+    return FactorGroup(made, (key, Sightline(X(0), gtsam.Pose3(), z)))
+
+
+def test_a_landmark_does_not_stay_where_a_wrong_first_sighting_placed_it():
+    """Two later sightings agree on another place; the robust kernel has a second minimum at the first one."""
+    wrong = np.array([10.0, 0.7])
+    right = np.array([10.0, 0.0])
+    smoother = Smoother(SmootherParams())
+    smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 0.01)})
+    smoother.add_landmark(L(0), 10.0 * np.array([np.cos(0.7), np.sin(0.7), 0.0]))
+    for k, z in enumerate((wrong, right, right)):
+        group = seen_from_origin(0, z)
+        smoother.add(group.factors, group.seen, gain=100.0)
+        smoother.update(float(k))
+    azimuth_rad = np.arctan2(*smoother.estimates.atPoint3(L(0))[1::-1])
+    assert abs(azimuth_rad) < 0.05
+
+
+def test_sightings_that_share_a_factor_have_the_information_of_their_own_factors():
+    """Ten sightings of two landmarks from one keyframe, with robust kernels; then two leave, and three of a factor stay."""
+    rng = np.random.default_rng(3)
+    z = np.array([10.0, 0.1]) + rng.normal(0.0, [0.2, 0.04], (10, 2))
+    groups = {k: seen_from_origin(k % 2, polar) for k, polar in enumerate(z)}
+    values = values_of(
+        X0=gtsam.Pose3(), L0=np.array([10.0, 1.0, 0.0]), L1=np.array([10.0, 1.2, 0.0])
+    )
+    groups[10] = FactorGroup({"prior": pose_prior(X(0), gtsam.Pose3(), 0.1)})
+    window = WholeWindow(Thresholds(1e-9, 1e-9))
+    window.update(groups, values, removed=(), relinearises=True)
+    assert window.isam.getFactorsUnsafe().nrFactors() == 3
+    ordering = gtsam.Ordering([X(0), L(0), L(1)])
+    for removed in ((), (3, 5)):
+        window.update({}, gtsam.Values(), removed=removed, relinearises=True)
+        for handle in removed:
+            del groups[handle]
+        held = window.isam.getFactorsUnsafe().linearize(values)
+        apart = graph_of_groups(groups.values()).linearize(values)
+        np.testing.assert_allclose(
+            held.augmentedHessian(ordering),
+            apart.augmentedHessian(ordering),
+            rtol=1e-12,
+            atol=1e-9,
+        )
 
 
 @pytest.mark.parametrize(

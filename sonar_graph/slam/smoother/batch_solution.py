@@ -20,7 +20,12 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.smoother.factor_store import Sightlines, picked, tangent_size
+from sonar_graph.slam.smoother.factor_store import (
+    Known,
+    Sightlines,
+    picked,
+    tangent_size,
+)
 
 MAX_STEPS = 50
 """Steps that a descent may try, whether or not they lower the error: each costs a factorisation of the graph."""
@@ -212,7 +217,7 @@ OUTVOTED, LEAST_SCATTER_M = 5.0, 0.01
 median of all, which is at least so much."""
 
 
-def misplaced(values: gtsam.Values, sightlines: Sightlines) -> list[int]:
+def misplaced(values: Known, sightlines: Sightlines) -> list[int]:
     """Landmarks behind the sonar in at least half of their sightings, or where only a few of them say (`OUTVOTED`).
 
     A robust kernel leaves a landmark where its first sightings put it, however many contradict these: far from all of

@@ -142,6 +142,8 @@ class FactorStore:
         self.groups: dict[int, FactorGroup] = {}
         """All groups by handle."""
         self._leaving_with: dict[int, list[int]] = defaultdict(list)
+        self._lines: dict[int, dict[int, Sightline]] = defaultdict(dict)
+        """Sightings of each landmark, by handle."""
         self._next = 0
 
     def add(self, group: FactorGroup) -> int:
@@ -152,7 +154,9 @@ class FactorStore:
             self.new_graph.add(factor)
         if group.seen is not None:
             # most groups are sightings: do not search the keys of their factors
-            lasting = [group.seen[1].pose_key]
+            landmark_key, line = group.seen
+            self._lines[landmark_key][handle] = line
+            lasting = [line.pose_key]
         else:
             keys = {key for factor in group for key in list(factor.keys())}
             poses = [key for key in keys if is_pose(key)]
@@ -169,6 +173,7 @@ class FactorStore:
             self.new.pop(handle, None)
             group = self.groups.pop(handle)
             self.gone.update(group)
+            self._drop_line(handle, group)
         # GTSAM's graph would keep a hole
         self.new_graph = graph_of(self.new.values())
 
@@ -180,7 +185,12 @@ class FactorStore:
                 group = self.groups.pop(handle, None)
                 if group is not None:
                     left.append(handle)
+                    self._drop_line(handle, group)
         return left
+
+    def _drop_line(self, handle: int, group: FactorGroup) -> None:
+        if group.seen is not None:
+            del self._lines[group.seen[0]][handle]
 
     def take_up(self) -> None:
         """The window has taken up what was new, and let go of what is gone."""
@@ -199,13 +209,19 @@ class FactorStore:
     def __iter__(self) -> Iterator[FactorGroup]:
         return iter(self.groups.values())
 
+    def sightlines_of(self, landmark_key: int) -> list[Sightline]:
+        """Sightings of a landmark, in the order in which they came."""
+        return list(self._lines[landmark_key].values())
+
     def sightlines(self) -> Sightlines:
         """All sightings, by landmark's key."""
-        lines: dict[int, list[Sightline]] = defaultdict(list)
-        for group in self:
-            if group.seen is not None:
-                lines[group.seen[0]].append(group.seen[1])
-        return lines
+        return {
+            key: self.sightlines_of(key) for key, lines in self._lines.items() if lines
+        }
+
+    def newly_seen(self) -> set[int]:
+        """Landmarks whose sightings the window has not taken up yet."""
+        return {group.seen[0] for group in self.new.values() if group.seen is not None}
 
 
 def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:

@@ -5,8 +5,10 @@ Its estimate is causal. The *history* is the batch solution of the whole graph b
 smoothed result is asked for. With a bounded history, a fixed-lag smoother takes the place of iSAM2, and the history is
 the graph of its window: newer factors and the marginals of older ones.
 
-One rule restarts the window: an update has diverged if it increased the error of the graph. The window then begins
-again at the batch solution. A large correction, such as a position fix after a gap, decreases the error and is kept.
+Two faults restart the window at the batch solution. An update has diverged if it increased the error of the graph. A
+landmark is misplaced if most of its sightings contradict the place that its first ones gave it: a robust kernel has a
+second minimum there, which no Gauss-Newton step leaves. A large correction, such as a position fix after a gap,
+decreases the error and is kept.
 """
 
 from collections import deque
@@ -25,6 +27,7 @@ from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
     KeptCovariance,
     Marginals,
+    misplaced,
     solve_in_sight,
 )
 from sonar_graph.slam.smoother.factor_store import (
@@ -46,12 +49,11 @@ MOST_NOISE_SHARE = 0.2
 the weights of a robust kernel only when it linearises a factor."""
 LEAST_SUSPICIOUS = 1.0
 """Step of the newest keyframe or of a landmark (rad or m) from which an update is tested for divergence."""
-LEAST_ITERATED = 0.03
+LEAST_ITERATED = 0.02
 """Step (rad or m) after which another Gauss-Newton step follows in the same update, for example at a loop closure."""
-MOST_STEPS = 4
-"""Further Gauss-Newton steps in an update, at most: each costs as much as an update."""
-MOST_SETTLING_STEPS = 10
-"""The same after an exchange of factors, which may move the estimate far."""
+MOST_STEPS = 20
+"""Further Gauss-Newton steps in an update, at most: each costs as much as an update. A robust kernel shortens steps, and
+some 15 of them cross from a minimum that has vanished to the next (`benchmarks/validation/isam2_constants.py`)."""
 REACH = 1.5
 """Distance of landmarks, in longest ranges, up to which the next frame may show them: the vehicle has moved by then. A
 shorter reach needs a second covariance in many frames (`benchmarks/validation/isam2_constants.py`)."""
@@ -267,6 +269,8 @@ class Smoother:
         self._newest_bias: int | None = None
         self._refused: set[int] = set()
         self._left: set[int] = set()
+        self._tested: dict[int, int] = {}
+        """Number of sightings of a landmark when it was last tested (`_has_misplaced`)."""
         self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, Marginals] | None = None
         self._window = self._empty_window()
@@ -428,8 +432,8 @@ class Smoother:
         return self._changed(handles)
 
     def settle(self, time_s: float) -> None:
-        """Gauss-Newton steps until no landmark and not the newest keyframe would be relinearised, ten at most."""
-        self._iterate(time_s, MOST_SETTLING_STEPS, self.params.relinearize_threshold)
+        """Gauss-Newton steps until no landmark and not the newest keyframe would be relinearised (`MOST_STEPS`)."""
+        self._iterate(time_s, self.params.relinearize_threshold)
 
     def _changed(self, added: Sequence[int] = ()) -> Changed:
         """Changes since the last answer."""
@@ -459,13 +463,16 @@ class Smoother:
         relinearises = (
             time_s >= self._relinearised_s + self.params.relinearize_interval_s
         )
+        seen = self._store.newly_seen()
         # GTSAM counts updates, but their rate depends on what the sonar sees
         if relinearises:
             self._relinearised_s = time_s
         is_solved = self._step(time_s, lag_s, relinearises=relinearises)
         if not is_solved:
             return
-        self._iterate(time_s, MOST_STEPS, LEAST_ITERATED)
+        self._iterate(time_s, LEAST_ITERATED)
+        if not self.is_bounded and self._has_misplaced(seen):
+            self._restart(time_s)
         # marginals of a bounded window stay linearised where their poses left
         if isinstance(self._window, FixedLagWindow):
             may_restart = time_s >= self._restarted_s + self.params.lag_s
@@ -476,9 +483,9 @@ class Smoother:
             ):
                 self._restart(time_s)
 
-    def _iterate(self, time_s: float, most_steps: int, least: float) -> None:
+    def _iterate(self, time_s: float, least: float) -> None:
         """Further Gauss-Newton steps while the last one was large (rad or m); a restart where they diverge."""
-        for _ in range(most_steps):
+        for _ in range(MOST_STEPS):
             step = self._largest_step()
             # not <= : also where the step is no number
             if not step <= LEAST_SUSPICIOUS and self._has_diverged():
@@ -546,6 +553,20 @@ class Smoother:
         error_after = graph.error(self.estimates.all())
         # an error that is no number has increased too
         return not error_after <= error_before
+
+    def _has_misplaced(self, keys: set[int]) -> bool:
+        """True when one of these landmarks is not where its sightings place it (`misplaced`).
+
+        A landmark is tested at its third sighting, and when its sightings have doubled since the last test. So a
+        restart that leaves it where it was, because most of its sightings are wrong, is rarely repeated.
+        """
+        due = {}
+        for key in keys:
+            lines = self._store.sightlines_of(key)
+            if len(lines) > 2 * self._tested.get(key, 1):
+                due[key] = lines
+                self._tested[key] = len(lines)
+        return bool(misplaced(self.estimates, due))
 
     def _restart(self, time_s: float) -> None:
         """Begin the window again at the batch solution of the graph."""

@@ -7,13 +7,15 @@ given its neighbours. Millimetre odometry reaches this ratio after some metres o
 slower: a window changes to QR when Cholesky has failed, and stays with it (docs/theory/isam2.md).
 """
 
+from collections import defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
+from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.factor_store import (
     BIAS,
     LANDMARK,
@@ -28,8 +30,15 @@ NEVER = 1_000_000_000
 MOST_FILL = 1.5
 """Growth of the Bayes tree since all variables were last ordered together, from which they are ordered again
 (`benchmarks/validation/isam2_constants.py`)."""
+FEWEST_TOGETHER = 3
+"""New sightings of one landmark from one keyframe, from which they become one factor. It is linearised in Python: for
+fewer sightings that takes longer than it saves (`benchmarks/validation/isam2_constants.py`)."""
 LAST = 1
 """Group of the variables that are eliminated last; all others are in group 0."""
+Groups = Mapping[int, FactorGroup]
+"""Groups of factors by handle."""
+View = tuple[int, int]
+"""Keys of a keyframe and of a landmark that it sees."""
 Times = Mapping[Any, float]
 """Time (s) at which a variable was last used, by key."""
 
@@ -57,8 +66,79 @@ def isam2_params(thresholds: Thresholds, *, is_by_qr: bool) -> gtsam.ISAM2Params
     return params
 
 
+class BundleError:
+    """Error of several sightings of one landmark from one keyframe, called by GTSAM.
+
+    Parameters
+    ----------
+    view
+        Keys of keyframe and landmark.
+    groups
+        Factors of each sighting.
+    """
+
+    __slots__ = ("_graph", "_order", "keys", "rows")
+
+    def __init__(self, view: View, groups: Iterable[FactorGroup]) -> None:
+        self.keys = list(view)
+        self._graph = graph_of(groups)
+        self._order = gtsam.Ordering()
+        for key in view:
+            self._order.push_back(key)
+        factors = [self._graph.at(i) for i in range(self._graph.size())]
+        self.rows = sum([factor.dim() for factor in factors])
+
+    def __call__(
+        self,
+        _: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[Floats] | None,
+    ) -> Floats:
+        """Whitened errors with the weights of their kernels, shape (rows,): iSAM2 only linearises its factors."""
+        A, b = self._graph.linearize(values).jacobian(self._order)  # A x = b
+        if jacobians is not None:
+            jacobians[0] = A[:, :6]  # (rows, 6)
+            jacobians[1] = A[:, 6:]  # (rows, 3)
+        return -b
+
+
+def parts_of(groups: Groups) -> list[dict[int, FactorGroup]]:
+    """Groups by handle, in parts: several sightings of one landmark from one keyframe, or a single group."""
+    views: dict[View | int, dict[int, FactorGroup]] = defaultdict(dict)
+    for handle, group in groups.items():
+        if group.seen is None:
+            views[handle][handle] = group
+        else:
+            landmark_key, line = group.seen
+            views[line.pose_key, landmark_key][handle] = group
+    parts = []
+    for view in views.values():
+        if len(view) >= FEWEST_TOGETHER:
+            parts.append(view)
+        else:
+            parts += [{handle: group} for handle, group in view.items()]
+    return parts
+
+
+def factors_of(part: Groups) -> list[gtsam.NonlinearFactor]:
+    """The factors of a single group; one factor for several sightings."""
+    groups = list(part.values())
+    seen = groups[0].seen
+    if len(groups) == 1 or seen is None:
+        return list(groups[0])
+    landmark_key, line = seen
+    error = BundleError((line.pose_key, landmark_key), groups)
+    noise = gtsam.noiseModel.Unit.Create(error.rows)
+    return [gtsam.CustomFactor(noise, error.keys, error)]
+
+
 class WholeWindow:
-    """iSAM2 over all variables of the run."""
+    """iSAM2 over all variables of the run.
+
+    An update of iSAM2 searches all factors of each variable that it eliminates. The landmarks in reach are always among
+    these variables, so that the search grows with the run. Therefore several new sightings of one landmark from one
+    keyframe enter as one factor.
+    """
 
     def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
         params = isam2_params(thresholds, is_by_qr=is_by_qr)
@@ -73,14 +153,16 @@ class WholeWindow:
         Held as a reference: while Python holds it, GTSAM hands this object to factors written in Python instead of
         copying all values for each of them."""
         self._slots: dict[int, list[int]] = {}
+        self._parts: dict[int, Groups] = {}
+        """By handle: the groups whose factors share these slots."""
 
-    def begin(self, groups: Mapping[int, FactorGroup], values: gtsam.Values) -> None:
+    def begin(self, groups: Groups, values: gtsam.Values) -> None:
         """Add all groups of factors, by handle, and all variables. RuntimeError where there is no solution."""
         self.update(groups, values, removed=(), relinearises=False)
 
     def update(
         self,
-        new: Mapping[int, FactorGroup],
+        new: Groups,
         values: gtsam.Values,
         *,
         removed: Iterable[int],
@@ -99,9 +181,8 @@ class WholeWindow:
         """
         # GTSAM would put the variables of new factors last, and in an update without new factors none
         params = gtsam.ISAM2UpdateParams()
-        params.removeFactorIndices = [
-            slot for handle in removed for slot in self._slots.pop(handle)
-        ]
+        slots, kept = self._without(set(removed))
+        params.removeFactorIndices = slots
         params.force_relinearize = relinearises
         groups = gtsam.KeyGroupMap()
         eliminated_again = gtsam.KeyList()
@@ -112,10 +193,27 @@ class WholeWindow:
                 eliminated_again.push_back(key)
         params.constrainedKeys = groups
         params.extraReelimKeys = eliminated_again
-        result = self.isam.update(graph_of(new.values()), values, params)
+        parts = parts_of(kept | dict(new))
+        factors = [factors_of(part) for part in parts]
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in chain.from_iterable(factors):
+            graph.add(factor)
+        result = self.isam.update(graph, values, params)
         indices = iter(result.getNewFactorsIndices())
-        for handle, group in new.items():
-            self._slots[handle] = list(islice(indices, len(group.factors)))
+        for part, made in zip(parts, factors, strict=True):
+            slots = list(islice(indices, len(made)))
+            for handle in part:
+                self._slots[handle] = slots
+                self._parts[handle] = part
+
+    def _without(self, removed: set[int]) -> tuple[list[int], dict[int, FactorGroup]]:
+        """Slots of removed groups, and the groups beside them in these slots, which enter again."""
+        slots = {slot for handle in removed for slot in self._slots.pop(handle)}
+        beside: dict[int, FactorGroup] = {}
+        for handle in removed:
+            beside.update(self._parts.pop(handle))
+        kept = {handle: beside[handle] for handle in sorted(beside.keys() - removed)}
+        return sorted(slots), kept
 
     def holds(self, key: int) -> bool:
         """True for a variable in the window."""
