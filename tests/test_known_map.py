@@ -1,7 +1,6 @@
 """Runs with a map of known landmarks: every estimator starts with it, and notices what moved."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_start import MapLocator
-from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.given_map import given_map_table, located_line
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -61,7 +58,7 @@ def rms_m(dive: Sequence, told: dict) -> float:
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf])
-def test_a_filter_begins_with_the_places_and_the_joint_covariance_of_the_map(kind):
+def test_a_filter_begins_with_places_and_covariance_of_the_map(kind):
     """Wherever the vehicle starts, and however unsure of its pose."""
     rng = np.random.default_rng(1)
     root = rng.standard_normal((9, 9))
@@ -91,16 +88,6 @@ def test_a_map_makes_a_dive_more_accurate_and_stays_consistent(dive, kind):
     rows = np.searchsorted(truth.ids, found.ids)
     e = (np.array(found.positions_m) - truth.positions[rows]).ravel()
     assert 0.3 < e @ np.linalg.solve(found.joint(), e) / e.size < 2.0
-
-
-def test_all_estimators_agree_about_a_dive_in_a_map(dive):
-    ends = []
-    for kind in KINDS:
-        _, told = run(kind, with_map(dive, surveyed(dive)))
-        ends.append(list(told.values())[-1])
-    for other in ends[1:]:
-        e = ends[0].world_T_body.localCoordinates(other.world_T_body)
-        assert e @ np.linalg.solve(ends[0].covariance, e) < 6.0
 
 
 @each
@@ -145,7 +132,8 @@ def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
     assert estimator.withheld() == ["landmarks of the map that were not seen: 99"]
 
 
-RIGHT, WRONG = 1.0, 100.0
+RIGHT = 1.0
+WRONG = 100.0
 """Squared distances of sightings that agree with the map, and that contradict it."""
 
 
@@ -157,7 +145,7 @@ def judged(sightings: list[tuple[int, float]]) -> KnownLandmarks:
     return known
 
 
-def test_a_landmark_has_moved_where_most_sightings_contradict_it_and_most_landmarks_agree():
+def test_a_landmark_has_moved_if_most_of_its_sightings_contradict_it():
     agree = [(i, RIGHT) for i in (1, 2, 3)]
     assert judged(agree + [(0, WRONG)] * 2).moved == []
     assert judged(agree + [(0, WRONG)] * 3).moved == [0]
@@ -166,7 +154,7 @@ def test_a_landmark_has_moved_where_most_sightings_contradict_it_and_most_landma
     assert both.moved == [0, 4]
 
 
-def test_where_as_many_landmarks_contradict_as_agree_none_is_let_go_and_all_are_named():
+def test_none_has_moved_where_as_many_contradict_as_agree():
     known = judged([(1, RIGHT)] + [(0, WRONG)] * 9)
     assert known.moved == []
     assert known.messages()[0].startswith("landmarks 0 contradict the map")
@@ -188,7 +176,7 @@ def unknown_start(dive: Sequence) -> Start:
 
 
 @each
-def test_an_unknown_start_is_found_in_the_map_and_no_pose_is_claimed_before(dive, kind):
+def test_an_unknown_start_is_found_in_the_map(dive, kind):
     lost = with_map(dive, surveyed(dive), unknown_start(dive))
     _, told = run(kind, lost)
     estimates = list(told.values())
@@ -204,20 +192,6 @@ def test_an_unknown_start_is_found_in_the_map_and_no_pose_is_claimed_before(dive
                 - estimate.world_T_body.translation()
             )
             assert np.linalg.norm(e) < 0.5
-
-
-@each
-def test_landmarks_that_moved_do_not_bend_a_start_that_is_found(dive, kind):
-    """One of them is in view at the start."""
-    known = surveyed(dive)
-    places = np.array(known.positions_m)
-    places[2] += [1.5, 0.5, 0.0]
-    places[6] += [-1.0, 1.5, 0.0]
-    wrong = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
-    estimator, told = run(kind, with_map(dive, wrong, unknown_start(dive)))
-    assert rms_m(dive, told) < 0.1
-    (message,) = estimator.withheld()
-    assert message.startswith("landmarks 3, 7 no longer stand where the map has them")
 
 
 def test_a_start_that_is_found_does_not_depend_on_how_the_log_is_cut(dive):
@@ -303,22 +277,6 @@ def test_a_covariance_that_is_none_is_refused(covariance, message):
         KnownMap.of([1], [[0.0, 0.0, 0.0]], covariance_m2=covariance)
 
 
-def test_the_landmarks_of_a_comparison_are_a_map_without_correlations(
-    dive, tmp_path: Path
-):
-    from sonar_graph.logs import write_landmarks_csv
-
-    estimator, _ = run(EkfSlam, with_map(dive, None))
-    landmarks = estimator.landmarks()
-    write_landmarks_csv(tmp_path / "landmarks.csv", landmarks)
-    known, warnings = read_map(tmp_path / "landmarks.csv")
-    np.testing.assert_allclose(known.positions_m, landmarks.positions)
-    np.testing.assert_allclose(
-        known.joint()[3:6, 3:6], landmarks.covariances[1], atol=1e-15
-    )
-    assert "no correlations" in warnings[0]
-
-
 def test_the_start_that_is_found_is_a_prior_of_a_ninth_of_its_information(dive):
     """The estimator weighs the sightings that found it; a tighter prior would count them twice."""
     lost = with_map(dive, surveyed(dive), unknown_start(dive))
@@ -342,25 +300,6 @@ def test_a_map_of_the_same_log_is_doubted_and_one_of_another_dive_is_not(tmp_pat
     again = in_map(first, tmp_path / "map.toml")
     assert "made from the same log" in again.notes["log.warnings"]
     assert "log.warnings" not in in_map(second, tmp_path / "map.toml").notes
-
-
-def test_the_page_of_a_located_dive_has_the_given_map_and_what_became_of_it(dive):
-    """What moved comes first; estimates are shown in the map's world, without alignment."""
-    known = surveyed(dive)
-    places = np.array(known.positions_m)
-    places[2] += [1.5, 0.5, 0.0]
-    more = KnownMap.of([*known.ids, 99], [*places, (25.0, 0.0, -2.0)], sigma_m=SIGMA_M)
-    compared = compare(with_map(dive, more, unknown_start(dive)), ["isam2", "ekf-slam"])
-    table = given_map_table(compared)
-    rows = [[cell.text for cell in row] for row in table.rows]
-    assert rows[0][0] == "3"
-    assert all(cell.endswith("moved") for cell in rows[0][3:])
-    assert [row[0] for row in rows if row[3:] == ["not seen"] * 2] == ["99"]
-    assert located_line(compared).startswith("Located in the map (star): isam2: after ")
-    page = render_report(compared)
-    assert 'id="show-raw" checked' in page
-    assert "map that was given" in page
-    assert "start heading" not in compared.sequence.notes.get("log.sensors", "")
 
 
 def test_the_truth_is_not_moved_to_estimates_that_a_map_has_placed(dive):
