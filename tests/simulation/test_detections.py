@@ -247,6 +247,25 @@ def test_a_wrong_identity_is_one_other_landmark_s_for_its_share(
         assert len(set(ids[is_wrong].tolist())) <= 1
 
 
+def test_a_track_is_of_one_landmark_and_has_no_gap():
+    drawn = np.random.default_rng(5)
+    landmark = drawn.integers(0, 3, 60)
+    stamps_ns = np.cumsum(drawn.integers(1, 800_000_000, 60))
+    watched = simulated.Watched.of(landmark, stamps_ns)
+    for number, true in enumerate(watched.landmark.tolist()):
+        rows = np.flatnonzero(watched.track == number)
+        assert set(landmark[rows].tolist()) == {true}
+        age_s = (stamps_ns[rows] - stamps_ns[rows[0]]) / 1e9
+        np.testing.assert_allclose(watched.age_s[rows], age_s)
+        assert watched.lifetime_s[number] == pytest.approx(age_s.max())
+    for index in range(3):
+        rows = np.flatnonzero(landmark == index)
+        is_new = np.diff(watched.track[rows]) != 0
+        is_far = np.diff(stamps_ns[rows]) > 1_000_000_000
+        assert 5 < is_far.sum() < len(is_far) - 5
+        np.testing.assert_array_equal(is_new, is_far)
+
+
 def test_options_of_tracks_without_tracks_are_refused():
     for options, message in (
         (

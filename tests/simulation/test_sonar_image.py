@@ -186,6 +186,18 @@ def test_level_over_range_is_that_of_spreading_absorption_and_gain():
     )
 
 
+def test_absorption_is_what_gain_gives_back_and_noise_shows():
+    quiet = simulator(noise_db=15.0, absorption_db_m=0.0, floor_db=-60.0)
+    far = simulator(noise_db=15.0, absorption_db_m=0.8, floor_db=-60.0)
+    difference = level_db(far).mean(axis=0) - level_db(quiet).mean(axis=0)
+    np.testing.assert_allclose(difference, 2 * 0.8 * (far.ranges_m() - 2.0), atol=1e-3)
+    at_2_m = bins_at(far, 2.0)[0]
+    noise = np.mean(
+        [intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(5)]
+    )
+    assert 10 * np.log10(noise) == pytest.approx(15, abs=0.2)
+
+
 @pytest.mark.parametrize("height_m", [0.03, 0.06])
 def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
     near_m = 1.45
