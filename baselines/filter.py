@@ -598,7 +598,7 @@ class FilterShell(ABC):
         return self.sonar._replace(gate=min(self.sonar.gate, self._known.gate))
 
     def _judge_map(self, landmark_id: int, judged: Judged) -> None:
-        """Let a landmark of the map go that has moved; its next sighting maps it anew."""
+        """Let a landmark of the map go that has moved; its next sighting maps it again."""
         if landmark_id not in self._known.held:
             return
         squared = float(judged.e @ np.linalg.solve(judged.S, judged.e))

@@ -78,7 +78,7 @@ def read_map(path: Path) -> ReadMap:
         known, is_marginal = of_table(text, path)
         if is_marginal:
             warnings.append(
-                f"{path}: covariances of single landmarks, and no correlations between them; run --save-map writes all"
+                f"{path}: covariances of single landmarks, and no correlations between them; the map.toml of a run has them"
             )
     farthest_m = float(np.abs(np.array(known.positions_m)).max())
     if farthest_m > MOST_M:
@@ -179,7 +179,7 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     start = sequence.calibration.start.in_map()
     note = f"{len(known.ids)} landmarks of {path.name}"
     if start.source == "map":
-        note += "; the log states no place in it: the start is found by identified landmarks"
+        note += "; the start is found in it, by identified landmarks"
     if known.source.startswith(f"{map_origin(sequence)}, "):
         warnings.append(
             f"{path}: this map was made from the same log, whose measurements count twice then: results look too certain"

@@ -15,6 +15,8 @@ from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_start import MapLocator
+from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.given_map import given_map_table, located_line
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -300,6 +302,30 @@ def test_a_map_of_the_same_log_is_doubted_and_one_of_another_dive_is_not(tmp_pat
     again = in_map(first, tmp_path / "map.toml")
     assert "made from the same log" in again.notes["log.warnings"]
     assert "log.warnings" not in in_map(second, tmp_path / "map.toml").notes
+
+
+def test_the_page_of_a_located_dive_has_the_given_map_and_what_became_of_it(dive):
+    """What moved comes first; estimates are shown in the map's world, without alignment."""
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    places[2] += [1.5, 0.5, 0.0]
+    more = KnownMap.of([*known.ids, 99], [*places, (25.0, 0.0, -2.0)], sigma_m=SIGMA_M)
+    compared = compare(with_map(dive, more, unknown_start(dive)), ["isam2", "ekf-slam"])
+    table = given_map_table(compared)
+    rows = [[cell.text for cell in row] for row in table.rows]
+    assert rows[0][0] == "3"
+    assert all(cell.endswith("moved") for cell in rows[0][3:])
+    assert [row[0] for row in rows if row[3:] == ["not seen"] * 2] == ["99"]
+    assert located_line(compared).startswith("Located in the map (star): isam2: after ")
+    smoothed = compared.runs[0].smoothed
+    assert len(smoothed) > len(compared.runs[0].causal)
+    truth = dive.true_poses.at(smoothed.stamps_ns[:5])
+    away = smoothed.positions[:5] - truth.positions
+    assert np.abs(away).max() < 0.3
+    page = render_report(compared)
+    assert 'id="show-raw" checked' in page
+    assert "map that was given" in page
+    assert "start heading" not in compared.sequence.notes.get("log.sensors", "")
 
 
 def test_the_truth_is_not_moved_to_estimates_that_a_map_has_placed(dive):

@@ -117,55 +117,55 @@ def view(
     found = {
         name: command for name, one in VIEWERS.items() if (command := command_of(one))
     }
-    asked = viewer if viewer is not None else next(iter(found), "browser")
-    if asked in VIEWERS and asked not in found:
-        raise EvaluationError(
-            f"--viewer {asked}: is not installed: {VIEWERS[asked].install}"
-        )
-    if asked in VIEWERS and log is None:
-        raise EvaluationError(
-            f"{result}: has no {RESULT_LOG} for {asked}; compare and run write one"
-        )
-    if log is None or asked == "browser":
-        if asked == "browser" and viewer is None:
+    chosen = viewer or next(iter(found if log else ()), "browser")
+    if chosen == "browser":
+        if viewer is None and not found:
             advice = "; ".join(
                 f"{name}: {one.install}" for name, one in VIEWERS.items()
             )
             echo(f"No viewer for {RESULT_LOG} is installed ({advice})", err=True)
-        if page is None:
-            if result.is_file() and result.name != RESULT_LOG:
-                raise EvaluationError(
-                    f"{result}: is a log, with no {PAGE} beside it; a viewer shows it ({', '.join(VIEWERS)}), and "
-                    f"`sonar-graph compare {result} -o DIR` makes a result of it"
-                )
-            folder = result if result.is_dir() else result.parent
-            raise EvaluationError(
-                f"{result}: has no {PAGE}; sonar-graph report {folder} writes it"
-            )
-        is_open = has_screen() and webbrowser.open(page.absolute().as_uri())
-        echo(f"{'Opened' if is_open else 'No screen here; open'} {page}")
+        show_page(result, page)
         return
-    if not has_screen():
-        echo(
-            f"No screen here; open {log} with {asked}"
-            + (f", or {page} in a browser" if page else "")
+    if chosen not in found:
+        raise EvaluationError(
+            f"--viewer {chosen}: is not installed: {VIEWERS[chosen].install}"
         )
+    if log is None:
+        raise EvaluationError(
+            f"{result}: has no {RESULT_LOG} for {chosen}; compare and run write one"
+        )
+    if not has_screen():
+        instead = f", or {page} in a browser" if page else ""
+        echo(f"No screen here; open {log} with {chosen}{instead}")
         return
     # the viewer goes on when the command has ended
     subprocess.Popen(
-        [*found[asked], str(log.absolute())],
+        [*found[chosen], str(log.absolute())],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
     layout = log.parent / LAYOUT
-    told = (
-        f"; import {layout} as its layout"
-        if VIEWERS[asked].takes_layout and layout.is_file()
-        else ""
-    )
-    echo(f"Opened {log} with {asked}{told}")
+    has_layout = VIEWERS[chosen].takes_layout and layout.is_file()
+    told = f"; import {layout} as its layout" if has_layout else ""
+    echo(f"Opened {log} with {chosen}{told}")
+
+
+def show_page(result: Path, page: Path | None) -> None:
+    """Open the page of a result in the browser, or name it where there is no screen."""
+    if page is None and result.is_file() and result.name != RESULT_LOG:
+        raise EvaluationError(
+            f"{result}: is a log, with no {PAGE} beside it; a viewer shows it ({', '.join(VIEWERS)}), and "
+            f"`sonar-graph compare {result} -o DIR` makes a result of it"
+        )
+    if page is None:
+        folder = result if result.is_dir() else result.parent
+        raise EvaluationError(
+            f"{result}: has no {PAGE}; sonar-graph report {folder} writes it"
+        )
+    is_open = has_screen() and webbrowser.open(page.absolute().as_uri())
+    echo(f"{'Opened' if is_open else 'No screen here; open'} {page}")
 
 
 def files_of(result: Path) -> tuple[Path | None, Path | None]:

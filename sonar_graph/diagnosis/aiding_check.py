@@ -412,6 +412,8 @@ def findings_of(
         by_cause = cause_of(check.name, check.causes, found, sequence.calibration)
         if by_cause is not None:
             return [by_cause]
+        fault = odd_gain(check, replace(found, gain=gain), sequence, config)
+    if fault is None:
         fault = other_values(check, found, sigma)
     if fault is not None:
         grave = Gravity.GRAVE
@@ -440,7 +442,7 @@ def findings_of(
 def grave_fault(
     check: Check, found: Match, sequence: Sequence, config: LogConfig
 ) -> Advice | None:
-    """Cause and line of a fault beyond doubt: stuck, a jump, another sense or unit; None: none."""
+    """Cause and line of a fault beyond doubt: stuck, a jump, another sense, or a unit with a name; None: none."""
     gain = found.gain
     size = abs(gain.value)
     sigma = check.sigma(sequence)
@@ -458,11 +460,22 @@ def grave_fault(
     is_opposite = found.is_mirrored or (gain.is_known and gain.value < 0)
     if is_opposite and is_borne_out:
         return check.sense(config)
+    # a gain without a unit's name may have another cause
+    return odd_gain(check, found, sequence, config) if unit_of(check, size) else None
+
+
+def odd_gain(
+    check: Check, found: Match, sequence: Sequence, config: LogConfig
+) -> Advice | None:
+    """A gain that is surely far from 1 of a sensor that agrees with its reference otherwise; None: there is none."""
+    gain = found.gain
+    size = abs(gain.value)
     other_unit = SLIPPING_UNIT if check.slips(sequence) else OTHER_UNIT
     is_sure = matters(replace(gain, value=size - 1.0), 0.0)
-    if is_sure and is_borne_out and not 1 / other_unit < size < other_unit:
-        return unit_advice(check, found, config)
-    return None
+    is_far = is_sure and not 1 / other_unit < size < other_unit
+    if not is_far or found.misfit > MOST_MISFIT:
+        return None
+    return unit_advice(check, found, config)
 
 
 def other_values(check: Check, found: Match, sigma: float) -> Advice | None:

@@ -112,6 +112,7 @@ LARGEST_DENSITY_RATIO = 1.5
 LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
 CERTAIN_SIGMAS = 4.0
+PAIRED_SIGMAS = 2.0
 LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
@@ -643,8 +644,8 @@ def brought_apart(before: Sequence, after: Sequence) -> str:
         if agreed is None or agrees is None or not agrees.gain.is_known:
             continue
         error = abs(agrees.gain.value - 1.0) - abs(agreed.gain.value - 1.0)
-        # the same rows twice: their noise is common to both
-        is_off = error > CERTAIN_SIGMAS * agrees.gain.sigma
+        # the same rows twice, whose noise is common to both
+        is_off = error > PAIRED_SIGMAS * agrees.gain.sigma
         if is_off or agrees.scatter > CLEARLY_BETTER * agreed.scatter:
             names.append(check.name)
     return " and ".join(names)

@@ -112,11 +112,14 @@ def check_outcome(
 ) -> None:
     """Refuse results that cannot be scored.
 
-    Raises `EvaluationError` when the smoothed trajectory is not at the causal one's instants; a
+    Raises `EvaluationError` when the smoothed trajectory does not end with the causal one's instants; a
     pose or landmark is not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
     """
-    # scores compare both paths instant by instant
-    if not np.array_equal(causal.stamps_ns, smoothed.stamps_ns):
+    # scores compare both paths instant by instant; a start that is found later gives smoothed poses before it
+    earlier = len(smoothed) - len(causal)
+    if earlier < 0 or not np.array_equal(
+        causal.stamps_ns, smoothed.stamps_ns[earlier:]
+    ):
         raise EvaluationError(
             f"trajectory() has {len(smoothed)} instants, not the {len(causal)} for which process returned estimates"
         )

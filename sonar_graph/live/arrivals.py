@@ -106,6 +106,7 @@ class Arrivals:
         no detection up to its stamp will come.
         """
         newest_ns = stamp_ns
+        # stamps and arrivals go on by the same time, unless a clock was set
         if arrival_ns is not None and self._clock_ns is not None:
             newest_ns, last_arrival_ns = self._clock_ns
             ahead_ns = stamp_ns - newest_ns
@@ -118,11 +119,13 @@ class Arrivals:
         if self.done_ns is not None and stamp_ns <= self.done_ns:
             return LATE
         if block is not None:
+            # a sonar frame has many rows of one stamp
             if sensor != "detections" and stamp_ns in self._stamps_ns[sensor]:
                 return REPEATED
             self._stamps_ns[sensor].add(stamp_ns)
             waiting = self._waiting[sensor]
             waiting.append(block)
+            # joining thousands of single rows at once would delay a step
             if len(waiting) > MOST_PARTS:
                 waiting[:] = [joined(waiting)]
             self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
@@ -160,6 +163,7 @@ class Arrivals:
 
     def _step(self, end_ns: int) -> Measurements:
         assert self.start_ns is not None
+        # the first step has what came before the start too
         after_ns = self.start_ns - PAUSE_NS if self.done_ns is None else self.done_ns
         rows: dict[str, Any] = {}
         for name, parts in self._waiting.items():
@@ -179,6 +183,7 @@ def joined(parts: list[Any]) -> Any:
     if len(parts) == 1:
         return parts[0]
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+    # late messages come after newer ones
     order = np.argsort(stamps_ns, kind="stable")
     columns = {
         name: _stacked(name, [getattr(part, name) for part in parts])[order]

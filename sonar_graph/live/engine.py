@@ -180,6 +180,7 @@ class Engine:
         at_ns = self.log_time_ns = self._record.write(
             name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
         )
+        # of a sensor that began late
         if is_new and self._reader is not None:
             self._find_places()
         if dropped == OVERLOADED:  # all other reasons are found again
@@ -272,6 +273,7 @@ class Engine:
 
         Its mounting is part of the calibration, which an estimator has from its beginning.
         """
+        # the record is what is left of the messages until now
         self._record.flush()
         dropped = dropped_messages(self.record_path)
         needed = {*self.in_use.values(), *self._places}
@@ -281,6 +283,7 @@ class Engine:
             if (message.topic, message.arrival_ns) not in dropped
             and (message.topic in needed or message.topic.endswith("tf_static"))
         ]
+        # without it everything goes on as before
         if not self._set_up(held):
             self._unfit.add(name)
             self.remarks.append(f"{name} is not used: {self.waits_for}")
@@ -336,12 +339,15 @@ class Engine:
             dvl: Any = choices["dvl"].adapter
             choices["dvl"] = replace(choices["dvl"], adapter=dvl.at_first())
             assembly = self._assembly(recording, choices)
+            # a sensor of no use may become one later
             for role, choice in choices.items():
                 if not _is_of_use(assembly, role):
                     choices[role] = replace(choice, topic=None, adapter=None)
             tables = pinned(self._config, choices, assembly)
+            # as a later reading of the record has it
             plain = json.loads(json.dumps(tables))
             config = LogConfig.parse(plain, self._config.source)
+            # by the pinned configuration, as single messages are read from now on
             assembly = self._assembly(recording, choose_topics(recording, {}, config))
             sequence = assembly.sequence("live")
             reader = MessageReader(assembly)
@@ -395,6 +401,7 @@ class Engine:
             for part in parts
             if not part.fault and message.arrival_ns < first_ns + SETUP_NS
         )
+        # the median, since the first message may be the wrong one
         if offsets_ns:
             usual_ns = offsets_ns[len(offsets_ns) // 2]
             self._arrivals.expect(first_ns + usual_ns, first_ns)

@@ -98,6 +98,7 @@ class FoxgloveLink:
         from websockets.exceptions import ConnectionClosed
 
         while not self._is_ended.is_set():
+            # a robot's radio breaks off now and then
             with suppress(ConnectionClosed):
                 self._pass_on(received, is_wanted)
             self.breaks += not self._is_ended.is_set()
@@ -116,36 +117,24 @@ class FoxgloveLink:
         for data in self._socket:
             if isinstance(data, str):
                 said = json.loads(data)
-                channels = (
-                    said.get("channels", []) if said.get("op") == "advertise" else []
-                )
-                wanted = [
-                    channel
-                    for channel in channels
-                    if channel["encoding"] == "cdr"
-                    and is_wanted(channel["topic"], channel["schemaName"])
-                ]
-                for channel in wanted:
-                    topics[channel["id"]] = channel["topic"], channel["schemaName"]
+                is_offer = said.get("op") == "advertise"
+                subscriptions = []
+                for channel in said["channels"] if is_offer else ():
+                    name = (channel["topic"], channel["schemaName"])
+                    if channel["encoding"] != "cdr" or not is_wanted(*name):
+                        continue
+                    number = channel["id"]
+                    topics[number] = name
+                    subscriptions.append({"id": number, "channelId": number})
+                    # IDL is not read: the definition of ROS 2 is taken then
                     if channel.get("schemaEncoding") in (None, "ros2msg"):
-                        self._definitions[channel["schemaName"]] = channel["schema"]
-                if wanted:
-                    subscriptions = [
-                        {"id": channel["id"], "channelId": channel["id"]}
-                        for channel in wanted
-                    ]
-                    self._socket.send(
-                        json.dumps({"op": "subscribe", "subscriptions": subscriptions})
-                    )
+                        self._definitions[name[1]] = channel["schema"]
+                if subscriptions:
+                    wish = {"op": "subscribe", "subscriptions": subscriptions}
+                    self._socket.send(json.dumps(wish))
             elif len(data) >= HEAD.size and data[0] == MESSAGE_DATA:
                 _, number, sent_ns = HEAD.unpack_from(data)
                 if number in topics:
-                    received(
-                        Message(
-                            *topics[number],
-                            data[HEAD.size :],
-                            time.time_ns(),
-                            0,
-                            sent_ns,
-                        )
-                    )
+                    payload = data[HEAD.size :]
+                    now_ns = time.time_ns()
+                    received(Message(*topics[number], payload, now_ns, 0, sent_ns))

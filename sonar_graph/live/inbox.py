@@ -18,7 +18,8 @@ class Inbox:
     def __init__(self, most_bytes: int = 1 << 28) -> None:
         self.dropped: Counter[str] = Counter()
         self._messages: deque[Message] = deque()
-        self._bytes, self._most_bytes = 0, most_bytes
+        self._bytes = 0
+        self._most_bytes = most_bytes
         self._changed = threading.Condition()
 
     def put(self, message: Message) -> None:
@@ -26,6 +27,7 @@ class Inbox:
         with self._changed:
             self._messages.append(message)
             self._bytes += len(message.payload)
+            # an estimator that hangs must not take all memory
             while self._bytes > self._most_bytes:
                 oldest = self._messages.popleft()
                 self._bytes -= len(oldest.payload)
@@ -90,6 +92,7 @@ class Silence:
         }
         silent = {topic: for_s for topic, for_s in known.items() if for_s > SILENT_S}
         new = silent.keys() - self._said
+        # where no topic sends any more, the link is at fault and not a sensor
         if new and all(at_s - heard_s > SILENT_S for heard_s in self._heard_s.values()):
             yield f"nothing comes any more since {min(silent.values()):.0f} s: does the sender run?"
         else:

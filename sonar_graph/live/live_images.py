@@ -88,12 +88,14 @@ class LiveImages:
         for role, blocks in self._rows.items():
             if len(blocks) > MOST_PARTS:
                 self._rows[role] = [joined(blocks)]
+        # images may come long before or after the other sensors
         if not self._topic:
             self._find(message)
         if message.topic == self._topic and self._adapter is not None:
             self._read(message, self._adapter, sequence)
         while self._images:
             topic, at_ns, frame = self._images[0]
+            # a track needs the motion up to its image
             if frame.stamps_ns[0] > self._newest_ns["imu"]:
                 break
             self._images.popleft()

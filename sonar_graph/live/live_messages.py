@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Iterator
-from itertools import groupby
+from itertools import groupby, repeat
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,6 +62,7 @@ def recorded_messages(path: Path) -> Iterator[Message]:
     """
     for file_path in log_parts(path):
         with LogFile(file_path) as file:
+            # chunks without wanted topics are read too: every message is wanted
             passage = Passage(file, lambda _: Keep.ALL, may_skip=False)
             for _, parts in groupby(passage, key=lambda part: id(part.data)):
                 yield from _in_order(list(parts))
@@ -70,18 +71,12 @@ def recorded_messages(path: Path) -> Iterator[Message]:
 
 def _in_order(parts: list[ChunkPart]) -> Iterator[Message]:
     """Messages of one chunk in the order in which they were written."""
-    rows = []
+    rows: list[Any] = []
+    # a passage gives a chunk topic by topic
     for topic, _, found in parts:
         if topic.name != DROPPED_TOPIC and topic.encoding == "cdr":
-            columns = (
-                found.offsets.tolist(),
-                found.sizes.tolist(),
-                found.log_times_ns.tolist(),
-            )
-            rows += [
-                (at, size, log_time_ns, topic)
-                for at, size, log_time_ns in zip(*columns, strict=True)
-            ]
+            columns = (found.offsets, found.sizes, found.log_times_ns)
+            rows += zip(*(column.tolist() for column in columns), repeat(topic))
     for at, size, log_time_ns, topic in sorted(rows, key=lambda row: row[0]):
         sequence, _, sent_ns = HEAD.unpack_from(parts[0].data, at - HEAD.size)
         payload = bytes(parts[0].data[at : at + size])
@@ -102,10 +97,15 @@ def play_messages(
     is_ended: Callable[[], bool],
 ) -> tuple[int, float]:
     """Give messages to ``put`` at ``rate`` times their pace; their number, and the longest delay in seconds."""
-    first_ns, begun_s, count, latest_s = None, time.monotonic(), 0, 0.0
+    begun_s = time.monotonic()
+    first_ns = None
+    count = 0
+    latest_s = 0.0
     for message in messages:
-        first_ns = message.arrival_ns if first_ns is None else first_ns
+        if first_ns is None:
+            first_ns = message.arrival_ns
         due_s = begun_s + (message.arrival_ns - first_ns) * 1e-9 / rate
+        # short sleeps, so that Ctrl-C ends it at once
         while (left_s := due_s - time.monotonic()) > 0:
             if is_ended():
                 return count, latest_s

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
 from sonar_graph.live.live_messages import gather
@@ -20,6 +19,7 @@ from sonar_graph.logs.adapters import (
     LARGEST,
     Adapter,
     ImuAdapter,
+    Mask,
     field_of,
     turn,
 )
@@ -91,6 +91,7 @@ class MessageReader:
         adapter = self._adapters[role]
         table = adapter.table(topic)
         first = table.groups[0]
+        # a log of such messages is refused, so that its record must not have them
         if _sizes(adapter, first) != self._sizes[role]:
             raise LogError("has arrays of another length than the first messages")
         block, dropped = adapter.read(table, self._setups[role])
@@ -173,11 +174,11 @@ def _bytes_of(messages: Messages, path: str) -> Ints:
     return column.starts[0] + (index or 0) * size + np.arange(size)
 
 
-def _stays(messages: Messages) -> NDArray[np.bool_]:
+def _stays(messages: Messages) -> Mask:
     """Mask of the bytes that decide where the numbers are, and whether the message is sound."""
     layout = messages.layout
     stays = np.zeros(messages.payloads.shape[1], bool)
-    stays[:2] = True
+    stays[:2] = True  # the byte order
     for at, _ in layout.words:
         stays[at : at + 4] = True
     for path in (*layout.plan.texts, *layout.plan.booleans):

@@ -112,6 +112,7 @@ class LiveRun:
             self._answers.append,
             lambda step: self.engine.without_detections(step, time.time_ns()),
         )
+        # in this process, whose predictions must not wait for a compiler
         warm_predictor(warm_up)
         self._predictor: Predictor | None = None
         self._silence = Silence()
@@ -156,6 +157,7 @@ class LiveRun:
             self._take(message, dropped.get((message.topic, message.arrival_ns)))
             for step in self.engine.steps():
                 worker.add(step)
+            # an estimator that is behind would lose detections
             while worker.error is None and (worker.waiting or worker.is_busy):
                 time.sleep(1e-4)
             self._use_answers()
@@ -194,12 +196,14 @@ class LiveRun:
         for message in messages:
             self._silence.heard(message.topic, time.monotonic())
             self._take(message)
+        # each message gives the steps that it completes; the rest of many comes now
         if not messages:
             self._give_steps()
         self._use_answers()
         if failure := self._images.failure():
             self._said(failure)
         for stamp_ns, detections in self._images.recognised():
+            # recorded like detections of a robot, so that the record gives the same estimates
             payload = payload_of_detections(detections, stamp_ns)
             self._put(DETECTED, payload)
             self._take(Message(DETECTED, TOPICS[DETECTED], payload, time.time_ns()))
@@ -295,8 +299,10 @@ class LiveRun:
                 self._now.detected_ns = max(self._now.detected_ns, part.stamp_ns)
             if self._predictor is None or part.role not in MOTION:
                 continue
+            # the predictor does not wait for steps
             rows = [part.block if part.role == role else None for role in MOTION]
             self._predictor.add(*rows)
+            # of many rows at once only the newest pose is of use
             if part.role == "imu" and part is parts[-1] and not self._is_quiet:
                 self._predict(self._predictor, arrival_ns)
 

@@ -86,6 +86,7 @@ class Form:
     def payload(self, stamp_ns: int, *numbers: Floats) -> bytes:
         """The message at a stamp."""
         STAMP.pack_into(self._bytes, self._stamp_at, *divmod(stamp_ns, NS_PER_S))
+        # numbers in a message are not aligned, so that no array can be a view of them
         content = np.concatenate([part.ravel() for part in numbers]).tobytes()
         self._bytes[self._numbers_at : self._numbers_at + len(content)] = content
         return bytes(self._bytes)

@@ -81,6 +81,7 @@ class Predictor:
         before = self._estimate
         if before is not None and estimate.stamp_ns <= before.stamp_ns:
             return
+        # the smooth frame moves on by odometry alone, so that it never jumps
         if before is not None:
             step = self._odometry.motion(
                 before.stamp_ns, estimate.stamp_ns, BIAS, known_ns=self._newest_ns
@@ -103,6 +104,7 @@ class Predictor:
         estimate = self._estimate
         if estimate is None:
             return None
+        # an estimate may be of an instant after the newest row
         newest_ns = max(self._newest_ns, estimate.stamp_ns)
         motion = self._odometry.motion(estimate.stamp_ns, newest_ns, BIAS)
         A = motion.i_T_j.inverse().AdjointMap()

@@ -154,6 +154,7 @@ class SonarWorker:
                 i for i, one in enumerate(self._waiting) if one.rows.frame is not None
             ]
             dropped = []
+            # rows stay: tracks need the motion between the images that are left
             for i in images[:-MOST_FRAMES]:
                 one = self._waiting[i]
                 dropped.append(one)
@@ -167,6 +168,7 @@ class SonarWorker:
             was_ended = self._is_ended
             self._is_ended = True
             self._changed.notify()
+        # outside the lock, which the thread that waits for an answer needs
         if not was_ended:
             self._process.end()
 

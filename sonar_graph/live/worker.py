@@ -94,7 +94,7 @@ def serve_estimator() -> None:
 
 def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     if isinstance(request, Begin):
-        # loads numba
+        # loads numba, which the process that serves a robot has loaded already
         from sonar_graph.navigation import make_estimator
 
         kind = load_estimator(request.name)
@@ -133,6 +133,7 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     _Served.update_s += update_s
     _Served.estimates += found
     landmarks_now = None
+    # a map of thousands takes long: now and then is enough for viewers
     if found and before_s >= _Served.next_map_s:
         landmarks_now = newest_landmarks_of(estimator)
         map_s = time.perf_counter() - before_s
@@ -180,6 +181,7 @@ class Worker:
         """Why the estimator failed, if it did."""
         self._process.answer()  # that it is ready
         steps = list(warm_up.replay(warm_up.instants(options.rate_hz)))
+        # what is compiled or loaded at the first use must not delay the first pose
         for request in (self._begin(warm_up.calibration), steps, FINISH):
             self._ask(request)
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -209,6 +211,7 @@ class Worker:
             return
         with self._changed:
             self._waiting.append(step)
+            # of the oldest, since the newest decide the pose
             late = len(self._waiting) - self._most_waiting - 1
             if late >= 0 and not self._is_catching_up:
                 oldest = self._waiting[late]
@@ -244,6 +247,7 @@ class Worker:
                     steps = self._waiting[:MOST_AT_ONCE]
                     del self._waiting[:MOST_AT_ONCE]
                     self.is_busy = True
+                # a run that begins again forgets the steps of the one before
                 if begin is not None:
                     self._ask(begin)
                 if steps:

@@ -51,6 +51,7 @@ def _types() -> Any:
     except ImportError as error:
         raise LogError("live needs rosbags: pip install 'sonar-graph[live]'") from error
     store = get_typestore(Stores.ROS2_JAZZY)
+    # drivers and this package have types that are not of the distribution
     for name, text in DEFINITIONS.items():
         full = name.replace("/", "/msg/")
         if full not in store.types:
@@ -87,7 +88,10 @@ def open_session(connect: Iterable[str] = (), listen: Iterable[str] = ()) -> Any
         import zenoh
     except ImportError as error:
         raise LogError("live needs zenoh: pip install 'sonar-graph[live]'") from error
-    config, connect, listen = zenoh.Config(), list(connect), list(listen)
+    config = zenoh.Config()
+    connect = list(connect)
+    listen = list(listen)
+    where = ", ".join([*connect, *listen])
     settings = {
         "mode": "router" if listen else "client",
         "connect/endpoints": connect,
@@ -100,22 +104,16 @@ def open_session(connect: Iterable[str] = (), listen: Iterable[str] = ()) -> Any
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        where = ", ".join([*connect, *listen])
         raise LogError(
             f"{where}: no endpoint of zenoh; expected one such as {DEFAULT_ROUTER}"
         ) from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        where = ", ".join([*connect, *listen])
-        raise LogError(
-            f"{where}: zenoh cannot {'listen' if listen else 'connect'}: "
-            + (
-                "is the port taken? name another"
-                if listen
-                else "is a router (rmw_zenohd) or `sonar-graph play` there?"
-            )
-        ) from error
+        fault = "connect: is a router (rmw_zenohd) or `sonar-graph play` there?"
+        if listen:
+            fault = "listen: is the port taken? name another"
+        raise LogError(f"{where}: zenoh cannot {fault}") from error
 
 
 def subscribe(
@@ -135,27 +133,25 @@ def subscribe(
         found = parse_key(str(sample.key_expr))
         if found is None or not is_wanted(*found):
             return
-        sequence, sent_ns, sender = 0, 0, b""
-        if (
-            sample.attachment is not None
-            and len(data := sample.attachment.to_bytes()) >= ATTACHMENT.size
-        ):
+        message = Message(*found, sample.payload.to_bytes(), arrival_ns)
+        data = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        # other publishers of zenoh attach nothing, or something else
+        if len(data) >= ATTACHMENT.size:
             sequence, sent_ns, _, sender = ATTACHMENT.unpack_from(data)
-        received(
-            Message(
-                *found, sample.payload.to_bytes(), arrival_ns, sequence, sent_ns, sender
+            message = message._replace(
+                sequence=sequence, sent_ns=sent_ns, sender=sender
             )
-        )
+        received(message)
 
     def take_latched(sample: Any) -> None:
-        content = str(sample.key_expr), sample.payload.to_bytes()
-        if (
-            content not in latched
-        ):  # what was kept by several senders comes several times
+        content = (str(sample.key_expr), sample.payload.to_bytes())
+        # what was kept by several senders comes several times
+        if content not in latched:
             latched.add(content)
             take(sample)
 
     latched: set[tuple[str, bytes]] = set()
+    # what this program publishes itself is not received
     remote = zenoh.Locality.REMOTE
     kept = zenoh.ext.declare_advanced_subscriber(
         session,

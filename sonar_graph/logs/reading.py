@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Never
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
@@ -23,6 +22,7 @@ from sonar_graph.logs.adapters import (
     FieldTable,
     GeodeticFields,
     LogConfig,
+    Mask,
     MessageTable,
     Origin,
     Setup,
@@ -258,12 +258,11 @@ def _scanned(
 
     types = wanted_types(config or LogConfig())
     recording = scanned(types)
-    if config is not None:
-        return recording, config
-    own = recorded_config(recording) or LogConfig()
+    used = config or recorded_config(recording) or LogConfig()
     # the types of its own topics are known only now
-    is_enough = wanted_types(own) <= types
-    return recording if is_enough else scanned(wanted_types(own)), own
+    if not wanted_types(used) <= types:
+        recording = scanned(wanted_types(used))
+    return recording, used
 
 
 class Assembly:
@@ -426,7 +425,7 @@ class Assembly:
             self._dropped[role] = dropped
         return rows
 
-    def _contradicted(self, role: str, rows: Any) -> tuple[NDArray[np.bool_], str, str]:
+    def _contradicted(self, role: str, rows: Any) -> tuple[Mask, str, str]:
         """Mask of rows that other sensors contradict, shape (n,), the reason, and a setting that uses them."""
         none = np.zeros(len(rows), bool)
         imu = self.block("imu") if role != "imu" else None

@@ -4,7 +4,7 @@ Every sighting of a landmark of the map is compared with its prediction, by the 
 azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. A wrong identity
 contradicts seldom and here and there; a landmark that has moved is contradicted each time. So a landmark is contradicted
 from `FEWEST` contradictions on, where they are more than half of its sightings. As long as fewer landmarks are contradicted
-than agree, it has moved, and the estimator maps it anew. Where as many are contradicted, the start may be wrong, or those
+than agree, it has moved, and the estimator maps it again. Where as many are contradicted, the start may be wrong, or those
 that agree have moved: then their sightings are refused, and a message names both.
 """
 
@@ -133,9 +133,9 @@ class KnownLandmarks:
             contradicted = []
         if moved:
             treated = (
-                "mapped anew; correct the map"
+                "mapped again; correct the map"
                 if self._may_release
-                else "their sightings are refused; correct the map, or give history.policy = whole to map them anew"
+                else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
             )
             lines.append(
                 f"landmarks {listed(moved)} no longer stand where the map has them: {treated}"

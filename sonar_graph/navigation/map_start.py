@@ -4,14 +4,14 @@ The level frame o has its origin at the body's first position, and its yaw is ze
 a sighting of landmark i gives a place ``q_k`` in o, with covariance ``S_k``; the landmark's height in the map gives the
 elevation. Heading psi and position t of the start are common to all sightings::
 
-    m_i = R(psi) q_k + t + e_k,    e_k ~ N(0, R(psi) S_k R(psi)^T + M_i)                                       (1)
+    m_i = R(psi) q_k + t + e_k,    cov(e_k, e_l) = M_ij + R(psi) S_k R(psi)^T where k = l                      (1)
 
 Two sightings of different landmarks give psi and t (two-point resection). Every pair proposes a start, refined by least
 squares over the landmarks that agree with it. A landmark agrees where most of its sightings lie within the 99.9 % ellipse
 of (1). One with a wrong identity lies anywhere in the area A of the map. The evidence of a start h, with the prior of a
 pose uniform over A and all headings, and its posterior covariance Sigma::
 
-    E(h) = prod_agreeing (1 - w) N(e_i) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
+    E(h) = N(e) prod_agreeing (1 - w) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
     E(one) = n (1 - w) / A (w / A)^(n - 1),    E(none) = (w / A)^n                                             (3)
 
 w is the probability of a wrong identity. Sightings of one landmark count once, by their mean: a recogniser errs in the same
@@ -237,10 +237,9 @@ def spread(
 def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     """The start that outweighs all others by `ODDS`; None without one."""
     places = np.array(known.positions_m)[:, :2]
-    M = known.joint()
-    place_cov = np.array(
-        [M[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] for k in range(len(places))]
-    )
+    m = len(places)
+    is_level = np.arange(3 * m) % 3 < 2
+    M = known.joint()[np.ix_(is_level, is_level)]  # (2 m, 2 m)
     q = np.array([s.q for s in sightings])
     S = np.array([s.S for s in sightings])
     rows = np.array([s.row for s in sightings])
@@ -250,7 +249,7 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     reach_m = float(np.linalg.norm(q, axis=1).max())
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
     is_of = np.unique(rows)[:, None] == rows
-    data = MapData(q, S, np.linalg.inv(S), rows, is_of, places, place_cov, area_m2)
+    data = MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2)
     found: list[FoundStart] = []
     for proposal in proposals(data):
         # sightings of the same landmarks propose the same start many times
@@ -290,10 +289,16 @@ class MapData(NamedTuple):
     """True for the sightings of each landmark that was seen, shape (l, k)."""
     places: Floats
     """Shape (m, 2)."""
-    place_cov: Floats
-    """Shape (m, 2, 2)."""
+    M: Floats
+    """Joint covariance of the places, shape (2 m, 2 m)."""
     area_m2: float
     """A."""
+
+    @property
+    def place_cov(self) -> Floats:
+        """Covariance of each place, shape (m, 2, 2)."""
+        m = len(self.places)
+        return self.M.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
 
 
 def proposals(data: MapData) -> list[Floats]:
@@ -340,26 +345,35 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
         if np.count_nonzero(agreeing) < 2:
             return None
         q, S = mean_sightings(agrees[agreeing], data)  # (a, 2), (a, 2, 2)
-        e = data.places[seen[agreeing]] - q @ R.T - parameters[1:]
-        W = R @ S @ R.T + data.place_cov[seen[agreeing]]
+        e = (data.places[seen[agreeing]] - q @ R.T - parameters[1:]).ravel()  # (2 a,)
+        W = joint_covariance(R @ S @ R.T, seen[agreeing], data.M)  # (2 a, 2 a)
         by_psi = q @ turn(parameters[0] + 0.5 * math.pi).T
-        by_t = np.broadcast_to(np.eye(2), (len(q), 2, 2))
-        J = np.concatenate([by_psi[:, :, None], by_t], axis=2)  # (a, 2, 3)
-        weighted = np.linalg.solve(W, J)  # (a, 2, 3)
-        information = np.einsum("aij,aik->jk", J, weighted)
-        gradient = np.einsum("aij,ai->j", weighted, e)
+        by_t = np.tile(np.eye(2), (len(q), 1))
+        J = np.column_stack([by_psi.ravel(), by_t])  # (2 a, 3)
+        weighted = np.linalg.solve(W, J)  # (2 a, 3)
+        information = J.T @ weighted
+        gradient = weighted.T @ e
         step = np.linalg.solve(information, gradient)
         parameters = parameters + step
         if float(step @ gradient) < CONVERGED:
             break
     covariance = np.asarray(np.linalg.inv(information), np.float64)
-    squared = np.einsum("ai,ai->a", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
-    log_density = -0.5 * (squared + np.log(np.linalg.det(2.0 * math.pi * W)))
+    _, log_det = np.linalg.slogdet(2.0 * math.pi * W)
+    log_density = -0.5 * float(e @ np.linalg.solve(W, e) + log_det)
     wrong = np.count_nonzero(~agreeing) * math.log(WRONG / data.area_m2)
-    right = float(log_density.sum()) + len(q) * math.log(1.0 - WRONG)
+    right = log_density + len(q) * math.log(1.0 - WRONG)
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
     prior = math.log(2.0 * math.pi * data.area_m2)
     return FoundStart(parameters, covariance, right + wrong + volume - prior)
+
+
+def joint_covariance(S: Floats, rows: Any, M: Floats) -> Floats:
+    """Covariance of (1) over some landmarks, whose places err together, shape (2 a, 2 a); ``S``: (a, 2, 2)."""
+    coordinates = np.add.outer(2 * rows, np.arange(2)).ravel()
+    W = M[np.ix_(coordinates, coordinates)]
+    for k, cov in enumerate(S):
+        W[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
+    return W
 
 
 def mean_sightings(is_averaged: Any, data: MapData) -> tuple[Floats, Floats]:
@@ -398,7 +412,6 @@ class StartInMap:
         self._locator = MapLocator(calibration)
         self._waiting: list[Measurements] = []
         self._inner: Estimator | None = None
-        self._from_ns = 0
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Causal estimate at the end of the measurements; None as long as the vehicle is not located in the map."""
@@ -410,7 +423,6 @@ class StartInMap:
             return None
         started = self._calibration.model_copy(update={"start": self._locator.start()})
         self._inner = self._make(started, Odometry(started))
-        self._from_ns = measurements.end_ns
         estimate = None
         for each in self._waiting:
             estimate = self._inner.process(each)
@@ -418,11 +430,10 @@ class StartInMap:
         return estimate
 
     def trajectory(self) -> Trajectory:
-        """Estimates from the instant on at which the vehicle was located."""
+        """Poses at all instants, also those before the vehicle was located; none until then."""
         if self._inner is None:
             return Trajectory.from_estimates([])
-        whole = self._inner.trajectory()
-        return whole.rows(np.flatnonzero(whole.stamps_ns >= self._from_ns))
+        return self._inner.trajectory()
 
     def landmarks(self) -> LandmarkMap:
         """Best present estimate of every landmark; none before the vehicle is located."""

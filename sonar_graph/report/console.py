@@ -6,6 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonar_graph.evaluation import (
+    RAW,
     Comparison,
     headline_metric,
     label,
@@ -46,13 +47,20 @@ ASK_INSPECT = (
 )
 
 
+def shown_metric(comparison: Comparison) -> str | None:
+    """The position error of the table: not aligned where a given map states the world."""
+    metric = headline_metric(comparison)
+    is_in_map = comparison.sequence.calibration.map is not None
+    return RAW if metric and is_in_map else metric
+
+
 def summary(comparison: Comparison) -> Group:
     """The runs in rows with position error (causal and smoothed), yaw error, NEES and time; below, why runs failed.
 
     The numbers are those of the report. NEES is 1 for a consistent estimator and marked by `Score.verdict`. The lines
     below the table may be as wide as the terminal.
     """
-    metric = headline_metric(comparison)
+    metric = shown_metric(comparison)
     errors = (
         {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"}
         if metric

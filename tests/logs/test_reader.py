@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.data_stream import ReadDataStream
 from mcap.records import Chunk, ChunkIndex, Message
@@ -311,6 +311,8 @@ RANDOM = settings(
     st.floats(0, 1),
     st.integers(1, 3000),
 )
+# up to a message within an uncompressed chunk
+@example("remove", 0.0, 1449)
 @pytest.mark.parametrize("compression", [ZSTD, NONE])
 def test_no_damage_makes_up_a_message_or_loses_one_silently(
     path: Path, compression: CompressionType, how: str, part: float, count: int

@@ -9,23 +9,23 @@ from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED, TRUTH_WORDS, Z_
 from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.landmark_messages import (
-    DetectionRowsAdapter, LandmarkMapAdapter, LandmarkRowsAdapter, detection_warnings, range_and_azimuth,
+    DetectionRowsAdapter, LandmarkRowsAdapter, detection_warnings, range_and_azimuth,
 )
 from sonar_graph.logs.adapters.log_config import (
     LogConfig, as_log_config, changes_text, plain_lines, read_log_config, read_toml, shipped_for, shipped_like, table_text,
 )
 from sonar_graph.logs.adapters.message_table import (
-    LARGEST, LAST_S, Dropped, FieldTable, MessageTable, field_of, header_stamps_ns,
+    LARGEST, LAST_S, Dropped, FieldTable, Mask, MessageTable, field_of,
 )
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter, samples_of_rows
 from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, body_to_ros
 
 __all__ = [
     "ADAPTERS", "ANGLES", "Adapter", "DepthAdapter", "DetectionRowsAdapter", "Dropped", "DvlAdapter", "ENU_R_NED", "FORCES",
-    "FieldTable", "GeodeticFields", "ImuAdapter", "LARGEST", "LAST_S", "LENGTHS", "LandmarkMapAdapter",
+    "FieldTable", "GeodeticFields", "ImuAdapter", "LARGEST", "LAST_S", "LENGTHS", "Mask",
     "LandmarkRowsAdapter", "LogConfig", "MessageTable", "Origin", "PRESSURES", "RATES", "Refused", "SAMPLE_TYPES",
     "SHIPPED", "SPEEDS", "Setup", "Shipped", "SonarAdapter", "TIMES", "TRUTH_WORDS", "Z_DOWN_TYPES", "as_log_config",
     "axes_matrix", "body_to_ros", "changes_text", "detection_warnings", "did_you_mean", "east_north_up", "field_of",
-    "header_stamps_ns", "leaf_fields", "plain_lines", "read_log_config", "read_toml", "range_and_azimuth", "samples_of_rows",
+    "leaf_fields", "plain_lines", "read_log_config", "read_toml", "range_and_azimuth", "samples_of_rows",
     "shipped_for", "shipped_like", "table_text", "turn",
 ]

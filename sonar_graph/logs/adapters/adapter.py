@@ -11,7 +11,6 @@ from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
@@ -20,6 +19,7 @@ from sonar_graph.logs.adapters.geodesy import Origin
 from sonar_graph.logs.adapters.message_table import (
     SAME_STAMP,
     FieldTable,
+    Mask,
     MessageTable,
     field_of,
     share,
@@ -54,6 +54,7 @@ def axes_matrix(rotation: Rotation) -> Floats:
     if isinstance(rotation, str):
         signs = [1.0, 1.0, 1.0] if rotation == "flu" else [1.0, -1.0, -1.0]
         return np.diag(signs)
+    # written as rows of a matrix, a mirrored driver needs no angles
     if isinstance(rotation[0], str):
         return np.array([_ALONG[axis] for axis in rotation])
     angles = np.array(rotation, float)
@@ -210,6 +211,7 @@ class Adapter(Section):
         """Frame of the sensor; empty where the messages do not name one."""
         if self.frame_id is not None:
             return self.frame_id
+        # one sensor fills a topic, so that the first message is enough
         named = map(messages[0].first_string, field_paths(self.frame_id_field))
         return next(filter(None, named), "")
 
@@ -283,7 +285,7 @@ class CovarianceFields(PathSection):
     zero: Reading = "unknown"
     """Meaning of a covariance of zeros."""
 
-    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
         is_negative = matrices[:, 0, 0] < 0
@@ -291,12 +293,13 @@ class CovarianceFields(PathSection):
         is_invalid = is_negative & (self.of_negative(is_negative) == "invalid")
         is_invalid |= is_zero & (self.zero == "invalid")
         is_finite = np.isfinite(matrices).all(axis=(1, 2))
+        # estimators would take a matrix that is no covariance for certainty
         is_unknown = is_negative | is_zero | ~is_finite | _is_impossible(matrices)
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
         return np.where(is_unknown[:, None, None], np.nan, matrices), is_invalid
 
-    def of_negative(self, is_negative: NDArray[np.bool_]) -> Reading:
+    def of_negative(self, is_negative: Mask) -> Reading:
         """Meaning of negative first elements, given which messages have one."""
         if self.negative != "found":
             return self.negative
@@ -350,7 +353,7 @@ def variances(fields: CovarianceFields | None, table: FieldTable) -> Floats:
     return fields.read_variance(table) if fields else np.full(len(table), np.nan)
 
 
-def _is_impossible(matrices: Floats) -> NDArray[np.bool_]:
+def _is_impossible(matrices: Floats) -> Mask:
     """Matrices with a zero on the diagonal or a negative eigenvalue beyond rounding, shape (n,); False for NaN."""
     is_finite = np.all(np.isfinite(matrices), axis=(1, 2))
     finite = np.where(is_finite[:, None, None], matrices, np.eye(3))

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
@@ -29,8 +28,9 @@ from sonar_graph.logs.adapters.adapter import (
 from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
+    Mask,
     fit_block,
     not_finite,
     share,
@@ -91,6 +91,7 @@ class HeadingAdapter(Adapter):
 
     def refusal(self, topic: Topic) -> str | None:
         """Reason why no message has a heading, which completes "/imu ..."."""
+        # an inspection may hold the stamps alone, which do not show it
         is_read = topic.keep is Keep.ALL and topic.messages()
         if not is_read or self.is_measured(self.table(topic)).any():
             return None
@@ -101,7 +102,7 @@ class HeadingAdapter(Adapter):
             "status = false under [heading] in a log configuration"
         )
 
-    def is_measured(self, table: FieldTable) -> NDArray[np.bool_]:
+    def is_measured(self, table: FieldTable) -> Mask:
         """Mask of messages that say that yaw is measured, shape (n,)."""
         is_measured = np.ones(len(table), bool)
         if self.status is not None:
@@ -110,7 +111,7 @@ class HeadingAdapter(Adapter):
             is_measured &= np.isfinite(self.variance.read_variance(table))
         return is_measured
 
-    def read(self, table: FieldTable, setup: Setup) -> tuple[Heading | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Heading]:
         """Yaw of the body with its sigma; NaN: unknown."""
         faults = {NO_MEASUREMENT: ~self.is_measured(table)}
         if self.orientation is not None:
@@ -122,6 +123,7 @@ class HeadingAdapter(Adapter):
             body_R_driver = setup.body_R_sensor @ axes_matrix(self.rotation)
             R = ENU_R[self.world] @ world_R_sensor @ body_R_driver.T  # (n, 3, 3)
             yaw_rad = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+            # near the vertical the yaw is that of rounding
             is_steep = np.abs(R[:, 2, 0]) > np.sin(STEEPEST_RAD)
             faults["without an orientation"] = ~is_rotation
             faults["with the nose too steep for a heading"] = is_steep
@@ -156,7 +158,7 @@ class HeadingAdapter(Adapter):
                 )
 
 
-def not_zero(quaternions: Floats) -> NDArray[np.bool_]:
+def not_zero(quaternions: Floats) -> Mask:
     """Mask of quaternions that are rotations, shape (n,)."""
     lengths = np.linalg.norm(quaternions, axis=1)
     return np.isfinite(lengths) & (lengths > 0.5)
@@ -167,9 +169,9 @@ class Places(NamedTuple):
 
     position_m: Floats
     """Shape (n, 3), z up; a height that was not measured is 0."""
-    faults: dict[str, NDArray[np.bool_]]
+    faults: dict[str, Mask]
     """Masks of rows without a position, by reason."""
-    has_height: NDArray[np.bool_]
+    has_height: Mask
 
 
 class GeodeticFields(PathSection):
@@ -190,7 +192,7 @@ class GeodeticFields(PathSection):
     origin_deg_m: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
 
-    def read(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def read(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Latitude, longitude in degrees and height in metres, shape (n, 3), and a mask of fixes, shape (n,).
 
         Drivers without a fix send latitude and longitude 0; a height that is not measured is NaN.
@@ -205,6 +207,7 @@ class GeodeticFields(PathSection):
         height = np.full(len(table), np.nan)
         if self.height:
             height = table.column(self.height).astype(float)
+        # receivers without satellites send zeros
         is_fix = np.isfinite(place).all(axis=1) & place.any(axis=1)
         is_fix &= (np.abs(place) <= [90.0, 360.0]).all(axis=1)
         if self.status is not None:
@@ -226,6 +229,7 @@ class GeodeticFields(PathSection):
         fixes = places[order[is_fix[order]]]
         if not len(fixes):
             return None
+        # some receivers give heights later than places
         heights = fixes[np.isfinite(fixes[:, 2]), 2].tolist()
         latitude, longitude, _ = fixes[0].tolist()
         return latitude, longitude, next(iter(heights), 0.0)
@@ -298,9 +302,7 @@ class PositionAdapter(PlaceAdapter):
         """Values of `position` in metres from the origin, along the driver's axes, shape (n, 3)."""
         return super().scaled(table) - self.origin_m
 
-    def read(
-        self, table: FieldTable, setup: Setup
-    ) -> tuple[PositionFixes | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[PositionFixes]:
         """Fixes with covariances, NaN: unknown; the calibration's noise counts for fixes without height and covariance."""
         places = self.places(table, setup.origin)
         C = np.full((len(table), 3, 3), np.nan)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from sonar_graph.devices import velocity_of_beams
@@ -29,8 +28,9 @@ from sonar_graph.logs.adapters.adapter import (
 )
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
+    Mask,
     fit_block,
     not_finite,
     share,
@@ -62,7 +62,7 @@ class BeamGeometry(PathSection):
         across = np.sin(tilt) * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
         return np.column_stack([across, np.full(len(azimuth), np.cos(tilt))])
 
-    def velocities(self, table: FieldTable) -> tuple[Floats, NDArray[np.bool_]]:
+    def velocities(self, table: FieldTable) -> tuple[Floats, Mask]:
         """Velocities along the driver's axes, shape (n, 3), and rows with too few beams, shape (n,)."""
         along = table.column(self.velocity).astype(float)  # (n, beams)
         count = len(self.azimuth_deg)
@@ -76,6 +76,7 @@ class BeamGeometry(PathSection):
                 fault = f"has {marks.shape[1:]} elements; there are {count} beams"
                 table.refuse(self.valid, fault)
             is_valid &= marks.astype(bool)
+        # with one noise for all beams its size does not matter
         velocity, _ = velocity_of_beams(self.directions(), along, is_valid, 1.0)
         return velocity, is_valid.sum(axis=1) < FEWEST_BEAMS
 
@@ -106,7 +107,7 @@ ACCEPTING = {
 }
 """Settings that use messages which were left out, by the reason."""
 Number = bool | int | float
-Masks = dict[str, NDArray[np.bool_]]
+Masks = dict[str, Mask]
 
 
 class DvlAdapter(Adapter):
@@ -151,7 +152,7 @@ class DvlAdapter(Adapter):
             )
         return self
 
-    def read(self, table: FieldTable, setup: Setup) -> tuple[Dvl | None, Dropped]:  # noqa: ARG002  # of all adapters
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Dvl]:  # noqa: ARG002  # of all adapters
         """The rows with a valid velocity; a covariance that is not known is NaN."""
         velocity, faults = self._velocity(table)
         covariance = np.full((len(table), 3, 3), np.nan)
@@ -197,6 +198,7 @@ class DvlAdapter(Adapter):
             f"with {path} not {str(self.valid_where[path]).lower()}": ~is_valid
             for path, is_valid in self._filled(table).items()
         }
+        # a mark and a count do not exclude each other
         if self.good_beams is not None and self._is_filled(table, self.good_beams):
             faults[NO_BEAM] = table.column(self.good_beams) == 0
         return faults
@@ -219,11 +221,12 @@ class DvlAdapter(Adapter):
             faults[SENTINEL] = is_same & (np.abs(velocity[:, 0]) > LARGEST_SPEED_M_S)
             if self.lock == "found" and not self.are_zeros_measured:
                 faults[ZEROS] = _in_time(zeros_in_one_step, table, velocity)
+        # a habit shows in many messages, not in a single one
         if self.lock == "found":
             faults[REPEATED] = _in_time(repeats, table, velocity)
         return faults
 
-    def _may_count(self, is_good: NDArray[np.bool_]) -> bool:
+    def _may_count(self, is_good: Mask) -> bool:
         """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
         return self.lock == "signs" or bool(is_good.any())
 
@@ -267,6 +270,7 @@ class DvlAdapter(Adapter):
             settings["altitude"] = False
         if self.covariance is not None:
             settings["covariance"] = self.covariance.pinned(table).model_dump()
+        # a count that never reached three beams would leave out everything
         is_by_signs = can_count and not self._is_marked(table)
         return settings | {"lock": "signs" if is_by_signs else "marked"}
 
@@ -288,8 +292,8 @@ class DvlAdapter(Adapter):
 
 
 def _in_time(
-    rule: Callable[[Floats], NDArray[np.bool_]], table: FieldTable, velocity: Floats
-) -> NDArray[np.bool_]:
+    rule: Callable[[Floats], Mask], table: FieldTable, velocity: Floats
+) -> Mask:
     """Mask by a rule for rows in the order of their stamps, since messages may be recorded out of order."""
     order = np.argsort(table.stamps_ns, kind="stable")
     found = np.empty(len(order), bool)
@@ -297,7 +301,7 @@ def _in_time(
     return found
 
 
-def zeros_in_one_step(velocity: Floats) -> NDArray[np.bool_]:
+def zeros_in_one_step(velocity: Floats) -> Mask:
     """Rows of zeros, shape (n,), that the velocity reaches or leaves by a step which no vehicle makes.
 
     A vehicle slows down over several rows. A driver without bottom lock sends zeros from one row to the next, and the
@@ -316,7 +320,7 @@ def zeros_in_one_step(velocity: Floats) -> NDArray[np.bool_]:
     return is_zero & np.isin(run, [run[jumps], run[jumps + 1]])
 
 
-def repeats(velocity: Floats) -> NDArray[np.bool_]:
+def repeats(velocity: Floats) -> Mask:
     """Rows, shape (n,), that repeat the velocity of the row before, where the driver does so all the time.
 
     Such a driver publishes at its own rate, or once for each of two reports of the instrument, and holds the velocity

@@ -26,8 +26,8 @@ from sonar_graph.logs.adapters.adapter import (
 from sonar_graph.logs.adapters.aiding_messages import ENU_R, World
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
     MessageTable,
     fit_block,
     not_finite,
@@ -108,7 +108,7 @@ class DetectionListsAdapter(Adapter):
         self,
         table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkDetections | None, Dropped]:
+    ) -> Fit[LandmarkDetections]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
         groups = [group for group in table.groups if group["range_m"].shape[1]]
         if not groups:
@@ -174,7 +174,7 @@ def _fit(
     faults: Mapping[str, np.ndarray],
     measured: tuple[Floats, Floats, Floats],
     tracks: Floats | Ints,
-) -> tuple[LandmarkDetections | None, Dropped]:
+) -> Fit[LandmarkDetections]:
     """Rows fit for use, from ranges, azimuths and covariances."""
     columns = (*measured, rows.ids, rows.probabilities, tracks)
     return fit_block(LandmarkDetections, rows.stamps_ns, faults, *columns, unique=False)
@@ -208,7 +208,7 @@ class DetectionArrayAdapter(Adapter):
         self,
         table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkDetections | None, Dropped]:
+    ) -> Fit[LandmarkDetections]:
         """One row a detection that has a result; the scores are the posterior, in the order of the results."""
         groups = [
             group for group in table.groups if group.lengths("detections.results")
@@ -229,6 +229,7 @@ class DetectionArrayAdapter(Adapter):
             turn(self.rotation, positions), turn_covariances(self.rotation, covariances)
         )
         ranges, azimuths, _ = measured
+        # a detection that is nothing in particular has no results
         faults = {
             "without a result": rows.ids[:, 0] < 0,
             NOT_FINITE: not_finite(ranges, azimuths, scores),
@@ -311,7 +312,7 @@ class LandmarkMapAdapter(Adapter):
         self,
         table: MessageTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkMap | None, Dropped]:
+    ) -> Fit[LandmarkMap]:
         """The last map of a topic."""
         # a map is latched: the newest counts
         last = max(table.groups, key=lambda group: int(group.rows[-1]))
@@ -422,7 +423,7 @@ class DetectionRowsAdapter(Adapter):
         self,
         table: FieldTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkDetections | None, Dropped]:
+    ) -> Fit[LandmarkDetections]:
         """Detections in the order of their stamps."""
         range_m = table.column(self.range) * self.range_scale
         to_the_left = -1.0 if self.rotation == "frd" else 1.0
@@ -439,6 +440,7 @@ class DetectionRowsAdapter(Adapter):
             given = table.beside(self.probabilities)
             is_given = ~np.isnan(given).all(axis=1)
             probability[is_given] = np.nan_to_num(given[is_given])
+        # an unknown landmark takes no share of the posterior
         probability[ids < 0] = 0.0
         covariance = np.full((len(table), 2, 2), np.nan)
         if self.range_sigma is not None and self.azimuth_sigma is not None:
@@ -477,7 +479,7 @@ class LandmarkRowsAdapter(Adapter):
         self,
         table: FieldTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
-    ) -> tuple[LandmarkMap | None, Dropped]:
+    ) -> Fit[LandmarkMap]:
         """Map of the rows, of which each has another identity."""
         ids = _whole(table, self.id)
         positions = table.beside(self.position) * self.scale
@@ -492,6 +494,7 @@ class LandmarkRowsAdapter(Adapter):
             )
         if not len(fit):
             return None, dropped
+        # maps are compared by identity
         order = fit[np.argsort(ids[fit])]
         in_enu_m = turned(ENU_R[self.world], positions[order])
         unknown = np.full((len(order), 3, 3), np.nan)

@@ -59,6 +59,7 @@ class LogConfig:
                     f"needs a log configuration only for what is still to be changed"
                 )
         config = cls(values, source)
+        # what a table means depends on the type, which only the log may have
         for role, table in values.items():
             if role not in ADAPTERS:
                 raise LogError(
@@ -232,6 +233,7 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
 def changes_text(adapter: Adapter, shipped: Adapter | None) -> str:
     """Differences from the shipped adapter, or all settings where none is shipped; empty: nothing differs."""
     base = shipped or type(adapter).model_construct(type="")
+    # the topic is in a note of its own
     changed = {}
     for name in type(adapter).model_fields:
         value = getattr(adapter, name)

@@ -12,8 +12,12 @@ from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import NS_PER_S, Block, Ints
 
 Rows = TypeVar("Rows", bound=Block)
+Measured = TypeVar("Measured")
+Mask = NDArray[np.bool_]
 Dropped = dict[str, int]
 """Number of rows left out, by reason."""
+Fit = tuple[Measured | None, Dropped]
+"""Measurements of the rows fit for use, None without any, and the others."""
 NOT_FINITE = "with values that are not finite or beyond 1e15"
 SAME_STAMP = "with the stamp of another"
 LARGEST = 1e15
@@ -176,12 +180,12 @@ def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
     ).astype(np.int64)
 
 
-def share(has_it: NDArray[np.bool_]) -> str:
+def share(has_it: Mask) -> str:
     """How many of some rows have a fault, such as "3 of 20"."""
     return f"{np.count_nonzero(has_it)} of {len(has_it)}"
 
 
-def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+def not_finite(*columns: NDArray[Any]) -> Mask:
     """Mask of rows in which some column has a value that is not finite or larger than `LARGEST`, shape (n,)."""
     return ~np.all(
         [(np.abs(c) < LARGEST).reshape(len(c), -1).all(axis=1) for c in columns], axis=0
@@ -189,13 +193,14 @@ def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def fit_rows(
-    stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool
+    stamps_ns: Ints, faults: Mapping[str, Mask], *, unique: bool
 ) -> tuple[Ints, Dropped]:
     """Rows fit for use in the order of their stamps, shape (n,), and the number of the others by fault.
 
     Faults are masks, shape (n,), by name; a row counts for its first fault only. With ``unique``, all but the first of
     rows with the same stamp are left out.
     """
+    # one fault a row, so that the counts add up to the rows left out
     fit = np.ones(len(stamps_ns), bool)
     counts = {}
     for fault, has_it in faults.items():
@@ -214,10 +219,10 @@ def fit_rows(
 def fit_block(
     kind: type[Rows],
     stamps_ns: Ints,
-    faults: Mapping[str, NDArray[np.bool_]],
+    faults: Mapping[str, Mask],
     *columns: NDArray[Any],
     unique: bool = True,
-) -> tuple[Rows | None, Dropped]:
+) -> Fit[Rows]:
     """Block of the rows that `fit_rows` chooses, None without any, and the number of the others by fault."""
     rows, dropped = fit_rows(stamps_ns, faults, unique=unique)
     if not rows.size:

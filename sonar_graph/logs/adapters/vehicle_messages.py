@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
@@ -34,8 +33,9 @@ from sonar_graph.logs.adapters.adapter import (
 from sonar_graph.logs.adapters.aiding_messages import ENU_R, PlaceAdapter, not_zero
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
-    Dropped,
     FieldTable,
+    Fit,
+    Mask,
     fit_block,
     fit_rows,
     not_finite,
@@ -60,9 +60,9 @@ class _Signals(NamedTuple):
     """Shape (n, 3)."""
     force: Floats
     """Shape (n, 3); NaN without accelerometers."""
-    no_rate: NDArray[np.bool_]
+    no_rate: Mask
     """Rows whose status calls the rate not measured, shape (n,)."""
-    no_force: NDArray[np.bool_]
+    no_force: Mask
     denied: list[str]
     """Statuses that do so in all rows, although the values change."""
 
@@ -91,7 +91,7 @@ class ImuAdapter(Adapter):
     unfilled: Literal["all", "each"] = "all"
     """"all": zeros are not measured where all messages have them; "each": wherever a message has them."""
 
-    def read(self, table: FieldTable, setup: Setup) -> tuple[Imu | None, Dropped]:  # noqa: ARG002  # of all adapters
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Imu]:  # noqa: ARG002  # of all adapters
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         found = self._signals(table)
         force = found.force
@@ -134,6 +134,7 @@ class ImuAdapter(Adapter):
     def pinned(self, table: FieldTable) -> dict[str, Any]:
         """Settings by which single messages are read as all messages of a table are together."""
         imu, _ = self.read(table, Setup())
+        # what no message fills now may be filled later, message by message
         has_force = imu is not None and bool(np.isfinite(imu.specific_force).any())
         settings: dict[str, Any] = {"unfilled": "each"}
         if has_force:
@@ -147,7 +148,7 @@ class ImuAdapter(Adapter):
         if self.linear_acceleration is not None:
             sent = table.beside(self.linear_acceleration)
             force = sent * self.linear_acceleration_scale
-        marks: list[NDArray[np.bool_]] = []
+        marks: list[Mask] = []
         denied = []
         for key, values in zip(STATUSES, (rate, force), strict=True):
             path = getattr(self, key)
@@ -201,7 +202,7 @@ class DepthAdapter(Adapter):
             raise ValueError("give either pressure or height")
         return self
 
-    def read(self, table: FieldTable, setup: Setup) -> tuple[Depth | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Depth]:
         """Heights with variances; NaN: unknown."""
         scale = self.scale
         above = table.column(str(self.height)) * scale if self.height else None
@@ -262,9 +263,7 @@ class TruthAdapter(PlaceAdapter):
             )
         return self
 
-    def read(
-        self, table: FieldTable, setup: Setup
-    ) -> tuple[Trajectory | None, Dropped]:
+    def read(self, table: FieldTable, setup: Setup) -> Fit[Trajectory]:
         """Poses; quaternions are NaN where only positions are known."""
         positions, faults, _ = self.places(table, setup.origin)
         quaternions = self._quaternions(table)
@@ -279,7 +278,7 @@ class TruthAdapter(PlaceAdapter):
             return Trajectory.of_positions(stamps_ns, positions[rows]), dropped
         chosen = quaternions[rows]
         lengths = np.linalg.norm(chosen, axis=1)
-        # unit quaternions keep every bit
+        # of drivers that round to four digits; unit quaternions keep every bit
         scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)
         chosen = chosen / scale[:, None]
         if self.world != "enu" or self.rotation != "flu":

@@ -145,33 +145,28 @@ class _Parser:
         if name in self._done:
             return self._done[name]
         fields: dict[str, Field] = {}
-        for line in (
-            line.split("#", 1)[0].strip() for line in self._texts[name].splitlines()
-        ):
-            match = _FIELD.match(line)
-            if line and (match is None or match["length"] == "0"):
+        for line in self._texts[name].splitlines():
+            stated = line.split("#", 1)[0].strip()
+            match = _FIELD.match(stated)
+            if stated and (match is None or match["length"] == "0"):
                 raise LogError(
-                    f"the definition of {name} has the line {line[:_SHOWN]!r}, which is no ros2msg field"
+                    f"the definition of {name} has the line {stated[:_SHOWN]!r}, which is no ros2msg field"
                 )
-            if match is None or match["rest"].startswith(
-                "="
-            ):  # an empty line, a constant
+            # an empty line, or a constant
+            if match is None or match["rest"].startswith("="):
                 continue
-            kind = self._kind(match["type"], name, users)
-            length = (
-                1
-                if match["array"] is None
-                else int(match["length"])
-                if match["length"].isdigit()
-                else None
-            )
-            if match["name"] in fields:
+            field_name = match["name"]
+            if field_name in fields:
                 raise LogError(
-                    f"the definition of {name} has two fields called {match['name']}"
+                    f"the definition of {name} has two fields called {field_name}"
                 )
-            fields[match["name"]] = Field(
-                match["name"], kind, length, is_array=match["array"] is not None
-            )
+            kind = self._kind(match["type"], name, users)
+            is_array = match["array"] is not None
+            length: int | None = 1
+            if is_array:
+                # "<=3" bounds a sequence, and has no number of its own
+                length = int(match["length"]) if match["length"].isdigit() else None
+            fields[field_name] = Field(field_name, kind, length, is_array=is_array)
         struct = self._done[name] = Struct(name, tuple(fields.values()))
         self._sizes[name] = sum(
             self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1
@@ -188,12 +183,11 @@ class _Parser:
         """Primitive, string or nested type of a field of ``owner``."""
         if type_name in PRIMITIVES or type_name == STRING:
             return type_name
-        package = owner.split("/", 1)[0]
         wanted = short_name(type_name)
-        # old definitions write Header without its package
-        wanted = {"Header": "std_msgs/Header"}.get(
-            wanted, wanted if "/" in wanted else f"{package}/{wanted}"
-        )
+        if "/" not in wanted:
+            # old definitions write Header without its package
+            package = "std_msgs" if wanted == "Header" else owner.split("/", 1)[0]
+            wanted = f"{package}/{wanted}"
         if (
             wanted not in self._texts
             and wanted.startswith("builtin_interfaces/")

@@ -2,7 +2,7 @@
 
 Every topic is converted. Payloads become CDR. Types get the definition of ROS 2 Jazzy where it has them, with fields
 mapped where the two differ, and otherwise the definition in the bag. Stamps, in messages and of recording, stay the
-same to the nanosecond. The types and MD5 sums of a ROS 1 bag are kept in a metadata record.
+same to the nanosecond.
 """
 
 from __future__ import annotations
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 
-SOURCE_METADATA = "rosbag"
-"""Metadata record of the type and MD5 sum of each topic in the bag."""
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _PIECE_BYTES = 1 << 20
 _METADATA = "metadata.yaml"
@@ -342,7 +340,8 @@ class Ros1InMcap:
                     channel.topic,
                     kind,
                     MessageDefinition(MessageDefinitionFormat.MSG, text),
-                    self.typestore.generate_msgdef(kind)[1],
+                    # the sum over the definition, which nothing here needs
+                    "",
                     counts.get(number, 0),
                     # the file does not state which topics were latched
                     ConnectionExtRosbag1(
@@ -380,11 +379,6 @@ class _BagCopy:
 
         bag = self._bag
         writer = self._writer
-        stated = {
-            c.topic: f"{c.msgtype.replace('/msg/', '/')} {c.digest}"
-            for c in bag.connections
-        }
-        writer.mcap.add_metadata(SOURCE_METADATA, stated)
         known = bag.typestore.fielddefs
         connections = [c for c in bag.connections if c.msgtype in known]
         missing = {

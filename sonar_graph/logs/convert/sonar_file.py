@@ -238,7 +238,9 @@ def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead |
                 )
         except DamagedFrameError as error:
             # bytes may be missing from the frame before, or from the file's header
-            start = pending.at + 1 if pending else 0 if at == kind.first_at else at + 1
+            start = 0 if at == kind.first_at else at + 1
+            if pending:
+                start = pending.at + 1
             headers = plausible_headers(source, kind, start)
             found = next((other for other in headers if other.at != at), None)
             end = found.at if found else source.size

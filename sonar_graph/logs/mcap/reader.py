@@ -31,7 +31,7 @@ from sonar_graph.logs.mcap.record_walk import (
     RecordWalk,
     content_of,
 )
-from sonar_graph.logs.mcap.time_window import TimeWindow
+from sonar_graph.logs.mcap.time_window import Limits
 from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic
 
 _BLOCK = 1 << 22
@@ -74,7 +74,7 @@ def _content(file: LogFile, record: Record) -> Content:
 class Passage:
     """One pass through a file, in the order of the file: the wanted messages of each chunk, topic by topic.
 
-    ``keep`` gives the wanted part of a message by the name of its type; ``window`` the wanted time of recording, but of
+    ``keep`` gives the wanted part of a message by the name of its type; ``limits`` the wanted time of recording, but of
     latched topics everything is wanted. With ``may_skip`` chunks without wanted messages are skipped by the summary.
     """
 
@@ -82,7 +82,7 @@ class Passage:
         self,
         file: LogFile,
         keep: Callable[[str], Keep],
-        window: TimeWindow | None = None,
+        limits: Limits | None = None,
         *,
         may_skip: bool = True,
         progress: Progress | None = None,
@@ -94,16 +94,11 @@ class Passage:
         self.skipped = 0
         """Number of skipped chunks."""
         self.chunks = 0
-        self.part: str | None = None
-        """Text of the wanted time, if not all is wanted."""
+        self.limits = limits
+        """The wanted time; None: all."""
         self._file = file
         self._may_skip = may_skip
         self._progress = progress
-        self._limits_ns: tuple[int, int] | None = None
-        if window is not None and (window.start or window.end):
-            beginning_ns = first_time_ns(file)
-            self._limits_ns = window.resolve(beginning_ns)
-            self.part = window.describe(beginning_ns)
         self._described = Descriptions(file.path, keep)
         self.topics = self._described.by_name
         """All described topics by name."""
@@ -147,7 +142,7 @@ class Passage:
         start_ns = index.message_start_time
         end_ns = index.message_end_time
         # without a window every chunk is inside
-        first_ns, after_ns = self._limits_ns or (start_ns, end_ns + 1)
+        first_ns, after_ns, _ = self.limits or (start_ns, end_ns + 1, "")
         is_inside = start_ns < after_ns and end_ns >= first_ns
         topics = [
             self._described.by_channel.get(channel)
@@ -258,8 +253,8 @@ class Passage:
                     {self._name(channel): len(found.sizes)},
                 )
                 continue
-            if self._limits_ns and not topic.is_latched:
-                first_ns, after_ns = self._limits_ns
+            if self.limits and not topic.is_latched:
+                first_ns, after_ns, _ = self.limits
                 times_ns = found.log_times_ns
                 found = found.of((times_ns >= first_ns) & (times_ns < after_ns))
             if len(found.sizes):
@@ -289,6 +284,10 @@ class Passage:
             damage.remarks.append(
                 f"{self._file.fault}; the data before its end is whole"
             )
+            # no writer mixes the two: bytes are missing up to a message within a chunk
+            if self._is_loose and self.chunks:
+                reason = "messages lie outside chunks, so that the head of a chunk is missing"
+                damage.losses.append(Loss(0, self._file.size, reason))
         if damage.ending is not None:
             damage.ending.start_ns = self._last_ns
         unprotected = []

@@ -8,7 +8,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.bag_folder import log_parts
 from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile
 from sonar_graph.logs.mcap.reader import Passage, Progress, Recording, first_time_ns
-from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
+from sonar_graph.logs.mcap.time_window import Limits, TimeWindow
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 
 _PIECE_BYTES = 1 << 20
@@ -65,7 +65,7 @@ def _passages(
     sizes = [part.stat().st_size if part.exists() else 0 for part in parts]
     ends = list(accumulate(sizes))
     failures = []
-    is_first = True
+    limits: Limits | None = None
     for part, size, end in zip(parts, sizes, ends, strict=True):
         name = part.name if parts != [path] else ""
         try:
@@ -79,26 +79,14 @@ def _passages(
             continue
         with file:
             # a part of the time is counted from the beginning of the first file
-            window = _fixed(window, file) if is_first else window
-            is_first = False
+            if limits is None and window is not None and (window.start or window.end):
+                limits = window.resolve(first_time_ns(file))
             shown = _shifted(progress, end - size, ends[-1])
-            passage = Passage(file, keep, window, progress=shown)
+            passage = Passage(file, keep, limits, progress=shown)
             yield file, passage
         damage.extend(passage.damage, name)
     if len(failures) == len(parts):
         raise failures[0]
-
-
-def _fixed(window: TimeWindow | None, first: LogFile) -> TimeWindow | None:
-    """The same window in absolute times, by the beginning of the first file of a log."""
-    if window is None or not (window.start or window.end):
-        return window
-    beginning_ns = first_time_ns(first)
-    start, end = (
-        None if limit is None else Instant(absolute_ns=limit.resolve(beginning_ns))
-        for limit in (window.start, window.end)
-    )
-    return TimeWindow(start, end)
 
 
 def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
@@ -113,7 +101,7 @@ def _join(whole: Recording, file: LogFile, passage: Passage) -> None:
     _gather_all(passage, file)
     counts = passage.counts
     # where chunks are skipped or left out, not every message that can be read was counted
-    is_complete = not passage.skipped and passage.part is None
+    is_complete = not passage.skipped and passage.limits is None
     settle(passage.damage, passage.topics, counts if is_complete else None)
     for name, topic in passage.topics.items():
         # topics that are only counted are listed, although their chunks were skipped
@@ -132,7 +120,7 @@ def _join(whole: Recording, file: LogFile, passage: Passage) -> None:
     whole.metadata |= passage.metadata
     whole.chunks += passage.chunks
     whole.skipped_chunks += passage.skipped
-    whole.part = whole.part or passage.part
+    whole.part = passage.limits.text if passage.limits else None
 
 
 def _gather_all(passage: Passage, file: LogFile) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import NamedTuple
 
 from sonar_graph.errors import LogError
 
@@ -53,6 +54,17 @@ class Instant:
         return beginning_ns + round((self.seconds or 0.0) * _NS_PER_S)
 
 
+class Limits(NamedTuple):
+    """Times of recording of a part of a log, nanoseconds since 1970."""
+
+    first_ns: int
+    """First instant within the part."""
+    after_ns: int
+    """First instant after it."""
+    text: str
+    """The same in seconds after the log's beginning."""
+
+
 @dataclass(frozen=True)
 class TimeWindow:
     """Part of a log from ``start`` up to but not including ``end``; None: from the beginning, to the end.
@@ -72,24 +84,20 @@ class TimeWindow:
     @classmethod
     def parse(cls, start: str | None, end: str | None) -> TimeWindow:
         """Window between two times in text, as `Instant.parse` takes them; None: no limit."""
-        first, last = (
+        limits = [
             None if text is None else Instant.parse(text) for text in (start, end)
-        )
-        return cls(first, last)
+        ]
+        return cls(*limits)
 
-    def describe(self, beginning_ns: int) -> str:
-        """Text with the limits in seconds after the log's beginning."""
-        start_ns, end_ns = self.resolve(beginning_ns)
-        start = f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        end = f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
-        return f"{start if self.start else 'the beginning'} to {end if self.end else 'the end'} of the recording"
-
-    def resolve(self, beginning_ns: int) -> tuple[int, int]:
-        """First instant within and first instant after the window, nanoseconds since 1970."""
-        start_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
-        end_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
-        if start_ns >= end_ns:
+    def resolve(self, beginning_ns: int) -> Limits:
+        """The window of a log whose earliest message was recorded at an instant."""
+        first_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS
+        after_ns = self.end.resolve(beginning_ns) if self.end else _LAST_NS
+        if first_ns >= after_ns:
             raise LogError(
                 "the wanted part of the log ends before it starts: its start must be less than its end"
             )
-        return start_ns, end_ns
+        start = f"{(first_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        end = f"{(after_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        text = f"{start if self.start else 'the beginning'} to {end if self.end else 'the end'} of the recording"
+        return Limits(first_ns, after_ns, text)

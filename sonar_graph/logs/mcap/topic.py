@@ -138,7 +138,8 @@ class Topic:
         kept = sizes if self.keep is Keep.ALL else np.minimum(sizes, self.keep.value)
         self.times.append(log_times_ns)
         self.held_bytes += int(kept.sum())
-        smallest, largest = int(kept.min(initial=1 << 62)), int(kept.max(initial=0))
+        smallest = int(kept.min(initial=1 << 62))
+        largest = int(kept.max(initial=0))
         for size in [largest] if smallest == largest else np.unique(kept).tolist():
             rows = np.flatnonzero(kept == size)
             if not size:

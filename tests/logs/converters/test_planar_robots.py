@@ -150,39 +150,6 @@ def test_chain_of_relative_poses_is_the_composition_of_the_files_steps(recorded)
     )
 
 
-def test_a_landmark_stays_where_it_is_from_pose_to_pose(recorded):
-    """Predicted to the next pose, as it is and mirrored; in the office where the robot turns."""
-    name, _, sequence = recorded
-    least_turn_rad, count, most_m = (
-        (0.05, 4000, 0.05) if name == "dlr" else (-1, 500, 0.5)
-    )
-    motions, d = hold_past_motions(sequence), sequence.detections
-    medians = []
-    for azimuth_rad in (d.azimuth_rad, -d.azimuth_rad):
-        points = np.column_stack(
-            [
-                d.range_m * np.cos(azimuth_rad),
-                d.range_m * np.sin(azimuth_rad),
-                np.ones(len(d)),
-            ]
-        )
-        at = zip(
-            (d.stamps_ns // 10**9).tolist(), d.most_probable()[0].tolist(), strict=True
-        )
-        seen = {
-            (k, i): point for (k, i), point in zip(at, points, strict=True) if i >= 0
-        }
-        moved = [
-            np.linalg.norm(np.linalg.solve(motions[k], point) - seen[k + 1, i])
-            for (k, i), point in seen.items()
-            if (k + 1, i) in seen and abs(motions[k][1, 0]) > least_turn_rad
-        ]
-        assert len(moved) > count
-        medians.append(np.median(moved))
-    assert medians[0] < most_m
-    assert medians[1] > (0.3 if name == "dlr" else medians[0])
-
-
 # ---- MRCLAM: commands and barcodes
 
 T0 = 1248444187
