@@ -116,8 +116,24 @@ def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest):
     assert_all_is_least_squares(fed, with_ranges(gone))
 
 
-def test_after_an_exchange_the_estimate_is_that_of_what_is_left():
-    """Six sightings that put a landmark a metre off are taken out: a thousandth of that is left."""
+class Refusing:
+    """A solver whose elimination fails while the estimate settles."""
+
+    def __init__(self, solver: gtsam.ISAM2) -> None:
+        self.solver = solver
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, *rest) -> gtsam.ISAM2Result:
+        if not graph.size() and not rest[1]:
+            raise RuntimeError("Indeterminant linear system detected")
+        return self.solver.update(graph, *rest)
+
+    def __getattr__(self, name: str):
+        return getattr(self.solver, name)
+
+
+@pytest.mark.parametrize("gives_up", [False, True])
+def test_after_an_exchange_the_estimate_is_that_of_what_is_left(monkeypatch, gives_up):
+    """Of six sightings that put a landmark a metre off, also when Cholesky gives up, a thousandth is left."""
     fed = in_the_basin(15, FOREVER_S)
     wrong: list[int] = []
     for k in range(9, 15):
@@ -131,8 +147,12 @@ def test_after_an_exchange_the_estimate_is_that_of_what_is_left():
         fed.smoother.update(14.0)
     right = solve(graph_of(fed.given), fed.smoother.values).atPoint3(L(3))
     off_m = [np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - right)]
+    solved = counted(monkeypatch, batch_solution, "descended")
+    if gives_up:
+        fed.smoother._window.isam = Refusing(fed.smoother._window.isam)
     fed.smoother.exchange(14.0, wrong)
     off_m.append(np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - right))
+    assert solved or not gives_up
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
 
