@@ -6,7 +6,6 @@ a circle.
 """
 
 import ast
-from collections import deque
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -139,25 +138,3 @@ def tangles(graph: Graph) -> list[frozenset[Path]]:
         if path in below[path]
     }
     return sorted(found, key=sorted)
-
-
-def shortest_circle(graph: Graph, tangle: frozenset[Path]) -> list[Path]:
-    """Shortest circle of imports in a tangle, beginning and ending with the same file."""
-    circles = [_circle_through(graph, start) for start in sorted(tangle)]
-    return min(circles, key=len)
-
-
-def _circle_through(graph: Graph, start: Path) -> list[Path]:
-    """Shortest circle through a file, by breadth-first search."""
-    came_from: dict[Path, Path] = {}
-    waiting = deque([start])
-    while start not in came_from:
-        path = waiting.popleft()
-        for target in sorted(graph[path]):
-            if target not in came_from:
-                came_from[target] = path
-                waiting.append(target)
-    circle = [start, came_from[start]]
-    while circle[-1] != start:
-        circle.append(came_from[circle[-1]])
-    return circle[::-1]

@@ -153,10 +153,8 @@ def write_batch(batch: RecordedBatch, folder: Path) -> Path:
 def _run(
     rng: np.random.Generator, log: str, seed: int, name: str, error_m: float
 ) -> RecordedRun:
-    causal_m, smoothed_m = (
-        error_m * rng.lognormal(0, 0.1),
-        0.6 * error_m * rng.lognormal(0, 0.1),
-    )
+    causal_m = error_m * rng.lognormal(0, 0.1)
+    smoothed_m = 0.6 * error_m * rng.lognormal(0, 0.1)
     values = {
         "causal.ate_se2_m": causal_m,
         "smoothed.ate_se2_m": smoothed_m,

@@ -115,7 +115,8 @@ def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
 
 
 def _sequence(stamps: Ints, truth: Trajectory | None, planar: bool) -> Sequence:
-    ends, n = np.array([stamps[0] - STEP_NS, stamps[-1]]), len(stamps)
+    ends = np.array([stamps[0] - STEP_NS, stamps[-1]])
+    n = len(stamps)
     return Sequence(
         name="basin-three-laps",
         calibration=Calibration(
@@ -142,7 +143,8 @@ def _sequence(stamps: Ints, truth: Trajectory | None, planar: bool) -> Sequence:
 def _laps(stamps: Ints, planar: bool) -> Trajectory:
     along = np.linspace(0, 3 * 4 * 0.999, len(stamps)) % 4
     side = along.astype(int)
-    start, step = CORNERS[side], CORNERS[side + 1] - CORNERS[side]
+    start = CORNERS[side]
+    step = CORNERS[side + 1] - CORNERS[side]
     xy = start + (along - side)[:, None] * step
     z = np.zeros(len(stamps)) if planar else 0.2 * np.sin(along)
     return Trajectory.without_covariances(
@@ -158,7 +160,8 @@ def _disturbed(
     rng: np.random.Generator, path: Trajectory, wander_m: float, sigma_m: float
 ) -> Trajectory:
     """The path with slowly varying errors of standard deviation ``wander_m``, reported as ``sigma_m``."""
-    n, memory = len(path), 0.995
+    n = len(path)
+    memory = 0.995
     slow = wander_m * lfilter(
         [1], [1, -memory], rng.normal(0, np.sqrt(1 - memory**2), (n, 4)), axis=0
     )

@@ -72,7 +72,8 @@ def difference(
 ) -> tuple[float, float]:
     """Largest difference of pose (m, rad) and of the covariance of some axes, relative to the sigmas."""
     assert [e.stamp_ns for e in one] == [e.stamp_ns for e in other]
-    poses, covs = [], []
+    poses = []
+    covs = []
     for a, b in zip(one, other, strict=True):
         poses.append(
             np.abs(
@@ -133,9 +134,7 @@ def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
     [(EkfSlamParams(), 0.0), (InvariantEkfParams(), 1.5)],
     ids=["ekf-slam", "invariant-ekf"],
 )
-def test_filters_judge_detections_as_the_smoother_does_by_default_and_ekf_slam_as_published(
-    params, kernel_width
-):
+def test_filters_judge_detections_as_the_smoother_or_as_published(params, kernel_width):
     smoother = Isam2Params()
     assert smoother.kernel == RobustKernel(shape="cauchy", width=1.5)
     assert params.kernel_width == kernel_width
@@ -152,10 +151,8 @@ def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
     An azimuth says less of y from farther off, which filters do not linearise anew: 2e-6 of the variance of y.
     """
     sequence, _ = rail(NODES)
-    truth, fixes_ns = (
-        run(filters(sequence.calibration)[0], sequence),
-        sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10,
-    )
+    truth = run(filters(sequence.calibration)[0], sequence)
+    fixes_ns = sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10
     x = np.array(
         [
             [estimate.world_T_body.translation()[0] + 0.12, 0.0, 0.0]
@@ -181,7 +178,11 @@ def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 def test_headings_of_a_biased_compass_are_the_textbook_s_scalar_update(kind):
     """At rest: n of them have the variance ``bias^2 + sigma^2 / n``, and ``1 / P' = 1 / P + 1 / R``."""
-    n, yaw_rad, sigma, bias, prior = 21, 0.01, 0.02, 0.05, 0.3
+    n = 21
+    yaw_rad = 0.01
+    sigma = 0.02
+    bias = 0.05
+    prior = 0.3
     sequence, _ = rail()
     start = sequence.calibration.start.model_copy(
         update={"rpy_sigma_rad": (1e-6, 1e-6, prior)}
@@ -199,25 +200,6 @@ def test_headings_of_a_biased_compass_are_the_textbook_s_scalar_update(kind):
     )
     assert estimate.covariance[2, 2] == pytest.approx(
         1 / (1 / prior**2 + 1 / R), rel=1e-3
-    )
-
-
-@smoothers
-def test_the_smoothed_trajectory_is_least_squares_with_all_measurements(params):
-    """And better than the causal one, but for the last pose."""
-    sequence, numbers = rail(NODES)
-    mean, variance = numbers.solution(NODES)
-    estimator = made(Isam2, sequence.calibration, params)
-    causal = run(estimator, sequence)
-    smoothed = estimator.trajectory()
-    for k in range(1, NODES):
-        assert smoothed.positions[k - 1, 0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
-        assert smoothed.covariances[k - 1, 3, 3] == pytest.approx(
-            variance[f"x{k}"], abs=1e-6
-        )
-    assert smoothed.covariances[9, 3, 3] < causal[9].covariance[3, 3] - 1e-6
-    assert smoothed.positions[-1, 0] == pytest.approx(
-        causal[-1].world_T_body.translation()[0], abs=1e-6
     )
 
 
@@ -293,14 +275,14 @@ def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind)
 def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
     """Rows of a sensor come 2 s late, in a call that ends before the one before: a fix counts, the others cannot."""
     sequence, _ = rail(NODES)
-    estimator, others = (
-        made(kind, sequence.calibration),
-        made(kind, sequence.calibration),
-    )
+    estimator = made(kind, sequence.calibration)
+    others = made(kind, sequence.calibration)
     run(estimator, sequence), run(others, sequence)
     end_ns = sequence.end_ns
     late_ns = np.array([end_ns - 3 * NS_PER_S, end_ns - 2 * NS_PER_S])
-    z_m, yaw_rad, sigma = np.zeros(2), np.zeros(2), np.full(2, 0.01)
+    z_m = np.zeros(2)
+    yaw_rad = np.zeros(2)
+    sigma = np.full(2, 0.01)
     late = Measurements(
         int(late_ns[-1]),
         depth=Depth(late_ns, z_m, sigma**2),
@@ -332,110 +314,34 @@ def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
-def test_rows_from_before_the_first_epoch_are_not_called_late(kind):
-    """A sensor that is switched on first."""
-    sequence, _ = rail(NODES)
-    early_ns = np.array([T0_NS - 2 * NS_PER_S, T0_NS - NS_PER_S])
-    depth, heading = (
-        Depth(early_ns, np.zeros(2), np.full(2, 1e-4)),
-        Heading(early_ns, np.zeros(2), np.full(2, 0.01)),
-    )
-    fixes = PositionFixes(
-        early_ns, np.full((2, 3), 9.0), np.tile(1e-6 * np.eye(3), (2, 1, 1))
-    )
-    estimator, others = (
-        made(kind, sequence.calibration),
-        made(kind, sequence.calibration),
-    )
-    estimates = run(
-        estimator, replace(sequence, depth=depth, heading=heading, positions=fixes)
-    )
-    estimator.process(Measurements(sequence.end_ns, heading=heading, positions=fixes))
-    assert not estimator.refused_rows()
-    assert max(difference(estimates, run(others, sequence))) == 0.0
-    estimates = [
-        e.process(Measurements(sequence.end_ns + 1)) for e in (estimator, others)
-    ]
-    assert max(difference(estimates[:1], estimates[1:])) == 0.0
-
-
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
-def test_headings_of_one_stamp_in_two_calls_both_count(kind):
-    sequence, _ = rail(NODES)
-    start = sequence.calibration.start.model_copy(
-        update={"rpy_sigma_rad": (1e-6, 1e-6, 0.3)}
-    )
-    known = sequence.calibration.model_copy(update={"start": start})
-    sigmas = []
-    for count in range(3):
-        estimator = made(kind, known)
-        middle_ns = int(sequence.dvl.stamps_ns[NODES // 2])
-        for step in replace(sequence, calibration=known, detections=None).replay(
-            sequence.instants(1 / STEP_S)
-        ):
-            estimate = estimator.process(step)
-            for _ in range(count * (step.end_ns == middle_ns + NS_PER_S)):
-                row = Heading(np.array([step.end_ns]), np.zeros(1), np.full(1, 0.3))
-                estimate = estimator.process(Measurements(step.end_ns, heading=row))
-        assert not estimator.refused_rows()
-        sigmas.append(estimate.covariance[2, 2])
-    one, two = 0.05**2 + 0.3**2, 0.05**2 + 0.3**2 / 2
-    assert sigmas == pytest.approx(
-        [0.09, 1 / (1 / 0.09 + 1 / one), 1 / (1 / 0.09 + 1 / two)], rel=1e-2
-    )
-
-
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [("heading", "headings contradict its yaw"), ("positions", "position fixes")],
 )
-def test_an_estimate_too_sure_to_follow_its_headings_or_fixes_says_how_many_contradict_it(
-    kind, wrong, said
-):
+def test_headings_or_fixes_that_contradict_the_estimate_are_counted(kind, wrong, said):
     """Its compass' bias follows them in time and hides that. Single outliers and an unsure start are no matter."""
     world = aided_world()
-    sure = world.calibration.start.model_copy(
-        update={"rpy_sigma_rad": (1e-3,) * 3, "position_sigma_m": (1e-3,) * 3}
-    )
-    off, wide = {"heading": (2.0, {"rpy_sigma_rad": (0.01, 0.01, 2.0)})}.get(
-        wrong, (40.0, {"position_sigma_m": (50.0,) * 3})
-    )
-    unsure = sure.model_copy(update=wide)
-    for start, share, is_told in (
-        (sure, 1, True),
-        (sure, 10, False),
-        (unsure, 1, False),
-        (sure, 0, False),
-    ):
-        heading, fixes = world.heading, world.positions
-        yaw_rad, places = heading.yaw_rad.copy(), fixes.position_m.copy()
-        if share:
-            (yaw_rad if wrong == "heading" else places[:, :2])[::share] += (
-                off  # depths know z
-            )
-        known = world.calibration.model_copy(update={"start": start})
+    rows = getattr(world, wrong)
+    column = "yaw_rad" if wrong == "heading" else "position_m"
+    # depths know z
+    off = np.array(2.0 if wrong == "heading" else [40.0, 40.0, 0.0])
+    for sigma, every, is_told in ((1e-3, 1, True), (1e-3, 10, False), (50.0, 1, False)):
+        start = {"position_sigma_m": (sigma,) * 3}
+        start["rpy_sigma_rad"] = (1e-3, 1e-3, min(sigma, 2.0))
+        known = world.calibration.model_copy(
+            update={"start": world.calibration.start.model_copy(update=start)}
+        )
+        values = getattr(rows, column).copy()
+        values[::every] += off
         given = replace(world, calibration=known, detections=None)
-        if wrong == "heading":
-            given = replace(
-                given, heading=replace(heading, yaw_rad=yaw_rad), positions=None
-            )
-        else:
-            given = replace(
-                given, heading=None, positions=replace(fixes, position_m=places)
-            )
+        given = replace(given, heading=None, positions=None)
         estimator = made(kind, known)
-        run(estimator, given)
+        run(estimator, replace(given, **{wrong: replace(rows, **{column: values})}))
         told = [line for line in estimator.withheld() if said in line]
-        assert bool(told) == is_told, (share, start == sure, estimator.withheld())
+        assert bool(told) == is_told, (sigma, every, estimator.withheld())
         if told:
             count, judged = map(int, told[0].split(" ")[0:3:2])
-            assert (
-                0.8 * judged
-                < count
-                <= judged
-                <= len(heading if wrong == "heading" else fixes)
-            )
+            assert 0.8 * judged < count <= judged <= len(rows)
 
 
 NO_ROWS = {
@@ -457,14 +363,12 @@ NO_ROWS = {
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 @pytest.mark.parametrize("row", NO_ROWS.values(), ids=NO_ROWS)
-def test_a_heading_or_fix_that_no_sensor_gives_is_named_and_changes_nothing(kind, row):
+def test_an_impossible_heading_or_fix_is_named_and_changes_nothing(kind, row):
     sequence, _ = rail(NODES)
     at_ns = T0_NS + 5 * NS_PER_S
     sensor = "heading" if isinstance(row, Heading) else "positions"
-    estimator, others = (
-        made(kind, sequence.calibration),
-        made(kind, sequence.calibration),
-    )
+    estimator = made(kind, sequence.calibration)
+    others = made(kind, sequence.calibration)
     estimates = run(
         estimator,
         replace(sequence, **{sensor: replace(row, stamps_ns=np.array([at_ns]))}),
@@ -473,28 +377,3 @@ def test_a_heading_or_fix_that_no_sensor_gives_is_named_and_changes_nothing(kind
         (sensor, at_ns, Refusal.UNSOUND)
     ]
     assert max(difference(estimates, run(others, sequence))) < 1e-9
-
-
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
-def test_unknown_noise_of_a_heading_or_fix_is_the_calibration_s(kind):
-    """NaN, of a covariance anywhere in it; another noise is another result."""
-    world = aided_world()
-    heading, fixes = world.heading, world.positions
-    ends = []
-    for sigma in (np.nan, 1.0, 1.5):
-        noise = (
-            sigma * world.calibration.heading.sigma_rad,
-            sigma * np.array(world.calibration.positions.sigma_m),
-        )
-        covs = np.tile(np.diag(np.square(noise[1])), (len(fixes), 1, 1))
-        covs[:, 0, 1] = covs[:, 1, 0] = np.nan if np.isnan(sigma) else 0.0
-        told = (
-            replace(heading, sigma_rad=np.full(len(heading), noise[0])),
-            replace(fixes, covariance_m2=covs),
-        )
-        sequence = replace(world, heading=told[0], positions=told[1])
-        ends.append(
-            run(kind(world.calibration, Odometry(world.calibration)), sequence, 1.0)
-        )
-    assert max(difference(ends[0], ends[1])) < 1e-9
-    assert max(difference(ends[0], ends[2])) > 1e-4

@@ -13,7 +13,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.errors import CalibrationError, SettingError
 from sonar_graph.images import decibels
-from sonar_graph.settings import meanings_of, parse
+from sonar_graph.settings import parse
 
 angles = st.floats(-3, 3)
 lengths = st.floats(-5, 5)
@@ -27,33 +27,6 @@ def test_mounting_turns_about_z_after_y_after_x(translation_m, rpy_rad):
     ).as_matrix()  # fixed axes x, y, z: Rz Ry Rx
     np.testing.assert_allclose(body_T_sensor.rotation().matrix(), expected, atol=1e-12)
     np.testing.assert_array_equal(body_T_sensor.translation(), translation_m)
-
-
-def test_start_heading_is_positive_to_the_left():
-    ahead_of_body = Start(
-        position_m=(1.0, 2.0, 0.0), rpy_rad=(0.0, 0.0, np.pi / 2)
-    ).pose()
-    np.testing.assert_allclose(
-        ahead_of_body.transformFrom(np.array([1.0, 0, 0])), [1, 3, 0], atol=1e-12
-    )
-
-
-def test_sonar_pitched_down_looks_at_the_floor():
-    body_T_sonar = Mounting(rpy_rad=(0.0, np.radians(30), 0.0)).pose()
-    assert body_T_sonar.transformFrom(np.array([1.0, 0, 0]))[2] == pytest.approx(-0.5)
-
-
-def test_calibration_survives_json():
-    calibration = parse(
-        Calibration,
-        {"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}},
-        "x",
-    )
-    assert Calibration.model_validate_json(calibration.model_dump_json()) == calibration
-
-
-def test_empty_calibration_is_usable():
-    assert parse(Calibration, {}, "x") == Calibration()
 
 
 @pytest.mark.parametrize(
@@ -161,12 +134,6 @@ def test_calibration_cannot_be_changed():
         SettingError, match=r"Calibration.gravity_m_s2 cannot be set; model_copy"
     ):
         Calibration().gravity_m_s2 = 1.0  # type: ignore[misc]
-
-
-def test_every_field_says_what_it_means():
-    imu = type(Calibration().imu)
-    without = [name for name in imu.model_fields if not meanings_of(imu).get(name)]
-    assert without == ["mounting"]  # its type says it
 
 
 @given(st.floats(20.0, 120.0))

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = """
 import sys
 from sonar_graph.estimator import load_estimator
@@ -33,6 +35,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_loops_are_in_the_cache_once_the_other_process_is_done(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

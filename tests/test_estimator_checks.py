@@ -19,7 +19,6 @@ from sonar_graph.testing.laws import (
     Check,
     ContractError,
     check_estimator,
-    require_covariance,
 )
 
 
@@ -365,51 +364,3 @@ def test_the_first_violation_is_named_and_so_is_an_estimator_that_raises():
         ContractError, match=r"\w+: the estimator raised TypeError: .*may be None"
     ):
         check_estimator(but({"process": lambda _, measurements: len(measurements.dvl)}))
-
-
-@pytest.mark.parametrize(
-    ("covariance", "complaint"),
-    [
-        (np.eye(6)[:5], "shape"),
-        (np.eye(6) * np.nan, "not finite"),
-        (np.triu(np.ones((6, 6))), "not symmetric"),
-        (-np.eye(6), "negative eigenvalue"),
-    ],
-)
-def test_what_is_no_covariance_is_refused(covariance, complaint):
-    require_covariance(np.eye(6), 6, "P")
-    require_covariance(np.zeros((6, 6)), 6, "P")
-    with pytest.raises(ContractError, match=complaint):
-        require_covariance(covariance, 6, "P")
-
-
-class Silent(PlainDeadReckoning):
-    """Returns nothing at all."""
-
-    def process(self, measurements): ...
-    def trajectory(self): ...
-    def landmarks(self): ...
-    def detections(self): ...
-
-
-class Strict(PlainDeadReckoning):
-    """Needs a Doppler log in every step."""
-
-    def process(self, measurements):
-        len(measurements.dvl)
-        return super().process(measurements)
-
-
-@pytest.mark.parametrize(
-    ("broken", "said"),
-    [
-        (Silent, r"trajectory\(\) returned None, not a Trajectory: CausalEstimates"),
-        (
-            Strict,
-            r"TypeError: .*NoneType.* \(test_estimator_checks.py, line \d+\); any block",
-        ),
-    ],
-)
-def test_the_true_cause_is_named(broken: Any, said: str) -> None:
-    with pytest.raises(ContractError, match=said):
-        check_estimator(broken)

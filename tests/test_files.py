@@ -1,6 +1,5 @@
 """Nothing of the user's is lost: files of others, links, pipes, a second command, an end in the middle."""
 
-import errno
 import os
 import signal
 import subprocess
@@ -11,7 +10,6 @@ import pytest
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import (
-    kind_of,
     others_in,
     remove_written,
     replacing,
@@ -65,9 +63,7 @@ def test_a_result_replaces_what_an_earlier_one_wrote_and_leaves_all_else(tmp_pat
 
 @pytest.mark.parametrize("name", ["a.json", "runs/x/b.json"])
 @pytest.mark.parametrize("is_changed", [False, True])
-def test_a_file_of_others_or_one_changed_since_is_replaced_only_when_told_and_never_removed(
-    tmp_path, name, is_changed
-):
+def test_files_of_others_are_replaced_only_with_overwrite(tmp_path, name, is_changed):
     new = {"a.json": "2", "runs/x/b.json": "2"}
     if is_changed:
         write(tmp_path, dict.fromkeys(new, "1"))
@@ -87,7 +83,8 @@ def test_a_file_of_others_or_one_changed_since_is_replaced_only_when_told_and_ne
 
 
 def test_links_are_never_followed(tmp_path, monkeypatch):
-    mine, folder = tmp_path / "mine", tmp_path / "out"
+    mine = tmp_path / "mine"
+    folder = tmp_path / "out"
     mine.mkdir()
     (mine / "b.json").write_text("mine")
     folder.mkdir()
@@ -123,11 +120,12 @@ def test_a_block_that_fails_changes_nothing_and_leaves_no_temporary_file(tmp_pat
 
 
 @pytest.mark.parametrize("is_new", [False, True])
-def test_a_file_that_is_interrupted_as_it_begins_or_later_leaves_nothing_not_even_its_folder(
+def test_an_interrupted_file_leaves_nothing_not_even_its_folder(
     tmp_path, monkeypatch, is_new
 ):
     """A signal has no better moment: the file is there, and who asked for it does not know yet."""
-    path, opened = tmp_path / "made" / "below" / "log.mcap", os.open
+    path = tmp_path / "made" / "below" / "log.mcap"
+    opened = os.open
     if not is_new:
         path.parent.mkdir(parents=True)
     before = list(tmp_path.rglob("*"))
@@ -178,9 +176,7 @@ with result_written(Path(sys.argv[1]), "comparison"), replacing(Path(sys.argv[1]
 
 
 @pytest.mark.parametrize("is_new", [False, True])
-def test_what_a_killed_command_left_is_removed_by_the_next_one_and_nothing_else(
-    tmp_path, is_new
-):
+def test_what_a_killed_command_left_is_removed_by_the_next_one(tmp_path, is_new):
     if not is_new:
         write(tmp_path, {"a.json": "1"})
     mine = {f".{name}.{'0' * 24}.partial.json": "mine" for name in "ab"}
@@ -198,19 +194,6 @@ def test_what_a_killed_command_left_is_removed_by_the_next_one_and_nothing_else(
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_is_left_as_it_was(
-    tmp_path,
-):
-    (tmp_path / "there").mkdir()
-    for name in ("made", "there"):
-        with pytest.raises(RuntimeError):
-            write(tmp_path / name, {"a.json": "1"}, error=RuntimeError)
-    assert [path.name for path in tmp_path.rglob("*")] == ["there"]
-    with result_written(tmp_path / "empty", "batch"):
-        pass
-    assert kind_of(tmp_path / "empty") == "batch"
-
-
 @pytest.mark.parametrize(
     "manifest",
     [
@@ -221,9 +204,7 @@ def test_a_folder_without_files_stays_of_its_kind_and_one_that_failed_is_left_as
         "[" * 9999,
     ],
 )
-def test_a_manifest_that_is_not_ours_is_refused_and_nothing_outside_the_folder_is_touched(
-    tmp_path, manifest
-):
+def test_a_manifest_that_is_not_ours_is_refused(tmp_path, manifest):
     folder = tmp_path / "out"
     write(folder, {"a.json": "1"})
     (folder / ".sonar_graph.json").write_text(manifest)
@@ -265,7 +246,7 @@ with result_folder(Path(sys.argv[1]), "comparison"):
 """
 
 
-def test_second_process_is_refused_until_the_first_is_killed_although_its_children_live(
+def test_a_second_process_is_refused_until_the_first_is_killed(
     tmp_path,
 ):
     with subprocess.Popen(
@@ -291,22 +272,8 @@ def test_second_process_is_refused_until_the_first_is_killed_although_its_childr
             os.kill(child, 9)
 
 
-def test_a_lock_is_of_one_folder_and_ends_with_the_block_also_by_an_error(tmp_path):
-    with pytest.raises(KeyboardInterrupt), result_folder(tmp_path, KIND):
-        raise KeyboardInterrupt
-    with result_folder(tmp_path, KIND), result_folder(tmp_path / "other", KIND):
-        with (
-            pytest.raises(EvaluationError, match="another command"),
-            result_folder(tmp_path, KIND),
-        ):
-            pass
-        write(tmp_path, {"a.json": "1"})
-
-
 @pytest.mark.parametrize("content", ["", "mine"])
-def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_run_is_removed(
-    tmp_path, content
-):
+def test_a_file_with_the_name_of_the_lock_stays(tmp_path, content):
     (tmp_path / ".lock").write_text(content)
     with result_folder(tmp_path, KIND):
         pass
@@ -317,30 +284,12 @@ def test_a_file_with_the_name_of_the_lock_stays_where_nothing_is_written_or_a_ru
     assert (tmp_path / ".lock").exists() == bool(content)
 
 
-def test_a_lock_whose_file_is_removed_by_the_command_that_had_it_is_none(
-    tmp_path, monkeypatch
-):
-    def replace_and_lock(_descriptor: int) -> None:
-        (tmp_path / ".lock").unlink()
-        (tmp_path / ".lock").touch()
-
-    monkeypatch.setattr(
-        sys.modules[result_folder.__module__], "_lock", replace_and_lock
-    )
-    with (
-        pytest.raises(EvaluationError, match="another command"),
-        result_folder(tmp_path, KIND),
-    ):
-        pass
-
-
 @pytest.mark.parametrize(
     "act", [lambda folder: write(folder, {"a.json": "2"}), remove_written]
 )
-def test_what_is_behind_a_linked_folder_is_not_removed_even_if_it_is_as_we_wrote_it(
-    tmp_path, act
-):
-    folder, mine = tmp_path / "out", tmp_path / "mine"
+def test_what_is_behind_a_linked_folder_is_not_removed(tmp_path, act):
+    folder = tmp_path / "out"
+    mine = tmp_path / "mine"
     write(folder, {"a.json": "1", "runs/x/b.json": "1"})
     (folder / "runs").rename(mine)
     (folder / "runs").symlink_to(mine)
@@ -365,19 +314,3 @@ def test_a_lock_that_is_a_link_or_a_folder_is_refused(tmp_path):
         ):
             pass
     assert (tmp_path / "mine").read_text() == "mine"
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="other locks")
-@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK])
-def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch, number):
-    import fcntl
-
-    def no_lock(*_arguments: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(fcntl, "flock", no_lock)
-    with (
-        pytest.raises(EvaluationError, match="cannot be locked against a second"),
-        result_folder(tmp_path, KIND),
-    ):
-        pass

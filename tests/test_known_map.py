@@ -1,7 +1,6 @@
 """Runs with a map of known landmarks: every estimator starts with it, and notices what moved."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,7 +60,7 @@ def rms_m(dive: Sequence, told: dict) -> float:
 
 
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf])
-def test_a_filter_begins_with_the_places_and_the_joint_covariance_of_the_map(kind):
+def test_a_filter_begins_with_places_and_covariance_of_the_map(kind):
     """Wherever the vehicle starts, and however unsure of its pose."""
     rng = np.random.default_rng(1)
     root = rng.standard_normal((9, 9))
@@ -91,16 +90,6 @@ def test_a_map_makes_a_dive_more_accurate_and_stays_consistent(dive, kind):
     rows = np.searchsorted(truth.ids, found.ids)
     e = (np.array(found.positions_m) - truth.positions[rows]).ravel()
     assert 0.3 < e @ np.linalg.solve(found.joint(), e) / e.size < 2.0
-
-
-def test_all_estimators_agree_about_a_dive_in_a_map(dive):
-    ends = []
-    for kind in KINDS:
-        _, told = run(kind, with_map(dive, surveyed(dive)))
-        ends.append(list(told.values())[-1])
-    for other in ends[1:]:
-        e = ends[0].world_T_body.localCoordinates(other.world_T_body)
-        assert e @ np.linalg.solve(ends[0].covariance, e) < 6.0
 
 
 @each
@@ -145,7 +134,8 @@ def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
     assert estimator.withheld() == ["landmarks of the map that were not seen: 99"]
 
 
-RIGHT, WRONG = 1.0, 100.0
+RIGHT = 1.0
+WRONG = 100.0
 """Squared distances of sightings that agree with the map, and that contradict it."""
 
 
@@ -157,7 +147,7 @@ def judged(sightings: list[tuple[int, float]]) -> KnownLandmarks:
     return known
 
 
-def test_a_landmark_has_moved_where_most_sightings_contradict_it_and_most_landmarks_agree():
+def test_a_landmark_has_moved_if_most_of_its_sightings_contradict_it():
     agree = [(i, RIGHT) for i in (1, 2, 3)]
     assert judged(agree + [(0, WRONG)] * 2).moved == []
     assert judged(agree + [(0, WRONG)] * 3).moved == [0]
@@ -166,7 +156,7 @@ def test_a_landmark_has_moved_where_most_sightings_contradict_it_and_most_landma
     assert both.moved == [0, 4]
 
 
-def test_where_as_many_landmarks_contradict_as_agree_none_is_let_go_and_all_are_named():
+def test_none_has_moved_where_as_many_contradict_as_agree():
     known = judged([(1, RIGHT)] + [(0, WRONG)] * 9)
     assert known.moved == []
     assert known.messages()[0].startswith("landmarks 0 contradict the map")
@@ -188,7 +178,7 @@ def unknown_start(dive: Sequence) -> Start:
 
 
 @each
-def test_an_unknown_start_is_found_in_the_map_and_no_pose_is_claimed_before(dive, kind):
+def test_an_unknown_start_is_found_in_the_map(dive, kind):
     lost = with_map(dive, surveyed(dive), unknown_start(dive))
     _, told = run(kind, lost)
     estimates = list(told.values())
@@ -204,20 +194,6 @@ def test_an_unknown_start_is_found_in_the_map_and_no_pose_is_claimed_before(dive
                 - estimate.world_T_body.translation()
             )
             assert np.linalg.norm(e) < 0.5
-
-
-@each
-def test_landmarks_that_moved_do_not_bend_a_start_that_is_found(dive, kind):
-    """One of them is in view at the start."""
-    known = surveyed(dive)
-    places = np.array(known.positions_m)
-    places[2] += [1.5, 0.5, 0.0]
-    places[6] += [-1.0, 1.5, 0.0]
-    wrong = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
-    estimator, told = run(kind, with_map(dive, wrong, unknown_start(dive)))
-    assert rms_m(dive, told) < 0.1
-    (message,) = estimator.withheld()
-    assert message.startswith("landmarks 3, 7 no longer stand where the map has them")
 
 
 def test_a_start_that_is_found_does_not_depend_on_how_the_log_is_cut(dive):
@@ -301,22 +277,6 @@ def test_a_bad_map_is_refused_with_file_and_remedy(tmp_path, text, message):
 def test_a_covariance_that_is_none_is_refused(covariance, message):
     with pytest.raises(SettingError, match=message):
         KnownMap.of([1], [[0.0, 0.0, 0.0]], covariance_m2=covariance)
-
-
-def test_the_landmarks_of_a_comparison_are_a_map_without_correlations(
-    dive, tmp_path: Path
-):
-    from sonar_graph.logs import write_landmarks_csv
-
-    estimator, _ = run(EkfSlam, with_map(dive, None))
-    landmarks = estimator.landmarks()
-    write_landmarks_csv(tmp_path / "landmarks.csv", landmarks)
-    known, warnings = read_map(tmp_path / "landmarks.csv")
-    np.testing.assert_allclose(known.positions_m, landmarks.positions)
-    np.testing.assert_allclose(
-        known.joint()[3:6, 3:6], landmarks.covariances[1], atol=1e-15
-    )
-    assert "no correlations" in warnings[0]
 
 
 def test_the_start_that_is_found_is_a_prior_of_a_ninth_of_its_information(dive):

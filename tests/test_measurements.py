@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import (
     FIRST_TOO_LARGE_ID,
     PAUSE_NS,
-    UNMEASURED_M2,
     Depth,
     Dvl,
     Heading,
@@ -20,8 +18,6 @@ from sonar_graph.measurements import (
     LandmarkDetections,
     Measurements,
     PositionFixes,
-    no_posterior,
-    possible_ranges,
 )
 
 
@@ -50,28 +46,9 @@ def test_windows_between_consecutive_cuts_hold_every_row_once(stamps_ns, cuts_ns
     np.testing.assert_array_equal(rows, block.z_m)
 
 
-def test_window_excludes_its_beginning_and_includes_its_end_and_is_none_without_rows():
+def test_a_window_excludes_its_beginning_and_includes_its_end():
     assert depth([10, 20, 30]).between(10, 20).stamps_ns.tolist() == [20]
     assert depth([10, 20]).between(20, 100) is None
-
-
-@given(sorted_stamps)
-def test_frames_are_the_rows_of_each_stamp(stamps_ns):
-    n = len(stamps_ns)
-    ids, posterior = np.arange(n)[:, None], np.ones((n, 1))
-    block = LandmarkDetections(
-        np.array(stamps_ns),
-        np.ones(n),
-        np.zeros(n),
-        np.full((n, 2, 2), np.nan),
-        ids,
-        posterior,
-    )
-    frames = list(block.frames())
-    assert [set(frame.stamps_ns.tolist()) for frame in frames] == [
-        {stamp} for stamp in sorted(set(stamps_ns))
-    ]
-    assert LandmarkDetections.concatenate(frames).candidate_ids.tolist() == ids.tolist()
 
 
 @given(sorted_stamps, st.integers(0, 20))
@@ -98,24 +75,6 @@ def test_no_rows_and_stamps_that_run_backwards_are_refused(stamps_ns, said):
     with pytest.raises(MeasurementError, match=said):
         depth(stamps_ns)
     assert depth([-(2**62), 2**62]).stamps_ns.tolist() == [-(2**62), 2**62]
-
-
-def test_whole_number_columns_become_floats_and_identities_stay_whole():
-    block = LandmarkDetections([0], [3], [1], [[[1, 0], [0, 1]]], [[7]], [[1]])  # type: ignore[arg-type]
-    assert block.range_m.dtype == np.float64
-    assert block.candidate_ids.dtype == np.int64
-
-
-@given(arrays.arrays(np.float64, (6, 4), elements=st.floats(0, 0.25)))
-def test_most_probable_identity_has_the_largest_posterior(posterior):
-    ids = np.arange(24).reshape(6, 4)
-    block = LandmarkDetections(
-        np.arange(6), np.ones(6), np.zeros(6), np.zeros((6, 2, 2)), ids, posterior
-    )
-    best, probability = block.most_probable()
-    for row in range(6):
-        assert probability[row] == max(posterior[row])
-        assert posterior[row][ids[row].tolist().index(best[row])] == probability[row]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -154,81 +113,33 @@ def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
     [
         (
             lambda n: Imu(n, np.zeros((5, 2)), np.zeros((5, 3))),
-            r"Imu.angular_velocity: expected shape (5, 3)",
+            "Imu.angular_velocity: expected shape (5, 3)",
         ),
-        (
-            lambda n: Imu(n, np.zeros((5, 3)), np.zeros(5)),
-            r"Imu.specific_force: expected shape (5, 3), not (5,)",
-        ),
-        (
-            lambda n: Imu(n, np.zeros((4, 3)), np.zeros((5, 3))),
-            r"Imu.angular_velocity: ",
-        ),
-        (lambda n: Imu(n, np.zeros((5, 3)), np.zeros((4, 3))), r"Imu.specific_force: "),
         (
             lambda n: Imu(n, np.zeros((3, 5)), np.zeros((3, 5))),
-            r"one row for each of 5 stamps; transpose it",
-        ),
-        (
-            lambda n: Dvl(n, np.zeros(5), np.zeros((5, 3, 3))),
-            r"Dvl.velocity: expected shape (5, 3), not (5,)",
+            "one row for each of 5 stamps; transpose it",
         ),
         (
             lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))),
-            r"Dvl.velocity_cov: expected shape (5, 3, 3)",
-        ),
-        (
-            lambda n: Dvl(n[:3], np.zeros((3, 3)), np.eye(3)),
-            r"Dvl.velocity_cov: expected shape (3, 3, 3)",
+            "Dvl.velocity_cov: expected shape (5, 3, 3)",
         ),
         (
             lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)),
-            r"Depth.z_m: expected shape (5,), not (5, 1)",
+            "Depth.z_m: expected shape (5,), not (5, 1)",
         ),
         (
             lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)),
-            r"Heading.yaw_rad: expected shape (5,), not (5, 1)",
+            "Heading.yaw_rad: expected shape (5,)",
         ),
         (
             lambda n: PositionFixes(n, np.zeros((5, 2)), np.zeros((5, 3, 3))),
-            r"position_m: expected shape (5, 3)",
-        ),
-        (
-            lambda n: PositionFixes(n, np.zeros((5, 3)), np.zeros((5, 3))),
-            r"covariance_m2: expected shape (5, 3, 3)",
-        ),
-        (
-            lambda n: LandmarkDetections(
-                n, n, n, np.zeros((5, 2)), np.zeros((5, 1)), np.ones((5, 1))
-            ),
-            r"LandmarkDetections.range_azimuth_cov: expected shape (5, 2, 2), not (5, 2)",
+            "position_m: expected shape (5, 3)",
         ),
     ],
 )
 def test_columns_of_another_shape_are_refused_by_name(made, message):
     with pytest.raises(MeasurementError, match=re.escape(message)):
         made(np.arange(5))
-
-
-def test_detections_belong_to_no_track_unless_said():
-    columns = (
-        np.array([1, 1, 1]),
-        np.ones(3),
-        np.zeros(3),
-        np.zeros((3, 2, 2)),
-        np.ones((3, 1), int),
-        np.ones((3, 1)),
-    )
-    alone, tracked = (
-        LandmarkDetections(*columns),
-        LandmarkDetections(*columns, np.array([5, 6, 5])),
-    )
-    assert alone.track.tolist() == [-1, -1, -1]
-    assert LandmarkDetections.concatenate([alone, tracked]).rows(
-        slice(2, 5)
-    ).track.tolist() == [-1, 5, 6]
-    with pytest.raises(MeasurementError, match=r"LandmarkDetections\.track"):
-        LandmarkDetections(*columns, np.array([5, 6]))
 
 
 def seen(**columns) -> LandmarkDetections:
@@ -312,52 +223,12 @@ def test_detections_that_cannot_be_are_named_in_one_line(columns, said):
     assert "\n" not in str(caught.value)
 
 
-def test_the_largest_identity_and_rounding_of_single_precision_pass():
-    single = np.array([[0.9, 0.1], [0.7, 0.3]], np.float32)
-    assert seen(
-        candidate_ids=[[1, 2**56 - 1]] * 2, id_probability=single * np.float32(1 + 1e-7)
-    ).track.tolist() == [
-        -1,
-        -1,
-    ]
-
-
-@pytest.mark.parametrize("end", [1.5, 2.0, "3", None, True])
-def test_an_end_is_an_integer(end):
-    with pytest.raises(
-        MeasurementError,
-        match=r"^Measurements\.end_ns: expected an integer, nanoseconds",
-    ):
-        Measurements(end)  # type: ignore[arg-type]
-    assert Measurements(np.int64(3)).end_ns == 3  # type: ignore[arg-type]
-
-
-def test_a_range_is_above_zero_and_at_most_100_km():
-    assert possible_ranges(np.array([1e-9, 1.0, 100_000.0])).all()
-    assert not possible_ranges(
-        np.array([0.0, -1.0, np.nextafter(100_000.0, np.inf), np.inf, np.nan])
-    ).any()
-
-
-def test_an_azimuth_lies_within_a_full_turn():
-    for azimuth, is_sound in (
-        (-np.pi, True),
-        (2 * np.pi, True),
-        (-2 * np.pi, True),
-        (6.3, False),
-        (-40.0, False),
-    ):
-        assert seen(azimuth_rad=[azimuth, 0.0]).are_sound().tolist() == [is_sound, True]
-
-
 @given(
     st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
     st.integers(-70, 70),
     st.integers(-70, 70),
 )
-def test_a_detection_is_sound_where_its_covariance_has_eigenvalues_above_zero(
-    root, i, j
-):
+def test_a_detection_is_valid_if_its_covariance_is_positive_definite(root, i, j):
     for more in (0.1, -0.1):
         A = np.reshape(root, (2, 2))
         cov = A @ A.T + more * np.eye(2)
@@ -375,43 +246,11 @@ def test_a_detection_is_sound_where_its_covariance_has_eigenvalues_above_zero(
         assert not seen(range_azimuth_cov=[wrong, np.eye(2)]).are_sound()[0]
 
 
-def test_posteriors_that_were_rounded_to_single_precision_still_are():
-    exact = np.random.default_rng(1).dirichlet(np.ones(20), 1000)
-    assert not no_posterior(exact.astype(np.float32).astype(np.float64)).any()
-
-
-@pytest.mark.parametrize(
-    "row", [[0.5, 0.500002], [-1e-9, 0.5], [0.5, np.nan], [np.inf, 0.0], [2.0, -1.5]]
-)
-def test_what_is_no_posterior_is_told_from_one_beside_it(row):
-    assert no_posterior(
-        np.array([row, [0.0, 0.0], [1.0, 0.0], [0.5, 0.5]])
-    ).tolist() == [True, False, False, False]
-
-
 def test_the_largest_identity_is_the_last_that_a_key_gives_back():
     largest = FIRST_TOO_LARGE_ID - 1
     assert gtsam.Symbol(gtsam.symbol("l", largest)).index() == largest
     with pytest.raises((ValueError, RuntimeError)):
         gtsam.symbol("l", FIRST_TOO_LARGE_ID)
-
-
-def test_a_block_in_the_place_of_another_is_refused_by_name():
-    heading = Heading(np.array([3]), np.zeros(1), np.ones(1))
-    assert Measurements(5, heading=heading).heading is heading
-    for name in ("imu", "dvl", "depth", "detections", "positions"):
-        kind = {"detections": "LandmarkDetections", "positions": "PositionFixes"}.get(
-            name, name
-        )
-        with pytest.raises(
-            MeasurementError,
-            match=rf"(?i)Measurements\.{name}: expected {kind} or None, not Heading",
-        ):
-            Measurements(5, **{name: heading})  # type: ignore[arg-type]
-    with pytest.raises(
-        MeasurementError, match="heading: expected Heading or None, not list"
-    ):
-        Measurements(5, heading=[heading])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -439,12 +278,10 @@ def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
         np.arange(5), np.zeros(5), np.array(sigmas)
     ).are_sound().tolist() == [True, True, *[False] * 3]
     good = np.array([[4.0, 1.9, 0.0], [1.9, 1.0, 0.0], [0.0, 0.0, 1e8]])
-    skew, indefinite, infinite, unknown = (
-        good.copy(),
-        good.copy(),
-        good.copy(),
-        good.copy(),
-    )
+    skew = good.copy()
+    indefinite = good.copy()
+    infinite = good.copy()
+    unknown = good.copy()
     skew[0, 1], infinite[2, 2], unknown[0, 0] = 1.8, np.inf, np.nan
     indefinite[0, 1] = indefinite[1, 0] = 2.1
     # indefinite, though no pair of axes is
@@ -455,32 +292,6 @@ def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
     assert fixes.are_sound().tolist() == [True] * 4 + [False] * 6
 
 
-def test_a_heading_counts_turns_while_a_double_keeps_them_and_its_sigma_is_at_most_one():
-    for yaw, sigma, is_sound in (
-        (-1e9, 2 * np.pi, True), (1e9, np.nan, True), (-1.001e9, 0.1, False), (1e300, np.nan, False),
-        (0.0, 6.3, False), (0.0, 1e200, False),
-    ):  # fmt: skip
-        assert Heading([0, 1], [yaw, 0.0], [sigma, 0.1]).are_sound().tolist() == [
-            is_sound,
-            True,
-        ]
-    assert np.spacing(1e9) < 1.2e-7
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_a_fix_and_its_sigma_are_within_a_quarter_of_the_earth_s_circumference(axis):
-    for at, variance, is_sound in (
-        (-1e7, 1e14, True), (1e7, np.nan, True), (0.0, UNMEASURED_M2, True),
-        (-1.001e7, 4.0, False), (1e12, np.nan, False), (1e308, 4.0, False), (0.0, 1.001e14, False), (0.0, 1e300, False),
-    ):  # fmt: skip
-        positions, covs = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
-        positions[0, axis], covs[0, axis, axis] = at, variance
-        assert PositionFixes([0, 1], positions, covs).are_sound().tolist() == [
-            is_sound,
-            True,
-        ]
-
-
 @pytest.mark.parametrize(
     "block",
     [
@@ -488,14 +299,12 @@ def test_a_fix_and_its_sigma_are_within_a_quarter_of_the_earth_s_circumference(a
         PositionFixes([20], np.zeros((1, 3)), np.ones((1, 3, 3))),
     ],
 )
-def test_rows_more_than_a_day_before_all_else_are_refused_by_name_as_stamps_in_seconds(
+def test_rows_a_day_before_all_else_are_refused_as_stamps_in_seconds(
     block,
 ):
     """Of the call's end or its first motion, for a whole log may be one call."""
-    field, now_ns = (
-        ("heading" if isinstance(block, Heading) else "positions"),
-        PAUSE_NS + 21,
-    )
+    field = "heading" if isinstance(block, Heading) else "positions"
+    now_ns = PAUSE_NS + 21
     with pytest.raises(
         MeasurementError,
         match=rf"{type(block).__name__} has a row at 20 ns, .*of seconds: np.round",

@@ -7,7 +7,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import Estimate, Trajectory
 
 angles = st.floats(-3.1, 3.1)
 
@@ -38,58 +38,12 @@ def test_trajectory_through_estimates_keeps_their_poses(roll, pitch, yaw):
     np.testing.assert_array_equal(path.covariances[0], covariance)
 
 
-def test_trajectory_through_no_estimate_is_empty():
-    path = Trajectory.from_estimates([])
-    assert len(path) == 0
-    assert path.covariances.shape == (0, 6, 6)
-
-
-def test_results_say_themselves_in_a_line():
-    two = LandmarkMap(
-        np.array([1, 7]), np.arange(6.0).reshape(2, 3), np.zeros((2, 3, 3))
-    )
-    log = DetectionLog(
-        np.zeros(3, int),
-        np.zeros(3, int),
-        np.zeros((3, 2)),
-        np.zeros((3, 2, 2)),
-        [Outcome.USED] * 3,
-    )
-    assert [
-        repr(each) for each in (turning(), Trajectory.from_estimates([]), two, log)
-    ] == [
-        "Trajectory(11 poses, 0 to 10000000000 ns)",
-        "Trajectory(0 poses)",
-        "LandmarkMap(2 landmarks, ids [1, 7])",
-        "DetectionLog(3 USED)",
-    ]
-
-
-def test_poses_at_the_own_instants_are_the_own_poses():
-    path = turning()
-    again = path.at(path.stamps_ns)
-    np.testing.assert_allclose(again.positions, path.positions, atol=1e-12)
-    np.testing.assert_allclose(
-        (again.rotations().inv() * path.rotations()).magnitude(), 0, atol=1e-12
-    )
-
-
-@given(st.floats(0, 1), st.floats(-3, 3))
-def test_interpolation_of_a_steady_turn_is_exact(fraction, step_rad):
-    path = turning(3, step_rad)
-    stamp_ns = round((1 + fraction) * 1e9)
-    there = path.at(np.array([stamp_ns]))
-    seconds = stamp_ns * 1e-9
-    assert there.positions[0, 0] == pytest.approx(seconds, abs=1e-9)
-    half = step_rad * seconds / 2
-    dot = there.quaternions_xyzw[0] @ [0, 0, np.sin(half), np.cos(half)]
-    assert abs(dot) == pytest.approx(1, abs=1e-12)
-
-
 def test_interpolation_is_that_of_scipy():
-    rng, n = np.random.default_rng(3), 50
+    rng = np.random.default_rng(3)
+    n = 50
     stamps_ns = np.cumsum(rng.integers(1, 10**9, n))
-    positions, rotations = rng.normal(size=(n, 3)), Rotation.random(n, rng=rng)
+    positions = rng.normal(size=(n, 3))
+    rotations = Rotation.random(n, rng=rng)
     path = Trajectory.without_covariances(stamps_ns, positions, rotations.as_quat())
     asked_ns = np.sort(rng.integers(stamps_ns[0], stamps_ns[-1], 200))
     there = path.at(asked_ns)
@@ -101,16 +55,6 @@ def test_interpolation_is_that_of_scipy():
     np.testing.assert_allclose(
         there.positions, line(asked_ns.astype(float)), atol=1e-12
     )
-
-
-def test_one_row_is_there_at_its_own_instant_and_no_instants_give_no_rows():
-    one = turning().rows(slice(1))
-    np.testing.assert_array_equal(one.at(one.stamps_ns).positions, one.positions)
-    assert len(turning().at(np.empty(0, np.int64))) == 0
-
-
-def test_interpolated_poses_claim_no_covariance():
-    assert np.isnan(turning().at(np.array([5 * 10**8])).covariances).all()
 
 
 def test_interpolation_keeps_nanoseconds_of_an_epoch():
@@ -134,12 +78,3 @@ def test_stamps_must_increase_strictly():
         Trajectory.without_covariances(
             np.array([1, 1]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1))
         )
-
-
-def test_rows_select_every_column_alike():
-    path = turning()
-    part = path.rows(np.array([2, 5]))
-    assert part.stamps_ns.tolist() == [2 * 10**9, 5 * 10**9]
-    np.testing.assert_array_equal(part.positions, path.positions[[2, 5]])
-    np.testing.assert_array_equal(part.quaternions_xyzw, path.quaternions_xyzw[[2, 5]])
-    assert part.covariances.shape == (2, 6, 6)

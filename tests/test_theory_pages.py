@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import cv2
+import pytest
 
 THEORY = Path(__file__).parents[1] / "docs" / "theory"
 
@@ -28,6 +29,7 @@ def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
     assert drawn.shape == shown.shape
 
 
+@pytest.mark.slow
 def test_the_picture_of_scenes_is_what_its_script_draws(tmp_path):
     picture = tmp_path / "scenes.png"
     command = [sys.executable, "-W", "error", THEORY / "sonar_image.py", picture]
@@ -43,7 +45,8 @@ def test_the_picture_of_scenes_is_what_its_script_draws(tmp_path):
 
 
 def test_lines_quoted_on_the_way_from_the_paper_stand_in_the_files():
-    code, quoted = "", []
+    code = ""
+    quoted = []
     for line in (THEORY / "from_the_paper.md").read_text(encoding="utf-8").splitlines():
         if named := re.findall(r"`((?:sonar_graph|baselines)/[a-z_/0-9]+[.]py)`", line):
             code = (THEORY.parents[1] / named[-1]).read_text(encoding="utf-8")

@@ -22,6 +22,7 @@ from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 from sonar_graph.recognition.confusion_fit import LEAST_FRAMES
 from sonar_graph.recognition.labels import read_labels
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"
@@ -63,7 +64,7 @@ def number_after(text: str, pattern: str) -> float:
 
 
 @pytest.mark.slow
-def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_estimator(
+def test_first_comparison_finds_the_landmarks_and_writes_a_page(
     tmp_path,
 ):
     printed = run("01_first_comparison.py", tmp_path)
@@ -81,6 +82,7 @@ def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_esti
         assert (tmp_path / "comparison" / "runs" / name / "trajectory.tum").is_file()
 
 
+@pytest.mark.slow
 def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     printed = run("02_library.py", tmp_path)
     assert number_after(printed, r"in 10\.00 s:") == pytest.approx(0.39 * 10, abs=1.5)
@@ -91,13 +93,12 @@ def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     assert "120 poses" in printed or "119 poses" in printed
     assert 0 < abs(number_after(printed, r"landmarks \[1, 2\]:")) < 1
     printed = run("05_preintegration.py", tmp_path)
-    bias, sigma = number_after(printed, "about z:"), number_after(printed, "±")
+    bias = number_after(printed, "about z:")
+    sigma = number_after(printed, "±")
     assert abs(bias - 0.01) < 3.5 * sigma < 1e-3
     assert number_after(printed, "after 20 s:") < 0.05
-    off_m, sigma_m = (
-        number_after(printed, "gap of 5 s:"),
-        number_after(printed, "1 sigma "),
-    )
+    off_m = number_after(printed, "gap of 5 s:")
+    sigma_m = number_after(printed, "1 sigma ")
     assert off_m < 3.5 * sigma_m < 0.2
 
 
@@ -150,8 +151,21 @@ def assert_landmarks_are_true(printed: str, off_m: float) -> int:
     return len(seen)
 
 
+def assert_is_simulated(found: Sequence, depth_scale: float | None = None) -> None:
+    """Whatever axes and units lie between; a depth from pressure has the gravity of the reader's calibration."""
+    truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
+    scale = depth_scale or truth.calibration.gravity_m_s2 / 9.80665
+    for one, other in (
+        (found.imu.angular_velocity, truth.imu.angular_velocity),
+        (found.imu.specific_force, truth.imu.specific_force),
+        (found.dvl.velocity, truth.dvl.velocity),
+        (found.depth.z_m, truth.depth.z_m * scale),
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
 @pytest.mark.slow
-def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tmp_path):
+def test_page_on_own_logs_has_programs_and_commands_that_work(tmp_path):
     page = (TUTORIALS / "04_your_own_log.md").read_text(encoding="utf-8")
     making, *others = blocks(page, "python")
     (configuration,) = blocks(page, "toml")
@@ -174,10 +188,8 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
                 '# topic = "/nav/dvl"\n# type = "my_msgs/msg/Speed"' in printed[words]
             )
             (tmp_path / target).write_text(configuration, encoding="utf-8")
-    first, second = (
-        printed["inspect dive.mcap"],
-        printed["inspect dive.mcap --log-config dive.toml"],
-    )
+    first = printed["inspect dive.mcap"]
+    second = printed["inspect dive.mcap --log-config dive.toml"]
     assert "not usable for compare: no DVL" in first
     assert "gravity is felt along -z" in first
     assert "less than the atmosphere's" in first
@@ -187,27 +199,15 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
     assert not re.findall("warning|not usable|left out", rest), rest
     for program in others:
         output(tmp_path, "python", "-W", "error", "-c", program)
-    # What is read from the log that the page makes is what was simulated, whatever the axes and units between.
-    truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
-    found = read_log(
-        tmp_path / "dive.mcap", config=read_log_config(tmp_path / "dive.toml")
-    )
-    np.testing.assert_allclose(
-        found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        found.imu.specific_force, truth.imu.specific_force, atol=1e-12
-    )
-    np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-12)
-    # the calibration does not travel in a foreign log
-    scale = truth.calibration.gravity_m_s2 / 9.80665
-    np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m * scale, atol=1e-9)
+    config = read_log_config(tmp_path / "dive.toml")
+    assert_is_simulated(read_log(tmp_path / "dive.mcap", config=config))
 
 
 @pytest.mark.slow
 def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path):
     page = (TUTORIALS / "07_batches.md").read_text(encoding="utf-8")
-    (suite,), (program,) = blocks(page, "toml"), blocks(page, "python")
+    (suite,) = blocks(page, "toml")
+    (program,) = blocks(page, "python")
     commands = re.findall(r"^    (sonar-graph|python) (.*)$", page, re.MULTILINE)
     assert [words.split()[:2] for _, words in commands] == [
         ["bench", "lap.toml"],
@@ -260,7 +260,7 @@ nbformat.write(notebook, "executed.ipynb")
 
 
 @pytest.mark.slow
-def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when_it_is_run(
+def test_the_notebook_is_stored_without_output_and_runs(
     tmp_path,
 ):
     pytest.importorskip(
@@ -281,14 +281,13 @@ def test_the_notebook_is_stored_without_output_and_shows_tables_and_figures_when
     assert "at the same 240 instants" in "".join(cells[-1]["outputs"][0]["text"])
 
 
-def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulated_run(
+@pytest.mark.slow
+def test_page_on_tables_gives_the_simulated_run(
     tmp_path,
 ):
     page = (TUTORIALS / "11_tables.md").read_text(encoding="utf-8")
-    ((making,), (configuration, more, vehicle)) = (
-        blocks(page, "python"),
-        blocks(page, "toml"),
-    )
+    (making,) = blocks(page, "python")
+    configuration, more, vehicle = blocks(page, "toml")
     parse_csv_config(tomllib.loads(configuration) | tomllib.loads(more), "the page")
     PartialCalibration.parse(tomllib.loads(vehicle), "the page")
     output(tmp_path, "python", "-W", "error", "-c", making)
@@ -307,20 +306,11 @@ def test_page_on_tables_has_a_program_and_a_configuration_that_give_the_simulate
                 if row and row != 'rotation = "frd"'
             ]
             (tmp_path / target).write_text(configuration, encoding="utf-8")
-    truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
-    found = read_log(tmp_path / "dive.mcap")
-    np.testing.assert_allclose(
-        found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        found.imu.specific_force, truth.imu.specific_force, atol=1e-9
-    )
-    np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-9)
-    np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m, atol=1e-9)
+    assert_is_simulated(read_log(tmp_path / "dive.mcap"), depth_scale=1.0)
 
 
 @pytest.mark.slow
-def test_programs_on_the_page_of_your_own_script_are_short_and_find_the_landmarks(
+def test_programs_on_the_page_of_own_scripts_find_the_landmarks(
     tmp_path,
 ):
     page = (TUTORIALS.parent / "howto" / "own_estimator.md").read_text("utf-8")
@@ -360,7 +350,7 @@ def test_every_tutorial_is_listed_and_run():
 
 
 @pytest.mark.slow
-def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it_says(
+def test_page_on_doubtful_identities_has_commands_that_work(
     tmp_path,
 ):
     pytest.importorskip("dask", reason="needs sonar-graph[bench]")

@@ -32,14 +32,14 @@ CALIBRATION = Calibration(
     positions=PositionCalibration(antenna_m=tuple(ANTENNA)),
 )
 NOISE = np.diag([0.02**2, 0.01**2])
-BODY_M, LANDMARKS = (
-    np.array([1.0, -2.0, 0.5]),
-    np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]]),
-)
+BODY_M = np.array([1.0, -2.0, 0.5])
+LANDMARKS = np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]])
 BIAS = np.array([1e-3, -2e-3, 3e-3, 2e-3, 1e-3, -3e-3, 0.02, 0.01, -0.03, 0.04, 0.0])
-D_BIAS, NOTHING = np.random.default_rng(11).normal(size=(6, 3)), np.zeros(6)
+D_BIAS = np.random.default_rng(11).normal(size=(6, 3))
+NOTHING = np.zeros(6)
 TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
-MOTION_SIGMA, MOTION_COV = 1e-3, 1e-6 * np.eye(6)
+MOTION_SIGMA = 1e-3
+MOTION_COV = 1e-6 * np.eye(6)
 
 
 def triples(*parts: Any) -> Any:
@@ -99,7 +99,9 @@ def pose_after(world: World, motion: Motion, eps: Floats = NOTHING) -> gtsam.Pos
     The gyros' turns about the world's vertical by the second, all else by the first; a scale error shortens level ways.
     """
     off = world.bias - BIAS
-    tilting, turning, scale = off[:3], off[3:6], off[10]
+    tilting = off[:3]
+    turning = off[3:6]
+    scale = off[10]
     up_i = world.R.T @ [0.0, 0.0, 1.0]
     up_j = motion.dR.T @ up_i
     theta = motion.D[:3] @ tilting + up_j * (up_j @ motion.D[:3] @ (turning - tilting))
@@ -130,7 +132,8 @@ def random_covariance(n: int, scale: float = 0.03, seed: int = 0) -> Floats:
 class Ekf:
     """EKF-SLAM; its error is a difference of the state's numbers, whose only bias is that of the compass."""
 
-    kind, bare = EkfSlam, 7
+    kind = EkfSlam
+    bare = 7
 
     @staticmethod
     def begin(slam: Any, world: World, P: Floats) -> None:
@@ -156,7 +159,8 @@ class Ekf:
     def moved(world: World, xi: Floats) -> World:
         """The world whose error against the given one is xi."""
         angles = gtsam.Rot3(world.R).rpy() + xi[3:6]
-        R, bias = gtsam.Rot3.RzRyRx(angles).matrix(), world.bias + xi[6] * np.eye(11)[9]
+        R = gtsam.Rot3.RzRyRx(angles).matrix()
+        bias = world.bias + xi[6] * np.eye(11)[9]
         return World(R, world.X + xi[:3], world.landmarks + xi[7:].reshape(-1, 3), bias)
 
     @staticmethod
@@ -177,7 +181,8 @@ class Ekf:
 class Invariant:
     """The invariant filter; its error moves the world, by the matrix exponential of the group."""
 
-    kind, bare = InvariantEkf, 17
+    kind = InvariantEkf
+    bare = 17
 
     @staticmethod
     def begin(slam: Any, world: World, P: Floats) -> None:
@@ -204,7 +209,8 @@ class Invariant:
     def moved(world: World, xi: Floats) -> World:
         points = np.vstack([world.X, world.landmarks])
         size = 3 + len(points)
-        algebra, element = np.zeros((size, size)), np.eye(size)
+        algebra = np.zeros((size, size))
+        element = np.eye(size)
         algebra[:3, :3] = gtsam.SO3.Hat(xi[:3])
         algebra[:3, 3:] = xi[14:].reshape(-1, 3).T
         element[:3, :3], element[:3, 3:] = world.R, points.T

@@ -103,10 +103,8 @@ def seen(stamps_ns, range_m=2.0, azimuth_rad=0.1, landmark=3, probability=1.0):
         np.broadcast_to(np.asarray(values, float), shape)
         for values in (range_m, azimuth_rad)
     ]
-    ids, probabilities = (
-        np.full((*shape, 1), landmark),
-        np.full((*shape, 1), probability),
-    )
+    ids = np.full((*shape, 1), landmark)
+    probabilities = np.full((*shape, 1), probability)
     return LandmarkDetections(
         np.asarray(stamps_ns),
         *rows,
@@ -145,10 +143,13 @@ def height_and_tilt(slam):
     return state.points[0, 2], state.P[16, 16], np.diag(state.P)[:2]
 
 
-YAW_RATE, SPEED, LEVER = 0.1, 0.3, np.array([0.2, 0.1, -0.3])
+YAW_RATE = 0.1
+SPEED = 0.3
+LEVER = np.array([0.2, 0.1, -0.3])
 
 
-CIRCLE_S, CIRCLE_START = 20, Start(position_m=(1.0, 2.0, -3.0), rpy_rad=(0.0, 0.0, 0.5))
+CIRCLE_S = 20
+CIRCLE_START = Start(position_m=(1.0, 2.0, -3.0), rpy_rad=(0.0, 0.0, 0.5))
 
 
 def circle_calibration(**imu_noise):
@@ -165,7 +166,8 @@ def circle_calibration(**imu_noise):
 def circle(gyro_error=0.0, velocity_error=0.0, seconds=CIRCLE_S):
     """A level circle; the DVL off the centre of the body, the accelerometer silent."""
     velocity = np.array([SPEED, 0.0, 0.0]) + np.cross([0.0, 0.0, YAW_RATE], LEVER)
-    gyro, doppler = imu(seconds, (0.0, 0.0, YAW_RATE), NO_FORCE), dvl(seconds, velocity)
+    gyro = imu(seconds, (0.0, 0.0, YAW_RATE), NO_FORCE)
+    doppler = dvl(seconds, velocity)
     return (
         replace(gyro, angular_velocity=gyro.angular_velocity + gyro_error),
         replace(doppler, velocity=doppler.velocity + velocity_error),
@@ -197,10 +199,8 @@ def aided(mission):
         np.sort(np.append(depth_ns[::n], depth_ns[::n] + 1_000_000)) for n in (3, 7)
     )
     yaw_rad = mission.truth.at(heading_ns).rotations().as_euler("ZYX")[:, 0]
-    sigma_rad, covs = (
-        np.full(len(yaw_rad), math.nan),
-        np.full((len(fixes_ns), 3, 3), math.nan),
-    )
+    sigma_rad = np.full(len(yaw_rad), math.nan)
+    covs = np.full((len(fixes_ns), 3, 3), math.nan)
     sigma_rad[5::10], covs[3::10] = -1.0, -np.eye(3)
     fixes = PositionFixes(fixes_ns, mission.truth.at(fixes_ns).positions + 1.0, covs)
     return replace(

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
     Calibration,
@@ -32,48 +31,9 @@ def started(sequence, **changes):
     )
 
 
-def sure_and_unsure(kind, mission):
-    """Started level, so that the body's third axis is the world's; heading, x and y known and hardly known."""
-    for sigma in (1e-4, 0.5):
-        level = {
-            "rpy_rad": (0.0, 0.0, mission.calibration.start.rpy_rad[2]),
-            "rpy_sigma_rad": (0.02, 0.02, sigma),
-        }
-        begun = started(
-            mission, **level, position_sigma_m=(100 * sigma, 100 * sigma, 0.01)
-        )
-        yield run(kind, begun, gate_probability=1.0)
-
-
-@pytest.mark.slow
-def test_an_unknown_world_frame_changes_no_invariant_estimate(mission):
-    """Invariance under a stochastic rigid transformation: only covariances differ, by the start's and no more."""
-    sure, unsure = sure_and_unsure(InvariantEkf, mission)
-    assert_allclose(
-        unsure.trajectory().positions, sure.trajectory().positions, atol=1e-6
-    )
-    assert_allclose(unsure.landmarks().positions, sure.landmarks().positions, atol=1e-6)
-    assert_allclose(
-        yaw_variances(unsure.trajectory()) - yaw_variances(sure.trajectory()),
-        0.5**2,
-        rtol=1e-3,
-    )
-
-
-def test_an_unknown_world_frame_changes_the_plain_filter_s_estimates_and_it_invents_a_heading(
-    mission,
-):
-    sure, unsure = sure_and_unsure(EkfSlam, mission)
-    assert (
-        np.abs(unsure.trajectory().positions - sure.trajectory().positions).max() > 0.1
-    )
-    assert (yaw_variances(unsure.trajectory()) - yaw_variances(sure.trajectory()))[
-        -1
-    ] < 0.8 * 0.5**2
-
-
 def test_the_world_s_frame_changes_nothing_but_the_frame(mission):
-    turn, shift = Rotation.from_euler("z", 2.0), np.array([300.0, -200.0, 0.0])
+    turn = Rotation.from_euler("z", 2.0)
+    shift = np.array([300.0, -200.0, 0.0])
     start = mission.calibration.start
     roll, pitch, yaw = start.rpy_rad
     moved = started(
@@ -81,7 +41,8 @@ def test_the_world_s_frame_changes_nothing_but_the_frame(mission):
         position_m=tuple(turn.apply(start.position_m) + shift),
         rpy_rad=(roll, pitch, yaw + 2.0),
     )
-    here, there = run(InvariantEkf, mission), run(InvariantEkf, moved)
+    here = run(InvariantEkf, mission)
+    there = run(InvariantEkf, moved)
     for one, other in (
         (here.trajectory(), there.trajectory()),
         (here.landmarks(), there.landmarks()),
@@ -101,11 +62,12 @@ def test_the_world_s_frame_changes_nothing_but_the_frame(mission):
 
 
 @slam_filters
-def test_a_robot_at_rest_learns_its_heading_from_one_landmark_only_in_the_plain_filter(
+def test_a_robot_at_rest_learns_a_heading_only_in_the_plain_filter(
     kind,
 ):
     """Heading unknown to 0.3 rad. Julier and Uhlmann, "A counter example to the theory of SLAM", ICRA 2001."""
-    rng, t = np.random.default_rng(0), later(*np.arange(0.2, 20.1, 0.2))
+    rng = np.random.default_rng(0)
+    t = later(*np.arange(0.2, 20.1, 0.2))
     calibration = Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-7, gyro_bias_sigma=0.0),
         dvl=DvlCalibration(velocity_sigma_m_s=(1e-5, 1e-5, 1e-5)),
@@ -133,7 +95,8 @@ def test_a_robot_at_rest_learns_its_heading_from_one_landmark_only_in_the_plain_
 
 def test_a_gyro_s_bias_is_learnt_from_landmarks():
     """At rest with a gyro that turns: the landmark stays where it was, so the gyro is wrong."""
-    bias, t = 2e-3, later(*np.arange(0.2, 30.1, 0.2))
+    bias = 2e-3
+    t = later(*np.arange(0.2, 30.1, 0.2))
     calibration = Calibration(
         imu=ImuCalibration(gyro_noise_density=1e-4, gyro_bias_sigma=5e-3)
     )
@@ -145,13 +108,3 @@ def test_a_gyro_s_bias_is_learnt_from_landmarks():
     assert state.P[8, 8] ** 0.5 < 0.1 * 5e-3
     _, state = run(InvariantEkf, replace(turning, detections=None)).state()
     assert state.bias[5] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_without_a_bias_to_estimate_there_is_none_and_none_that_walks(mission):
-    without = mission.calibration.imu.model_copy(
-        update={"gyro_bias_sigma": 0.0, "gyro_bias_walk_density": 1e-3}
-    )
-    calibration = mission.calibration.model_copy(update={"imu": without})
-    _, state = run(InvariantEkf, replace(mission, calibration=calibration)).state()
-    assert_array_equal(state.bias[:6], 0.0)
-    assert_array_equal(state.P[3:9], 0.0)

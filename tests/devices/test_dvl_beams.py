@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, velocity_of_beams
 from sonar_graph.navigation.samples import is_partial
 
-TILT, SIGMA = np.radians(30.0), 0.02
+TILT = np.radians(30.0)
+SIGMA = 0.02
 AZIMUTHS = np.radians([45.0, -45.0, -135.0, 135.0])
 JANUS = np.column_stack(
     [
@@ -30,14 +31,12 @@ def solved(directions, valid):
     return velocity[0], cov[0]
 
 
-def test_four_beams_of_a_janus_are_a_velocity_with_the_covariance_of_the_textbook():
+def test_four_janus_beams_give_velocity_and_covariance_of_the_textbook():
     """By least squares; horizontally sigma^2 / (2 sin^2 tilt), vertically sigma^2 / (4 cos^2 tilt)."""
     along = JANUS @ VELOCITY + SIGMA * np.random.default_rng(0).standard_normal((1, 4))
     velocity, cov = velocity_of_beams(JANUS, along, np.ones((1, 4), dtype=bool), SIGMA)
-    across, down = (
-        SIGMA**2 / (2 * np.sin(TILT) ** 2),
-        SIGMA**2 / (4 * np.cos(TILT) ** 2),
-    )
+    across = SIGMA**2 / (2 * np.sin(TILT) ** 2)
+    down = SIGMA**2 / (4 * np.cos(TILT) ** 2)
     np.testing.assert_allclose(velocity, along @ np.linalg.pinv(JANUS).T, atol=1e-12)
     np.testing.assert_allclose(cov[0], np.diag([across, across, down]), atol=1e-16)
 
@@ -66,7 +65,8 @@ def test_a_further_beam_never_takes_information_away(valid, more):
 
 def test_rows_do_not_mix_and_what_is_not_valid_may_be_anything():
     rng = np.random.default_rng(0)
-    velocities, valid = rng.standard_normal((50, 3)), rng.random((50, 4)) < 0.6
+    velocities = rng.standard_normal((50, 3))
+    valid = rng.random((50, 4)) < 0.6
     along = np.where(valid, velocities @ JANUS.T, np.nan)
     together, covs = velocity_of_beams(JANUS, along, valid, SIGMA)
     for k in range(50):

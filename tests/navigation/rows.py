@@ -58,7 +58,8 @@ def waves(stamps_ns: Ints, seed: int, amplitude: float) -> Floats:
     """Three smooth components, periods of 1 s to 5 s, shape (n, 3)."""
     rng = np.random.default_rng(seed)
     t = (stamps_ns - T0_NS)[:, None] * 1e-9
-    phase, period = rng.uniform(0, 2 * np.pi, (2, 3)), rng.uniform(1, 5, (2, 3))
+    phase = rng.uniform(0, 2 * np.pi, (2, 3))
+    period = rng.uniform(1, 5, (2, 3))
     return (
         amplitude
         * np.sin(2 * np.pi * t / period[0] + phase[0])
@@ -91,7 +92,8 @@ def steps_of(
     def sampled(stamps: Ints, values: Floats) -> Floats:
         if hold_past:
             return values[np.minimum(np.searchsorted(stamps, middles), len(stamps) - 1)]
-        t, knots = (middles - start_ns).astype(float), (stamps - start_ns).astype(float)
+        t = (middles - start_ns).astype(float)
+        knots = (stamps - start_ns).astype(float)
         return np.column_stack([np.interp(t, knots, column) for column in values.T])
 
     psd = np.zeros((len(middles), 3, 3))
@@ -148,15 +150,14 @@ def dense_covariance(
     steps: Steps, bias: Floats, lever: Floats, gyro_density: float
 ) -> tuple[Floats, Floats]:
     """Covariance (6, 6) and bias derivative (6, 3) at the end, step by step with differentiated exponentials."""
-    P, D = np.zeros((6, 6)), np.zeros((6, 3))
+    P = np.zeros((6, 6))
+    D = np.zeros((6, 3))
     poses = dead_reckoned(steps, bias, lever)
     for k, (before, after) in enumerate(pairwise(poses)):
-        dt, w, v, motion = (
-            steps.duration_s[k],
-            steps.rate[k] - bias,
-            steps.velocity[k],
-            before.between(after),
-        )
+        dt = steps.duration_s[k]
+        w = steps.rate[k] - bias
+        v = steps.velocity[k]
+        motion = before.between(after)
 
         def off(error: Floats, dt=dt, w=w, v=v, motion=motion) -> Floats:
             wrong = w + error[:3]
@@ -172,5 +173,6 @@ def dense_covariance(
             steps.velocity_psd[k] / dt,
         )
         F = motion.inverse().AdjointMap()
-        P, D = F @ P @ F.T + G @ Q @ G.T, F @ D - G[:, :3]
+        P = F @ P @ F.T + G @ Q @ G.T
+        D = F @ D - G[:, :3]
     return P, D

@@ -2,22 +2,18 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.measurements import Depth, Dvl
 from sonar_graph.navigation.dvl_screening.depth_gate import (
     DEPTH_GATE,
-    FEWEST,
     UNSTATED_M,
     VERTICAL_M_S,
 )
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
     LONG_NS,
-    MOST_WAITING,
     GateResult,
     gate_velocities,
     needed,
@@ -69,7 +65,8 @@ def after_half_a_second(
 @pytest.mark.parametrize("seconds", [0.1, 1.0, 5.0, 30.0])
 def test_the_distance_is_that_of_the_formula(seconds):
     """A true velocity's passes the gate but once in a billion."""
-    u, v = [0.6, -0.2, 0.3], [0.9, 0.4, -0.2]
+    u = [0.6, -0.2, 0.3]
+    v = [0.9, 0.4, -0.2]
     assert judged([0, round(seconds * NS)], [u, v]).distance == pytest.approx(
         [0.0, expected(seconds, u, v)]
     )
@@ -85,15 +82,6 @@ def test_correlated_noise_counts_as_such():
         assert after_half_a_second(u, Q_u, v, Q_v) == pytest.approx(
             (v - u) @ np.linalg.solve(S, v - u)
         )
-
-
-def test_the_first_row_of_all_has_nothing_to_be_compared_with():
-    assert judged([5], [[9.0, 0.0, 0.0]]).distance == pytest.approx([0.0])
-    assert judged([5], [[9.0, 0.0, 0.0]], known=(5, 7)).distance == pytest.approx([0.0])
-    (distance,) = judged([NS], [[9.0, 0.0, 0.0]], known=(-NS, 0, NS, 2 * NS)).distance
-    assert distance == pytest.approx(81.0 / (COVS[:, 0, 0].sum() + WALK**2))
-    (distance,) = judged([NS], [[9.0, 0.0, 0.0]], known=(0, NS - 1)).distance
-    assert distance == pytest.approx(81.0 / COVS[:, 0, 0].sum(), rel=1e-6)
 
 
 def test_rows_are_compared_with_the_last_one_believed():
@@ -120,16 +108,8 @@ def test_a_distance_at_the_gate_is_believed():
         assert (d[2] == 0.0) == believed
 
 
-def test_outliers_are_named_where_there_are_any():
-    at = [0, NS // 10]
-    calm = [[0.5, 0.0, 0.0]] * 2
-    jump = [[0.5, 0.0, 0.0], [9.0, 0.0, 0.0]]
-    assert not judged(at, calm).has_outliers
-    assert judged(at, jump).has_outliers
-    assert judged(at, jump).is_outlier.tolist() == [False, True]
-
-
-HZ, WRONG = 7.0, [5.0, 0.0, 0.0]
+HZ = 7.0
+WRONG = [5.0, 0.0, 0.0]
 
 
 def told(rows: Dvl, calls: int = 1) -> Odometry:
@@ -178,7 +158,7 @@ def test_wrong_ones_of_the_first_rows_are_refused_and_no_others(wrong, hz):
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0])
-def test_a_vehicle_that_moves_from_the_start_is_believed_with_its_first_row(speed):
+def test_a_vehicle_that_moves_from_the_start_keeps_its_first_row(speed):
     """Once enough rows agree, and never later than the tenth; its own rows are kept to the bit."""
     rows = start({}, speed)
     enough = needed(rows.velocity[0])
@@ -191,7 +171,7 @@ def test_a_vehicle_that_moves_from_the_start_is_believed_with_its_first_row(spee
         assert np.array_equal(column, own[:enough])
 
 
-def test_the_start_stays_a_node_with_the_velocity_of_the_first_row_believed():
+def test_the_start_stays_a_node_with_the_first_accepted_velocity():
     """Less surely known: by the walk and what the vehicle may have turned since."""
     rows = start({0: WRONG, 1: WRONG})
     stamps_ns, velocity, cov = told(rows).rows()[3:6]
@@ -203,25 +183,6 @@ def test_the_start_stays_a_node_with_the_velocity_of_the_first_row_believed():
         np.eye(3) * (1e-4 + walk**2 * t + (0.3 * t * 0.3) ** 2)
     )
     assert cov[2] == pytest.approx(1e-4 * np.eye(3))
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.integers(0, 2**32 - 1), st.permutations(range(12)), st.sets(st.integers(1, 11))
-)
-def test_blocks_out_of_order_are_believed_as_in_order(seed, order, cuts):
-    """Gaps, wrong rows and slow stretches; blocks of any sizes come in any order, before any motion is used."""
-    rng = np.random.default_rng(seed)
-    ns = T0_NS + np.cumsum(rng.choice([NS // 5, NS, 4 * NS], 12, p=[0.7, 0.15, 0.15]))
-    velocity = np.array([0.4, 0.0, 0.0]) + 0.02 * rng.standard_normal((12, 3))
-    rows = dvl(ns, velocity, 1e-4 * np.eye(3))
-    odometry = Odometry(Calibration())
-    for block in np.split(np.array(order), sorted(cuts)):
-        odometry.add(None, rows.rows(np.sort(block)))
-    stamps_ns = odometry.rows()[3]
-    assert (np.diff(stamps_ns) > 0).all()
-    told_of = [row.stamp_ns for row in odometry.refused]
-    assert sorted([*stamps_ns.tolist(), *told_of]) == ns.tolist()
 
 
 def test_wrong_rows_that_go_on_for_long_are_never_believed():
@@ -236,7 +197,7 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
         [0.5, 0.0, 0.0],
     )
     rows = dvl(ns, velocity, 1e-4 * np.eye(3))
-    for calls in (1, 7, len(ns)):
+    for calls in (1, 7):
         used = np.isin(ns, told(rows, calls).rows()[3])
         assert not used[wrong].any()
         assert used[~wrong].sum() >= np.count_nonzero(~wrong) - 2
@@ -251,23 +212,6 @@ def test_a_slow_log_is_not_in_doubt_for_ever():
     ):
         rows = start({}, speed=1.0, hz=hz, seconds=seconds)
         assert told(rows, calls).rows()[3].tolist() == rows.stamps_ns.tolist()
-
-
-def test_rows_that_confirm_each_other_here_and_there_are_no_majority():
-    """Every third row agrees, the two between contradict it: each time differently."""
-    value = {k: [-3.0 + 0.9 * k, 4.0 - 1.1 * k, 0.0] for k in range(12) if k % 3}
-    assert told(start(value, seconds=11 / HZ)).start_by(2**62) is None
-
-
-def test_not_more_than_so_many_rows_wait():
-    ns = stamps(HZ, 30.0)
-    # each contradicts all others, so that none is confirmed
-    rng = np.random.default_rng(0)
-    velocity = rng.uniform(-40.0, 40.0, (len(ns), 3))
-    odometry = told(dvl(ns, velocity, 1e-4 * np.eye(3)))
-    assert odometry.start_by(2**62) is None
-    assert [row.stamp_ns for row in odometry.refused] == ns.tolist()
-    assert len(odometry._intake._confirmation.waiting_ns) == MOST_WAITING
 
 
 def after_gap(
@@ -296,7 +240,7 @@ def test_wrong_rows_after_a_long_gap_are_refused_and_no_others(gap_s, wrong):
         assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
 
 
-def test_a_gap_lasts_until_its_end_is_confirmed_and_after_a_shorter_one_a_row_is_enough():
+def test_a_long_gap_lasts_until_its_end_is_confirmed():
     rows, first = after_gap(30.0, {})
     assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first
     ended = told(rows.rows(slice(0, first + 2)))
@@ -328,8 +272,10 @@ def used(
     seconds: list[float], z_m: list[float], calibration: Calibration = DEPTHS
 ) -> list[int]:
     """Rows that are used; the others are named, and the same whether they come at once or one by one."""
-    rows, found = depths(seconds, z_m), []
-    whole, single = Odometry(calibration), Odometry(calibration)
+    rows = depths(seconds, z_m)
+    found = []
+    whole = Odometry(calibration)
+    single = Odometry(calibration)
     for k in range(len(rows)):
         found += [k] * (single.used_depths(rows.rows(slice(k, k + 1))) is not None)
     kept = whole.used_depths(rows)
@@ -355,26 +301,10 @@ def test_a_depth_passes_as_far_as_a_vehicle_gets_and_its_noise_goes():
             assert used([0.0, seconds], [-5.0, -5.0 + sign * 1.001 * edge_m]) == [0]
 
 
-def test_a_refused_depth_is_told_with_its_distance():
-    odometry = Odometry(DEPTHS)
-    odometry.used_depths(depths([0.0, 1.0], [-5.0, 95.0]))
-    (row,) = odometry.refused
-    assert row.distance == pytest.approx(((100.0 - VERTICAL_M_S) / NOISE_M) ** 2)
-
-
 UNSTATED = Calibration(depth=DepthCalibration(sigma_m=0.1))
 
 
-def test_first_depths_far_from_the_start_are_used_when_enough_agree_unless_it_is_stated():
-    assert used([0.0], [-13.0]) == [0]
-    seconds, far = [0.0, 1.0, 2.0, 3.0], [-50.0] * 4
-    assert used(seconds, far, UNSTATED) == [FEWEST - 1, 3]
-    assert used(seconds, far) == []
-    assert used([*seconds, 4.0], [-50.0, -900.0, -50.0, 300.0, -50.0], UNSTATED) == [4]
-    assert used([*seconds, 4.0], [*far, -5.0]) == [4]
-
-
-def test_a_depth_that_hangs_stays_refused_and_the_first_right_ones_after_that_are_found_by_their_agreement():
+def test_a_depth_that_hangs_stays_refused_until_right_ones_agree():
     seconds = np.arange(1000.0)
     for calibration in (DEPTHS, UNSTATED):
         assert used(
@@ -385,7 +315,7 @@ def test_a_depth_that_hangs_stays_refused_and_the_first_right_ones_after_that_ar
     assert used(seconds.tolist(), hangs.tolist()) == [*range(5), *range(902, 1000)]
 
 
-def test_depths_after_a_long_gap_are_used_near_the_last_or_when_enough_agree():
+def test_depths_after_a_long_gap_are_near_the_last_or_agree():
     seconds = [0.0, 0.2, 60.0, 61.0, 62.0, 63.0]
     assert used(seconds, [-5.0, -5.0, -13.0, -13.0, -13.0, -13.0]) == [0, 1, 2, 3, 4, 5]
     assert used(seconds, [-5.0, -5.0, -100.0, -5.0, -5.0, -5.0]) == [0, 1, 3, 4, 5]

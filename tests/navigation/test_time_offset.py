@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from threadpoolctl import threadpool_info, threadpool_limits
 
-from sonar_graph.navigation.alignment import dvl_imu, reference_offset, time_offset
 from sonar_graph.navigation.alignment.time_offset import (
     Estimate1D,
     NormalEquations,
@@ -16,19 +14,20 @@ from sonar_graph.navigation.alignment.time_offset import (
     SampleSeries,
     fit,
     rate_noise_power,
-    reason_not_unique,
     search_offset,
 )
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 Signal = Callable[[np.ndarray], np.ndarray]
 
-RATIOS, WIDE = np.array([0.3, 0.02]), np.array([1e4, 1e4])
+RATIOS = np.array([0.3, 0.02])
+WIDE = np.array([1e4, 1e4])
 
 
 def stretch_of(seed: int, walks: tuple[bool, bool, bool]) -> SampleSeries:
-    rng, m = np.random.default_rng(seed), 20
-    y, A = rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 2))
+    rng = np.random.default_rng(seed)
+    m = 20
+    y = rng.standard_normal((m, 3))
+    A = rng.standard_normal((m, 3, 2))
     return SampleSeries(y, A, np.tile(np.eye(3), (m, 1, 1)), np.ones(m), walks)
 
 
@@ -36,10 +35,8 @@ def dense_covariance(
     m: int, walks: bool, ratios: np.ndarray = RATIOS, duration_s: float = 1.0
 ) -> np.ndarray:
     """Of differences of white samples, plus a rate's white noise, plus the walk of a rate from the beginning."""
-    difference, middle = (
-        np.diff(np.eye(m + 1), axis=0),
-        duration_s * (np.arange(m) + 0.5),
-    )
+    difference = np.diff(np.eye(m + 1), axis=0)
+    middle = duration_s * (np.arange(m) + 0.5)
     walk = duration_s**2 * np.minimum.outer(middle, middle)
     return (
         difference @ difference.T
@@ -62,7 +59,8 @@ def one_problem(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
 
 def textbook(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
     """Common parameters and their covariance."""
-    (columns, y), m = one_problem(stretches), len(stretches[0].y)
+    columns, y = one_problem(stretches)
+    m = len(stretches[0].y)
     weight = np.linalg.inv(
         block_diag(
             *[dense_covariance(m, walks) for s in stretches for walks in s.walks]
@@ -78,7 +76,7 @@ def textbook(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     "walks", [(True, True, True), (True, True, False), (False, False, False)]
 )
-def test_fit_is_generalised_least_squares_with_a_walk_on_the_axes_that_walk(walks):
+def test_fit_is_generalised_least_squares_with_walking_axes(walks):
     stretches = [stretch_of(seed, walks) for seed in range(4)]
     parameters, covariance = textbook(stretches)
     found = fit(stretches, WIDE, RATIOS)
@@ -88,7 +86,8 @@ def test_fit_is_generalised_least_squares_with_a_walk_on_the_axes_that_walk(walk
 
 def whitened_power(stretch: SampleSeries) -> float:
     """``tr(P (K - D))`` with dense matrices, rows axis by axis; D is the covariance of differences of white samples."""
-    m, B = len(stretch.y), by_axis(stretch.B)
+    m = len(stretch.y)
+    B = by_axis(stretch.B)
     K = block_diag(*[dense_covariance(m, walks) for walks in stretch.walks])
     difference = block_diag(*[np.diff(np.eye(m + 1), axis=0)] * 3)
     weight = np.linalg.inv(K)
@@ -101,36 +100,6 @@ def test_power_of_the_rates_noise_is_the_trace_with_dense_matrices():
     assert rate_noise_power(stretches, RATIOS) == pytest.approx(
         sum(map(whitened_power, stretches)), rel=1e-9
     )
-
-
-def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
-    """y is noise alone, its rates' part also in the only column: it takes the bias off to find nothing."""
-    rng = np.random.default_rng(5)
-    m, found, corrected = 20, [], []
-    signal = rng.standard_normal((m, 3, 1))
-    factor = np.linalg.cholesky(
-        dense_covariance(m, True) - dense_covariance(m, False) + RATIOS[0] * np.eye(m)
-    )
-    for _ in range(400):
-        rates = factor @ rng.standard_normal((m, 3))
-        y = np.diff(rng.standard_normal((m + 1, 3)), axis=0) + rates
-        stretch = SampleSeries(
-            y, 4 * signal + rates[:, :, None], np.tile(np.eye(3), (m, 1, 1)), np.ones(m)
-        )
-        result = fit([stretch], WIDE[:1], RATIOS)
-        found.append(result.parameters[0])
-        corrected.append(
-            found[-1] - result.covariance[0, 0] * rate_noise_power([stretch], RATIOS)
-        )
-    of_mean = np.std(found) / np.sqrt(len(found))
-    assert np.mean(found) > 8 * of_mean
-    assert abs(np.mean(corrected)) < 3 * of_mean
-
-
-def test_a_narrow_prior_holds_a_parameter_that_the_data_do_not_see():
-    stretch = stretch_of(0, (True, True, True))
-    found = fit([replace(stretch, A=0 * stretch.A)], np.array([0.1, 3.0]), RATIOS)
-    assert np.sqrt(np.diag(found.covariance)) == pytest.approx([0.1, 3.0])
 
 
 def noisy_stretch(
@@ -155,13 +124,14 @@ def restricted_likelihood(stretches: list[SampleSeries], ratios: np.ndarray) -> 
         len(stretches[0].y), True, ratios, float(stretches[0].duration_s[0])
     )
     K = block_diag(*[one] * (3 * len(stretches)))
-    (X, y), weight = one_problem(stretches), np.linalg.inv(K)
+    X, y = one_problem(stretches)
+    weight = np.linalg.inv(K)
     left = y - X @ np.linalg.solve(X.T @ weight @ X, X.T @ weight @ y)
     determinants = np.linalg.slogdet(K)[1] + np.linalg.slogdet(X.T @ weight @ X)[1]
     return float((len(y) - X.shape[1]) * np.log(left @ weight @ left) + determinants)
 
 
-def test_the_criterion_is_the_restricted_likelihood_with_one_dense_covariance_and_the_ratios_have_the_highest():
+def test_the_ratios_maximise_the_restricted_likelihood():
     rng = np.random.default_rng(3)
     stretches = [noisy_stretch(rng, (0.8, 0.3), 0.5) for _ in range(4)]
     tried = [
@@ -186,13 +156,6 @@ def test_the_criterion_is_the_restricted_likelihood_with_one_dense_covariance_an
         )
 
 
-def test_ratios_are_those_of_the_noise_that_was_simulated():
-    rng = np.random.default_rng(4)
-    found = fit([noisy_stretch(rng, (0.8, 0.3), 0.5) for _ in range(300)], WIDE)
-    assert found.ratios == pytest.approx([0.8, 0.3], rel=0.35)
-    assert found.variance == pytest.approx(0.01, rel=0.1)
-
-
 def test_a_stretch_own_parameter_that_is_there_twice_counts_once():
     """As gravity and its turning do in a stretch of one difference: a basis of all columns would take rows away."""
     stretches = [stretch_of(seed, (True, True, False)) for seed in range(3)]
@@ -208,27 +171,10 @@ def test_a_stretch_own_parameter_that_is_there_twice_counts_once():
     )
 
 
-def test_what_fits_nearly_exactly_is_told_as_exactly():
-    """Differences that are the model's but for a ten thousandth: the variance is that of the little left over."""
-    rng, p = np.random.default_rng(6), np.array([2.0, -3.0])
-    exact = [
-        replace(s, y=s.A @ p + s.B @ np.ones(3))
-        for s in (stretch_of(seed, (True,) * 3) for seed in range(3))
-    ]
-    noisy = [
-        replace(s, y=s.y + 1e-4 * np.diff(rng.standard_normal((21, 3)), axis=0))
-        for s in exact
-    ]
-    found = fit(noisy, WIDE, np.array([1e-6, 1e-6]))
-    assert found.parameters == pytest.approx(p, abs=1e-3)
-    assert found.variance == pytest.approx(1e-8, rel=0.5)
-
-
-T_S, NOISE = np.arange(200.0), 0.01
-NOTHING, STEADY = (
-    np.empty((len(T_S) - 1, 3, 0)),
-    np.tile(np.eye(3), (len(T_S) - 1, 1, 1)),
-)
+T_S = np.arange(200.0)
+NOISE = 0.01
+NOTHING = np.empty((len(T_S) - 1, 3, 0))
+STEADY = np.tile(np.eye(3), (len(T_S) - 1, 1, 1))
 
 
 def searched(
@@ -278,7 +224,7 @@ def textbook_covariance(
 
 
 @pytest.mark.parametrize("offset_s", [-0.43, 0.2, 0.25, 1.36])
-def test_sigma_is_the_textbooks_wherever_the_offset_lies_between_grid_points(offset_s):
+def test_sigma_is_the_textbooks_between_grid_points_too(offset_s):
     found = searched(swaying, offset_s).offset()
     assert found.is_known
     assert found.sigma == pytest.approx(
@@ -295,13 +241,6 @@ def test_the_range_ends_at_two_seconds(offset_s):
     assert "no best offset within ±2 s" in searched(swaying, 1.35 * offset_s).reason
 
 
-def test_an_offset_that_still_moves_after_the_last_step_is_not_known(monkeypatch):
-    assert searched(lambda t_s: swaying(2.0 * t_s), 0.28, noise=1e-6).reason == ""
-    monkeypatch.setattr(time_offset, "ROUNDS", 1)
-    told = searched(lambda t_s: swaying(2.0 * t_s), 0.28, noise=1e-6).reason
-    assert told.startswith("it does not settle: after 1 steps near +0.28 s")
-
-
 def test_a_motion_that_repeats_is_named_with_two_of_its_places():
     """A turn in 1.2 s."""
     phase = 2 * np.pi / 1.2
@@ -314,28 +253,6 @@ def test_a_motion_that_repeats_is_named_with_two_of_its_places():
     one, other = (float(part.split(" s")[0]) for part in reason.split(" and "))
     assert one != other
     assert {one, other} <= {-0.9, 0.3, 1.5}
-
-
-GRID_S = np.arange(-20, 21) / 10
-
-
-@pytest.mark.parametrize(
-    ("at", "worse", "is_rival"),
-    [
-        *((at, 15.0, True) for at in (0.8, -0.4, 2.0, -2.0)),
-        (0.8, 17.0, False),  # four sigmas
-        (0.5, 15.0, False),  # a neighbour
-    ],
-)
-def test_another_place_within_four_sigmas_of_the_best_is_a_rival(at, worse, is_rival):
-    misfit = 500.0 * np.abs(GRID_S - 0.3) + 100.0
-    misfit[np.argmin(np.abs(GRID_S - at))] = 100.0 + worse
-    reason = reason_not_unique(GRID_S, misfit, int(np.argmin(misfit)))
-    assert reason == (
-        f"+0.3 s and {at:+.1f} s fit as well: too little changes in the motion"
-        if is_rival
-        else ""
-    )
 
 
 @pytest.mark.parametrize(
@@ -353,39 +270,3 @@ def test_what_is_too_unsure_is_not_known_and_keeps_the_first_reason(
     assert Estimate1D(1.0, sigma, reason).limited(0.2, "too little") == Estimate1D(
         1.0, sigma, limited
     )
-
-
-def test_where_nothing_tells_the_offset_stays_in_the_range():
-    """Noise alone: steps far beyond the range would be as good as any."""
-    for seed in range(2):
-        found = searched(lambda t_s: 1e-6 * swaying(t_s), 0.3, seed)
-        assert abs(found.offset_s) <= 2.2
-        assert found.reason
-
-
-class SearchBegunError(Exception):
-    """With the number of threads at that time."""
-
-
-def blas_threads() -> int:
-    return max(
-        pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"
-    )
-
-
-@pytest.mark.parametrize("module", [dvl_imu, reference_offset])
-def test_offsets_are_searched_by_one_thread(module, monkeypatch: pytest.MonkeyPatch):
-    def stop_and_tell(*_: object) -> None:
-        raise SearchBegunError(blas_threads())
-
-    run = simulate_basin(BasinOptions(duration_s=120.0, laps=1, speed_m_s=0.4))
-    monkeypatch.setattr(module, "search_offset", stop_and_tell)
-    match, other = (
-        ("match_dvl_to_imu", run.dvl)
-        if module is dvl_imu
-        else ("match_reference_to_imu", run.truth)
-    )
-    with threadpool_limits(2, user_api="blas"):
-        assert blas_threads() == 2
-        with pytest.raises(SearchBegunError, match=r"^1$"):
-            getattr(module, match)(run.imu, other, run.calibration)

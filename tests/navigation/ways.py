@@ -19,9 +19,14 @@ from sonar_graph.navigation import Odometry, PreintegratedMotion
 
 from .rows import T0_NS, at, dvl, stamps
 
-IMU_HZ, DVL_HZ = 10.0, 2.0
-LOST_S, FOUND_S, OPEN_S, WAITS_S = 6.0, 11.0, 10.8, 1e-3
-BODY_P_IMU, BODY_P_DVL = np.array([0.2, -0.1, 0.1]), np.array([-0.5, 0.3, -0.2])
+IMU_HZ = 10.0
+DVL_HZ = 2.0
+LOST_S = 6.0
+FOUND_S = 11.0
+OPEN_S = 10.8
+WAITS_S = 1e-3
+BODY_P_IMU = np.array([0.2, -0.1, 0.1])
+BODY_P_DVL = np.array([-0.5, 0.3, -0.2])
 SIGMA_M_S = (0.01, 0.02, 0.005)
 ANY_VELOCITY = 1e3
 STEADY = 1e-9
@@ -151,14 +156,18 @@ def spoilt(imu, dvl, column, delta):
     """Rows with one column changed."""
     if column == "velocity":
         return imu, Dvl(dvl.stamps_ns, dvl.velocity + delta, dvl.velocity_cov)
-    rate, force = imu.angular_velocity, imu.specific_force
+    rate = imu.angular_velocity
+    force = imu.specific_force
     return Imu(
         imu.stamps_ns,
         *((rate + delta, force) if column == "rate" else (rate, force + delta)),
     ), dvl
 
 
-GYRO, ACCEL, SIGMA, GRAVITY = 2e-4, 1e-3, 0.005, np.array([0.0, 0.0, -9.8])
+GYRO = 2e-4
+ACCEL = 1e-3
+SIGMA = 0.005
+GRAVITY = np.array([0.0, 0.0, -9.8])
 QUIET = ImuCalibration(
     gyro_noise_density=0.0,
     gyro_bias_sigma=0.0,
@@ -181,7 +190,10 @@ DVL = DvlCalibration(
 class Vehicle:
     """Surging and swaying while it turns, by hand: x(t), v(t), a(t) and a constant rate about a tilted axis."""
 
-    IMU_HZ, DVL_HZ, LOST_S, FOUND_S = 50.0, 5.0, 6.0, 16.0
+    IMU_HZ = 50.0
+    DVL_HZ = 5.0
+    LOST_S = 6.0
+    FOUND_S = 16.0
     axis = np.array([0.05, -0.04, 0.12])
 
     def attitude(self, t):

@@ -30,7 +30,9 @@ from sonar_graph.simulation.vehicle import VehiclePath, drive, follow, smooth_no
 LANDMARKS_XY_M = np.array([[2.4, 0.05], [4.0, -0.12], [5.6, 0.1], [6.4, -0.08]])
 OTHERS_M = np.array([[3.2, 0.1, FLOOR_Z_M], [4.8, -0.1, FLOOR_Z_M]])
 """A stone and a rough patch as large and as bright as a landmark."""
-LENGTH_M, SPEED_M_S, RAMP_S = 5.2, 0.17, 2.0
+LENGTH_M = 5.2
+SPEED_M_S = 0.17
+RAMP_S = 2.0
 TOPIC = "/sonar/image"
 
 
@@ -55,7 +57,8 @@ class Lane:
 
     def one(self, row: int) -> SonarFrames:
         """A block of one frame."""
-        frames, only = self.frames, slice(row, row + 1)
+        frames = self.frames
+        only = slice(row, row + 1)
         return replace(
             frames, stamps_ns=frames.stamps_ns[only], intensity=frames.intensity[only]
         )
@@ -88,7 +91,8 @@ def lane_path(rng: np.random.Generator) -> VehiclePath:
 
 def lane_run(seed: int) -> Lane:
     """The run of a seed."""
-    options, streams = SimulationOptions(seed=seed, frame_rate_hz=5.0), Streams.of(seed)
+    options = SimulationOptions(seed=seed, frame_rate_hz=5.0)
+    streams = Streams.of(seed)
     world = world_on_floor(
         LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world
     )

@@ -11,23 +11,21 @@ from sonar_graph.errors import LogError
 from sonar_graph.measurements import Floats
 from sonar_graph.recognition.clock_offset import (
     ClockOffset,
-    NavigationMotion,
     estimate_offset,
 )
 from sonar_graph.recognition.image_motion import ImageMotions, PlanarStep
 from tests.recognition.imaged_lane import Lane
 
-RANGE_M, NOISE = 1.9, np.array([0.003, 0.002, 0.001])
+RANGE_M = 1.9
+NOISE = np.array([0.003, 0.002, 0.001])
 """Of yaw, of the motion ahead and of the motion across at the range."""
 
 
 @pytest.fixture(scope="module")
 def steps(lane: Lane) -> list[PlanarStep]:
     """True motion of the lane in the sonar's plane, with the noise of motion from images."""
-    body_T_sonar, rng = (
-        lane.sequence.calibration.sonar.mounting.pose(),
-        np.random.default_rng(3),
-    )
+    body_T_sonar = lane.sequence.calibration.sonar.mounting.pose()
+    rng = np.random.default_rng(3)
     stamps = lane.frames.stamps_ns[
         lane.frames.stamps_ns <= lane.sequence.truth.stamps_ns[-1]
     ]
@@ -82,18 +80,6 @@ def test_an_offset_is_searched_about_what_was_stated(lane, steps):
     assert abs(found.seconds - 50.3) < 3 * found.sigma_s + 0.01
 
 
-def test_motion_of_stretches_adds_up_to_the_end_of_the_log_and_is_unknown_beyond(lane):
-    first_ns = lane.sequence.start_ns
-    motion = NavigationMotion(lane.sequence, first_ns, first_ns + round(2e9))
-    first, second, both, beyond, before = motion.over(
-        np.array([0.33, 1.21, 0.33, 1.21, -0.01]),
-        np.array([1.21, 1.99, 1.99, 2.01, 1.0]),
-    )
-    assert np.abs(both).max() > 0.1
-    assert first + second == pytest.approx(both, abs=1e-12)
-    assert np.isnan([beyond, before]).all()
-
-
 def test_steps_that_err_wildly_are_left_out(lane, steps):
     wild: list[PlanarStep] = list(steps)
     for k in range(5, len(wild), 17):
@@ -139,13 +125,3 @@ def test_the_motion_of_images_tells_the_offset(lane):
     found = estimated(lane, seen, -0.8)
     assert abs(found.seconds + 0.8) < 3 * found.sigma_s + 0.01
     assert min(found.correlations) > 0.9
-
-
-def test_an_offset_between_those_that_are_tried_is_found_to_a_tenth_of_their_distance(
-    lane, steps
-):
-    off_s = [
-        estimated(lane, steps, 1.37 + d, around_s=1.4, search_s=1.5).seconds - d
-        for d in (0.0, 0.006)
-    ]
-    assert off_s[1] == pytest.approx(off_s[0], abs=0.002)

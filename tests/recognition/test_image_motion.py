@@ -21,7 +21,8 @@ from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import RecognitionSession
 from tests.recognition.imaged_lane import Lane
 
-SURE, RANGE_M = 0.9, 1.9
+SURE = 0.9
+RANGE_M = 1.9
 """RANGE_M: the middle of the images, where motion across the line of sight is seen best."""
 
 
@@ -47,7 +48,8 @@ def look_at_all(lane: Lane, motions: ImageMotions, rows: range) -> list:
 
 @pytest.mark.parametrize("is_floor_known", [True, False])
 def test_steps_are_the_true_ones_within_their_covariance(lane, is_floor_known):
-    calibration, rows = lane.sequence.calibration, range(60)
+    calibration = lane.sequence.calibration
+    rows = range(60)
     if not is_floor_known:
         calibration = calibration.model_copy(update={"floor": None})
     motions = ImageMotions(calibration)
@@ -75,7 +77,8 @@ def test_steps_are_the_true_ones_within_their_covariance(lane, is_floor_known):
 def test_a_frame_of_another_scene_is_not_laid_upon_the_one_before(lane):
     motions = ImageMotions(lane.sequence.calibration)
     look_at_all(lane, motions, range(3))
-    rng, other = np.random.default_rng(1), lane.one(3)
+    rng = np.random.default_rng(1)
+    other = lane.one(3)
     noise = rng.rayleigh(40.0, other.intensity.shape).astype(np.uint8)
     step = motions.look(
         SonarFrames(other.stamps_ns, noise, other.ranges_m, other.azimuths_rad)

@@ -11,8 +11,6 @@ from sonar_graph.recognition.recognition_record import (
     read_recognition,
     write_recognition,
 )
-from sonar_graph.sonar.recogniser import REJECTED
-from sonar_graph.sonar.regions import CandidateVerdict
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 
@@ -55,7 +53,7 @@ def test_the_surest_picture_of_each_landmark_is_shown_in_order(
     assert len(recognition.shown()) == 6
 
 
-def test_what_was_written_is_read_again_and_the_commonest_outcome_comes_first(
+def test_what_was_written_is_read_again_commonest_outcome_first(
     recognition, tmp_path: Path
 ) -> None:
     write_recognition(recognition, tmp_path)
@@ -93,9 +91,7 @@ def test_nothing_of_an_earlier_recognition_is_left(
     ("unlike", "is_doubted"),
     [((6, 10), True), ((5, 10), False), ((9, 9), False), ((0, 0), False)],
 )
-def test_a_floor_of_another_roughness_is_told_where_most_of_ten_tracks_show_it(
-    recognition, unlike, is_doubted
-):
+def test_a_floor_of_another_roughness_is_named(recognition, unlike, is_doubted):
     lines = [
         line
         for line in replace(recognition, unlike=unlike).naming()
@@ -108,7 +104,7 @@ def test_a_floor_of_another_roughness_is_told_where_most_of_ten_tracks_show_it(
 @pytest.mark.parametrize(
     ("off", "other", "is_doubted"), [(60, 40, True), (40, 60, False), (9, 0, False)]
 )
-def test_a_wrong_floor_is_doubted_where_nothing_is_named_and_most_candidates_lie_off_it(
+def test_a_wrong_floor_is_doubted_if_most_candidates_lie_off_it(
     recognition, off, other, is_doubted
 ):
     outcomes = Counter(
@@ -123,7 +119,3 @@ def test_a_wrong_floor_is_doubted_where_nothing_is_named_and_most_candidates_lie
     assert all(
         line.startswith("Warning: 60 of 100 rejected candidates") for line in lines
     )
-
-
-def test_the_words_of_a_candidate_off_the_floor_are_those_of_the_recogniser():
-    assert REJECTED[CandidateVerdict.OFF_FLOOR] == CANDIDATE_OFF_FLOOR

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.recognition.recognition_record import SEE_TRACKS, Recognition
+from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import RecognitionSession
 from sonar_graph.recognition.track_stories import MOST_EXAMPLES, TrackStories
 from sonar_graph.report.tracks.track_page import write_track_page
@@ -21,10 +21,8 @@ NAMES = ["1: disc", "2: square", "3: triangle", "4: cross"]
 
 @pytest.fixture(scope="module")
 def told(lane: Lane) -> tuple[Recognition, TrackStories]:
-    recogniser, stories = (
-        Recogniser(lane.sequence.calibration),
-        TrackStories(lane.sequence.calibration.sonar.image),
-    )
+    recogniser = Recogniser(lane.sequence.calibration)
+    stories = TrackStories(lane.sequence.calibration.sonar.image)
     see = lambda frame: stories.see(frame, recogniser)  # noqa: E731
     session = RecognitionSession(
         lane.sequence, recogniser=recogniser, pictures=False, seen=see
@@ -83,22 +81,6 @@ def test_the_page_shows_every_track_with_picture_and_reasons(told, lane, tmp_pat
     assert re.search(r"<strong>(0\.9\d|1\.00)</strong> 3: triangle", text)
 
 
-def test_the_page_does_not_send_to_itself_and_counts_one_in_the_singular(
-    told, lane, tmp_path
-):
-    recognition = replace(of_tracks(told[0], 20, 20), frames=1)
-    stories = TrackStories(lane.sequence.calibration.sonar.image)
-    number, story = next(iter(told[1].tracks.items()))
-    stories.tracks[number] = replace(story, frames=1)
-    assert SEE_TRACKS in recognition.naming()
-    write_track_page(tmp_path / "page.html", "one", recognition, stories, NAMES, 0)
-    text = (tmp_path / "page.html").read_text("utf-8")
-    assert "20 of 20 tracks are of no landmark" in text
-    assert "--report" not in text
-    assert '<p class="summary">1 frame, 1 track</p>' in text
-    assert not re.search(r"\b1 (frames|tracks)\b", text)
-
-
 def of_tracks(recognition: Recognition, count: int, none: int) -> Recognition:
     """Detections of some tracks, of which some are of no landmark."""
     row = recognition.detections.rows(np.zeros(1, np.int64))
@@ -134,7 +116,7 @@ def test_images_of_which_nearly_all_tracks_are_none_are_doubted(
     assert told[0].unlike_the_model() is None
 
 
-def test_a_log_of_other_landmarks_is_the_only_reason_given_for_tracks_of_none(told):
+def test_a_log_of_other_landmarks_is_the_reason_for_tracks_of_none(told):
     others = LandmarkMap(
         np.array([11, 12]), np.zeros((2, 3)), np.full((2, 3, 3), np.nan)
     )

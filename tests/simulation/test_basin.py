@@ -1,7 +1,5 @@
 """The basin run is the published experiment, as far as it is published."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -25,7 +23,7 @@ def test_landmarks_are_where_the_paper_puts_them(published: Sequence):
     )
 
 
-def test_vehicle_turns_right_by_a_quarter_four_times_in_each_of_three_laps_of_the_published_time(
+def test_the_vehicle_drives_three_laps_in_the_published_time(
     published: Sequence,
 ):
     truth = published.truth
@@ -41,20 +39,12 @@ def test_vehicle_turns_right_by_a_quarter_four_times_in_each_of_three_laps_of_th
     assert min(np.sum(quarter == -q) / 50 for q in range(12)) > 60  # seconds
 
 
-def test_vehicle_stays_in_the_water_and_moves_gently(published: Sequence):
-    positions = published.truth.positions
-    assert -1.0 < positions[:, 2].min() < positions[:, 2].max() < -0.4
-    assert np.linalg.norm(np.diff(positions, axis=0) * 50, axis=1).max() < 0.25
-    assert np.linalg.norm(np.diff(positions, 2, axis=0) * 2500, axis=1).max() < 0.2
-    tilt = np.degrees(published.truth.rotations().as_euler("ZYX")[:, 1:]).std(axis=0)
-    assert np.all((tilt > 0.5) & (tilt < 2))
-
-
-def test_every_landmark_is_seen_each_lap_mostly_from_the_published_distance(
+def test_every_landmark_is_seen_each_lap_at_the_published_distance(
     published: Sequence,
 ):
     ids, probability = published.detections.most_probable()
-    found, ids = published.detections.rows(probability > 0.9), ids[probability > 0.9]
+    found = published.detections.rows(probability > 0.9)
+    ids = ids[probability > 0.9]
     visits = np.concatenate([[0], np.flatnonzero(np.diff(ids)) + 1])
     assert ids[visits].tolist() == [1, 2, 3, 4] * 3
     lap = (found.stamps_ns[visits] - published.start_ns) * 1e-9 // (2039 / 3)
@@ -75,7 +65,7 @@ def test_shorter_runs_work_too(duration_s: float, laps: int):
     assert np.linalg.norm(run.truth.positions[-1] - run.truth.positions[0]) < 0.6
 
 
-def test_speed_is_the_one_asked_for_where_time_allows_and_too_short_a_run_says_how_long_it_must_be():
+def test_speed_is_as_asked_and_too_short_a_run_is_refused():
     assert cruise_speed(BasinOptions()) == 0.15
     assert cruise_speed(BasinOptions(duration_s=300, laps=1)) == 0.15
     # 28 m in what 4 turns (8 s) and 8 ramps (3 s) leave of 120 s.
@@ -88,9 +78,3 @@ def test_speed_is_the_one_asked_for_where_time_allows_and_too_short_a_run_says_h
     ):
         simulate_basin(BasinOptions(duration_s=100, laps=1))
     simulate_basin(BasinOptions(duration_s=119, laps=1))
-
-
-def test_a_whole_run_is_simulated_in_seconds():
-    begin = time.process_time()
-    simulate_basin(BasinOptions(seed=1))
-    assert time.process_time() - begin < 3

@@ -3,8 +3,6 @@
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 from sonar_graph.calibration import Mounting, SonarCalibration
@@ -27,7 +25,8 @@ WORLD = simulated.World(
     -2.0,
 )
 STAMPS = regular_stamps(10.0, 600.0, 0.013)
-KNOTS_S, SWAY = np.linspace(0, 600, 1201), np.array([0.8, 0.8, 0.2, 0.1, 0.1, 0.5])
+KNOTS_S = np.linspace(0, 600, 1201)
+SWAY = np.array([0.8, 0.8, 0.2, 0.1, 0.1, 0.5])
 PATH = VehiclePath.through(
     KNOTS_S, smooth_noise(KNOTS_S, SWAY, 6.0, 6, np.random.default_rng(11))
 )
@@ -44,10 +43,8 @@ def detect(
 
 def seen_points(frames: int | None = None) -> Floats:
     """By another library: the landmarks in the sonar's frame at every instant, shape (n, m, 3)."""
-    motion, body_T_sonar = (
-        PATH.at(seconds_since_start(STAMPS[:frames])),
-        SONAR.mounting.pose(),
-    )
+    motion = PATH.at(seconds_since_start(STAMPS[:frames]))
+    body_T_sonar = SONAR.mounting.pose()
     bodies = zip(motion.world_R_body.as_matrix(), motion.position, strict=True)
     poses = [
         gtsam.Pose3(gtsam.Rot3(rotation), position) * body_T_sonar
@@ -60,11 +57,9 @@ def in_view() -> np.ndarray:
     """Which landmark each frame's fan holds, shape (n, m)."""
     x, y, z = np.moveaxis(seen_points(), -1, 0)
     level = np.hypot(x, y)
-    distance, azimuth, elevation = (
-        np.hypot(level, z),
-        np.arctan2(y, x),
-        np.arctan2(z, level),
-    )
+    distance = np.hypot(level, z)
+    azimuth = np.arctan2(y, x)
+    elevation = np.arctan2(z, level)
     return (
         (distance >= 1.0)
         & (distance <= 6.0)
@@ -78,11 +73,6 @@ def assert_binomial(successes: int, trials: int, probability: float) -> None:
     assert low <= successes <= high
 
 
-def test_points_in_the_sonars_frame_agree_with_gtsam():
-    found = simulated.landmarks_in_sonar(PATH, STAMPS[:20], SONAR, WORLD)
-    np.testing.assert_allclose(found, seen_points(20), atol=1e-12)
-
-
 def point(distance: float, azimuth: float, elevation: float) -> Floats:
     across = distance * np.cos(elevation)
     return np.array(
@@ -94,35 +84,10 @@ def point(distance: float, azimuth: float, elevation: float) -> Floats:
     )
 
 
-@given(st.floats(0.2, 20), st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
-def test_polar_coordinates_invert_their_definition(
-    distance: float, azimuth: float, elevation: float
-):
-    found = simulated.range_azimuth_elevation(point(distance, azimuth, elevation))
-    np.testing.assert_allclose(
-        found, [distance, azimuth, elevation], rtol=1e-9, atol=1e-9
-    )
-
-
-def test_fan_ends_at_its_edges():
-    within = [(3.0, 0.0, 0.0), (1.01, 0.59, 0.29), (5.99, -0.59, -0.29)]
-    outside = [
-        (0.99, 0, 0),
-        (6.01, 0, 0),
-        (3, 0.61, 0),
-        (3, -0.61, 0),
-        (3, 0, 0.31),
-        (3, 0, -0.31),
-        (3, np.pi, 0),
-    ]
-    assert [
-        bool(simulated.inside(FAN, point(*place))) for place in within + outside
-    ] == [True] * 3 + [False] * 7
-
-
-def test_a_perfect_recogniser_reports_exactly_what_is_in_view_and_another_misses_its_share():
+def test_a_perfect_recogniser_reports_exactly_what_is_in_view():
     """Confidently, with room for none; where nothing is in view there is no block."""
-    found, (rows, columns) = detect(), np.nonzero(in_view())
+    found = detect()
+    rows, columns = np.nonzero(in_view())
     reported = zip(
         found.stamps_ns.tolist(), found.most_probable()[0].tolist(), strict=True
     )
@@ -142,13 +107,9 @@ def test_a_perfect_recogniser_reports_exactly_what_is_in_view_and_another_misses
 
 
 def test_range_and_azimuth_carry_the_noise_of_their_covariance():
-    noisy, quiet = (
-        detect(),
-        detect(
-            SONAR.model_copy(
-                update={"range_sigma_m": 1e-12, "azimuth_sigma_rad": 1e-12}
-            )
-        ),
+    noisy = detect()
+    quiet = detect(
+        SONAR.model_copy(update={"range_sigma_m": 1e-12, "azimuth_sigma_rad": 1e-12})
     )
     sigmas = np.sqrt(np.diagonal(noisy.range_azimuth_cov, axis1=1, axis2=2))
     np.testing.assert_allclose(sigmas, np.tile([0.015, 0.007], (len(noisy), 1)))
@@ -163,11 +124,9 @@ def test_range_and_azimuth_carry_the_noise_of_their_covariance():
     assert np.all(np.abs(error.mean(axis=0)) < 4 / np.sqrt(len(error)))
 
 
-def test_identities_are_mistaken_at_the_stated_rate_and_for_all_others_alike():
-    true_ids, ids = (
-        detect().most_probable()[0],
-        detect(wrong_id_rate=0.2).most_probable()[0],
-    )
+def test_identities_are_mistaken_at_the_stated_rate():
+    true_ids = detect().most_probable()[0]
+    ids = detect(wrong_id_rate=0.2).most_probable()[0]
     mistaken = true_ids != ids
     assert_binomial(int(mistaken.sum()), len(ids), 0.2)
     of_first = ids[mistaken & (true_ids == 3)]
@@ -181,7 +140,7 @@ def test_identities_are_mistaken_at_the_stated_rate_and_for_all_others_alike():
     assert np.all(lone.most_probable()[0] == 3)
 
 
-def test_false_detections_come_at_the_stated_rate_all_over_the_fan_and_say_none_unless_confusion_is_asked_for():
+def test_false_detections_come_at_the_stated_rate_all_over_the_fan():
     found = detect(detection_probability=0, false_detections_per_frame=0.5)
     low, high = stats.poisson.interval(0.9999, 0.5 * len(STAMPS))
     assert low < len(found) < high
@@ -215,7 +174,7 @@ def test_a_share_of_all_detections_names_nothing():
     assert (detect(anonymous_share=1.0).candidate_ids < 0).all()
 
 
-def test_landmarks_are_numbered_from_one_and_their_heights_obey_the_floor_prior():
+def test_landmarks_are_numbered_and_their_heights_obey_the_floor_prior():
     xy = np.arange(2000.0).reshape(1000, 2)
     landmarks = simulated.world_on_floor(
         xy, -1.7, 0.03, np.random.default_rng(0)
@@ -242,33 +201,9 @@ def tracks_of(found: LandmarkDetections) -> list[LandmarkDetections]:
     ]
 
 
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 2), st.integers(1, 2_000_000_000)),
-        min_size=1,
-        max_size=40,
-    )
-)
-def test_a_track_is_of_one_landmark_and_has_no_gap(steps: list[tuple[int, int]]):
-    landmark = np.array([index for index, _ in steps])
-    stamps_ns = np.cumsum([gap for _, gap in steps])
-    watched = simulated.Watched.of(landmark, stamps_ns)
-    for number, true in enumerate(watched.landmark.tolist()):
-        rows = np.flatnonzero(watched.track == number)
-        assert set(landmark[rows].tolist()) == {true}
-        assert (np.diff(stamps_ns[rows]) <= NS).all()
-        assert watched.age_s[rows] == pytest.approx(
-            (stamps_ns[rows] - stamps_ns[rows[0]]) / NS
-        )
-        assert watched.lifetime_s[number] == pytest.approx(watched.age_s[rows].max())
-    for index in range(3):
-        rows = np.flatnonzero(landmark == index)
-        is_new = np.diff(watched.track[rows]) != 0
-        assert is_new.tolist() == (np.diff(stamps_ns[rows]) > NS).tolist()
-
-
-def test_without_tracks_nothing_is_of_one_and_tracks_alone_change_nothing_else():
-    plain, tracked = basin(), basin(tracks=True)
+def test_tracks_change_nothing_else():
+    plain = basin()
+    tracked = basin(tracks=True)
     assert set(plain.track.tolist()) == {-1}
     for name in (
         "stamps_ns",
@@ -294,7 +229,7 @@ def test_an_identity_comes_when_its_track_is_old_enough():
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
-def test_a_wrong_identity_is_that_of_one_other_landmark_for_a_share_of_the_track(
+def test_a_wrong_identity_is_one_other_landmark_s_for_its_share(
     share: float,
 ):
     right = [track.most_probable()[0][-1] for track in tracks_of(basin(tracks=True))]
@@ -312,18 +247,23 @@ def test_a_wrong_identity_is_that_of_one_other_landmark_for_a_share_of_the_track
         assert len(set(ids[is_wrong].tolist())) <= 1
 
 
-@pytest.mark.slow
-def test_the_share_of_wrong_tracks_is_as_asked():
-    """Thirty runs of eight tracks or more: 0.3 give or take four standard errors."""
-    wrong = []
-    for seed in range(30):
-        plain, mixed = (
-            basin(seed=seed, tracks=True, wrong_id_rate=rate, wrong_id_share=1.0)
-            for rate in (0.0, 0.3)
-        )
-        pairs = zip(tracks_of(plain), tracks_of(mixed), strict=True)
-        wrong += [a.most_probable()[0][0] != b.most_probable()[0][0] for a, b in pairs]
-    assert np.mean(wrong) == pytest.approx(0.3, abs=4 * np.sqrt(0.3 * 0.7 / len(wrong)))
+def test_a_track_is_of_one_landmark_and_has_no_gap():
+    drawn = np.random.default_rng(5)
+    landmark = drawn.integers(0, 3, 60)
+    stamps_ns = np.cumsum(drawn.integers(1, 800_000_000, 60))
+    watched = simulated.Watched.of(landmark, stamps_ns)
+    for number, true in enumerate(watched.landmark.tolist()):
+        rows = np.flatnonzero(watched.track == number)
+        assert set(landmark[rows].tolist()) == {true}
+        age_s = (stamps_ns[rows] - stamps_ns[rows[0]]) / 1e9
+        np.testing.assert_allclose(watched.age_s[rows], age_s)
+        assert watched.lifetime_s[number] == pytest.approx(age_s.max())
+    for index in range(3):
+        rows = np.flatnonzero(landmark == index)
+        is_new = np.diff(watched.track[rows]) != 0
+        is_far = np.diff(stamps_ns[rows]) > 1_000_000_000
+        assert 5 < is_far.sum() < len(is_far) - 5
+        np.testing.assert_array_equal(is_new, is_far)
 
 
 def test_options_of_tracks_without_tracks_are_refused():

@@ -41,7 +41,7 @@ def residuals(run):
     ]
 
 
-def test_detections_fit_the_reference_to_their_noise_and_err_at_their_rates():
+def test_detections_fit_the_reference_and_err_at_their_rates():
     clean = residuals(add_landmarks(RECORDED, CLEAN))
     assert len(clean) > 100
     assert clean.std(axis=0) == pytest.approx(1.0, abs=0.15)

@@ -14,7 +14,7 @@ def mission() -> Sequence:
     )
 
 
-def test_vehicle_goes_round_and_round_at_the_stated_speed_heading_along_its_path(
+def test_the_vehicle_goes_round_at_the_stated_speed(
     mission: Sequence,
 ):
     positions = mission.truth.positions
@@ -36,24 +36,6 @@ def test_up_to_ten_landmarks_are_in_view_and_all_come_back(mission: Sequence):
     assert counts.max() <= 10
     ids, _ = found.most_probable()
     seconds = (found.stamps_ns - mission.start_ns) * 1e-9
-    early, late = ids[seconds < 200], ids[seconds >= 200]
+    early = ids[seconds < 200]
+    late = ids[seconds >= 200]
     assert set(early) == set(late) == set(range(1, 21))
-
-
-def test_sonar_options_bound_what_is_seen():
-    narrow = MissionOptions(
-        duration_s=60,
-        range_max_m=9.0,
-        azimuth_aperture_rad=0.6,
-        false_detections_per_frame=0,
-    )
-    found = simulate_mission(narrow).detections
-    assert found.range_m.max() < 9 + 5 * narrow.range_sigma_m
-    assert np.abs(found.azimuth_rad).max() < 0.3 + 5 * narrow.azimuth_sigma_rad
-
-
-@pytest.mark.parametrize("landmarks", [1, 20])
-def test_number_of_landmarks_is_the_one_asked_for(landmarks: int):
-    run = simulate_mission(MissionOptions(duration_s=20, landmarks=landmarks))
-    assert run.true_landmarks.ids.tolist() == list(range(1, landmarks + 1))
-    assert np.hypot(*run.true_landmarks.positions[:, :2].T).max() <= 11

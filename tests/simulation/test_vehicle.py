@@ -90,7 +90,8 @@ def test_drive_cruises_at_its_speed_and_accelerates_no_more_than_stated():
     seconds = np.linspace(0, piece.duration_s, 23_001)
     x = follow((0.0, 0.0, 0.0), [piece], seconds)[:, 0]
     step = seconds[1]
-    speed, acceleration = np.diff(x) / step, np.diff(x, 2) / step**2
+    speed = np.diff(x) / step
+    acceleration = np.diff(x, 2) / step**2
     np.testing.assert_allclose(speed[5000:15000], 0.15, rtol=1e-6)
     assert speed.min() > -1e-9
     assert np.abs(acceleration).max() == pytest.approx(1.5 * 0.15 / 3.0, rel=1e-3)

@@ -27,8 +27,6 @@ class Fed:
     ) -> None:
         self.smoother = smoother_with(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
         self.groups: dict[int, Factors] = {}
-        self.live: list[gtsam.Pose3] = []
-        """Newest pose of the basin's run after each update."""
 
     def add(self, new: Factors) -> None:
         self.groups[self.smoother.add(new)] = new
@@ -62,7 +60,8 @@ def on_the_rail(
     is_bounded: bool = False,
 ) -> Fed:
     _, numbers = rail(nodes)
-    fed, seen = Fed(lag_s, stale_shift_m, is_bounded=is_bounded), set()
+    fed = Fed(lag_s, stale_shift_m, is_bounded=is_bounded)
+    seen = set()
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     fed.add({"start prior": factors.start_prior(X(0), calibration())})
     cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
@@ -90,7 +89,8 @@ def ranged(
     k: int, i: int, distance: float, elevation_sigma: float | None = None
 ) -> Factors:
     """Factors of a range on the rail."""
-    z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e-2])
+    z = np.array([distance, 0.0])
+    R = np.diag([RANGE_SIGMA_M**2, 1e-2])
     return factors.landmark_sighting(
         X(k), L(i), gtsam.Pose3(), z, R, plain, elevation_sigma
     )
@@ -120,75 +120,42 @@ def in_the_basin(
     lag_s: float,
     stale_shift_m: float = NEVER_M,
     seed: int = 0,
-    bias_steps: int = 1000,
     kernel=plain,
-    *,
-    height_m: float = -1.0,
-    sonar: gtsam.Pose3 = SONAR,
-    roll_rad: float = 0.0,
 ) -> Fed:
-    """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear.
-
-    The landmarks lie about a height that the smoother is not told. ``roll_rad``: of the body's axes, by which sonar and
-    path stay where they are.
-    """
-    rng, rolled = (
-        np.random.default_rng(seed),
-        gtsam.Pose3(gtsam.Rot3.Rx(roll_rad), np.zeros(3)),
-    )
-    sonar = rolled.inverse().compose(sonar)
+    """Circles past three landmarks with a constant gyro bias; nothing about it is linear."""
+    rng = np.random.default_rng(seed)
     turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
     landmarks = {
-        3: np.array([3.0, 1.0, 0.0]),
-        5: np.array([2.0, 4.0, 0.2]),
-        8: np.array([-1.0, 2.5, -0.2]),
+        3: np.array([3.0, 1.0, -1.0]),
+        5: np.array([2.0, 4.0, -0.8]),
+        8: np.array([-1.0, 2.5, -1.2]),
     }
-    landmarks = {i: p + height_m * np.eye(3)[2] for i, p in landmarks.items()}
-    cov = np.diag([1e-4] * 3 + [4e-4] * 3)
-    fed, truth, seen = Fed(lag_s, stale_shift_m), rolled, set()
-    fed.smoother.add_pose(X(0), rolled, 0.0)
+    sigmas = np.array([0.01] * 3 + [0.02] * 3)
+    start = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    by_gyro = -np.eye(6, 11) * (np.arange(11) < 3)
+    R = np.diag([4e-4, 8e-5])
+    fed = Fed(lag_s, stale_shift_m)
+    truth = gtsam.Pose3()
+    fed.smoother.add_pose(X(0), truth, 0.0)
     fed.smoother.add_bias(B(0), np.zeros(11))
-    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
-    fed.add({"start prior": gtsam.PriorFactorPose3(X(0), rolled, prior)})
+    fed.add({"start prior": gtsam.PriorFactorPose3(X(0), truth, start)})
     fed.add({"bias prior": factors.bias_prior(B(0), np.full(11, 0.01))})
     for k in range(1, steps):
-        truth = truth.compose(rolled.inverse()).compose(turn).compose(rolled)
-        moved = turn.compose(
-            gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6))
-        )
-        moved = rolled.inverse().compose(moved).compose(rolled)
-        motion = motion_of(moved, cov, -np.eye(6, 11) * (np.arange(11) < 3))
-        fed.smoother.add_pose(
-            X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k)
-        )
-        fed.add(
-            {
-                "odometry": OdometryWithBias(
-                    X(k - 1), X(k), B((k - 1) // bias_steps), motion
-                )
-            }
-        )
-        if k % bias_steps == 0:
-            new = k // bias_steps
-            fed.smoother.add_bias(B(new), fed.smoother.values.atVector(B(new - 1)))
-            fed.add(
-                {"bias walk": factors.bias_walk(B(new - 1), B(new), np.full(11, 0.003))}
-            )
+        truth = truth.compose(turn)
+        moved = turn.compose(gtsam.Pose3.Expmap(sigmas * rng.standard_normal(6)))
+        motion = motion_of(moved, np.diag(sigmas**2), by_gyro)
+        before = fed.smoother.values.atPose3(X(k - 1))
+        fed.smoother.add_pose(X(k), before.compose(moved), float(k))
+        fed.add({"odometry": OdometryWithBias(X(k - 1), X(k), B(0), motion)})
         for i, p in landmarks.items():
-            z = polar(truth.compose(sonar), p) + [0.02, 0.009] * rng.standard_normal(2)
-            if i not in seen:
+            z = polar(truth.compose(SONAR), p) + [0.02, 0.009] * rng.standard_normal(2)
+            elevation_sigma = 0.3 if k == 1 else None
+            if k == 1:
                 fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
-            new = factors.landmark_sighting(
-                X(k),
-                L(i),
-                sonar,
-                z,
-                np.diag([4e-4, 8e-5]),
-                kernel,
-                None if i in seen else 0.3,
+            fed.add(
+                factors.landmark_sighting(
+                    X(k), L(i), SONAR, z, R, kernel, elevation_sigma
+                )
             )
-            fed.add(new)
-            seen.add(i)
         fed.smoother.update(float(k))
-        fed.live.append(fed.smoother.values.atPose3(X(k)))
     return fed

@@ -81,7 +81,8 @@ def assert_same_factors(
     tolerance: float = 1e-7,
 ) -> None:
     """One by one, in standard deviations of what they measure."""
-    a, b = rows_of(one, values), rows_of(other, values)
+    a = rows_of(one, values)
+    b = rows_of(other, values)
     assert {name: len(rows) for name, rows in a.items()} == {
         name: len(rows) for name, rows in b.items()
     }
@@ -98,7 +99,7 @@ def assert_same_factors(
 
 def assert_same_graph(one: Isam2, other: Isam2, tolerance: float = 1e-6) -> None:
     """Factors, and marginals of every variable in the units of its standard deviations, at the values of the other."""
-    values, _ = other._smoother.solve_history()
+    values = gtsams_solution(other.graph, other.values)
     assert_same_factors(one.graph, other.graph, values, tolerance)
     a, b = (gtsam.Marginals(each.graph, values) for each in (one, other))
     for key in values.keys():  # noqa: SIM118  # gtsam.Values is no mapping

@@ -89,7 +89,8 @@ def smoother_with(
 
 def values_of(**named: Any) -> gtsam.Values:
     """Values by name: X0, L3, B1."""
-    values, symbols = gtsam.Values(), {"X": X, "L": L, "B": B}
+    values = gtsam.Values()
+    symbols = {"X": X, "L": L, "B": B}
     for name, value in named.items():
         values.insert(symbols[name[0]](int(name[1:])), value)
     return values
@@ -167,10 +168,8 @@ def motion_of(
     bias: Floats | None = None,
 ) -> PreintegratedMotion:
     """Motion of one second."""
-    D_bias, bias = (
-        (np.zeros((6, 11)) if D_bias is None else D_bias),
-        (np.zeros(11) if bias is None else bias),
-    )
+    D_bias = np.zeros((6, 11)) if D_bias is None else D_bias
+    bias = np.zeros(11) if bias is None else bias
     return PreintegratedMotion(i_T_j, cov, D_bias, bias, 1.0, np.zeros(3))
 
 
@@ -179,7 +178,8 @@ def some_motion(seed: int = 0, sigma: float = 0.01) -> PreintegratedMotion:
     i_T_j = gtsam.Pose3.Expmap(
         np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)])
     )
-    D_bias, bias = rng.standard_normal((6, 11)), 0.01 * rng.standard_normal(11)
+    D_bias = rng.standard_normal((6, 11))
+    bias = 0.01 * rng.standard_normal(11)
     return motion_of(i_T_j, random_covariance(6, sigma, seed + 1), D_bias, bias)
 
 
@@ -202,8 +202,10 @@ def detected(
     cov: Floats | None = None,
 ) -> LandmarkDetections:
     """Rows z (range, azimuth), shape (n, 2); stamps and candidates are one for all rows or one for each."""
-    z, probabilities = np.asarray(z, float), np.asarray(probabilities, float)
-    n, width = len(z), probabilities.shape[-1]
+    z = np.asarray(z, float)
+    probabilities = np.asarray(probabilities, float)
+    n = len(z)
+    width = probabilities.shape[-1]
     return LandmarkDetections(
         np.broadcast_to(np.asarray(stamps_ns, np.int64), n).copy(),
         z[:, 0],

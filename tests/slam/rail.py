@@ -22,7 +22,9 @@ from .made import detected
 
 T0_NS = 1_600_000_000 * NS_PER_S
 STEP_S = 0.5
-START_SIGMA_M, VELOCITY_SIGMA_M_S, RANGE_SIGMA_M = 0.1, 0.03, 0.05
+START_SIGMA_M = 0.1
+VELOCITY_SIGMA_M_S = 0.03
+RANGE_SIGMA_M = 0.05
 LANDMARKS_M = {4: 25.0, 7: 40.0}
 
 
@@ -40,7 +42,8 @@ class Rail:
             f"l{i}" for i in sorted({i for _, i, _ in ranges})
         ]
         column = {name: k for k, name in enumerate(names)}
-        A, b = [np.eye(len(names))[0] / START_SIGMA_M], [0.0]
+        A = [np.eye(len(names))[0] / START_SIGMA_M]
+        b = [0.0]
         for k, moved in enumerate(self.displacements_m[: nodes - 1]):
             sigma = VELOCITY_SIGMA_M_S * STEP_S
             A.append((np.eye(len(names))[k + 1] - np.eye(len(names))[k]) / sigma)

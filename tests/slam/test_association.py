@@ -2,22 +2,19 @@
 
 from itertools import product
 
-import gtsam
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
-from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.models import ACCEPTED, identify
-from sonar_graph.slam.landmarks.landmark_graph import AmendableJournal, Assignment
 from sonar_graph.slam.landmarks.mixture import (
     LEAST_LANDMARKS,
     IdentityPosterior,
     RecogniserErrors,
 )
-from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.landmarks.tracked import (
     NO_LANDMARK,
     UNDECIDED,
@@ -31,7 +28,6 @@ from sonar_graph.slam.landmarks.unknown import (
     drop_unlikely,
     pair_jointly,
 )
-from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 from .made import detected
@@ -43,7 +39,8 @@ def stated(
     return detected(stamps_ns, np.ones((len(stamps_ns), 2)), ids, probabilities)
 
 
-REPEATED, NO_IDENTITY = Outcome.REPEATED, Outcome.NO_IDENTITY
+REPEATED = Outcome.REPEATED
+NO_IDENTITY = Outcome.NO_IDENTITY
 
 
 @pytest.mark.parametrize(
@@ -82,24 +79,6 @@ def test_the_most_probable_identity_is_accepted(
     assert outcomes.tolist() == [
         ACCEPTED if why is None else OUTCOME_NUMBERS[why] for why in refusals
     ]
-
-
-def test_a_row_is_amended_in_its_place_and_loses_its_innovation():
-    journal = AmendableJournal()
-    sightings = [
-        Sighting(stamp_ns, row, Sightline(0, gtsam.Pose3(), np.ones(2)), np.eye(2))
-        for row, stamp_ns in enumerate((5, 6))
-    ]
-    assert journal.record(5, 2, Outcome.USED, np.ones(2), np.eye(2)) == 0
-    assert journal.record(6, 3, Outcome.WAITING) == 1
-    journal.amend(Assignment(sightings[0], Outcome.MOVED, 7))
-    journal.amend(Assignment(sightings[1], Outcome.FORGOTTEN))
-    log = journal.log()
-    assert log.outcomes == [Outcome.MOVED, Outcome.FORGOTTEN]
-    assert log.landmark_ids.tolist() == [7, 3]
-    assert log.stamps_ns.tolist() == [5, 6]
-    assert np.isnan(log.innovations).all()
-    assert np.isnan(log.innovation_covs).all()
 
 
 CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4).map(
@@ -160,35 +139,27 @@ def test_what_reaches_the_least_probability_is_decided(
     assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
 
 
-def test_of_a_tracks_rows_the_one_stays_that_its_identity_explains_best() -> None:
-    """Of a track that counts as nothing the most probable row, of equals the first; of one named twice the sum."""
+FLAT = [0.2] * 4
+TRACKS = [3, 3, NO_TRACK, 8]
+BELIEFS = [[0.9, 0, 0, 0], [0, 0, 0.8, 0], [1.0, 0, 0, 0], FLAT]
 
-    def kept(
-        tracks: list[int],
-        beliefs: list[list[float]],
-        identity: int = UNDECIDED,
-        ids: list | None = None,
-    ) -> list:
-        rows = detected(
-            0, np.ones((len(tracks), 2)), ids or [4, 5, 6, 7], beliefs, tracks
-        )
-        return [
-            k
-            for k, why in enumerate(
-                second_rows_of_tracks(rows, dict.fromkeys(tracks, identity))
-            )
-            if why is None
-        ]
 
-    flat = [0.2] * 4
-    one = [3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], [1.0, 0, 0, 0], flat]
-    assert kept(*one, 6) == [1, 2, 3]
-    assert kept(*one, 4) == [0, 2, 3]
-    assert kept(
-        [3, 3, 3, NO_TRACK, NO_TRACK],
-        [flat, [0, 0.8, 0, 0], [0, 0, 0.8, 0], flat, flat],
-    ) == [1, 3, 4]
-    assert kept([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]], 0, [0] * 4) == [1]
+@pytest.mark.parametrize(
+    ("tracks", "beliefs", "ids", "identity", "kept"),
+    [
+        (TRACKS, BELIEFS, [4, 5, 6, 7], 6, [1, 2, 3]),
+        (TRACKS, BELIEFS, [4, 5, 6, 7], 4, [0, 2, 3]),
+        ([3, 3], [FLAT, [0, 0.8, 0, 0]], [4, 5, 6, 7], UNDECIDED, [1]),
+        ([3, 3], [FLAT, FLAT], [4, 5, 6, 7], UNDECIDED, [0]),
+        ([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]], [0] * 4, 0, [1]),
+    ],
+)
+def test_of_a_track_the_row_stays_that_its_identity_explains_best(
+    tracks, beliefs, ids, identity, kept
+):
+    rows = detected(0, np.ones((len(tracks), 2)), ids, beliefs, tracks)
+    reasons = second_rows_of_tracks(rows, dict.fromkeys(tracks, identity))
+    assert [k for k, why in enumerate(reasons) if why is None] == kept
 
 
 PROBABILITY = 0.95
@@ -265,7 +236,7 @@ def brute_force(case: Innovations) -> tuple[int, float, tuple[int, ...]]:
     seed=928, m=3, n=3, spread=1.5
 )  # two pairs beyond their gate, and the third finds its landmark taken
 @example(seed=15, m=3, n=3, spread=1.5)  # two pairs beyond their gate, three inside
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     m=st.integers(1, 4),
@@ -287,7 +258,8 @@ def test_the_pairing_is_that_of_trying_all(seed: int, m: int, n: int, spread: fl
 
 SPACING = 1.0
 SHIFT = 0.8
-VEHICLE_SIGMA, SIGMA = 1.0, 0.1
+VEHICLE_SIGMA = 1.0
+SIGMA = 0.1
 
 
 def shifted() -> Innovations:
@@ -301,39 +273,14 @@ def shifted() -> Innovations:
     )
 
 
-def test_an_error_that_all_share_does_not_mislead_joint_compatibility():
-    """Each detection by itself would be paired with the second landmark, within the same gate.
-
-    Negative control: with errors taken as independent the crossed pairing, whose innovations differ by two metres,
-    would be compatible.
-    """
-    case = shifted()
-    assert np.argmin(case.distances(), axis=1).tolist() == [1, 1]
-    assert (case.distances()[:, 1] <= chi2.ppf(PROBABILITY, 2)).all()
-    assert pair_jointly(case, PROBABILITY).landmarks == (0, 1)
-    independent = Innovations(
-        case.innovation, np.diag(np.diag(case.expected_cov)), case.noise
-    )
-    (_, joint), (_, apart) = distance(case, (1, 0)), distance(independent, (1, 0))
-    assert joint > chi2.ppf(PROBABILITY, 4) > apart
-
-
-@pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
-def test_a_pair_is_kept_when_it_is_denser_than_its_rival(sigma: float):
-    case = Innovations(
-        np.array([[[0.1, 0.0]]]), sigma**2 * np.eye(2), 1e-6 * np.eye(2)[None]
-    )
-    density = multivariate_normal.logpdf([0.1, 0.0], cov=(sigma**2 + 1e-6) * np.eye(2))
-    for rival, size in ((density - 1e-6, 1), (density + 1e-6, 0)):
-        assert drop_unlikely(case, Pairing((0,), 0.0), np.array([rival])).size == size
-
-
-def test_two_that_share_a_wide_error_support_each_other_but_not_where_they_may_be_anywhere():
+def test_two_that_share_a_wide_error_support_each_other():
     """One alone says nothing beside a rival of 0.2 a unit; two at the right distance from each other do.
 
     Each given the other is denser than a rival of 3 a unit; where both are together is not.
     """
-    rival, case, both = np.log(np.full(2, 0.2)), shifted(), Pairing((0, 1), 0.0)
+    rival = np.log(np.full(2, 0.2))
+    case = shifted()
+    both = Pairing((0, 1), 0.0)
     assert drop_unlikely(case, both, rival).landmarks == (0, 1)
     assert drop_unlikely(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
     e, C = case.of(both.landmarks)
@@ -346,7 +293,7 @@ def test_two_that_share_a_wide_error_support_each_other_but_not_where_they_may_b
 def test_a_pair_that_the_others_contradict_is_dropped():
     """The third lies where the common error of the first two does not let it be."""
     expected = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    z: Floats = expected + np.array([[0.8, 0.0], [0.8, 0.0], [-0.3, 0.6]])
+    z = expected + np.array([[0.8, 0.0], [0.8, 0.0], [-0.3, 0.6]])
     shared = np.tile(np.eye(2), (3, 1))
     cov = shared @ shared.T + 1e-4 * np.eye(6)
     case = Innovations(

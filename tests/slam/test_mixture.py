@@ -106,17 +106,6 @@ def of_nothing(seen: TrackedObject) -> float:
     return LOG_U + (len(seen.sightings) - 1) * max(LOG_U, peak - REPEATED_LOSS)
 
 
-def some_watches(values: gtsam.Values) -> list[TrackedObject]:
-    rng = np.random.default_rng(4)
-    return [
-        watch(values, PLACES[7], [0, 1, 2], rng.standard_normal((3, 2)), {7: 0.9}),
-        watch(
-            values, PLACES[4], [3], 3.0 * rng.standard_normal((1, 2)), {7: 0.6, 4: 0.3}
-        ),
-        watch(values, PLACES[9], [1, 4], rng.standard_normal((2, 2)), {}),
-    ]
-
-
 @pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
 def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
     e = np.sinh(np.linspace(-18.0, 18.0, 400_001))  # as far as Cauchy's tails matter
@@ -125,23 +114,11 @@ def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
     ) == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("kernel", KERNELS[1:], ids=NAMES[1:])
-def test_a_kernels_loss_is_that_of_gtsam(kernel: Kernel) -> None:
-    estimator = kernel.estimator()
-    assert estimator is not None
-    for e in [-30.0, -2.0, -1.31, -1.29, -0.4, 0.0, 0.7, 1.5, 8.0]:
-        assert float(kernel.loss(np.array(e))) == pytest.approx(
-            estimator.loss(e), rel=1e-12
-        )
-
-
 def losses(kernel: Kernel, noise: Floats) -> Floats:
     """That of the graph's factors and that of the mixture, shape (n, 2), of points at elevation 0 all about one."""
-    estimator, values, found = (
-        kernel.estimator(),
-        values_of(X0=gtsam.Pose3(), L7=np.zeros(3)),
-        [],
-    )
+    estimator = kernel.estimator()
+    values = values_of(X0=gtsam.Pose3(), L7=np.zeros(3))
+    found = []
     z = np.array([3.0, 0.2])
     robust = (
         (lambda model: gtsam.noiseModel.Robust.Create(estimator, model))
@@ -172,23 +149,13 @@ def test_the_mixtures_loss_is_that_of_the_graphs_factors(kernel: Kernel) -> None
     np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("kernel", KERNELS[1:], ids=NAMES[1:])
-def test_a_kernel_on_correlated_noise_is_once_to_twice_as_strict_in_the_mixture(
-    kernel: Kernel,
-) -> None:
-    """The factor's is of the norm, the mixture's of both components: a loss that is concave in e² adds up to more."""
-    theirs, ours = losses(kernel, R).T
-    assert (ours >= theirs * (1 - 1e-9)).all()
-    assert (ours <= 2.0 * theirs * (1 + 1e-9)).all()
-    assert (ours / theirs).max() > 1.15, "else one of the two has come to be the other"
-
-
 def test_a_new_detections_components_are_predictive_densities() -> None:
     """Of three landmarks, one of them across the cut of the azimuth; of one that is not in the graph, and of none."""
     rng = np.random.default_rng(2)
     A = rng.standard_normal((3, 2, 2))
     S = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(2)
-    z, expected = np.array([3.0, 3.1]), np.array([[3.2, 3.0], [2.0, -3.1], [3.5, 2.0]])
+    z = np.array([3.0, 3.1])
+    expected = np.array([[3.2, 3.0], [2.0, -3.1], [3.5, 2.0]])
     said = {4: 0.6, 5: 0.3}
     found = MIXTURE.at_first(IdentityPosterior(said), [7, 4, 9], z, expected, S)
     for k, i in enumerate((7, 4, 9)):
@@ -201,56 +168,11 @@ def test_a_new_detections_components_are_predictive_densities() -> None:
     assert found.keys() == {7, 4, 9, 5, None}
 
 
-def test_gains_are_densities_over_that_of_no_landmark() -> None:
-    values = world()
-    watches, points = (
-        some_watches(values),
-        np.array([PLACES[7], PLACES[4] + [0.0, 0.05, 0.0]]),
-    )
-    found = MIXTURE.gains(7, watches, points, values)
-    for n, seen in enumerate(watches):
-        named, none = log_weights(seen.posterior.probability, 7)
-        for k, point in enumerate(points):
-            expected = (
-                named + log_density(values, seen, point) - none - of_nothing(seen)
-            )
-            assert found[n, k] == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.parametrize("is_alone", [True, False])
-def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(
-    is_alone: bool,
-) -> None:
-    """Else its perfect fit would be praised; others fit it, or do not, as any landmark."""
-    values = world()
-    watches = some_watches(values)
-    own, other, third = watches
-    found = MIXTURE.scores(
-        watches, values, [7, 4, None], {7: 3 if is_alone else 4, 4: 6}
-    )
-    in_place = log_density(values, own, PLACES[7])
-    weight, none = log_weights({7: 0.9}, 7)
-    assert found[0][7] == pytest.approx(
-        weight + (of_nothing(own) if is_alone else in_place)
-    )
-    assert found[0][4] == pytest.approx(
-        log_weights({7: 0.9}, 4)[0] + log_density(values, own, PLACES[4])
-    )
-    assert found[0][None] == pytest.approx(none + of_nothing(own))
-    others_weight = log_weights(other.posterior.probability, 7)[0]
-    assert found[1][7] == pytest.approx(
-        others_weight + log_density(values, other, PLACES[7])
-    )
-    assert found[2][4] == pytest.approx(
-        log_weights({}, 4)[0] + log_density(values, third, PLACES[4])
-    )
-    assert [list(row) for row in found] == [[4, 7, None]] * 3
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""
-    values, rng = world(), np.random.default_rng(seed)
+    values = world()
+    rng = np.random.default_rng(seed)
     watches = []
     for frames in ([0, 1], [0, 1], [2], [3], [4, 5]):
         place = [*PLACES.values(), np.array([3.5, 0.9, -1.0])][int(rng.integers(4))]
@@ -283,11 +205,13 @@ def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
 
 
 SAID = {7: 0.9}
-HERE, THERE = PLACES[7], PLACES[7] + np.array([0.0, 0.4, 0.0])
+HERE = PLACES[7]
+THERE = PLACES[7] + np.array([0.0, 0.4, 0.0])
 
 
 def vote(watches: list[TrackedObject], point: Floats) -> float:
-    values, (weight, none) = world(), log_weights(SAID, 7)
+    values = world()
+    weight, none = log_weights(SAID, 7)
     gains = (
         weight + log_density(values, w, point) - none - of_nothing(w) for w in watches
     )
@@ -304,7 +228,8 @@ def test_the_place_with_most_votes_wins_whatever_lies_far_off(
     """What fits nowhere has no voice, however far off it is; summed errors would be drawn to it."""
     values = world()
     far = [HERE + np.array([0.0, 1.2 + 0.5 * k, 0.0]) for k in range(strays)]
-    rng, points = np.random.default_rng(3), [HERE] * here + [THERE] * there + far
+    rng = np.random.default_rng(3)
+    points = [HERE] * here + [THERE] * there + far
     watches = [
         watch(values, point, [0], 0.3 * rng.standard_normal((1, 2)), SAID)
         for point in points

@@ -78,7 +78,8 @@ def change(
 def errors(
     graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkGraph
 ) -> list[float]:
-    rng, found = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    found = []
     for _ in range(4):
         values = gtsam.Values()
         for k in range(POSES):
@@ -108,10 +109,8 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(
 ) -> None:
     """Each stage gives each sighting to a landmark or none; the first to come is often not the earliest."""
     landmarks = begun()
-    seen, of = (
-        [sighting_of(7, k, floor, landmarks) for k in range(POSES)],
-        dict[Sighting, int](),
-    )
+    seen = [sighting_of(7, k, floor, landmarks) for k in range(POSES)]
+    of = dict[Sighting, int]()
     for stage in stages:
         change(
             landmarks,
@@ -122,10 +121,8 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(
             ],
         )
         of = {s: i for s, i in zip(seen, stage, strict=True) if i is not None}
-        expected, ids = (
-            graph_of(landmarks.smoother.graph.at(k) for k in range(POSES)),
-            sorted(set(of.values())),
-        )
+        expected = graph_of(landmarks.smoother.graph.at(k) for k in range(POSES))
+        ids = sorted(set(of.values()))
         for i in ids:
             mine = sorted(
                 (s for s, landmark in of.items() if landmark == i),
@@ -158,37 +155,6 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
     assert landmarks.any_sighting(7) is first
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ([Outcome.FORGOTTEN], Outcome.USED_LATER),
-        ([], Outcome.TAKEN_BACK),
-        ([Outcome.GATED], Outcome.USED_LATER),
-        ([], Outcome.WITHHELD),
-        ([Outcome.USED_LATER, Outcome.TAKEN_BACK], Outcome.USED),
-    ],
-)
-def test_a_state_that_may_not_follow_is_refused_and_changes_nothing(
-    before: list[Outcome], after: Outcome
-) -> None:
-    """From waiting by way of other states."""
-    landmarks = begun()
-    sighting = sighting_of(7, 0, None, landmarks)
-    for outcome in before:
-        landmarks.apply([Assignment(sighting, outcome, 7)], float(POSES))
-    state, outcomes = (
-        landmarks.state(sighting).outcome,
-        landmarks.journal.log().outcomes,
-    )
-    with pytest.raises(AssertionError, match="cannot become"):
-        landmarks.apply([Assignment(sighting, after, 7)], float(POSES))
-    assert (
-        landmarks.state(sighting).outcome,
-        landmarks.ids,
-        landmarks.journal.log().outcomes,
-    ) == (state, [], outcomes)
-
-
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
 POINT = np.array([3.0, 0.5, -1.7])
 
@@ -201,7 +167,8 @@ def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
 
     Poses are on an arc, at different heights, and look at the point.
     """
-    sigmas, poses = np.sqrt(np.diag(NOISE)), []
+    sigmas = np.sqrt(np.diag(NOISE))
+    poses = []
     for a in np.linspace(0.0, 0.8, 6).tolist():
         off = [2.2 * math.cos(a), 2.2 * math.sin(a), -1.0 - 0.3 * math.sin(5 * a)]
         poses.append(gtsam.Pose3(gtsam.Rot3.Yaw(a), POINT - off).compose(MOUNTED))

@@ -18,12 +18,10 @@ FLOOR_DB = 35.0
 
 def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> Floats:
     """Down by the pitch, then rolled; written out."""
-    cp, sp, cr, sr = (
-        np.cos(pitch_rad),
-        np.sin(pitch_rad),
-        np.cos(roll_rad),
-        np.sin(roll_rad),
-    )
+    cp = np.cos(pitch_rad)
+    sp = np.sin(pitch_rad)
+    cr = np.cos(roll_rad)
+    sr = np.sin(roll_rad)
     return np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array(
         [[1, 0, 0], [0, cr, -sr], [0, sr, cr]]
     )
@@ -43,17 +41,16 @@ def candidates_at(
     range_m: list[float], azimuth_rad: list[float], rejected: tuple[int, ...] = ()
 ) -> Candidates:
     """Candidates with these positions and an elevation known to 0.07 rad."""
-    zero, verdicts = np.zeros(len(range_m)), np.zeros(len(range_m), dtype=np.int64)
+    zero = np.zeros(len(range_m))
+    verdicts = np.zeros(len(range_m), dtype=np.int64)
     verdicts[list(rejected)] = CandidateVerdict.TOO_SMALL
     positions = (
         np.zeros((len(zero), 3)),
         np.array(range_m, dtype=float),
         np.array(azimuth_rad, dtype=float),
     )
-    boxes, labels = (
-        np.zeros((len(zero), 4), dtype=np.int64),
-        np.zeros((2, 2), dtype=np.int32),
-    )
+    boxes = np.zeros((len(zero), 4), dtype=np.int64)
+    labels = np.zeros((2, 2), dtype=np.int32)
     return Candidates(
         *positions, *[zero] * 4, verdicts, zero + 0.07, boxes, WINDOW, labels
     )
@@ -105,8 +102,10 @@ def image_db(
     xy, lit = floor_points(rotation)
     level = np.where(lit, FLOOR_DB, 0.0)
     if design is not None:
-        u, v = xy[..., 0] - xy_m[0], xy[..., 1] - xy_m[1]
-        cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+        u = xy[..., 0] - xy_m[0]
+        v = xy[..., 1] - xy_m[1]
+        cos = np.cos(heading_rad)
+        sin = np.sin(heading_rad)
         on_floor = design.level_db(
             np.nan_to_num(cos * u + sin * v, nan=9.0),
             np.nan_to_num(cos * v - sin * u, nan=9.0),

@@ -40,7 +40,7 @@ def model(
     )  # fmt: skip
 
 
-def test_log_odds_are_weighted_evidence_and_scores_the_posterior_of_one_look():
+def test_log_odds_are_weighted_evidence():
     evidence = np.eye(len(EVIDENCE))[[2, 5]]
     np.testing.assert_allclose(model().log_odds(evidence), [2, 5])
     scores = soft_scores(np.array([[3.0, -6.0, 0.0]]), 2.0)[0]
@@ -58,16 +58,6 @@ def test_rows_are_the_means_of_their_dirichlet_posteriors():
         rows[:2], [[1 / 3] * 3, np.array([9.5, 1.5, 0.5]) / 11.5]
     )
     np.testing.assert_allclose(rows[2], [0.2, 0.3, 0.5], atol=1e-8)
-
-
-def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks():
-    shipped = confusion_for(DEFAULT_DESIGNS)
-    landmarks = sum(
-        int(shipped.provenance[f"tracks of landmark {k}"]) for k in shipped.ids
-    )
-    none = int(shipped.provenance["tracks of no landmark"])
-    for row, trials in zip(shipped.array(), [landmarks] * 4 + [none], strict=True):
-        assert row.min() >= 0.5 / (trials + 2.5)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +89,8 @@ def test_what_was_never_confused_in_the_shipped_model_is_bounded_by_its_tracks()
 def test_a_file_comes_back_and_a_wrong_one_is_named_with_the_reason(
     tmp_path: Path, change, complaint: str | None
 ):
-    path, written = tmp_path / "model.json", model(designs=DESIGNS)
+    path = tmp_path / "model.json"
+    written = model(designs=DESIGNS)
     path.write_text(
         "{"
         if change is None

@@ -17,7 +17,6 @@ from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.sonar import recogniser as module
-from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import (
@@ -133,9 +132,7 @@ def standing(
         ),
     ],
 )
-def test_a_track_is_reported_from_the_frame_that_is_enough_and_the_reason_is_said(
-    settings, y_m, reasons
-):
+def test_a_track_is_reported_from_the_frame_that_is_enough(settings, y_m, reasons):
     params = RecogniserParams(
         detection=DetectionParams(keep_at_edge=y_m > 0), independent=False, **settings
     )
@@ -204,10 +201,8 @@ def test_other_designs_and_blocks_of_more_frames_are_refused():
     ):
         Recogniser(DECIBELS, params=model)
     assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], model).ids.tolist() == [1, 2]
-    recogniser, both = (
-        Recogniser(DECIBELS, params=EVERY),
-        np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)]),
-    )
+    recogniser = Recogniser(DECIBELS, params=EVERY)
+    both = np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)])
     with pytest.raises(
         MeasurementError, match=r"a block of 2 frames; give blocks of one"
     ):
@@ -219,33 +214,9 @@ def test_other_designs_and_blocks_of_more_frames_are_refused():
     assert recogniser.stamp_ns is None
 
 
-def test_nothing_that_stands_out_disappears_without_a_row(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    seen, select, recogniser = (
-        [],
-        module.select_candidates,
-        Recogniser(DECIBELS, params=EVERY),
-    )
-    monkeypatch.setattr(
-        module,
-        "select_candidates",
-        lambda *a, **k: seen.append(select(*a, **k)) or seen[-1],
-    )
-    for k in range(4):
-        recogniser.process(
-            frame(k, picture(CROSS, 1.7, 0.0, 0.4, k)), aside(0.0, k), VIEW
-        )
-        fates = [f for f in recogniser.fates if np.isfinite(f.range_m)]
-        assert len(fates) == len(seen[-1]) > 1
-        assert sum(f.track >= 0 for f in fates) == len(seen[-1].accepted)
-        assert {f.stamp_ns for f in recogniser.fates} == {k * FRAME_NS}
-        words = Counter(f.outcome for f in fates if f.track < 0)
-        assert words["candidate rejected: too small"] == np.sum(seen[-1].verdicts == 3)
-
-
-def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_once():
-    good, bad = Recogniser(DECIBELS, params=EVERY), Recogniser(DECIBELS, params=EVERY)
+def test_a_bad_frame_has_no_sighting_and_its_motion_counts_once():
+    good = Recogniser(DECIBELS, params=EVERY)
+    bad = Recogniser(DECIBELS, params=EVERY)
     for recogniser in (good, bad):
         pass_by(recogniser, SQUARE, 5)
     assert (
@@ -257,10 +228,8 @@ def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_onc
     assert bad.fates[0].outcome == "frame not used: all samples are zero"
     assert bad.sightings == []
     last = frame(6, picture(SQUARE, 1.7, -0.15, 0.4, 6))
-    expected, found = (
-        good.process(last, aside(0.05), VIEW),
-        bad.process(last, aside(-0.3), VIEW),
-    )
+    expected = good.process(last, aside(0.05), VIEW)
+    found = bad.process(last, aside(-0.3), VIEW)
     np.testing.assert_allclose(found.range_m, expected.range_m)
     np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
     assert [f.track for f in bad.fates if f.track >= 0] == [
@@ -268,14 +237,12 @@ def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_onc
     ]
 
 
-def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
+def test_a_sonar_that_comes_to_rest_keeps_its_belief():
     """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
-    recogniser, image = (
-        Recogniser(DECIBELS, params=EVERY),
-        picture(SQUARE, 1.7, -0.2, 0.4, 8),
-    )
+    recogniser = Recogniser(DECIBELS, params=EVERY)
+    image = picture(SQUARE, 1.7, -0.2, 0.4, 8)
     before = pass_by(recogniser, SQUARE)[-1]
-    for k in range(500):
+    for k in range(60):
         found = recogniser.process(
             frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW
         )
@@ -283,74 +250,13 @@ def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
     np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
 
 
-def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_counts_them():
-    ours, papers = (
-        [
-            float(found.id_probability[0, SQUARE])
-            for found in pass_by(recogniser, SQUARE, 8, 0.0)
-            if found is not None
-        ]
-        for rule in ("virtual-evidence", "jeffrey")
-        for params in [
-            RecogniserParams(identity=IdentityParams(rule=rule), independent=False)
-        ]
-        for recogniser in [Recogniser(DECIBELS, params=params)]
-    )
-    np.testing.assert_allclose(ours, ours[0], rtol=1e-9)
-    assert papers[-1] > papers[0]
-
-
-def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> float:
-    """Belief in the square after frames along these steps, with the same picture of it in each."""
-    recogniser = Recogniser(
-        DECIBELS,
-        params=RecogniserParams(least_frames=1, least_existence=0.0, independent=False),
-    )
-    for k, (step, xy) in enumerate(zip([None, *steps], xy_m, strict=True)):
-        found = recogniser.process(frame(k, picture(SQUARE, *xy, 0.4, 5)), step, VIEW)
-    return float(found.id_probability[0, SQUARE])
-
-
-def test_turning_on_the_spot_is_no_news_and_moving_across_is():
-    """The vertical is tilted in the sonar's axes."""
-    turned = moved(turned=gtsam.Rot3.AxisAngle(ROTATION.T @ [0.0, 0.0, 1.0], 0.03))
-    spots = [
-        (1.7 * np.cos(0.03 * k), round(-1.7 * np.sin(0.03 * k), 6)) for k in range(4)
-    ]
-    turning, once = _belief_after([turned] * 3, spots), _belief_after([], spots[:1])
-    across = _belief_after(
-        [aside(0.05)] * 3, [(1.7, round(-0.05 * k, 6)) for k in range(4)]
-    )
-    assert once - 0.1 < turning <= once
-    assert across > once
-
-
-def test_what_is_across_turns_with_the_sonar(monkeypatch: pytest.MonkeyPatch):
-    """After a quarter turn, motion along the old centre beam is motion to the side."""
-    recogniser, looks = Recogniser(DECIBELS, params=EVERY), []
-    step = recogniser._beliefs.step
-    monkeypatch.setattr(
-        recogniser._beliefs, "step", lambda *args: looks.append(args[3:]) or step(*args)
-    )
-    for k, motion in enumerate(
-        [None, moved(turned=gtsam.Rot3.Rz(np.pi / 2)), moved(ahead_m=0.1)]
-    ):
-        recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), motion, VIEW)
-    # in the axes of the first frame
-    np.testing.assert_allclose(looks[-1][0], [0.0, 0.1, 0.0], atol=1e-12)
-    np.testing.assert_allclose(looks[0][1], [[0.0, 1.0, 0.0]], atol=0.02)
-    np.testing.assert_allclose(looks[1][1], [[-1.0, 0.0, 0.0]], atol=0.02)
-
-
 def test_two_discs_at_once_are_not_both_the_disc():
     """Two discs in one image: one is the landmark, the other is believed to be none."""
     recogniser = Recogniser(DECIBELS, params=EVERY)
     for k in range(9):
         y_m = round(0.2 - 0.05 * k, 6)
-        left, right = (
-            picture(DISC, 1.7, y_m + 0.2, 0.4, k),
-            picture(DISC, 1.75, y_m - 0.2, 0.4, k),
-        )
+        left = picture(DISC, 1.7, y_m + 0.2, 0.4, k)
+        right = picture(DISC, 1.75, y_m - 0.2, 0.4, k)
         found = recogniser.process(
             frame(k, np.maximum(left, right)), aside(0.05, k), VIEW
         )
@@ -377,7 +283,7 @@ def test_no_landmark_is_the_most_probable_identity_of_two_tracks(
         np.testing.assert_array_equal(found, beliefs)
 
 
-def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its_identity_changes():
+def test_a_track_is_reported_as_often_as_its_errors_are_independent():
     # one frame in four
     model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 0.8})
     named = {}
@@ -403,27 +309,9 @@ def test_a_track_is_reported_as_often_as_its_errors_are_independent_and_when_its
     )
 
 
-def test_a_new_identity_is_reported_at_once(monkeypatch: pytest.MonkeyPatch):
-    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 3.8})
-    recogniser, frames = (
-        Recogniser(DECIBELS, params=RecogniserParams(confusion=model)),
-        iter(range(15)),
-    )
-    believed = np.eye(5)[[SQUARE] * 8 + [DISC] * 7]
-    monkeypatch.setattr(
-        recogniser._beliefs,
-        "step",
-        lambda association, *_: believed[[next(frames)] * len(association)],
-    )
-    found = pass_by(recogniser, SQUARE, frames=15, step_m=0.02)
-    assert [k for k, one in enumerate(found) if one is not None] == [2, 8]
-
-
 def recogniser_said(model) -> Counter:
-    recogniser, said = (
-        Recogniser(DECIBELS, params=RecogniserParams(confusion=model)),
-        Counter(),
-    )
+    recogniser = Recogniser(DECIBELS, params=RecogniserParams(confusion=model))
+    said = Counter()
     for k in range(15):
         y = round((15 // 2 - k) * 0.02, 6)
         recogniser.process(
