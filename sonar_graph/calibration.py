@@ -356,6 +356,11 @@ class KnownMap(Section):
         twice = [i for i, count in Counter(self.ids).items() if count > 1]
         if twice:
             raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
+        if min(self.ids) < 0:
+            reason = (
+                f"{min(self.ids)}: identities of landmarks are whole numbers from 0 on"
+            )
+            raise misfits(type(self), {"ids": reason})
         if len(self.positions_m) != len(self.ids):
             reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
             raise misfits(type(self), {"positions_m": reason})
@@ -392,6 +397,10 @@ class KnownMap(Section):
         """
         if (sigma_m is None) == (covariance_m2 is None):
             raise SettingError("KnownMap.of: give one of sigma_m and covariance_m2")
+        if sigma_m is not None and not sigma_m > 0:
+            raise SettingError(
+                f"KnownMap.of: sigma_m: expected more than 0 m, not {sigma_m}"
+            )
         places = np.asarray(positions_m, np.float64)
         if sigma_m is not None:
             covariance_m2 = sigma_m**2 * np.eye(places.size)

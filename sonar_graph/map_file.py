@@ -62,7 +62,7 @@ def read_map(path: Path) -> ReadMap:
     (4,)
     """
     try:
-        text = text_of(path)
+        text = text_of(path, "utf-8-sig")  # tables of spreadsheets begin with a mark
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -98,8 +98,9 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
     if not {"id", *PLACE} <= set(heads) or not (
         is_marginal or has_axes or "sigma_m" in heads
     ):
+        apart = "; separate them by commas" if ";" in text.partition("\n")[0] else ""
         raise LogError(
-            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}"
+            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}{apart}"
         )
     ids: list[int] = []
     places: list[list[float]] = []
@@ -134,9 +135,9 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         else:
             columns = SIGMAS if has_axes else ("sigma_m",) * 3
             sigmas = [number(column) for column in columns]
-            if min(sigmas) < 0.0:
+            if min(sigmas) <= 0.0:
                 raise LogError(
-                    f"{where}: {columns[0]}: expected a sigma of 0 m or more"
+                    f"{where}: {columns[0]}: expected a sigma above 0 m, such as 0.001"
                 )
             blocks.append(np.diag(np.square(sigmas)))
     if not ids:

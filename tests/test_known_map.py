@@ -244,8 +244,11 @@ BAD = {
     "half an id": (HEAD + "1.5,0,2,3,0.1\n", "line 2: id: expected a whole number"),
     "a negative sigma": (
         HEAD + "1,0,2,3,-0.1\n",
-        "line 2: sigma_m: expected a sigma of 0 m or more",
+        "line 2: sigma_m: expected a sigma above 0 m",
     ),
+    "no sigma": (HEAD + "1,0,2,3,0\n", "expected a sigma above 0 m"),
+    "a negative identity": (HEAD + "-1,0,2,3,0.1\n", "whole numbers from 0 on"),
+    "semicolons": (HEAD.replace(",", ";"), "separate them by commas"),
     "a grid of a country": (
         HEAD + "1,512345,2,3,0.1\n",
         "give metres from an origin near by",
@@ -261,6 +264,12 @@ def test_a_bad_map_is_refused_with_file_and_remedy(tmp_path, text, message):
         read_map(path)
     assert message in str(refused.value)
     assert len(str(refused.value)) < 300
+
+
+def test_a_table_of_a_spreadsheet_with_its_mark_is_read(tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text(HEAD + "1,0,2,3,0.1\n", encoding="utf-8-sig")
+    assert read_map(path).map.ids == (1,)
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def compare(
 ) -> Comparison:
     """Compare the sensors of a sequence, run estimators one after the other over it, and score them.
 
-    What the sensors contradict is in the notes of the comparison's sequence and is logged.
+    What the sensors contradict is in the notes of the comparison's sequence and is logged, as are failures of estimators.
 
     Parameters
     ----------
@@ -166,6 +166,8 @@ def compare(
                 progress=told,
             )
         )
+        if runs[-1].status == "failed":
+            LOG.warning("%s failed: %s", name, runs[-1].reason)
     return judge(sequence, instants_ns, runs)
 
 

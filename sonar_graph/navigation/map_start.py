@@ -125,6 +125,18 @@ class MapLocator:
             if self.found is None and self._see(frame):
                 self.found = located(self._newest(), self._map)
 
+    def lacking(self) -> str:
+        """What is missing for a start."""
+        seen = len({sighting.row for sighting in self._sightings})
+        if seen < 2:
+            return (
+                f"{seen} of its landmarks were identified, and at least two are needed"
+            )
+        return (
+            f"of its landmarks {seen} were identified, and no place explains them {ODDS:g} times better than all others "
+            "together: few landmarks or wrong identities, or another map"
+        )
+
     def _see(self, frame: LandmarkDetections) -> bool:
         """Add the sightings of a frame; True where there are any."""
         stamp_ns = int(frame.stamps_ns[0])
@@ -475,9 +487,7 @@ class StartInMap:
     def withheld(self) -> list[str]:
         """Messages of the estimator; before it begins, that the vehicle is not located."""
         if self._inner is None:
-            return [
-                "not yet located in the map: at least two landmarks of the map must be identified from different places"
-            ]
+            return [f"not yet located in the map: {self._locator.lacking()}"]
         return withheld_of(self._inner)
 
 
