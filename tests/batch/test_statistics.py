@@ -333,3 +333,43 @@ def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
         statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
         == 1.0
     )
+
+
+@given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_failure_rate_solves_wilsons_equation(counts):
+    failed, runs = counts
+    rate = statistics.failure_rate(failed, runs)
+    z = stats.norm.ppf(0.975)
+    for bound in (rate.low, rate.high):
+        assert (rate.share - bound) ** 2 == pytest.approx(
+            z**2 * bound * (1 - bound) / runs, abs=1e-9
+        )
+    assert 0 <= rate.low <= rate.share <= rate.high <= 1
+
+
+def test_the_interval_of_skewed_differences_holds_their_mean_more_often_than_students():
+    draws = np.random.default_rng(2).lognormal(0, 1, (2000, 10))
+    mean = math.exp(0.5)
+    own = np.array([statistics.mean_interval(values) for values in draws])
+    students = np.stack(
+        stats.t.interval(0.95, 9, draws.mean(axis=1), stats.sem(draws, axis=1)), axis=1
+    )
+    held, held_by_student = (
+        np.mean((low < mean) & (mean < high)) for low, high in (own.T, students.T)
+    )
+    assert held > 0.89
+    assert held_by_student < held - 0.03
+
+
+def test_pairing_takes_away_what_hard_seeds_cost_everybody():
+    rng = np.random.default_rng(4)
+    hardness = rng.normal(0, 5, 20)
+    reference = hardness + rng.normal(0, 0.1, 20)
+    own = hardness - 0.3 + rng.normal(0, 0.1, 20)
+    told = statistics.paired(own, reference)
+    assert told.p_value < 0.001
+    assert told.interval[0] < -0.3 < told.interval[1] < 0
+    assert told.smaller >= 18
+    assert statistics.paired(rng.permutation(own), reference).p_value > 0.05, (
+        "without pairs the seeds hide it"
+    )

@@ -309,3 +309,16 @@ def test_nothing_is_judged_without_truth():
         assert consistency.reliability_of(replace(run, **{missing: None})) is None, (
             missing
         )
+
+
+def test_planar_nees_ignores_height():
+    pose, above = gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 5.0]))
+    covariance = np.diag([1e-2] * 3 + [1e-2] * 3)
+    planar = consistency.error_series(
+        single(above, covariance), single(pose, covariance), 2
+    )
+    spatial = consistency.error_series(
+        single(above, covariance), single(pose, covariance), 3
+    )
+    assert planar.nees_position[0] == pytest.approx(1.0)
+    assert spatial.nees_position[0] == pytest.approx(1.0 + 2500.0)

@@ -305,3 +305,25 @@ def test_more_freedom_never_fits_worse_and_yaw_alignment_is_the_best_of_the_plan
 def test_unpaired_points_are_refused(shapes):
     with pytest.raises(EvaluationError, match="paired points"):
         metrics.umeyama(np.zeros(shapes[0]), np.zeros(shapes[1]))
+
+
+def test_a_constant_heading_error_is_in_yaw_but_not_in_relative_yaw():
+    truth = random_walk(3)
+    estimate = moved(truth, Rotation.from_euler("z", 0.2), (0.0, 0.0, 0.0))
+    assert metrics.rmse(metrics.yaw_errors_rad(estimate, truth)) == pytest.approx(0.2)
+    assert metrics.rmse(
+        metrics.relative_errors(estimate, truth, 1.0).yaw_rad
+    ) == pytest.approx(0.0, abs=1e-9)
+
+
+@given(seeds, st.floats(-np.pi, np.pi))
+def test_alignment_undoes_a_motion_that_it_allows(seed, angle):
+    points, shift = cloud(seed), np.array([10.0, -3.0, 2.0])
+    turns = (
+        Rotation.random(rng=seed).as_matrix(),
+        Rotation.from_euler("z", angle).as_matrix(),
+    )
+    for align, turn in zip((metrics.align_se3, metrics.align_yaw), turns, strict=True):
+        alignment = align(points, points @ turn.T + shift)
+        np.testing.assert_allclose(alignment.rotation, turn, atol=1e-10)
+        np.testing.assert_allclose(alignment.translation, shift, atol=1e-9)
