@@ -4,7 +4,7 @@ If nothing truly changed, old and new may be exchanged in any case: the log rati
 contestants and columns together, change their sign. So the largest statistic of all groups is compared with its values
 under changes of sign (Westfall, Young 1993): exact for any distribution, any number of groups and any dependence
 between them. Fewer than 5 cases have too few changes of sign for 5 %; their ratios are taken as normal and rotated
-(Langsrud 2005). Method and limits: docs/theory/batch_statistics.md.
+(Langsrud 2005).
 """
 
 import itertools
