@@ -647,9 +647,11 @@ def brought_apart(before: Sequence, after: Sequence) -> str:
         agrees = check.compare(after, second)
         if agreed is None or agrees is None or not agrees.gain.is_known:
             continue
-        error = abs(agrees.gain.value - 1.0) - abs(agreed.gain.value - 1.0)
-        # the same rows twice, whose noise is common to both
-        is_off = error > PAIRED_SIGMAS * agrees.gain.sigma
+        off = replace(agrees.gain, value=agrees.gain.value - 1.0)
+        error = abs(off.value) - abs(agreed.gain.value - 1.0)
+        # the same rows twice, whose noise is common to both; a gain that would be right in itself decides nothing
+        is_worse = error > PAIRED_SIGMAS * agrees.gain.sigma
+        is_off = is_worse and matters(off, check.least_scale)
         if is_off or agrees.scatter > CLEARLY_BETTER * agreed.scatter:
             names.append(check.name)
     return " and ".join(names)

@@ -12,9 +12,9 @@ of (1). One with a wrong identity lies anywhere in the area A of the map. The ev
 pose uniform over A and all headings, and its posterior covariance Sigma::
 
     E(h) = N(e) prod_agreeing (1 - w) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
-    E(one) = n (1 - w) / A (w / A)^(n - 1),    E(none) = (w / A)^n                                             (3)
+    E(one) = n (1 - w) / A (w / A)^(n - 1),    E(other) = w / A^n                                             (3)
 
-w is the probability of a wrong identity. Sightings of one landmark count once, by their mean: a recogniser errs in the same
+w is the probability of a wrong identity, and of a map of another place, in which all of them are. Sightings of one landmark count once, by their mean: a recogniser errs in the same
 way again. The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`, and when its
 heading is known well enough to linearise at it. Arun, Huang and Blostein,
 "Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory, Inference, and Learning
@@ -277,10 +277,10 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     if not starts:
         return None
     log_others = math.log(WRONG / area_m2)
-    none = n * log_others
+    of_other_place = math.log(WRONG) - n * math.log(area_m2)
     one = math.log(n * (1.0 - WRONG) / area_m2) + (n - 1) * log_others
     best = starts[0]
-    rivals = [start.log_evidence for start in starts[1:]] + [none, one]
+    rivals = [start.log_evidence for start in starts[1:]] + [of_other_place, one]
     weight = float(np.logaddexp.reduce(rivals))
     is_ahead = best.log_evidence - weight >= math.log(ODDS)
     return best if is_ahead and is_linear(best, data) else None
