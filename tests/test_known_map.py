@@ -14,7 +14,7 @@ from sonar_graph.evaluation import compare
 from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
-from sonar_graph.navigation.map_start import MapLocator
+from sonar_graph.navigation.map_start import MapLocator, MapSighting, located
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.given_map import given_map_table, located_line
 from sonar_graph.sequence import Sequence
@@ -219,6 +219,22 @@ def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
     assert set(told.values()) == {None}
     (message,) = estimator.withheld()
     assert message.startswith("not yet located in the map")
+
+
+@pytest.mark.parametrize(("others", "is_found"), [(1, True), (7, False)])
+def test_three_landmarks_that_agree_are_no_start_where_most_do_not(others, is_found):
+    """Seven wrong identities of ten speak for a map of another place, one of four does not."""
+    rng = np.random.default_rng(1)
+    places = np.column_stack([rng.uniform(0, 100, (10, 2)), np.full(10, -4.0)])
+    known = KnownMap.of(range(10), places, sigma_m=0.05)
+    t = np.array([40.0, 60.0])
+    S = np.diag([0.1**2, 0.1**2])
+    right = [MapSighting(i, places[i, :2] - t, S) for i in range(3)]
+    wrong = [MapSighting(3 + i, rng.uniform(-50, 50, 2), S) for i in range(others)]
+    found = located(right + wrong, known)
+    assert (found is not None) == is_found
+    if found is not None:
+        np.testing.assert_allclose(found.parameters, [0.0, *t], atol=0.5)
 
 
 def test_a_second_dive_starts_with_the_map_of_the_first(dive, tmp_path):

@@ -663,7 +663,7 @@ def contradicted(finding: Finding, names: str) -> Finding:
         return finding
     return replace(
         finding,
-        cause=f"accelerometers and gyros have it so, but {names} agree with the Doppler log as it is: gyros, "
+        cause=f"accelerometers and gyros have it so, but the Doppler log as it is fits {names} better: gyros, "
         "accelerometers or single axes of the Doppler log are wrong",
         line="",
     )

@@ -14,11 +14,12 @@ pose uniform over A and all headings, and its posterior covariance Sigma::
     E(h) = N(e) prod_agreeing (1 - w) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
     E(one) = n (1 - w) / A (w / A)^(n - 1),    E(other) = w / A^n                                             (3)
 
-w is the probability of a wrong identity, and of a map of another place, in which all of them are. Sightings of one landmark count once, by their mean: a recogniser errs in the same
-way again. The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`, and when its
-heading is known well enough to linearise at it. Arun, Huang and Blostein,
-"Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory, Inference, and Learning
-Algorithms", 2003, chapter 28 (evidence).
+w is the probability of a wrong identity, and of a map of another place, in which all of them are. Sightings of one
+landmark count once, by their mean: a recogniser errs in the same way again. The vehicle is located when the best start
+outweighs all others together, and (3), by `ODDS`, and when its heading is known well enough to linearise at it.
+
+Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory,
+Inference, and Learning Algorithms", 2003, chapter 28 (evidence).
 """
 
 import math
