@@ -232,6 +232,8 @@ def click_two(browser, address: str, before: int) -> None:
     frame = 1 + before // 2
     for _ in range(frame):
         page.keyboard.press("ArrowRight")
+    page.keyboard.press("PageDown")
+    page.keyboard.press("PageUp")
     until(lambda: page.locator("#where").text_content().startswith(f"{frame + 1} of "))
     page.keyboard.press("3")
     assert page.locator("input[value='3']").is_checked()
@@ -249,6 +251,19 @@ def click_two(browser, address: str, before: int) -> None:
     mark = page.locator("#marks circle").nth(0).bounding_box()
     assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
     assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
+    held: list = []
+    # a picture that is long in coming
+    page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))
+    page.keyboard.press("ArrowRight")
+    until(lambda: page.locator("#frame").input_value() == f"{frame + 1}")
+    page.keyboard.press("3")
+    page.mouse.click(*middle)  # of the picture that is shown, whose label it replaces
+    page.wait_for_timeout(200)
+    assert page.locator("#where").text_content().startswith(f"{frame + 1} of ")
+    assert page.locator("#marks text").all_text_contents() == ["none", "3"]
+    held[0].continue_()
+    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 2} of "))
+    assert page.locator("#marks circle").count() == 0
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 900})
         assert page.evaluate("document.documentElement.scrollWidth") <= width
