@@ -16,7 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 from sonar_graph.calibration import Calibration, KnownMap, Section
-from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.errors import EstimatorError, SonarGraphError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
 from sonar_graph.motion import MotionSource
 from sonar_graph.settings import nested, parse, suggestion
@@ -219,21 +219,74 @@ def returned_estimate(value: object) -> Estimate | None:
     )
 
 
-def points_by_name() -> dict[str, list[EntryPoint]]:
-    """Entry points of all installed estimators; two where two packages use one name."""
-    found: dict[str, list[EntryPoint]] = {}
-    for point in sorted(
-        entry_points(group=ENTRY_POINT_GROUP), key=lambda one: one.name
-    ):
-        same = found.setdefault(point.name, [])
-        if point.value not in [one.value for one in same]:
-            same.append(point)
-    return found
+@dataclass(frozen=True)
+class PlugIns:
+    """Plug-ins of one kind."""
+
+    group: str
+    """Entry-point group."""
+    kind: str
+    """Word for one of them, in messages."""
+    unknown: type[SonarGraphError]
+    """Error for a name that no package or two packages have."""
+    broken: type[SonarGraphError]
+    """Error for a plug-in that cannot be loaded."""
+    built_in: tuple[str, ...] = ()
+    """Names that need no plug-in, for messages."""
+
+    def points(self) -> dict[str, list[EntryPoint]]:
+        """Entry points by name, nothing imported; two where two packages use one name."""
+        found: dict[str, list[EntryPoint]] = {}
+        for point in sorted(entry_points(group=self.group), key=lambda one: one.name):
+            same = found.setdefault(point.name, [])
+            if point.value not in [one.value for one in same]:
+                same.append(point)
+        return found
+
+    def load(self, name: str) -> tuple[Any, str]:
+        """Import a plug-in; what its entry point names, and words for it in messages.
+
+        Raises
+        ------
+        SonarGraphError
+            As ``unknown``, listing the names that exist, or the packages that share a name; as ``broken`` with the
+            reason, when the import fails.
+        """
+        found = self.points()
+        if name not in found:
+            names = [*self.built_in, *found]
+            known = ", ".join(names) or "none; reinstall the package"
+            raise self.unknown(
+                f"no {self.kind} is called {name!r}{suggestion(name, names)} installed: {known}"
+            )
+        if len(found[name]) > 1:
+            places = " and ".join(
+                f"{point.dist.name if point.dist else 'a package'} ({point.value})"
+                for point in found[name]
+            )
+            raise self.unknown(
+                f"two packages bring {self.kind}s called {name!r}: {places}; uninstall one, or rename its entry point"
+            )
+        (point,) = found[name]
+        words = f"{name} ({point.value})"
+        try:
+            return point.load(), words
+        except SystemExit as error:
+            raise self.broken(
+                f"{words} cannot be loaded: it calls sys.exit({error})"
+            ) from error
+        except Exception as error:  # the import of another's package fails in any way
+            raise self.broken(f"{words} cannot be loaded: {error}") from error
+
+
+ESTIMATORS = PlugIns(
+    ENTRY_POINT_GROUP, "estimator", UnknownEstimatorError, EstimatorError
+)
 
 
 def installed_estimators() -> dict[str, EntryPoint]:
     """Entry points by name; nothing is imported. `load_estimator` refuses a name that two packages use."""
-    return {name: points[0] for name, points in points_by_name().items()}
+    return {name: points[0] for name, points in ESTIMATORS.points().items()}
 
 
 def is_foreign(name: str) -> bool:
@@ -300,41 +353,12 @@ def load_estimator(name: str) -> type[Estimator]:
         raise UnknownEstimatorError(
             f"expected the name of an installed estimator, not {asked!r:.60}"
         )
-    installed = points_by_name()
-    if name not in installed:
-        known = ", ".join(installed) or "none; reinstall the package"
-        raise UnknownEstimatorError(
-            f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}"
-        )
-    if len(installed[name]) > 1:
-        places = " and ".join(
-            f"{point.dist.name if point.dist else 'a package'} ({point.value})"
-            for point in installed[name]
-        )
-        raise UnknownEstimatorError(
-            f"two packages bring an estimator called {name!r}: {places}; uninstall one, or rename its entry point"
-        )
-    point = installed[name][0]
-    try:
-        loaded: Any = point.load()
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # a third party's import may fail in any way
-        reason = (
-            f"it calls sys.exit({error})"
-            if isinstance(error, SystemExit)
-            else str(error)
-        )
-        raise EstimatorError(
-            f"{name} ({point.value}) cannot be loaded: {reason}"
-        ) from error
+    loaded, place = ESTIMATORS.load(name)
     missing = missing_of(loaded, ("Params", *METHODS))
     if missing:
-        raise EstimatorError(
-            f"{name} ({point.value}) lacks {missing} of the estimator contract"
-        )
-    return loaded
+        raise EstimatorError(f"{place} lacks {missing} of the estimator contract")
+    kind: type[Estimator] = loaded
+    return kind
 
 
 def make_candidate(

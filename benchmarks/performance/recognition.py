@@ -15,7 +15,7 @@ speckle, from 1 to 10 m, each of them compared with the designs in every frame.
 
 ``actag_ratio`` is AcTag's time for a frame over ours, in the mean over the same frames, every few of the log. AcTag
 1.0.1 as it comes (compiled path, its default settings), for tags as large as our landmarks; where it is not installed
-(``pip install 'sonar-graph[actag]'``) the figure is null and its target not met. Our time has tracking and beliefs in
+(``pip install benchmarks/actag_plugin``) the figure is null and its target not met. Our time has tracking and beliefs in
 it, AcTag's has none; AcTag finds nothing here, since these are not its tags.
 
 Everything runs on one core; of each side all CPU time of the process counts, which no other process adds to. ``wall``
@@ -167,7 +167,7 @@ def make_actag(frames: SonarFrames) -> Any:
         from actag import AcTag
     except ImportError:
         note(
-            "AcTag is not installed, so that nothing is compared with it: pip install 'sonar-graph[actag]'"
+            "AcTag is not installed, so that nothing is compared with it: pip install benchmarks/actag_plugin"
         )
         return None
     opening_rad = float(np.ptp(frames.azimuths_rad))
@@ -203,7 +203,7 @@ def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
         number += len(seen)
         for frame, (step, view), is_compared in zip(seen, known, compared, strict=True):
             with clocks.timing("frame"):
-                detections = ours.process(frame, step, view)
+                detections = ours.process(frame, step, view).detections
             if is_compared:
                 clocks.cpu_ms["compared"].append(clocks.cpu_ms["frame"][-1])
                 clocks.wall_ms["compared"].append(clocks.wall_ms["frame"][-1])
@@ -254,14 +254,10 @@ def crowded_frame_ms(objects: int) -> float:
             np.array([frame * 200_000_000]), picture[None], ranges_m, azimuths_rad
         )
         with clocks.timing("frame"):
-            ours.process(block, still if frame else None)
-    assert (
-        sum(
-            sighting is not None and sighting.fit is not None
-            for sighting in ours.sightings
-        )
-        >= 0.9 * objects
-    )
+            result = ours.process(block, still if frame else None)
+    sightings = [track.sighting for track in result.tracks]
+    fitted = [sighting for sighting in sightings if sighting and sighting.fit]
+    assert len(fitted) >= 0.9 * objects
     return float(np.mean(clocks.cpu_ms["frame"][CROWDED_FRAMES // 4 :]))
 
 

@@ -1,7 +1,7 @@
 """Reading of AcTags in simulated DIDSON frames by AcTag's detector.
 
 A lap of the simulated basin with four AcTags on its floor instead of landmarks, stones and rough patches beside them.
-Frames go through `sonar_graph.sonar.actag`, with the true motion between frames.
+Frames go through the recogniser of `benchmarks/actag_plugin`, with the true motion between frames.
 """
 
 import sys
@@ -10,10 +10,18 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "actag_plugin"))
 
 import cv2
 import gtsam
 import numpy as np
+from actag_plugin import (
+    FOAM_DB,
+    PLATE_DB,
+    AcTagRecogniser,
+    AcTagSettings,
+    tag_design,
+)
 from common import conclude, make_parser, note, print_table, refuse
 
 from sonar_graph.calibration import Calibration
@@ -21,8 +29,7 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.simulation import BasinOptions, simulate_basin_frames
 from sonar_graph.simulation.sonar_image.frames import FrameTruth
-from sonar_graph.sonar import AcTagRecogniser, AcTagSettings, SonarStep
-from sonar_graph.sonar.actag import FOAM_DB, PLATE_DB, tag_design
+from sonar_graph.sonar import SonarStep
 
 TAGS = (1, 2, 3, 4)
 FAR_M = 0.1
@@ -70,7 +77,8 @@ def pose_of(truth: FrameTruth) -> gtsam.Pose3:
 
 
 def run(options: BasinOptions, settings: AcTagSettings) -> dict[str, float]:
-    recogniser, before, errors = AcTagRecogniser(Calibration(), settings), None, []
+    recogniser = AcTagRecogniser(Calibration(), settings.model_dump())
+    before, errors = None, []
     in_view = decoded = frames = 0
     spent_s = 0.0
     for block in simulate_basin_frames(options, frames_per_block=1):
@@ -81,7 +89,7 @@ def run(options: BasinOptions, settings: AcTagSettings) -> dict[str, float]:
             else SonarStep(before.between(pose), np.zeros((6, 6)))
         )
         before, frames, start = pose, frames + 1, time.perf_counter()
-        found = recogniser.process(block.frames, step)
+        found = recogniser.process(block.frames, step).detections
         spent_s += time.perf_counter() - start
         whole = block.truth.ids[
             (block.truth.share_in_view[0] == 1) & (block.truth.ids > 0)

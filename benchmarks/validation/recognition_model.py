@@ -37,6 +37,7 @@ from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.recognition.confusion_fit import (
     LabelledFits,
     LabelledSightings,
+    TrueObjects,
     accuracy,
     confusion_rows,
     estimate_confusion,
@@ -149,25 +150,10 @@ def sightings_of(seed: int) -> LabelledSightings:
         for frame, *range_azimuth in zip(
             one_by_one(block.frames), *columns, strict=True
         ):
-            session.take(frame)
-            if recogniser.stamp_ns != int(frame.stamps_ns[0]):
-                continue
-            tracks = zip(
-                recogniser.track_ids.tolist(),
-                recogniser.news.tolist(),
-                recogniser.sightings,
-                strict=True,
-            )
-            for track, news, sighting in tracks:
-                if sighting is not None:
-                    found.add(
-                        sighting,
-                        recogniser.stamp_ns,
-                        (seed, track),
-                        news,
-                        truth.ids[is_landmark],
-                        *range_azimuth,
-                    )
+            objects = TrueObjects(truth.ids[is_landmark], *range_azimuth)
+            result = session.take(frame)
+            for track in result.tracks:
+                found.add(result.stamp_ns, seed, track, objects)
     return found
 
 

@@ -100,7 +100,7 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
         in_view.append(block.truth.share_in_view >= WHOLE)
         for row, frame in enumerate(one_by_one(block.frames)):
             for rule, session in sessions.items():
-                if (reported := session.take(frame)) is not None:
+                if (reported := session.take(frame).detections) is not None:
                     found[rule].append(
                         _judged(reported, float(block_s[row]), block.truth, row)
                     )

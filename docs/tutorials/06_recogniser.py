@@ -63,13 +63,13 @@ for k in range(30):
     step = (
         SonarStep(pose(k - 1).between(pose(k)), np.diag(step_sigma**2)) if k else None
     )
-    found = recogniser.process(frame, step, FloorView.from_pose(pose(k), FLOOR_Z_M))
+    result = recogniser.process(frame, step, FloorView.from_pose(pose(k), FLOOR_Z_M))
+    found = result.detections
 
     # 4. What came out: a row for each thing seen and trusted, as often as errors are independent, and why no more.
     if k % 6 == 5:
         print(
-            f"frame {k}: "
-            + "; ".join(sorted({fate.outcome for fate in recogniser.fates}))
+            f"frame {k}: " + "; ".join(sorted({fate.outcome for fate in result.fates}))
         )
     if found is not None:
         ids, probability = found.most_probable()

@@ -37,7 +37,6 @@ from sonar_graph.files import replacing
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.devices import LandmarkDesign
-    from sonar_graph.images import SonarFrames
     from sonar_graph.logs import ImagesAlone
     from sonar_graph.recognition import (
         LandmarkRecogniser,
@@ -57,10 +56,11 @@ MOST_WARNINGS_SHOWN = 10
 # tracks of a class below which calibrate warns
 FEW_TRACKS = 10
 RecogniserName = Annotated[
-    Literal["designs", "actag"],
+    str,
     typer.Option(
         "--recogniser",
-        help="designs: ours; actag: AcTag's own detector, which sees AcTags only (extra actag).",
+        metavar="NAME",
+        help="designs: ours; else the name of an installed plug-in.",
     ),
 ]
 Motion = Annotated[
@@ -77,9 +77,7 @@ Settings = Annotated[
         metavar="NAME=VALUE",
         help="A setting of the recogniser, such as identity.unknown_prior=0.5 (sections: detection, tracking, "
         "appearance, identity; a wrong name is answered with those that there are, and "
-        "help(sonar_graph.sonar.recogniser) explains them), or of actag: family, tag_size_m "
-        "(side of the inner square), bit_corrections, pixels_per_bit; "
-        "may be repeated.",
+        "help(sonar_graph.sonar.recogniser) explains them), or of the plug-in; may be repeated.",
     ),
 ]
 
@@ -141,17 +139,18 @@ class RecogniserOptions:
         name: str = "designs",
     ) -> LandmarkRecogniser:
         """The recogniser of that name."""
-        from sonar_graph.sonar import AcTagRecogniser, AcTagSettings, Recogniser
+        from sonar_graph.recognition import RECOGNISERS
+        from sonar_graph.sonar import Recogniser
 
-        if name != "actag":
+        if name == "designs":
             return Recogniser(calibration, self.read_designs(), self.params(settings))
         if self.is_given:
             raise typer.BadParameter(
-                "--designs, --model and --rule are not for actag, which knows its own tags: use --set"
+                f"--designs, --model and --rule are not for the recogniser {name}: use --set"
             )
-        return AcTagRecogniser(
-            calibration, validated(AcTagSettings, nested_settings(settings), "actag")
-        )
+        make, _ = RECOGNISERS.load(name)
+        made: LandmarkRecogniser = make(calibration, nested_settings(settings))
+        return made
 
 
 @dataclass(frozen=True)
@@ -211,7 +210,7 @@ def recognise(
     stories = TrackStories(sequence.calibration.sonar.image) if page else None
     if stories is not None and not isinstance(made, Recogniser):
         raise typer.BadParameter(
-            "--report shows the tracks of the recogniser of designs; actag has none"
+            f"--report shows the tracks of the recogniser of designs; {options.recogniser} has none"
         )
     found = recognise_log(log, sequence, reading, made, motion, stories)
     if found is None:
@@ -432,11 +431,6 @@ def recognise_log(
 ) -> Recognition | None:
     """Landmarks in a log's sonar images, with a progress bar; None without images."""
     from sonar_graph.recognition import recognise_images
-    from sonar_graph.sonar import Recogniser
-
-    def see(frame: SonarFrames) -> None:
-        if stories is not None and isinstance(recogniser, Recogniser):
-            stories.see(frame, recogniser)
 
     with progress_bars() as progress:
         return recognise_images(
@@ -448,7 +442,7 @@ def recognise_log(
             progress=lambda done: progress(
                 "recognising landmarks", done, 0, f"{done} frames"
             ),
-            seen=see,
+            seen=stories.see if stories is not None else None,
         )
 
 

@@ -110,7 +110,7 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     frame: SonarFrames | None = request.frame
     if frame is None:
         return READY
-    found = session.take(frame)
+    found = session.take(frame).detections
     session.forget()
     return SonarAnswer(int(frame.stamps_ns[0]), found)
 

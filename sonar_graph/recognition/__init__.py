@@ -11,14 +11,14 @@ from sonar_graph.recognition.recognition_record import (
     write_recognition,
 )
 from sonar_graph.recognition.session import (
-    LandmarkRecogniser, RecognitionSession, one_by_one, recognise, recognise_images, with_detections,
+    RECOGNISERS, LandmarkRecogniser, RecognitionSession, one_by_one, recognise, recognise_images, with_detections,
 )
 from sonar_graph.recognition.track_stories import TrackStories, TrackStory
 
 __all__ = [
     "ClockOffset", "DrawnFrame", "ImageMotions", "LabelDesk", "LabelServer", "LabelledLog", "Labels",
-    "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNITION", "Recognition",
-    "RecognitionSession", "SEE_TRACKS", "SURE", "TrackStories", "TrackStory", "calibrate", "calibrate_by_labels",
-    "estimate_offset", "one_by_one", "read_labels", "read_recognition", "recognise", "recognise_images",
-    "shown_frames", "with_detections", "write_recognition",
+    "LandmarkRecogniser", "MotionFrom", "NO_FLOOR", "PICTURE_FOLDER", "PlanarStep", "RECOGNISERS", "RECOGNITION",
+    "Recognition", "RecognitionSession", "SEE_TRACKS", "SURE", "TrackStories", "TrackStory", "calibrate",
+    "calibrate_by_labels", "estimate_offset", "one_by_one", "read_labels", "read_recognition", "recognise",
+    "recognise_images", "shown_frames", "with_detections", "write_recognition",
 ]

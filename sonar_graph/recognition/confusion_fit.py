@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -33,6 +33,7 @@ from sonar_graph.sonar import (
     ObjectSighting,
     Recogniser,
     RecogniserParams,
+    TrackInFrame,
     confusion_for,
     mark_of,
     posterior_mean_rows,
@@ -66,8 +67,8 @@ class LabelledFits:
     """Index of the true class; the number of ids for "none of them", shape (n,)."""
     track: Ints
     """Track of each patch, shape (n,); frames of one track are not independent."""
-    news: Floats
-    """Independent share of each frame of a track, shape (n,)."""
+    independent_share: Floats
+    """Of each frame for its track, shape (n,)."""
     error_m: Floats
     """Measured minus true along the ray and across it, shape (n, 2); NaN where there is no landmark."""
     range_per_height: Floats
@@ -100,84 +101,80 @@ class Accuracy(NamedTuple):
         return np.asarray(self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power)
 
 
+class TrueObjects(NamedTuple):
+    """Landmarks where they truly are, in the sonar's axes."""
+
+    ids: Ints
+    """Shape (m,)."""
+    range_m: Floats
+    """Shape (m,)."""
+    azimuth_rad: Floats
+    """Shape (m,)."""
+
+    def label_of(self, sighting: ObjectSighting) -> tuple[int, int]:
+        """Identity of the landmark that was seen, `NONE` or `NO_LABEL`, and its row."""
+        turned = self.azimuth_rad - sighting.azimuth_rad
+        off_m = np.hypot(self.range_m - sighting.range_m, self.range_m * np.sin(turned))
+        off_m = np.where(np.abs(turned) < np.pi / 2, off_m, np.inf)
+        at = int(np.argmin(off_m))
+        if off_m[at] <= SAME_M:
+            return int(self.ids[at]), at
+        return (NONE if off_m[at] > APART_M else NO_LABEL), at
+
+
+class LabelledSighting(NamedTuple):
+    """Row of `LabelledFits`; its track with the number of its log."""
+
+    evidence: Floats
+    bound_m: Floats
+    moved_m: Floats
+    label: int
+    track: tuple[int, int]
+    independent_share: float
+    error_m: tuple[float, float]
+    range_per_height: float
+    stamp_ns: int
+
+
 class LabelledSightings:
     """Sightings with their true classes, for designs with these identities in order."""
 
     def __init__(self, ids: tuple[int, ...]) -> None:
         self.ids = ids
-        self._rows: list[tuple[Any, ...]] = []
+        self._rows: list[LabelledSighting] = []
 
     def add(
-        self,
-        sighting: ObjectSighting,
-        stamp_ns: int,
-        track: tuple[int, int],
-        news: float,
-        ids: Ints,
-        range_m: Floats,
-        azimuth_rad: Floats,
+        self, stamp_ns: int, log: int, track: TrackInFrame, truth: TrueObjects
     ) -> None:
-        """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
-        label, at = label_of(sighting, ids, range_m, azimuth_rad)
-        known = label != NONE
-        fit = sighting.fit
-        place = sighting.bound_m, sighting.moved_m
-        if (
-            fit is None
-            or place[0] is None
-            or label == NO_LABEL
-            or (known and label not in self.ids)
-        ):
+        """Add the sighting of a track in a frame of a log, if its class is known."""
+        sighting = track.sighting
+        if sighting is None or sighting.fit is None:
             return
-        error = np.nan, np.nan
-        if known:
-            error = (
-                sighting.range_m - range_m[at],
-                range_m[at] * (sighting.azimuth_rad - azimuth_rad[at]),
-            )
-        row = self.ids.index(label) if known else len(self.ids)
+        # without bounds the accuracy cannot be told from that of other fits
+        if sighting.bound_m is None or sighting.moved_m is None:
+            return
+        label, at = truth.label_of(sighting)
+        is_landmark = label != NONE
+        if label == NO_LABEL or (is_landmark and label not in self.ids):
+            return
+        error_m = (np.nan, np.nan)
+        if is_landmark:
+            range_m = truth.range_m[at]
+            turned = sighting.azimuth_rad - truth.azimuth_rad[at]
+            error_m = (sighting.range_m - range_m, range_m * turned)
         self._rows.append(
-            (
-                fit.evidence,
-                *place,
-                row,
-                track,
-                news,
-                error,
-                sighting.range_per_height,
-                stamp_ns,
+            LabelledSighting(
+                evidence=sighting.fit.evidence,
+                bound_m=sighting.bound_m,
+                moved_m=sighting.moved_m,
+                label=self.ids.index(label) if is_landmark else len(self.ids),
+                track=(log, track.id),
+                independent_share=track.independent_share,
+                error_m=error_m,
+                range_per_height=sighting.range_per_height,
+                stamp_ns=stamp_ns,
             )
         )
-
-    def add_frame(self, recogniser: Recogniser, run: Run, log: int) -> None:
-        """Add what a recogniser saw in its last frame, of a log with truth; nothing at times that the truth lacks."""
-        stamp_ns = recogniser.stamp_ns
-        truth = run.true_poses
-        assert truth is not None
-        assert run.true_landmarks is not None
-        if (
-            stamp_ns is None
-            or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]
-        ):
-            return
-        range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-        tracks = zip(
-            recogniser.track_ids.tolist(),
-            recogniser.news.tolist(),
-            recogniser.sightings,
-            strict=True,
-        )
-        for track, news, sighting in tracks:
-            if sighting is not None:
-                self.add(
-                    sighting,
-                    stamp_ns,
-                    (log, track),
-                    news,
-                    run.true_landmarks.ids,
-                    range_m,
-                    azimuth_rad,
-                )
 
     def extend(self, other: LabelledSightings) -> None:
         """Add all sightings of other logs, with the same designs."""
@@ -185,39 +182,25 @@ class LabelledSightings:
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
-        columns = zip(*self._rows, strict=True) if self._rows else [()] * 9
-        evidence, bound, moved, label, track, news, error, rise, stamp_ns = columns
+        rows = self._rows
+        tracks = np.reshape([row.track for row in rows], (-1, 2))
+        _, track = np.unique(tracks, axis=0, return_inverse=True)
+        evidence = np.array([row.evidence for row in rows], float)
         return LabelledFits(
-            np.array(evidence, float).reshape(-1, len(self.ids), len(EVIDENCE)),
-            np.array(bound, float).reshape(-1, 2),
-            np.array(moved, float).reshape(-1, 2),
-            np.array(label, np.int64),
-            np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[
-                1
-            ].ravel(),
-            np.array(news, float),
-            np.array(error, float).reshape(-1, 2),
-            np.array(rise, float),
-            np.array(stamp_ns, np.int64),
+            evidence=evidence.reshape(-1, len(self.ids), len(EVIDENCE)),
+            bound_m=np.array([row.bound_m for row in rows], float).reshape(-1, 2),
+            moved_m=np.array([row.moved_m for row in rows], float).reshape(-1, 2),
+            label=np.array([row.label for row in rows], np.int64),
+            track=track.ravel(),
+            independent_share=np.array([row.independent_share for row in rows], float),
+            error_m=np.array([row.error_m for row in rows], float).reshape(-1, 2),
+            range_per_height=np.array([row.range_per_height for row in rows], float),
+            stamp_ns=np.array([row.stamp_ns for row in rows], np.int64),
         )
 
 
-def label_of(
-    sighting: ObjectSighting, ids: Ints, range_m: Floats, azimuth_rad: Floats
-) -> tuple[int, int]:
-    """Identity of the landmark that was seen, `NONE` or `NO_LABEL`, and its row."""
-    off = np.hypot(
-        range_m - sighting.range_m, range_m * np.sin(azimuth_rad - sighting.azimuth_rad)
-    )
-    off = np.where(np.abs(azimuth_rad - sighting.azimuth_rad) < np.pi / 2, off, np.inf)
-    at = int(np.argmin(off))
-    if off[at] <= SAME_M:
-        return int(ids[at]), at
-    return (NONE if off[at] > APART_M else NO_LABEL), at
-
-
-def true_ranges_azimuths(run: Run, stamp_ns: int) -> tuple[Floats, Floats]:
-    """True range and azimuth of every landmark at an instant, shapes (m,)."""
+def true_objects(run: Run, stamp_ns: int) -> TrueObjects:
+    """True landmarks of a run with truth, as the sonar sees them at an instant."""
     assert run.true_poses is not None
     assert run.true_landmarks is not None
     pose = run.true_poses.at(np.array([stamp_ns]))
@@ -227,7 +210,11 @@ def true_ranges_azimuths(run: Run, stamp_ns: int) -> tuple[Floats, Floats]:
     q = (run.true_landmarks.positions - origin) @ (
         world_R_body @ mounting.rotation().matrix()
     )
-    return np.linalg.norm(q, axis=1), np.arctan2(q[:, 1], q[:, 0])
+    return TrueObjects(
+        run.true_landmarks.ids,
+        np.linalg.norm(q, axis=1),
+        np.arctan2(q[:, 1], q[:, 0]),
+    )
 
 
 def calibrate(
@@ -280,11 +267,18 @@ def calibrate(
             )
         recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
-        for stamp_ns in session.run(
+        first_ns = run.true_poses.stamps_ns[0]
+        last_ns = run.true_poses.stamps_ns[-1]
+        for result in session.run(
             read_sonar_frames(path, topic, config, salvage=salvage)
         ):
-            if recogniser.stamp_ns == stamp_ns:
-                gathered.add_frame(recogniser, run, log)
+            stamp_ns = result.stamp_ns
+            # the truth of a log may begin later and end earlier than its images
+            if not result.tracks or not first_ns <= stamp_ns <= last_ns:
+                continue
+            truth = true_objects(run, stamp_ns)
+            for track in result.tracks:
+                gathered.add(stamp_ns, log, track, truth)
         if not session.result.frames:
             raise LogError(no_images(path))
     names = spelt(", ".join(path.name for path, _ in logs))
@@ -528,7 +522,7 @@ def fit_weights(
 
 
 def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
-    """Sums of evidence and of news over tracks, the class of each, and how much it counts.
+    """Sums of evidence and of independent shares over tracks, the class of each, and how much it counts.
 
     A track that was of several classes is one of each. Landmarks and none of them have the shares of the prior in sum.
     """
@@ -537,11 +531,15 @@ def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
     label = []
     for track, k in np.unique(np.stack([fits.track, fits.label]), axis=1).T.tolist():
         rows = np.flatnonzero(
-            (fits.track == track) & (fits.label == k) & (fits.news > 0)
+            (fits.track == track) & (fits.label == k) & (fits.independent_share > 0)
         )
         if len(rows):
-            sums.append(np.einsum("n,nke->ke", fits.news[rows], fits.evidence[rows]))
-            counted.append(fits.news[rows].sum())
+            sums.append(
+                np.einsum(
+                    "n,nke->ke", fits.independent_share[rows], fits.evidence[rows]
+                )
+            )
+            counted.append(fits.independent_share[rows].sum())
             label.append(k)
     labels = np.array(label)
     of_none = labels == fits.evidence.shape[1]

@@ -35,7 +35,11 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs import ImagesAlone, read_sonar_frames
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Floats
-from sonar_graph.recognition.confusion_fit import LabelledSightings, estimate_confusion
+from sonar_graph.recognition.confusion_fit import (
+    LabelledSightings,
+    TrueObjects,
+    estimate_confusion,
+)
 from sonar_graph.recognition.image_motion import MotionFrom
 from sonar_graph.recognition.session import RecognitionSession
 from sonar_graph.sequence import Sequence as Run
@@ -46,6 +50,7 @@ from sonar_graph.sonar import (
     ObjectSighting,
     Recogniser,
     RecogniserParams,
+    TrackInFrame,
 )
 
 COLUMNS = ("stamp_ns", "range_m", "azimuth_rad", "id")
@@ -64,7 +69,7 @@ IN_DEGREES = (
 NO_TRACK = "no track there"
 CONTRADICTED = "contradicts other labels of its track, so left out"
 """Why labels tell nothing."""
-NOWHERE = np.array([-1]), np.array([1e9]), np.array([0.0])
+NOWHERE = TrueObjects(np.array([-1]), np.array([1e9]), np.array([0.0]))
 """True landmarks around what is none: one that is far away."""
 
 
@@ -158,10 +163,8 @@ def _from_csv(text: str, log: Path) -> dict[str, object]:
 class LabelledTrack:
     """Sightings of a track with the sonar's pose at each, and the labels that it met, all in one frame at rest."""
 
-    sightings: list[tuple[int, gtsam.Pose3, ObjectSighting, float]] = field(
-        default_factory=list
-    )
-    """Each after its stamp and the pose of the sonar, with the independent share of the frame."""
+    frames: list[tuple[int, gtsam.Pose3, TrackInFrame]] = field(default_factory=list)
+    """Frames with a sighting: stamp, pose of the sonar, the track in it."""
     seen: list[Floats] = field(default_factory=list)
     """Places of the sightings."""
     labels: list[tuple[int, Label]] = field(default_factory=list)
@@ -292,16 +295,14 @@ def calibrate_by_labels(
         }
         known = [track for track in sure.values() if track.ids != {None}]
         share = trusted_share(known) if known else 0.0
-        for number, track in sure.items():
+        for track in sure.values():
             (landmark,) = track.ids
             place = track.middle() + share * track.off()
-            for stamp_ns, world_T_sonar, sighting, news in track.sightings:
-                truth = (
-                    NOWHERE
-                    if landmark is None
-                    else _seen_from(world_T_sonar, place, landmark)
-                )
-                gathered.add(sighting, stamp_ns, (log, number), news, *truth)
+            for stamp_ns, world_T_sonar, in_frame in track.frames:
+                truth = NOWHERE
+                if landmark is not None:
+                    truth = _seen_from(world_T_sonar, place, landmark)
+                gathered.add(stamp_ns, log, in_frame, truth)
     try:
         return estimate_confusion(gathered.fits(), gathered.ids, provenance, designs)
     except CalibrationError as error:
@@ -333,34 +334,27 @@ def _labelled_tracks(
         recogniser=recogniser,
         pictures=False,
         motion=log.motion,
-        seen=used.append,
+        seen=lambda frame, _: used.append(frame),
     )
     tracks: dict[int, LabelledTrack] = defaultdict(LabelledTrack)
     unmet: dict[str, list[int]] = defaultdict(list)
     by_stamp: dict[int, list[tuple[int, Label]]] = defaultdict(list)
     for row, label in enumerate(log.labels.labels, 1):
         by_stamp[label.stamp_ns].append((row, label))
-    for stamp_ns in session.run(blocks):
-        if recogniser.stamp_ns != stamp_ns:
+    for result in session.run(blocks):
+        stamp_ns = result.stamp_ns
+        if not result.is_used:
             unmet[UNUSED] += [row for row, _ in by_stamp.pop(stamp_ns, [])]
             continue
         seen: dict[int, ObjectSighting] = {}
-        rows = zip(
-            recogniser.track_ids.tolist(),
-            recogniser.sightings,
-            recogniser.news.tolist(),
-            strict=True,
-        )
-        for number, sighting, news in rows:
+        for in_frame in result.tracks:
+            sighting = in_frame.sighting
             if sighting is None:
                 continue
-            seen[number] = sighting
-            tracks[number].sightings.append(
-                (stamp_ns, session.start_T_sonar, sighting, news)
-            )
-            tracks[number].seen.append(
-                place_of(sighting.range_m, sighting.azimuth_rad, session)
-            )
+            seen[in_frame.id] = sighting
+            track = tracks[in_frame.id]
+            track.frames.append((stamp_ns, session.start_T_sonar, in_frame))
+            track.seen.append(place_of(sighting.range_m, sighting.azimuth_rad, session))
         for row, label in by_stamp.pop(stamp_ns, []):
             away = {
                 number: _distance(sighting, label) for number, sighting in seen.items()
@@ -426,12 +420,10 @@ def place_of(range_m: float, azimuth_rad: float, session: RecognitionSession) ->
     return np.asarray(session.start_T_sonar.transformFrom(q))
 
 
-def _seen_from(
-    world_T_sonar: gtsam.Pose3, place: Floats, landmark: int
-) -> tuple[Floats, Floats, Floats]:
-    """Identity, range and azimuth of a place, each of shape (1,)."""
+def _seen_from(world_T_sonar: gtsam.Pose3, place: Floats, landmark: int) -> TrueObjects:
+    """A landmark at a place."""
     q = world_T_sonar.transformTo(place)
-    return (
+    return TrueObjects(
         np.array([landmark]),
         np.array([np.linalg.norm(q)]),
         np.array([np.arctan2(q[1], q[0])]),

@@ -17,7 +17,8 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
-from sonar_graph.errors import LogError, MeasurementError
+from sonar_graph.errors import CalibrationError, LogError, MeasurementError
+from sonar_graph.estimator import PlugIns
 from sonar_graph.images import NO_DEPTH, NO_HEIGHT, NO_TILT, SonarFrames, decibels
 from sonar_graph.logs import (
     ImagesAlone,
@@ -44,8 +45,8 @@ from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import (
     EVIDENCE,
     Fan,
-    Fate,
     FloorView,
+    RecognisedFrame,
     Recogniser,
     RecogniserParams,
     SonarStep,
@@ -61,19 +62,26 @@ LEAPT = "out of order: its stamp is ahead of the frame after it"
 NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 
 
+RECOGNISERS = PlugIns(
+    "sonar_graph.recognisers",
+    "recogniser",
+    CalibrationError,
+    CalibrationError,
+    built_in=("designs",),
+)
+"""Recognisers of other packages: functions or classes of a calibration and a dict of settings."""
+
+
 class LandmarkRecogniser(Protocol):
     """Interface of `Recogniser` and of anything used in its place."""
-
-    fates: list[Fate]
-    """Outcome of every candidate, track and fault in the last frame."""
 
     def process(
         self,
         frame: SonarFrames,
         motion: SonarStep | None = None,
         view: FloorView | None = None,
-    ) -> LandmarkDetections | None:
-        """Detections in one frame."""
+    ) -> RecognisedFrame:
+        """Recognise landmarks in a block of one frame."""
         ...
 
     def notes(self) -> dict[str, str]:
@@ -107,7 +115,7 @@ def recognise(
     params
         Settings of the `Recogniser`; None: the defaults.
     recogniser
-        Another recogniser, such as `AcTagRecogniser`; then `designs` and `params` are not used.
+        Another recogniser (`LandmarkRecogniser`); then `designs` and `params` are not used.
     calibration, config, window, salvage
         As of `sonar_graph.logs.read_log`.
     topics
@@ -189,12 +197,12 @@ def recognise_images(
     window: Window | None = None,
     salvage: bool = False,
     progress: Callable[[int], None] | None = None,
-    seen: Callable[[SonarFrames], None] | None = None,
+    seen: Callable[[SonarFrames, RecognisedFrame], None] | None = None,
 ) -> Recognition | None:
     """Recognise landmarks in sonar images, with a record of what became of every candidate and frame.
 
     Parameters and errors are those of `recognise`, with the topic of the images and the window and salvage of the
-    sequence; ``progress`` is called with the number of frames done, ``seen`` with each frame after it was used.
+    sequence; ``progress`` is called with the number of frames done, ``seen`` with each frame that was used and its result.
     None where there are no images.
 
     Without IMU and Doppler log (`ImagesAlone`) the motion is from the images; "fixed" is of a sonar at rest.
@@ -273,7 +281,7 @@ class RecognitionSession:
         recogniser: LandmarkRecogniser | None = None,
         pictures: bool = True,
         motion: MotionFrom = "navigation",
-        seen: Callable[[SonarFrames], None] | None = None,
+        seen: Callable[[SonarFrames, RecognisedFrame], None] | None = None,
     ) -> None:
         self._draws = pictures
         self._seen = seen
@@ -309,12 +317,11 @@ class RecognitionSession:
         self._fan_of: tuple[object, object] = (None, None)
         self._picture_period_ns = PICTURE_PERIOD_NS
 
-    def run(self, blocks: Iterable[SonarFrames]) -> Iterator[int]:
-        """Take in blocks of frames; the stamp of each frame after it is taken."""
+    def run(self, blocks: Iterable[SonarFrames]) -> Iterator[RecognisedFrame]:
+        """Recognise blocks of frames; the result of each frame, as it is done."""
         frames = (frame for block in blocks for frame in one_by_one(block))
         for frame in without_leaps(frames, self.refuse):
-            self.take(frame)
-            yield int(frame.stamps_ns[0])
+            yield self.take(frame)
 
     def extend(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
         """Take in rows of the other sensors that have come since, where the images come live."""
@@ -325,14 +332,14 @@ class RecognitionSession:
         """Forget what only the record of the whole run needs, where there is no end."""
         self._blocks.clear()
 
-    def take(self, frame: SonarFrames) -> LandmarkDetections | None:
-        """Take in a block of one frame."""
-        self.result.frames += 1
+    def take(self, frame: SonarFrames) -> RecognisedFrame:
+        """Recognise a block of one frame."""
         stamp_ns = int(frame.stamps_ns[0])
         if not self._motions.covers(stamp_ns):
             reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
-            self._warn(stamp_ns, f"{NOT_USED}: {reason}")
-            return None
+            self.refuse(stamp_ns, reason)
+            return RecognisedFrame.not_used(stamp_ns, f"{NOT_USED}: {reason}")
+        self.result.frames += 1
         if isinstance(self._motions, ImageMotions):
             self._motions.look(frame)
         step, view = self._motions.at(stamp_ns)
@@ -344,33 +351,26 @@ class RecognitionSession:
         self.result.outcomes[OFF_FLOOR] += (
             view is not None and not self._may_show_floor(frame, view)
         )
-        found = self.recogniser.process(frame, step, view)
-        is_used = True
-        for fate in self.recogniser.fates:
-            if np.isnan(fate.range_m) and fate.track < 0:
+        result = self.recogniser.process(frame, step, view)
+        for fate in result.fates:
+            if fate.is_of_frame:
                 self._warn(stamp_ns, fate.outcome)
-                is_used &= not fate.outcome.startswith(NOT_USED)
             else:
                 self.result.outcomes[fate.outcome] += 1
-        if found is not None:
-            self._blocks.append(found)
-        if isinstance(self.recogniser, Recogniser):
-            for track, sighting in zip(
-                self.recogniser.track_ids.tolist(),
-                self.recogniser.sightings,
-                strict=True,
-            ):
-                if sighting is not None and sighting.fit is not None:
-                    total, count = self._beyond.get(track, (0.0, 0))
-                    beyond = float(
-                        sighting.fit.evidence[:, EVIDENCE.index("beyond")].mean()
-                    )
-                    self._beyond[track] = total + beyond, count + 1
-        if self._seen is not None and is_used:
-            self._seen(frame)
-        if self._draws and is_used:
-            self._draw(frame, found)
-        return found
+        if not result.is_used:
+            return result
+        if result.detections is not None:
+            self._blocks.append(result.detections)
+        for track in result.tracks:
+            if track.sighting is not None and track.sighting.fit is not None:
+                beyond = track.sighting.fit.evidence[:, EVIDENCE.index("beyond")]
+                total, count = self._beyond.get(track.id, (0.0, 0))
+                self._beyond[track.id] = total + float(beyond.mean()), count + 1
+        if self._seen is not None:
+            self._seen(frame, result)
+        if self._draws:
+            self._draw(frame, result.detections)
+        return result
 
     def refuse(self, stamp_ns: int, reason: str) -> None:
         """Count a message that is not a usable frame."""

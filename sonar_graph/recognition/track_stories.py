@@ -10,7 +10,7 @@ from sonar_graph.calibration import SonarImage
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
-from sonar_graph.sonar import Fan, Recogniser
+from sonar_graph.sonar import Fan, RecognisedFrame
 
 HALF_M = 0.35
 """Half of the side of a picture."""
@@ -51,7 +51,7 @@ class Rejected:
 
 
 class TrackStories:
-    """Collector of stories: `see` after every frame of a recogniser."""
+    """Collector of stories: call `see` with every frame that was used."""
 
     def __init__(self, image: SonarImage) -> None:
         self.tracks: dict[int, TrackStory] = {}
@@ -59,19 +59,11 @@ class TrackStories:
         self._image = image
         self._fan: tuple[SonarFrames, Fan] | None = None
 
-    def see(self, frame: SonarFrames, recogniser: Recogniser) -> None:
-        """Take in what a recogniser made of a block of one frame."""
-        stamp_ns = int(frame.stamps_ns[0])
+    def see(self, frame: SonarFrames, result: RecognisedFrame) -> None:
+        """Take in the result for a block of one frame."""
+        stamp_ns = result.stamp_ns
         views = _Views(frame, self._image, self._fan_of(frame))
-        if recogniser.stamp_ns != stamp_ns:
-            return
-        rows = zip(
-            recogniser.track_ids.tolist(),
-            recogniser.sightings,
-            recogniser.beliefs,
-            strict=True,
-        )
-        for number, sighting, beliefs in rows:
+        for number, sighting, _, beliefs in result.tracks:
             story = self.tracks.setdefault(number, TrackStory(number, stamp_ns))
             story.beliefs = beliefs
             if sighting is None:
@@ -82,7 +74,7 @@ class TrackStories:
             if visible > story.visible + BETTER:
                 story.visible = visible
                 story.jpeg = views.around(sighting.range_m, sighting.azimuth_rad)
-        for fate in recogniser.fates:
+        for fate in result.fates:
             if fate.track in self.tracks:
                 self.tracks[fate.track].outcomes[fate.outcome] += 1
             elif fate.track < 0 and np.isfinite(fate.range_m):

@@ -11,7 +11,7 @@ of the 2014 paper, section II-B::
     (3)   b[m, k] = sum_j p[m, k | j] s[m, j]
 
 (2) and (3) are Jeffrey's rule: `jeffrey`. Ours is bounded evidence: `bounded_evidence`. With the log odds l of a
-frame, its independent share 0 <= w <= 1 (`news_of_motion`), and the sums over the frames of a track, carried by A,
+frame, its independent share 0 <= w <= 1 (`independent_share`), and the sums over the frames of a track, carried by A,
 
     L[m] = sum_j A[m, j] L[j] + w[m] l[m],    W[m] = sum_j A[m, j] W[j] + w[m]
     b[m]  =  (1 - doubt) p[m] + doubt birth,    p[m, k]  ~  birth[k] exp( L[m, k] / (W[m] + looks) )
@@ -69,7 +69,7 @@ def bounded_evidence(
 
     The mean of the log odds counts, times a share that comes near to 1 with the number of looks: the mismatch between
     a landmark and its design is the same in every frame, so that no number of them makes certain. A share of doubt is
-    left for tracks whose looks tell nothing.
+    left for tracks whose frames hold no evidence.
     """
     log_belief = np.log(birth) + log_odds / (counted + looks)[:, None]
     odds = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
@@ -78,7 +78,7 @@ def bounded_evidence(
     )
 
 
-def news_of_motion(moved_m: Floats, aperture_m: float) -> Floats:
+def independent_share(moved_m: Floats, aperture_m: float) -> Floats:
     """Independent share of a frame after motion across the line of sight, shape as given.
 
     ``1 - rho^2`` with rho the correlation of speckle with the frame before. A lens of aperture D that both sends and
@@ -104,7 +104,7 @@ class IdentityParams(Section):
     which strangers of the calibration basins are rarely accepted (docs/theory/recognition.md)."""
     forgetting: float = Field(1e-4, ge=0, lt=1)
     """Share of a belief that returns to that of a new track, per frame; of the rule jeffrey only."""
-    least_news: float = Field(0.1, ge=0, lt=1)
+    least_independent_share: float = Field(0.1, ge=0, lt=1)
     """Frames with a smaller independent share are left out; motion adds up until the next one counts."""
     aperture_m: float = Field(0.14, gt=0)
     """Aperture of the sonar's lens; it sets how soon speckle changes."""
@@ -138,75 +138,81 @@ class Beliefs:
         self._order: list[int] = []
         self._beliefs, self._log_odds = np.empty((2, 0, known + 1))
         self._counted = np.empty(0)
-        self.weights: Floats = np.empty(0)
-        """Independent share of the last frame for each track, shape (M,)."""
-        self._looked: Ints = np.empty(0, dtype=np.int64)
-        self._places = np.empty((0, 3))
+        self._seen_tracks: Ints = np.empty(0, dtype=np.int64)
+        self._seen_from = np.empty((0, 3))
+        """Tracks, and the places of the sonar from which they were seen."""
 
     def step(
         self,
         association: Association,
         log_odds: Floats,
-        is_looked: Bools,
+        is_fitted: Bools,
         place: Floats,
         sideways: Floats,
-    ) -> Floats:
-        """Predict and update for one frame; the beliefs after it, shape (M, K).
+    ) -> tuple[Floats, Floats]:
+        """Predict and update for one frame; the beliefs after it, shape (M, K), and its independent shares, shape (M,).
 
-        Log odds of the classes, shape (M, K), the last one's 0, of the tracks that were looked at, shape (M,).
+        Log odds of the classes, shape (M, K), the last one's 0, of the tracks that designs were fitted to, shape (M,).
         ``place`` is the position of the sonar in a fixed frame, shape (3,), and ``sideways`` the horizontal unit vector
         across each line of sight in the same frame, shape (M, 3).
         """
         rows = [self._order.index(track) for track in association.previous_ids.tolist()]
         self._order = association.ids.tolist()
-        news = np.ones(len(is_looked))
-        if self.params.rule != "jeffrey":
-            news = self._news(association.ids, place, sideways)
-        self.weights = np.where(is_looked & (news >= self.params.least_news), news, 0.0)
-        known = np.where(self.weights[:, None] > 0, log_odds, 0.0)
         if self.params.rule == "jeffrey":
+            # the paper's rule counts every frame in full
+            shares = np.where(is_fitted, 1.0, 0.0)
             predicted = predict(
                 self._beliefs[rows],
                 association.matrix,
                 self._birth,
                 self.params.forgetting,
             )
+            known = np.where(is_fitted[:, None], log_odds, 0.0)
             scores = np.where(
-                self.weights[:, None] > 0, soft_scores(known, self._model.looks), 0.0
+                is_fitted[:, None], soft_scores(known, self._model.looks), 0.0
             )
             self._beliefs = jeffrey(predicted, scores, self._model.array())
-            return self._beliefs
-        self._remember(association.ids[self.weights > 0], place)
+            return self._beliefs, shares
+        shares = self._independent_shares(association.ids, place, sideways)
+        is_counted = is_fitted & (shares >= self.params.least_independent_share)
+        shares = np.where(is_counted, shares, 0.0)
+        known = np.where(shares[:, None] > 0, log_odds, 0.0)
+        self._remember(association.ids[shares > 0], place)
+        # sums of evidence go with the tracks, as beliefs do in equation (1)
         carried = association.matrix[:, :-1]
-        self._log_odds = carried @ self._log_odds[rows] + self.weights[:, None] * known
-        self._counted = carried @ self._counted[rows] + self.weights
-        return bounded_evidence(
+        self._log_odds = carried @ self._log_odds[rows] + shares[:, None] * known
+        self._counted = carried @ self._counted[rows] + shares
+        beliefs = bounded_evidence(
             self._birth,
             self._log_odds,
             self._counted,
             self._model.looks,
             self._model.doubt,
         )
+        return beliefs, shares
 
-    def _news(self, ids: Ints, place: Floats, sideways: Floats) -> Floats:
-        """Independent share of a look from here at each track, shape (M,); places of other tracks are forgotten."""
-        look, row = np.nonzero(self._looked[:, None] == ids)
-        self._looked = self._looked[look]
-        self._places = self._places[look]
-        moved = place - self._places
+    def _independent_shares(self, ids: Ints, place: Floats, sideways: Floats) -> Floats:
+        """Independent share of a frame from here for each track, shape (M,); places of other tracks are forgotten."""
+        seen, row = np.nonzero(self._seen_tracks[:, None] == ids)
+        self._seen_tracks = self._seen_tracks[seen]
+        self._seen_from = self._seen_from[seen]
+        moved = place - self._seen_from
         aside = np.vecdot(moved, sideways[row])
         ahead = np.sqrt(np.maximum(np.vecdot(moved, moved) - aside**2, 0.0))
+        # speckle is a function of the place: the nearest earlier place decides, however long ago
         nearest = np.full(len(ids), np.inf)
         np.minimum.at(nearest, row, np.hypot(aside, ahead / self.params.ahead_ratio))
-        return news_of_motion(nearest, self.params.aperture_m)
+        return independent_share(nearest, self.params.aperture_m)
 
     def _remember(self, ids: Ints, place: Floats) -> None:
-        """Remember the place from which tracks were looked at; of too many of a track the first is forgotten."""
-        self._looked = np.append(self._looked, ids)
-        self._places = np.vstack([self._places, np.tile(place, (len(ids), 1))])
-        if len(self._looked) <= self.params.most_looks:
+        """Remember the place from which tracks were seen; of too many places of a track the first is forgotten."""
+        self._seen_tracks = np.append(self._seen_tracks, ids)
+        self._seen_from = np.vstack([self._seen_from, np.tile(place, (len(ids), 1))])
+        if len(self._seen_tracks) <= self.params.most_looks:
             return
-        _, first, count = np.unique(self._looked, return_index=True, return_counts=True)
+        _, first, count = np.unique(
+            self._seen_tracks, return_index=True, return_counts=True
+        )
         too_many = first[count > self.params.most_looks]
-        self._looked = np.delete(self._looked, too_many)
-        self._places = np.delete(self._places, too_many, axis=0)
+        self._seen_tracks = np.delete(self._seen_tracks, too_many)
+        self._seen_from = np.delete(self._seen_from, too_many, axis=0)

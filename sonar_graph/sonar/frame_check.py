@@ -89,6 +89,15 @@ def check_block(frame: SonarFrames) -> None:
         )
 
 
+class FrameVerdict(NamedTuple):
+    """Verdict on a frame."""
+
+    fault: str | None = None
+    """Reason not to use it."""
+    change: str | None = None
+    """Change of window since the good frame before it."""
+
+
 class FrameCheck:
     """Comparison of each frame with the good one before it; the scale of samples is decibels in bytes by default."""
 
@@ -98,41 +107,39 @@ class FrameCheck:
         self._image: NDArray[np.generic] | None = None
         self._window: RangeWindow | None = None
         self._seen: list[RangeWindow] = []
-        self.change: str | None = None
-        """Change of window at the last good frame."""
 
-    def fault(self, frame: SonarFrames) -> str | None:
-        """Reason not to use a frame (a block of one); None for a good one, with which later ones are compared."""
+    def judge(self, frame: SonarFrames) -> FrameVerdict:
+        """Judge a frame (a block of one); later ones are compared with it if it is good."""
         stamp_ns = int(frame.stamps_ns[0])
         image = frame.intensity[0]
         window = RangeWindow(frame.ranges_m, frame.azimuths_rad)
-        self.change = None
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            return (
-                "duplicated: same stamp as the frame before"
-                if stamp_ns == self._stamp_ns
-                else "out of order"
-            )
-        reason = (
-            None if window.shares_arrays(self._window) else window.fault()
-        ) or self._fault_of_samples(image)
-        if reason is not None:
-            return reason
+        if self._stamp_ns == stamp_ns:
+            return FrameVerdict("duplicated: same stamp as the frame before")
+        if self._stamp_ns is not None and stamp_ns < self._stamp_ns:
+            return FrameVerdict("out of order")
+        # of one block of frames the window was judged with the first
+        is_judged = window.shares_arrays(self._window)
+        fault = (None if is_judged else window.fault()) or self._fault_of_samples(image)
+        if fault is not None:
+            return FrameVerdict(fault)
         is_change = self._window is not None and not window.is_like(self._window)
         if (self._window is None or is_change) and not any(
             window.is_like(seen) for seen in self._seen
         ):
             self._seen = [*self._seen[-MOST_WINDOWS + 1 :], window]
-            if (
-                len(self._seen) > 1
-            ):  # a window counts from its second frame on; the first of all is taken as it is
-                return f"wrong size or window: {window}; used if it comes again"
-        if is_change:
-            self.change = f"window changed: {window}; tracks that lie in it go on"
+            # a damaged header looks like a new window, once: a window counts from its second frame on
+            if len(self._seen) > 1:
+                return FrameVerdict(
+                    f"wrong size or window: {window}; used if it comes again"
+                )
         self._stamp_ns = stamp_ns
         self._image = image
         self._window = window
-        return None
+        if is_change:
+            return FrameVerdict(
+                change=f"window changed: {window}; tracks that lie in it go on"
+            )
+        return FrameVerdict()
 
     def _fault_of_samples(self, image: NDArray[np.generic]) -> str | None:
         """Reason not to use these samples."""

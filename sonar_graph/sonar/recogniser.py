@@ -3,9 +3,12 @@
     frame -> decibels -> candidates (cfar) -> tracks (tracker) -> fits of designs (appearance) -> beliefs (bayes)
 
 The steps are those of the 2014 paper: candidate selection, elimination of noisy data, Bayesian feature estimation.
-Every candidate, track and unused frame has a row in `Recogniser.fates` that says why.
+Every candidate, track and unused frame has a row with its reason in `RecognisedFrame.fates`.
 """
 
+from __future__ import annotations
+
+import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames, decibels
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sonar.appearance import AppearanceParams, CandidateFit, ObjectSighting
 from sonar_graph.sonar.bayes import Beliefs, IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams, check_candidates, select_candidates
@@ -68,8 +71,8 @@ class Fate(NamedTuple):
     >>> recogniser = Recogniser(Calibration())
     >>> black = np.zeros((1, 96, 512), np.uint8)
     >>> ranges_m, azimuths_rad = np.linspace(1.26, 2.51, 512), np.linspace(0.25, -0.25, 96)
-    >>> found = recogniser.process(SonarFrames(np.array([0]), black, ranges_m, azimuths_rad))
-    >>> [fate.outcome for fate in recogniser.fates]
+    >>> result = recogniser.process(SonarFrames(np.array([0]), black, ranges_m, azimuths_rad))
+    >>> [fate.outcome for fate in result.fates]
     ['frame not used: all samples are zero']
     """
 
@@ -81,6 +84,55 @@ class Fate(NamedTuple):
     """NaN for a frame."""
     outcome: str
     """Words; `REPORTED` for a detection."""
+
+    @classmethod
+    def of_frame(cls, stamp_ns: int, outcome: str) -> Fate:
+        """Outcome of a whole frame."""
+        return cls(stamp_ns, -1, np.nan, np.nan, outcome)
+
+    @property
+    def is_of_frame(self) -> bool:
+        """True for the outcome of a whole frame."""
+        return self.track < 0 and math.isnan(self.range_m)
+
+
+class TrackInFrame(NamedTuple):
+    """A track in one frame."""
+
+    id: int
+    """Number of the track."""
+    sighting: ObjectSighting | None
+    """Fit of the designs; None where the track took no candidate."""
+    independent_share: float
+    """Independent share of the frame for this track, 0 to 1."""
+    beliefs: Floats
+    """Probability of each landmark and of none of them, shape (ids + 1,)."""
+
+
+class RecognisedFrame(NamedTuple):
+    """Result of a recogniser for one frame.
+
+    Examples
+    --------
+    >>> from sonar_graph.sonar import RecognisedFrame
+    >>> RecognisedFrame.not_used(0, "frame not used: saturated").is_used
+    False
+    """
+
+    stamp_ns: int
+    detections: LandmarkDetections | None
+    """One row for each track that is seen now and trusted, with the posterior over all landmarks; None without one."""
+    fates: list[Fate]
+    """Outcome of every candidate, every track and every fault."""
+    tracks: tuple[TrackInFrame, ...] = ()
+    """Empty of a recogniser without tracks."""
+    is_used: bool = True
+    """False for a frame with a fault."""
+
+    @classmethod
+    def not_used(cls, stamp_ns: int, reason: str) -> RecognisedFrame:
+        """Result for a frame that must not be used."""
+        return cls(stamp_ns, None, [Fate.of_frame(stamp_ns, reason)], is_used=False)
 
 
 PITCH_RAD = 0.15
@@ -96,6 +148,16 @@ REJECTED = {
     int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}"
     for v in CandidateVerdict
 }
+
+
+class LastReport(NamedTuple):
+    """Last detection of a track."""
+
+    stamp_ns: int
+    best: int
+    """Most probable class."""
+    level: int
+    """Number of `ACCEPTED_FROM` that its probability had reached."""
 
 
 class Recogniser:
@@ -125,7 +187,7 @@ class Recogniser:
     >>> noise = np.random.default_rng(1).normal(100.0, 10.0, (1, 96, 512)).astype(np.uint8)
     >>> ranges_m, azimuths_rad = np.linspace(1.26, 2.51, 512), np.linspace(0.25, -0.25, 96)
     >>> recogniser = Recogniser(Calibration())
-    >>> recogniser.process(SonarFrames(np.array([0]), noise, ranges_m, azimuths_rad)) is None
+    >>> recogniser.process(SonarFrames(np.array([0]), noise, ranges_m, azimuths_rad)).detections is None
     True
     """
 
@@ -146,7 +208,7 @@ class Recogniser:
         check_headings(self.designs)
         self._calibration = calibration
         opening_rad = calibration.sonar.elevation_aperture_rad
-        self._look = CandidateFit(
+        self._appearance = CandidateFit(
             self.designs, self.params.appearance, self.confusion, opening_rad
         )
         self._tracker = Tracker(self.params.tracking)
@@ -158,21 +220,8 @@ class Recogniser:
             if self.params.independent
             else 0
         )
-        self._reported: dict[int, tuple[int, tuple[int, int]]] = {}
-        """Stamp of the last report of each track, its most probable identity then, and how many of `ACCEPTED_FROM` that
-        had reached."""
-        self.fates: list[Fate] = []
-        """Outcome of every candidate, track and fault in the last frame."""
-        self.stamp_ns: int | None = None
-        """Stamp of the last frame."""
-        self.sightings: list[ObjectSighting | None] = []
-        """Fit of the designs to each track of the last frame; None for a track without a candidate."""
-        self.track_ids: Ints = np.empty(0, dtype=np.int64)
-        """Numbers of these tracks."""
-        self.news: Floats = np.empty(0)
-        """Independent share of the last frame for these tracks."""
-        self.beliefs: Floats = np.empty((0, len(self.ids) + 1))
-        """Probability of each landmark and of none of them for these tracks, shape (M, ids + 1)."""
+        self._reported: dict[int, LastReport] = {}
+        """Last report of each track."""
 
     def prepare(self, frame: SonarFrames) -> None:
         """Draw the templates that frames with these ranges and beams may need, while nobody waits."""
@@ -183,15 +232,15 @@ class Recogniser:
             max(tilt_rad - half_rad, 0.0),
             min(tilt_rad + half_rad, STEEPEST_RAD),
         )
-        self._look.prepare(frame.ranges_m, frame.azimuths_rad, depressions_rad)
+        self._appearance.prepare(frame.ranges_m, frame.azimuths_rad, depressions_rad)
 
     def process(
         self,
         frame: SonarFrames,
         motion: SonarStep | None = None,
         view: FloorView | None = None,
-    ) -> LandmarkDetections | None:
-        """Detections in one frame: cfar, tracker, appearance, bayes.
+    ) -> RecognisedFrame:
+        """Recognise landmarks in one frame: cfar, tracker, appearance, bayes.
 
         Parameters
         ----------
@@ -202,31 +251,22 @@ class Recogniser:
         view
             Tilt and height over the floor; None: not known, and patches are compared in the image's plane.
 
-        Returns
-        -------
-        LandmarkDetections | None
-            One row for each track that is seen now and trusted, with the posterior over all landmarks. None without
-            such a track and for a frame that must not be used; `fates` says why.
-
         Raises
         ------
         MeasurementError
             When the block is not one frame.
         """
         check_block(frame)
-        self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
-        self.sightings = []
-        self.track_ids = np.empty(0, dtype=np.int64)
-        self.news = np.empty(0)
-        self.beliefs = np.empty((0, len(self.ids) + 1))
+        stamp_ns = int(frame.stamps_ns[0])
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
-        if (fault := self._check.fault(frame)) is not None:
+        verdict = self._check.judge(frame)
+        if verdict.fault is not None:
+            # the tracker predicts over this frame with the next good one
             self._tracker.skip(motion or SonarStep.none())
-            self.fates = [
-                Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")
-            ]
-            return None
+            return RecognisedFrame.not_used(
+                stamp_ns, f"frame not used: {verdict.fault}"
+            )
         image_db = decibels(
             np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image
         )
@@ -234,104 +274,121 @@ class Recogniser:
             image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection
         )
         association = self._tracker.step(candidates, motion, stamp_ns)
-        self.track_ids = association.ids
-        self.sightings = self._look.at(
+        sightings = self._appearance.at(
             image_db, frame, view, candidates, association.candidate
         )
-        log_odds = self._look.log_odds(self.sightings)
-        is_looked = np.isfinite(log_odds[:, -1])
+        log_odds = self._appearance.log_odds(sightings)
+        is_fitted = np.isfinite(log_odds[:, -1])
+        # horizontal unit vectors across each line of sight, in the axes of the first frame: motion along them changes
+        # the speckle most
         azimuth = np.arctan2(association.position_m[:, 1], association.position_m[:, 0])
         across = np.column_stack(
             [-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)]
         )
         sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
         place = self._start_T_sonar.translation()
-        beliefs = self._beliefs.step(association, log_odds, is_looked, place, sideways)
-        self.news = self._beliefs.weights
-        self.beliefs = each_once(beliefs)
-        found = self._report(candidates, association, beliefs)
-        if self._check.change is not None:
-            self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
-        return found
+        beliefs, shares = self._beliefs.step(
+            association, log_odds, is_fitted, place, sideways
+        )
+        detections, fates = self._report(candidates, association, sightings, beliefs)
+        if verdict.change is not None:
+            fates.append(Fate.of_frame(stamp_ns, verdict.change))
+        columns = (
+            association.ids.tolist(),
+            sightings,
+            shares.tolist(),
+            each_once(beliefs),
+        )
+        tracks = tuple(TrackInFrame(*row) for row in zip(*columns, strict=True))
+        return RecognisedFrame(stamp_ns, detections, fates, tracks)
 
     def _report(
-        self, candidates: Candidates, association: Association, beliefs: Floats
-    ) -> LandmarkDetections | None:
+        self,
+        candidates: Candidates,
+        association: Association,
+        sightings: Sequence[ObjectSighting | None],
+        beliefs: Floats,
+    ) -> tuple[LandmarkDetections | None, list[Fate]]:
         """Rows for the tracks that are seen and trusted; fates of all candidates and tracks."""
         stamp_ns = association.stamp_ns
-        params = self.params
         columns = (
             candidates.verdicts.tolist(),
             candidates.range_m.tolist(),
             candidates.azimuth_rad.tolist(),
         )
-        self.fates = [
+        fates = [
             Fate(stamp_ns, -1, range_m, azimuth_rad, REJECTED[verdict])
             for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
             if verdict != CandidateVerdict.ACCEPTED
         ]
-        reported = []
-        before = self._reported
+        # a track that ended is never reported again
         self._reported = {
-            track: before[track]
+            track: self._reported[track]
             for track in association.ids.tolist()
-            if track in before
+            if track in self._reported
         }
-        for row, sighting in enumerate(self.sightings):
+        reported: dict[int, ObjectSighting] = {}
+        for row, sighting in enumerate(sightings):
             if sighting is None:
                 continue
-            outcome = REPORTED
             track = int(association.ids[row])
-            best = int(np.argmax(beliefs[row]))
-            said = (
-                best,
-                bisect_right(ACCEPTED_FROM, beliefs[row, best])
-                if best < len(self.ids)
-                else 0,
-            )
-            last_ns, last_said = before.get(track, (stamp_ns - self._interval_ns, said))
-            if sighting.fit is None:
-                outcome = "not reported: too little of it is in view"
-            elif association.frames_seen[row] < params.least_frames:
-                outcome = (
-                    f"not reported: seen in fewer than {params.least_frames} frames"
-                )
-            elif association.existence[row] < params.least_existence:
-                outcome = (
-                    f"not reported: exists with less than {params.least_existence:g}"
-                )
-            elif (
-                stamp_ns - last_ns < self._interval_ns
-                and said[0] == last_said[0]
-                and said[1] <= last_said[1]
-            ):
-                outcome = NOT_INDEPENDENT
-            else:
-                reported.append((row, sighting))
-                self._reported[track] = stamp_ns, said
-            self.fates.append(
+            outcome = self._outcome(row, association, sighting, beliefs[row])
+            if outcome == REPORTED:
+                reported[row] = sighting
+                self._reported[track] = LastReport(stamp_ns, *self._named(beliefs[row]))
+            fates.append(
                 Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome)
             )
-        self.fates += [
+        fates += [
             Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")
             for track, reason in zip(
                 association.ended_ids.tolist(), association.ended_reasons, strict=True
             )
         ]
         if not reported:
-            return None
-        rows = [row for row, _ in reported]
-        return LandmarkDetections(
+            return None, fates
+        rows = list(reported)
+        found = reported.values()
+        detections = LandmarkDetections(
             stamps_ns=np.full(len(rows), stamp_ns),
-            range_m=np.array([sighting.range_m for _, sighting in reported]),
-            azimuth_rad=np.array([sighting.azimuth_rad for _, sighting in reported]),
-            range_azimuth_cov=np.array(
-                [sighting.covariance for _, sighting in reported]
-            ),
+            range_m=np.array([sighting.range_m for sighting in found]),
+            azimuth_rad=np.array([sighting.azimuth_rad for sighting in found]),
+            range_azimuth_cov=np.array([sighting.covariance for sighting in found]),
             candidate_ids=np.tile(self.ids, (len(rows), 1)),
             id_probability=each_once(beliefs[rows])[:, :-1],
             track=association.ids[rows],
         )
+        return detections, fates
+
+    def _named(self, beliefs: Floats) -> tuple[int, int]:
+        """Most probable class, and the number of `ACCEPTED_FROM` that its probability reaches; 0 of no landmark."""
+        best = int(np.argmax(beliefs))
+        is_landmark = best < len(self.ids)
+        return best, bisect_right(ACCEPTED_FROM, beliefs[best]) if is_landmark else 0
+
+    def _outcome(
+        self,
+        row: int,
+        association: Association,
+        sighting: ObjectSighting,
+        beliefs: Floats,
+    ) -> str:
+        """Outcome of the track in this row, which took a candidate."""
+        params = self.params
+        if sighting.fit is None:
+            return "not reported: too little of it is in view"
+        if association.frames_seen[row] < params.least_frames:
+            return f"not reported: seen in fewer than {params.least_frames} frames"
+        if association.existence[row] < params.least_existence:
+            return f"not reported: exists with less than {params.least_existence:g}"
+        last = self._reported.get(int(association.ids[row]))
+        if last is None:
+            return REPORTED
+        best, level = self._named(beliefs)
+        # a changed or surer identity is reported although range and azimuth repeat their errors
+        is_changed = best != last.best or level > last.level
+        is_due = association.stamp_ns - last.stamp_ns >= self._interval_ns
+        return REPORTED if is_changed or is_due else NOT_INDEPENDENT
 
     def notes(self) -> dict[str, str]:
         """Rule, designs and model, for the notes of a log."""

@@ -50,11 +50,15 @@ def test_a_sighting_is_of_what_truly_lies_there():
         ((2.0, 0.1 + 0.42 / 2), confusion_fit.NONE),
     ):
         assert (
-            confusion_fit.label_of(sighting(*place), IDS, RANGE_M, AZIMUTH_RAD)[0]
+            confusion_fit.TrueObjects(IDS, RANGE_M, AZIMUTH_RAD).label_of(
+                sighting(*place)
+            )[0]
             == label
         ), place
         assert (
-            confusion_fit.label_of(sighting(*place), IDS, RANGE_M, behind)[0]
+            confusion_fit.TrueObjects(IDS, RANGE_M, behind).label_of(sighting(*place))[
+                0
+            ]
             == confusion_fit.NONE
         ), place
 
@@ -62,7 +66,7 @@ def test_a_sighting_is_of_what_truly_lies_there():
 @given(st.integers(0, 27))
 def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
     stamp_ns = int(lane.sequence.truth.stamps_ns[50 * second])
-    range_m, azimuth_rad = confusion_fit.true_ranges_azimuths(lane.sequence, stamp_ns)
+    _, range_m, azimuth_rad = confusion_fit.true_objects(lane.sequence, stamp_ns)
     motion = lane.path.at(np.array([float(second)]))
     mounting = lane.sequence.calibration.sonar.mounting
     body_R_sonar = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])

@@ -9,7 +9,7 @@ import pytest
 
 from sonar_graph.errors import CalibrationError
 from sonar_graph.recognition import confusion_fit
-from sonar_graph.recognition.confusion_fit import true_ranges_azimuths
+from sonar_graph.recognition.confusion_fit import true_objects
 from sonar_graph.recognition.labels import (
     Label,
     LabelledLog,
@@ -30,11 +30,7 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
     for stamp_ns in lane.frames.stamps_ns[::6].tolist():
         if not run.truth.stamps_ns[0] <= stamp_ns <= run.truth.stamps_ns[-1]:
             continue
-        rows = zip(
-            run.true_landmarks.ids.tolist(),
-            *true_ranges_azimuths(run, stamp_ns),
-            strict=True,
-        )
+        rows = zip(*true_objects(run, stamp_ns), strict=True)
         for landmark, range_m, azimuth_rad in rows:
             if 1.5 < range_m < 2.3 and abs(azimuth_rad) < 0.17:
                 off = CLICK_PIXELS_M * rng.standard_normal(2)
@@ -44,7 +40,7 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
                         stamp_ns=stamp_ns,
                         range_m=place[0],
                         azimuth_rad=place[1],
-                        id=landmark,
+                        id=int(landmark),
                     )
                 )
     found = lane_recognition.detections
@@ -52,7 +48,7 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
     for stamp_ns, range_m, azimuth_rad in zip(
         none.stamps_ns, none.range_m, none.azimuth_rad, strict=True
     ):
-        ranges_m, azimuths_rad = true_ranges_azimuths(run, stamp_ns)
+        _, ranges_m, azimuths_rad = true_objects(run, stamp_ns)
         if (
             np.hypot(ranges_m - range_m, ranges_m * (azimuths_rad - azimuth_rad)).min()
             > 0.5

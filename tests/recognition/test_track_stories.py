@@ -23,9 +23,8 @@ NAMES = ["1: disc", "2: square", "3: triangle", "4: cross"]
 def told(lane: Lane) -> tuple[Recognition, TrackStories]:
     recogniser = Recogniser(lane.sequence.calibration)
     stories = TrackStories(lane.sequence.calibration.sonar.image)
-    see = lambda frame: stories.see(frame, recogniser)  # noqa: E731
     session = RecognitionSession(
-        lane.sequence, recogniser=recogniser, pictures=False, seen=see
+        lane.sequence, recogniser=recogniser, pictures=False, seen=stories.see
     )
     for row in range(len(lane.frames)):
         session.take(lane.one(row))

@@ -9,8 +9,8 @@ from sonar_graph.sonar.bayes import (
     Beliefs,
     IdentityParams,
     bounded_evidence,
+    independent_share,
     jeffrey,
-    news_of_motion,
     predict,
 )
 from sonar_graph.sonar.confusion import Confusion
@@ -121,7 +121,7 @@ def test_news_follow_from_the_autocorrelation_of_a_triangle():
     expected = (
         1 - np.interp(moved, places, autocorrelation / autocorrelation.max()) ** 2
     )
-    np.testing.assert_allclose(news_of_motion(moved, 0.14), expected, atol=1e-3)
+    np.testing.assert_allclose(independent_share(moved, 0.14), expected, atol=1e-3)
     assert expected[4] == pytest.approx(0.5, abs=0.01)
 
 
@@ -176,7 +176,7 @@ def _after(
             float(
                 beliefs.step(
                     _association(before, [7]), log_odds, looked, place, SIDEWAYS
-                )[0, 0]
+                )[0][0, 0]
             )
         )
         before = [7]
@@ -223,13 +223,13 @@ def test_beliefs_follow_their_tracks(is_reversed: bool):
     scores = np.array([[6.0, -3.0, 0.0], [-3.0, 6.0, 0.0]])
     place = np.zeros(3)
     sideways = np.tile(SIDEWAYS, (2, 1))
-    first = beliefs.step(
+    first, _ = beliefs.step(
         _association([], [3, 4]), scores, np.array([True, True]), place, sideways
     )
     change = (
         _association([4, 3], [3, 4]) if is_reversed else _association([3, 4], [4, 3])
     )
-    after = beliefs.step(
+    after, _ = beliefs.step(
         change, np.nan * scores, np.array([False, False]), place, sideways
     )
     np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)

@@ -5,7 +5,9 @@ import pytest
 
 from sonar_graph.calibration import SonarImage
 from sonar_graph.images import SonarFrames
-from sonar_graph.sonar.frame_check import FrameCheck
+from sonar_graph.sonar.frame_check import FrameCheck, FrameVerdict
+
+GOOD = FrameVerdict()
 
 BEAMS = 10
 BINS = 40
@@ -84,31 +86,30 @@ BAD_IN_ITSELF = {
 def test_a_bad_frame_is_named_and_does_not_become_the_measure_of_the_next(name):
     frame, words = (BAD | BAD_IN_ITSELF)[name]
     check = FrameCheck()
-    assert name in BAD or words in (FrameCheck().fault(frame) or "")
-    assert check.fault(_frame(1)) is None
-    assert words in (check.fault(frame) or "")
-    assert check.change is None
-    assert check.fault(_frame(2)) is None
-    assert check.change is None
+    assert name in BAD or words in (FrameCheck().judge(frame).fault or "")
+    assert check.judge(_frame(1)) == GOOD
+    verdict = check.judge(frame)
+    assert words in (verdict.fault or "")
+    assert verdict.change is None
+    assert check.judge(_frame(2)) == GOOD
 
 
 def test_good_frames_have_no_fault_on_the_scale_of_the_calibration():
     wide = _noise(1) * np.uint16(100)
     some_saturated = _changed(np.s_[:4], 255)
-    assert FrameCheck().fault(_frame(1, some_saturated)) is None
+    assert FrameCheck().judge(_frame(1, some_saturated)) == GOOD
     for scale in (SonarImage(scale="linear"), SonarImage(full_scale=65535)):
-        assert FrameCheck(scale).fault(_frame(1, wide)) is None
+        assert FrameCheck(scale).judge(_frame(1, wide)) == GOOD
     assert "sonar.image.full_scale" in (
-        FrameCheck(SonarImage(full_scale=4095)).fault(_frame(1, wide)) or ""
+        FrameCheck(SonarImage(full_scale=4095)).judge(_frame(1, wide)).fault or ""
     )
 
 
 def test_a_new_window_is_used_from_its_second_frame_on():
     check = FrameCheck()
-    assert check.fault(_frame(1)) is None
+    assert check.judge(_frame(1)) == GOOD
     faults, changes = zip(
-        *((check.fault(_frame(n, end_m=3.0)), check.change) for n in (2, 3, 4)),
-        strict=True,
+        *(check.judge(_frame(n, end_m=3.0)) for n in (2, 3, 4)), strict=True
     )
     assert [fault is None for fault in faults] == [False, True, True]
     assert [change is None for change in changes] == [True, False, True]
@@ -118,13 +119,10 @@ def test_a_new_window_is_used_from_its_second_frame_on():
 def test_windows_that_alternate_lose_one_frame():
     check = FrameCheck()
     faults = [
-        check.fault(_frame(stamp, end_m=2.0 + stamp % 2)) for stamp in range(1, 9)
+        check.judge(_frame(stamp, end_m=2.0 + stamp % 2)).fault for stamp in range(1, 9)
     ]
     assert [number for number, fault in enumerate(faults) if fault] == [1]
     check = FrameCheck()
     for stamp in range(1, 20):
-        assert (
-            check.fault(_frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp))
-            is None
-        )
-        assert check.change is None
+        shifted = _frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp)
+        assert check.judge(shifted) == GOOD

@@ -21,6 +21,7 @@ from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import (
     REPORTED,
+    RecognisedFrame,
     Recogniser,
     RecogniserParams,
     each_once,
@@ -78,7 +79,7 @@ def pass_by(
     return [
         recogniser.process(
             frame(k, picture(design, 1.7, y, 0.4, k)), aside(step_m, k), VIEW
-        )
+        ).detections
         for k, y in places
     ]
 
@@ -104,16 +105,17 @@ def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int)
 def standing(
     recogniser: Recogniser, frames: range, design: int | None = SQUARE, y_m: float = 0.0
 ) -> list:
-    """Detections of frames from one place, and the outcomes of their tracks."""
-    results = []
-    for k in frames:
-        found = recogniser.process(
+    """Results of frames from one place."""
+    return [
+        recogniser.process(
             frame(k, picture(design, 1.7, y_m, 0.4, k)), aside(0.0, k), VIEW
         )
-        results.append(
-            (found, [fate.outcome for fate in recogniser.fates if fate.track >= 0])
-        )
-    return results
+        for k in frames
+    ]
+
+
+def outcomes_of_tracks(result: RecognisedFrame) -> list[str]:
+    return [fate.outcome for fate in result.fates if fate.track >= 0]
 
 
 @pytest.mark.parametrize(
@@ -137,32 +139,27 @@ def test_a_track_is_reported_from_the_frame_that_is_enough(settings, y_m, reason
         detection=DetectionParams(keep_at_edge=y_m > 0), independent=False, **settings
     )
     results = standing(Recogniser(DECIBELS, params=params), range(5), y_m=y_m)
-    for (found, outcomes), reason in zip(results, reasons, strict=False):
-        assert found is None
-        assert set(outcomes) == {f"not reported: {reason}"}
-    assert all(
-        found is not None and REPORTED in outcomes
-        for found, outcomes in results[len(reasons) :]
-    )
+    for result, reason in zip(results, reasons, strict=False):
+        assert result.detections is None
+        assert set(outcomes_of_tracks(result)) == {f"not reported: {reason}"}
+    for result in results[len(reasons) :]:
+        assert result.detections is not None
+        assert REPORTED in outcomes_of_tracks(result)
 
 
 def test_a_track_ends_with_a_row_and_the_next_has_another_number():
     recogniser = Recogniser(DECIBELS, params=EVERY)
-    standing(recogniser, range(4), DISC)
-    assert recogniser.track_ids.tolist() == [0]
+    seen = standing(recogniser, range(4), DISC)
+    assert [track.id for track in seen[-1].tracks] == [0]
     blank = standing(recogniser, range(4, 30), None)
-    assert all(found is None for found, _ in blank)
-    assert "track ended: exists with less than 0.01" in [
-        outcome for _, outcomes in blank for outcome in outcomes
-    ]
-    tracks = [
-        found.track.tolist()
-        for found, _ in standing(recogniser, range(30, 36))
-        if found is not None
-    ]
+    assert all(result.detections is None for result in blank)
+    ends = [outcome for result in blank for outcome in outcomes_of_tracks(result)]
+    assert "track ended: exists with less than 0.01" in ends
+    last = standing(recogniser, range(30, 36))
+    tracks = [one.detections.track.tolist() for one in last if one.detections]
     assert len(set(map(tuple, tracks))) == 1
     assert tracks[0] == [
-        fate.track for fate in recogniser.fates if fate.outcome == REPORTED
+        fate.track for fate in last[-1].fates if fate.outcome == REPORTED
     ]
     assert tracks[0][0] > 0
 
@@ -183,7 +180,7 @@ def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
             (image, None),
         )
         found = [
-            r.process(frame(k, im), aside(0.0, k), v)
+            r.process(frame(k, im), aside(0.0, k), v).detections
             for r, (im, v) in zip(recognisers, given, strict=True)
         ]
     plain, linear, flat = ((one.range_m, one.azimuth_rad) for one in found)
@@ -211,7 +208,6 @@ def test_other_designs_and_blocks_of_more_frames_are_refused():
             None,
             VIEW,
         )
-    assert recogniser.stamp_ns is None
 
 
 def test_a_bad_frame_has_no_sighting_and_its_motion_counts_once():
@@ -219,21 +215,20 @@ def test_a_bad_frame_has_no_sighting_and_its_motion_counts_once():
     bad = Recogniser(DECIBELS, params=EVERY)
     for recogniser in (good, bad):
         pass_by(recogniser, SQUARE, 5)
-    assert (
-        bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW)
-        is None
-    )
-    assert [fate[:2] for fate in bad.fates] == [(5 * FRAME_NS, -1)]
-    assert np.isnan(bad.fates[0][2:4]).all()
-    assert bad.fates[0].outcome == "frame not used: all samples are zero"
-    assert bad.sightings == []
+    result = bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW)
+    assert (result.is_used, result.detections, result.tracks) == (False, None, ())
+    assert [fate[:2] for fate in result.fates] == [(5 * FRAME_NS, -1)]
+    assert result.fates[0].is_of_frame
+    assert result.fates[0].outcome == "frame not used: all samples are zero"
     last = frame(6, picture(SQUARE, 1.7, -0.15, 0.4, 6))
     expected = good.process(last, aside(0.05), VIEW)
     found = bad.process(last, aside(-0.3), VIEW)
-    np.testing.assert_allclose(found.range_m, expected.range_m)
-    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
-    assert [f.track for f in bad.fates if f.track >= 0] == [
-        f.track for f in good.fates if f.track >= 0
+    np.testing.assert_allclose(found.detections.range_m, expected.detections.range_m)
+    np.testing.assert_allclose(
+        found.detections.id_probability, expected.detections.id_probability, atol=1e-6
+    )
+    assert [f.track for f in found.fates if f.track >= 0] == [
+        f.track for f in expected.fates if f.track >= 0
     ]
 
 
@@ -245,7 +240,7 @@ def test_a_sonar_that_comes_to_rest_keeps_its_belief():
     for k in range(60):
         found = recogniser.process(
             frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW
-        )
+        ).detections
     assert before.id_probability[0, SQUARE] > 0.9
     np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
 
@@ -259,7 +254,7 @@ def test_two_discs_at_once_are_not_both_the_disc():
         right = picture(DISC, 1.75, y_m - 0.2, 0.4, k)
         found = recogniser.process(
             frame(k, np.maximum(left, right)), aside(0.05, k), VIEW
-        )
+        ).detections
         if found is not None and len(found) == 2:
             pair = found.id_probability
             assert pair.argmax(axis=1)[pair.max(axis=1) > 0.5].tolist() in ([], [DISC])
@@ -314,8 +309,8 @@ def recogniser_said(model) -> Counter:
     said = Counter()
     for k in range(15):
         y = round((15 // 2 - k) * 0.02, 6)
-        recogniser.process(
+        result = recogniser.process(
             frame(k, picture(SQUARE, 1.7, y, 0.4, k)), aside(0.02, k), VIEW
         )
-        said.update(fate.outcome for fate in recogniser.fates if fate.track >= 0)
+        said.update(outcomes_of_tracks(result))
     return said

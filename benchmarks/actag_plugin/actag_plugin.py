@@ -1,4 +1,7 @@
-"""AcTag fiducials in sonar images, decoded by AcTag's own detector (the extra ``actag``), and as designs to simulate.
+"""AcTag fiducials in sonar images, decoded by AcTag's own detector, as a recogniser by plug-in; and designs to simulate.
+
+    pip install benchmarks/actag_plugin
+    sonar-graph recognise dive.mcap -o tags.mcap --recogniser actag --set family=AcTag24h10 --set tag_size_m=0.13
 
 AcTag wants rows and columns equally spaced in range and azimuth, the farthest range and the leftmost azimuth first, and
 its filters have a size in pixels. Frames are therefore resampled by the log's table of beams, with
@@ -23,12 +26,18 @@ from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import Floats, LandmarkDetections
-from sonar_graph.sonar.frame_check import FrameCheck, check_block
-from sonar_graph.sonar.geometry import FloorView, points
-from sonar_graph.sonar.recogniser import REPORTED, Fate
-from sonar_graph.sonar.tracker import SonarStep
+from sonar_graph.settings import parse
+from sonar_graph.sonar import (
+    REPORTED,
+    Fate,
+    FloorView,
+    FrameCheck,
+    RecognisedFrame,
+    SonarStep,
+    check_block,
+)
 
-INSTALL = "pip install 'sonar-graph[actag]'"
+INSTALL = "pip install benchmarks/actag_plugin"
 BITS_OF_INNER_SQUARE = 3
 """Of a tag with 24 bits, which is 7 bits wide."""
 COUNTS_A_DECIBEL = 255 / 80
@@ -38,14 +47,7 @@ SEED = 1
 
 
 class AcTagSettings(Section):
-    """Family of tags, and settings of AcTag.
-
-    Examples
-    --------
-    >>> from sonar_graph.sonar import AcTagSettings
-    >>> AcTagSettings(tag_size_m=0.2).family
-    'AcTag24h10'
-    """
+    """Family of tags, and settings of AcTag."""
 
     family: str = "AcTag24h10"
     """AcTag24h4, 24h6, 24h8 or 24h10: number of bits, and least number in which two tags differ."""
@@ -76,14 +78,14 @@ class Tag(NamedTuple):
 
 
 class AcTagRecogniser:
-    """Recogniser of AcTags, with the interface of `sonar_graph.sonar.Recogniser`.
+    """Recogniser of AcTags (`sonar_graph.recognition.LandmarkRecogniser`).
 
     Parameters
     ----------
     calibration
         Scale of the samples of the sonar.
     settings
-        None: the defaults.
+        Values of `AcTagSettings` by name; None: the defaults.
 
     Raises
     ------
@@ -92,9 +94,11 @@ class AcTagRecogniser:
     """
 
     def __init__(
-        self, calibration: Calibration, settings: AcTagSettings | None = None
+        self, calibration: Calibration, settings: dict[str, Any] | None = None
     ) -> None:
-        self.settings = settings or AcTagSettings()
+        self.settings = parse(
+            AcTagSettings, settings or {}, "settings of actag", CalibrationError
+        )
         self._image = calibration.sonar.image
         self._check = FrameCheck(calibration.sonar.image)
         self._make = _import_actag("actag", "recognising").AcTag
@@ -106,16 +110,14 @@ class AcTagRecogniser:
             ) from error
         self._start_T_sonar = gtsam.Pose3()
         self._seen: dict[int, tuple[Floats, int]] = {}
-        self.fates: list[Fate] = []
-        """Outcome of every tag and fault in the last frame."""
 
     def process(
         self,
         frame: SonarFrames,
         motion: SonarStep | None = None,
         view: FloorView | None = None,
-    ) -> LandmarkDetections | None:
-        """Tags in a block of one frame; motion as for `Recogniser`, the floor is not used.
+    ) -> RecognisedFrame:
+        """Decode the tags in a block of one frame; motion as for `Recogniser`, the floor is not used.
 
         Raises
         ------
@@ -128,11 +130,11 @@ class AcTagRecogniser:
         settings = self.settings
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
-        if (fault := self._check.fault(frame)) is not None:
-            self.fates = [
-                Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")
-            ]
-            return None
+        verdict = self._check.judge(frame)
+        if verdict.fault is not None:
+            return RecognisedFrame.not_used(
+                stamp_ns, f"frame not used: {verdict.fault}"
+            )
         bit_m = settings.tag_size_m / BITS_OF_INNER_SQUARE
         image_db = decibels(frame.intensity[0], self._image)
         picture_db, rows_m, columns_rad = evenly_sampled(
@@ -149,23 +151,25 @@ class AcTagRecogniser:
             Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist())
             for id_, _, range_azimuth in decoded
         ]
-        self.fates = []
+        fates = []
         reported = []
-        for n, tag in enumerate(tags):
+        decoded_ids: set[int] = set()
+        for tag in tags:
             outcome = REPORTED
-            if tag.id in [other.id for other in tags[:n]]:
+            if tag.id in decoded_ids:
                 outcome = "not reported: decoded already in this frame"
             elif self._frames_in_place(tag) < settings.least_frames:
                 outcome = f"not reported: decoded in fewer than {settings.least_frames} frames in one place"
             else:
                 reported.append(tag)
-            self.fates.append(Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome))
-        if self._check.change is not None:
-            self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
+            decoded_ids.add(tag.id)
+            fates.append(Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome))
+        if verdict.change is not None:
+            fates.append(Fate.of_frame(stamp_ns, verdict.change))
         if not reported:
-            return None
+            return RecognisedFrame(stamp_ns, None, fates)
         covariance = np.diag([settings.range_sigma_m**2, settings.azimuth_sigma_rad**2])
-        return LandmarkDetections(
+        detections = LandmarkDetections(
             stamps_ns=np.full(len(reported), stamp_ns),
             range_m=np.array([tag.range_m for tag in reported]),
             azimuth_rad=np.array([tag.azimuth_rad for tag in reported]),
@@ -173,11 +177,12 @@ class AcTagRecogniser:
             candidate_ids=np.array([[tag.id] for tag in reported]),
             id_probability=np.full((len(reported), 1), settings.probability),
         )
+        return RecognisedFrame(stamp_ns, detections, fates)
 
     def _frames_in_place(self, tag: Tag) -> int:
         """Frames in a row that have a tag in one place; remembers the place."""
-        q = points(np.array([tag.range_m]), np.array([tag.azimuth_rad]))[0]
-        place = np.asarray(self._start_T_sonar.transformFrom(q))
+        direction = np.array([np.cos(tag.azimuth_rad), np.sin(tag.azimuth_rad), 0.0])
+        place = np.asarray(self._start_T_sonar.transformFrom(tag.range_m * direction))
         before, frames = self._seen.get(tag.id, (place, 0))
         frames = (
             frames + 1
