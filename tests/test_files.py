@@ -149,7 +149,7 @@ def test_killed_between_two_files_all_are_still_known_as_ours(tmp_path, monkeypa
     replace = Path.replace
 
     def dies(self: Path, target: Path) -> Path:
-        if target.name == "b.json":
+        if target == tmp_path / "b.json":
             raise OSError("killed")
         return replace(self, target)
 

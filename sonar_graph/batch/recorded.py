@@ -18,7 +18,7 @@ import numpy as np
 
 from sonar_graph.batch.store import LOG, NOT_RUN, ROW, RUNS, SUITE
 from sonar_graph.errors import EvaluationError
-from sonar_graph.files import BATCH, kind_of, read_json
+from sonar_graph.files import BATCH, Manifest, read_json
 from sonar_graph.measurements import Floats
 
 RESULTS = "results.parquet"
@@ -208,7 +208,7 @@ class RecordedBatch:
 
 def is_batch(folder: Path) -> bool:
     """True if a batch was begun in a folder."""
-    return kind_of(folder) == BATCH or any(
+    return Manifest.found(folder).kind == BATCH or any(
         (folder / name).is_file() for name in (RESULTS, SUITE)
     )
 

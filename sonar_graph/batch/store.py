@@ -15,24 +15,24 @@ with its final name is therefore complete. Decisions: docs/design/0011-batch.md.
 """
 
 import contextlib
-import hashlib
 import re
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
 from sonar_graph.errors import BatchError, EvaluationError
 from sonar_graph.files import (
     COMPARISON,
-    DIGEST_DIGITS,
-    changed_in,
+    MANIFEST,
+    Manifest,
+    digest_of,
     others_in,
     read_json,
     remove_written,
     strict_json,
-    write_manifest,
 )
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
@@ -163,13 +163,12 @@ class Store:
         row = strict_json({KEY: key, **outcome.row}) + "\n"
         contents = {**outcome.files, LOG: outcome.log.encode(), ROW: row.encode()}
         digests = {
-            name: [hashlib.blake2b(content).hexdigest()[:DIGEST_DIGITS]]
-            for name, content in contents.items()
+            name: [digest_of(BytesIO(content))] for name, content in contents.items()
         }
         partial.mkdir()
         try:
             # before the files, so that what a killed batch leaves here can be removed by its manifest
-            write_manifest(partial, COMPARISON, digests)
+            Manifest(kind=COMPARISON, files=digests).write(partial / MANIFEST)
             for name, content in contents.items():
                 path = partial / name
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,7 +186,7 @@ class Store:
         """
         folder = self.run_folder(key)
         gone = self._partial_folder(key)
-        if others := [*others_in(folder), *changed_in(folder)]:
+        if others := others_in(folder):
             raise BatchError(
                 f"{folder}: would be replaced, and holds {others[0]}, which is not as the run wrote it; move it away"
             )

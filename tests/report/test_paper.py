@@ -10,7 +10,7 @@ import pytest
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import compare
-from sonar_graph.files import PAPER, kind_of
+from sonar_graph.files import PAPER, Manifest
 from sonar_graph.report import write_paper
 from sonar_graph.report.paper import COLUMN_IN, PAGE_IN
 from sonar_graph.testing import small_world
@@ -78,7 +78,7 @@ def test_the_same_result_gives_the_same_files_and_only_own_files_are_replaced(tm
         for path in tmp_path.rglob("*.*")
         if not path.name.startswith(".")
     }
-    assert kind_of(tmp_path) == PAPER
+    assert Manifest.found(tmp_path).kind == PAPER
     (tmp_path / "protocol.txt").write_text("mine")
     with pytest.raises(
         EvaluationError,
