@@ -13,6 +13,7 @@ import pytest
 from numba.core import event
 
 from sonar_graph.numerics import compiling
+from sonar_graph.sonar.cfar import interpolated
 
 KERNELS = """
 from sonar_graph.numerics import compiled, matrices
@@ -53,6 +54,13 @@ def told(
 def loops(tmp_path: Path) -> Path:
     (tmp_path / "loops.py").write_text(KERNELS)
     return tmp_path
+
+
+def test_numba_has_the_private_names_that_the_cache_uses():
+    """pyproject.toml bounds numba's version for these names; look here before the bound is raised."""
+    cache_file = interpolated._cache._cache_file
+    assert isinstance(cache_file._source_stamp, str)
+    assert isinstance(cache_file._load_index(), dict)
 
 
 def test_the_first_compilation_is_told_once_and_later_ones_are_not(loops):

@@ -35,7 +35,7 @@ class _Progress(event.Listener):
         if not self._count:
             self._told_s = now_s
             # without an index no earlier run has compiled this file: the user waits, and should know why
-            if not any(Path(dispatcher._cache.cache_path).glob("*.nbi")):
+            if not any(Path(dispatcher.stats.cache_path).glob("*.nbi")):
                 LOG.warning(NOTICE)
         # compiled functions compile those that they call first
         self._depth += 1
