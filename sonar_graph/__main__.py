@@ -1,4 +1,4 @@
-"""``python -m sonar_graph`` is ``sonar-graph``, for whom its folder is not on the path."""
+"""``python -m sonar_graph`` is ``sonar-graph``, where the folder of that command is not on the path."""
 
 from sonar_graph.cli import main
 

@@ -88,21 +88,21 @@ class SectionType(ModelMetaclass):
         except ValidationError as error:
             faults = []
             for fault in error.errors():
-                told = expectation(fault["type"], fault["msg"])
+                text = expectation(fault["type"], fault["msg"])
                 if fault["type"] != MISFIT:
-                    told += f", not {fault['input']!r:.60}"
+                    text += f", not {fault['input']!r:.60}"
                 if fault["type"] == "extra_forbidden":
                     known = (
                         getattr(cls, "model_fields", {})
                         if len(fault["loc"]) == 1
                         else {}
                     )
-                    told = (
+                    text = (
                         "there is no such field"
                         + f"; there are: {', '.join(known)}" * bool(known)
                     )
                 faults.append(
-                    f"{cls.__name__}.{'.'.join(map(str, fault['loc']))}: {told}"
+                    f"{cls.__name__}.{'.'.join(map(str, fault['loc']))}: {text}"
                 )
             raise SettingError("; ".join(faults)) from None
 
@@ -145,7 +145,7 @@ def require_params(params: object, kind: type[Section], name: str) -> None:
 
 
 def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
-    """Metadata of a union of sections that one of their fields tells apart; it has a default.
+    """Metadata of a union of sections that one of their fields distinguishes; it has a default.
 
     ``tag``: that field, with a literal text in each section; ``default``: its value where it is not given.
     """
@@ -231,7 +231,7 @@ class DvlCalibration(Section):
     scale_sigma: Annotated[
         Number, within(0, 0.2, "a relative error between 0 and 0.2 (0.5 % are 0.005)")
     ] = 0.0
-    """Standard deviation of the relative error that is left; 0: none is estimated."""
+    """Standard deviation of the relative error that is left; 0: it is not estimated."""
 
 
 class DepthCalibration(Section):
@@ -249,7 +249,7 @@ class HeadingCalibration(Section):
     sigma_rad: Annotated[Spread, Field(gt=0)] = 0.02
     """White noise of one sample, where the log has no variance."""
     bias_sigma_rad: Spread = 0.05
-    """Error that all samples of a run share: deviation, declination, mounting; 0: none is estimated."""
+    """Error that all samples of a run share: deviation, declination, mounting; 0: it is not estimated."""
 
 
 class PositionCalibration(Section):
@@ -438,7 +438,7 @@ class Calibration(Section):
     planar: PlanarMotion | None = None
     """None: the vehicle moves in three dimensions."""
     map: KnownMap | None = None
-    """Landmarks whose places are known; None: none is."""
+    """Landmarks whose places are known, or None."""
     use_gravity: bool = True
     """Take roll and pitch from the accelerometers, where they measure."""
     odometry_interpolation: Literal["linear", "hold-past"] = "linear"

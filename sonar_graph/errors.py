@@ -1,13 +1,13 @@
 """Errors that this package raises on purpose, under one root.
 
-Each message says what was asked, what was found, and what to do. The command line prints it on one line and exits
+Each message has what was requested, what was found, and what to do. The command line prints it on one line and exits
 with 2; only an unforeseen error ends in a traceback.
 """
 
 import re
 
 MISFIT = "misfit"
-"""Type of a validation error whose message alone says all."""
+"""Type of a validation error whose message needs no words around it."""
 
 
 class SonarGraphError(Exception):
@@ -31,7 +31,7 @@ class SettingError(SonarGraphError, ValueError):
 
 
 class SimulationError(SonarGraphError):
-    """A simulated run is asked for that cannot be made."""
+    """A simulated run cannot be made as requested."""
 
 
 class LogError(SonarGraphError):
@@ -47,7 +47,7 @@ class DatasetError(LogError):
 
 
 class AlignmentError(SonarGraphError):
-    """Attitude and gyro bias cannot be told from a stretch of a run."""
+    """Attitude and gyro bias cannot be determined from a stretch of a run."""
 
 
 class EstimatorError(SonarGraphError):
@@ -55,7 +55,7 @@ class EstimatorError(SonarGraphError):
 
 
 class UnknownEstimatorError(EstimatorError):
-    """No installed estimator has the name that was asked for."""
+    """No installed estimator has the requested name."""
 
 
 class EvaluationError(SonarGraphError):

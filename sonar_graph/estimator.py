@@ -290,7 +290,7 @@ def installed_estimators() -> dict[str, EntryPoint]:
 
 
 def is_foreign(name: str) -> bool:
-    """Tell whether another package brings an estimator, whose code may change the process that loads it."""
+    """True if another package brings an estimator, whose code may change the process that loads it."""
     point = installed_estimators().get(name)
     return (
         point is not None and point.dist is not None and point.dist.name != DISTRIBUTION
@@ -348,10 +348,10 @@ def load_estimator(name: str) -> type[Estimator]:
     >>> load_estimator("ekf-slam").__name__
     'EkfSlam'
     """
-    asked: object = name
-    if not isinstance(asked, str):
+    given: object = name
+    if not isinstance(given, str):
         raise UnknownEstimatorError(
-            f"expected the name of an installed estimator, not {asked!r:.60}"
+            f"expected the name of an installed estimator, not {given!r:.60}"
         )
     loaded, place = ESTIMATORS.load(name)
     missing = missing_of(loaded, ("Params", *METHODS))
@@ -364,7 +364,7 @@ def load_estimator(name: str) -> type[Estimator]:
 def make_candidate(
     kind: type[Estimator] | MakeEstimator, overrides: dict[str, Any], name: str
 ) -> Candidate:
-    """An estimator of this name with some of its settings replaced; `make_params` says how. A function takes none."""
+    """An estimator of this name with some of its settings replaced; in the form of `make_params`. A function takes none."""
     if isinstance(kind, type):
         return Candidate(kind, make_params(kind, overrides, name))
     if overrides:

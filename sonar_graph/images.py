@@ -25,7 +25,7 @@ class SonarFrames:
     """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
 
     ``intensity[i, b, r]`` is the sample of frame i in the beam at ``azimuths_rad[b]`` and the bin at ``ranges_m[r]``.
-    ``calibration.sonar.image`` says whether samples are decibels or amplitudes, and their full scale. A single frame
+    ``calibration.sonar.image`` states whether samples are decibels or amplitudes, and their full scale. A single frame
     is a block with n = 1: ``image[None]``.
 
     Raises

@@ -40,7 +40,7 @@ MOST_M = 1e5
 
 
 class ReadMap(NamedTuple):
-    """A map and what is to be said about it."""
+    """A map and the remarks about it."""
 
     map: KnownMap
     warnings: list[str]
@@ -174,7 +174,7 @@ def map_origin(sequence: Sequence) -> str:
 def in_map(sequence: Sequence, path: Path) -> Sequence:
     """A sequence with the map of a file. Its start is found in the map where the log states no place.
 
-    The note ``log.map`` of the sequence says what was done.
+    The note ``log.map`` of the sequence describes what was done.
     """
     known, warnings = read_map(path)
     start = sequence.calibration.start.in_map()

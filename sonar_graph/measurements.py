@@ -45,7 +45,7 @@ MOST_YAW_RAD = 1e9
 
 FULL_TURN_RAD = 2.0 * np.pi
 """No azimuth lies beyond: half a turn to either side, or a turn where it is counted from 0 on. A sigma of yaw beyond it
-tells nothing (a direction anywhere on the circle has 1.8 rad)."""
+constrains nothing (a direction anywhere on the circle has 1.8 rad)."""
 
 
 def no_posterior(probability: Floats) -> NDArray[np.bool_]:
@@ -66,10 +66,10 @@ def possible_ranges(range_m: Floats) -> NDArray[np.bool_]:
 class Block:
     """Base class of the measurements: columns, arrays whose first axis runs over the rows, with a stamp each.
 
-    The constructor converts types where needed (without a copy where not). A column says in its metadata the ``shape``
+    The constructor converts types where needed (without a copy where not). A column has in its metadata the ``shape``
     of one row, where that is fixed, and whether it must be ``finite``; elsewhere NaN means "not measured".
 
-    Raises `MeasurementError` when there is no row, a column has another shape or type than it says, a number that must
+    Raises `MeasurementError` when there is no row, a column has another shape or type than stated, a number that must
     be finite is not, or stamps are no integers or run backwards.
     """
 
@@ -152,7 +152,7 @@ class Block:
         return block
 
     def between(self, after_ns: int, until_ns: int) -> Self | None:
-        """The rows with ``after_ns < stamp <= until_ns``, or None where there is none."""
+        """The rows with ``after_ns < stamp <= until_ns``, or None without any."""
         first, last = np.searchsorted(
             self.stamps_ns, [after_ns, until_ns], side="right"
         )

@@ -186,7 +186,7 @@ class MotionSource(Protocol):
         """Motion from one instant to another, over gaps too, without the gyro bias (body axes, shape (3,), rad/s).
 
         The attitude ``world_R_i`` at the start, shape (3, 3), serves to remove the Earth's rotation where the
-        calibration says so; None: it is not removed. Rows stamped after ``known_ns``, by default ``end_ns``, are not
+        calibration has a latitude; None: it is not removed. Rows stamped after ``known_ns``, by default ``end_ns``, are not
         used: to an epoch it is final only if that is an instant at which the epoch is reached.
         """
 

@@ -37,7 +37,7 @@ from sonar_graph.states import (
 )
 
 MOST_INSTANTS = 10_000_000
-"""Two months at 2 Hz; a clock that was set meanwhile could ask for all memory."""
+"""Two months at 2 Hz; a clock that was set meanwhile could take all memory."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,7 +67,7 @@ class Sequence:
     depth: Depth | None = None
     detections: LandmarkDetections | None = None
     truth: Trajectory | None = None
-    """Reference poses of the body, or its positions only; `notes` says where they come from."""
+    """Reference poses of the body, or its positions only; `notes` names their origin."""
     true_landmarks: LandmarkMap | None = None
     heading: Heading | None = None
     positions: PositionFixes | None = None

@@ -128,8 +128,8 @@ def settings_of(
 def meanings_of(model: type[BaseModel]) -> dict[str, str]:
     """The text below each field of a class and of its bases, from their source.
 
-    Pydantic reads it for every class that it makes, which takes a third of a second when a comparison begins; it is
-    asked for where settings are listed.
+    Pydantic's own reader (`use_attribute_docstrings`) works at every import, which takes a third of a second when a
+    comparison begins; settings are listed seldom.
     """
     found: dict[str, str] = {}
     for kind in reversed(model.__mro__):
@@ -264,7 +264,7 @@ def choice(name: str, known: Iterable[str], owner: str = "") -> str:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Question after an unknown name whether the most similar known name is meant; a semicolon where none is."""
+    """Question after an unknown name whether the most similar known name is meant; a semicolon if none is similar."""
     similar = max(known, key=partial(_similarity, name), default="")
     return (
         f"; did you mean {similar}?"
@@ -315,7 +315,7 @@ class _Spot(NamedTuple):
     """Without the tags of unions."""
     section: type[BaseModel] | None
     tag: str
-    """Name of the field that tells the options apart; empty where it is no union."""
+    """Name of the field that distinguishes the options; empty where it is no union."""
     value: str
     options: list[type[BaseModel]]
 
@@ -451,12 +451,12 @@ def _template_lines(
         usual = getattr(default, name, usual)
         value = usual if stated is None else getattr(stated, name)
         meaning = _sentence(meanings_of(model).get(name))
-        is_said = stated is not None and (value != usual or default is None)
+        is_stated = stated is not None and (value != usual or default is None)
         shown = value if value is not None else 0.0
         line = f"{prefix}{name} = {toml_value(shown)}"
-        notes = " ".join(filter(None, [meaning, f"({remark})" if is_said else ""]))
+        notes = " ".join(filter(None, [meaning, f"({remark})" if is_stated else ""]))
         lines.append(
-            ("" if is_said else "# ") + line + (f"  # {notes}" if notes else "")
+            ("" if is_stated else "# ") + line + (f"  # {notes}" if notes else "")
         )
     return lines
 

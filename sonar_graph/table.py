@@ -11,7 +11,7 @@ from html import escape
 from sonar_graph.states import ABSENT as ABSENT
 
 RUN_COLOURS = 6
-"""Colours that a page has for runs; the next run begins anew."""
+"""Colours that a page has for runs; the next run begins with the first again."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Cell:
 
     @property
     def sorting(self) -> float | str:
-        """The value by which rows are sorted; empty where there is none."""
+        """The value by which rows are sorted; empty without one."""
         value = self.numbers[0] if self.numbers else self.text
         return value if value == value else ""
 
@@ -116,7 +116,7 @@ def text_table(
 def as_html(table: Table, *, is_sortable: bool = False) -> str:
     """The table as a ``<table>`` element, all texts escaped.
 
-    In a sortable one headings are buttons and cells say their ``sorting``, for the script of a page.
+    In a sortable one headings are buttons and cells have their ``sorting``, for the script of a page.
     """
 
     def named(text: str, run: int | None) -> str:

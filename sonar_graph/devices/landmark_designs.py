@@ -206,7 +206,7 @@ class _Entry(Section):
     def design(self, folder: Path) -> LandmarkDesign:
         """The design, drawn or with its picture from the folder.
 
-        Raises `ValueError` when the picture cannot be read, or the landmark cannot be told from the floor.
+        Raises `ValueError` when the picture cannot be read, or the landmark looks like the floor.
         """
         if self.picture is not None:
             mask = read_picture(folder / self.picture, self.black_db, self.white_db)
@@ -286,7 +286,7 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
     Raises
     ------
     CalibrationError
-        Naming the file and field, when there is none, one is impossible, or two share an identity or look the same.
+        Naming the file and field, when it has no landmark, one is impossible, or two share an identity or look the same.
 
     Examples
     --------

@@ -13,7 +13,7 @@ LARGEST_TEXT = 1 << 27
 
 
 def as_path(value: object, call: str) -> Path:
-    """An argument as a path; an `ArgumentError` that names the expected ``call`` where it is none."""
+    """An argument as a path; an `ArgumentError` that names the expected ``call`` for anything else."""
     if not isinstance(value, str | Path):
         raise ArgumentError(
             f"{call}: expected a path, a str or Path, not {type(value).__name__}"
@@ -56,7 +56,7 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(text_of(path))
     except (OSError, ValueError, RecursionError) as error:
         raise EvaluationError(
-            f"{path}: cannot be read as JSON ({error}); write the comparison anew"
+            f"{path}: cannot be read as JSON ({error}); write the comparison again"
         ) from error
     if not isinstance(content, dict):
         raise EvaluationError(

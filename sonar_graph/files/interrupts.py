@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: noticed where compiled code swallows them, deferred while files change, and told in one line."""
+"""Ctrl-C and SIGTERM: noticed where compiled code swallows them, deferred while files change, and reported in one line."""
 
 import contextlib
 import os

@@ -28,7 +28,7 @@ Tell = Callable[[object], None]
 
 
 class KilledError(Exception):
-    """A process, or what it was asked to do, was ended; the text says how."""
+    """A process, or its work, was ended; the text is the reason."""
 
 
 class OwnProcess:
@@ -82,7 +82,7 @@ class OwnProcess:
         return self._process.pid
 
     def is_alive(self) -> bool:
-        """Tell whether it runs."""
+        """True while it runs."""
         return self._process.poll() is None
 
     def send(self, request: object) -> None:
@@ -92,7 +92,7 @@ class OwnProcess:
             self._requests.flush()
 
     def look(self) -> Any:
-        """The next answer; None if there is none within `LOOK_EVERY_S`.
+        """The next answer; None if none comes within `LOOK_EVERY_S`.
 
         Raises `KilledError` when the process ended, and an answer that is an exception.
         """

@@ -78,7 +78,7 @@ class Manifest(BaseModel):
         path.write_text(self.model_dump_json(indent=1) + "\n", "utf-8")
 
     def owns(self, folder: Path, name: str) -> bool:
-        """Tell whether a file is as this package wrote it, or is empty in its place; true where there is none."""
+        """True if a file is as this package wrote it, or is empty in its place, or is missing."""
         path = folder / name
         if not os.path.lexists(path):
             return True
@@ -90,7 +90,7 @@ class Manifest(BaseModel):
 
 
 def _is_linked(folder: Path, name: str) -> bool:
-    """Tell whether a folder on the way to a file is a link: what is behind it is others'."""
+    """True if a folder on the way to a file is a link: what is behind it is others'."""
     return any((folder / part).is_symlink() for part in Path(name).parents)
 
 
@@ -364,7 +364,7 @@ def others_in(folder: Path) -> list[str]:
 
 
 def _is_service_file(folder: Path, name: str) -> bool:
-    """Tell whether a file is the manifest or the lock; a lock with content is others'."""
+    """True if a file is the manifest or the lock; a lock with content is others'."""
     path = folder / name
     is_lock = name == LOCK and not path.is_symlink() and path.stat().st_size == 0
     return name == MANIFEST or is_lock

@@ -248,7 +248,7 @@ Index = tuple[Place, ...]
 UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = itertools.product(
     np.arange(0, 6, 3), repeat=2
 )
-"""First elements of the blocks of a 6 by 6 array; not literals, for each of which numba would compile anew."""
+"""First elements of the blocks of a 6 by 6 array; not literals: numba would compile a function for each of them."""
 
 SERIES_RAD2 = 1e-2
 """Squared angle below which the series of `curvature` serve: their next terms are below 1e-12."""

@@ -1,4 +1,4 @@
-"""Offset between the clock of sonar images and that of IMU and Doppler log, by what both say of the motion.
+"""Offset between the clock of sonar images and that of IMU and Doppler log, by the motion that both measure.
 
 For step k between frames the images give the motion ahead and the motion across at the middle range r of the image,
 which is what they show best (`sonar_graph.recognition.image_motion`)::
@@ -62,7 +62,7 @@ class ClockOffset:
     steps: int
     """Steps of the images that were compared."""
     correlations: tuple[float, float]
-    """Of the motion ahead and across with what IMU and Doppler log say."""
+    """Of the motion ahead and across with that of IMU and Doppler log."""
     nats: float
     """Logarithm of how much more likely it is than the next best."""
 
@@ -128,7 +128,7 @@ def estimate_offset(
     Raises
     ------
     LogError
-        When the images cannot tell, with the reason.
+        When the images do not determine the offset, with the reason.
     """
     known = [step for step in steps if step.is_measured]
     if len(known) < LEAST_STEPS:
@@ -204,7 +204,8 @@ def _profile(
 ) -> Floats:
     """Likelihood of each offset in nats over no relation, -inf where it is not covered, shape as ``likely``.
 
-    ``moved``: motion of the navigation with an offset, made anew each time: for all offsets it would fill the memory.
+    ``moved``: motion of the navigation with an offset, computed at each call: of all offsets it would fill the
+    memory.
     """
     profile = likely.copy()
     for at in np.flatnonzero(np.isfinite(likely)).tolist():

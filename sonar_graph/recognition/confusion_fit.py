@@ -48,7 +48,7 @@ NONE = -1
 LEAST_FRAMES = 3
 """Labelled frames from which a class is measured."""
 LEAST_FOR_ENDS = 40
-"""Tracks of which one lies beyond each end of the range that holds 95 %."""
+"""So many tracks have one beyond each end of the range that holds 95 %."""
 PRIOR_SHARE = 0.25
 """Standard deviation of what is fitted about the shipped model, as a share of it; of looks, of their logarithm."""
 
@@ -150,7 +150,7 @@ class LabelledSightings:
         sighting = track.sighting
         if sighting is None or sighting.fit is None:
             return
-        # without bounds the accuracy cannot be told from that of other fits
+        # the accuracy is a function of the bounds, which this fit lacks
         if sighting.bound_m is None or sighting.moved_m is None:
             return
         label, at = truth.label_of(sighting)
@@ -244,7 +244,7 @@ def calibrate(
     Raises
     ------
     CalibrationError
-        When a log has no truth, has none of the landmarks, or too few frames of landmarks or of what is none.
+        When a log has no truth, has none of the landmarks, or too few frames of landmarks or of other things.
     LogError
         When a log has no images, or they cannot be read.
     """
@@ -299,9 +299,9 @@ def estimate_confusion(
     """Fit the model to labelled frames, all classes weighing the same, for designs with these ids in their order.
 
     Without the designs themselves, as measured, no recogniser accepts the model. A design with too few frames keeps the
-    row of the confusion matrix that it has without calibration (`confusion_for`), and the provenance says so.
+    row of the confusion matrix that it has without calibration (`confusion_for`), and the provenance names it.
 
-    Raises `CalibrationError` when no landmark has enough frames, or what is none has too few, naming them.
+    Raises `CalibrationError` when no landmark has enough frames, or other things have too few, naming them.
     """
     counts = np.bincount(fits.label, minlength=len(ids) + 1)
     names = [*(f"landmark {i}" for i in ids), "no landmark"]
@@ -421,9 +421,9 @@ def accuracy(
 ) -> Accuracy:
     """Usual bounds along the ray and across, their sigmas there, and the power of the bound, as `Confusion` has them.
 
-    The most probable ones for normal errors of which each track counts once, with a normal prior about the power of the
+    The most probable ones for normal errors, where each track counts once, with a normal prior about the power of the
     given accuracy (`PRIOR_SHARE`) and limits. The usual bound is the geometric mean. Errors of a track repeat, so that
-    n tracks are as many samples, one of which is lost to the height for the range. The variances of the given accuracy
+    n tracks are as many samples, less one for the range, lost to the height. The variances of the given accuracy
     count as ``1 / (2 PRIOR_SHARE^2)`` further ones, from which a sigma is known to `PRIOR_SHARE` of itself.
     """
     known = np.isfinite(error).all(axis=1) & np.isfinite(bound).all(axis=1)
@@ -461,7 +461,7 @@ def accuracy(
 def report_interval_s(
     error: Floats, track_of: Ints, stamp_ns: Ints, prior_s: float
 ) -> float:
-    """Time in which a track tells as much of a place as one independent frame (`Confusion.report_interval_s`).
+    """Time in which a track constrains a place as much as one independent frame (`Confusion.report_interval_s`).
 
     Of errors in sigmas. The mean of a track has the variance c, the mean product of the errors of different frames; 1 /
     c independent frames would have it. A track of T seconds is worth one of them in c T: the mean over tracks and both

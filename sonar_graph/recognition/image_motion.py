@@ -40,7 +40,7 @@ LONGEST_STEP_NS = 2 * NS_PER_S
 """Longest time between frames that can be laid upon each other."""
 FASTEST_RAD_S = math.radians(60.0)
 FASTEST_M_S = 2.0
-"""A vehicle with an imaging sonar neither turns nor drives faster: what says so is a wrong fit."""
+"""A vehicle with an imaging sonar neither turns nor drives faster: such a fit is wrong."""
 UNKNOWN_RAD_S = math.radians(10.0)
 UNKNOWN_M_S = 0.3
 """Standard deviations of a motion that was not measured, about that of the step before."""

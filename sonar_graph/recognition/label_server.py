@@ -136,7 +136,7 @@ class LabelDesk:
         return None
 
     def take_back(self, frame: int) -> str | None:
-        """Remove the last label of a frame; the reason where there is none."""
+        """Remove the last label of a frame; the reason if it has no label."""
         with self._lock:
             stamp_ns = self.frames[frame].stamp_ns
             rows = [
@@ -184,7 +184,7 @@ class LabelServer(ThreadingHTTPServer):
         return f"http://{self.host}/{self.word}/"
 
     def handle_error(self, *_: Any) -> None:
-        """A browser that goes away in the middle of a request is no news."""
+        """A browser that goes away in the middle of a request is no error."""
 
     def page(self, nonce: str) -> str:
         """The page, whose script has this nonce."""
@@ -197,11 +197,11 @@ class _LabelRequest(BaseHTTPRequestHandler):
     timeout = 30
 
     def log_message(self, *_: Any) -> None:
-        """Keep the terminal for what the command says."""
+        """Keep requests out of the terminal, which shows the messages of the command."""
 
     def do_GET(self) -> None:
-        asked = self._asked()
-        if asked == "":
+        requested = self._requested()
+        if requested == "":
             nonce = secrets.token_urlsafe(16)
             policy = (
                 "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; "
@@ -210,11 +210,11 @@ class _LabelRequest(BaseHTTPRequestHandler):
             self._send(
                 self.server.page(nonce).encode(), "text/html; charset=utf-8", policy
             )
-        elif asked == "state":
+        elif requested == "state":
             self._send_json(self.server.desk.state())
         elif (
-            asked is not None
-            and (number := self._frame_of(asked.removeprefix("frame/"))) is not None
+            requested is not None
+            and (number := self._frame_of(requested.removeprefix("frame/"))) is not None
         ):
             self._send(self.server.desk.frames[number].jpeg, "image/jpeg")
         else:
@@ -222,14 +222,14 @@ class _LabelRequest(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         desk = self.server.desk
-        asked = self._asked()
+        requested = self._requested()
         content = self._content()
         number = None if content is None else self._frame_of(str(content.get("frame")))
-        if asked not in ("label", "take-back"):
+        if requested not in ("label", "take-back"):
             self._refuse(HTTPStatus.NOT_FOUND)
         elif content is None or number is None:
             self._refuse(HTTPStatus.BAD_REQUEST)
-        elif asked == "take-back":
+        elif requested == "take-back":
             self._answer(partial(desk.take_back, number))
         else:
             column, row, landmark = (
@@ -252,11 +252,11 @@ class _LabelRequest(BaseHTTPRequestHandler):
             fault = change()
         except (
             Exception
-        ) as error:  # such as a full disk: the page says so, and nothing is lost
+        ) as error:  # such as a full disk: the page shows it, and nothing is lost
             fault = f"not saved: {error}"
         self._send_json(self.server.desk.state() | {"fault": fault})
 
-    def _asked(self) -> str | None:
+    def _requested(self) -> str | None:
         """Path after the word; None where the word or the host is another."""
         if self.headers.get("Host") not in (
             self.server.host,
@@ -272,7 +272,7 @@ class _LabelRequest(BaseHTTPRequestHandler):
         )
 
     def _content(self) -> dict[str, Any] | None:
-        """JSON object of a request; None where it is none, is too long, or comes from another page."""
+        """JSON object of a request; None if it is something else, is too long, or comes from another page."""
         length = self.headers.get("Content-Length", "")
         is_json = self.headers.get("Content-Type") == "application/json"
         if not (length.isdecimal() and int(length) <= MOST_BYTES):

@@ -12,8 +12,8 @@ labelled sightings, as a log with known truth does (`sonar_graph.recognition.con
 A click errs by a centimetre, more than the recogniser does. With the distance d of the labels' mean place from the
 median one of the track's sightings, and V the variance of such means by the scatter of the labels of a track (that of
 `CLICK_SIGMA_M` where no track has two), the true place is taken as the sightings' plus
-``max(0, 1 - mean V / mean d^2) d`` (James and Stein 1961): labels tell an error that all tracks share only as far as it
-exceeds their own. Errors of the motion that carries a place add to the model's sigmas, which so are rather too large.
+``max(0, 1 - mean V / mean d^2) d`` (James and Stein 1961): labels correct an error that all tracks share only as far as
+it exceeds their own. Errors of the motion that carries a place add to the model's sigmas, which so are rather too large.
 """
 
 import csv
@@ -57,7 +57,7 @@ COLUMNS = ("stamp_ns", "range_m", "azimuth_rad", "id")
 NEAR_M = 0.2
 """Distance of a candidate up to which a label is of it."""
 CLICK_SIGMA_M = 0.01
-"""Standard deviation of a label along each axis, where labels do not tell it."""
+"""Standard deviation of a label along each axis, where labels do not determine it."""
 MOST_ROWS = 8
 """Rows of labels that a message lists."""
 OUTSIDE = "outside of the image"
@@ -68,9 +68,9 @@ IN_DEGREES = (
 )
 NO_TRACK = "no track there"
 CONTRADICTED = "contradicts other labels of its track, so left out"
-"""Why labels tell nothing."""
+"""Reasons why labels are not used."""
 NOWHERE = TrueObjects(np.array([-1]), np.array([1e9]), np.array([0.0]))
-"""True landmarks around what is none: one that is far away."""
+"""True landmarks around other things: one that is far away."""
 
 
 class Label(Section):
@@ -109,7 +109,7 @@ def read_labels(path: Path, log: Path) -> Labels:
 
     Examples
     --------
-    A landmark, and something that is none:
+    A landmark, and something else:
 
     >>> from pathlib import Path
     >>> from sonar_graph.recognition import read_labels
@@ -178,7 +178,7 @@ class LabelledTrack:
         return {label.id for _, label in self.labels}
 
     def drop_contradictions(self) -> list[int]:
-        """Leave out several identities in one frame, and those that fewer than half of the rest say; their rows."""
+        """Leave out several identities in one frame, and those of fewer than half of the rest; their rows."""
         said_at: dict[int, set[int | None]] = defaultdict(set)
         for _, label in self.labels:
             said_at[label.stamp_ns].add(label.id)
@@ -252,7 +252,7 @@ def calibrate_by_labels(
     params: RecogniserParams | None = None,
     salvage: bool = False,
 ) -> Confusion:
-    """Measure the model of recognition on logs with labels; its provenance says of each file what labels met.
+    """Measure the model of recognition on logs with labels; its provenance counts the labels of each file that met a track.
 
     The other parameters are those of `calibrate`.
 
@@ -289,7 +289,7 @@ def calibrate_by_labels(
         provenance[f"labels {log}"] = (
             f"{spelt(one.file.name)}: {what_labels_met(given, unmet)}"
         )
-        # those that nobody labelled tell nothing
+        # a track without a label, or with two identities, has no known class
         sure = {
             number: track for number, track in tracks.items() if len(track.ids) == 1
         }
@@ -313,21 +313,21 @@ def calibrate_by_labels(
 
 
 def what_labels_met(given: int, unmet: dict[str, list[int]]) -> str:
-    """How many of the labels met a track, and the rows (from 1) of those that tell nothing, by reason."""
+    """How many of the labels met a track, and the rows (from 1) of those not used, by reason."""
     missed = sum(len(rows) for reason, rows in unmet.items() if reason != CONTRADICTED)
-    said = [f"{given - missed} of {given} labels met a track of the recogniser"]
+    parts = [f"{given - missed} of {given} labels met a track of the recogniser"]
     for reason, rows in sorted(unmet.items(), key=lambda item: min(item[1], default=0)):
         if rows:
             listed = ", ".join(map(str, sorted(rows)[:MOST_ROWS]))
             more = f" and {len(rows) - MOST_ROWS} more" if len(rows) > MOST_ROWS else ""
-            said.append(f"row{'s' if len(rows) > 1 else ''} {listed}{more}: {reason}")
-    return "; ".join(said)
+            parts.append(f"row{'s' if len(rows) > 1 else ''} {listed}{more}: {reason}")
+    return "; ".join(parts)
 
 
 def _labelled_tracks(
     log: LabelledLog, recogniser: Recogniser, blocks: Iterable[SonarFrames]
 ) -> tuple[dict[int, LabelledTrack], dict[str, list[int]]]:
-    """Tracks by number, with the labels that they met, and the rows (from 1) of labels that tell nothing, by reason."""
+    """Tracks by number, with the labels that they met, and the rows (from 1) of labels not used, by reason."""
     used: deque[SonarFrames] = deque(maxlen=1)
     session = RecognitionSession(
         log.run,
@@ -371,7 +371,11 @@ def _labelled_tracks(
                 )
                 places = {NO_TRACK: label, IN_DEGREES: in_radians} if used else {}
                 reason = next(
-                    (said for said, at in places.items() if _is_within(used[0], at)),
+                    (
+                        reason
+                        for reason, at in places.items()
+                        if _is_within(used[0], at)
+                    ),
                     OUTSIDE,
                 )
                 unmet[reason].append(row)

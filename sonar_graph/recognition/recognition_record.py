@@ -105,10 +105,10 @@ class Recognition:
             else set(np.unique(self.detections.candidate_ids).tolist())
         )
         never = ", ".join(map(str, sorted(looked_for - named.keys())))
-        said = [*counts, f"none of them: {named[NONE]}"]
+        shares = [*counts, f"none of them: {named[NONE]}"]
         lines = (
             [
-                f"Most probable: {', '.join(said)}{f'; never: landmark {never}' if never else ''}"
+                f"Most probable: {', '.join(shares)}{f'; never: landmark {never}' if never else ''}"
             ]
             if named
             else []
@@ -221,7 +221,7 @@ def write_recognition(recognition: Recognition | None, folder: Path) -> None:
 
 
 def read_recognition(folder: Path) -> Recognition | None:
-    """Read the files of `write_recognition`, without detections; None where there are none."""
+    """Read the files of `write_recognition`, without detections; None for a folder without them."""
     if not (folder / RECOGNITION).is_file():
         return None
     entry: dict[str, Any] = read_json(folder / RECOGNITION)

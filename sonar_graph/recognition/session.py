@@ -124,7 +124,7 @@ def recognise(
     Returns
     -------
     Sequence
-        A copy of the sequence; earlier detections are replaced, and the notes say how these were made.
+        A copy of the sequence; earlier detections are replaced, and the notes describe how these were made.
 
     Raises
     ------
@@ -408,7 +408,7 @@ class RecognitionSession:
         return result
 
     def _may_show_floor(self, frame: SonarFrames, view: FloorView) -> bool:
-        """Tell whether the floor lies within the vertical aperture at any range ahead."""
+        """True if the floor lies within the vertical aperture at any range ahead."""
         ranges_m = frame.ranges_m
         q = view.floor_points(
             ranges_m, np.full(len(ranges_m), float(np.median(frame.azimuths_rad)))

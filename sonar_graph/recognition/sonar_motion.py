@@ -17,7 +17,7 @@ GRAVITY_INTERVAL_NS = NS_PER_S
 KEPT_NS = 60 * NS_PER_S
 """Rows of a live run that are kept before the last frame, for a sensor that is late."""
 KNOWN_HEIGHT_M = 0.1
-"""Sigma of a start's height up to which it tells where the floor is, before the first depth sample."""
+"""Sigma of a start's height up to which it gives the place of the floor, before the first depth sample."""
 _NO_BIAS = np.zeros(3)
 
 
@@ -157,11 +157,11 @@ class SonarMotions:
             self._odometry.forget_before(settled_ns - KEPT_NS)
 
     def covers(self, stamp_ns: int) -> bool:
-        """True for an instant with IMU and Doppler log, not before the last one asked for."""
+        """True for an instant with IMU and Doppler log, not before the last one that was requested."""
         return self._start_ns <= stamp_ns <= self._end_ns and not self.passed(stamp_ns)
 
     def passed(self, stamp_ns: int) -> bool:
-        """True for an instant before the last one asked for."""
+        """True for an instant before the last one that was requested."""
         return not self._is_first and stamp_ns < self._stamp_ns
 
     def at(self, stamp_ns: int) -> tuple[SonarStep | None, FloorView | None]:

@@ -20,7 +20,7 @@ MOST_EXAMPLES = 6
 EXAMPLE_PERIOD_NS = 5 * NS_PER_S
 """Least time between these."""
 BETTER = 0.05
-"""Rise of the visible share with which a track is drawn anew."""
+"""Rise of the visible share from which on a track is drawn again."""
 
 
 @dataclass
@@ -107,7 +107,7 @@ class TrackStories:
 
 
 class _Views:
-    """Pictures of places in one frame, drawn when the first is asked for."""
+    """Pictures of places in one frame, drawn with the first of them."""
 
     def __init__(self, frame: SonarFrames, image: SonarImage, fan: Fan) -> None:
         self._frame = frame

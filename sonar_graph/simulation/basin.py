@@ -2,7 +2,7 @@
 
 Four landmarks lie on the floor of a basin of 20 m × 14 m × 1.7 m, at (5, 0), (7, -5), (2, -7) and (0, -2). A vehicle
 with an imaging sonar tilted 30° down drives around them three times in 2039 s at about 0.15 m/s. The route, the square
-of 7 m through the landmarks with a stop before each, is this project's: docs/theory/simulation.md says why.
+of 7 m through the landmarks with a stop before each, is this project's, for the reasons in docs/theory/simulation.md.
 
 Source: "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks", 2014.
 """

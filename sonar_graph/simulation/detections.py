@@ -190,7 +190,7 @@ def simulate_detections(
     """Landmark detections in the sonar frames at ``stamps_ns``; None where there was not one.
 
     The posterior of a recognised detection is 0.97 for its identity and 0.02 spread evenly over the other landmarks
-    (0.01 says "none of them"); that of a false one is 0.20 spread at random over all landmarks (0.80 says "none").
+    (0.01 is "none of them"); that of a false one is 0.20 spread at random over all landmarks (0.80 is "none").
     False detections belong to no track. Path and world are the truth; there is one stamp a frame, shape (n,).
     """
     true_rng, false_rng = rng.spawn(2)

@@ -72,11 +72,11 @@ class SimulationOptions(Section):
     dvl: DvlName = "workhorse"
     """Doppler log preset."""
     gyro_bias_scale: float = Field(1.0, ge=0)
-    """Times the preset's gyro bias and its random walk; 0: none, and estimators are told so."""
+    """Times the preset's gyro bias and its random walk; 0: none, and estimators know it."""
     accel_bias_scale: float = Field(1.0, ge=0)
-    """Times the preset's accelerometer bias; 0: none, and estimators are told so."""
+    """Times the preset's accelerometer bias; 0: none, and estimators know it."""
     dvl_scale_error: float = Field(0.0, gt=-0.5, lt=0.5)
-    """Relative error of all velocities (0.007 reads 0.7 % too fast); estimators are not told."""
+    """Relative error of all velocities (0.007 reads 0.7 % too fast); estimators do not know it."""
     dvl_dropouts_per_hour: float = Field(0.0, ge=0)
     """Losses of bottom lock."""
     dvl_dropout_s: float = Field(3.0, gt=0)
@@ -108,4 +108,4 @@ class SimulationOptions(Section):
     start_rotation_sigma_rad: float = Field(0.005, gt=0)
     """The same for its rotation, about each body axis."""
     floor_sigma_m: float = Field(0.01, gt=0)
-    """Landmark heights are drawn about the floor with this sigma, and estimators are told so."""
+    """Landmark heights are drawn about the floor with this sigma, and estimators know it."""

@@ -1,6 +1,6 @@
 """Recording of all sensors along a true path, as a `Sequence`.
 
-Each sensor draws from a random stream of its own, so that changing one (the sonar's frame rate, say) leaves the noise
+Each sensor draws from a random stream of its own, so that changing one (such as the sonar's frame rate) leaves the noise
 of all others as it was.
 """
 
@@ -97,7 +97,7 @@ def record(
 ) -> Sequence:
     """Simulate all measurements along a path, with the truth and the calibration that holds for them.
 
-    Path and world are the truth; the notes say where values come from, beside generator and options.
+    Path and world are the truth; the notes name the origin of values, the generator and its options.
 
     Raises `SimulationError` when options of tracks are set without ``tracks``.
     """
@@ -171,7 +171,7 @@ def true_calibration(
     world: World,
     rng: np.random.Generator,
 ) -> Calibration:
-    """The noise that is simulated, and a start drawn about the true one, so that its error is as large as it says."""
+    """The noise that is simulated, and a start drawn about the true one, so that its error matches its sigma."""
     preset = IMU_PRESETS[options.imu]
     sigma_m_s = DVL_PRESETS[options.dvl].velocity_sigma_m_s
     imu = preset.model_copy(

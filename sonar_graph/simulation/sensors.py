@@ -1,6 +1,6 @@
 """Readings of an IMU, a Doppler log and a pressure sensor along a true motion, with noise and faults.
 
-Samples are instantaneous values at their stamps. The Earth's rotation is left out, and the calibration does not ask
+Samples are instantaneous values at their stamps. The Earth's rotation is left out, and the calibration does not require
 estimators to remove it. docs/theory/simulation.md
 """
 

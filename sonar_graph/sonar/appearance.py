@@ -1,9 +1,9 @@
-"""Appearance of candidates: best place and heading of every design in the image around them, and what speaks for it.
+"""Appearance of candidates: best place and heading of every design in the image around them, and the evidence for it.
 
 The image is sampled on a square grid of the floor, where foreshortening and the shape of the fan drop out; its x axis
 points away from the sonar, along the line of sight. Designs are templates on the same grid
-(`sonar_graph.sonar.templates`), and the correlation with them finds place and heading. What speaks for a design there,
-against anything else, is `sonar_graph.sonar.evidence`. Derivation: docs/theory/recognition.md.
+(`sonar_graph.sonar.templates`), and the correlation with them finds place and heading. The evidence for a design
+there, against anything else, is in `sonar_graph.sonar.evidence`. Derivation: docs/theory/recognition.md.
 """
 
 import math
@@ -66,7 +66,7 @@ class DesignFit:
     """Fit of each design to a patch."""
 
     evidence: Floats
-    """What speaks for each design, in the columns of `sonar_graph.sonar.evidence.EVIDENCE`, shape (designs, 11)."""
+    """Evidence for each design, in the columns of `sonar_graph.sonar.evidence.EVIDENCE`, shape (designs, 11)."""
     visible: float
     """Share of the cells in view at the best fit of all."""
     heading_rad: Floats

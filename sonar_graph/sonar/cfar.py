@@ -193,7 +193,7 @@ def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
 
 
 SPREADS_DB = np.linspace(0.05, 12.0, 240)
-"""Spreads of which offsets are tabled."""
+"""Spreads at which offsets are tabulated."""
 
 
 @lru_cache(maxsize=16)

@@ -1,6 +1,6 @@
 """Measured model of recognition: how much each piece of evidence counts, and how often landmarks look like which.
 
-Classes and features are the designs in their order, last "none". With phi_k what speaks for design k in a frame
+Classes and features are the designs in their order, last "none". With phi_k the evidence for design k in a frame
 (`sonar_graph.sonar.evidence.EVIDENCE`) and w the weights, which all designs share::
 
     l_k = w . phi_k        l_none = 0        log odds of a track that always looks like this
@@ -81,7 +81,7 @@ class Confusion(Section):
     roughness: tuple[float, float] | None = None
     """2.5 and 97.5 % quantiles, over tracks, of their mean evidence `beyond`; None: not measured."""
     doubt: float = Field(5e-4, ge=0, lt=1)
-    """Share of tracks whose looks tell nothing: what was never seen in n tracks may still happen in 1 / 2n of them."""
+    """Share of tracks whose frames hold no evidence: what was never seen in n tracks may still happen in 1 / 2n of them."""
     range_sigma_m: float = Field(gt=0, allow_inf_nan=False)
     """Standard deviation of the range in a frame whose bound of it is `range_bound_m`."""
     across_sigma_m: float = Field(gt=0, allow_inf_nan=False)
@@ -95,7 +95,7 @@ class Confusion(Section):
     height_bias_m: float = Field(0.0, gt=-1, lt=1)
     """Height of the faces that sound sees over the heights of the true landmarks."""
     report_interval_s: float = Field(0.0, ge=0, allow_inf_nan=False)
-    """Time in which a track tells as much of a place as one independent frame; 0: its frames are independent."""
+    """Time in which a track constrains a place as much as one independent frame; 0: its frames are independent."""
     provenance: Mapping[str, str] = Field(default_factory=dict)
     """Source of the frames, counts by class, assumptions."""
 
@@ -249,7 +249,7 @@ def read_confusion(path: Path) -> Confusion:
 
 
 def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
-    """The model that ships for the designs that ship; for others an assumed one, which says so in its provenance.
+    """The model that ships for the designs that ship; for others an assumed one, marked so in its provenance.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What speaks for a design at its best place, against anything else that may lie on the floor.
+"""Evidence for a design at its best place, against anything else that may lie on the floor.
 
 A patch is explained by figures with unknown levels. With B the bright parts of a design at its heading (its figure), D
 its dark parts, B_q the figure stretched by `STRETCHES`, S and S_q the floor behind a figure, which something tall would
@@ -43,7 +43,7 @@ Bytes = NDArray[np.uint8]
 
 
 class Evidence(NamedTuple):
-    """What speaks for a design, one number a piece."""
+    """Evidence for a design, one number a feature."""
 
     prior: float
     """1."""
@@ -63,7 +63,7 @@ class Evidence(NamedTuple):
     """Root of ``ln R(without D) / R(design)``, or of ``ln R(without B) / R(design)`` where that is less: a plate alone
     is no landmark."""
     bare: float
-    """1 for a design without dark parts, which no plate can speak for."""
+    """1 for a design without dark parts, for which no plate is evidence."""
     rival: float
     """Logarithm of the least R(covered) of all designs over that of this one, as shares of what one level leaves."""
     covered: float
@@ -655,7 +655,7 @@ class Covered(NamedTuple):
 def least_covered(
     view: View, values: Bytes, uncovered: Bytes, kept: Floats, products: Products, fit: DesignFitted
 ) -> Covered:  # fmt: skip
-    """Least sum of squares that a figure leaves of which all beyond a straight edge is covered, and that edge.
+    """Least sum of squares that a figure leaves when all of it beyond a straight edge is covered, and that edge.
 
     The floor and D are taken out of the figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``.
     """

@@ -41,7 +41,7 @@ class RangeWindow(NamedTuple):
         )
 
     def is_like(self, other: RangeWindow) -> bool:
-        """True for the same bins and beams, up to what a driver computes anew for every ping."""
+        """True for the same bins and beams, up to rounding in a driver that computes them for every ping."""
         return self.shares_arrays(other) or all(
             len(own) == len(others)
             and bool(

@@ -29,7 +29,7 @@ from sonar_graph.measurements import Floats
 class FloorView:
     """A sonar over a level floor.
 
-    Level axes have their origin at the sonar, z up and x horizontal, along the centre beam or where `turned` says; the
+    Level axes have their origin at the sonar, z up and x horizontal, along the centre beam or the bearing of `turned`; the
     floor is the plane ``z = -height_m``.
 
     Raises

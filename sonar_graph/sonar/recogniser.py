@@ -224,7 +224,7 @@ class Recogniser:
         """Last report of each track."""
 
     def prepare(self, frame: SonarFrames) -> None:
-        """Draw the templates that frames with these ranges and beams may need, while nobody waits."""
+        """Draw the templates that frames with these ranges and beams may need, before the first of them arrives."""
         sonar = self._calibration.sonar
         tilt_rad = abs(sonar.mounting.rpy_rad[1])
         half_rad = sonar.elevation_aperture_rad / 2 + PITCH_RAD
@@ -400,7 +400,7 @@ class Recogniser:
             "detections.model": "; ".join(
                 f"{k}: {v}" for k, v in self.confusion.provenance.items()
             )
-            or "not said",
+            or "unknown",
         }
 
 

@@ -25,7 +25,7 @@ Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 MEDIAN_TO_SIGMA = 1.4826
 LEAST_SPREAD_DB = 0.2
-"""Below it a level cannot be told from its quantisation."""
+"""Smaller differences of level are lost in the quantisation."""
 STEPS_PER_DB = 8.0
 DEVIATION_STEPS_PER_DB = 40.0
 LARGEST_WINDOW = 127

@@ -220,7 +220,7 @@ def middle_m(design: LandmarkDesign, heading_rad: float) -> Floats:
 
 
 def check_headings(designs: Sequence[LandmarkDesign]) -> None:
-    """Refuse designs of which nothing tells where the middle of their square is.
+    """Refuse designs whose image does not show where the middle of their square is.
 
     A figure beside it that looks the same turned by `TURNED_RAD` and more, with its dark parts, may belong to several
     middles. Raises `CalibrationError` naming the design.

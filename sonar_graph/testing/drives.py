@@ -99,7 +99,7 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
 
 
 def aided_world() -> Sequence:
-    """Left turn with heading and position fixes as well, of which every second row states its noise.
+    """Left turn with heading and position fixes as well; every second row of these states its noise.
 
     Examples
     --------
@@ -154,8 +154,8 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     Examples
     --------
     >>> from sonar_graph.testing import misnamed_world
-    >>> said, probability = misnamed_world().detections.most_probable()
-    >>> said[:2], int((said < 0).sum())
+    >>> named, probability = misnamed_world().detections.most_probable()
+    >>> named[:2], int((named < 0).sum())
     (array([ 9, 11]), 6)
     """
     world = small_world()
@@ -164,13 +164,13 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     assert rows is not None
     frame, place = np.divmod(np.arange(len(rows)), len(LANDMARKS_M))
     track = frame // TRACK_FRAMES * len(LANDMARKS_M) + place
-    said = noise.choice(["right", "wrong", "nothing"], len(rows), p=[0.7, 0.2, 0.1])
-    said = np.where(
-        frame < MISNAMED_FRAMES, "wrong", said[track] if is_tracked else said
+    named = noise.choice(["right", "wrong", "nothing"], len(rows), p=[0.7, 0.2, 0.1])
+    named = np.where(
+        frame < MISNAMED_FRAMES, "wrong", named[track] if is_tracked else named
     )
     names = np.array(list(LANDMARKS_M), dtype=np.int64)
     wrong = names[(place + 1) % len(names)]
-    ids = np.select([said == "wrong", said == "nothing"], [wrong, -1], names[place])
+    ids = np.select([named == "wrong", named == "nothing"], [wrong, -1], names[place])
     misnamed = replace(
         rows, candidate_ids=ids[:, None], track=track if is_tracked else rows.track
     )

@@ -53,7 +53,7 @@ SYMMETRY = 1e-9
 
 
 class ContractError(AssertionError):
-    """An estimator breaks the contract; the message says how.
+    """An estimator breaks the contract; the message names the law.
 
     Examples
     --------
@@ -99,10 +99,10 @@ def run(
     *,
     ask_every: int = 0,
 ) -> EstimatorRun:
-    """Run a fresh estimator over a sequence, cut at the instants, and ask for all results at the end.
+    """Run a fresh estimator over a sequence, cut at the instants, and request all results at the end.
 
-    ``ask_every``: also ask twice after every so many steps, and again at the end; 0: only at the end.
-    Raises `ContractError` when the answers to one question, asked twice, differ.
+    ``ask_every``: also request them twice after every so many steps, and again at the end; 0: only at the end.
+    Raises `ContractError` when two requests of the same results differ.
     """
     estimator = fresh(make, sequence.calibration)
     estimates: list[Estimate] = []
@@ -397,9 +397,9 @@ def same_input_gives_same_output(make: MakeEstimator) -> None:
 
 
 def asking_changes_nothing(make: MakeEstimator) -> None:
-    """Trajectory, landmarks and detections may be asked for at any time, and twice: not a bit of anything changes.
+    """Trajectory, landmarks and detections may be requested at any time, and twice: not a bit of anything changes.
 
-    Also where identities are wrong or missing, and an estimator may revise them when it is asked.
+    Also where identities are wrong or missing, and an estimator may revise them at a request.
     """
     for world, every in (
         (aided_world(), 1),

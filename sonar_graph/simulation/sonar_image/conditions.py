@@ -70,7 +70,7 @@ class SceneConditions(Section):
     """Sigma about each axis of the sonar's rotation against the one in the log, drawn once a run; estimators are not
     told."""
     altitude_error_m: float = Field(0.0, ge=0, le=0.3)
-    """Sigma of the sonar's height against the one in the log, drawn once a run; estimators are not told."""
+    """Sigma of the sonar's height against the one in the log, drawn once a run; estimators do not know it."""
 
     @model_validator(mode="before")
     @classmethod

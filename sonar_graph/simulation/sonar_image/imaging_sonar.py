@@ -151,14 +151,14 @@ class ImageOptions(SceneConditions):
     the four lowest identities lie there, in the order of their identities at (5, 0), (7, -5), (2, -7) and (0, -2).
     None: those that ship."""
     speckle: Literal["world", "frame"] = "world"
-    """world: scatterers stay where they are, so that speckle changes only as the vehicle moves; frame: drawn anew for
+    """world: scatterers stay where they are, so that speckle changes only as the vehicle moves; frame: drawn for
     each frame, as many simulators do."""
     side_lobes: bool = True
     """Side lobes of the beams in azimuth; off: Gaussian beams of the same width."""
     cross_talk_db: float | None = -25.0
     """Power from all beams fired together with one, against its own; None: none."""
     measured_lens: bool = True
-    """The log has the true azimuths of the beams; off: it says that they are equally spaced."""
+    """The log has the true azimuths of the beams; off: it has equally spaced ones."""
     floor_db: float = 40.0
     """Level of the floor at 2 m in the middle of the fan, over the lowest sample."""
     absorption_db_m: float = Field(0.8, ge=0)
@@ -178,9 +178,9 @@ class ImageOptions(SceneConditions):
     drop_probability: float = Field(0.01, ge=0, lt=1)
     """Share of the frames that are never recorded."""
     time_offset_s: float = 0.0
-    """Delay of the stamps; estimators are not told. Real drivers: 0.02 to 0.1."""
+    """Delay of the stamps; estimators do not know it. Real drivers: 0.02 to 0.1."""
     sound_speed_error: float = Field(0.0, gt=-0.1, lt=0.1)
-    """Relative error of the sound speed with which times become ranges; estimators are not told."""
+    """Relative error of the sound speed with which times become ranges; estimators do not know it."""
     stones: int = Field(4, ge=0, le=6)
     """Rounded stones on the route, up to 6 cm high."""
     decoys: int = Field(4, ge=0, le=6)

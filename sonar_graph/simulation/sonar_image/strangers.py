@@ -1,6 +1,6 @@
 """Unknown objects by name: natural ones, and ones that look like landmarks.
 
-Sizes are those of landmarks (0.1 to 0.4 m), levels and heights what such things might have; none is measured.
+Sizes are those of landmarks (0.1 to 0.4 m), levels and heights what such things might have, not measured ones.
 """
 
 from collections.abc import Callable, Sequence

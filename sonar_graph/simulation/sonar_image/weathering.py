@@ -1,6 +1,6 @@
 """Landmarks as years under water leave them: weaker foam, growth and sediment, in patches.
 
-A patch is where a smooth Gaussian random field exceeds its own quantile, so that the share of the area is as asked.
+A patch is where a smooth Gaussian random field exceeds its own quantile, so that it covers the wanted share of the area.
 """
 
 from dataclasses import replace
