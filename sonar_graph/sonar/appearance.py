@@ -135,6 +135,7 @@ class Appearance:
         self.designs = len(designs)
         self._designs = tuple(designs)
         self._blur_m = blur_m
+        # drawn once for a resolution: the search runs over them in every frame
         templates = Templates.of(
             designs, self.params.cell_m, self.params.margin_m, blur_m
         )
@@ -169,6 +170,7 @@ class Appearance:
         best = find_places(patch, self._search, self.params.least_searched)
         if best.visible < self.params.least_visible:
             return None
+        # the search used half of the dark parts; evidence fits their level
         found = self.figures.evidence(patch, best.template, best.cell)
         if found is None:
             return None
@@ -199,23 +201,28 @@ class Appearance:
         edge = int(fit.edge[design])
         to_middle_m = self._to_middle_m[row]
         origin = self._rim + self._steps
+        # from the far edge at the top to where the ray meets the plane again, in that plane
         shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
         shade = min(shadow_m / cell_m * FINE / SHADE_FINE, LONGEST_SHADOW)
         relief = self._relief(design, row, int(shade))
+        # two lengths of the shadow are drawn; in between they are interpolated
         lit = Lit(relief_m * grazing_slope, shade - int(shade))
         start = (fit.centre_m[design] - to_middle_m - patch.centre_m) / cell_m + origin
         place, bound = relief.place(patch, self._compared, start, lit)
         moved_m = np.zeros(2)
+        # part of the figure seems covered: place the rest, and count the difference as an error
         if edge >= 0:
             half = self.templates.side // 2
             x_m, y_m = (cell_m * (one - half) for one in self._compared)
             is_kept = self.figures.is_kept(row, edge, x_m, y_m)
             kept = (self._compared[0][is_kept], self._compared[1][is_kept])
             of_kept, bound_of_kept = relief.place(patch, kept, place, lit)
+            # too few cells of the rest are in view: keep the place of the whole
             if np.isfinite(bound_of_kept).all():
                 moved_m = cell_m * (of_kept - place)
                 place = of_kept
                 bound = bound_of_kept
+        # an error of the heading turns the way from the figure to the middle
         turned_m = HEADING_SIGMA_RAD * np.array([-to_middle_m[1], to_middle_m[0]])
         return Placed(
             centre_m=patch.centre_m + cell_m * (place - origin) + to_middle_m,
@@ -238,6 +245,7 @@ class Appearance:
 def numbered_places(side: int) -> Ints:
     """`Search.row` of so many places along each axis."""
     is_start = np.arange(side) % COARSE == 0
+    # the starts first, so that their rows are one block of a matrix product
     order = np.argsort(~(is_start[:, None] & is_start), axis=None, kind="stable")
     return np.argsort(order).reshape(side, side)
 
@@ -273,6 +281,7 @@ def find_places(patch: Patch, search: Search, least_searched: float) -> BestPlac
         for y in range(0, places, COARSE):
             lay(laid, search, x, y)
     found = coarse_correlations(laid, search)
+    # for designs that correlate nowhere
     template = search.first[:-1].copy()
     cell = np.zeros((designs, 2), np.int64)
     top = np.zeros((designs, 2))
@@ -283,6 +292,7 @@ def find_places(patch: Patch, search: Search, least_searched: float) -> BestPlac
     for x in range(0, places, COARSE):
         for y in range(0, places, COARSE):
             row = search.row[x, y]
+            # at the rim of the image few cells correlate with anything
             if laid.sums[row, 0] < least_searched * cells:
                 continue
             for k in range(designs):
@@ -312,6 +322,7 @@ def unlaid(patch: Patch, search: Search) -> Laid:
         total += level_db[at]
         count += seen[at]
         is_cut = is_cut or seen[at] < 1
+    # correlations do not depend on the mean; single precision does
     mean = np.float32(total / max(count, 1.0))
     patch_db = np.empty(len(seen), np.float32)
     for at in range(len(seen)):
@@ -332,6 +343,7 @@ def unlaid(patch: Patch, search: Search) -> Laid:
 def lay(laid: Laid, search: Search, x: int, y: int) -> None:
     """Fill in the row of one place."""
     row = search.row[x, y]
+    # one offset: cells are numbered row by row
     shift = x * search.patch_side + y
     cells = search.cells
     patch_db = laid.patch_db
@@ -353,6 +365,7 @@ def coarse_correlations(laid: Laid, search: Search) -> Floats32:
     """Correlations of all templates at the places from which the search climbs, shape (places, templates)."""
     rows = ((len(search.row) + COARSE - 1) // COARSE) ** 2
     templates = len(search.pictures)
+    # in blocks small enough that OpenBLAS stays on one core
     most = max(1, MOST_MULTIPLICATIONS // search.pictures.size)
     found = np.empty((rows, templates), np.float32)
     sums = laid.sums
@@ -361,6 +374,7 @@ def coarse_correlations(laid: Laid, search: Search) -> Floats32:
         ab = np.dot(laid.level_db[begin:end], search.pictures.T)
         b = search.sums[:1]
         bb = search.sums[1:]
+        # sums over a template depend on which of its cells are seen
         if laid.is_cut:
             b = np.dot(laid.held[begin:end], search.pictures.T)
             bb = np.dot(laid.held[begin:end], search.squares.T)
@@ -378,6 +392,7 @@ def coarse_correlations(laid: Laid, search: Search) -> Floats32:
 def climb(laid: Laid, search: Search, template: int, cell: Ints, top: Floats) -> None:
     """Move a template's place uphill, cell by cell, and fill in the top beside it."""
     places = len(search.row)
+    # each place is computed once
     known = np.full(search.row.shape, np.nan)
     x = cell[0]
     y = cell[1]
@@ -402,6 +417,7 @@ def climb(laid: Laid, search: Search, template: int, cell: Ints, top: Floats) ->
     top[0] = x
     top[1] = y
     if 0 < x < places - 1:
+        # the top between cells, where both neighbours are known
         top[0] += parabola_top(known[x - 1, y], known[x, y], known[x + 1, y])
     if 0 < y < places - 1:
         top[1] += parabola_top(known[x, y - 1], known[x, y], known[x, y + 1])
@@ -411,6 +427,7 @@ def climb(laid: Laid, search: Search, template: int, cell: Ints, top: Floats) ->
 def correlation_at(laid: Laid, search: Search, template: int, x: int, y: int) -> float:
     """Correlation of one template at one place."""
     row = search.row[x, y]
+    # the search has laid the starts only
     if laid.sums[row, 0] == 0:
         lay(laid, search, x, y)
     picture = search.pictures[template]
@@ -518,11 +535,13 @@ class CandidateFit:
     ) -> list[ObjectSighting | None]:
         """Sightings of the candidates in these rows; None for a row of -1."""
         grid = self._grid_of(frame)
+        # without a floor, patches lie in the plane of the image
         plane = view or SLANT_PLANE
         seen = rows[rows >= 0]
         range_m = candidates.range_m[seen]
         azimuth_rad = candidates.azimuth_rad[seen]
         points_m = plane.floor_points(range_m, azimuth_rad) @ plane.level_R_sonar.T
+        # each patch is turned so that its x axis points away from the sonar
         bearing_rad = np.arctan2(points_m[:, 1], points_m[:, 0])
         away_m = np.hypot(points_m[:, 0], points_m[:, 1])
         fits = [
@@ -555,6 +574,7 @@ class CandidateFit:
         """Fit of the designs to what lies at a distance and bearing on the floor; NaN: the ray does not reach it."""
         if math.isnan(away_m):
             return None
+        # templates of the nearest resolution: drawn for each range they would take seconds
         steps = grid.blur_steps(away_m, math.hypot(away_m, plane.height_m))
         appearance = appearance_at(self._designs, self._params, *steps)
         patch = grid.patch(
@@ -567,6 +587,7 @@ class CandidateFit:
         fit = appearance.fit(patch)
         if fit is None:
             return None
+        # only the likeliest design is placed to a fraction of a cell
         best = int((fit.evidence @ self._weights).argmax())
         slope = ASSUMED_SLOPE if plane is SLANT_PLANE else plane.height_m / away_m
         return Fitted(fit, appearance.place(patch, fit, best, slope))
@@ -614,17 +635,20 @@ class CandidateFit:
         places_m = np.concatenate([xy_m[:, None], xy_m[:, None] + moved_xy_m], axis=1)
         cos = np.cos(bearing_rad[rows])
         sin = np.sin(bearing_rad[rows])
+        # about the vertical, by the bearing of each patch
         level_R_patch = np.array([[cos, -sin], [sin, cos]])
         level_xy_m = np.einsum("ijn,nkj->nki", level_R_patch, places_m).reshape(-1, 2)
         all_range_m, all_azimuth_rad = (view or SLANT_PLANE).range_azimuth(level_xy_m)
         ranges_m = all_range_m.reshape(-1, 3)
         azimuths_rad = all_azimuth_rad.reshape(-1, 3)
         r = ranges_m[:, 0]
+        # differences from the place, along the ray and across it
         along_m = ranges_m - r[:, None]
         across_m = r[:, None] * (azimuths_rad - azimuths_rad[:, :1])
         moved_m = np.sqrt((np.stack([along_m, across_m], axis=-1) ** 2).sum(axis=1))
         range_per_height = np.zeros(len(r)) if view is None else view.height_m / r
         away_m = np.hypot(xy_m[:, 0], xy_m[:, 1])
+        # dr = (d / r) dx along the floor, and r da = (r / d) dy across
         bound_m = bound_xy_m * np.array([away_m / r, r / away_m]).T
         of_place = model.range_azimuth_cov(bound_m, r)
         to_range_azimuth = np.column_stack([np.ones_like(r), r])
@@ -635,6 +659,7 @@ class CandidateFit:
                 fit=fitted[n].of_designs,
                 range_m=float(r[n] + model.height_bias_m * rise),
                 azimuth_rad=float(azimuths_rad[n, 0]),
+                # a fit is never less certain than the centroid of the candidate
                 covariance=np.minimum(of_place[n], covariance[row]),
                 range_per_height=rise,
                 bound_m=bound_m[n],

@@ -54,9 +54,11 @@ def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
     """
     evidence = predicted @ confusion
     possible = evidence > 0
+    # (2) and (3) together: sum_j C[k, j] s[j] / evidence[j], times the prediction
     ratio = np.divide(
         scores, evidence, out=np.zeros_like(scores, dtype=float), where=possible
     )
+    # features that are impossible under the prediction change nothing
     kept = np.where(possible, 0.0, scores).sum(axis=1, keepdims=True)
     posterior = predicted * (ratio @ confusion.T + kept)
     return np.where(scores.any(axis=1, keepdims=True), posterior, predicted)
@@ -72,6 +74,7 @@ def bounded_evidence(
     left for tracks whose frames hold no evidence.
     """
     log_belief = np.log(birth) + log_odds / (counted + looks)[:, None]
+    # the largest exponent is 0: no overflow
     odds = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
     return np.asarray(
         (1 - doubt) * odds / odds.sum(axis=1, keepdims=True) + doubt * birth
@@ -89,6 +92,7 @@ def independent_share(moved_m: Floats, aperture_m: float) -> Floats:
 
     which leaves one half at 3.6 cm for the 0.14 m of a DIDSON's high frequency.
     """
+    # beyond the aperture speckle is independent
     u = np.minimum(2.0 * np.abs(moved_m) / aperture_m, 2.0)
     rho = np.where(u <= 1, 1 - 1.5 * u**2 + 0.75 * u**3, 0.25 * (2 - u) ** 3)
     return np.asarray(1.0 - rho**2)

@@ -92,6 +92,7 @@ def select_candidates(
         odd_counts(length_m, cell_m)
         for length_m in (params.smoothing_m, params.background_m, params.closing_m)
     )
+    # fewer cells would leave the speckle of single looks
     smoothing = np.maximum(smoothing, LEAST_COUNT).tolist()
     wide = np.maximum(closing, LEAST_COUNT).tolist()
     closing = wide if params.closing_m > 0 else closing
@@ -102,6 +103,7 @@ def select_candidates(
     level_db, spread_db = background_of(smooth, smoothing, neighbourhood)
     contrast = smooth - _at_pixels(level_db, shape)
     offsets = false_alarm_offsets_db(spread_db, params.false_alarm)
+    # bytes, as opencv wants them
     mask = cv2.compare(contrast, _at_pixels(offsets, shape), cv2.CMP_GT)
     closed = cv2.morphologyEx(
         mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, closing[::-1])
@@ -147,6 +149,7 @@ def judged(
     verdicts[area_m2 > params.max_area_m2] = CandidateVerdict.TOO_LARGE
     verdicts[area_m2 < params.min_area_m2] = CandidateVerdict.TOO_SMALL
     verdicts[at_edge & (not params.keep_at_edge)] = CandidateVerdict.AT_EDGE
+    # the last ones override the others: what is off the floor has no size
     verdicts[~(area_m2 > 0)] = CandidateVerdict.OFF_FLOOR
     accepted = np.flatnonzero(verdicts == CandidateVerdict.ACCEPTED)
     strongest_first = accepted[
@@ -177,6 +180,7 @@ def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
     5.57 dB, and an offset of 9.14 dB for 1 %.
     """
     wanted = (spread_db / DB_PER_NEPER) ** 2
+    # psi'(L) is about 1 / L for many looks, and 1 / L^2 for few
     log_looks = -np.log(wanted) if wanted < 1 else -0.5 * np.log(wanted)
     for _ in range(30):
         looks = np.exp(log_looks)
@@ -281,10 +285,12 @@ def bright_parts(
         cv2.morphologyEx(is_bright, cv2.MORPH_CLOSE, closing), connectivity=8
     )
     places = [np.stack([x_m, y_m])[:, labels == part] for part in range(1, count)]
+    # the largest part is the figure
     places.sort(key=lambda place: -place.shape[1])
     areas = np.array([place.shape[1] * CELL_M**2 for place in places])
     extents = np.array(
         [
+            # as `Regions.extent_m`
             np.sqrt(12 * np.linalg.eigvalsh(np.cov(place, bias=True)).max())
             for place in places
         ]

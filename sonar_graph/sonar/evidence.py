@@ -196,10 +196,12 @@ class Figures(NamedTuple):
         gram = []
         kept = []
         for one in figures:
+            # over all cells: a patch that is seen whole needs no sum over cells again
             in_steps = one.values.astype(float)
             gram.append(float(STEP) ** 2 * (in_steps.T @ in_steps))
             all_seen = np.ones(len(one.values), np.float32)
             kept.append(kept_sums(one.values, all_seen, one.uncovered))
+        # a cell narrower than the width of the blur at half power repeats its neighbour
         independent = math.prod(
             min(templates.cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m
         )
@@ -232,6 +234,7 @@ class Figures(NamedTuple):
         edge = np.full(len(template), -1)
         if not fill_evidence(self, patch, template, cell, found, edge):
             return None
+        # so far `rival` is the logarithm for each design alone: compare with the best of all designs
         found[:, RIVAL] = found[:, RIVAL].min() - found[:, RIVAL]
         return found * self.counts, edge
 
@@ -264,6 +267,7 @@ class _Grid(NamedTuple):
         x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
         away_m = np.hypot(x_m, y_m)
         is_around = away_m <= material_m + REACH_M
+        # within 60 degrees of the direction away from the sonar, where a shadow falls
         is_behind = (away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m)
         return cls(x_m, y_m, away_m, material_m, cell_m, is_around | is_behind)
 
@@ -281,6 +285,7 @@ def _figure(
         drawn(design, heading_rad, side, grid.cell_m, blur_m, stretch)
         for stretch in STRETCHES
     ]
+    # levels of figures are relative to the brightest part: beta takes the contrast
     brightest_db = float(np.nanmax(design.mask))
     darkest_db = min(float(np.nanmin(design.mask)), -1.0)
     figures = [bright / brightest_db for bright, _ in parts]
@@ -293,8 +298,10 @@ def _figure(
     is_compared = grid.is_explained & ~(own_shadow & is_off_plate)
     shades = [behind(one, SHADOW_CELLS) for one in figures]
     exact = np.stack([np.ones_like(figure), dark, *figures, *shades])
+    # the models are read in every fit; bytes fit into the cache of the processor
     steps = np.clip(np.rint(exact[:, is_compared].T / STEP), 0, 255)
     smooth = np.stack([cv2.blur(dark, (3, 3)), cv2.blur(figure, (3, 3))])
+    # for a disc of radius r the second moment about its middle is r^2 / 2
     weights = np.maximum(figure, 0.0)
     second_moment_m2 = float(np.average(grid.away_m**2, weights=weights))
     radius_m = math.sqrt(2 * second_moment_m2)
@@ -317,12 +324,14 @@ def _figure(
 
 def _zones(figure: Floats32, dark: Floats32, is_compared: Bools) -> Ints:
     """Zone of each cell about a figure, shape as given."""
+    # dilation by a square of this side marks the cells within `NEAR_CELLS` of the figure
     kernel = np.ones((2 * NEAR_CELLS + 1, 2 * NEAR_CELLS + 1), np.uint8)
     is_out = (figure < OUT) & is_compared
     is_near = cv2.dilate((figure > PART).astype(np.uint8), kernel) > 0
     is_behind = behind(figure, BEHIND_CELLS) > PART
     near = NEAR * (is_out & is_near)
     back = BEHIND * (is_out & is_behind)
+    # a plate belongs to the design, so its cells are no floor
     far = FAR * (is_out & ~is_near & (dark < OUT))
     return np.asarray(near + back + far)
 
@@ -425,6 +434,7 @@ def fill_evidence(
     False where too little is in view, or where it has one level.
     """
     for k in range(len(template)):
+        # rows of this template in the arrays that hold all templates
         begin = figures.first[template[k]]
         end = figures.first[template[k] + 1]
         shift = cell[k, 0] * figures.patch_side + cell[k, 1]
@@ -433,8 +443,10 @@ def fill_evidence(
         values = figures.values[begin:end]
         uncovered = figures.uncovered[begin:end]
         view = viewed(part, cells)
+        # a few cells fit any figure
         if view.cells < LEAST_CELLS:
             return False
+        # one level everywhere: every model is perfect, and all ratios are 0 / 0
         if view.total < LEAST_VARIANCE_DB2 * view.cells:
             return False
         products = products_in_view(figures.gram[template[k]], values, view)
@@ -445,16 +457,21 @@ def fill_evidence(
         zones = figures.zones[begin:end]
         around = surroundings(part, cells, view, fit, smooth, zones)
         kept = figures.kept[template[k]]
+        # cut by the rim of the image: sums over all cells are too large
         if view.cells < len(cells):
             kept = kept_sums(values, view.is_seen, uncovered)
         covered = least_covered(view, values, uncovered, kept, products, fit)
+        # a figure darker than the floor is no figure of foam
         whole = fit.design if fit.beta > 0 else fit.without_figure
         cells_count = 0.5 * view.cells * figures.counts[COVERED]
+        # log likelihood ratio of the covered figure against the whole one
         gain = cells_count * math.log(max(whole / covered.squares, 1.0))
+        # prior odds: 1/2 for the whole figure, 1/72 for each edge
         if gain > math.log(EDGES * len(OFFSETS)):
             edge[k] = covered.edge
         left = min(covered.squares, whole)
         sigma = math.sqrt(fit.design / view.cells)
+        # gain of D, then gain of B: a plate without foam is another thing that lies there
         plate = math.log(fit.shaded / fit.both)
         foam = math.log(max(fit.without_figure, LEAST_LEFT_DB2) / fit.design)
         plate_and_foam = max(min(plate, foam), 0.0)
@@ -498,6 +515,7 @@ def viewed(part: PatchPart, cells: NDArray[np.int32]) -> View:
         level_db[n] = part_db[cells[n]]
         is_seen[n] = part_seen[cells[n]]
     count = float(np.dot(is_seen, is_seen))
+    # the floor is one of the columns; without the mean, sums of squares lose fewer digits
     mean_db = np.float32(np.dot(level_db, is_seen) / max(count, 1.0))
     for n in range(len(cells)):
         level_db[n] = (level_db[n] - mean_db) * is_seen[n]
@@ -510,6 +528,7 @@ def products_in_view(gram: Floats, values: Bytes, view: View) -> Products:
     """Products of the columns with each other and with the levels, without the cells that are not in view."""
     levels = products_of(view.level_db, values)
     room = np.empty((4, 5))
+    # nothing is cut: the table has the products
     if view.cells == len(values):
         return Products(gram, levels, view.total, room)
     in_view = gram.copy()
@@ -531,21 +550,25 @@ def design_fitted(products: Products, count: float, has_dark: bool) -> DesignFit
     beta = plain.levels[1]
     delta = 0.0
     if has_dark:
+        # a plate that seems brighter than the floor is no plate: keep the fit without it
         with_dark = least_squares(products, (FLOOR, FIGURE, DARK))
         if with_dark.levels[2] < 0:
             design = with_dark.squares
             floor_db = with_dark.levels[0]
             beta = with_dark.levels[1]
             delta = with_dark.levels[2]
+    # D without its mean, as the floor takes the mean
     dark_mean = gram[FLOOR, DARK] / count
     dark_product = products.levels[DARK] - dark_mean * products.levels[FLOOR]
     without_figure = products.total
     if delta < 0:
         dark_square = gram[DARK, DARK] - gram[FLOOR, DARK] ** 2 / count
         without_figure = products.total - dark_product**2 / dark_square
+    # a shadow that is brighter than the floor is none
     with_shadow = least_squares(products, (FLOOR, FIGURE, SHADOW))
     shaded = with_shadow.squares if with_shadow.levels[2] < 0 else plain.squares
     both = min(design, shaded)
+    # D and S overlap, and only together do they leave the least
     if delta < 0 and shaded < plain.squares:
         with_both = least_squares(products, (FLOOR, FIGURE, DARK, SHADOW))
         if with_both.levels[2] < 0 and with_both.levels[3] < 0:
@@ -561,6 +584,7 @@ def otherwise(products: Products, fit: DesignFitted) -> Left:
     squares = fit.shaded
     without_shadow = fit.plain
     for q in range(1, len(STRETCHES)):
+        # one elimination gives both: S is the last column
         one = least_squares(products, (FLOOR, FIGURE + q, SHADOW + q))
         without_shadow = min(without_shadow, one.without_last)
         is_dark = one.levels[2] < 0
@@ -585,14 +609,17 @@ def surroundings(
     back_cells = 0
     for n in range(len(cells)):
         at = cells[n]
+        # means over 3 by 3 cells that are mostly not seen are too noisy
         if zones[n] == 0 or held[at] <= 0.5:
             continue
         of_floor = smooth_db[at] - view.mean_db - fit.floor_db
         off_db = of_floor - fit.beta * smooth[n, 1] - fit.delta * smooth[n, 0]
         if zones[n] & NEAR:
+            # only brighter: next to a landmark lies its shadow, and foam of other things
             near += max(off_db, 0.0) ** 2
             near_cells += 1
         if zones[n] & FAR:
+            # only darker: farther out other objects may be bright
             far += min(off_db, 0.0) ** 2
             far_cells += 1
         if zones[n] & BEHIND and is_seen[n] > 0:
@@ -664,16 +691,19 @@ def least_covered(
     for n in range(len(level_db)):
         b_n = STEP * values[n, FIGURE]
         if b_n > OUT:
+            # cells outside of the figure add nothing to b^T z
             bz_n = b_n * level_db[n]
             for edge in range(len(bright)):
                 bright[edge] += bz_n * np.float32(uncovered[n, edge])
     gram = products.gram
     dark_mean = gram[FLOOR, DARK] / view.cells
+    # D^T D without the floor
     dd = gram[DARK, DARK] - gram[FLOOR, DARK] ** 2 / view.cells
     least = fit.without_figure
     best = -1
     for edge in range(len(kept)):
         b = kept[edge, 0]
+        # take the floor, and then D, out of b (Frisch, Waugh 1933)
         bb = kept[edge, 1] - b**2 / view.cells
         bz = float(bright[edge])
         if fit.delta < 0:
@@ -702,11 +732,13 @@ def least_squares(products: Products, columns: tuple[int, ...]) -> Left:
     for i in range(n):
         for j in range(n):
             a[i, j] = products.gram[columns[i], columns[j]]
+        # keeps the pivot positive where two columns are nearly the same
         a[i, i] += 1e-3
         a[i, n] = products.levels[columns[i]]
     left = products.total
     without_last = products.total
     for i in range(n):
+        # the columns before the last one leave this much
         without_last = left
         left -= a[i, n] ** 2 / a[i, i]
         for k in range(i + 1, n):

@@ -61,6 +61,7 @@ class RangeWindow(NamedTuple):
             return "ranges or azimuths that are not finite"
         steps_m = np.diff(ranges_m)
         steps_rad = np.diff(azimuths_rad)
+        # a damaged header has steps of several sizes
         is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(
             steps_m.mean()
         )
@@ -157,6 +158,7 @@ class FrameCheck:
                 f"samples over {self._scale.full_scale:g}, the full scale that the calibration states; "
                 "correct sonar.image.full_scale or sonar.image.scale with --calibration"
             )
+        # of a bright scene a few samples saturate; half of them is a wrong gain
         if np.count_nonzero(image == high) > SATURATED_SHARE * image.size:
             return "saturated"
         if self._image is not None and np.array_equal(image, self._image):

@@ -83,15 +83,18 @@ class Relief(NamedTuple):
         """A design at this heading against the direction away from the sonar, which is the grid's x axis."""
         of_bright, power = echo_power(design, heading_rad, grid.side, grid.cell_m)
         is_bright = power > 1
+        # W is a difference quotient: a side of this width, over its width
         width = max(1, round(SIDE_M / grid.cell_m * FINE))
         bright_db, whole_db, raised_db = (
             seen_db(one, grid.cell_m, grid.blur_m)
             for one in (of_bright, power, with_side(power, width))
         )
         is_shaded = is_bright.copy()
+        # a shadow grows away from the sonar, along the first axis
         for _ in range(shade_steps * SHADE_FINE):
             is_shaded[1:] |= is_shaded[:-1]
         shorter = seen_share(is_shaded & ~is_bright, grid.cell_m, grid.blur_m)
+        # one step longer, between which lengths are interpolated
         for _ in range(SHADE_FINE):
             is_shaded[1:] |= is_shaded[:-1]
         return cls(
@@ -141,6 +144,7 @@ def fit_place(
     ``M = [1, B, D, S, dz/dx, dz/dy]`` with ``dz/dp = -(beta grad B + delta grad D + gamma grad S)``; the bound is the
     root of the last two on the diagonal of ``s^2 (M^T M)^-1``, s^2 the mean square of what is left.
     """
+    # the near side and the shadow as the sonar lights them from here
     S = relief.shorter + np.float32(lit.longer) * (relief.longer - relief.shorter)
     B = relief.figure + np.float32(lit.side_m) * relief.side
     D = relief.dark * (1 - S)
@@ -150,6 +154,7 @@ def fit_place(
     along = np.zeros_like(B)
     across = np.zeros_like(B)
     seen_cells = max(np.sum(patch.seen), 1.0)
+    # single precision loses less without the mean
     mean_db = np.float32(np.sum(patch.level_db * patch.seen) / seen_cells)
     level_db = patch.level_db
     seen = patch.seen
@@ -159,6 +164,7 @@ def fit_place(
     M = np.empty((7, len(rows)), np.float32)
     for step in range(STEPS + 1):
         size = 4 if step == 0 else 6  # the levels alone at first: slopes need them
+        # figures are shifted by whole cells; their slopes carry the rest
         x0 = round(place[0])
         y0 = round(place[1])
         if step > 0:
@@ -177,18 +183,23 @@ def fit_place(
                 M[5, n] = across[i, j]
                 M[6, n] = level_db[x, y] - mean_db
             else:
+                # a cell out of view has no weight
                 M[:, n] = 0
+        # rows of M are the columns of the model and z: one product gives G and g
         products = np.dot(M, M.T).astype(np.float64)
         count = products[0, 0]
         if count < LEAST_CELLS:
             return
         c, inverse = solved(products, size)
+        # with no contrast the slopes vanish, and the place is free
         beta = np.float32(max(c[1], LEAST_BETA_DB))
         delta = np.float32(max(c[2], 0))
         gamma = np.float32(min(c[3], 0))
         if size == 6:
+            # R = z^T z - c^T g
             left = products[6, 6] - np.dot(c, products[6, :6])
             variance = max(left, 0.0) / count
+            # slopes are of neighbouring cells: beyond one cell they mislead
             place[0] = x0 + min(max(c[4], -1.0), 1.0)
             place[1] = y0 + min(max(c[5], -1.0), 1.0)
             bound[0] = math.sqrt(variance * inverse[0])
@@ -221,8 +232,11 @@ def solved(products: Floats, size: int) -> tuple[Floats, tuple[float, float]]:
     c = np.zeros(size)
     second = 0.0
     for i in range(size):
+        # keeps pivots positive without a shadow or dark parts, whose columns are 0
         a[i, i] += 1e-6
     for i in range(size - 1):
+        # for a 2 by 2 block with pivots d1, d2 the inverse has the diagonal s / (d1 d2) and 1 / d2, s the
+        # element before its elimination
         if i == size - 2:
             second = a[i + 1, i + 1]
         for k in range(i + 1, size):

@@ -226,6 +226,7 @@ class Recogniser:
     def prepare(self, frame: SonarFrames) -> None:
         """Draw the templates that frames with these ranges and beams may need, before the first of them arrives."""
         sonar = self._calibration.sonar
+        # the vehicle pitches about the mounting
         tilt_rad = abs(sonar.mounting.rpy_rad[1])
         half_rad = sonar.elevation_aperture_rad / 2 + PITCH_RAD
         depressions_rad = (
@@ -416,6 +417,7 @@ def each_once(beliefs: Floats) -> Floats:
     named = best[best < known]
     if len(np.unique(named)) == len(named):
         return beliefs
+    # a track may be "none of them" as often as there are tracks: one such column each
     cost = -np.log(
         np.maximum(
             np.hstack([beliefs[:, :known], np.tile(beliefs[:, known:], (1, tracks))]),
@@ -425,6 +427,7 @@ def each_once(beliefs: Floats) -> Floats:
     _, assigned = linear_sum_assignment(cost)
     result = beliefs.copy()
     for track, landmark in enumerate(best.tolist()):
+        # the landmark goes to the track where it is likelier
         if landmark < known and assigned[track] != landmark and landmark in assigned:
             result[track, known] += result[track, landmark]
             result[track, landmark] = 0.0

@@ -41,12 +41,14 @@ def background_of(
     On a grid of nodes, about one independent level each, shapes (nodes, nodes).
     """
     beams, bins = smoothing
+    # one node a smoothing patch: nearly independent levels, and hundreds of times fewer
     nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
     ordered = np.sort(nodes, axis=0)
     count = len(nodes)
     medians = (
         ordered[[(count - 1) // 2]] + ordered[[count // 2]]
     ) / 2  # np.median takes three times as long
+    # time-varying gain and the edges of the vertical beam change along range only
     trend = cv2.blur(medians, (TREND_NODES, 1))
     window = (
         min(
@@ -70,6 +72,7 @@ def _median(
 ) -> Floats32:
     """Median over a square window, to half a step; mirrored at the edges."""
     half = window // 2
+    # as bytes, of which a histogram finds the median
     counts = cv2.convertScaleAbs(
         np.maximum(values, -zero / steps_per_db), alpha=steps_per_db, beta=zero
     )
@@ -101,12 +104,14 @@ def running_median(counts: Bytes, window: int) -> Bytes:
             for j in range(window):
                 histogram[counts[i + k, j]] += 1
         for j in range(columns):
+            # move by one column: one column leaves, one enters
             for k in range(window if j else 0):
                 gone = counts[i + k, j - 1]
                 come = counts[i + k, j + window - 1]
                 histogram[gone] -= 1
                 histogram[come] += 1
                 below += int(come < median) - int(gone < median)
+            # the median moves by few steps, since few bytes changed
             while below > middle:
                 median -= 1
                 below -= histogram[median]
@@ -159,12 +164,14 @@ def measure_regions(
         np.ascontiguousarray(level_R_sonar),
         height_m,
     )
+    # off the floor a region has no area; its centroid is not used
     weight = np.maximum(sums[:, AREA], 1e-12)
     x = sums[:, X] / weight
     y = sums[:, Y] / weight
     xx = sums[:, XX] / weight - x * x
     xy = sums[:, XY] / weight - x * y
     yy = sums[:, YY] / weight - y * y
+    # larger eigenvalue of the 2 by 2 matrix of second moments
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
     points = np.stack([x, y, np.full(count, -height_m)], axis=1) @ level_R_sonar
     r, a, e = ranges_azimuths_elevations(points)
@@ -190,8 +197,10 @@ def floor_cell(
     """
     (xx, xy, xz), (yx, yy, yz), (up_x, up_y, up_z) = R
     across = up_x * cos_a + up_y * sin_a
+    # u . q = -h with q = r (cos e c + sin e z)
     k = -height_m / r
     norm2 = across * across + up_z * up_z
+    # the solution nearer to the centre beam
     w = math.copysign(math.sqrt(norm2 - k * k), up_z)
     cos_e = (across * k + up_z * w) / norm2
     sin_e = (up_z * k - across * w) / norm2
@@ -201,6 +210,7 @@ def floor_cell(
         * r
         * math.sqrt((cos_e * cos_e + ratio * ratio) / (r * r - height_m * height_m))
     )
+    # nearer than the floor, or beyond the horizon; NaN compares false
     if not (area > 0 and r > height_m):
         return 0.0, 0.0, 0.0
     px = r * cos_e * cos_a
@@ -225,6 +235,7 @@ def pixel_sums(
         cos_a = math.cos(azimuths_rad[beam])
         sin_a = math.sin(azimuths_rad[beam])
         for n in range(bins):
+            # nearly all pixels are background
             if labels[beam, n] == 0:
                 continue
             r = ranges_m[n]
@@ -234,6 +245,7 @@ def pixel_sums(
                 if height_m > 0
                 else (r * cos_a, r * sin_a, r)
             )
+            # regions are measured in area on the ground, not in pixels: a far pixel is larger
             area *= dr * da
             row[AREA] += area
             row[LEVEL] += contrast_db[beam, n]

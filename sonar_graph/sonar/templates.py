@@ -95,6 +95,7 @@ class Templates:
         of: list[int] = []
         headings: list[float] = []
         for index, design in enumerate(designs):
+            # symmetric designs repeat: of equal pictures the first heading stands for all
             for heading in 2 * np.pi * np.arange(HEADINGS) / HEADINGS:
                 bright, dark = drawn(design, heading, side, cell_m, blur_m)
                 picture = (bright + SEARCHED_DARK * dark).ravel()[cells]
@@ -127,6 +128,7 @@ def drawn(
     and the pulse blur the *power* of the echo, so that what is bright grows and what is dark shrinks; a cell is then a
     mean of decibels. Both parts add up to the whole.
     """
+    # the near side covers this part of the face, as seen along the ray
     width = round(design.standing_m * ASSUMED_SLOPE / cell_m * FINE)
     bright_db, whole_db = (
         seen_db(with_side(power, width), cell_m, blur_m)
@@ -140,6 +142,7 @@ def with_side(power: Floats32, width: int) -> Floats32:
     is_bright = power > 1
     inner = is_bright.copy()
     for _ in range(width):
+        # erosion away from the sonar leaves what is not near the front edge
         inner[1:] &= inner[:-1]
     return np.where(is_bright & ~inner, power * np.float32(10 ** (SIDE_DB / 10)), power)
 
@@ -162,6 +165,7 @@ def echo_power(
     sin = math.sin(heading_rad)
     (x0, y0) = design.figure_m
     (x_share, y_share) = stretch
+    # from the grid into the axes of the design
     level = design.level_db(
         x0 + (cos * x_m + sin * y_m) / x_share, y0 + (-sin * x_m + cos * y_m) / y_share
     )
@@ -187,6 +191,7 @@ def seen_share(is_in: NDArray[np.bool_], cell_m: float, blur_m: Blur) -> Floats3
 
 def blurred(fine: Floats32, cell_m: float, blur_m: Blur) -> Floats32:
     """Power on a fine grid, blurred away from the sonar (x) and across."""
+    # opencv refuses a width of zero
     away, across = (max(one, LEAST_BLUR_M) / cell_m * FINE for one in blur_m)
     return np.asarray(
         cv2.GaussianBlur(fine, (0, 0), sigmaX=across, sigmaY=away), np.float32
@@ -226,6 +231,7 @@ def check_headings(designs: Sequence[LandmarkDesign]) -> None:
     middles. Raises `CalibrationError` naming the design.
     """
     for design in designs:
+        # a figure in the middle has its middle there at any heading
         if design.figure_m == (0.0, 0.0):
             continue
         side = 2 * math.ceil(material_radius_m(design) / CHECKED_CELL_M) + 1
@@ -240,6 +246,7 @@ def check_headings(designs: Sequence[LandmarkDesign]) -> None:
             for k in range(HEADINGS)
         )
         off = [float(np.mean((sum(one) - sum(first)) ** 2)) for one in turned]
+        # small turns look alike by the blur, and move the middle little
         least = round(TURNED_RAD * HEADINGS / (2 * math.pi))
         if min(off[least - 1 : -least + 1 or None]) < SAME_SHARE * float(
             np.var(sum(first))
@@ -303,6 +310,7 @@ class PolarGrid(NamedTuple):
         elevation_aperture_rad: float = math.pi,
     ) -> PolarGrid:
         """Grid of equally spaced bins, shape (bins,), and of beams in one direction, shape (beams,)."""
+        # beams may run from left to right or from right to left
         order = np.argsort(azimuths_rad)
         places = np.linspace(
             azimuths_rad.min(), azimuths_rad.max(), _STEPS_A_BEAM * len(azimuths_rad)
@@ -340,11 +348,13 @@ class PolarGrid(NamedTuple):
         self, first_m: float, last_m: float, depressions_rad: tuple[float, float]
     ) -> list[tuple[int, int]]:
         """All `blur_steps` between two ranges and depressions, those of middle ranges first."""
+        # a window that begins at the sonar would need endless sets
         first_m = max(first_m, last_m / NEAREST)
         shares = np.linspace(
             -0.5, 0.5, math.ceil(4 * math.log(last_m / first_m, BLUR_RATIO)) + 2
         )
         found = dict[tuple[int, int], None]()
+        # a dict keeps the order and drops repeats
         for share in sorted(shares.tolist(), key=abs):
             range_m = math.sqrt(first_m * last_m) * (last_m / first_m) ** share
             for depression_rad in np.linspace(*depressions_rad, 5).tolist():
@@ -363,19 +373,9 @@ class PolarGrid(NamedTuple):
     ) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
         level, seen, smooth, held = np.zeros((4, side, side), np.float32)
-        sample_floor(
-            self,
-            image_db,
-            view.level_R_sonar,
-            view.height_m,
-            centre_m,
-            cell_m,
-            level,
-            seen,
-            smooth,
-            held,
-        )
-        return Patch(level, seen, smooth, held, centre_m)
+        patch = Patch(level, seen, smooth, held, centre_m)
+        sample_floor(self, image_db, view.level_R_sonar, view.height_m, cell_m, patch)
+        return patch
 
 
 @inlined
@@ -409,17 +409,16 @@ def smooth_levels(
     total = np.empty(side + 2, np.float32)
     count = np.empty(side + 2, np.float32)
     for i in range(side):
+        # mirrored at the rim: row -1 is row 1
         before = abs(i - 1)
         after = side - 1 - abs(side - 2 - i)
         for j in range(side):
             total[j + 1] = level[before, j] + level[i, j] + level[after, j]
             count[j + 1] = seen[before, j] + seen[i, j] + seen[after, j]
-        total[0], total[-1], count[0], count[-1] = (
-            total[2],
-            total[-3],
-            count[2],
-            count[-3],
-        )
+        total[0] = total[2]
+        total[-1] = total[-3]
+        count[0] = count[2]
+        count[-1] = count[-3]
         for j in range(side):
             n = count[j] + count[j + 1] + count[j + 2]
             held[i, j] = n / np.float32(9)
@@ -430,22 +429,31 @@ def smooth_levels(
 
 @compiled
 def sample_floor(
-    grid: PolarGrid, image_db: Floats32, R: Floats, height_m: float, centre: Floats, cell_m: float,
-    level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32,
-) -> None:  # fmt: skip
-    """Fill in levels on a square grid of the floor, 1 where a point is in the image, and both by `smooth_levels`.
+    grid: PolarGrid,
+    image_db: Floats32,
+    R: Floats,
+    height_m: float,
+    cell_m: float,
+    patch: Patch,
+) -> None:
+    """Fill in the levels of a patch of zeros, 1 where a point is in the image, and both by `smooth_levels`.
 
     Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
     between the two nearest; linear between beams. R is ``level_R_sonar``.
     """
     (beams, bins) = image_db.shape
+    level = patch.level_db
+    seen = patch.seen
+    centre = patch.centre_m
     side = len(level)
     nodes = grid.beam_of_azimuth
     per_bin = 1 / grid.bin_m
     per_step = 1 / grid.azimuth_step_rad
+    # half of a cell, in bins
     half_bins = 0.5 * cell_m * per_bin
     half = 0.5 * (side - 1)
     z = -height_m
+    # finer than bins: interpolate; coarser: average, or speckle aliases
     is_fine = half_bins < 0.5
     reach = 1.0 if is_fine else half_bins
     places = np.empty(side)
@@ -455,11 +463,13 @@ def sample_floor(
         x = centre[0] + cell_m * (i - half)
         for j in range(side):
             y = centre[1] + cell_m * (j - half)
+            # q = R^T p, written out: an array for each point costs more than the sum
             q0 = xx * x + yx * y + zx * z
             q1 = xy * x + yy * y + zy * z
             q2 = xz * x + yz * y + zz * z
             distance = math.sqrt(x * x + y * y + z * z)
             places[j] = (azimuth(q0, q1) - grid.first_azimuth_rad) * per_step
+            # above the opening the sonar does not look, whatever the range
             is_lit = abs(q2) <= grid.highest_sine * distance
             middles[j] = (
                 (distance - grid.first_range_m) * per_bin if is_lit else -2.0 * reach
@@ -469,14 +479,17 @@ def sample_floor(
             middle = middles[j]
             first = math.floor(middle - reach + 1)
             last = math.floor(middle + reach)
+            # outside of the image: level and seen stay 0
             if first < 0 or last >= bins or not 0 <= place < len(nodes) - 1:
                 continue
+            # unsigned indices skip the check for negative ones
             k = np.uint32(place)
             first = np.uint32(first)
             last = np.uint32(last)
             beam = nodes[k] + (place - k) * (nodes[k + np.uint32(1)] - nodes[k])
             if beam < 0 or beam > beams - 1:
                 continue
+            # the last beam has no next one to interpolate with
             b = np.uint32(min(beam, beams - 2))
             share = beam - b
             one = image_db[b]
@@ -495,4 +508,4 @@ def sample_floor(
                     last - first + np.uint32(1)
                 )
             seen[i, j] = 1.0
-    smooth_levels(level, seen, smooth, held)
+    smooth_levels(level, seen, patch.smooth_db, patch.held)

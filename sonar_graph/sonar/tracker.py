@@ -121,6 +121,7 @@ class TrackStates:
         R = step.previous_T_sonar.rotation().matrix()
         t = step.previous_T_sonar.translation()
         q = (self.position_m - t) @ R
+        # derivative of q by the tangent of the step, rotation first
         J = np.empty((len(self), 3, 6))
         J[:, :, :3] = (q @ SKEW).reshape(-1, 3, 3)
         J[:, :, 3:] = -np.eye(3)
@@ -161,6 +162,7 @@ class Expected(NamedTuple):
         """N(z; h(q), S) of n measurements; 0 where the squared Mahalanobis distance exceeds the gate. Shape (n, M)."""
         e = self.innovations(z[:, None])
         distance2 = (e[:, :, None] @ self.information @ e[:, :, :, None])[:, :, 0, 0]
+        # density of a normal with information S^-1 in two dimensions
         peak = np.sqrt(np.linalg.det(self.information)) / (2 * math.pi)
         return np.where(distance2 <= gate, peak * np.exp(-0.5 * distance2), 0.0)
 
@@ -175,6 +177,7 @@ def corrected(
     H = expected.H
     K = P @ H.mT @ expected.information * (took >= 0)[:, None, None]
     q = tracks.position_m + (K @ expected.innovations(z[took])[:, :, None])[:, :, 0]
+    # Joseph's form stays positive definite for any gain
     rest = np.eye(3) - K @ H
     return replace(
         tracks, position_m=q, position_cov=rest @ P @ rest.mT + K @ noise @ K.mT
@@ -283,12 +286,14 @@ class Tracker:
         densities = expected.densities(z, self._gate)
         area = math.prod((window[:, 1] - window[:, 0]).tolist())
 
+        # density of candidates that come from no known track
         unexplained = (params.new_per_frame + params.clutter_per_frame) / area
         weights = densities * (before.existence * detection)
         weights = np.hstack([weights, np.full((len(weights), 1), unexplained)])
         matrix = np.asarray(weights / weights.sum(axis=1, keepdims=True))
         took = most_probable_assignment(matrix)
 
+        # existence by Bayes: p(frame | exists) over p(frame | does not), with clutter in the denominator
         likelihood = 1.0 - detection
         seen = np.flatnonzero(took >= 0)
         likelihood[seen] += (
@@ -306,6 +311,7 @@ class Tracker:
         after = replace(
             after, existence=existence, frames_seen=before.frames_seen + (took >= 0)
         )
+        # a track that left the image by several sigmas cannot be detected again
         least_inside = np.minimum(above, below).min(axis=1)
         reasons = [
             "left the image" if least < -params.leaving_sigmas else ""
