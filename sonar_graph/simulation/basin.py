@@ -225,6 +225,7 @@ def _world_and_path(
     world = world_on_floor(
         LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world
     )
+    # the identities are those of the designs that lie there
     world = replace(
         world,
         landmark_ids=np.array([design.id for design in designs_laid(options.image)]),
@@ -234,6 +235,7 @@ def _world_and_path(
         0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1
     )
     x, y, yaw = follow((0.0, 0.0, 0.0), route(options, rng), seconds).T
+    # depth, roll and pitch are not steered
     level = np.zeros_like(seconds)
     intended = np.column_stack([x, y, level + BODY_Z_M, level, level, yaw])
     slow = smooth_noise(seconds, np.array([0.12, 0.12, 0.03]), 40.0, 3, rng)
@@ -275,6 +277,7 @@ def objects_on_floor(
     landmarks = [
         place_landmark(*each, FLOOR_Z_M, image.foam_height_m) for each in placed
     ]
+    # wear and strangers leave the places of all else as they were
     wear_rng, strangers_rng = rng.spawn(2)
     landmarks = [
         weathered(one, image, own)
@@ -283,6 +286,7 @@ def objects_on_floor(
     spots = []
     beside = []
     corner = np.zeros(2)
+    # the four sides of the square, clockwise
     for heading_rad in -math.pi / 2 * np.arange(SIDES):
         ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
         left = np.array([-ahead[1], ahead[0]])
@@ -302,6 +306,7 @@ def objects_on_floor(
             aside_m = strangers_rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
             beside.append([*(corner + along_m * ahead + aside_m * left), FLOOR_Z_M])
         corner = corner + SIDE_M * ahead
+    # all spots are drawn, whatever the number of stones
     chosen = rng.permutation(np.array(spots))[: image.stones + image.decoys]
     others = scattered_objects(chosen, image.stones, rng)
     return (
@@ -379,10 +384,12 @@ def route(options: BasinOptions, rng: np.random.Generator) -> list[RouteLeg]:
     """
     speed = cruise_speed(options)
     sides = SIDES * options.laps
+    # no time is left where the speed was raised for the duration
     spare_s = max(
         0.0, options.duration_s - sides * (SIDE_M / speed + 2 * RAMP_S + TURN_S)
     )
     share = rng.uniform(0.8, 1.2, sides)
+    # where the sonar, not the body, is that far from the landmark
     stop_m = LANDMARK_ALONG_SIDE_M - WATCHING_M - YSHARK.sonar.translation_m[0]
     pose: PlanarPose = (0.0, 0.0, 0.0)
     legs: list[RouteLeg] = []

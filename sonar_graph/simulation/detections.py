@@ -50,6 +50,7 @@ def world_on_floor(
     Estimators are given the floor prior N(floor_z_m, height_sigma_m²), from which the heights are drawn: landmarks
     exactly on the floor would make every estimator look too cautious. Horizontal positions have the shape (m, 2).
     """
+    # drawn even where the sigma is 0, so that other draws stay as they were
     heights = floor_z_m + height_sigma_m * rng.standard_normal(len(xy_m))
     return World(
         np.arange(1, len(xy_m) + 1), np.column_stack([xy_m, heights]), floor_z_m
@@ -84,6 +85,7 @@ class Watched:
             zip(landmark.tolist(), stamps_ns.tolist(), strict=True)
         ):
             number, last_ns = newest.get(index, (-1, 0))
+            # first seen, or seen again after too long: a new track
             if number < 0 or stamp_ns - last_ns > LONGEST_GAP_S * 1e9:
                 number = len(landmarks)
                 landmarks.append(index)
@@ -193,6 +195,7 @@ def simulate_detections(
     (0.01 is "none of them"); that of a false one is 0.20 spread at random over all landmarks (0.80 is "none").
     False detections belong to no track. Path and world are the truth; there is one stamp a frame, shape (n,).
     """
+    # false detections leave those of landmarks as they were
     true_rng, false_rng = rng.spawn(2)
     frames = len(stamps_ns)
     landmarks = len(world.landmark_ids)
@@ -214,12 +217,14 @@ def simulate_detections(
         first_taken_for = _mistaken(
             watched.landmark, landmarks, recogniser.wrong_id_rate, true_rng
         )
+        # a wrong identity is revised after its share of the rest of the track
         corrected_s = delay_s + share * np.maximum(watched.lifetime_s - delay_s, 0.0)
         is_corrected = (watched.age_s >= corrected_s[true_track]) & (share < 1)
         believed = np.where(
             is_corrected, watched.landmark[true_track], first_taken_for[true_track]
         )
         true_posterior = _confident(believed, landmarks)
+        # no identity yet: all landmarks and "none of them" are alike
         true_posterior[watched.age_s < delay_s] = 1 / (landmarks + 1)
     else:
         taken_for = _mistaken(landmark, landmarks, recogniser.wrong_id_rate, true_rng)
@@ -243,6 +248,7 @@ def simulate_detections(
     frame = np.concatenate([true_frame, false_frame])
     if not len(frame):
         return None
+    # rows of a frame keep their order: landmarks before false ones
     order = np.argsort(frame, kind="stable")
     views = np.concatenate(
         [true_views, np.column_stack([false_distance, false_azimuth])]
@@ -268,6 +274,7 @@ def _mistaken(
     if not others:
         return landmark
     wrong = rng.random(len(landmark)) < rate
+    # a shift by 1 or more never ends at the landmark itself
     shift = rng.integers(1, others + 1, size=len(landmark))
     return np.where(wrong, (landmark + shift) % landmarks, landmark)
 

@@ -171,12 +171,14 @@ def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
         )
     stamps_ns = stamps_ns[inside]
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
+    # a spline through every pose would follow the noise of the reference
     knots = [0.0]
     for instant in seconds[1:].tolist():
         if instant - knots[-1] >= KNOT_S - 1e-6:
             knots.append(instant)
     seconds = np.array(knots) if len(knots) >= LEAST_POSES else seconds
     poses = reference.at(stamps_ns[0] + np.rint(seconds * NS_PER_S).astype(np.int64))
+    # a jump by 2 pi would be a turn
     angles = np.unwrap(rpy_from_rotation(poses.rotations()), axis=0)
     return int(stamps_ns[0]), VehiclePath.through(
         seconds, np.column_stack([poses.positions, angles])
@@ -195,11 +197,14 @@ def landmarks_beside(
             np.cumsum(np.linalg.norm(np.diff(motion.position[:, :2], axis=0), axis=1)),
         ]
     )
+    # by the distance travelled, so that a hovering vehicle gets no heap
     places_m = np.arange(
         0.5 * options.spacing_m, max(along_m[-1], options.spacing_m), options.spacing_m
     )
+    # first instant at each place
     row = np.minimum(np.searchsorted(along_m, places_m), len(seconds) - 1)
     course = np.arctan2(motion.velocity[row, 1], motion.velocity[row, 0])
+    # to the left or to the right
     side_m = rng.choice([-1.0, 1.0], len(row)) * rng.uniform(
         options.side_min_m, options.side_max_m, len(row)
     )

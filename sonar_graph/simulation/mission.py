@@ -98,6 +98,7 @@ def simulate_mission(options: MissionOptions | None = None) -> Sequence:
     xy, heading = loop(options.speed_m_s * seconds)
     level = np.zeros_like(seconds)
     intended = np.column_stack([xy, level + BODY_Z_M, level, level, heading])
+    # no vehicle keeps its course exactly
     position = smooth_noise(seconds, np.array([0.05, 0.05, 0.04]), 8.0, 3, streams.path)
     attitude = smooth_noise(seconds, np.radians([1.8, 1.8, 2.0]), 4.0, 3, streams.path)
     path = VehiclePath.through(
@@ -109,11 +110,13 @@ def simulate_mission(options: MissionOptions | None = None) -> Sequence:
 def loop(travelled_m: Floats) -> tuple[Floats, Floats]:
     """Position (n, 2) and unwrapped heading (n,) after a distance on the loop r = 6 m + 1.2 m cos(3 angle)."""
     fine = np.linspace(0, 2 * math.pi, 20_001)
+    # length of the loop by fine chords, for a constant speed
     along_m = np.concatenate(
         [[0.0], np.cumsum(np.hypot(*np.diff(_loop_xy(fine), axis=0).T))]
     )
     laps, rest_m = np.divmod(travelled_m, along_m[-1])
     angle = np.interp(rest_m, along_m, fine) + 2 * math.pi * laps
+    # the heading is the tangent of the loop
     ahead = _loop_xy(angle + 1e-4) - _loop_xy(angle - 1e-4)
     return _loop_xy(angle), np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
 

@@ -120,6 +120,7 @@ def record(
     imu_ns, dvl_ns, depth_ns, truth_ns = (
         regular_stamps(rate, path.duration_s) for rate in rates_hz
     )
+    # sensors run at their own rates; the sonar is not in step with any
     frames_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
     truth = path.at(seconds_since_start(truth_ns))
     return Sequence(
@@ -183,6 +184,7 @@ def true_calibration(
         }
     )
     true = path.at(np.zeros(1))
+    # the start in the calibration errs by what its sigmas state
     position = true.position[0] + options.start_position_sigma_m * rng.standard_normal(
         3
     )

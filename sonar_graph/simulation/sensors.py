@@ -22,6 +22,7 @@ EPOCH_NS = 1_400_000_000 * NS_PER_S
 
 def regular_stamps(rate_hz: float, duration_s: float, offset_s: float = 0.0) -> Ints:
     """Stamps every 1 / rate from ``offset_s`` after the start of the run to its end, shape (n,), nanoseconds."""
+    # the last sample may lie at the very end, in spite of rounding
     count = int(np.floor((duration_s - offset_s) * rate_hz + 1e-9)) + 1
     return EPOCH_NS + np.rint(
         (offset_s + np.arange(count) / rate_hz) * NS_PER_S
@@ -50,6 +51,7 @@ def imu_readings(
 
     Shapes (n, 3), rad/s and m/s²; at rest and level the force is (0, 0, +gravity).
     """
+    # specific force is what is left when gravity is taken from the acceleration
     imu_R_body = body_R_sensor(mounting).inv()
     lever = np.array(mounting.translation_m)
     omega = motion.angular_velocity
@@ -84,6 +86,7 @@ def simulate_imu(
         * np.sqrt(dt_s)
         * rng.standard_normal((len(stamps_ns), 3))
     )
+    # the walk begins at the bias of the start
     steps[0] = 0
     gyro_bias = first_bias + np.cumsum(steps, axis=0)
     accel_bias = calibration.accel_bias_sigma * rng.standard_normal(3)
@@ -133,9 +136,11 @@ def simulate_dvl(
     velocity = exact + sigmas * rng.standard_normal(exact.shape)
     covariance = np.broadcast_to(np.diag(sigmas**2), (len(stamps_ns), 3, 3))
     duration_s = float(seconds[-1])
+    # a Poisson process: uniform instants, as many as a Poisson draw
     begins = np.sort(
         rng.uniform(0, duration_s, rng.poisson(dropouts_per_hour * duration_s / 3600))
     )
+    # last loss before each row
     latest = np.concatenate([[-np.inf], begins])[
         np.searchsorted(begins, seconds, side="right")
     ]

@@ -61,6 +61,7 @@ class VehiclePath:
 
     def at(self, seconds: Floats) -> Kinematics:
         """Motion at any instants from 0 to ``duration_s``, shape (n,), seconds since the start."""
+        # derivatives of the spline are exact
         pose, rate, change = (self.spline(seconds, nu=order) for order in range(3))
         angular_velocity, angular_acceleration = angular_motion(
             pose[:, 3:], rate[:, 3:], change[:, 3:]
@@ -97,6 +98,7 @@ def smooth_noise(
     The shorter the interval between coefficients, the livelier. ``sigma`` is their standard deviation, for all columns
     or each; the curve's own is about 0.66 of it.
     """
+    # a spline of this degree needs as many knots beyond each end
     spans = int(np.ceil(seconds[-1] / interval_s)) + 1
     knots = interval_s * np.arange(-DEGREE, spans + DEGREE + 1)
     coefficients = sigma * rng.standard_normal((spans + DEGREE, columns))
@@ -153,11 +155,13 @@ def follow(start: PlanarPose, legs: list[RouteLeg], seconds: Floats) -> Floats:
     for (from_, to), leg in zip(
         pairwise([start, *(leg.goal for leg in legs)]), legs, strict=True
     ):
+        # a leg moves all later instants: what follows begins at its goal
         first = np.searchsorted(seconds, begin_s)
         elapsed_s = seconds[first:] - begin_s
         full_speed_s = leg.duration_s - leg.ramp_s
         progress = np.ones_like(elapsed_s)
         if full_speed_s > 0:
+            # gain speed, and lose it again after the full time
             covered = _distance(elapsed_s, leg.ramp_s) - _distance(
                 elapsed_s - full_speed_s, leg.ramp_s
             )
@@ -189,6 +193,7 @@ def hover(start: PlanarPose, duration_s: float) -> RouteLeg:
 
 def _distance(seconds: Floats, ramp_s: float) -> Floats:
     """Distance at unit final speed: the integral of the smoothstep 3u² - 2u³, then of 1."""
+    # u^3 - u^4 / 2 is the integral of the smoothstep over u
     u = np.clip(seconds / ramp_s, 0, 1)
     distance: Floats = ramp_s * (u**3 - u**4 / 2) + np.maximum(seconds - ramp_s, 0)
     return distance

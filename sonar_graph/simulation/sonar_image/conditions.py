@@ -67,8 +67,8 @@ class SceneConditions(Section):
     """Unknown objects beside the landmarks, in turn: stone, weed and stick, or "natural" for all three; lid, tile,
     hexagon, pan-lid, box and round-stone, or "look-alikes" for all six."""
     attitude_error_deg: float = Field(0.0, ge=0, le=10)
-    """Sigma about each axis of the sonar's rotation against the one in the log, drawn once a run; estimators are not
-    told."""
+    """Sigma about each axis of the sonar's rotation against the one in the log, drawn once a run; estimators do not
+    know it."""
     altitude_error_m: float = Field(0.0, ge=0, le=0.3)
     """Sigma of the sonar's height against the one in the log, drawn once a run; estimators do not know it."""
 
@@ -91,6 +91,7 @@ def true_mounting(
 
     Angles of the mounting err by independent normal errors, and so does its height.
     """
+    # a stream of its own: other options leave the errors as they were
     rng = np.random.default_rng([seed, 3])
     turned_rad = np.radians(conditions.attitude_error_deg) * rng.standard_normal(3)
     x, y, z = mounting.translation_m

@@ -101,6 +101,7 @@ def block_rays(
         y = (view.first_row + row + 0.5) * cell_m - view.position_m[1]
         for column in range(surface.relief_m.shape[1]):
             relief = surface.relief_m[row, column]
+            # the even floor shades nothing
             if relief < raised_m:
                 continue
             x = (surface.first_column + column + 0.5) * cell_m - view.position_m[0]
@@ -115,6 +116,7 @@ def block_rays(
                     horizon.tangent[bearing, distance] = rise
     for bearing in range(bearings):
         for distance in range(1, distances):
+            # what blocks a ray blocks it for all that lies behind
             before = horizon.tangent[bearing, distance - 1]
             if before > horizon.tangent[bearing, distance]:
                 horizon.tangent[bearing, distance] = before
@@ -132,11 +134,13 @@ def add_echo(
 ) -> None:
     """One echo with its phase, spread over the bins that the pulse reaches."""
     waves = range_m * tables.waves_per_m
+    # only the fraction of a wave turns the phase
     step = int((waves - np.floor(waves)) * PHASE_STEPS)
     cos = tables.phasor[step, 0] * amplitude
     sin = tables.phasor[step, 1] * amplitude
     real = re * cos - im * sin
     imaginary = re * sin + im * cos
+    # first of the bins that the pulse reaches, its middle between the third and fourth
     place = (range_m - tables.range_start_m) * tables.bins_per_m - 0.5 * TAPS + 0.5
     first = int(np.floor(place))
     within = int((place - first) * PULSE_STEPS)
@@ -158,6 +162,7 @@ def is_blocked(
     aside = view.heading[0] * y - view.heading[1] * x
     run = np.sqrt(x * x + y * y)
     bearing = int((aside / ahead / horizon.half_tangent + 1.0) * 0.5 * bearings)
+    # one step nearer: a cell must not shade itself
     distance = int(run / horizon.distance_m) - 1
     if not 0 <= bearing < bearings or distance < 0:
         return False
@@ -189,12 +194,14 @@ def table_places(
         return -1, -1
     t = left / forward
     t2 = t * t
+    # arctangent by its series: most points lie near the axis
     azimuth = (
         t * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9))))
         if t2 < 0.1
         else np.arctan(t)
     )
     column = int(np.floor(azimuth * tables.columns_per_rad + 0.5 * tables.columns))
+    # the table is over the sine, which needs no arcsine here
     lift = int((up * per_range + 0.5) * ELEVATION_STEPS)
     if not 0 <= column < tables.columns or not 0 <= lift < ELEVATION_STEPS:
         return -1, -1
@@ -217,6 +224,7 @@ def sum_echoes(
     cells = points.shape[0]
     has_objects = surface.amplitude.shape[0] > 0
     has_shadows = horizon.tangent.shape[0] > 0
+    # a pulse reaches into the window from as far as its taps
     least_m2 = (tables.range_start_m - TAPS * tables.bin_m) ** 2
     most_m2 = (tables.range_start_m + (tables.bins + TAPS) * tables.bin_m) ** 2
     height_m = view.position_m[2] - view.floor_z_m
@@ -247,6 +255,7 @@ def sum_echoes(
                 area = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
             z = relief - height_m
             range_m2 = x * x + y * y + z * z
+            # u . N times the range; not positive: the facet faces away
             toward = x * slope_x + y * slope_y - z
             if range_m2 < least_m2 or range_m2 > most_m2 or toward <= 0:
                 continue
@@ -264,9 +273,12 @@ def sum_echoes(
             add_echo(
                 tables, echoes, beam_column, range_m, amplitude, point[0], point[1]
             )
+            # of upright sides the floor in front of them is a mirror
             steepness = 1 - 1 / area
             if steepness > STEEP and relief > 0 and floor_reflection > 0:
+                # distance of the image of the facet below the floor
                 image_m = np.sqrt(x * x + y * y + (height_m + relief) ** 2)
+                # there by the floor and back direct, and the other way round
                 ghost = 2 * floor_reflection * steepness * amplitude
                 add_echo(
                     tables,

@@ -104,7 +104,9 @@ class FrameSimulator:
         self._tables = tables_of(sonar, column_rad, pulse_sigma_m)
 
         ranges_m = sonar.ranges_m()
+        # there and back, against the reference range
         absorbed_db = 2 * options.absorption_db_m * (ranges_m - REFERENCE_M)
+        # the operator sees the time-varied gain of the sonar, with its error
         gain_db = GAIN_SLOPE_DB * np.log10(ranges_m / REFERENCE_M) + absorbed_db
         gain_db = gain_db + drawn_gain_error_db(
             options.tvg_error_db, len(ranges_m), seed
@@ -116,6 +118,7 @@ class FrameSimulator:
         reference_intensity = float(
             across_m * along_m / CELL_M**2 * REFERENCE_GRAZING**2
         )
+        # so that the mean level of the floor at the reference is `floor_db`
         strength = 10 ** (options.floor_db / 20) / np.sqrt(reference_intensity)
         spreading = strength * (REFERENCE_M / ranges_m) ** 2 * 10 ** (-absorbed_db / 20)
         self._spreading: Floats32 = spreading.astype(np.float32)
@@ -125,8 +128,10 @@ class FrameSimulator:
         offset = middles[None, :] - sonar.azimuths_rad()[:, None]
         pattern = sonar.two_way_pattern(offset, options.side_lobes)
         matters = pattern > LEAST_AMPLITUDE
+        # beams are narrow: each has a band of columns that reach it
         first = matters.argmax(axis=1)
         last = columns - matters[:, ::-1].argmax(axis=1)
+        # `through_beams` takes four columns at a time
         self._bands = np.column_stack([first // 4 * 4, -(-last // 4) * 4])
         self._beam_matrix: Floats32 = pattern.astype(np.float32)
 
@@ -158,6 +163,7 @@ class FrameSimulator:
         The sonar's x points along its axis, its y to the left. The frame's number is the seed of its noise.
         ``surface_z_m`` is the height of the water's surface; None: too far away to matter.
         """
+        # a byte for the full span
         counts = self.level_db(position_m, world_R_sonar, number, surface_z_m) * (
             255 / self.sonar.decibel_span
         )
@@ -175,6 +181,7 @@ class FrameSimulator:
         total = self.scattered(position_m, world_R_sonar, number)
         columns, bins, _ = total.shape
         seen = np.zeros((self.sonar.beams, bins * 2), np.float32)
+        # real and imaginary parts are samples alike: the pattern of a beam is real
         by_column = np.ascontiguousarray(total).reshape(columns, -1)
         echoes.through_beams(self._beam_matrix, self._bands, by_column, seen)
         if self.options.cross_talk_db is not None:
@@ -186,10 +193,12 @@ class FrameSimulator:
                 signal, self.sonar, *heights_m, self.options.surface_path_db
             )
         if self.options.noise_db is not None:
+            # the power of complex noise is the sum over both parts
             sigma = np.float32(10 ** (self.options.noise_db / 20) * np.sqrt(0.5))
             signal = signal + sigma * self._rng(number, 0).standard_normal(
                 signal.shape, np.float32
             )
+        # the detector of the sonar keeps the power and drops the phase
         intensity = signal[..., 0] ** 2 + signal[..., 1] ** 2
         return 10 * np.log10(np.maximum(intensity, np.float32(1e-12))) + self._gain_db
 
@@ -215,6 +224,7 @@ class FrameSimulator:
         if sector is not None:
             cells = cells_of(sector, position_m)
             is_fixed = self.options.speckle == "world"
+            # speckle of a frame: amplitudes are taken from another place of the floor
             shift = (
                 np.zeros(2, np.int64)
                 if is_fixed
@@ -237,16 +247,19 @@ class FrameSimulator:
                 sector.farthest_m / np.cos(sector.half_bearing_rad / 2),
             )
             laid = laid_out(near, cells, self._floor.relief_m)
+            # an even floor without objects needs neither slopes nor shadows
             if laid.relief_m.any() or not np.isnan(laid.amplitude).all():
                 surface = laid
                 if self.options.shadows:
                     steps = int(np.ceil(sector.farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
+                    # no ray is blocked so far
                     blocked = np.full((BEARINGS, steps), -np.inf, np.float32)
                     horizon = Horizon(
                         blocked,
                         float(np.tan(sector.half_bearing_rad + 0.02)),
                         DISTANCE_STEP_M,
                     )
+                    # ripples reach down from the even floor: their crests shade their troughs
                     raised_m = RAISED_M - self.options.ripple_height_m
                     echoes.block_rays(view, surface, horizon, raised_m, CELL_M)
             reflection = (
@@ -263,6 +276,7 @@ class FrameSimulator:
                 reflection,
                 total,
             )
+        # pulses of scatterers just outside of the window reach into it
         return total[:, TAPS:-TAPS]
 
 
@@ -272,6 +286,7 @@ def with_cross_talk(seen: Floats32, sonar: ImagingSonar, level_db: float) -> Flo
     others = sonar.beams // groups - 1
     if groups == 1 or others < 1:
         return seen
+    # the power of all others together is `level_db`
     leak = float(10 ** (level_db / 20) / np.sqrt(others))
     number = np.arange(sonar.beams) % groups
     together = np.stack([seen[number == group].sum(axis=0) for group in range(groups)])
@@ -287,13 +302,17 @@ def with_surface_path(
 ) -> Floats32:
     """Add echoes that went one way by the surface and arrive later than the direct ones."""
     ranges_m = sonar.ranges_m()
+    # horizontal distance of the scatterer on the floor
     run2 = np.maximum(ranges_m**2 - height_m**2, 0.0)
+    # one way direct, one way by the image of the sonar in the surface
     late_m = 0.5 * (ranges_m + np.sqrt(run2 + (height_m + 2 * depth_m) ** 2))
+    # direct bin whose echo arrives at each bin by the surface
     source = np.rint(
         np.interp(ranges_m, late_m, np.arange(len(ranges_m)), left=-1)
     ).astype(int)
     arrives = source >= 0
     of = source[arrives]
+    # the longer way turns the phase
     turn = 2 * np.pi * (2 / sonar.wavelength_m) * (late_m - ranges_m)[of]
     level = 10 ** (level_db / 20) * (ranges_m / late_m)[of] ** 2
     cos = (level * np.cos(turn)).astype(np.float32)
@@ -309,7 +328,9 @@ def with_surface_path(
 def tables_of(sonar: ImagingSonar, column_rad: float, pulse_sigma_m: float) -> Tables:
     """Tables of a sonar for columns of some width and a Gaussian pulse."""
     bin_m = sonar.range_length_m / sonar.bins
+    # beyond the outermost beam its pattern is over after a few widths
     half_rad = np.abs(sonar.azimuths_rad()).max() + 4 * sonar.beam_width_rad
+    # tables at the middles of their steps
     angle = 2 * np.pi * (np.arange(PHASE_STEPS) + 0.5) / PHASE_STEPS
     place = (np.arange(PULSE_STEPS) + 0.5) / PULSE_STEPS
     offset = np.arange(TAPS) + 1 - 0.5 * TAPS - place[:, None]
@@ -333,6 +354,7 @@ def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
     """Error of the time-varied gain: a tilt over the window and a slow wave of a third of it, shape (bins,)."""
     rng = np.random.default_rng([seed, 1])
     along = np.linspace(-0.5, 0.5, bins)
+    # whole numbers of draws: other options leave the random stream as it was
     tilt = rng.standard_normal()
     wave = rng.standard_normal()
     phase = rng.uniform(0, 2 * np.pi)
@@ -358,6 +380,7 @@ def laid_out(
         for item in objects:
             y = (rows + 0.5) * CELL_M - item.position_m[1]
             x = (columns + 0.5) * CELL_M - item.position_m[0]
+            # the current scours the sand around an object
             away_m = np.hypot(x, y[:, None]) - item.extent_m
             relief_m *= np.clip(away_m / SCOUR_M, 0, 1).astype(np.float32)
     for item in objects:
@@ -367,6 +390,7 @@ def laid_out(
         to_columns, own_columns = _overlap(
             item.first_column - first_column, item.amplitude.shape[1], shape[1]
         )
+        # cells of the patch without material stay floor
         patch = item.amplitude[own_rows, own_columns]
         amplitude[to_rows, to_columns] = np.where(
             np.isnan(patch), amplitude[to_rows, to_columns], patch
@@ -442,6 +466,7 @@ def image_along(
 
     Frames are stamped later than their pings, shape (n,), by the options' time offset.
     """
+    # a dropped frame keeps its number, so that the others look as without drops
     numbers = np.array(
         [n for n in range(len(pings_ns)) if not simulator.is_dropped(n)], dtype=np.int64
     )
@@ -458,6 +483,7 @@ def image_along(
                 positions, world_R_sonar, block.tolist(), strict=True
             )
         ]
+        # the pose is that of the ping; only the stamp is late
         stamps_ns = pings_ns[block] + round(simulator.options.time_offset_s * NS_PER_S)
         frames = SonarFrames(
             stamps_ns, np.stack(images), simulator.ranges_m(), simulator.azimuths_rad()
@@ -476,6 +502,7 @@ def frame_truth(
     fan = FieldOfView(
         sonar.range_start_m, far_m, half_azimuth_rad, sonar.elevation_span_rad / 2
     )
+    # all objects in all frames at once
     sonar_R_world = world_R_sonar.inv().as_matrix()
     centres = np.reshape([o.position_m for o in objects], (-1, 3))
     discs = (

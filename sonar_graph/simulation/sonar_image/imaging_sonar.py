@@ -70,6 +70,7 @@ class ImagingSonar(Section):
         """True azimuth of each beam, positive to the left, rightmost first, shape (beams,)."""
         if self.lens_cubic is None:
             return self.linear_azimuths_rad()
+        # the cubic gives the beam of an angle; the inverse is needed
         numbers = np.polyval(self.lens_cubic, _FINE_DEG)
         return np.radians(
             -np.interp(np.arange(1, self.beams + 1), numbers, _FINE_DEG)[::-1]
@@ -79,6 +80,7 @@ class ImagingSonar(Section):
         """Amplitude over the angle from a beam's centre, 1 there; without side lobes a Gaussian of equal width."""
         if side_lobes:
             return (
+                # the same aperture sends and receives: the one-way pattern squared
                 np.sinc(self.aperture_m * np.sin(offset_rad) / self.wavelength_m) ** 2
             )
         return np.exp2(-((2 * offset_rad / self.beam_width_rad) ** 2))
@@ -106,29 +108,27 @@ DIDSON = ImagingSonar(
 )
 """High frequency, shortest extended window. The lens is the measured one: beams 0.37° apart at the centre, 0.21° at the
 edge. Length of the pulse: ours."""
-ARIS_3000 = ImagingSonar(
-    frequency_hz=3.0e6,
-    beams=128,
-    azimuth_span_rad=np.radians(30.0),
-    beam_width_rad=np.radians(0.2),
-    elevation_span_rad=np.radians(15.0),
-    bins=512,
-    range_start_m=1.26,
-    range_length_m=1.25,
-    range_resolution_m=0.004,
-    firing_groups=8,
+ARIS_3000 = DIDSON.model_copy(
+    update={
+        "frequency_hz": 3.0e6,
+        "beams": 128,
+        "azimuth_span_rad": np.radians(30.0),
+        "beam_width_rad": np.radians(0.2),
+        "elevation_span_rad": np.radians(15.0),
+        "lens_cubic": None,
+    }
 )
 """ARIS Explorer 3000 with all beams, over the same window. Beams equally spaced: its lens is not simulated."""
-OCULUS_M1200D = ImagingSonar(
-    frequency_hz=2.1e6,
-    beams=512,
-    azimuth_span_rad=np.radians(60.0),
-    beam_width_rad=np.radians(0.4),
-    elevation_span_rad=np.radians(12.0),
-    bins=512,
-    range_start_m=1.26,
-    range_length_m=1.25,
-    range_resolution_m=0.004,
+OCULUS_M1200D = DIDSON.model_copy(
+    update={
+        "frequency_hz": 2.1e6,
+        "beams": 512,
+        "azimuth_span_rad": np.radians(60.0),
+        "beam_width_rad": np.radians(0.4),
+        "elevation_span_rad": np.radians(12.0),
+        "firing_groups": 1,
+        "lens_cubic": None,
+    }
 )
 """Oculus M1200d, high frequency; an electronic array, which forms all beams from one ping."""
 SonarName = Literal["didson", "aris3000", "oculus1200"]
@@ -190,6 +190,7 @@ class ImageOptions(SceneConditions):
         """The sonar with its window."""
         sonar = SONARS[self.sonar]
         length_m = self.window_m or sonar.range_length_m
+        # real sonars lengthen their pulse with the window
         resolution_m = sonar.range_resolution_m * length_m / sonar.range_length_m
         return sonar.model_copy(
             update={"range_length_m": length_m, "range_resolution_m": resolution_m}

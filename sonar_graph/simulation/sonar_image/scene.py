@@ -46,6 +46,7 @@ class Scatterers:
 
 def smooth_field(length_m: float, rng: np.random.Generator) -> Floats:
     """Periodic Gaussian random field of unit variance with the correlation ``exp(-(d / length)²)``, (1250, 1250)."""
+    # noise filtered in the frequency domain is periodic, as the floor is
     frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
     smoothing = np.exp(
         -((np.pi * length_m) ** 2)
@@ -66,6 +67,7 @@ def ripples(length_m: float, height_m: float, rng: np.random.Generator) -> Float
     """
     heading = rng.uniform(-np.pi, np.pi)
     period_m = CELLS * CELL_M
+    # whole numbers of waves in the period, or the crests would break at its border
     waves_x, waves_y = np.rint(
         period_m / length_m * np.array([np.cos(heading), np.sin(heading)])
     )
@@ -91,6 +93,7 @@ def scatterers(
     ``texture_shape`` is the shape of the Gamma distribution of its strength (mean 1, smooth over the texture's length
     and periodic); None: even.
     """
+    # texture and ripples do not change the scatterers
     points_rng, texture_rng, ripple_rng = rng.spawn(3)
     points = np.empty((CELLS, CELLS, 4), np.float32)
     points[..., :2] = points_rng.standard_normal(
@@ -99,6 +102,7 @@ def scatterers(
     points[..., 2:] = points_rng.random((CELLS, CELLS, 2), np.float32)
     strength = np.ones((CELLS, CELLS))
     if texture_shape is not None:
+        # a Gaussian field through the quantiles of the Gamma distribution
         quantiles = np.linspace(-6, 6, 2001)
         levels = stats.gamma.ppf(
             stats.norm.cdf(quantiles), texture_shape, scale=1 / texture_shape
@@ -164,12 +168,14 @@ def place(
     """
     radius_m = extent_m + margin_m
     first = np.floor((position_m[:2] - radius_m) / CELL_M).astype(int) - 1
+    # a cell more on each side, for the slopes at the border
     cells = int(np.ceil(2 * radius_m / CELL_M)) + 3
     x = (first[0] + np.arange(cells) + 0.5) * CELL_M - position_m[0]
     y = (first[1] + np.arange(cells) + 0.5) * CELL_M - position_m[1]
     world_x, world_y = np.meshgrid(x, y)
     cos = np.cos(yaw_rad)
     sin = np.sin(yaw_rad)
+    # from the world into the axes of the object
     level_db, height_m = shape(
         cos * world_x + sin * world_y, cos * world_y - sin * world_x
     )
@@ -214,6 +220,7 @@ def place_landmark(
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         level_db = design.level_db(x_m, y_m)
+        # the floor meets the bottom of the landmark without a step, which would shine
         away = np.clip((np.hypot(x_m, y_m) - plate_m) / SLOPE_M, 0, 1)
         ground_m = bottom_m * 0.5 * (1 + np.cos(np.pi * away))
         height_m = np.where(
@@ -247,6 +254,7 @@ def block(length_m: float, width_m: float, height_m: float, level_db: float) -> 
 
 def ragged_patch(radius_m: float, level_db: float, rng: np.random.Generator) -> Shape:
     """A flat rough patch whose radius varies irregularly with direction, from about half to one and a half."""
+    # higher harmonics are weaker: a rough outline without spikes
     order = np.arange(1, 6)
     waves = rng.normal(0, 0.28 / np.sqrt(order), (2, len(order)))
 
@@ -335,15 +343,18 @@ def lit_sector(
             -1,
         ).reshape(-1, 3)
     )
+    # how far along the floor each ray comes while it drops by one
     run = np.hypot(rays[:, 0], rays[:, 1])
     nearest, farthest = (np.sqrt(max(r**2 - height_m**2, 0.0)) for r in ranges_m)
     drop = -rays[:, 2] / run
+    # the steepest ray limits the near side, the flattest one the far side
     nearest = max(nearest, height_m / max(drop.max(), 1e-6))
     if drop.min() > 0:
         farthest = min(farthest, height_m / drop.min())
     if nearest >= farthest or height_m <= 0:
         return None
     heading = axis[:2] / np.hypot(*axis[:2])
+    # relative to the axis: tilt and roll widen the sector on the floor
     bearings = np.arctan2(
         heading[0] * rays[:, 1] - heading[1] * rays[:, 0], rays[:, :2] @ heading
     )
@@ -355,6 +366,7 @@ def lit_sector(
 def cells_of(sector: Sector, foot_m: Floats) -> Cells:
     """Cells of a quadrilateral that contains the sector; ``foot_m`` is the point below the sonar."""
     bearing = sector.half_bearing_rad * np.array([1, 1, 0, -1, -1])
+    # two chords from outside touch the arc of the far side
     far_m = sector.farthest_m / np.cos(sector.half_bearing_rad / 2)
     reach_m = np.array([sector.nearest_m, far_m, far_m, far_m, sector.nearest_m])
     ahead = reach_m * np.cos(bearing)
@@ -369,10 +381,12 @@ def cells_of(sector: Sector, foot_m: Floats) -> Cells:
     for x1, y1, x2, y2 in zip(x, y, np.roll(x, -1), np.roll(y, -1), strict=True):
         if abs(y2 - y1) < 1e-9:
             continue
+        # rows whose middle this side of the polygon crosses
         crosses = (middle >= min(y1, y2)) & (middle <= max(y1, y2))
         at = x1 + (middle[crosses] - y1) * (x2 - x1) / (y2 - y1)
         left[crosses] = np.minimum(left[crosses], at)
         right[crosses] = np.maximum(right[crosses], at)
+    # rows that no side crosses hold no cell
     empty = left > right
     left[empty] = x[0]
     right[empty] = x[0]

@@ -40,6 +40,7 @@ def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> 
     step = 2 * np.pi / corners
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+        # angle from the middle of the nearest side
         from_side = np.arctan2(y_m, x_m) % step - step / 2
         inside = np.hypot(x_m, y_m) * np.cos(from_side) < apothem_m
         return np.where(inside, level_db, np.nan), np.where(inside, height_m, 0.0)
@@ -74,6 +75,7 @@ def boulder(
     """A stone of random outline and lumpy top: half an ellipsoid whose radius varies with direction."""
     order = np.arange(1, 5)
     waves = rng.normal(0, 0.16 / np.sqrt(order), (2, len(order)))
+    # stones are longer than wide, and not smooth on top
     flattened = rng.uniform(0.6, 1.0)
     lumps = rng.uniform(0, 2 * np.pi, 2)
     lump_m = 0.5 * radius_m
@@ -102,6 +104,7 @@ def tuft(
     rng: np.random.Generator,
 ) -> Shape:
     """Weed: narrow fronds from one root, which lie over the floor and between which it shows."""
+    # each frond is a parabola from the root
     angle = rng.uniform(-np.pi, np.pi, fronds)
     length_m = radius_m * rng.uniform(0.4, 1.0, fronds)
     bend = rng.normal(0, 2.5, fronds)
@@ -222,6 +225,7 @@ def strangers_at(
     )
     if not kinds:
         return []
+    # each kind once before any comes again
     order = np.concatenate(
         [rng.permutation(len(kinds)) for _ in range(-(-len(spots_m) // len(kinds)))]
     )

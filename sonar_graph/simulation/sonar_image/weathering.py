@@ -29,6 +29,7 @@ def patches(
     # the field's autocorrelation is exp(-(d / PATCH_M)^2)
     sigma = PATCH_M / (2 * CELL_M)
     field = gaussian_filter(rng.standard_normal(is_material.shape), sigma, mode="wrap")
+    # the quantile over the material, so that the share is exact
     ranked = np.sort(field[is_material])
     count = round(share * len(ranked))
     if count == 0:
@@ -45,6 +46,7 @@ def weathered(
     amplitude = landmark.amplitude.astype(float)
     relief_m = landmark.relief_m.astype(float)
     is_material = ~np.isnan(amplitude)
+    # brighter than the floor: foam; the rest is plate
     is_bright = amplitude > 1
     amplitude[is_bright] *= 10 ** (conditions.contrast_db / 20)
     if conditions.plate_db is not None:
@@ -52,10 +54,12 @@ def weathered(
     if conditions.fouling > 0:
         grows, depth = patches(is_material, conditions.fouling, fouling_rng)
         amplitude[grows & is_material] = 10 ** (FOULING_DB / 20)
+        # growth is highest in the middle of its patch
         relief_m += np.where(is_material, GROWTH_M * depth, 0.0)
     if conditions.sediment > 0:
         drowned, _ = patches(is_material, conditions.sediment, sediment_rng)
         amplitude[drowned] = np.nan
+        # sediment lies in a drape: it rounds the edges below it
         relief_m = np.where(
             drowned,
             gaussian_filter(relief_m, DRAPE_M / CELL_M, mode="nearest"),
