@@ -205,6 +205,7 @@ def at_first_use(
         import ast
         from pathlib import Path
 
+        # the imports under TYPE_CHECKING are the one list of names; here they are read, not run
         module = sys.modules[package]
         tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
         listed = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
@@ -214,6 +215,7 @@ def at_first_use(
         if places.get(name, "").startswith(f"{package}."):
             setattr(module, name, getattr(import_module(places[name]), name))
             return getattr(module, name)
+        # a submodule, as after an import of it
         if find_spec(f"{package}.{name}"):
             return import_module(f"{package}.{name}")
         raise AttributeError(

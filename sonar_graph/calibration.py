@@ -153,6 +153,7 @@ def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
     def with_tag(value: Any) -> Any:
         if isinstance(value, str):
             raise ValueError(f'expected a section with {tag} = "{value}"')
+        # a section without its tag is of the default kind
         return {tag: default, **value} if isinstance(value, dict) else value
 
     return Field(discriminator=tag), BeforeValidator(with_tag)
@@ -324,6 +325,7 @@ class Start(Section):
 
     def in_map(self) -> Self:
         """The start of a run with a known map: where nothing gives its place, the place is found in the map."""
+        # heading and vehicle give no place in the world
         is_placed = self.source not in ("heading", "vehicle")
         return self if is_placed else self.model_copy(update={"source": "map"})
 
@@ -357,6 +359,7 @@ class KnownMap(Section):
     def _check(self) -> Self:
         if not self.ids:
             raise misfits(type(self), {"ids": "a map needs at least one landmark"})
+        # a survey with one landmark in two rows
         twice = [i for i, count in Counter(self.ids).items() if count > 1]
         if twice:
             raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
@@ -368,12 +371,14 @@ class KnownMap(Section):
         if len(self.positions_m) != len(self.ids):
             reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
             raise misfits(type(self), {"positions_m": reason})
+        # x, y and z of each landmark
         size = 3 * len(self.ids)
         if [len(row) for row in self.covariance_m2] != [size] * size:
             reason = f"expected {size} rows of {size} numbers, three a landmark"
             raise misfits(type(self), {"covariance_m2": reason})
         P = self.joint()
         largest = float(np.abs(P).max())
+        # relative to the largest entry: rounding of a text file
         is_symmetric = bool((np.abs(P - P.T) <= 1e-6 * largest).all())
         if not is_symmetric or np.linalg.eigvalsh(P)[0] < -1e-9 * largest:
             reason = "expected a symmetric matrix without negative eigenvalues"

@@ -79,6 +79,7 @@ def expectation(kind: str, message: str) -> str:
     """Text of a validation error of this type, without the words of the library that found it."""
     if kind in EXPECTED:
         return f"expected {EXPECTED[kind]}"
+    # pydantic puts it before the messages of validators
     message = message.removeprefix("Value error, ")
     return re.sub(
         "^Input should be (?=(greater|less))", "expected a number ", message

@@ -177,6 +177,7 @@ class Candidate:
 
     def fresh(self, calibration: Calibration, odometry: MotionSource) -> Estimator:
         """An estimator that has seen nothing."""
+        # a function has its settings within
         settings = () if self.params is None else (self.params,)
         estimator = self.make(calibration, odometry, *settings)
         missing = missing_of(estimator, METHODS)
@@ -238,6 +239,7 @@ class PlugIns:
         """Entry points by name, nothing imported; two where two packages use one name."""
         found: dict[str, list[EntryPoint]] = {}
         for point in sorted(entry_points(group=self.group), key=lambda one: one.name):
+            # a package that is installed twice, as in an editable install, announces the same twice
             same = found.setdefault(point.name, [])
             if point.value not in [one.value for one in same]:
                 same.append(point)
@@ -267,6 +269,7 @@ class PlugIns:
             raise self.unknown(
                 f"two packages bring {self.kind}s called {name!r}: {places}; uninstall one, or rename its entry point"
             )
+        # only now is the package imported: it may take seconds, or fail
         (point,) = found[name]
         words = f"{name} ({point.value})"
         try:
@@ -309,6 +312,7 @@ def name_of(estimator: EstimatorChoice) -> str:
     """
     if isinstance(estimator, str):
         return estimator
+    # a lambda or a partial has no name for tables
     own = getattr(estimator, "__name__", "")
     if isinstance(estimator, type):
         missing = missing_of(estimator, ("Params", *METHODS))

@@ -80,6 +80,7 @@ def decibels(samples: NDArray[Any], image: SonarImage) -> NDArray[np.float32]:
         return np.multiply(
             samples, np.float32(image.decibel_span / image.full_scale), dtype=np.float32
         )
+    # the logarithm of zero: one count, or the smallest amplitude worth drawing
     least = 1.0 if np.issubdtype(samples.dtype, np.integer) else 1e-5 * image.full_scale
     ratio = np.maximum(samples, np.float32(least)) / np.float32(least)
     return np.float32(20.0 / image.gamma) * np.log10(ratio, dtype=np.float32)

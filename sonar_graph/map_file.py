@@ -93,11 +93,13 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
     reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
     heads = [head.strip() for head in reader.fieldnames or []]
     reader.fieldnames = heads
+    # landmarks.csv of a comparison
     is_marginal = set(TRIANGLE) <= set(heads)
     has_axes = set(SIGMAS) <= set(heads)
     if not {"id", *PLACE} <= set(heads) or not (
         is_marginal or has_axes or "sigma_m" in heads
     ):
+        # spreadsheets of some countries write semicolons
         apart = "; separate them by commas" if ";" in text.partition("\n")[0] else ""
         raise LogError(
             f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}{apart}"
@@ -120,6 +122,7 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
             return value
 
         landmark_id = number("id")
+        # a table of floats may hold 4.0, and not 4.5
         if landmark_id != int(landmark_id):
             raise LogError(f"{where}: id: expected a whole number, not {row['id']!r}")
         if int(landmark_id) in ids:
@@ -130,6 +133,7 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         places.append([number(column) for column in PLACE])
         if is_marginal:
             block = np.zeros((3, 3))
+            # upper triangle, mirrored below
             block[np.triu_indices(3)] = [number(column) for column in TRIANGLE]
             blocks.append(block + np.triu(block, 1).T)
         else:
@@ -142,6 +146,7 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
             blocks.append(np.diag(np.square(sigmas)))
     if not ids:
         raise LogError(f"{path}: no landmark: give a line for each below the heading")
+    # no correlations between landmarks: the file has none
     joint = np.zeros((3 * len(ids), 3 * len(ids)))
     for k, block in enumerate(blocks):
         joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = block
@@ -167,6 +172,7 @@ def write_map(path: Path, known: KnownMap) -> None:
 
 def map_origin(sequence: Sequence) -> str:
     """Name of a log in the source of its map, with a checksum of its first rates, since names repeat."""
+    # rates of a real gyro do not repeat
     first = sequence.imu.angular_velocity[:100]
     return f"{sequence.name} ({zlib.crc32(first.tobytes()):08x})"
 
@@ -181,6 +187,7 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     note = f"{len(known.ids)} landmarks of {path.name}"
     if start.source == "map":
         note += "; the start is found in it, by identified landmarks"
+    # the map has the measurements of this log in it already
     if known.source.startswith(f"{map_origin(sequence)}, "):
         warnings.append(
             f"{path}: this map was made from the same log, whose measurements count twice then: results look too certain"

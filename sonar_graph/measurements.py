@@ -51,6 +51,7 @@ constrains nothing (a direction anywhere on the circle has 1.8 rad)."""
 def no_posterior(probability: Floats) -> NDArray[np.bool_]:
     """Mask, shape (n,), of rows of ``probability``, shape (n, k), that are below 0, NaN, or above 1 in sum."""
     with np.errstate(invalid="ignore", over="ignore"):
+        # NaN compares false, and so is no posterior
         is_one = (probability >= 0).all(axis=1) & (
             probability.sum(axis=1) <= 1.0 + ROUNDING
         )
@@ -79,6 +80,7 @@ class Block:
     def __post_init__(self) -> None:
         name = type(self).__name__
         stamps = np.asarray(self.stamps_ns)
+        # a block of no rows would have no first stamp, which everything that takes blocks needs
         if stamps.size == 0:
             raise MeasurementError(
                 f"{name}: a block needs at least one row; leave the block out instead"
@@ -94,6 +96,7 @@ class Block:
             )
             row_shape = values.shape[1:] if shape is None else shape
             if values.shape[:1] != (n,):
+                # the usual mistake: columns in place of rows
                 advice = "; transpose it" * (values.shape[1:] == (n,))
                 raise MeasurementError(
                     f"{place}: shape {values.shape} has not one row for each of {n} stamps{advice}"
@@ -107,6 +110,7 @@ class Block:
                 raise MeasurementError(
                     f"{place}: row {row} is not finite; leave such rows out of the block"
                 )
+            # the class is frozen for its users, not for its own constructor
             object.__setattr__(self, column, values)
         if (
             n > 1
@@ -127,6 +131,7 @@ class Block:
     def is_too_fast(self) -> bool:
         """True where stamps, at least ten, follow each other faster than any sensor measures."""
         stamps_ns = np.unique(self.stamps_ns)
+        # a few close rows may be a burst of a driver; many are stamps in another unit
         return len(stamps_ns) >= 10 and bool(
             stamps_ns[-1] - stamps_ns[0] < FASTEST_NS * (len(stamps_ns) - 1)
         )
@@ -147,6 +152,7 @@ class Block:
     @classmethod
     def of_valid(cls, *columns: NDArray[Any]) -> Self:
         """A block of columns that are known to keep the rules, which are not checked again."""
+        # the constructor would check all rows of a log again for every step of a replay
         block = object.__new__(cls)
         vars(block).update(zip(_names(cls), columns, strict=True))  # type: ignore[arg-type]  # hash of a row
         return block
@@ -193,6 +199,7 @@ def _columns(
 
 def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any]:
     """Column as int64 or float64; refuses floats where integers are expected, instead of truncating them."""
+    # a stamp in float seconds would be truncated without a word
     kinds, expected = ("iu", "integers") if is_whole else ("iufb", "numbers")
     if values.dtype.kind not in kinds and values.size:
         advice = (
@@ -328,6 +335,7 @@ class PositionFixes(Block):
         """
         with np.errstate(all="ignore"):
             sigmas = np.sqrt(np.einsum("nii->ni", self.covariance_m2))
+            # without units, so that one tolerance holds for metres and millimetres
             correlations = self.covariance_m2 / (
                 sigmas[:, :, None] * sigmas[:, None, :]
             )
@@ -335,6 +343,7 @@ class PositionFixes(Block):
                 np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2))
                 <= ROUNDING
             )
+            # leading minors: the first is 1
             is_definite = (correlations[:, 0, 1] ** 2 < 1 - ROUNDING) & (
                 np.linalg.det(correlations) > ROUNDING
             )
@@ -383,6 +392,7 @@ class LandmarkDetections(Block):
     Each row has the posterior given all evidence of the track so far, so the last row's is the best."""
 
     def __post_init__(self) -> None:
+        # detections without tracks are the usual case
         if not len(self.track):
             object.__setattr__(
                 self, "track", np.full(len(self.stamps_ns), NO_TRACK, dtype=np.int64)
@@ -395,6 +405,7 @@ class LandmarkDetections(Block):
                     f"LandmarkDetections.{column}: expected shape (n, k), k >= 1 identities of each row with their"
                     f" probabilities, not {shape}"
                 )
+        # it would be the key of another variable of the graph
         too_large = (self.candidate_ids >= FIRST_TOO_LARGE_ID).any(axis=1)
         improper = "probabilities that are not between 0 and 1, or more than 1 in sum; 97 % is 0.97"
         for column, has_it, fault in (
@@ -410,12 +421,14 @@ class LandmarkDetections(Block):
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """Rows of each sonar frame, that is of each stamp."""
+        # rows of a frame share a stamp and follow each other
         edges = [0, *(np.flatnonzero(np.diff(self.stamps_ns)) + 1).tolist(), len(self)]
         for first, last in pairwise(edges):
             yield self.rows(slice(first, last))
 
     def are_sound(self) -> NDArray[np.bool_]:
         """Mask, shape (n,), of rows with possible range and azimuth, and a positive definite or no covariance (NaN)."""
+        # determinant and symmetry relative to the diagonal: metres and radians differ
         a, b, c, d = self.range_azimuth_cov.reshape(-1, 4).T
         with np.errstate(all="ignore"):
             is_definite = (

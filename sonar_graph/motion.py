@@ -62,9 +62,11 @@ class PreintegratedMotion:
             return next_motion
         if next_motion.duration_s == 0.0:
             return self
+        # the perturbation of the first motion, moved to the last frame
         A = next_motion.i_T_j.inverse().AdjointMap()
         i_R_j = self.i_T_j.rotation().matrix()
         duration_s = self.duration_s + next_motion.duration_s
+        # means over time add up by their durations, in one frame
         impulse = self.mean_specific_force * self.duration_s
         impulse += i_R_j @ next_motion.mean_specific_force * next_motion.duration_s
         return PreintegratedMotion(

@@ -148,6 +148,7 @@ class Sequence:
 
     def off_the_clock(self) -> list[RefusedRow]:
         """Rows more than a day before the start or after the end, which `replay` leaves out, or that are too fast."""
+        # no log pauses for a day: a clock was set there
         first_ns = self.start_ns - PAUSE_NS
         last_ns = self.end_ns + PAUSE_NS
         too_fast = [
@@ -183,6 +184,7 @@ class Sequence:
             raise MeasurementError(
                 f"{rate_hz!r} Hz is no rate; expected a number of more than 0, and at most one instant a nanosecond"
             )
+        # whole nanoseconds, so that instants do not drift by rounding
         step_ns = round(NS_PER_S / rate_hz)
         count = (self.end_ns - self.start_ns) // step_ns
         if count > MOST_INSTANTS:
@@ -205,6 +207,7 @@ class Sequence:
 
     def replay(self, instants_ns: Ints) -> Iterator[Measurements]:
         """Measurements between successive instants; the first item holds all from a day before the start on."""
+        # sensors that began earlier belong to the first call
         after_ns = self.start_ns - PAUSE_NS
         for end_ns in instants_ns.tolist():
             rows: dict[str, Any] = {
@@ -217,6 +220,7 @@ class Sequence:
 
 def longest_part(stamps_ns: Ints) -> tuple[int, int]:
     """First and last stamp of the part with the most rows between pauses."""
+    # in float: differences of stamps of 1970 and 2200 do not fit into 64 bits
     pauses = np.flatnonzero(np.diff(stamps_ns.astype(np.float64)) > PAUSE_NS) + 1
     first, end = max(
         pairwise([0, *pauses.tolist(), len(stamps_ns)]),

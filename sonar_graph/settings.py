@@ -31,6 +31,7 @@ def nested(
     for name, value in sorted(
         values.items(), key=lambda named: named[0].count(".")
     ):  # sections before their settings
+        # the sections are made on the way, where they are missing
         *sections, last = name.split(".")
         place = tree
         for section in sections:
@@ -96,7 +97,9 @@ def settings_of(
                 for setting in settings_of(
                     option, value if isinstance(value, option) else None, f"{path}."
                 ):
+                    # other options may have a setting of this name too
                     top = setting.name[len(path) + 1 :].split(".")[0]
+                    # the options that have this setting
                     with_it = [
                         option,
                         *(other for other in others if top in other.model_fields),
@@ -181,6 +184,8 @@ def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
     ``error``: from validating plain values; ``model``: model against which they were validated.
     """
     errors = error.errors()
+    # pydantic reports each missing element of a list: one message for the list is enough; a dict keeps the
+    # order
     short = dict.fromkeys(e["loc"][:-1] for e in errors if _is_short_list(e))
     texts = [_describe(e, model) for e in errors if not _is_short_list(e)]
     for place in short:
@@ -198,6 +203,7 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return error["msg"]
     if error["type"] == "extra_forbidden":
         return unknown_field(place, model)
+    # the message of pydantic lists classes; people know the tags
     if error["type"] == "union_tag_invalid":
         at = _walk(model, place)
         given = error["ctx"]["tag"]
@@ -247,6 +253,7 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
     if owner.section is None:
         return fault + choice(name, [], whose)
     fields = list(owner.section.model_fields)
+    # the same name in a section below is what was probably meant
     inside = [setting.name for setting in settings_of(owner.section)]
     meant = [
         _path((*owner.names, *dotted.split(".")))
@@ -323,6 +330,7 @@ class _Spot(NamedTuple):
 def _walk(model: type[BaseModel], place: Place) -> _Spot:
     spot = _Spot((), model, "", "", [model])
     for name in place:
+        # the tag of a union is a step of the place, but no name in the file
         picked = (
             [option for option in spot.options if name in _tags(option, spot.tag)]
             if not spot.value
@@ -403,6 +411,7 @@ def toml_template(model: type[BaseModel], stated: BaseModel, remark: str) -> str
     default = model()
     lines = _template_lines(model, default, stated, "", remark, is_nested=False)
     for name, field in model.model_fields.items():
+        # of a section that may be absent
         section = next(
             (part for part in get_args(field.annotation) if _is_section(part)), None
         )
@@ -446,12 +455,14 @@ def _template_lines(
             continue
         if is_optional:
             continue
+        # a field without a default shows what it may hold
         example = field.examples[0] if field.examples else 0.1
         usual = example if field.is_required() else field.get_default()
         usual = getattr(default, name, usual)
         value = usual if stated is None else getattr(stated, name)
         meaning = _sentence(meanings_of(model).get(name))
         is_stated = stated is not None and (value != usual or default is None)
+        # TOML has no null
         shown = value if value is not None else 0.0
         line = f"{prefix}{name} = {toml_value(shown)}"
         notes = " ".join(filter(None, [meaning, f"({remark})" if is_stated else ""]))

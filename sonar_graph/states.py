@@ -34,6 +34,7 @@ def landmark_name(identity: int) -> str:
     >>> landmark_name(4), landmark_name(FIRST_ANONYMOUS_ID + 3)
     ('4', 'u3')
     """
+    # identities of designs are below
     number = identity - FIRST_ANONYMOUS_ID
     return str(identity) if number < 0 else f"u{number}"
 
@@ -117,6 +118,7 @@ class Trajectory:
         """Times, length and extent, for a notebook."""
         rows = [["poses", str(len(self))]]
         if len(self):
+            # along the poses: noise makes it too long
             length_m = np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()
             rows.append(
                 [
@@ -179,6 +181,7 @@ class Trajectory:
             [one.matrix() if isinstance(one, gtsam.Pose3) else one for one in poses],
             dtype=np.float64,
         )  # (n, 4, 4)
+        # an empty list has no shape of its own
         matrices = matrices if len(matrices) else np.empty((0, 4, 4))
         if matrices.shape != (n, 4, 4):
             raise MeasurementError(
@@ -268,10 +271,12 @@ class Trajectory:
             raise MeasurementError(
                 "Trajectory.at: an instant lies outside it; select the common time span first"
             )
+        # the last instant belongs to the last interval
         after = np.clip(
             np.searchsorted(self.stamps_ns, stamps_ns, side="right"), 1, len(self) - 1
         )
         before = after - 1
+        # of a single pose there is no interval
         interval_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         share = ((stamps_ns - self.stamps_ns[before]) / interval_ns)[:, None]
         positions = self.positions[before] + share * (
@@ -282,6 +287,7 @@ class Trajectory:
         start = Rotation.from_quat(self.quaternions_xyzw[before])
         end = Rotation.from_quat(self.quaternions_xyzw[after])
         quaternions = (
+            # a share of the rotation vector: constant rate along the shortest arc
             start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())
         ).as_quat()
         return Trajectory.without_covariances(stamps_ns, positions, quaternions)
@@ -306,6 +312,7 @@ class CausalEstimates:
         """Append an estimate; one for the same instant replaces the last, an earlier one is ignored."""
         if not self._estimates or estimate.stamp_ns > self._estimates[-1].stamp_ns:
             self._estimates.append(estimate)
+        # rows that came late changed the estimate of the same instant
         elif estimate.stamp_ns == self._estimates[-1].stamp_ns:
             self._estimates[-1] = estimate
 
@@ -486,6 +493,7 @@ class DetectionJournal:
     """
 
     def __init__(self) -> None:
+        # arrays of the standard library grow without copying every row
         self._stamps_ns = array("q")
         self._ids = array("q")
         self._outcomes = array("b")

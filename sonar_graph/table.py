@@ -47,6 +47,7 @@ class Cell:
     def sorting(self) -> float | str:
         """The value by which rows are sorted; empty without one."""
         value = self.numbers[0] if self.numbers else self.text
+        # NaN is not equal to itself
         return value if value == value else ""
 
 
@@ -122,6 +123,7 @@ def as_html(table: Table, *, is_sortable: bool = False) -> str:
     def named(text: str, run: int | None) -> str:
         if run is None:
             return escape(text)
+        # names of runs are long, and break at these marks only
         breakable = re.sub(r"([/=_,])", r"\1<wbr>", escape(text))
         return f'<span class="run run-{run % RUN_COLOURS}">{breakable}</span>'
 
@@ -133,6 +135,7 @@ def as_html(table: Table, *, is_sortable: bool = False) -> str:
     caption = f"{table.title}. {table.caption}" if table.caption else table.title
     lines.append(f"<caption><span>{escape(caption)}</span></caption>")
     lines.append("<thead>")
+    # one heading over all columns is the caption
     if len(table.groups) > 1:
         over = (
             f'<th scope="colgroup" colspan="{width}">{escape(heading)}</th>'
@@ -155,6 +158,7 @@ def as_html(table: Table, *, is_sortable: bool = False) -> str:
     for index, row in enumerate(table.rows):
         if index in table.sections:
             title = f'<th scope="rowgroup" colspan="{len(row)}"><span>{escape(table.sections[index])}</span></th>'
+            # each section is a body of its own, which sorts within itself
             lines += ["</tbody>", "<tbody>"] if index else []
             lines.append(f'<tr class="block">{title}</tr>')
         lines.append("<tr>")

@@ -105,6 +105,7 @@ class LandmarkDesign:
         """
         pixel_m = self.size_m / len(self.mask)
         is_bright = (np.nan_to_num(self.mask) >= LEAST_BRIGHT_DB).astype(np.uint8)
+        # as the candidate selection closes gaps of an image
         joined = cv2.morphologyEx(
             is_bright,
             cv2.MORPH_CLOSE,
@@ -112,10 +113,12 @@ class LandmarkDesign:
         )
         _, _, stats, centres = cv2.connectedComponentsWithStats(joined, connectivity=8)
         areas = stats[1:, cv2.CC_STAT_AREA]
+        # rows run down, y runs up
         places_m = pixel_m * (centres[1:] - (len(self.mask) - 1) / 2) * [1.0, -1.0]
         away_m = np.hypot(*places_m.T)
         if (
             not len(areas)
+            # the largest; of equal ones that nearest to the middle
             or away_m[best := np.lexsort((away_m, -areas))[0]] < CENTRED_M
         ):
             return 0.0, 0.0
@@ -136,6 +139,7 @@ class LandmarkDesign:
 
     def digest(self) -> str:
         """16 hexadecimal digits that change with name, size, height, relief or mask (from 0.01 dB on)."""
+        # whole counts of 0.01 dB, with a value of its own for the floor: equal on every machine
         counts = np.where(
             np.isnan(self.mask), -(2**31), np.round(100 * np.nan_to_num(self.mask))
         )
@@ -211,6 +215,7 @@ class _Entry(Section):
         if self.picture is not None:
             mask = read_picture(folder / self.picture, self.black_db, self.white_db)
         else:
+            # middles of pixels, the first row at +y
             pixels = round(self.size_m / PIXEL_M)
             middles_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * self.size_m
             x_m, y_m = np.meshgrid(middles_m, -middles_m)
@@ -223,6 +228,7 @@ class _Entry(Section):
                         f"shape {number} covers nothing of the square, which reaches from {-half_m:g} to {half_m:g} m "
                         "in x and y; move it, or leave it out"
                     )
+                # later shapes lie over earlier ones
                 mask[covered] = shape.level_db
         if np.isnan(mask).all():
             raise ValueError(
@@ -261,7 +267,9 @@ def read_picture(path: Path, black_db: float, white_db: float) -> Floats:
         raise ValueError(
             f"{path} is {width} x {height}; make it {MOST_PIXELS} x {MOST_PIXELS} or smaller"
         )
+    # levels are linear in the grey
     full = 255.0 if picture.dtype == np.uint8 else 65535.0
+    # the alpha channel, where there is one
     transparent = (
         picture[..., 3] < full / 2
         if picture.ndim == 3 and picture.shape[2] == 4
@@ -314,6 +322,7 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
         raise CalibrationError(
             f"{path}: no landmark designs; give a TOML file with [[landmark]] tables"
         )
+    # two that look alike would share the posterior of every detection
     for one, other in combinations(designs, 2):
         if one.id == other.id:
             raise CalibrationError(
@@ -335,6 +344,7 @@ def _landmark_tables(file: Path) -> list[dict[str, Any]]:
         raise CalibrationError(f"{file} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{file} is not TOML: {error}") from error
+    # a misspelt table would be an empty file
     if unknown := sorted(values.keys() - {"landmark"}):
         meant = (
             "; did you mean [[landmark]]?"
@@ -365,6 +375,7 @@ def _design(file: Path, number: int, table: dict[str, Any]) -> LandmarkDesign:
     try:
         return _Entry.model_validate(table).design(file.parent)
     except ValidationError as error:
+        # people count shapes from 1
         faults = re.sub(
             r"\bshapes\.(\d+)",
             lambda row: f"shape {int(row[1]) + 1}",

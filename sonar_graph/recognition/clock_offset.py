@@ -98,6 +98,7 @@ class NavigationMotion:
 
     def _until(self, seconds: Floats) -> Floats:
         """Sums until instants, linear between those of the grid."""
+        # linear between the instants of the grid
         place = np.asarray(seconds) * (NS_PER_S / GRID_NS)
         before = np.clip(place.astype(np.intp), 0, len(self._sums) - 2)
         sums = self._sums[before] + (place - before)[:, None] * (
@@ -136,6 +137,7 @@ def estimate_offset(
             f"{CANNOT_TELL}: {len(known)} of {len(steps)} steps between them could be measured, and {LEAST_STEPS} are "
             f"needed; {AS_STATED}"
         )
+    # the navigation is moved by every offset of the search
     margin_ns = round((abs(around_s) + search_s + 1.0) * NS_PER_S)
     navigation = NavigationMotion(
         sequence, known[0].start_ns - margin_ns, known[-1].end_ns + margin_ns
@@ -145,6 +147,7 @@ def estimate_offset(
         for name in ("start_ns", "end_ns")
     )
     yaw, x, y = np.array([step.motion for step in known]).T
+    # yaw and motion across look alike in an image; their sum at the middle range does not
     z = np.column_stack([x, y + range_m * yaw])
     offsets_s = around_s + np.arange(
         -search_s, search_s + 0.5 * OFFSET_STEP_S, OFFSET_STEP_S
@@ -154,6 +157,7 @@ def estimate_offset(
         return navigation.over(start_s + offset_s, end_s + offset_s)
 
     counts = np.array([np.isfinite(moved(s)[:, 0]).sum() for s in offsets_s.tolist()])
+    # an offset with few common steps may fit by chance
     is_covered = counts >= max(LEAST_STEPS, LEAST_SHARE * counts.max())
     if not is_covered.any():
         raise LogError(
@@ -162,22 +166,27 @@ def estimate_offset(
         )
     likely = np.where(is_covered, 0.0, -np.inf)
     most = np.quantile(np.abs(z), CLIPPED_AT, axis=0)
+    # first with clipped motions, to find the outliers of a good fit
     rough = _profile(np.clip(z, -most, most), moved, offsets_s, likely, np.ones(2))
     at_rough = moved(float(offsets_s[np.argmax(rough)]))
     residuals = z - _fitted(z, at_rough)
+    # robust standard deviation by the median
     spread = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
     z = np.where(np.abs(residuals) > OUTLYING * spread, np.nan, z)
+    # residuals of neighbouring steps repeat: so many fewer are independent
     repetition = np.array(
         [_repetition(column) for column in (z - _fitted(z, at_rough)).T]
     )
     found = _profile(z, moved, offsets_s, likely, repetition)
     best = int(np.argmax(found))
+    # the top may lie beyond the search
     if best in (0, len(found) - 1):
         raise LogError(
             f"{CANNOT_TELL}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; give a longer "
             f"--search SECONDS, or {AS_STATED}"
         )
     seconds = _top(offsets_s, found)
+    # the stretches of the jackknife differ by less
     near = np.abs(offsets_s - offsets_s[best]) <= APART_S
     sigma_s = _jackknife(z, moved, offsets_s[near])
     nats = float(found[best]) - float(
@@ -209,6 +218,7 @@ def _profile(
     """
     profile = likely.copy()
     for at in np.flatnonzero(np.isfinite(likely)).tolist():
+        # -n / 2 ln(1 - r^2) is the log likelihood ratio of a regression
         fitted = _fitted(z, moved(float(offsets_s[at])))
         for c in range(2):
             n = np.isfinite(z[:, c] + fitted[:, c]).sum() / repetition[c]
@@ -236,6 +246,7 @@ def _top(offsets_s: Floats, profile: Floats) -> float:
 def _jackknife(z: Floats, moved: Callable[[float], Floats], offsets_s: Floats) -> float:
     """Standard deviation by leaving out one stretch of the steps after the other."""
     tops = []
+    # stretches, not steps: errors of neighbouring steps repeat
     for left_out in np.array_split(np.arange(len(z)), STRETCHES):
         rest = z.copy()
         rest[left_out] = np.nan
@@ -275,5 +286,6 @@ def _repetition(values: Floats) -> float:
     r = np.where(np.isfinite(values), values, 0.0)
     lags = min(LONGEST_LAG, len(r) // 4)
     by_lag = np.array([np.sum(r[lag:] * r[: len(r) - lag]) for lag in range(lags + 1)])
+    # weights of Bartlett keep the variance positive (Newey, West 1987)
     weights = 1 - np.arange(1, lags + 1) / (lags + 1)
     return max(1.0, 1 + 2 * float(weights @ by_lag[1:]) / max(float(by_lag[0]), 1e-30))

@@ -115,6 +115,7 @@ class TrueObjects(NamedTuple):
         """Identity of the landmark that was seen, `NONE` or `NO_LABEL`, and its row."""
         turned = self.azimuth_rad - sighting.azimuth_rad
         off_m = np.hypot(self.range_m - sighting.range_m, self.range_m * np.sin(turned))
+        # a landmark behind the sonar is not near, however small the sine
         off_m = np.where(np.abs(turned) < np.pi / 2, off_m, np.inf)
         at = int(np.argmin(off_m))
         if off_m[at] <= SAME_M:
@@ -207,6 +208,7 @@ def true_objects(run: Run, stamp_ns: int) -> TrueObjects:
     mounting = run.calibration.sonar.mounting.pose()
     world_R_body = pose.matrices[0]
     origin = pose.positions[0] + world_R_body @ mounting.translation()
+    # row vectors: q = R^T (p - origin)
     q = (run.true_landmarks.positions - origin) @ (
         world_R_body @ mounting.rotation().matrix()
     )
@@ -256,6 +258,7 @@ def calibrate(
                 f"{path}: has no true poses and true landmarks; `sonar-graph label {path} -o labels.json` and "
                 "`calibrate --labels labels.json` measure the model by some twenty clicks"
             )
+        # labels of other landmarks would be taken for other things
         in_log = run.true_landmarks.ids.tolist()
         if not set(gathered.ids) & set(in_log):
             true, known = (
@@ -305,6 +308,7 @@ def estimate_confusion(
     """
     counts = np.bincount(fits.label, minlength=len(ids) + 1)
     names = [*(f"landmark {i}" for i in ids), "no landmark"]
+    # a design that was not seen enough keeps its assumed row
     is_known = counts >= LEAST_FRAMES
     poor = [
         f"{name}: {count}"
@@ -324,6 +328,7 @@ def estimate_confusion(
         matrix = np.where(is_known[:, None], matrix, confusion_for(designs).array())
     height_bias_m, error = without_height(fits)
     is_moved = fits.moved_m.any(axis=1) & np.isfinite(error).all(axis=1)
+    # sightings that something moved err by that, and do not show what the bound is; without others they count
     is_left_out = is_moved & (is_moved.sum() < np.isfinite(error).all(axis=1).sum())
     # these err by what moved them, too
     counted = np.where(is_left_out[:, None], np.nan, error)
@@ -404,6 +409,7 @@ def without_height(fits: LabelledFits) -> tuple[float, Floats]:
     known = np.isfinite(error[:, 0]) & (rise > 0)
     if not known.any():
         return 0.0, error
+    # frames of a track repeat its error of the height
     once = 1.0 / np.bincount(fits.track)[fits.track]
     bias_m = -float(
         np.sum((once * rise * error[:, 0])[known]) / np.sum((once * rise**2)[known])
@@ -433,6 +439,7 @@ def accuracy(
     once = 1.0 / np.bincount(track)[track]
     tracks = int(track.max()) + 1
     usual = np.exp(np.average(np.log(bound), axis=0, weights=once))
+    # a power law of the bound: sigma = usual sigma (bound / usual)^power
     growth = np.log(bound / usual)
     tiny = np.finfo(float).tiny
 
@@ -442,6 +449,7 @@ def accuracy(
         )
 
     def loss(power: float) -> float:
+        # negative log posterior of the power; the sigmas are profiled out
         off = (power - prior.power) / (PRIOR_SHARE * prior.power) if prior else 0.0
         return float(
             0.5 * off**2
@@ -450,6 +458,7 @@ def accuracy(
 
     power = float(minimize_scalar(loss, bounds=powers, method="bounded").x)
     squares = tracks * variances(power)
+    # the height was fitted to the ranges: one sample less
     samples = np.array([tracks - 1.0, tracks])
     if prior:
         before = 1 / (2 * PRIOR_SHARE**2)
@@ -475,6 +484,7 @@ def report_interval_s(
         stamps = stamp_ns[known & (track_of == track)]
         n = len(own)
         if n > 1:
+            # mean product of the errors of different frames of the track
             common = (own.sum(axis=0) ** 2 - (own**2).sum(axis=0)) / (n * (n - 1))
             seconds = seconds + float(common.mean() * np.ptp(stamps) * 1e-9)
             tracks = tracks + 1
@@ -502,12 +512,15 @@ def fit_weights(
     """
     sums, counted, label, share = track_sums(fits)
     classes = fits.evidence.shape[1] + 1
+    # the prior of the recogniser that will use the weights
     log_birth = np.log(IdentityParams().birth(classes - 1))
     scale = PRIOR_SHARE * np.abs(prior)
 
     def loss(unbounded: Floats) -> float:
+        # in units of their prior: the penalty is the squared length
         weights = prior + scale * unbounded[:-1]
         looks = prior_looks * np.exp(PRIOR_SHARE * unbounded[-1])
+        # as `bounded_evidence` weighs the end of a track
         odds = np.pad(sums @ weights, ((0, 0), (0, 1))) / (counted + looks)[:, None]
         log_posterior = log_softmax(odds + log_birth, axis=1)
         return float(
@@ -542,6 +555,7 @@ def track_sums(fits: LabelledFits) -> tuple[Floats, Floats, Ints, Floats]:
             counted.append(fits.independent_share[rows].sum())
             label.append(k)
     labels = np.array(label)
+    # landmarks and other things count by the prior, not by their number in the logs
     of_none = labels == fits.evidence.shape[1]
     unknown = IdentityParams().unknown_prior
     shares = np.where(

@@ -79,6 +79,7 @@ class FloorPicture:
             )
             @ view.level_R_sonar.T
         )
+        # a calibration in other units puts the floor out of reach
         if np.isnan(seen).all():
             raise CalibrationError(
                 f"the sonar is {view.height_m:.4g} m above the floor and sees nothing of it up to its range of "
@@ -86,6 +87,7 @@ class FloorPicture:
             )
         low = np.nanmin(seen[:, :2], axis=0)
         high = np.nanmax(seen[:, :2], axis=0)
+        # as many pixels ahead for every sonar: ECC takes time by the pixel
         self.pixel_m = float(high[0] - low[0]) / PIXELS_AHEAD
         self.corner_m = low
         """Level (x, y) of the first pixel."""
@@ -99,6 +101,7 @@ class FloorPicture:
         )
         q = q @ view.level_R_sonar
         order = np.argsort(azimuths_rad)
+        # place of each pixel of the raster in the image, with fractions, for the lookup of every frame
         azimuth = np.arctan2(q[..., 1], q[..., 0])
         beams = order.astype(float)
         self._beam = np.interp(azimuth, azimuths_rad[order], beams, -1, -1).astype(
@@ -110,6 +113,7 @@ class FloorPicture:
             (self._beam >= 0) & (self._bin >= 0) & (self._bin <= len(ranges_m) - 1)
         )
         """Pixels in the image, shape (height, width): x by y."""
+        # a blur over pixels that are not seen loses their share: it is put back below
         self._share = np.maximum(
             _blurred(self.seen.astype(np.float32)), np.float32(1e-3)
         )
@@ -118,6 +122,7 @@ class FloorPicture:
 
     def of(self, image_db: Picture) -> Picture:
         """Picture of a frame of levels, shape (beams, bins)."""
+        # by range: spreading and absorption; then by beam: the gains of beams
         levels = image_db - np.median(image_db, axis=0, keepdims=True)
         levels = np.clip(
             levels - np.median(levels, axis=1, keepdims=True), LOWEST_DB, HIGHEST_DB
@@ -141,6 +146,7 @@ class FloorPicture:
         )
         best = None
         correlation = LEAST_CORRELATION
+        # ECC climbs: the motion of the step before, and rest, are near most maxima
         for start in (guess, np.zeros(3)):
             try:
                 rho, warp = cv2.findTransformECC(
@@ -161,9 +167,11 @@ class FloorPicture:
                 correlation = float(rho)
         if best is None:
             return None
+        # inverse of P, with A = 4 pi blur^2
         information = self._information(now) / (
             4 * math.pi * BLUR_PIXELS**2 * (1 / min(correlation, 0.999) ** 2 - 1)
         )
+        # a picture that changes along one direction only does not show the motion along the other
         if np.linalg.cond(information) > 1e12:
             return None
         return best, np.asarray(np.linalg.inv(information))
@@ -173,10 +181,12 @@ class FloorPicture:
         by_x, by_y = np.gradient(
             picture / max(float(picture[self.seen].std()), 1e-6), self.pixel_m
         )
+        # gradients at the rim are those of the rim
         inner = cv2.erode(self.seen.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(
             bool
         )
         x, y = self._xy
+        # derivatives by yaw about the sonar, x and y
         J = np.stack([by_y * x - by_x * y, by_x, by_y], axis=-1)[inner]
         return np.asarray(J.T @ J, float)
 
@@ -186,6 +196,7 @@ class FloorPicture:
         place = motion[1:]
         c = math.cos(yaw)
         s = math.sin(yaw)
+        # OpenCV maps pixels now to pixels before, columns first
         R = np.array([[c, -s], [s, c]]).T
         shift = (R @ (self.corner_m - place) - self.corner_m) / self.pixel_m
         return np.ascontiguousarray(
@@ -223,6 +234,7 @@ class ImageMotions:
             world_T_sonar = calibration.start.pose().compose(
                 calibration.sonar.mounting.pose()
             )
+            # a start below the floor states no height
             if world_T_sonar.z() > calibration.floor.z_m:
                 self.view = FloorView.from_pose(world_T_sonar, calibration.floor.z_m)
         self._floor: tuple[SonarFrames, FloorPicture] | None = None
@@ -251,6 +263,7 @@ class ImageMotions:
         if self._is_fixed:
             return None
         frame = with_lens(frame, self._calibration.sonar.lens)
+        # another window has another raster, and no picture before
         if self._floor is None or not is_alike(self._floor[0], frame):
             view = self.view or SLANT_PLANE
             self._floor = (
@@ -271,6 +284,7 @@ class ImageMotions:
         seconds = (stamp_ns - before[0]) * 1e-9
         found = None
         if stamp_ns - before[0] <= LONGEST_STEP_NS:
+            # vehicles are slow to change their velocity: begin at the motion of the step before
             found = raster.motion(before[1], picture, self._last * seconds)
         fastest = seconds * np.array([FASTEST_RAD_S, FASTEST_M_S, FASTEST_M_S])
         is_measured = found is not None and bool((np.abs(found[0]) <= fastest).all())
@@ -278,6 +292,7 @@ class ImageMotions:
             motion, covariance = found
             self._last = motion / seconds
         else:
+            # not measured: go on as before, for as long as that is likely, with a large covariance
             motion = self._last * min(seconds, LONGEST_STEP_NS * 1e-9)
             covariance = np.diag(
                 np.square(seconds * np.array([UNKNOWN_RAD_S, UNKNOWN_M_S, UNKNOWN_M_S]))
@@ -297,6 +312,7 @@ class ImageMotions:
     def _sonar_step(self, step: PlanarStep) -> SonarStep:
         """Step in the sonar's axes, with what a plane does not show."""
         yaw, x, y = step.motion.tolist()
+        # from level axes into those of the sonar, where steps are given
         level_T_sonar = gtsam.Pose3(
             gtsam.Rot3((self.view or SLANT_PLANE).level_R_sonar), np.zeros(3)
         )
@@ -304,6 +320,7 @@ class ImageMotions:
         turn, place = (step.duration_s * sigma for sigma in (UNSEEN_RAD_S, UNSEEN_M_S))
         covariance = np.diag(np.square([turn, turn, 0.0, 0.0, 0.0, place]))
         now_R_before = planar.rotation().matrix().T
+        # yaw is the same; x and y turn into the axes of the frame now
         tangent = np.eye(3)  # translation of the tangent is in the axes now
         tangent[1:, 1:] = now_R_before[:2, :2]
         covariance[2:5, 2:5] = tangent @ step.covariance @ tangent.T

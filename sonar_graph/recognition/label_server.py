@@ -49,6 +49,7 @@ class ShownFrame:
             or self.fan.beam[int(row), int(column)] < 0
         ):
             return None
+        # the inverse of `Fan.pixel`
         ahead = self.fan.lowest_m + (height - row) / self.fan.pixels_per_m
         across = self.fan.half_width_m - column / self.fan.pixels_per_m
         return float(np.hypot(ahead, across)), float(np.arctan2(across, ahead))
@@ -73,6 +74,7 @@ def shown_frames(
             fan = frame, Fan.of(frame.ranges_m, frame.azimuths_rad, PIXELS_HIGH)
         picture = draw_fan(decibels(frame.intensity[0], sonar.image), fan[1], None)
         shown.append(ShownFrame(stamp_ns, as_jpeg(picture), fan[1]))
+        # too many: leave out every second, and look half as often from here on
         if len(shown) > MOST_FRAMES:
             del shown[1::2]
             period_ns = max(2 * period_ns, shown[1].stamp_ns - shown[0].stamp_ns)
@@ -106,6 +108,7 @@ class LabelDesk:
                     label.range_m, label.azimuth_rad
                 )
                 rows[number].append({"column": column, "row": row, "id": label.id})
+        # None stands for what is no landmark
         ids = [label.id for label in self.labels]
         return {
             "frames": rows,
@@ -150,6 +153,7 @@ class LabelDesk:
         return None
 
     def _write(self, labels: tuple[Label, ...]) -> None:
+        # written before it is shown: what the page has is in the file
         changed = Labels(log=self._labels.log, labels=labels)
         changed.write(self._path)
         self._labels = changed
@@ -170,6 +174,7 @@ class LabelServer(ThreadingHTTPServer):
         self.desk = desk
         self.ids = frozenset(ids)
         self._page = page
+        # other users of the computer do not know it
         self.word = secrets.token_urlsafe(16)
         super().__init__((HOST, port), _LabelRequest)
 
@@ -235,6 +240,7 @@ class _LabelRequest(BaseHTTPRequestHandler):
             column, row, landmark = (
                 content.get(name) for name in ("column", "row", "id")
             )
+            # the page offers these identities only
             is_known = landmark is None or (
                 isinstance(landmark, int) and landmark in self.server.ids
             )
@@ -258,6 +264,7 @@ class _LabelRequest(BaseHTTPRequestHandler):
 
     def _requested(self) -> str | None:
         """Path after the word; None where the word or the host is another."""
+        # a page of another host, whose name was made to lead here, has another host
         if self.headers.get("Host") not in (
             self.server.host,
             f"localhost:{self.server.server_port}",
@@ -275,6 +282,7 @@ class _LabelRequest(BaseHTTPRequestHandler):
         """JSON object of a request; None if it is something else, is too long, or comes from another page."""
         length = self.headers.get("Content-Length", "")
         is_json = self.headers.get("Content-Type") == "application/json"
+        # without a length the body never ends
         if not (length.isdecimal() and int(length) <= MOST_BYTES):
             self.close_connection = True
             return None
@@ -289,6 +297,7 @@ class _LabelRequest(BaseHTTPRequestHandler):
         return content if isinstance(content, dict) else None
 
     def _frame_of(self, text: str) -> int | None:
+        # nine digits are more frames than any log has
         number = int(text) if text.isdecimal() and len(text) < 9 else -1
         return number if 0 <= number < len(self.server.desk.frames) else None
 

@@ -182,9 +182,11 @@ class LabelledTrack:
         said_at: dict[int, set[int | None]] = defaultdict(set)
         for _, label in self.labels:
             said_at[label.stamp_ns].add(label.id)
+        # two identities of one object in one frame: neither counts
         sound = [
             label.id for _, label in self.labels if len(said_at[label.stamp_ns]) == 1
         ]
+        # the identity of more than half of the labels, if there is one
         most = [
             landmark
             for landmark, count in Counter(sound).items()
@@ -231,6 +233,7 @@ class LabelledLog:
 def trusted_share(tracks: Sequence[LabelledTrack]) -> float:
     """Share of the distance of labels from sightings that is not the labels' own error, pooled over tracks."""
     several = [track for track in tracks if len(track.labelled) > 1]
+    # both axes, where no track has two labels
     spread2 = 2 * CLICK_SIGMA_M**2
     if several:
         squares = sum(
@@ -238,6 +241,7 @@ def trusted_share(tracks: Sequence[LabelledTrack]) -> float:
             for track in several
         )
         spread2 = squares / sum(len(track.labelled) - 1 for track in several)
+    # variance of the mean of the labels of a track
     of_means = float(np.mean([spread2 / len(track.labelled) for track in tracks]))
     measured = float(np.mean([np.sum(track.off() ** 2) for track in tracks]))
     return max(0.0, 1.0 - of_means / max(measured, 1e-12))
@@ -294,6 +298,7 @@ def calibrate_by_labels(
             number: track for number, track in tracks.items() if len(track.ids) == 1
         }
         known = [track for track in sure.values() if track.ids != {None}]
+        # pooled over all tracks: one track has too few labels
         share = trusted_share(known) if known else 0.0
         for track in sure.values():
             (landmark,) = track.ids
@@ -328,6 +333,7 @@ def _labelled_tracks(
     log: LabelledLog, recogniser: Recogniser, blocks: Iterable[SonarFrames]
 ) -> tuple[dict[int, LabelledTrack], dict[str, list[int]]]:
     """Tracks by number, with the labels that they met, and the rows (from 1) of labels not used, by reason."""
+    # the last frame, with the lens of the calibration
     used: deque[SonarFrames] = deque(maxlen=1)
     session = RecognitionSession(
         log.run,
@@ -343,6 +349,7 @@ def _labelled_tracks(
         by_stamp[label.stamp_ns].append((row, label))
     for result in session.run(blocks):
         stamp_ns = result.stamp_ns
+        # its labels cannot meet a track
         if not result.is_used:
             unmet[UNUSED] += [row for row, _ in by_stamp.pop(stamp_ns, [])]
             continue
@@ -356,6 +363,7 @@ def _labelled_tracks(
             track.frames.append((stamp_ns, session.start_T_sonar, in_frame))
             track.seen.append(place_of(sighting.range_m, sighting.azimuth_rad, session))
         for row, label in by_stamp.pop(stamp_ns, []):
+            # the nearest sighting in this frame
             away = {
                 number: _distance(sighting, label) for number, sighting in seen.items()
             }
@@ -366,6 +374,7 @@ def _labelled_tracks(
                     place_of(label.range_m, label.azimuth_rad, session)
                 )
             else:
+                # a label outside of the image may be in degrees
                 in_radians = label.model_copy(
                     update={"azimuth_rad": np.radians(label.azimuth_rad)}
                 )
@@ -379,6 +388,7 @@ def _labelled_tracks(
                     OUTSIDE,
                 )
                 unmet[reason].append(row)
+    # labels that are left have no frame with their stamp
     unmet[NO_FRAME] = [row for labels in by_stamp.values() for row, _ in labels]
     unmet[CONTRADICTED] = [
         row for track in tracks.values() for row in track.drop_contradictions()
@@ -417,6 +427,7 @@ def _distance(sighting: ObjectSighting, label: Label) -> float:
 
 def place_of(range_m: float, azimuth_rad: float, session: RecognitionSession) -> Floats:
     """Place in the sonar's axes at the first frame, shape (3,): on the floor, or in the image's plane."""
+    # on the floor, and where the ray misses it in the plane of the image
     q = np.full(3, np.nan)
     for floor in (session.view, SLANT_PLANE):
         if floor is not None and np.isnan(q).any():

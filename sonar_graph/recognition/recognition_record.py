@@ -97,6 +97,7 @@ class Recognition:
         named: Counter[int] = Counter()
         if self.detections is not None:
             ids, probability = self.detections.most_probable()
+            # below it "none of them" is the most probable class
             named.update(np.where(probability > LEAST_NAMED, ids, NONE).tolist())
         counts = [f"landmark {i}: {n}" for i, n in sorted(named.items()) if i != NONE]
         looked_for = (
@@ -120,6 +121,7 @@ class Recognition:
             )
         if LACKS in self.notes:
             lines.append(f"Warning: {self.notes[LACKS]}")
+        # in more than half of the frames: a mounting or floor that is wrong
         if 2 * self.outcomes[OFF_FLOOR] > self.frames:
             lines.append(
                 f"Warning: in {self.outcomes[OFF_FLOOR]} of {self.frames} frames the sonar looks past the floor: check "
@@ -163,6 +165,7 @@ class Recognition:
         """Warning where nearly all tracks are of no landmark; None else, and for few tracks."""
         if self.detections is None:
             return None
+        # the last row of a track has all of its evidence
         last = {track: row for row, track in enumerate(self.detections.track.tolist())}
         none = 1 - self.detections.id_probability[list(last.values())].sum(axis=1)
         count = int(np.count_nonzero(none > LEAST_NAMED))
@@ -261,6 +264,7 @@ def draw_fan(
     image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetections | None
 ) -> Picture:
     """The frame in grey, the detections as rings with identity and posterior; shape (height, width, 3)."""
+    # a few bright samples must not darken the rest
     low, high = np.percentile(image_db, [5, 99.7])
     grey = np.clip((image_db - low) / max(high - low, 1e-6) * 255, 0, 255).astype(
         np.uint8
@@ -281,6 +285,7 @@ def draw_fan(
             )
             radius = round(0.23 * fan.pixels_per_m)
             is_sure = probability >= SURE
+            # certain ones stand out; the others show their posterior
             colour = RECOGNISED if is_sure else DOUBTFUL
             text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
             cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)

@@ -259,6 +259,7 @@ def without_leaps(
         if held is not None:
             stamp_ns = int(held.stamps_ns[0])
             next_ns = int(frame.stamps_ns[0])
+            # the next frame goes on from before: this one is ahead by mistake
             if stamp_ns > next_ns > latest_ns:
                 refuse(stamp_ns, LEAPT)
             else:
@@ -295,6 +296,7 @@ class RecognitionSession:
         """View of the floor at the last frame, where it is known."""
         self._sonar = sequence.calibration.sonar
         has_depth = getattr(sequence, "depth", None) is not None
+        # for the notes: why the floor was not known, where it was not
         lacking = (
             NO_HEIGHT
             if sequence.calibration.floor is None
@@ -347,6 +349,7 @@ class RecognitionSession:
         if step is not None:
             self.start_T_sonar = self.start_T_sonar.compose(step.previous_T_sonar)
         frame = with_lens(frame, self._sonar.lens)
+        # counted for warnings: without a floor fewer landmarks are recognised
         self.result.outcomes[NO_FLOOR] += view is None
         self.result.outcomes[OFF_FLOOR] += (
             view is not None and not self._may_show_floor(frame, view)
@@ -363,6 +366,7 @@ class RecognitionSession:
             self._blocks.append(result.detections)
         for track in result.tracks:
             if track.sighting is not None and track.sighting.fit is not None:
+                # how rough the surroundings are, against those of the measured model
                 beyond = track.sighting.fit.evidence[:, EVIDENCE.index("beyond")]
                 total, count = self._beyond.get(track.id, (0.0, 0))
                 self._beyond[track.id] = total + float(beyond.mean()), count + 1
@@ -413,6 +417,7 @@ class RecognitionSession:
         q = view.floor_points(
             ranges_m, np.full(len(ranges_m), float(np.median(frame.azimuths_rad)))
         )
+        # NaN where the ray does not reach the floor, which compares false
         elevation_rad = np.arcsin(q[:, 2] / ranges_m)
         return bool(
             (np.abs(elevation_rad) <= self._sonar.elevation_aperture_rad / 2).any()
@@ -431,6 +436,7 @@ class RecognitionSession:
         pictures = self.result.pictures
         stamp_ns = int(frame.stamps_ns[0])
         if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
+            # within the period only a first picture with detections replaces one without
             if found is None or pictures[-1].landmark_ids:
                 return
             pictures.pop()
@@ -457,5 +463,6 @@ class RecognitionSession:
             )
         )
         if len(pictures) > MOST_PICTURES:
+            # evenly over a run whose length is not known
             del pictures[1::2]
             self._picture_period_ns *= 2

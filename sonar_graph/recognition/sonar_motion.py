@@ -37,11 +37,13 @@ class _Tilt:
         for epoch_ns in self._odometry.epochs(
             self.epoch_ns + GRAVITY_INTERVAL_NS - 1, instant_ns
         ).tolist():
+            # too short: the noise of velocity at both ends would hide gravity
             if epoch_ns - self.epoch_ns < GRAVITY_INTERVAL_NS:
                 continue
             motion = self._odometry.motion(
                 self.epoch_ns, epoch_ns, _NO_BIAS, known_ns=instant_ns
             )
+            # a start between epochs has no velocity
             began_at_epoch = self.epoch_ns in self._odometry.epochs(
                 self.epoch_ns - 1, instant_ns
             )
@@ -50,9 +52,11 @@ class _Tilt:
                 if self._calibration.use_gravity and began_at_epoch
                 else None
             )
+            # predict by the gyros first, then correct by gravity
             self.up, self.variance = self.after(motion)
             if measured is not None:
                 direction, sigma = measured
+                # one variance for both directions: tilts of vehicles are small
                 gain = self.variance / (self.variance + sigma**2)
                 self.up = _unit(self.up + gain * (direction - self.up))
                 self.variance *= 1 - gain
@@ -60,6 +64,7 @@ class _Tilt:
 
     def after(self, motion: PreintegratedMotion) -> tuple[Floats, float]:
         """Up in the body and its variance after a motion since the last correction."""
+        # the bias is the same all the time: its error grows with time, not its root
         drift = self._calibration.imu.gyro_bias_sigma * motion.duration_s
         noise = float(np.max(np.diag(motion.covariance)[:3]))
         return (
@@ -123,6 +128,7 @@ class _Height:
         variances = np.where(
             np.isnan(rows.variance_m2), self._default, rows.variance_m2
         )
+        # height of the body's origin: the port is up . lever above it
         z_m = float(rows.z_m[-1] - up @ self._port)
         gain = self.variance / (self.variance + float(variances[-1]))
         self.z_m += gain * (z_m - self.z_m)
@@ -152,6 +158,7 @@ class SonarMotions:
             self._end_ns = max(self._end_ns, int(imu.stamps_ns[-1]))
         if depth is not None:
             self._height.add(depth)
+        # neither motion nor tilt needs rows before both
         settled_ns = min(self._stamp_ns, self._tilt.epoch_ns)
         if settled_ns > self._start_ns + KEPT_NS:
             self._odometry.forget_before(settled_ns - KEPT_NS)
@@ -169,6 +176,7 @@ class SonarMotions:
 
         The motion of the first frame is None, and so is the view where the height is not known or not positive.
         """
+        # provisional between epochs; nothing after the frame is used
         motion = self._odometry.motion(self._stamp_ns, stamp_ns, _NO_BIAS)
         step = None
         view = None
@@ -176,6 +184,7 @@ class SonarMotions:
         up, tilt_variance = self._tilt.after(
             self._odometry.motion(self._tilt.epoch_ns, stamp_ns, _NO_BIAS)
         )
+        # vertical part of the motion: up at the frame before, in its axes
         body_R_previous = motion.i_T_j.rotation().matrix().T
         climbed = up @ body_R_previous @ motion.i_T_j.translation()
         self._height.carry(
@@ -183,6 +192,7 @@ class SonarMotions:
         )
         self._height.correct(up, stamp_ns)
         if not self._is_first:
+            # the motion of the body as the sonar makes it, by its lever arm
             sonar_T_body = self._body_T_sonar.inverse()
             adjoint = sonar_T_body.AdjointMap()
             previous_T_sonar = sonar_T_body.compose(motion.i_T_j).compose(
@@ -197,6 +207,7 @@ class SonarMotions:
                 + up @ self._body_T_sonar.translation()
                 - self._floor.z_m
             )
+            # a floor above the sonar is a wrong calibration: without a view the plane of the image holds
             if height_m > 0:
                 level_R_sonar = level_from_up(
                     self._body_T_sonar.rotation().matrix().T @ up
@@ -212,6 +223,7 @@ class SonarMotions:
 
 def level_from_up(up: Floats) -> Floats:
     """Rotation to level axes, x in the vertical plane of the first axis, from the direction of up, shape (3, 3)."""
+    # the first axis without its vertical part
     x = np.array([1.0, 0.0, 0.0]) - up[0] * up
     y = np.array([0.0, up[2], -up[1]])
     return np.array([_unit(x), _unit(y), up])

@@ -71,6 +71,7 @@ class TrackStories:
             story.last_ns = stamp_ns
             story.frames = story.frames + 1
             visible = 0.0 if sighting.fit is None else sighting.fit.visible
+            # the picture in which most of the object is in view
             if visible > story.visible + BETTER:
                 story.visible = visible
                 story.jpeg = views.around(sighting.range_m, sighting.azimuth_rad)
@@ -80,6 +81,7 @@ class TrackStories:
             elif fate.track < 0 and np.isfinite(fate.range_m):
                 found = self.rejected.setdefault(fate.outcome, Rejected())
                 found.count += 1
+                # examples from different times, not five of one object
                 is_due = (
                     not found.examples
                     or stamp_ns - found.examples[-1][0] >= EXAMPLE_PERIOD_NS

@@ -117,6 +117,7 @@ def aided_world() -> Sequence:
             )
         }
     )
+    # not at the stamps of other sensors
     heading_ns = _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7
     fixes_ns = _stamps(0, FIX_HZ, DURATION_S)
     m = len(heading_ns)
@@ -125,6 +126,7 @@ def aided_world() -> Sequence:
         heading_ns - START_NS
     ) * 1e-9 + calibration.heading.sigma_rad * noise.standard_normal(m)
     body = _circle(fixes_ns)
+    # fixes are of the antenna, not of the body
     antenna = body.positions + body.rotations().apply(calibration.positions.antenna_m)
     fixes = antenna + calibration.positions.sigma_m * noise.standard_normal((n, 3))
     covs = np.tile(np.diag(np.square(calibration.positions.sigma_m)), (n, 1, 1))
@@ -163,12 +165,14 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     rows = world.detections
     assert rows is not None
     frame, place = np.divmod(np.arange(len(rows)), len(LANDMARKS_M))
+    # a new track for each landmark every few frames
     track = frame // TRACK_FRAMES * len(LANDMARKS_M) + place
     named = noise.choice(["right", "wrong", "nothing"], len(rows), p=[0.7, 0.2, 0.1])
     named = np.where(
         frame < MISNAMED_FRAMES, "wrong", named[track] if is_tracked else named
     )
     names = np.array(list(LANDMARKS_M), dtype=np.int64)
+    # the next landmark: wrong, but one that exists
     wrong = names[(place + 1) % len(names)]
     ids = np.select([named == "wrong", named == "nothing"], [wrong, -1], names[place])
     misnamed = replace(
@@ -190,6 +194,7 @@ def still_world() -> Sequence:
     calibration = Calibration(start=STILL_START)
     imu_stamps = _stamps(0, IMU_HZ, STILL_S)
     slow_stamps = _stamps(0, DVL_HZ, STILL_S)
+    # at rest the accelerometers measure the reaction to gravity, upwards
     up_in_body = (
         Rotation.from_euler("xyz", STILL_START.rpy_rad)
         .inv()
@@ -239,7 +244,9 @@ def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
     """Constant yaw rate; the specific force is centripetal acceleration v ω to the left, and gravity."""
     stamps_ns = _stamps(0, IMU_HZ, DURATION_S)
     shape = (len(stamps_ns), 3)
+    # white noise of a density, sampled at this rate
     root_hz = np.sqrt(IMU_HZ)
+    # v omega towards the centre of the circle
     force = np.array([0.0, SPEED_M_S * YAW_RATE_RAD_S, calibration.gravity_m_s2])
     rate_sigma = calibration.imu.gyro_noise_density * root_hz
     force_sigma = calibration.imu.accel_noise_density * root_hz
@@ -253,11 +260,13 @@ def _detections(
     calibration: Calibration, noise: np.random.Generator
 ) -> LandmarkDetections:
     """Every landmark in every frame that lies between two IMU samples; one in ten is not recognised."""
+    # between the stamps of IMU and DVL, so that poses have to be interpolated
     frames_ns = _stamps(0, FRAME_HZ, DURATION_S - 2)[3:] + NS_PER_S // 3
     stamps_ns = np.repeat(frames_ns, len(LANDMARKS_M))
     n = len(stamps_ns)
     there = np.tile(_true_landmarks().positions, (len(frames_ns), 1))
     body = _circle(frames_ns)
+    # the sonar sits at the body's origin
     here = np.repeat(body.positions, len(LANDMARKS_M), axis=0)
     facing = np.repeat(body.quaternions_xyzw, 3, axis=0)
     seen: Floats = Rotation.from_quat(facing).inv().apply(there - here)

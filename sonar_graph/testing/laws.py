@@ -112,6 +112,7 @@ def run(
     for number, step in enumerate(steps, start=1):
         estimate = returned_estimate(estimator.process(step))
         estimates += [] if estimate is None else [estimate]
+        # results between the steps must not change the later ones
         if ask_every and number % ask_every == 0:
             _answer_twice(estimator, estimates)
     return (
@@ -131,6 +132,7 @@ def _answer(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
 
 
 def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
+    # a request must not change the next one either
     first = _answer(estimator, estimates)
     second = _answer(estimator, estimates)
     differing = unlike(first, second)
@@ -173,6 +175,7 @@ def difference(one: EstimatorRun, other: EstimatorRun) -> float:
     Infinite where an instant or a landmark is missing from ``other``.
     """
     mine, theirs = _at_same_instants(one, other)
+    # a missing instant or landmark is no small difference
     if len(mine) != len(theirs) or not np.array_equal(
         one.landmarks.ids, other.landmarks.ids
     ):
@@ -193,6 +196,7 @@ def deviation(one: EstimatorRun, other: EstimatorRun) -> tuple[float, float]:
     mine, theirs = _at_same_instants(one, other)
     if len(mine) != len(theirs):
         return float("inf"), float("inf")
+    # in units of standard deviations: metres and radians compare
     sigmas = np.sqrt(np.einsum("nii->ni", mine.covariances))
     products = np.einsum("ni,nj->nij", sigmas, sigmas)
     return (
@@ -216,6 +220,7 @@ def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
     """[rotation, translation] from one trajectory to another in the body frame of the first, shape (n, 6)."""
     if not len(mine):
         return np.empty((0, 6))
+    # perturbations are in the body frame, as covariances are
     into_body = mine.rotations().inv()
     return np.hstack(
         [
@@ -238,6 +243,7 @@ def require_covariance(matrix: Floats, size: int, name: str) -> None:
         f"{name}: shape {matrix.shape}, not {(size, size)}",
     )
     require(bool(np.isfinite(matrix).all()), f"{name} is not finite")
+    # rounding grows with the largest entry
     scale = float(np.abs(matrix).max())
     asymmetry = float(np.abs(matrix - matrix.T).max())
     require(asymmetry <= SYMMETRY * scale, f"{name} is not symmetric: {asymmetry:.1e}")
@@ -259,6 +265,7 @@ def settings_have_defaults(make: MakeEstimator) -> None:
     """``Params()`` can be made without arguments, and a class takes them after calibration and odometry."""
     calibration = small_world().calibration
     try:
+        # by an instance: a function has no Params
         params = fresh(make, calibration).Params()
         if isinstance(make, type):
             make(calibration, Odometry(calibration), params)
@@ -280,11 +287,13 @@ def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:
 
 def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
     """`process` returns None before there is an IMU and a DVL sample, and afterwards an estimate at ``end_ns``."""
+    # for the first second there is no velocity
     world = small_world(dvl_delay_s=1.0)
     estimator = fresh(make, world.calibration)
     instants = np.arange(START_NS + NS_PER_S // 4, world.end_ns, NS_PER_S // 4)
     for step in world.replay(instants):
         estimate = returned_estimate(estimator.process(step))
+        # at the very start either is right
         if step.end_ns < world.start_ns:
             require(
                 estimate is None, "an estimate is returned before the first DVL sample"
@@ -330,12 +339,14 @@ def frames_and_signs_are_those_of_the_vocabulary(make: MakeEstimator) -> None:
         outcome = run(make, world)
         assert world.truth is not None
         assert world.true_landmarks is not None
+        # noise is small: a wrong sign or frame drives much farther away
         truth = world.truth.at(outcome.trajectory.stamps_ns)
         off_m = np.linalg.norm(outcome.trajectory.positions - truth.positions, axis=1)
         require(
             off_m.max() < 0.3,
             f"{world.name}: the trajectory leaves the truth by {off_m.max():.2f} m",
         )
+        # an estimator may map none of them
         known = np.isin(world.true_landmarks.ids, outcome.landmarks.ids)
         if known.any():
             off_m = np.linalg.norm(
@@ -357,6 +368,7 @@ def landmarks_are_sorted_and_unique(make: MakeEstimator) -> None:
         bool(np.all(np.diff(found.ids) > 0)),
         f"landmark ids do not ascend strictly: {found.ids.tolist()}",
     )
+    # an identity that was never detected is invented
     strangers = set(found.ids.tolist()) - set(LANDMARKS_M)
     require(not strangers, f"landmarks that nobody detected: {sorted(strangers)}")
     require(
@@ -401,6 +413,7 @@ def asking_changes_nothing(make: MakeEstimator) -> None:
 
     Also where identities are wrong or missing, and an estimator may revise them at a request.
     """
+    # often and seldom, with right and wrong identities
     for world, every in (
         (aided_world(), 1),
         (misnamed_world(), 3),
@@ -422,6 +435,7 @@ def live_agrees_with_replay(make: MakeEstimator) -> None:
     world = aided_world()
     windows = run(make, world)
     live = run(make, world, every_stamp(world))
+    # where it linearises differs, what it counts must not
     mean, covariance = deviation(windows, live)
     require(
         mean < LIVE_SIGMAS,
@@ -443,6 +457,7 @@ def live_equals_replay(make: MakeEstimator) -> None:
 def input_stays_as_it_was(make: MakeEstimator) -> None:
     """No array of the measurements is written to."""
     world = aided_world()
+    # the same world, made again
     untouched = aided_world()
     run(make, world)
     for block, before in zip(
@@ -460,6 +475,7 @@ def still_vehicle_stays_still(make: MakeEstimator) -> None:
     estimates = run(make, still_world()).estimates
     start = STILL_START.pose()
     for estimate in estimates:
+        # gravity and Earth's rate are the only motions that it could make up
         moved = start.between(estimate.world_T_body)
         drift_m = float(np.linalg.norm(moved.translation()))
         turn_rad = float(
