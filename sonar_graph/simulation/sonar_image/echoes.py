@@ -67,6 +67,13 @@ class SonarPlacement(NamedTuple):
     """Added to row and column of the amplitudes: (0, 0) where speckle belongs to the world."""
 
 
+class Floor(NamedTuple):
+    """Scatterers of the bare floor, as `Scatterers` has them."""
+
+    points: Floats32
+    texture: Floats32
+
+
 class Surface(NamedTuple):
     """Objects in view, cell by cell; arrays without a row where there is only floor."""
 
@@ -211,8 +218,7 @@ def table_places(
 @compiled
 def sum_echoes(
     view: SonarPlacement,
-    points: Floats32,
-    texture: Floats32,
+    floor: Floor,
     surface: Surface,
     horizon: Horizon,
     tables: Tables,
@@ -221,6 +227,8 @@ def sum_echoes(
 ) -> None:
     """Add every echo in view to ``echoes``, shape (columns, TAPS + bins + TAPS, 2), real and imaginary part."""
     cell_m = tables.cell_m
+    points = floor.points
+    texture = floor.texture
     cells = points.shape[0]
     has_objects = surface.amplitude.shape[0] > 0
     has_shadows = horizon.tangent.shape[0] > 0

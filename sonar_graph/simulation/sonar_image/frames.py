@@ -265,11 +265,10 @@ class FrameSimulator:
             reflection = (
                 self.options.floor_reflection if self.options.multipath else 0.0
             )
-            floor = self._floor
+            floor = echoes.Floor(self._floor.points, self._floor.texture)
             echoes.sum_echoes(
                 view,
-                floor.points,
-                floor.texture,
+                floor,
                 surface,
                 horizon,
                 tables,
