@@ -91,6 +91,7 @@ class SectionType(ModelMetaclass):
                 text = expectation(fault["type"], fault["msg"])
                 if fault["type"] != MISFIT:
                     text += f", not {fault['input']!r:.60}"
+                # the fields of an inner section are those of another class
                 if fault["type"] == "extra_forbidden":
                     known = (
                         getattr(cls, "model_fields", {})
@@ -377,6 +378,7 @@ class KnownMap(Section):
             reason = f"expected {size} rows of {size} numbers, three a landmark"
             raise misfits(type(self), {"covariance_m2": reason})
         P = self.joint()
+        # tolerances scale with the map
         largest = float(np.abs(P).max())
         # relative to the largest entry: rounding of a text file
         is_symmetric = bool((np.abs(P - P.T) <= 1e-6 * largest).all())

@@ -80,6 +80,7 @@ def read_map(path: Path) -> ReadMap:
             warnings.append(
                 f"{path}: covariances of single landmarks, and no correlations between them; the map.toml of a run has them"
             )
+    # national grids and millimetres are the usual mistakes
     farthest_m = float(np.abs(np.array(known.positions_m)).max())
     if farthest_m > MOST_M:
         raise LogError(

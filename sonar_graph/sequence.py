@@ -96,6 +96,7 @@ class Sequence:
 
     def _repr_html_(self) -> str:
         """The blocks with their rows, times and rates, for a notebook."""
+        # truth has stamps, and so a rate
         known = self.blocks() | {"truth": self.truth}
         rows = []
         for name, block in known.items():
@@ -195,6 +196,7 @@ class Sequence:
         instants = np.arange(
             self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64
         )
+        # one of the clocks was set, or the parts of a log are of two days
         if self.end_ns < self.start_ns:
             raise MeasurementError(
                 f"{self.name}: the rows of IMU and DVL have no time in common: of two clocks, or of one that was set?"

@@ -72,11 +72,12 @@ def settings_of(
     """
     found: dict[str, Setting] = {}
     for name, field in model.model_fields.items():
-        value = (
-            getattr(default, name)
-            if default
-            else field.get_default(call_default_factory=True)
-        )
+        value = field.get_default(call_default_factory=True)
+        if default is not None:
+            value = getattr(default, name)
+        elif field.is_required():
+            # a field without a default shows what it may hold
+            value = field.examples[0] if field.examples else 0.1
         path = f"{section}{name}"
         options = list(_sections(field.annotation))
         tag = field.discriminator
@@ -409,71 +410,36 @@ def toml_template(model: type[BaseModel], stated: BaseModel, remark: str) -> str
     back as it is, it gives ``stated``. ``remark``: after each line that is stated.
     """
     default = model()
-    lines = _template_lines(model, default, stated, "", remark, is_nested=False)
+    top: list[str] = []
+    sections: list[str] = []
     for name, field in model.model_fields.items():
-        # of a section that may be absent
-        section = next(
-            (part for part in get_args(field.annotation) if _is_section(part)), None
-        )
+        kind = next(_sections(field.annotation), None)
+        usual = getattr(default, name)
         value = getattr(stated, name)
-        if _is_section(field.annotation):
-            inside = _template_lines(
-                type(value), getattr(default, name), value, "", remark
+        if kind is None:
+            setting = Setting(name, usual, meanings_of(model).get(name, ""))
+            top.append(_template_line(setting, value, value != usual, remark))
+            continue
+        # a section that may be absent is commented out as a whole
+        absent = "# " * (value is None)
+        sections += ["", f"# {_sentence(kind.__doc__)}", f"{absent}[{name}]"]
+        given = {setting.name: setting.default for setting in settings_of(kind, value)}
+        for setting in settings_of(kind, usual):
+            shown = given[setting.name]
+            is_stated = value is not None and (
+                usual is None or shown != setting.default
             )
-            lines += [
-                "",
-                f"# {_sentence(field.annotation.__doc__)}",
-                f"[{name}]",
-                *inside,
-            ]
-        elif section is not None:
-            absent = "# " * (value is None)
-            lines += ["", f"# {_sentence(section.__doc__)}", f"{absent}[{name}]"]
-            lines += _template_lines(section, None, value, "", remark)
-    return "\n".join(lines) + "\n"
+            sections.append(_template_line(setting, shown, is_stated, remark))
+    return "\n".join([*top, *sections]) + "\n"
 
 
-def _template_lines(
-    model: type[BaseModel],
-    default: BaseModel | None,
-    stated: BaseModel | None,
-    prefix: str,
-    remark: str,
-    *,
-    is_nested: bool = True,
-) -> list[str]:
-    """A line for each setting of a section; those of sections in it under dotted names."""
-    lines: list[str] = []
-    for name, field in model.model_fields.items():
-        is_optional = any(_is_section(part) for part in get_args(field.annotation))
-        inner = field.annotation
-        if _is_section(inner):
-            if is_nested:
-                old = getattr(default, name, None)
-                new = getattr(stated, name, None)
-                lines += _template_lines(inner, old, new, f"{prefix}{name}.", remark)  # type: ignore[arg-type]
-            continue
-        if is_optional:
-            continue
-        # a field without a default shows what it may hold
-        example = field.examples[0] if field.examples else 0.1
-        usual = example if field.is_required() else field.get_default()
-        usual = getattr(default, name, usual)
-        value = usual if stated is None else getattr(stated, name)
-        meaning = _sentence(meanings_of(model).get(name))
-        is_stated = stated is not None and (value != usual or default is None)
-        # TOML has no null
-        shown = value if value is not None else 0.0
-        line = f"{prefix}{name} = {toml_value(shown)}"
-        notes = " ".join(filter(None, [meaning, f"({remark})" if is_stated else ""]))
-        lines.append(
-            ("" if is_stated else "# ") + line + (f"  # {notes}" if notes else "")
-        )
-    return lines
-
-
-def _is_section(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
+def _template_line(setting: Setting, value: Any, is_stated: bool, remark: str) -> str:
+    """Line of a template, commented out where the value is the default."""
+    # TOML has no null
+    line = f"{setting.name} = {toml_value(0.0 if value is None else value)}"
+    notes = [_sentence(setting.meaning), f"({remark})" if is_stated else ""]
+    note = " ".join(filter(None, notes))
+    return ("" if is_stated else "# ") + line + (f"  # {note}" if note else "")
 
 
 def _sentence(text: str | None) -> str:

@@ -284,6 +284,7 @@ class Trajectory:
         )
         if not self.has_orientation:
             return Trajectory.of_positions(stamps_ns, positions)
+        # slerp
         start = Rotation.from_quat(self.quaternions_xyzw[before])
         end = Rotation.from_quat(self.quaternions_xyzw[after])
         quaternions = (
@@ -355,6 +356,7 @@ class LandmarkMap:
 
     def _repr_html_(self) -> str:
         """Positions with their standard deviations, for a notebook: of the first `MOST_ROWS` landmarks."""
+        # NaN where a covariance is unknown, shown as a dash
         sigmas = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
         rows = [
             [

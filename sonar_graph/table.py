@@ -127,10 +127,8 @@ def as_html(table: Table, *, is_sortable: bool = False) -> str:
         breakable = re.sub(r"([/=_,])", r"\1<wbr>", escape(text))
         return f'<span class="run run-{run % RUN_COLOURS}">{breakable}</span>'
 
-    sortable, is_numeric = (
-        (' class="sortable"' if is_sortable else ""),
-        ' class="number"',
-    )
+    sortable = ' class="sortable"' if is_sortable else ""
+    is_numeric = ' class="number"'
     lines = [f'<table{sortable} id="table-{escape(table.name)}">']
     caption = f"{table.title}. {table.caption}" if table.caption else table.title
     lines.append(f"<caption><span>{escape(caption)}</span></caption>")

@@ -31,6 +31,7 @@ def regular(path: Path) -> Path:
 
 def text_of(path: Path, encoding: str = "utf-8") -> str:
     """Content of a text file; an OSError as of `regular`, and where it has more than `LARGEST_TEXT` bytes."""
+    # a log given as a text would fill the memory before it is refused
     if regular(path).stat().st_size > LARGEST_TEXT:
         reason = f"it has {path.stat().st_size} bytes, and at most {LARGEST_TEXT} are read as a text: give a part of it"
         raise OSError(errno.EFBIG, reason, str(path))
@@ -70,6 +71,7 @@ def _strict(value: Any) -> Any:
         return {str(key): _strict(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
         return [_strict(inner) for inner in value]
+    # JSON has neither NaN nor infinity
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

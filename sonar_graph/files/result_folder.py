@@ -135,6 +135,7 @@ class ResultFolder:
             if _is_linked(self.path, name) or (self.path / name).is_dir()
         ]
         owns = self._manifest.owns
+        # not even --overwrite goes through a link
         others = links or [
             name for name in names if not self._overwrite and not owns(self.path, name)
         ]
@@ -193,6 +194,7 @@ class ResultFolder:
         files = self._manifest.files
         for name in new:
             with self.staged(name).open("rb") as stream:
+                # a kill in the middle leaves either content
                 files[name] = [*files.get(name, [])[-1:], digest_of(stream)]
         # before the files: killed between two of them, each is known by its old or its new content
         self._manifest.write(self.staged(MANIFEST))
@@ -246,6 +248,7 @@ def result_folder(
 @contextmanager
 def folder_for_use(path: Path) -> Iterator[None]:
     """Make a folder and its parents; those of them that nothing was put into are removed when the block ends."""
+    # deepest first, in which order they are removed again
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
