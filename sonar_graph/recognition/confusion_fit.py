@@ -282,7 +282,7 @@ def calibrate(
             truth = true_objects(run, stamp_ns)
             for track in result.tracks:
                 gathered.add(stamp_ns, log, track, truth)
-        if not session.result.frames:
+        if not session.frames:
             raise LogError(no_images(path))
     names = spelt(", ".join(path.name for path, _ in logs))
     kinds = "; ".join(

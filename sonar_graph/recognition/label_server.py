@@ -19,9 +19,8 @@ import numpy as np
 
 from sonar_graph.calibration import SonarCalibration
 from sonar_graph.images import SonarFrames, decibels
-from sonar_graph.recognition.image_motion import is_alike
 from sonar_graph.recognition.labels import Label, Labels, is_of_one_object
-from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
+from sonar_graph.recognition.recognition_record import FrameFans, as_jpeg, draw_fan
 from sonar_graph.recognition.session import one_by_one
 from sonar_graph.sonar import Fan, with_lens
 
@@ -63,17 +62,16 @@ def shown_frames(
 ) -> list[ShownFrame]:
     """Pictures of frames, at least a period apart and at most `MOST_FRAMES`, evenly over the log."""
     shown: list[ShownFrame] = []
-    fan: tuple[SonarFrames, Fan] | None = None
+    fans = FrameFans()
     for frame in (
         frame for block in blocks for frame in one_by_one(with_lens(block, sonar.lens))
     ):
         stamp_ns = int(frame.stamps_ns[0])
         if shown and stamp_ns - shown[-1].stamp_ns < period_ns:
             continue
-        if fan is None or not is_alike(frame, fan[0]):
-            fan = frame, Fan.of(frame.ranges_m, frame.azimuths_rad, PIXELS_HIGH)
-        picture = draw_fan(decibels(frame.intensity[0], sonar.image), fan[1], None)
-        shown.append(ShownFrame(stamp_ns, as_jpeg(picture), fan[1]))
+        fan = fans.of(frame, PIXELS_HIGH)
+        picture = draw_fan(decibels(frame.intensity[0], sonar.image), fan, None)
+        shown.append(ShownFrame(stamp_ns, as_jpeg(picture), fan))
         # too many: leave out every second, and look half as often from here on
         if len(shown) > MOST_FRAMES:
             del shown[1::2]

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.calibration import SonarImage
 from sonar_graph.files import (
     COMPARISON,
     read_json,
@@ -21,13 +22,16 @@ from sonar_graph.files import (
     result_written,
     write_json,
 )
-from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.images import SonarFrames, decibels
+from sonar_graph.measurements import NS_PER_S, LandmarkDetections
+from sonar_graph.recognition.image_motion import is_alike
 from sonar_graph.sonar import Fan
 from sonar_graph.states import LandmarkMap
 
 RECOGNITION = "recognition.json"
 PICTURE_FOLDER = "recognised"
 MOST_SHOWN = 6
+MOST_PICTURES = 400
 NONE = -1
 LEAST_NAMED = 0.5
 """Posterior above which a detection counts as naming a landmark."""
@@ -321,3 +325,52 @@ def as_jpeg(picture: Picture) -> bytes:
     """The picture as the bytes of a JPEG file."""
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return encoded.tobytes()
+
+
+class FrameFans:
+    """Fans of frames; frames of one window share theirs."""
+
+    def __init__(self) -> None:
+        self._last: tuple[SonarFrames, Fan] | None = None
+
+    def of(self, frame: SonarFrames, pixels_high: int = 420) -> Fan:
+        """Fan of a frame, for pictures this high."""
+        if self._last is None or not is_alike(frame, self._last[0]):
+            fan = Fan.of(frame.ranges_m, frame.azimuths_rad, pixels_high)
+            self._last = (frame, fan)
+        return self._last[1]
+
+
+class DrawnFrames:
+    """Pictures spread evenly over a run whose length is not known: one a period, rather one with detections."""
+
+    def __init__(self, image: SonarImage) -> None:
+        self.pictures: list[DrawnFrame] = []
+        self._image = image
+        self._fans = FrameFans()
+        self._period_ns = NS_PER_S
+
+    def add(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
+        """Draw a block of one frame, if its time has come."""
+        stamp_ns = int(frame.stamps_ns[0])
+        is_early = (
+            bool(self.pictures)
+            and stamp_ns - self.pictures[-1].stamp_ns < self._period_ns
+        )
+        if is_early:
+            # within the period only a first picture with detections replaces one without
+            if found is None or self.pictures[-1].landmark_ids:
+                return
+            self.pictures.pop()
+        ids: list[int] = []
+        probabilities: list[float] = []
+        if found is not None:
+            ids, probabilities = (part.tolist() for part in found.most_probable())
+        image_db = decibels(frame.intensity[0], self._image)
+        jpeg = as_jpeg(draw_fan(image_db, self._fans.of(frame), found))
+        self.pictures.append(
+            DrawnFrame(stamp_ns, jpeg, tuple(ids), tuple(probabilities))
+        )
+        if len(self.pictures) > MOST_PICTURES:
+            del self.pictures[1::2]
+            self._period_ns *= 2

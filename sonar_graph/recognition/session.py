@@ -7,6 +7,7 @@ motion from the images themselves (`sonar_graph.recognition.image_motion`).
 Detections are made once for a log, and are the same for all estimators. Design: docs/design/0009-recognition.md.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError, LogError, MeasurementError
 from sonar_graph.estimator import PlugIns
-from sonar_graph.images import NO_DEPTH, NO_HEIGHT, NO_TILT, SonarFrames, decibels
+from sonar_graph.images import NO_DEPTH, NO_HEIGHT, NO_TILT, SonarFrames
 from sonar_graph.logs import (
     ImagesAlone,
     PartialCalibration,
@@ -29,22 +30,19 @@ from sonar_graph.logs import (
 )
 from sonar_graph.logs import no_images as no_images
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Imu, LandmarkDetections
+from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.recognition.image_motion import ImageMotions, MotionFrom
 from sonar_graph.recognition.recognition_record import (
     LACKS,
     NO_FLOOR,
     OFF_FLOOR,
-    DrawnFrame,
+    DrawnFrames,
     Recognition,
-    as_jpeg,
-    draw_fan,
 )
 from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import (
     EVIDENCE,
-    Fan,
     FloorView,
     RecognisedFrame,
     Recogniser,
@@ -53,9 +51,7 @@ from sonar_graph.sonar import (
     with_lens,
 )
 
-MOST_PICTURES = 400
 MOST_WARNINGS = 200
-PICTURE_PERIOD_NS = NS_PER_S
 NOT_USED = "frame not used"
 OUT_OF_ORDER = "out of order"
 LEAPT = "out of order: its stamp is ahead of the frame after it"
@@ -221,8 +217,8 @@ def recognise_images(
         )
     for _ in session.run(images):
         if progress is not None:
-            progress(session.result.frames)
-    return session.finish() if session.result.frames else None
+            progress(session.frames)
+    return session.finish() if session.frames else None
 
 
 def with_detections(sequence: Run, recognition: Recognition) -> Run:
@@ -286,7 +282,11 @@ class RecognitionSession:
     ) -> None:
         self._draws = pictures
         self._seen = seen
-        self.result = Recognition()
+        self.frames = 0
+        """Number of frames until now, refused ones included."""
+        self._outcomes: Counter[str] = Counter()
+        self._warnings: list[tuple[int, str]] = []
+        self._drawn = DrawnFrames(sequence.calibration.sonar.image)
         self.recogniser = recogniser or Recogniser(
             sequence.calibration, designs, params
         )
@@ -315,9 +315,6 @@ class RecognitionSession:
         self._blocks: list[LandmarkDetections] = []
         self._beyond: dict[int, tuple[float, int]] = {}
         """Sum of the evidence `beyond` of each track, and number of its frames."""
-        self._fan: Fan | None = None
-        self._fan_of: tuple[object, object] = (None, None)
-        self._picture_period_ns = PICTURE_PERIOD_NS
 
     def run(self, blocks: Iterable[SonarFrames]) -> Iterator[RecognisedFrame]:
         """Recognise blocks of frames; the result of each frame, as it is done."""
@@ -341,7 +338,7 @@ class RecognitionSession:
             reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
             self.refuse(stamp_ns, reason)
             return RecognisedFrame.not_used(stamp_ns, f"{NOT_USED}: {reason}")
-        self.result.frames += 1
+        self.frames += 1
         if isinstance(self._motions, ImageMotions):
             self._motions.look(frame)
         step, view = self._motions.at(stamp_ns)
@@ -350,16 +347,16 @@ class RecognitionSession:
             self.start_T_sonar = self.start_T_sonar.compose(step.previous_T_sonar)
         frame = with_lens(frame, self._sonar.lens)
         # counted for warnings: without a floor fewer landmarks are recognised
-        self.result.outcomes[NO_FLOOR] += view is None
-        self.result.outcomes[OFF_FLOOR] += (
-            view is not None and not self._may_show_floor(frame, view)
+        self._outcomes[NO_FLOOR] += view is None
+        self._outcomes[OFF_FLOOR] += view is not None and not self._may_show_floor(
+            frame, view
         )
         result = self.recogniser.process(frame, step, view)
         for fate in result.fates:
             if fate.is_of_frame:
                 self._warn(stamp_ns, fate.outcome)
             else:
-                self.result.outcomes[fate.outcome] += 1
+                self._outcomes[fate.outcome] += 1
         if not result.is_used:
             return result
         if result.detections is not None:
@@ -373,43 +370,45 @@ class RecognitionSession:
         if self._seen is not None:
             self._seen(frame, result)
         if self._draws:
-            self._draw(frame, result.detections)
+            self._drawn.add(frame, result.detections)
         return result
 
     def refuse(self, stamp_ns: int, reason: str) -> None:
         """Count a message that is not a usable frame."""
-        self.result.frames += 1
+        self.frames += 1
         self._warn(stamp_ns, f"{NOT_USED}: {reason}")
 
     def finish(self) -> Recognition:
         """The whole record."""
-        result = self.result
-        result.detections = (
-            LandmarkDetections.concatenate(self._blocks) if self._blocks else None
-        )
-        result.notes = {
-            "detections": f"recognised in {result.frames} sonar images"
-        } | self.recogniser.notes()
+        notes = {"detections": f"recognised in {self.frames} sonar images"}
+        notes |= self.recogniser.notes()
         if isinstance(self._motions, ImageMotions):
-            result.notes |= self._motions.notes()
-        if self._lacks and result.outcomes[NO_FLOOR]:
-            result.notes[LACKS] = self._lacks
-        if (
-            isinstance(self.recogniser, Recogniser)
-            and (usual := self.recogniser.confusion.roughness) is not None
-        ):
+            notes |= self._motions.notes()
+        if self._lacks and self._outcomes[NO_FLOOR]:
+            notes[LACKS] = self._lacks
+        unlike = (0, 0)
+        usual = None
+        if isinstance(self.recogniser, Recogniser):
+            usual = self.recogniser.confusion.roughness
+        if usual is not None:
             means = [total / count for total, count in self._beyond.values()]
-            result.unlike = (
-                sum(not usual[0] <= mean <= usual[1] for mean in means),
-                len(means),
-            )
-        result.outcomes = +result.outcomes  # drops zero counts
-        result.warnings.sort(key=lambda row: row[0])
-        if result.warnings:
-            result.notes["detections.warnings"] = "; ".join(
-                f"{n} x {reason}" for reason, n in result.warned().items()
-            )
-        return result
+            outside = [not usual[0] <= mean <= usual[1] for mean in means]
+            unlike = (sum(outside), len(means))
+        whole = Recognition(
+            frames=self.frames,
+            detections=LandmarkDetections.concatenate(self._blocks)
+            if self._blocks
+            else None,
+            outcomes=+self._outcomes,  # drops zero counts
+            warnings=sorted(self._warnings, key=lambda row: row[0]),
+            pictures=self._drawn.pictures,
+            notes=notes,
+            unlike=unlike,
+        )
+        if whole.warnings:
+            reasons = [f"{n} x {reason}" for reason, n in whole.warned().items()]
+            notes["detections.warnings"] = "; ".join(reasons)
+        return whole
 
     def _may_show_floor(self, frame: SonarFrames, view: FloorView) -> bool:
         """True if the floor lies within the vertical aperture at any range ahead."""
@@ -424,45 +423,6 @@ class RecognitionSession:
         )
 
     def _warn(self, stamp_ns: int, reason: str) -> None:
-        if (
-            len(self.result.warnings) < MOST_WARNINGS
-            or reason not in self.result.outcomes
-        ):
-            self.result.warnings.append((stamp_ns, reason))
-        self.result.outcomes[reason] += 1
-
-    def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
-        """Draw one frame a period, rather one with detections; of too many drop every second and double the period."""
-        pictures = self.result.pictures
-        stamp_ns = int(frame.stamps_ns[0])
-        if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
-            # within the period only a first picture with detections replaces one without
-            if found is None or pictures[-1].landmark_ids:
-                return
-            pictures.pop()
-        if self._fan is None or self._fan_of != (
-            id(frame.ranges_m),
-            id(frame.azimuths_rad),
-        ):
-            self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)
-            self._fan_of = (id(frame.ranges_m), id(frame.azimuths_rad))
-        ids, probabilities = (
-            found.most_probable()
-            if found is not None
-            else (np.empty(0, int), np.empty(0))
-        )
-        picture = draw_fan(
-            decibels(frame.intensity[0], self._sonar.image), self._fan, found
-        )
-        pictures.append(
-            DrawnFrame(
-                stamp_ns,
-                as_jpeg(picture),
-                tuple(ids.tolist()),
-                tuple(probabilities.tolist()),
-            )
-        )
-        if len(pictures) > MOST_PICTURES:
-            # evenly over a run whose length is not known
-            del pictures[1::2]
-            self._picture_period_ns *= 2
+        if len(self._warnings) < MOST_WARNINGS or reason not in self._outcomes:
+            self._warnings.append((stamp_ns, reason))
+        self._outcomes[reason] += 1

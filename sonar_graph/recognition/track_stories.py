@@ -9,7 +9,7 @@ import numpy as np
 from sonar_graph.calibration import SonarImage
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, Floats
-from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
+from sonar_graph.recognition.recognition_record import FrameFans, as_jpeg, draw_fan
 from sonar_graph.sonar import Fan, RecognisedFrame
 
 HALF_M = 0.35
@@ -57,12 +57,14 @@ class TrackStories:
         self.tracks: dict[int, TrackStory] = {}
         self.rejected: dict[str, Rejected] = {}
         self._image = image
-        self._fan: tuple[SonarFrames, Fan] | None = None
+        self._fans = FrameFans()
 
     def see(self, frame: SonarFrames, result: RecognisedFrame) -> None:
         """Take in the result for a block of one frame."""
         stamp_ns = result.stamp_ns
-        views = _Views(frame, self._image, self._fan_of(frame))
+        extent_m = float(np.ptp(frame.ranges_m))
+        fan = self._fans.of(frame, round(extent_m / HALF_M * SIDE_PIXELS / 2))
+        views = _Views(frame, self._image, fan)
         for number, sighting, _, beliefs in result.tracks:
             story = self.tracks.setdefault(number, TrackStory(number, stamp_ns))
             story.beliefs = beliefs
@@ -90,22 +92,6 @@ class TrackStories:
                     found.examples.append(
                         (stamp_ns, views.around(fate.range_m, fate.azimuth_rad))
                     )
-
-    def _fan_of(self, frame: SonarFrames) -> Fan:
-        if self._fan is None or not (
-            self._fan[0].ranges_m is frame.ranges_m
-            and self._fan[0].azimuths_rad is frame.azimuths_rad
-        ):
-            extent_m = float(frame.ranges_m.max() - frame.ranges_m.min())
-            self._fan = (
-                frame,
-                Fan.of(
-                    frame.ranges_m,
-                    frame.azimuths_rad,
-                    round(extent_m / HALF_M * SIDE_PIXELS / 2),
-                ),
-            )
-        return self._fan[1]
 
 
 class _Views:
