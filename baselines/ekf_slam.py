@@ -30,6 +30,7 @@ from baselines.kalman import (
     Judged,
     correction,
     distance,
+    innovation_of,
     judged,
     judged_far,
     motion_noise,
@@ -38,7 +39,7 @@ from baselines.kalman import (
     symmetric,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import (
     body_point_jacobian,
     huber_scale,
@@ -210,7 +211,14 @@ def predict(x: Floats, P: Floats, motion: Motion) -> None:
 @compiled
 def update(x: Floats, P: Floats, H: Floats, e: Floats, R: Floats) -> None:
     """``x <- x + K e``, ``P <- P - K S K^T``, with ``S = H P H^T + R`` and ``K = P H^T S^-1``."""
-    x += correction(P, H, e, R)
+    HP, S = innovation_of(P, H, R)
+    move(x, correction(P, HP, S, e))
+
+
+@inlined
+def move(x: Floats, by: Floats) -> None:
+    """Add to the state, and wrap roll and yaw."""
+    x += by
     x[ROLL] = wrap_angle(x[ROLL])
     x[YAW] = wrap_angle(x[YAW])
 
@@ -230,11 +238,12 @@ def observe(
     store_row(sight.range_by_point, H, 0, at)
     store_row(sight.azimuth_by_point, H, 1, at)
     noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
-    S = symmetric(H @ P @ H.T + noise)
+    HP, S = innovation_of(P, H, noise)
+    S = symmetric(S)
     # the kernel widens the noise of the detection, not that of the motion
     outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
-        update(x, P, H, e, noise + widened)
+        move(x, correction(P, HP, S + widened, e))
     return outcome, e, S
 
 
@@ -250,6 +259,17 @@ def update_depth(
     store_row6(T.T @ h_b, H, 0, 0)
     e = np.array([z_m - X.z - R.z @ q])
     update(x, P, H, e, np.array([[h_b @ (mat6(motion.C) @ h_b) + variance_m2]]))
+
+
+@compiled
+def update_numbers(
+    x: Floats, P: Floats, places: Ints, e: Floats, variances: Floats
+) -> None:
+    """Update by direct measurements of m numbers of the state, at their places."""
+    H = np.zeros((len(places), len(x)))
+    for k in range(len(places)):
+        H[k, places[k]] = 1.0
+    update(x, P, H, e, np.diag(variances))
 
 
 class EkfSlamParams(FilterParams):
@@ -431,7 +451,7 @@ class EkfSlam(FilterShell):
         """Update roll and pitch by the direction of the world's up in the body."""
         # roll is as uncertain as the pitch is steep
         level = math.hypot(up[1], up[2])
-        roll_off = wrap_angle(math.atan2(up[1], up[2]) - self._x[ROLL])
+        roll_off = wrap_angle(math.atan2(up[1], up[2]) - float(self._x[ROLL]))
         e = np.array([roll_off, math.atan2(-up[0], level) - self._x[PITCH]])
         self._update_numbers([ROLL, PITCH], e, [(sigma_rad / level) ** 2, sigma_rad**2])
 
@@ -447,7 +467,9 @@ class EkfSlam(FilterShell):
         self, places: list[int], e: Floats, variances: list[float]
     ) -> None:
         """Update by direct measurements of numbers of the state."""
-        update(self._x, self._P, np.eye(len(self._x))[places], e, np.diag(variances))
+        update_numbers(
+            self._x, self._P, np.array(places), e, np.array(variances, dtype=np.float64)
+        )
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""

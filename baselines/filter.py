@@ -22,11 +22,14 @@ from baselines.events import (
     LONG_AGO,
     NOT_STARTED,
     Call,
+    Felt,
     Motion,
     Order,
     Samples,
     Sonar,
     Views,
+    depth_values,
+    feel,
     in_frame,
     in_order,
     read_detections,
@@ -169,10 +172,7 @@ class FilterShell(ABC):
         self._done_ns = LONG_AGO
         self._opened_ns = 0
         self._opened_velocity = (np.zeros(3), 0.0)
-        self._turned = np.eye(3)
-        """Rotation since the interval of gravity began."""
-        self._impulse = np.zeros(3)
-        """Specific force since then, integrated in the frame of its start."""
+        self._felt = Felt.nothing()
         self._kept_ns = 0
         self._used_in_gap: dict[tuple[int, int], int] = {}
         self._may_be_far = False
@@ -369,14 +369,12 @@ class FilterShell(ABC):
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        z, R_z = read_detections(
+        z, R_z, e, S = read_detections(
             detections.range_m,
             detections.azimuth_rad,
             detections.range_azimuth_cov,
             self._R_z,
         )
-        e = np.full((len(ids), 2), math.nan)
-        S = np.full((len(ids), 2, 2), math.nan)
         return Views(stamps_ns, ids, z, R_z, outcome, e, S)
 
     def _samples(
@@ -392,11 +390,7 @@ class FilterShell(ABC):
         """
         blocks = []
         if depth is not None:  # the odometry has refused its unsound rows
-            blocks.append(
-                self._in_time(
-                    self._depths(depth), np.ones(len(depth), np.bool_), since_ns
-                )
-            )
+            blocks.append(self._in_time(self._depths(depth), None, since_ns))
         if heading is not None:
             blocks.append(
                 self._in_time(self._headings(heading), heading.are_sound(), since_ns)
@@ -419,12 +413,8 @@ class FilterShell(ABC):
 
     def _depths(self, depth: Depth) -> Samples:
         """Depths, with the calibration's noise where they have none."""
-        value = np.zeros((len(depth), 3))
-        noise = np.zeros((len(depth), 3, 3))
-        value[:, 2] = depth.z_m
-        variance_m2 = depth.variance_m2
-        noise[:, 2, 2] = np.where(
-            np.isnan(variance_m2), self.calibration.depth.sigma_m**2, variance_m2
+        value, noise = depth_values(
+            depth.z_m, depth.variance_m2, self.calibration.depth.sigma_m**2
         )
         return _samples(depth.stamps_ns, DEPTH, value, noise)
 
@@ -451,9 +441,16 @@ class FilterShell(ABC):
         return _samples(fixes.stamps_ns, FIX, fixes.position_m, noise)
 
     def _in_time(
-        self, samples: Samples, is_sound: NDArray[np.bool_], since_ns: int
+        self, samples: Samples, is_sound: NDArray[np.bool_] | None, since_ns: int
     ) -> Samples:
-        """The sound rows that are not late; the others are refused, or used if they are late fixes."""
+        """The sound rows that are not late; the others are refused, or used if they are late fixes.
+
+        ``is_sound``: None where all are.
+        """
+        if is_sound is None:
+            if samples.stamp_ns[0] >= since_ns:
+                return samples
+            is_sound = np.ones(len(samples.stamp_ns), np.bool_)
         is_late = samples.stamp_ns < since_ns
         is_used = is_sound & ~is_late
         if is_used.all():
@@ -542,8 +539,7 @@ class FilterShell(ABC):
         self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
         self.node_ns = epoch_ns
         # gravity is compared with the specific force in the frame where its interval began
-        self._impulse = self._impulse + self._turned @ motion.impulse
-        self._turned = self._turned @ motion.dR
+        feel(self._felt, motion)
         if self.calibration.planar is not None:
             self.update_plane(self.calibration.planar)
         if ends_interval:
@@ -554,8 +550,9 @@ class FilterShell(ABC):
         duration_s = (epoch_ns - self._opened_ns) * 1e-9
         velocity_i, variance_i = self._opened_velocity
         velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
+        turn, impulse = self._felt
         up = up_direction(
-            self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s
+            impulse / duration_s, turn, velocity_i, velocity_j, duration_s
         )
         if not math.isnan(up[0]):
             # one sigma for both ends, so that the noise of the difference is the same
@@ -563,15 +560,14 @@ class FilterShell(ABC):
             sigma_rad = tilt_sigma(
                 duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias
             )
-            self.update_up(up, sigma_rad, self._turned)
+            self.update_up(up, sigma_rad, turn)
         self._opened_ns = epoch_ns
         self._opened_velocity = (velocity_j, variance_j)
-        self._turned = np.eye(3)
-        self._impulse = np.zeros(3)
+        self._felt = Felt.nothing()
 
     def _see(self, motion: Motion, views: Views, first: int) -> None:
         """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
-        for row in in_frame(views, first):
+        for row in in_frame(views, first).tolist():
             z = views.z[row]
             R_z = views.R_z[row]
             landmark_id = int(views.ids[row])

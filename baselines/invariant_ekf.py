@@ -54,6 +54,7 @@ from baselines.kalman import (
     Judged,
     correction,
     distance,
+    innovation_of,
     judged,
     judged_far,
     motion_noise,
@@ -203,7 +204,13 @@ def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> Non
 @compiled
 def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
     """Update by an innovation: ``xi = K e`` moves the estimate by (1), ``P <- P - K S K^T``."""
-    xi = correction(state.P, H, e, R)
+    HP, S = innovation_of(state.P, H, R)
+    move(state, correction(state.P, HP, S, e))
+
+
+@inlined
+def move(state: InvariantState, xi: Floats) -> None:
+    """Move the estimate by an error, (1)."""
     # the error turns with the world, so that all points turn together
     Exp, J_l = exp_and_mean(vec(xi))
     store(Exp @ mat(state.R), state.R)
@@ -240,10 +247,11 @@ def observe(
     store_by_biases(sight.range_by_body, D, H, 0)
     store_by_biases(sight.azimuth_by_body, D, H, 1)
     noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
-    S = symmetric(H @ state.P @ H.T + noise)  # (9)
+    HP, S = innovation_of(state.P, H, noise)  # (9)
+    S = symmetric(S)
     outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
     if outcome != GATED:
-        update(state, H, e, noise + widened)
+        move(state, correction(state.P, HP, S + widened, e))
     return outcome, e, S
 
 
