@@ -23,7 +23,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from baselines.events import Motion, Sonar, elevation_of_new
+from baselines.events import Motion, Sighted, Sonar, Views, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
@@ -41,6 +41,7 @@ from baselines.kalman import (
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import (
+    Mount,
     body_point_jacobian,
     huber_scale,
     locate_from_body,
@@ -225,11 +226,19 @@ def move(x: Floats, by: Floats) -> None:
 
 @compiled
 def observe(
-    x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
+    x: Floats,
+    P: Floats,
+    at: int,
+    motion: Motion,
+    sonar: Sonar,
+    gate: float,
+    z: Floats,
+    R_z: Floats,
 ) -> tuple[int, Floats, Floats]:
     """Update by range and azimuth of a known landmark at ``x[at : at + 3]``; outcome, e of (7) and S."""
+    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
     R, X, T = pose_after(x, motion)
-    sight = sight_of(R, X, sonar.mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
+    sight = sight_of(R, X, mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
     e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])  # (7)
     H = np.zeros((2, len(x)))
     # H_b T and H_p, row by row
@@ -241,10 +250,26 @@ def observe(
     HP, S = innovation_of(P, H, noise)
     S = symmetric(S)
     # the kernel widens the noise of the detection, not that of the motion
-    outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
+    outcome, widened = judged(e, S, R_z, gate, sonar.kernel_width)
     if outcome != GATED:
         move(x, correction(P, HP, S + widened, e))
     return outcome, e, S
+
+
+@compiled
+def observe_frame(
+    x: Floats, P: Floats, motion: Motion, sonar: Sonar, views: Views, sighted: Sighted
+) -> None:
+    """Update by known landmarks of a frame in turn, and write outcomes and innovations."""
+    for k in range(len(sighted.rows)):
+        row = sighted.rows[k]
+        at = MAP + LANDMARK * sighted.slots[k]
+        outcome, e, S = observe(
+            x, P, at, motion, sonar, sighted.gates[k], views.z[row], views.R_z[row]
+        )
+        views.outcome[row] = outcome
+        views.e[row] = e
+        views.S[row] = S
 
 
 @compiled
@@ -337,26 +362,9 @@ class EkfSlam(FilterShell):
         """Carry the state over the motion to the next epoch."""
         predict(self._x, self._P, motion)
 
-    def observe(
-        self,
-        motion: Motion,
-        slot: int,
-        z: Floats,
-        R_z: Floats,
-        sonar: Sonar | None = None,
-    ) -> Judged:
-        """Update by range and azimuth of a known landmark, (6) and (7)."""
-        return Judged(
-            *observe(
-                self._x,
-                self._P,
-                MAP + LANDMARK * slot,
-                motion,
-                sonar or self.sonar,
-                z,
-                R_z,
-            )
-        )
+    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+        """Update by range and azimuth of known landmarks, (6) and (7)."""
+        observe_frame(self._x, self._P, motion, self.sonar, views, sighted)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats

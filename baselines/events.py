@@ -53,7 +53,8 @@ class Motion(NamedTuple):
 class Sonar(NamedTuple):
     """Sonar and floor, and the treatment of doubtful detections."""
 
-    mount: Mount
+    body_R_sonar: Floats
+    body_p_sonar: Floats
     aperture_rad: float
     floor_z_m: float
     """NaN where it is not known."""
@@ -62,6 +63,22 @@ class Sonar(NamedTuple):
     """Mahalanobis distance beyond which a detection is refused."""
     kernel_width: float
     """Of the Cauchy kernel, in standard deviations; infinite: none."""
+
+    @property
+    def mount(self) -> Mount:
+        """Place of the sonar."""
+        return Mount(self.body_R_sonar, self.body_p_sonar)
+
+
+class Sighted(NamedTuple):
+    """Views of known landmarks in one frame, in their order, m of them."""
+
+    rows: Ints
+    """Their numbers among the views, shape (m,)."""
+    slots: Ints
+    """Numbers of the landmarks in the state, shape (m,)."""
+    gates: Floats
+    """Mahalanobis distances beyond which they are refused, shape (m,)."""
 
 
 class Samples(NamedTuple):

@@ -26,6 +26,7 @@ from baselines.events import (
     Motion,
     Order,
     Samples,
+    Sighted,
     Sonar,
     Views,
     depth_values,
@@ -58,7 +59,6 @@ from sonar_graph.models import (
     MINIMUM_PROBABILITY,
     Contradictions,
     KnownLandmarks,
-    Mount,
     Verdict,
     identify,
     tilt_sigma,
@@ -122,7 +122,8 @@ def sonar_of(calibration: Calibration, params: FilterParams) -> Sonar:
     # the chi-square distribution of two degrees of freedom is 1 - exp(-d^2 / 2)
     has_gate = params.gate_probability < 1
     return Sonar(
-        mount=Mount(body_R_sonar, np.array(sonar.mounting.translation_m)),
+        body_R_sonar=body_R_sonar,
+        body_p_sonar=np.array(sonar.mounting.translation_m),
         aperture_rad=sonar.elevation_aperture_rad,
         floor_z_m=floor.z_m if floor else math.nan,
         floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
@@ -194,24 +195,17 @@ class FilterShell(ABC):
         """Carry the state over the motion to the next epoch."""
 
     @abstractmethod
-    def observe(
-        self,
-        motion: Motion,
-        slot: int,
-        z: Floats,
-        R_z: Floats,
-        sonar: Sonar | None = None,
-    ) -> Judged:
-        """Update by range and azimuth of a known landmark, a motion after the state.
+    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+        """Update by range and azimuth of known landmarks, one after the other, a motion after the state.
 
-        ``sonar``: with another gate; None: `sonar` of the filter.
+        Writes outcomes and innovations into the views.
         """
 
     @abstractmethod
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
     ) -> Judged | None:
-        """Update as `observe` by the point seen, where (6) and (7) are not linear enough; None where they are."""
+        """Update as `observe` by the point seen of one landmark; None where (6) and (7) are linear enough."""
 
     @abstractmethod
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
@@ -567,37 +561,63 @@ class FilterShell(ABC):
 
     def _see(self, motion: Motion, views: Views, first: int) -> None:
         """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
+        known: list[int] = []
         for row in in_frame(views, first).tolist():
-            z = views.z[row]
-            R_z = views.R_z[row]
             landmark_id = int(views.ids[row])
-            slot = self._slots.get(landmark_id)
-            if slot is None:  # seen for the first time
-                self.augment(motion, z, R_z)
-                self._slots[landmark_id] = self._landmarks
-                self._landmarks += 1
-                views.outcome[row] = NEW
+            if landmark_id in self._slots:
+                known.append(row)
                 continue
-            judged = (
-                self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
-            )
-            judged = judged or self.observe(
-                motion, slot, z, R_z, self._gated(landmark_id)
-            )
-            views.outcome[row], views.e[row], views.S[row] = judged
-            self._judge_map(landmark_id, judged)
+            # seen for the first time
+            self._observe(motion, views, known)
+            known = []
+            self.augment(motion, views.z[row], views.R_z[row])
+            self._slots[landmark_id] = self._landmarks
+            self._landmarks += 1
+            views.outcome[row] = NEW
+        self._observe(motion, views, known)
 
-    def _gated(self, landmark_id: int) -> Sonar:
-        """The sonar, whose gate refuses what contradicts a landmark of the map."""
+    def _observe(self, motion: Motion, views: Views, rows: list[int]) -> None:
+        """Update by known landmarks, which the rows of a frame show."""
+        if self._may_be_far:
+            rows = [row for row in rows if not self._observe_far(motion, views, row)]
+        if not rows:
+            return
+        ids = views.ids[rows].tolist()
+        sighted = Sighted(
+            rows=np.array(rows),
+            slots=np.array([self._slots[landmark_id] for landmark_id in ids]),
+            gates=np.array([self._gate(landmark_id) for landmark_id in ids]),
+        )
+        self.observe(motion, views, sighted)
+        if self._known.held:
+            for row in rows:
+                self._judge_map(views, row)
+
+    def _observe_far(self, motion: Motion, views: Views, row: int) -> bool:
+        """Update by the point seen in a row; False where that is not needed."""
+        landmark_id = int(views.ids[row])
+        judged = self.observe_far(
+            motion, self._slots[landmark_id], views.z[row], views.R_z[row]
+        )
+        if judged is None:
+            return False
+        views.outcome[row], views.e[row], views.S[row] = judged
+        self._judge_map(views, row)
+        return True
+
+    def _gate(self, landmark_id: int) -> float:
+        """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map."""
         if landmark_id not in self._known.held:
-            return self.sonar
-        return self.sonar._replace(gate=min(self.sonar.gate, self._known.gate))
+            return self.sonar.gate
+        return min(self.sonar.gate, self._known.gate)
 
-    def _judge_map(self, landmark_id: int, judged: Judged) -> None:
+    def _judge_map(self, views: Views, row: int) -> None:
         """Let a landmark of the map go that has moved; its next sighting maps it again."""
+        landmark_id = int(views.ids[row])
         if landmark_id not in self._known.held:
             return
-        squared = float(judged.e @ np.linalg.solve(judged.S, judged.e))
+        e = views.e[row]
+        squared = float(e @ np.linalg.solve(views.S[row], e))
         if self._known.judge(landmark_id, squared) is Verdict.RELEASE:
             del self._slots[landmark_id]
 
