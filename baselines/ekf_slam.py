@@ -23,13 +23,14 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from baselines.events import Motion, Sonar, elevation_of_new
+from baselines.events import Motion, Sighted, Sonar, Views, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
     Judged,
     correction,
     distance,
+    innovation_of,
     judged,
     judged_far,
     motion_noise,
@@ -38,8 +39,9 @@ from baselines.kalman import (
     symmetric,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import (
+    Mount,
     body_point_jacobian,
     huber_scale,
     locate_from_body,
@@ -210,18 +212,33 @@ def predict(x: Floats, P: Floats, motion: Motion) -> None:
 @compiled
 def update(x: Floats, P: Floats, H: Floats, e: Floats, R: Floats) -> None:
     """``x <- x + K e``, ``P <- P - K S K^T``, with ``S = H P H^T + R`` and ``K = P H^T S^-1``."""
-    x += correction(P, H, e, R)
+    HP, S = innovation_of(P, H, R)
+    move(x, correction(P, HP, S, e))
+
+
+@inlined
+def move(x: Floats, by: Floats) -> None:
+    """Add to the state, and wrap roll and yaw."""
+    x += by
     x[ROLL] = wrap_angle(x[ROLL])
     x[YAW] = wrap_angle(x[YAW])
 
 
 @compiled
 def observe(
-    x: Floats, P: Floats, at: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
+    x: Floats,
+    P: Floats,
+    at: int,
+    motion: Motion,
+    sonar: Sonar,
+    gate: float,
+    z: Floats,
+    R_z: Floats,
 ) -> tuple[int, Floats, Floats]:
     """Update by range and azimuth of a known landmark at ``x[at : at + 3]``; outcome, e of (7) and S."""
+    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
     R, X, T = pose_after(x, motion)
-    sight = sight_of(R, X, sonar.mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
+    sight = sight_of(R, X, mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
     e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])  # (7)
     H = np.zeros((2, len(x)))
     # H_b T and H_p, row by row
@@ -230,12 +247,29 @@ def observe(
     store_row(sight.range_by_point, H, 0, at)
     store_row(sight.azimuth_by_point, H, 1, at)
     noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
-    S = symmetric(H @ P @ H.T + noise)
+    HP, S = innovation_of(P, H, noise)
+    S = symmetric(S)
     # the kernel widens the noise of the detection, not that of the motion
-    outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
+    outcome, widened = judged(e, S, R_z, gate, sonar.kernel_width)
     if outcome != GATED:
-        update(x, P, H, e, noise + widened)
+        move(x, correction(P, HP, S + widened, e))
     return outcome, e, S
+
+
+@compiled
+def observe_frame(
+    x: Floats, P: Floats, motion: Motion, sonar: Sonar, views: Views, sighted: Sighted
+) -> None:
+    """Update by known landmarks of a frame in turn, and write outcomes and innovations."""
+    for k in range(len(sighted.rows)):
+        row = sighted.rows[k]
+        at = MAP + LANDMARK * sighted.slots[k]
+        outcome, e, S = observe(
+            x, P, at, motion, sonar, sighted.gates[k], views.z[row], views.R_z[row]
+        )
+        views.outcome[row] = outcome
+        views.e[row] = e
+        views.S[row] = S
 
 
 @compiled
@@ -250,6 +284,17 @@ def update_depth(
     store_row6(T.T @ h_b, H, 0, 0)
     e = np.array([z_m - X.z - R.z @ q])
     update(x, P, H, e, np.array([[h_b @ (mat6(motion.C) @ h_b) + variance_m2]]))
+
+
+@compiled
+def update_numbers(
+    x: Floats, P: Floats, places: Ints, e: Floats, variances: Floats
+) -> None:
+    """Update by direct measurements of m numbers of the state, at their places."""
+    H = np.zeros((len(places), len(x)))
+    for k in range(len(places)):
+        H[k, places[k]] = 1.0
+    update(x, P, H, e, np.diag(variances))
 
 
 class EkfSlamParams(FilterParams):
@@ -317,26 +362,9 @@ class EkfSlam(FilterShell):
         """Carry the state over the motion to the next epoch."""
         predict(self._x, self._P, motion)
 
-    def observe(
-        self,
-        motion: Motion,
-        slot: int,
-        z: Floats,
-        R_z: Floats,
-        sonar: Sonar | None = None,
-    ) -> Judged:
-        """Update by range and azimuth of a known landmark, (6) and (7)."""
-        return Judged(
-            *observe(
-                self._x,
-                self._P,
-                MAP + LANDMARK * slot,
-                motion,
-                sonar or self.sonar,
-                z,
-                R_z,
-            )
-        )
+    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+        """Update by range and azimuth of known landmarks, (6) and (7)."""
+        observe_frame(self._x, self._P, motion, self.sonar, views, sighted)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
@@ -431,7 +459,7 @@ class EkfSlam(FilterShell):
         """Update roll and pitch by the direction of the world's up in the body."""
         # roll is as uncertain as the pitch is steep
         level = math.hypot(up[1], up[2])
-        roll_off = wrap_angle(math.atan2(up[1], up[2]) - self._x[ROLL])
+        roll_off = wrap_angle(math.atan2(up[1], up[2]) - float(self._x[ROLL]))
         e = np.array([roll_off, math.atan2(-up[0], level) - self._x[PITCH]])
         self._update_numbers([ROLL, PITCH], e, [(sigma_rad / level) ** 2, sigma_rad**2])
 
@@ -447,7 +475,9 @@ class EkfSlam(FilterShell):
         self, places: list[int], e: Floats, variances: list[float]
     ) -> None:
         """Update by direct measurements of numbers of the state."""
-        update(self._x, self._P, np.eye(len(self._x))[places], e, np.diag(variances))
+        update_numbers(
+            self._x, self._P, np.array(places), e, np.array(variances, dtype=np.float64)
+        )
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""

@@ -53,7 +53,8 @@ class Motion(NamedTuple):
 class Sonar(NamedTuple):
     """Sonar and floor, and the treatment of doubtful detections."""
 
-    mount: Mount
+    body_R_sonar: Floats
+    body_p_sonar: Floats
     aperture_rad: float
     floor_z_m: float
     """NaN where it is not known."""
@@ -62,6 +63,22 @@ class Sonar(NamedTuple):
     """Mahalanobis distance beyond which a detection is refused."""
     kernel_width: float
     """Of the Cauchy kernel, in standard deviations; infinite: none."""
+
+    @property
+    def mount(self) -> Mount:
+        """Place of the sonar."""
+        return Mount(self.body_R_sonar, self.body_p_sonar)
+
+
+class Sighted(NamedTuple):
+    """Views of known landmarks in one frame, in their order, m of them."""
+
+    rows: Ints
+    """Their numbers among the views, shape (m,)."""
+    slots: Ints
+    """Numbers of the landmarks in the state, shape (m,)."""
+    gates: Floats
+    """Mahalanobis distances beyond which they are refused, shape (m,)."""
 
 
 class Samples(NamedTuple):
@@ -89,18 +106,26 @@ class Views(NamedTuple):
     S: Floats
 
 
-def in_frame(views: Views, first: int) -> list[int]:
-    """Detections of a frame that are to be used, of which one is given."""
-    return np.flatnonzero(
-        (views.stamp_ns == views.stamp_ns[first]) & (views.outcome == ACCEPTED)
-    ).tolist()
+@compiled
+def in_frame(views: Views, first: int) -> Ints:
+    """Detections of a frame that are to be used, of which the first is given."""
+    found = np.empty(len(views.stamp_ns), np.int64)
+    n = 0
+    for row in range(first, len(found)):
+        # rows of one frame follow each other
+        if views.stamp_ns[row] != views.stamp_ns[first]:
+            break
+        if views.outcome[row] == ACCEPTED:
+            found[n] = row
+            n += 1
+    return found[:n]
 
 
 @compiled
 def read_detections(
     range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats
-) -> tuple[Floats, Floats]:
-    """Detections z (m, 2) and their covariances (m, 2, 2): symmetric, and R_z where the log has none."""
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Columns z, R_z, e and S of `Views`. Covariances are made symmetric, and are R_z where the log has none."""
     z = np.empty((len(range_m), 2))
     noise = np.empty((len(range_m), 2, 2))
     for k in range(len(z)):
@@ -113,7 +138,45 @@ def read_detections(
         noise[k, 1, 1] = logged[k, 1, 1] if is_known else R_z[1, 1]
         noise[k, 0, 1] = across if is_known else R_z[0, 1]
         noise[k, 1, 0] = noise[k, 0, 1]
-    return z, noise
+    e = np.full((len(z), 2), math.nan)
+    S = np.full((len(z), 2, 2), math.nan)
+    return z, noise, e, S
+
+
+@compiled
+def depth_values(
+    z_m: Floats, variance_m2: Floats, unknown_m2: float
+) -> tuple[Floats, Floats]:
+    """Columns of `Samples` for depths; ``unknown_m2``: variance where a depth has none."""
+    value = np.zeros((len(z_m), 3))
+    noise = np.zeros((len(z_m), 3, 3))
+    for k in range(len(z_m)):
+        value[k, 2] = z_m[k]
+        is_known = not math.isnan(variance_m2[k])
+        noise[k, 2, 2] = variance_m2[k] if is_known else unknown_m2
+    return value, noise
+
+
+class Felt(NamedTuple):
+    """Turn and specific force since an interval of gravity began."""
+
+    turn: Floats
+    """Rotation from the start of the interval to the newest epoch, shape (3, 3)."""
+    impulse: Floats
+    """Specific force, integrated in the frame of the start, shape (3,), m/s."""
+
+    @classmethod
+    def nothing(cls) -> "Felt":
+        """At the start of an interval."""
+        return cls(np.eye(3), np.zeros(3))
+
+
+@compiled
+def feel(felt: Felt, motion: Motion) -> None:
+    """Continue by the motion to the next epoch."""
+    turn = mat(felt.turn)
+    store_vector(vec(felt.impulse) + turn @ vec(motion.impulse), felt.impulse, 0)
+    store(turn @ mat(motion.dR), felt.turn)
 
 
 class Order(NamedTuple):

@@ -22,11 +22,15 @@ from baselines.events import (
     LONG_AGO,
     NOT_STARTED,
     Call,
+    Felt,
     Motion,
     Order,
     Samples,
+    Sighted,
     Sonar,
     Views,
+    depth_values,
+    feel,
     in_frame,
     in_order,
     read_detections,
@@ -55,7 +59,6 @@ from sonar_graph.models import (
     MINIMUM_PROBABILITY,
     Contradictions,
     KnownLandmarks,
-    Mount,
     Verdict,
     identify,
     tilt_sigma,
@@ -119,7 +122,8 @@ def sonar_of(calibration: Calibration, params: FilterParams) -> Sonar:
     # the chi-square distribution of two degrees of freedom is 1 - exp(-d^2 / 2)
     has_gate = params.gate_probability < 1
     return Sonar(
-        mount=Mount(body_R_sonar, np.array(sonar.mounting.translation_m)),
+        body_R_sonar=body_R_sonar,
+        body_p_sonar=np.array(sonar.mounting.translation_m),
         aperture_rad=sonar.elevation_aperture_rad,
         floor_z_m=floor.z_m if floor else math.nan,
         floor_variance_m2=floor.sigma_m**2 if floor else math.nan,
@@ -169,10 +173,7 @@ class FilterShell(ABC):
         self._done_ns = LONG_AGO
         self._opened_ns = 0
         self._opened_velocity = (np.zeros(3), 0.0)
-        self._turned = np.eye(3)
-        """Rotation since the interval of gravity began."""
-        self._impulse = np.zeros(3)
-        """Specific force since then, integrated in the frame of its start."""
+        self._felt = Felt.nothing()
         self._kept_ns = 0
         self._used_in_gap: dict[tuple[int, int], int] = {}
         self._may_be_far = False
@@ -194,24 +195,17 @@ class FilterShell(ABC):
         """Carry the state over the motion to the next epoch."""
 
     @abstractmethod
-    def observe(
-        self,
-        motion: Motion,
-        slot: int,
-        z: Floats,
-        R_z: Floats,
-        sonar: Sonar | None = None,
-    ) -> Judged:
-        """Update by range and azimuth of a known landmark, a motion after the state.
+    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+        """Update by range and azimuth of known landmarks, one after the other, a motion after the state.
 
-        ``sonar``: with another gate; None: `sonar` of the filter.
+        Writes outcomes and innovations into the views.
         """
 
     @abstractmethod
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
     ) -> Judged | None:
-        """Update as `observe` by the point seen, where (6) and (7) are not linear enough; None where they are."""
+        """Update as `observe` by the point seen of one landmark; None where (6) and (7) are linear enough."""
 
     @abstractmethod
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
@@ -369,14 +363,12 @@ class FilterShell(ABC):
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        z, R_z = read_detections(
+        z, R_z, e, S = read_detections(
             detections.range_m,
             detections.azimuth_rad,
             detections.range_azimuth_cov,
             self._R_z,
         )
-        e = np.full((len(ids), 2), math.nan)
-        S = np.full((len(ids), 2, 2), math.nan)
         return Views(stamps_ns, ids, z, R_z, outcome, e, S)
 
     def _samples(
@@ -392,11 +384,7 @@ class FilterShell(ABC):
         """
         blocks = []
         if depth is not None:  # the odometry has refused its unsound rows
-            blocks.append(
-                self._in_time(
-                    self._depths(depth), np.ones(len(depth), np.bool_), since_ns
-                )
-            )
+            blocks.append(self._in_time(self._depths(depth), None, since_ns))
         if heading is not None:
             blocks.append(
                 self._in_time(self._headings(heading), heading.are_sound(), since_ns)
@@ -419,12 +407,8 @@ class FilterShell(ABC):
 
     def _depths(self, depth: Depth) -> Samples:
         """Depths, with the calibration's noise where they have none."""
-        value = np.zeros((len(depth), 3))
-        noise = np.zeros((len(depth), 3, 3))
-        value[:, 2] = depth.z_m
-        variance_m2 = depth.variance_m2
-        noise[:, 2, 2] = np.where(
-            np.isnan(variance_m2), self.calibration.depth.sigma_m**2, variance_m2
+        value, noise = depth_values(
+            depth.z_m, depth.variance_m2, self.calibration.depth.sigma_m**2
         )
         return _samples(depth.stamps_ns, DEPTH, value, noise)
 
@@ -451,9 +435,16 @@ class FilterShell(ABC):
         return _samples(fixes.stamps_ns, FIX, fixes.position_m, noise)
 
     def _in_time(
-        self, samples: Samples, is_sound: NDArray[np.bool_], since_ns: int
+        self, samples: Samples, is_sound: NDArray[np.bool_] | None, since_ns: int
     ) -> Samples:
-        """The sound rows that are not late; the others are refused, or used if they are late fixes."""
+        """The sound rows that are not late; the others are refused, or used if they are late fixes.
+
+        ``is_sound``: None where all are.
+        """
+        if is_sound is None:
+            if samples.stamp_ns[0] >= since_ns:
+                return samples
+            is_sound = np.ones(len(samples.stamp_ns), np.bool_)
         is_late = samples.stamp_ns < since_ns
         is_used = is_sound & ~is_late
         if is_used.all():
@@ -542,8 +533,7 @@ class FilterShell(ABC):
         self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
         self.node_ns = epoch_ns
         # gravity is compared with the specific force in the frame where its interval began
-        self._impulse = self._impulse + self._turned @ motion.impulse
-        self._turned = self._turned @ motion.dR
+        feel(self._felt, motion)
         if self.calibration.planar is not None:
             self.update_plane(self.calibration.planar)
         if ends_interval:
@@ -554,8 +544,9 @@ class FilterShell(ABC):
         duration_s = (epoch_ns - self._opened_ns) * 1e-9
         velocity_i, variance_i = self._opened_velocity
         velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
+        turn, impulse = self._felt
         up = up_direction(
-            self._impulse / duration_s, self._turned, velocity_i, velocity_j, duration_s
+            impulse / duration_s, turn, velocity_i, velocity_j, duration_s
         )
         if not math.isnan(up[0]):
             # one sigma for both ends, so that the noise of the difference is the same
@@ -563,45 +554,70 @@ class FilterShell(ABC):
             sigma_rad = tilt_sigma(
                 duration_s, velocity_sigma, self.calibration, has_bias=not self.has_bias
             )
-            self.update_up(up, sigma_rad, self._turned)
+            self.update_up(up, sigma_rad, turn)
         self._opened_ns = epoch_ns
         self._opened_velocity = (velocity_j, variance_j)
-        self._turned = np.eye(3)
-        self._impulse = np.zeros(3)
+        self._felt = Felt.nothing()
 
     def _see(self, motion: Motion, views: Views, first: int) -> None:
         """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
-        for row in in_frame(views, first):
-            z = views.z[row]
-            R_z = views.R_z[row]
+        known: list[int] = []
+        for row in in_frame(views, first).tolist():
             landmark_id = int(views.ids[row])
-            slot = self._slots.get(landmark_id)
-            if slot is None:  # seen for the first time
-                self.augment(motion, z, R_z)
-                self._slots[landmark_id] = self._landmarks
-                self._landmarks += 1
-                views.outcome[row] = NEW
+            if landmark_id in self._slots:
+                known.append(row)
                 continue
-            judged = (
-                self.observe_far(motion, slot, z, R_z) if self._may_be_far else None
-            )
-            judged = judged or self.observe(
-                motion, slot, z, R_z, self._gated(landmark_id)
-            )
-            views.outcome[row], views.e[row], views.S[row] = judged
-            self._judge_map(landmark_id, judged)
+            # seen for the first time
+            self._observe(motion, views, known)
+            known = []
+            self.augment(motion, views.z[row], views.R_z[row])
+            self._slots[landmark_id] = self._landmarks
+            self._landmarks += 1
+            views.outcome[row] = NEW
+        self._observe(motion, views, known)
 
-    def _gated(self, landmark_id: int) -> Sonar:
-        """The sonar, whose gate refuses what contradicts a landmark of the map."""
+    def _observe(self, motion: Motion, views: Views, rows: list[int]) -> None:
+        """Update by known landmarks, which the rows of a frame show."""
+        if self._may_be_far:
+            rows = [row for row in rows if not self._observe_far(motion, views, row)]
+        if not rows:
+            return
+        ids = views.ids[rows].tolist()
+        sighted = Sighted(
+            rows=np.array(rows),
+            slots=np.array([self._slots[landmark_id] for landmark_id in ids]),
+            gates=np.array([self._gate(landmark_id) for landmark_id in ids]),
+        )
+        self.observe(motion, views, sighted)
+        if self._known.held:
+            for row in rows:
+                self._judge_map(views, row)
+
+    def _observe_far(self, motion: Motion, views: Views, row: int) -> bool:
+        """Update by the point seen in a row; False where that is not needed."""
+        landmark_id = int(views.ids[row])
+        judged = self.observe_far(
+            motion, self._slots[landmark_id], views.z[row], views.R_z[row]
+        )
+        if judged is None:
+            return False
+        views.outcome[row], views.e[row], views.S[row] = judged
+        self._judge_map(views, row)
+        return True
+
+    def _gate(self, landmark_id: int) -> float:
+        """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map."""
         if landmark_id not in self._known.held:
-            return self.sonar
-        return self.sonar._replace(gate=min(self.sonar.gate, self._known.gate))
+            return self.sonar.gate
+        return min(self.sonar.gate, self._known.gate)
 
-    def _judge_map(self, landmark_id: int, judged: Judged) -> None:
+    def _judge_map(self, views: Views, row: int) -> None:
         """Let a landmark of the map go that has moved; its next sighting maps it again."""
+        landmark_id = int(views.ids[row])
         if landmark_id not in self._known.held:
             return
-        squared = float(judged.e @ np.linalg.solve(judged.S, judged.e))
+        e = views.e[row]
+        squared = float(e @ np.linalg.solve(views.S[row], e))
         if self._known.judge(landmark_id, squared) is Verdict.RELEASE:
             del self._slots[landmark_id]
 

@@ -47,13 +47,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from baselines.events import Motion, Sonar, elevation_of_new
+from baselines.events import Motion, Sighted, Sonar, Views, elevation_of_new
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
     Judged,
     correction,
     distance,
+    innovation_of,
     judged,
     judged_far,
     motion_noise,
@@ -69,6 +70,7 @@ from sonar_graph.models import (
     COMPASS,
     SCALE,
     KnownLandmarks,
+    Mount,
     bias_jacobian,
     bias_sigmas,
     body_point_jacobian,
@@ -203,7 +205,13 @@ def predict(state: InvariantState, motion: Motion, walk_variance: Floats) -> Non
 @compiled
 def update(state: InvariantState, H: Floats, e: Floats, R: Floats) -> None:
     """Update by an innovation: ``xi = K e`` moves the estimate by (1), ``P <- P - K S K^T``."""
-    xi = correction(state.P, H, e, R)
+    HP, S = innovation_of(state.P, H, R)
+    move(state, correction(state.P, HP, S, e))
+
+
+@inlined
+def move(state: InvariantState, xi: Floats) -> None:
+    """Move the estimate by an error, (1)."""
     # the error turns with the world, so that all points turn together
     Exp, J_l = exp_and_mean(vec(xi))
     store(Exp @ mat(state.R), state.R)
@@ -224,12 +232,19 @@ def store_by_biases(h_b: Vec6, D: Floats, H: Floats, row: int) -> None:
 
 @compiled
 def observe(
-    state: InvariantState, k: int, motion: Motion, sonar: Sonar, z: Floats, R_z: Floats
+    state: InvariantState,
+    k: int,
+    motion: Motion,
+    sonar: Sonar,
+    gate: float,
+    z: Floats,
+    R_z: Floats,
 ) -> tuple[int, Floats, Floats]:
     """Update by range and azimuth of a known landmark, (5); outcome, innovation and its covariance."""
     at = BODY.start + POINT * k
+    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
     R, X, D = pose_after(state, motion)
-    sight = sight_of(R, X, sonar.mount, vec(state.points[k]))
+    sight = sight_of(R, X, mount, vec(state.points[k]))
     e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])
     H = np.zeros((2, len(state.P)))
     # a turn of everything about the origin changes no view: H_theta is zero
@@ -240,11 +255,32 @@ def observe(
     store_by_biases(sight.range_by_body, D, H, 0)
     store_by_biases(sight.azimuth_by_body, D, H, 1)
     noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
-    S = symmetric(H @ state.P @ H.T + noise)  # (9)
-    outcome, widened = judged(e, S, R_z, sonar.gate, sonar.kernel_width)
+    HP, S = innovation_of(state.P, H, noise)  # (9)
+    S = symmetric(S)
+    outcome, widened = judged(e, S, R_z, gate, sonar.kernel_width)
     if outcome != GATED:
-        update(state, H, e, noise + widened)
+        move(state, correction(state.P, HP, S + widened, e))
     return outcome, e, S
+
+
+@compiled
+def observe_frame(
+    state: InvariantState,
+    motion: Motion,
+    sonar: Sonar,
+    views: Views,
+    sighted: Sighted,
+) -> None:
+    """Update by known landmarks of a frame in turn, and write outcomes and innovations."""
+    for m in range(len(sighted.rows)):
+        row = sighted.rows[m]
+        k = 1 + sighted.slots[m]
+        outcome, e, S = observe(
+            state, k, motion, sonar, sighted.gates[m], views.z[row], views.R_z[row]
+        )
+        views.outcome[row] = outcome
+        views.e[row] = e
+        views.S[row] = S
 
 
 @compiled
@@ -325,18 +361,9 @@ class InvariantEkf(FilterShell):
         """Carry the state over the motion to the next epoch, (2) and (3)."""
         predict(self._state, motion, self._walk_density**2 * duration_s)
 
-    def observe(
-        self,
-        motion: Motion,
-        slot: int,
-        z: Floats,
-        R_z: Floats,
-        sonar: Sonar | None = None,
-    ) -> Judged:
-        """Update by range and azimuth of a known landmark, (5)."""
-        return Judged(
-            *observe(self._state, 1 + slot, motion, sonar or self.sonar, z, R_z)
-        )
+    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+        """Update by range and azimuth of known landmarks, (5)."""
+        observe_frame(self._state, motion, self.sonar, views, sighted)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats

@@ -7,6 +7,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from baselines.events import Motion, Sonar
 from sonar_graph.measurements import Floats
@@ -31,22 +32,71 @@ class Judged(NamedTuple):
 
 
 @compiled
-def correction(P: Floats, H: Floats, e: Floats, R: Floats) -> Floats:
-    """``K e``, shape (n,), with ``K = P H^T S^-1`` and ``S = H P H^T + R``; P becomes ``P - K S K^T``.
+def innovation_of(P: Floats, H: Floats, R: Floats) -> tuple[Floats, Floats]:
+    """``H P``, shape (m, n), and ``S = H P H^T + R``, shape (m, m)."""
+    m, n = H.shape
+    HP = np.zeros((m, n))
+    for r in range(m):
+        for k in range(n):
+            # most numbers of H are zero
+            if H[r, k] != 0.0:
+                for j in range(n):
+                    HP[r, j] += H[r, k] * P[k, j]
+    S = np.empty((m, m))
+    for r in range(m):
+        for c in range(m):
+            total = 0.0
+            for k in range(n):
+                total += HP[r, k] * H[c, k]
+            S[r, c] = total + R[r, c]
+    return HP, S
+
+
+@compiled
+def cholesky(S: Floats) -> Floats:
+    """Lower triangle L with ``S = L L^T``; NaN on its diagonal where S is not positive definite.
+
+    For matrices of one to three rows LAPACK takes several times as long to call, and to compile.
+    """
+    L = np.zeros_like(S)
+    for i in range(len(S)):
+        for j in range(i + 1):
+            rest = S[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = rest / L[j, j]
+            else:
+                L[i, i] = math.sqrt(rest) if rest > 0.0 else math.nan
+    return L
+
+
+@compiled
+def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
+    """``K e``, shape (n,), with ``K = P H^T S^-1``; P becomes ``P - K S K^T``.
 
     Raises LinAlgError where S is not positive definite.
     """
-    # with S = L L^T no inverse of S is needed, and a covariance that is not positive definite is noticed
-    HP = H @ P  # (m, n)
-    S = HP @ H.T + R  # (m, m)
-    L_inverse = np.linalg.inv(np.linalg.cholesky(S))
-    V = L_inverse @ HP  # (m, n): K e = V^T L^-1 e, K S K^T = V^T V
-    for r in range(len(V)):
+    # with S = L L^T and V = L^-1 H P: K e = V^T L^-1 e, K S K^T = V^T V
+    L = cholesky(S)
+    V = HP.copy()  # (m, n)
+    w = e.copy()  # L^-1 e
+    Ke = np.zeros(len(P))
+    for r in range(len(S)):
+        if math.isnan(L[r, r]):
+            raise LinAlgError("S is not positive definite")
+        for k in range(r):
+            V[r] -= L[r, k] * V[k]
+            w[r] -= L[r, k] * w[k]
+        V[r] /= L[r, r]
+        w[r] /= L[r, r]
         for i in range(len(P)):
+            v = V[r, i]
+            Ke[i] += v * w[r]
             for j in range(len(P)):
                 # the factors commute: P stays symmetric to the last bit
-                P[i, j] -= V[r, i] * V[r, j]
-    return V.T @ (L_inverse @ e)
+                P[i, j] -= v * V[r, j]
+    return Ke
 
 
 @compiled
@@ -71,8 +121,16 @@ def motion_noise(range_by_body: Vec6, azimuth_by_body: Vec6, motion: Motion) -> 
 
 @compiled
 def distance(e: Floats, S: Floats) -> float:
-    """``sqrt(e^T S^-1 e)``, the Mahalanobis distance of an innovation."""
-    return math.sqrt(e @ np.linalg.inv(S) @ e)
+    """``sqrt(e^T S^-1 e)``, the Mahalanobis distance of an innovation; NaN where S is not positive definite."""
+    L = cholesky(S)
+    w = e.copy()  # L^-1 e
+    squared = 0.0
+    for r in range(len(S)):
+        for k in range(r):
+            w[r] -= L[r, k] * w[k]
+        w[r] /= L[r, r]
+        squared += w[r] * w[r]
+    return math.sqrt(squared)
 
 
 @compiled

@@ -421,6 +421,9 @@ class LandmarkDetections(Block):
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """Rows of each sonar frame, that is of each stamp."""
+        if self.stamps_ns[0] == self.stamps_ns[-1]:  # the usual case live
+            yield self
+            return
         # rows of a frame share a stamp and follow each other
         edges = [0, *(np.flatnonzero(np.diff(self.stamps_ns)) + 1).tolist(), len(self)]
         for first, last in pairwise(edges):
@@ -440,7 +443,7 @@ class LandmarkDetections(Block):
             np.abs(self.azimuth_rad) <= FULL_TURN_RAD
         )
         return is_possible & (
-            is_definite | np.isnan(self.range_azimuth_cov).any(axis=(1, 2))
+            is_definite | np.isnan(a) | np.isnan(b) | np.isnan(c) | np.isnan(d)
         )
 
     def most_probable(self) -> tuple[Ints, Floats]:

@@ -366,16 +366,21 @@ UNSOUND = OUTCOME_NUMBERS[Outcome.UNSOUND]
 
 
 def identify(
-    detections: LandmarkDetections, minimum_probability: float
+    detections: LandmarkDetections,
+    minimum_probability: float,
+    *,
+    are_sound: bool = False,
 ) -> tuple[Ints, NDArray[np.int8]]:
     """Most probable identity of each row, shape (n,), and `ACCEPTED` or the `OUTCOME_NUMBERS` of its refusal, (n,).
 
     Refused is an unsound row, and a posterior that is too low or NaN, or of no identity (-1). A landmark is in one
     place: of several rows of one frame with one identity the most probable is accepted, the first of equals.
+    ``are_sound``: True where unsound rows have been left out.
     """
     ids = np.empty(len(detections), np.int64)
     outcomes = np.full(len(detections), ACCEPTED, np.int8)
-    outcomes[~detections.are_sound()] = UNSOUND
+    if not are_sound:
+        outcomes[~detections.are_sound()] = UNSOUND
     rows = (detections.stamps_ns, detections.candidate_ids, detections.id_probability)
     _write_identities(*rows, minimum_probability, ids, outcomes)
     return ids, outcomes

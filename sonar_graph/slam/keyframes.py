@@ -35,6 +35,7 @@ from sonar_graph.models import (
     wrap_angle,
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion
+from sonar_graph.numerics import I3, ZERO, compiled, mat, store, store_vector, vec
 from sonar_graph.slam import factors
 from sonar_graph.slam.odometry_factor import OdometryWithBias
 from sonar_graph.slam.prediction import Tie
@@ -85,6 +86,25 @@ class Carried(NamedTuple):
     """Shape (n + 1, 3), m."""
     C: Floats
     """Covariance of the motion from each sample to the next, and from the last to j, shape (n, 6, 6)."""
+
+
+@compiled
+def until_last(dR: Floats, dp: Floats) -> tuple[Floats, Floats]:
+    """Motions from the start of each of n motions to the end of the last, and from there: (n + 1, 3, 3), (n + 1, 3)."""
+    n = len(dR)
+    k_R_j = np.empty((n + 1, 3, 3))
+    k_p_j = np.empty((n + 1, 3))
+    R = I3
+    p = ZERO
+    store(R, k_R_j[n])
+    store_vector(p, k_p_j[n], 0)
+    for k in range(n - 1, -1, -1):
+        step = mat(dR[k])
+        p = vec(dp[k]) + step @ p
+        R = step @ R
+        store(R, k_R_j[k])
+        store_vector(p, k_p_j[k], 0)
+    return k_R_j, k_p_j
 
 
 class Linearisation(NamedTuple):
@@ -463,9 +483,11 @@ class Keyframes:
             self._body_p_dvl,
         )
         removed = np.concatenate((gyro_bias, gyro_bias, np.zeros(BIASES - 6)))  # (11,)
-        motion = replace(motion, D_bias=D, bias=removed)
         # then to first order by the other biases
-        return replace(motion, i_T_j=motion.corrected(biases), bias=biases)
+        by_others = gtsam.Pose3.Expmap(D @ (biases - removed))
+        return replace(
+            motion, i_T_j=motion.i_T_j.compose(by_others), D_bias=D, bias=biases
+        )
 
     def _up(self, attitude: Floats) -> Floats:
         """The world's up in the body, along which the gyros' bias is split, shape (3,); zero without gravity."""
@@ -546,12 +568,7 @@ class Keyframes:
         age_s = np.append(interval.node_ns - stamps_ns, 0) * S_PER_NS
         by_bias_rad2 = self.calibration.imu.gyro_bias_sigma**2 * -np.diff(age_s**2)
         motions.C[:, :3, :3] += by_bias_rad2[:, None, None] * np.eye(3)
-        k_R_j = [np.eye(3)]
-        k_p_j = [np.zeros(3)]
-        for dR, dp in zip(motions.dR[::-1], motions.dp[::-1], strict=True):
-            k_p_j.append(dp + dR @ k_p_j[-1])
-            k_R_j.append(dR @ k_R_j[-1])
-        return Carried(np.array(k_R_j[::-1]), np.array(k_p_j[::-1]), motions.C)
+        return Carried(*until_last(motions.dR, motions.dp), motions.C)
 
     def _add_depth(self, j: int, depth: Depth, carried: Carried) -> None:
         """One factor for the averaged samples; at sample k the port lies at ``k_T_j^-1 port`` in frame j."""

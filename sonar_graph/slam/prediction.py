@@ -16,6 +16,7 @@ The tie of an instant to its keyframe is kept while the keyframe may still chang
 the pose is kept: 232 bytes for each instant.
 """
 
+import math
 from array import array
 from bisect import bisect_left
 from dataclasses import dataclass
@@ -26,13 +27,21 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models import polar_difference, view_points
+from sonar_graph.models import Mount, sight_of, view_points, wrap_angle
 from sonar_graph.motion import PreintegratedMotion
-from sonar_graph.numerics import cross_matrix
+from sonar_graph.numerics import (
+    Vec3,
+    Vec6,
+    compiled,
+    cross,
+    mat,
+    mat6,
+    store_row,
+    vec,
+)
 from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
 from sonar_graph.states import Estimate, Trajectory
 
-IDENTITY = np.eye(2)
 TRIANGLE = np.tril_indices(6)
 
 
@@ -210,11 +219,13 @@ class PredictedView:
         covariance: JointCovariance,
     ) -> None:
         motion = tie.motion
-        self.world_T_sonar = world_T_keyframe.compose(
-            motion.i_T_j.compose(body_T_sonar)
-        )
+        world_T_body = world_T_keyframe.compose(motion.i_T_j)
+        self.world_T_sonar = world_T_body.compose(body_T_sonar)
         """Pose of the sonar at the frame."""
-        self._world_T_keyframe = world_T_keyframe
+        self._keyframe = as_arrays(world_T_keyframe)
+        self._body = as_arrays(world_T_body)
+        self._sonar = as_arrays(self.world_T_sonar)
+        self._mount = Mount(*as_arrays(body_T_sonar))
         self._covariance = covariance
         self._motion = motion
         self._pose_row = covariance.rows[tie.pose_key]
@@ -235,14 +246,18 @@ class PredictedView:
         """
         row = self._pose_row
         P = self._covariance.matrix[row : row + 6, row : row + 6]
-        Q = self._motion.covariance
-        by_keyframe = _height_derivatives(self._world_T_keyframe, points)  # (m, 6)
-        by_body = _height_derivatives(
-            self._world_T_keyframe.compose(self._motion.i_T_j), points
-        )
-        from_keyframe = np.vecdot(by_keyframe @ P, by_keyframe)
-        from_motion = np.vecdot(by_body @ Q, by_body)
+        P = np.ascontiguousarray(P)
+        from_keyframe = height_variances(*self._keyframe, P, points)
+        from_motion = height_variances(*self._body, self._motion.covariance, points)
         return np.asarray(from_keyframe + from_motion)
+
+    def beam_points(self, z: Floats) -> Floats:
+        """Points of the world at range and azimuth, (m, 2), and elevation 0, shape (m, 3), m."""
+        return beam_points(*self._sonar, z)
+
+    def world_z_by_elevation(self) -> float:
+        """Height by which a point at elevation 0 rises for each radian of elevation and metre of range."""
+        return float(self._sonar[0][2, 2])
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
         """Expected range and azimuth of landmarks at points of the world, shape (m, 3).
@@ -253,8 +268,9 @@ class PredictedView:
         """
         predicted, joint = self.expect_jointly(keys, points, [])
         m = len(keys)
+        place = np.arange(m)
         # blocks on the diagonal
-        return predicted, np.einsum("kikj->kij", joint.reshape(m, 2, m, 2))
+        return predicted, joint.reshape(m, 2, m, 2)[place, :, place]
 
     def expect_jointly(
         self, keys: list[int], points: Floats, sources: list[Source]
@@ -304,33 +320,78 @@ class PredictedView:
 
         Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
-        # (m, 2, 6)
-        H_M = view_points(self.world_T_sonar, points).by_pose @ self._by_body
-        # diagonals of H_M Q H_M'
-        variances = (H_M @ motion.covariance * H_M).sum(axis=2)
-        return cov + IDENTITY * variances[:, None]
+        noise = cov.copy()
+        blur(*self._body, self._mount, motion.covariance, points, noise)
+        return noise
 
 
 def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its covariance."""
-    innovation = polar_difference(z, expected)
+    return Compared(*compared_columns(z, expected, prior_cov, cov))
+
+
+@compiled
+def compared_columns(
+    z: Floats, expected: Floats, prior_cov: Floats, cov: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Columns of `Compared`."""
+    innovation = z - expected
     S = prior_cov + cov
-    r, alpha = innovation.T
-    a, b, _, c = S.reshape(-1, 4).T
-    # e' S^-1 e with the closed inverse of a 2 x 2 matrix
-    distance = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b**2)
-    gain = np.maximum(
-        prior_cov[:, 0, 0] / cov[:, 0, 0], prior_cov[:, 1, 1] / cov[:, 1, 1]
-    )
-    return Compared(innovation, S, distance, gain)
+    distance = np.empty(len(z))
+    gain = np.empty(len(z))
+    for k in range(len(z)):
+        innovation[k, 1] = wrap_angle(innovation[k, 1])
+        r, alpha = innovation[k]
+        a = S[k, 0, 0]
+        b = S[k, 0, 1]
+        c = S[k, 1, 1]
+        # e' S^-1 e with the closed inverse of a 2 x 2 matrix
+        squares = c * r**2 - 2.0 * b * r * alpha + a * alpha**2
+        distance[k] = squares / (a * c - b**2)
+        gain[k] = max(
+            prior_cov[k, 0, 0] / cov[k, 0, 0], prior_cov[k, 1, 1] / cov[k, 1, 1]
+        )
+    return innovation, S, distance, gain
 
 
-def _height_derivatives(world_T_body: gtsam.Pose3, points: Floats) -> Floats:
-    """Derivatives of the world z of points of the body by the right perturbation of its pose, shape (m, 6)."""
-    world_R_body = world_T_body.rotation().matrix()
-    up = world_R_body[2]
-    q = (points - world_T_body.translation()) @ world_R_body  # body axes, (m, 3)
-    derivatives = np.empty((len(points), 6))
-    derivatives[:, :3] = q @ cross_matrix(up)  # q x up
-    derivatives[:, 3:] = up
-    return derivatives
+@compiled
+def height_variances(R: Floats, X: Floats, C: Floats, points: Floats) -> Floats:
+    """Variances of the world z of points fixed to a body, shape (m,), m², by the covariance C of the body's pose.
+
+    ``(R, X)``: pose of the body; C: of its right perturbation, shape (6, 6); points in the world, shape (m, 3).
+    """
+    found = np.empty(len(points))
+    world_R_body = mat(R)
+    up = world_R_body.z  # in the body
+    for k in range(len(points)):
+        off = Vec3(points[k, 0] - X[0], points[k, 1] - X[1], points[k, 2] - X[2])
+        h = Vec6(cross(world_R_body.T @ off, up), up)
+        found[k] = h @ (mat6(C) @ h)
+    return found
+
+
+@compiled
+def blur(
+    R: Floats, X: Floats, mount: Mount, C: Floats, points: Floats, noise: Floats
+) -> None:
+    """Add to the noise of range and azimuth of points, (m, 2, 2), their variances by the covariance C of the body."""
+    for k in range(len(points)):
+        point = Vec3(points[k, 0], points[k, 1], points[k, 2])
+        sight = sight_of(mat(R), vec(X), mount, point)
+        noise[k, 0, 0] += sight.range_by_body @ (mat6(C) @ sight.range_by_body)
+        noise[k, 1, 1] += sight.azimuth_by_body @ (mat6(C) @ sight.azimuth_by_body)
+
+
+@compiled
+def beam_points(R: Floats, t: Floats, z: Floats) -> Floats:
+    """Points of the world at range and azimuth of a sonar at ``(R, t)`` and elevation 0, shape (m, 3), m."""
+    found = np.empty((len(z), 3))
+    for k in range(len(z)):
+        on_beam = Vec3(z[k, 0] * math.cos(z[k, 1]), z[k, 0] * math.sin(z[k, 1]), 0.0)
+        store_row(vec(t) + mat(R) @ on_beam, found, k, 0)
+    return found
+
+
+def as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
+    """Rotation and position, in the layout for which compiled code exists."""
+    return np.ascontiguousarray(pose.rotation().matrix()), pose.translation()

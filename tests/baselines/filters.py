@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from baselines.ekf_slam import EkfSlam
-from baselines.events import Motion
+from baselines.events import Motion, Sighted, Views
 from baselines.filter import FilterShell
 from baselines.invariant_ekf import InvariantEkf, InvariantState
 from sonar_graph.calibration import (
@@ -256,3 +256,22 @@ def begun(
     n = filter_.bare + world.landmarks.size
     filter_.begin(slam, world, random_covariance(n) if P is None else P)
     return slam
+
+
+def observe_one(
+    slam: FilterShell, motion: Motion, slot: int, z: Floats, R_z: Floats
+) -> tuple[int, Floats, Floats]:
+    """Update by one known landmark: its outcome, innovation and the covariance of that."""
+    first = np.zeros(1, np.int64)
+    views = Views(
+        stamp_ns=first,
+        ids=first,
+        z=z[None],
+        R_z=R_z[None],
+        outcome=np.zeros(1, np.int8),
+        e=np.zeros((1, 2)),
+        S=np.zeros((1, 2, 2)),
+    )
+    sighted = Sighted(first, np.array([slot]), np.array([slam.sonar.gate]))
+    slam.observe(motion, views, sighted)
+    return int(views.outcome[0]), views.e[0], views.S[0]

@@ -29,6 +29,7 @@ from .filters import (
     both,
     carried,
     motion_of,
+    observe_one,
     pose_after,
     random_covariance,
     rotation,
@@ -151,7 +152,7 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(
         world,
         [1],
     )
-    outcome, innovation, S = slam.observe(motion, 1, view[:2] + e, R_z)
+    outcome, innovation, S = observe_one(slam, motion, 1, view[:2] + e, R_z)
     assert outcome == USED
     assert_allclose(innovation, e, atol=1e-9)
     assert_covariance(S, H @ P @ H.T + H_m @ C @ H_m.T + R_z)
@@ -412,7 +413,7 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(
     world = in_view(angles, motion, view)
     known = gauge(2) @ gauge(2).T
     slam = begun(Invariant, world, known, gate=1.0)
-    slam.observe(motion, 1, view[:2] + 0.1, NOISE)
+    observe_one(slam, motion, 1, view[:2] + 0.1, NOISE)
     slam.update_depth(motion, 0.3, 1e-2)
     slam.update_up(np.array([0.1, 0.2, 0.9]), 0.1, np.eye(3))
     slam.update_plane(PlanarMotion())

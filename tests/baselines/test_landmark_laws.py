@@ -29,6 +29,7 @@ from .filters import (
     begun,
     both,
     motion_of,
+    observe_one,
     random_covariance,
     rotation,
     sonar_after,
@@ -130,7 +131,9 @@ def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
 def test_the_innovation_of_azimuth_wraps_around(filter_):
     world, P, _ = with_landmark(filter_, view=(3.0, math.pi - 0.004, 0.1))
     slam = begun(filter_, world, P)
-    outcome, e, _ = slam.observe(MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE)
+    outcome, e, _ = observe_one(
+        slam, MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE
+    )
     assert outcome == USED
     assert e[1] == pytest.approx(0.008, abs=1e-9)
 
@@ -176,7 +179,7 @@ def look(filter_, X, position_sigma_m, may_be_far, wrong_m=0.0):
     z = np.array([np.linalg.norm(q) + wrong_m, np.arctan2(q[1], q[0])])
     R_z = np.diag([AHEAD.sonar.range_sigma_m**2, AHEAD.sonar.azimuth_sigma_rad**2])
     judged = slam.observe_far(STILL, 0, z, R_z) if may_be_far else None
-    outcome, e, S = judged or slam.observe(STILL, 0, z, R_z)
+    outcome, e, S = judged or observe_one(slam, STILL, 0, z, R_z)
     _, at, covariance = slam.pose_after(STILL)
     return outcome, at, covariance[3:, 3:], e, S
 

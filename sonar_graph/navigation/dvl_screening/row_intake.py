@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
-from sonar_graph.navigation.dvl_screening.depth_gate import DepthGate
+from sonar_graph.navigation.dvl_screening.depth_gate import USED, DepthGate
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
     GateResult,
@@ -61,11 +61,11 @@ class RowIntake:
         is_held = calibration.odometry_interpolation == "hold-past"
         self._body_R_imu = _rotation(calibration.imu.mounting)
         self._body_R_dvl = _rotation(calibration.dvl.mounting)
-        self._gyro_bias = np.array(calibration.imu.gyro_bias_rad_s)
+        gyro_bias = np.array(calibration.imu.gyro_bias_rad_s)
+        self._gyro_bias = gyro_bias if gyro_bias.any() else None
         self._scale = 1.0 + calibration.dvl.scale_error
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
         self._depth_gate = DepthGate(calibration)
-        self._depth_variance = calibration.depth.sigma_m**2
         self._gate = np.inf if is_held else GATE
         self._walk = calibration.dvl.velocity_walk_density
         self._confirmation = None if is_held else VelocityConfirmation(self._walk)
@@ -97,9 +97,8 @@ class RowIntake:
         rate = rows.angular_velocity
         force = rows.specific_force
         # a fault of the transmission: the row is refused whole
-        beyond = (np.abs(rate) > MOST_RATE_RAD_S) | (np.abs(force) > MOST_FORCE_M_S2)
-        if beyond.any():
-            is_used = np.asarray(~beyond.any(axis=1))
+        is_used = _are_within(rate, force)
+        if not is_used.all():
             self._refuse("imu", rows.stamps_ns[~is_used], Refusal.BEYOND_SENSOR)
             if not is_used.any():
                 return False
@@ -107,7 +106,7 @@ class RowIntake:
             rate = rate[is_used]
             force = force[is_used]
         # the calibration's bias is along the sensor's axes
-        if self._gyro_bias.any():
+        if self._gyro_bias is not None:
             rate = rate - self._gyro_bias
         if self._body_R_imu is not None:
             rate = _turned(self._body_R_imu, rate)
@@ -122,36 +121,11 @@ class RowIntake:
 
     def used_depths(self, depth: Depth) -> Depth | None:
         """Samples that pass, each stamp once; None without any."""
-        gate = self._depth_gate
-        is_used = np.zeros(len(depth), np.bool_)
-        variance_m2 = np.where(
-            np.isnan(depth.variance_m2), self._depth_variance, depth.variance_m2
-        )
-        rows = zip(
-            depth.stamps_ns.tolist(),
-            depth.z_m.tolist(),
-            variance_m2.tolist(),
-            strict=True,
-        )
-        for k, (stamp_ns, z_m, variance) in enumerate(rows):
-            if not 0.0 < variance < np.inf:
-                self._refused.append(
-                    RefusedRow("depth", stamp_ns, Refusal.UNSOUND, np.nan)
-                )
-            elif stamp_ns <= gate.newest_ns:
-                if stamp_ns < gate.newest_ns:  # a repeated stamp is no late sample
-                    self._refused.append(
-                        RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan)
-                    )
-            else:
-                distance = gate.distance(stamp_ns, z_m, variance)
-                is_used[k] = distance is None
-                if distance is not None:
-                    self._refused.append(
-                        RefusedRow("depth", stamp_ns, Refusal.OUT_OF_REACH, distance)
-                    )
-        if is_used.all():
+        samples = self._depth_gate.judge(depth)
+        if not samples.treatment.any():
             return depth
+        self._refused += samples.refused()
+        is_used = samples.treatment == USED
         return depth.rows(is_used) if is_used.any() else None
 
     def add_dvl(self, dvl: Dvl) -> bool:
@@ -274,6 +248,18 @@ class RowIntake:
         if len(stamps_ns) > 1 and (stamps_ns[1:] == stamps_ns[:-1]).any():
             rows = rows.rows(np.unique(stamps_ns, return_index=True)[1])
         return rows
+
+
+@compiled
+def _are_within(rate: Floats, force: Floats) -> NDArray[np.bool_]:
+    """True for rows whose angular rate and specific force a sensor can measure, or whose force is missing; shape (n,)."""
+    found = np.ones(len(rate), np.bool_)
+    for k in range(len(rate)):
+        for i in range(3):
+            # NaN is not beyond
+            if abs(rate[k, i]) > MOST_RATE_RAD_S or abs(force[k, i]) > MOST_FORCE_M_S2:
+                found[k] = False
+    return found
 
 
 @compiled

@@ -171,14 +171,7 @@ class SeenFrame:
 
     def beam_points(self, rows: list[int]) -> Floats:
         """Points of the world at the measured range and azimuth and elevation 0, shape (len(rows), 3), m."""
-        ranges_m, azimuths_rad = self.frame.z[rows].T
-        on_beam = np.zeros((len(rows), 3))  # sonar axes
-        on_beam[:, 0] = ranges_m * np.cos(azimuths_rad)
-        on_beam[:, 1] = ranges_m * np.sin(azimuths_rad)
-        world_T_sonar = self.view.world_T_sonar
-        return np.asarray(
-            on_beam @ world_T_sonar.rotation().matrix().T + world_T_sonar.translation()
-        )
+        return self.view.beam_points(self.frame.z[rows])
 
     def sightings(
         self, rows: list[int], points: Floats, elevation_rad: float = 0.0
@@ -217,9 +210,7 @@ class SeenFrame:
             return [None] * len(rows)
         points = self.beam_points(rows)
         # an elevation of e raises the point by e times the range along the sonar's z axis
-        slope_m = (
-            self.frame.z[rows, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
-        )
+        slope_m = self.frame.z[rows, 0] * self.view.world_z_by_elevation()
         by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
         variance = by_elevation + self.view.height_variances(points) + floor.sigma_m**2
         # an object on a wall or a wreck must not be pulled to the floor

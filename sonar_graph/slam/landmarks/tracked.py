@@ -152,7 +152,9 @@ class TrackedIdentities(IdentityPolicy):
         # the second rows are left out before a landmark is given to the most probable row of the frame
         kept = np.array([why is None for why in refusals])
         _, outcomes = identify(
-            frame if kept.all() else frame.rows(kept), self._minimum_probability
+            frame if kept.all() else frame.rows(kept),
+            self._minimum_probability,
+            are_sound=True,
         )
         for row, number in zip(
             np.flatnonzero(kept).tolist(), outcomes.tolist(), strict=True

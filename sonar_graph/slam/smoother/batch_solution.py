@@ -23,7 +23,9 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.factor_store import (
     Known,
     Sightlines,
+    missed,
     picked,
+    sighted_from,
     tangent_size,
 )
 
@@ -212,29 +214,30 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
     return tree
 
 
-OUTVOTED, LEAST_SCATTER_M = 5.0, 0.01
-"""A landmark lies where only a few sightings say if the median one misses it by so many times their scatter about the
-median of all, which is at least so much."""
+OUTVOTED = 5.0
+"""A landmark is misplaced where the median sighting misses it by more than this number of scatters. The scatter is the
+median distance of the sighted points from their median."""
+LEAST_SCATTER_M = 0.01
 
 
 def misplaced(values: Known, sightlines: Sightlines) -> list[int]:
-    """Landmarks behind the sonar in at least half of their sightings, or where only a few of them say (`OUTVOTED`).
+    """Landmarks behind the sonar in at least half of their sightings, or that most sightings contradict (`OUTVOTED`).
 
     A robust kernel leaves a landmark where its first sightings put it, however many contradict these: far from all of
     them their loss hardly falls.
     """
     found = []
     for key, lines in sightlines.items():
-        landmark = values.atPoint3(key)
-        if 2 * sum(line.is_behind(values, landmark) for line in lines) >= len(lines):
+        sighted = sighted_from(values, lines)
+        behind, miss_m = missed(sighted, np.asarray(values.atPoint3(key)))
+        if 2 * behind >= len(lines):
             found.append(key)
         elif len(lines) > 2:
-            points = np.array([line.point(values)[:2] for line in lines])
+            points = sighted.points()[:, :2]
             scatter_m = np.median(
                 np.linalg.norm(points - np.median(points, axis=0), axis=1)
             )
-            miss_m = np.median([line.miss_m(values, landmark) for line in lines])
-            if miss_m > OUTVOTED * max(scatter_m, LEAST_SCATTER_M):
+            if np.median(miss_m) > OUTVOTED * max(scatter_m, LEAST_SCATTER_M):
                 found.append(key)
     return found
 
@@ -245,9 +248,8 @@ def placed_again(
     """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
     placed = gtsam.Values(values)
     for key in landmark_keys:
-        placed.update(
-            key, np.median([line.point(values) for line in sightlines[key]], axis=0)
-        )
+        points = sighted_from(values, sightlines[key]).points()
+        placed.update(key, np.median(points, axis=0))
     return placed
 
 

@@ -5,17 +5,16 @@ history: groups are new until the window has taken them up. A group leaves a bou
 factors, or bias where they have none; marginals contain its information then.
 """
 
-import math
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models import BIASES, project, wrap_angle
+from sonar_graph.models import BIASES, wrap_angle
 
 POSE = ord("x")
 LANDMARK = ord("l")
@@ -94,23 +93,51 @@ class Sightline:
 
     def point(self, values: Known) -> Floats:
         """Point of the world where the landmark was measured, at elevation 0, shape (3,), m."""
-        on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
-        return self._world_T_sonar(values).transformFrom(on_beam)
+        return sighted_from(values, [self]).points()[0]
 
-    def is_behind(self, values: Known, landmark: Floats) -> bool:
-        """True when a point of the world is a right angle or more off the measured azimuth."""
-        x, y, _ = self._world_T_sonar(values).transformTo(landmark)
-        return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
 
-    def miss_m(self, values: Known, landmark: Floats) -> float:
-        """Distance by which range and azimuth miss a point of the world."""
-        x, y, z = self._world_T_sonar(values).transformTo(landmark)
-        expected, _ = project(np.array([x, y, z]))
-        turn_rad = wrap_angle(expected[1] - self.z[1])
-        return math.hypot(expected[0] - self.z[0], self.z[0] * turn_rad)
+class Sighted(NamedTuple):
+    """Poses of the sonar, and what it measured from there, n times."""
 
-    def _world_T_sonar(self, values: Known) -> gtsam.Pose3:
-        return values.atPose3(self.pose_key).compose(self.body_T_sonar)
+    R: Floats
+    """world_R_sonar, shape (n, 3, 3)."""
+    t: Floats
+    """Position of the sonar, shape (n, 3), m."""
+    z: Floats
+    """Range (m) and azimuth (rad), shape (n, 2)."""
+
+    def points(self) -> Floats:
+        """Points of the world at range and azimuth and elevation 0, shape (n, 3), m."""
+        range_m, azimuth_rad = self.z.T[:, :, None]  # (n, 1) each
+        beam = np.cos(azimuth_rad) * self.R[:, :, 0]
+        beam += np.sin(azimuth_rad) * self.R[:, :, 1]
+        return self.t + range_m * beam
+
+
+def sighted_from(values: Known, lines: Sequence[Sightline]) -> Sighted:
+    """Sightings from where keyframes are estimated."""
+    R = np.empty((len(lines), 3, 3))
+    t = np.empty((len(lines), 3))
+    z = np.empty((len(lines), 2))
+    for k, line in enumerate(lines):
+        world_T_sonar = values.atPose3(line.pose_key).compose(line.body_T_sonar)
+        R[k] = world_T_sonar.rotation().matrix()
+        t[k] = world_T_sonar.translation()
+        z[k] = line.z
+    return Sighted(R, t, z)
+
+
+def missed(sighted: Sighted, landmark: Floats) -> tuple[int, Floats]:
+    """Number of sightings with a point of the world behind, and the distance by which each misses the point, (n,), m.
+
+    Behind is a right angle or more off the measured azimuth.
+    """
+    range_m, azimuth_rad = sighted.z.T
+    q = np.einsum("nba,nb->na", sighted.R, landmark - sighted.t)  # in sonar axes
+    off_rad = wrap_angle(np.arctan2(q[:, 1], q[:, 0]) - azimuth_rad)
+    off_m = np.sqrt(np.vecdot(q, q)) - range_m
+    ahead_m = q[:, 0] * np.cos(azimuth_rad) + q[:, 1] * np.sin(azimuth_rad)
+    return int(np.count_nonzero(ahead_m <= 0)), np.hypot(off_m, range_m * off_rad)
 
 
 Sightlines = Mapping[int, Sequence[Sightline]]
@@ -208,6 +235,10 @@ class FactorStore:
 
     def __iter__(self) -> Iterator[FactorGroup]:
         return iter(self.groups.values())
+
+    def sighting_count(self, landmark_key: int) -> int:
+        """Number of sightings of a landmark."""
+        return len(self._lines[landmark_key])
 
     def sightlines_of(self, landmark_key: int) -> list[Sightline]:
         """Sightings of a landmark, in the order in which they came."""

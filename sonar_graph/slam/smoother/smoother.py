@@ -562,10 +562,10 @@ class Smoother:
         """
         due = {}
         for key in keys:
-            lines = self._store.sightlines_of(key)
-            if len(lines) > 2 * self._tested.get(key, 1):
-                due[key] = lines
-                self._tested[key] = len(lines)
+            count = self._store.sighting_count(key)
+            if count > 2 * self._tested.get(key, 1):
+                due[key] = self._store.sightlines_of(key)
+                self._tested[key] = count
         return bool(misplaced(self.estimates, due))
 
     def _restart(self, time_s: float) -> None:
