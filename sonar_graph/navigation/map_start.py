@@ -98,6 +98,8 @@ class FoundStart(NamedTuple):
     """Shape (3, 3)."""
     log_evidence: float
     """Logarithm of (2)."""
+    agreeing: frozenset[int]
+    """Rows of the landmarks that agree with it."""
 
 
 class MapLocator:
@@ -264,9 +266,12 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     is_of = np.unique(rows)[:, None] == rows
     data = MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2)
     found: list[FoundStart] = []
-    for proposal in proposals(data):
-        # sightings of the same landmarks propose the same start many times
-        if any(is_same(proposal, start) for start in found):
+    for proposal, pair in proposals(data):
+        # sightings of the same landmarks propose the same start many times; a landmark that agrees with none of the
+        # starts may be far from the pair that proposed them, and would agree with one that is turned a little
+        if any(
+            pair <= start.agreeing and is_same(proposal, start) for start in found
+        ):
             continue
         start = refined(proposal, data)
         if start is not None and math.isfinite(start.log_evidence):
@@ -314,8 +319,8 @@ class MapData(NamedTuple):
         return self.M.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
 
 
-def proposals(data: MapData) -> list[Floats]:
-    """(psi, t_x, t_y) by each pair of sightings of two landmarks whose distance in the map fits."""
+def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
+    """(psi, t_x, t_y) by each pair of sightings of two landmarks whose distance in the map fits, with their rows."""
     found = []
     for k, j in combinations(range(len(data.q)), 2):
         a = data.rows[k]
@@ -332,7 +337,7 @@ def proposals(data: MapData) -> list[Floats]:
         psi = math.atan2(placed[1], placed[0]) - math.atan2(seen[1], seen[0])
         middle = 0.5 * (data.q[k] + data.q[j])
         t = 0.5 * (data.places[a] + data.places[b]) - turn(psi) @ middle
-        found.append(np.array([psi, *t]))
+        found.append((np.array([psi, *t]), frozenset({int(a), int(b)})))
     return found
 
 
@@ -377,7 +382,8 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     right = log_density + len(q) * math.log(1.0 - WRONG)
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
     prior = math.log(2.0 * math.pi * data.area_m2)
-    return FoundStart(parameters, covariance, right + wrong + volume - prior)
+    rows = frozenset(seen[agreeing].tolist())
+    return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
 
 
 def joint_covariance(S: Floats, rows: Any, M: Floats) -> Floats:
