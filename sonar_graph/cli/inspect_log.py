@@ -86,12 +86,11 @@ def inspect(
     else:
         from sonar_graph.diagnosis import check_sensors
         from sonar_graph.evaluation import expense
-        from sonar_graph.logs import read_log
 
         is_read = False
         try:
             with working("comparing sensors"):
-                sequence = read_log(log, **reading.of_log)
+                sequence = reading.read(log)
                 is_read = True
                 large = expense(sequence)
                 findings = check_sensors(sequence, config)
@@ -238,7 +237,7 @@ def print_summary(
         )
 
 
-@with_options("salvage")
+@with_options("salvage", "map")
 def calibration(
     reading: ReadingOptions,
     log: Annotated[

@@ -76,7 +76,7 @@ class JoinOptions:
     overwrite: Overwrite = False
 
 
-@with_options("start", "end")
+@with_options("start", "end", "map")
 def join(
     images: Annotated[
         Path,

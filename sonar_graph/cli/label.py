@@ -54,7 +54,7 @@ class LabelOptions:
     overwrite: Overwrite = False
 
 
-@with_options()
+@with_options("map")
 def label(
     log: LogPath,
     output: Annotated[

@@ -170,7 +170,7 @@ class RecognitionChoices:
     overwrite: Overwrite = False
 
 
-@with_options("start", "end")
+@with_options("start", "end", "map")
 def recognise(
     log: LogPath,
     output: OutputLog,
@@ -289,7 +289,7 @@ class CalibrateOptions:
     overwrite: Overwrite = False
 
 
-@with_options("start", "end")
+@with_options("start", "end", "map")
 def calibrate(
     logs: Annotated[
         list[Path],

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sonar_graph.simulation import BasinOptions
 
 
-@with_options("start", "end", "salvage")
+@with_options("start", "end", "salvage", "map")
 def landmarks(
     log: Annotated[
         Path,

@@ -68,7 +68,7 @@ from sonar_graph.diagnosis.start import (
     turned_mounting,
     with_fitted,
 )
-from sonar_graph.diagnosis.start_place import start_place_findings
+from sonar_graph.diagnosis.start_place import map_findings, start_place_findings
 from sonar_graph.diagnosis.turn_rate import turn_rate_finding
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair, is_heading_stated
 from sonar_graph.diagnosis.units import force_scale, wrong_units
@@ -223,6 +223,9 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         if is_imu:
             reference = [f for f in reference if not f.quantity.startswith(START_TILT)]
     noise = noise_findings(sequence)
+    # sensors that are wrong do not fit a right map either
+    is_sound = not any(finding.grave for finding in by_motion)
+    of_map = list(map_findings(right)) if is_sound else []
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
     of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
     return [
@@ -233,6 +236,7 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         *bias,
         *by_motion,
         *reference,
+        *of_map,
         *noise,
     ]
 

@@ -1,4 +1,6 @@
-"""A stated start that the truth or the true landmarks contradict: such as that of a `live` run that came too late.
+"""A stated start that the truth or the true landmarks contradict, and a known map that the sightings contradict.
+
+A start is wrong where a `live` run came too late; a map is in another unit or has other axes (`sonar_graph.navigation`).
 
 With the pose of the body at the start (x_0, yaw_0) and the level motion since then (path d, yaw psi, in axes of the body
 at the start), a landmark seen at range r and azimuth a is, as complex numbers of the level plane, at::
@@ -19,10 +21,14 @@ from sonar_graph.diagnosis.findings import (
     Finding,
     Gravity,
     numbers,
+    unknown,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.models import listed, wrap_angle
+from sonar_graph.navigation import map_fit
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
+from sonar_graph.states import FIRST_ANONYMOUS_ID
 
 FARTHEST_M = 0.5
 """Distance of a start from the truth that a rough survey of both makes."""
@@ -47,6 +53,53 @@ def start_place_findings(right: Sequence, motion: BodyMotion) -> Iterator[Findin
     by_map = map_finding(right, motion)
     if by_map is not None:
         yield by_map
+
+
+def map_findings(right: Sequence) -> Iterator[Finding]:
+    """What is wrong with the known map, or with a stated start in it."""
+    known = right.calibration.map
+    if known is None or right.detections is None:
+        return
+    seen = set(right.detections.most_probable()[0].tolist())
+    named = {i for i in seen if 0 <= i < FIRST_ANONYMOUS_ID}
+    if named and named.isdisjoint(known.ids):
+        yield Finding(
+            "map: identities",
+            unknown("none in common"),
+            cause=f"none of the map's identities {listed(known.ids)} was seen; seen: {listed(named)}",
+            line="give the map of this place, with the identities of the log",
+            gravity=Gravity.GRAVE,
+        )
+        return
+    fit = map_fit(right)
+    if fit.mistake:
+        yield Finding(
+            "map: places",
+            unknown("the sightings do not fit it"),
+            cause=f"the sightings contradict the map: {fit.mistake}",
+            line=fit.remedy,
+            gravity=Gravity.GRAVE,
+        )
+        return
+    start = right.calibration.start
+    if fit.start is None or start.source == "map":
+        return
+    yaw, x, y = fit.start.parameters.tolist()
+    off = np.array([wrap_angle(yaw - start.rpy_rad[2]), *(x, y)])
+    off[1:] -= start.position_m[:2]
+    stated = [start.rpy_sigma_rad[2], *start.position_sigma_m[:2]]
+    P = fit.start.covariance + np.diag(np.square(stated))
+    if float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
+        return
+    stated_x, stated_y, _ = start.position_m
+    yield Finding(
+        "start pose",
+        unknown("the map has it elsewhere"),
+        cause=f"landmarks of the map place it at ({x:.2f}, {y:.2f}) m with a yaw of {wrap_angle(yaw):.3f} rad, not at "
+        f"({stated_x:.2f}, {stated_y:.2f}) m with {start.rpy_rad[2]:.3f} rad: another start, or a map of another frame?",
+        line='`start.source = "map"` ' + IN_CALIBRATION,
+        gravity=Gravity.GRAVE,
+    )
 
 
 def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:

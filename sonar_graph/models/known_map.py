@@ -10,6 +10,7 @@ that agree have moved: then their sightings are refused, and a message names bot
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from enum import Enum
 
 import numpy as np
@@ -133,7 +134,7 @@ class KnownLandmarks:
             contradicted = []
         if moved:
             treated = (
-                "mapped again; correct the map"
+                "mapped again; correct the map, or its sigmas where they are too small"
                 if self._may_release
                 else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
             )
@@ -151,6 +152,16 @@ class KnownLandmarks:
         return lines
 
 
-def listed(ids: list[int]) -> str:
-    """Identities in a message, ascending."""
-    return ", ".join(map(str, sorted(ids)))
+def listed(ids: Iterable[int]) -> str:
+    """Identities in a message, ascending, those that follow each other as ``1..9``."""
+    parts: list[list[int]] = []
+    for landmark_id in sorted(ids):
+        if parts and landmark_id == parts[-1][-1] + 1:
+            parts[-1].append(landmark_id)
+        else:
+            parts.append([landmark_id])
+    texts: list[str] = []
+    for part in parts:
+        is_long = len(part) > 2
+        texts += [f"{part[0]}..{part[-1]}"] if is_long else map(str, part)
+    return ", ".join(texts)

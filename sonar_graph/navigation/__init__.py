@@ -5,10 +5,11 @@ For use in any GTSAM program: docs/tutorials/05_preintegration.py.
 
 # fmt: off
 from sonar_graph.motion import Motions, MotionSource, PreintegratedMotion
+from sonar_graph.navigation.map_check import MapFit, map_fit
 from sonar_graph.navigation.map_start import make_estimator
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.samples import is_partial
 
 __all__ = [
-    "MotionSource", "Motions", "Odometry", "PreintegratedMotion", "is_partial", "make_estimator",
+    "MapFit", "MotionSource", "Motions", "Odometry", "PreintegratedMotion", "is_partial", "make_estimator", "map_fit",
 ]

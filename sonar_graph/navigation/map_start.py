@@ -24,6 +24,7 @@ Inference, and Learning Algorithms", 2003, chapter 28 (evidence).
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -45,10 +46,12 @@ from sonar_graph.models import (
     MINIMUM_PROBABILITY,
     elevation_on_floor,
     identify,
+    listed,
     locate,
 )
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.states import (
+    FIRST_ANONYMOUS_ID,
     DetectionLog,
     Estimate,
     LandmarkMap,
@@ -98,6 +101,8 @@ class FoundStart(NamedTuple):
     """Shape (3, 3)."""
     log_evidence: float
     """Logarithm of (2)."""
+    agreeing: frozenset[int]
+    """Rows of the landmarks that agree with it."""
 
 
 class MapLocator:
@@ -107,35 +112,45 @@ class MapLocator:
         assert calibration.map is not None
         self.found: FoundStart | None = None
         self._calibration = calibration
-        self._map = calibration.map
-        self._places = np.array(self._map.positions_m)
-        self._rows = {landmark_id: row for row, landmark_id in enumerate(self._map.ids)}
+        self.map = calibration.map
+        self._places = np.array(self.map.positions_m)
+        self._rows = {landmark_id: row for row, landmark_id in enumerate(self.map.ids)}
         self._odometry = Odometry(calibration)
         self._start_ns: int | None = None
         self._sightings: list[MapSighting] = []
+        self._others: set[int] = set()
+        """Identities that were seen and are not in the map."""
         sonar = calibration.sonar
         self._body_T_sonar = sonar.mounting.pose()
         self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
 
     def add(self, measurements: Measurements) -> None:
         """Take in measurements, and look for the start after each frame until it is found."""
+        for _ in self.frames_seen(measurements):
+            if self.found is None:
+                self.found = located(self.newest(), self.map)
+
+    def frames_seen(self, measurements: Measurements) -> Iterator[int]:
+        """Take in measurements; yields the stamp of each frame that shows landmarks of the map, once it is taken in."""
         self._odometry.add(measurements.imu, measurements.dvl)
         if measurements.detections is None:
             return
         for frame in measurements.detections.frames():
             if self.found is None and self._see(frame):
-                self.found = located(self._newest(), self._map)
+                yield int(frame.stamps_ns[0])
 
     def lacking(self) -> str:
         """What is missing for a start."""
         seen = len({sighting.row for sighting in self._sightings})
+        if not seen and self._others:
+            return f"none of its identities {listed(self.map.ids)} was seen; seen: {listed(self._others)}"
         if seen < 2:
             return (
                 f"{seen} of its landmarks were identified, and at least two are needed"
             )
         return (
             f"of its landmarks {seen} were identified, and no place explains them {ODDS:g} times better than all others "
-            "together: few landmarks or wrong identities, or another map"
+            "together: few landmarks or wrong identities, sigmas of the map that are too small, or another map"
         )
 
     def _see(self, frame: LandmarkDetections) -> bool:
@@ -146,11 +161,13 @@ class MapLocator:
         if self._start_ns is None or stamp_ns < self._start_ns:
             return False
         ids, outcomes = identify(frame, MINIMUM_PROBABILITY)
-        rows = [
-            k
-            for k in range(len(frame))
-            if outcomes[k] == ACCEPTED and int(ids[k]) in self._rows
-        ]
+        accepted = [k for k in range(len(frame)) if outcomes[k] == ACCEPTED]
+        rows = [k for k in accepted if int(ids[k]) in self._rows]
+        self._others.update(
+            int(ids[k])
+            for k in accepted
+            if int(ids[k]) not in self._rows and ids[k] < FIRST_ANONYMOUS_ID
+        )
         if not rows:
             return False
         start = self._calibration.start
@@ -187,7 +204,7 @@ class MapLocator:
             self._sightings.append(MapSighting(row, point[:2], S))
         return True
 
-    def _newest(self) -> list[MapSighting]:
+    def newest(self) -> list[MapSighting]:
         """The newest sightings, a few of each landmark, in the order of time."""
         count: Counter[int] = Counter()
         newest = []
@@ -249,6 +266,23 @@ def spread(
 
 def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     """The start that outweighs all others by `ODDS`; None without one."""
+    data = map_data(sightings, known)
+    starts = candidates(data)
+    if not starts:
+        return None
+    n = len(data.is_of)
+    log_others = math.log(WRONG / data.area_m2)
+    of_other_place = math.log(WRONG) - n * math.log(data.area_m2)
+    one = math.log(n * (1.0 - WRONG) / data.area_m2) + (n - 1) * log_others
+    best = starts[0]
+    rivals = [start.log_evidence for start in starts[1:]] + [of_other_place, one]
+    weight = float(np.logaddexp.reduce(rivals))
+    is_ahead = best.log_evidence - weight >= math.log(ODDS)
+    return best if is_ahead and is_linear(best, data) else None
+
+
+def map_data(sightings: list[MapSighting], known: KnownMap) -> "MapData":
+    """Sightings, one at least, and landmarks as arrays."""
     places = np.array(known.positions_m)[:, :2]
     m = len(places)
     is_level = np.arange(3 * m) % 3 < 2
@@ -256,17 +290,19 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     q = np.array([s.q for s in sightings])
     S = np.array([s.S for s in sightings])
     rows = np.array([s.row for s in sightings])
-    n = len(set(rows.tolist()))
-    if n < 2:
-        return None
     reach_m = float(np.linalg.norm(q, axis=1).max())
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
     is_of = np.unique(rows)[:, None] == rows
-    data = MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2)
+    return MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2)
+
+
+def candidates(data: "MapData") -> list[FoundStart]:
+    """Starts with two or more landmarks that agree, the one with the most evidence first."""
     found: list[FoundStart] = []
-    for proposal in proposals(data):
-        # sightings of the same landmarks propose the same start many times
-        if any(is_same(proposal, start) for start in found):
+    for proposal, pair in proposals(data):
+        # sightings of the same landmarks propose the same start many times; a landmark that agrees with none of the
+        # starts may be far from the pair that proposed them, and would agree with one that is turned a little
+        if any(pair <= start.agreeing and is_same(proposal, start) for start in found):
             continue
         start = refined(proposal, data)
         if start is not None and math.isfinite(start.log_evidence):
@@ -275,16 +311,7 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     for start in sorted(found, key=lambda start: -start.log_evidence):
         if not any(is_same(start.parameters, better) for better in starts):
             starts.append(start)
-    if not starts:
-        return None
-    log_others = math.log(WRONG / area_m2)
-    of_other_place = math.log(WRONG) - n * math.log(area_m2)
-    one = math.log(n * (1.0 - WRONG) / area_m2) + (n - 1) * log_others
-    best = starts[0]
-    rivals = [start.log_evidence for start in starts[1:]] + [of_other_place, one]
-    weight = float(np.logaddexp.reduce(rivals))
-    is_ahead = best.log_evidence - weight >= math.log(ODDS)
-    return best if is_ahead and is_linear(best, data) else None
+    return starts
 
 
 class MapData(NamedTuple):
@@ -314,8 +341,8 @@ class MapData(NamedTuple):
         return self.M.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
 
 
-def proposals(data: MapData) -> list[Floats]:
-    """(psi, t_x, t_y) by each pair of sightings of two landmarks whose distance in the map fits."""
+def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
+    """(psi, t_x, t_y) by each pair of sightings of two landmarks whose distance in the map fits, with their rows."""
     found = []
     for k, j in combinations(range(len(data.q)), 2):
         a = data.rows[k]
@@ -332,7 +359,7 @@ def proposals(data: MapData) -> list[Floats]:
         psi = math.atan2(placed[1], placed[0]) - math.atan2(seen[1], seen[0])
         middle = 0.5 * (data.q[k] + data.q[j])
         t = 0.5 * (data.places[a] + data.places[b]) - turn(psi) @ middle
-        found.append(np.array([psi, *t]))
+        found.append((np.array([psi, *t]), frozenset({int(a), int(b)})))
     return found
 
 
@@ -377,7 +404,8 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     right = log_density + len(q) * math.log(1.0 - WRONG)
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
     prior = math.log(2.0 * math.pi * data.area_m2)
-    return FoundStart(parameters, covariance, right + wrong + volume - prior)
+    rows = frozenset(seen[agreeing].tolist())
+    return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
 
 
 def joint_covariance(S: Floats, rows: Any, M: Floats) -> Floats:

@@ -1,0 +1,144 @@
+"""Check of a known map against the sightings of a log: other identities, axes, units and sigmas, another start.
+
+Where the sightings give no start in the map (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
+that then gives a start, with three or more landmarks, is named. A wrong sign of the heights leaves the start where it is
+and spoils ranges. It is named where the evidence (2) of the best start is `ODDS` times as large without it.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_graph.calibration import KnownMap
+from sonar_graph.measurements import Measurements
+from sonar_graph.navigation.map_start import (
+    ODDS,
+    FoundStart,
+    MapLocator,
+    MapSighting,
+    candidates,
+    located,
+    map_data,
+)
+from sonar_graph.sequence import Sequence
+
+LONGEST_S = 300.0
+"""Time after the start within which sightings count: later the odometry has drifted too far."""
+WINDOW_S = 5.0
+"""Time between two attempts to find the start."""
+FEWEST = 3
+"""Number of landmarks that must agree with a corrected map: two fit its mirror image too."""
+Z_UP = np.diag([1.0, 1.0, -1.0])
+SWAPPED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+NEGATED = "z_m has the wrong sign; the world's z points up"
+MIRRORED = (
+    "it is a mirror image: x_m and y_m are swapped, or one of them has the wrong sign"
+)
+MISTAKES = {
+    NEGATED: Z_UP,
+    MIRRORED: SWAPPED,
+    "the axes are north, east, down; the world's z points up": SWAPPED @ Z_UP,
+    "it is in feet": 0.3048 * np.eye(3),
+    "it is in centimetres": 0.01 * np.eye(3),
+    "it is in millimetres": 0.001 * np.eye(3),
+}
+"""Mistake of a map, and the matrix that undoes it."""
+SIGMA_FACTOR = 10.0
+
+
+class MapFit(NamedTuple):
+    """Fit of the sightings to the map."""
+
+    start: FoundStart | None
+    """None where the sightings give no start."""
+    mistake: str = ""
+    """Mistake of the map; empty where none is known."""
+    remedy: str = ""
+    """Change of the map that undoes it."""
+
+
+def map_fit(sequence: Sequence) -> MapFit:
+    """Fit of a log's first sightings to the map of its calibration."""
+    known = sequence.calibration.map
+    assert known is not None
+    start = first_start(sequence)
+    newest = sightings_of(sequence, known)
+    if len({sighting.row for sighting in newest}) < FEWEST:
+        return MapFit(start)
+    if start is not None:
+        negated = undone(known, Z_UP)
+        others = sightings_of(sequence, negated)
+        gain = evidence(others, negated) - evidence(newest, known)
+        if gain > math.log(ODDS):
+            return MapFit(start, NEGATED, remedy_of(known, Z_UP))
+        return MapFit(start)
+    for mistake, T in MISTAKES.items():
+        corrected = undone(known, T)
+        if fits(sightings_of(sequence, corrected), corrected):
+            return MapFit(None, mistake, remedy_of(known, T))
+    looser = known.model_copy(
+        update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
+    )
+    if fits(newest, looser):
+        factor = f"give sigmas up to {SIGMA_FACTOR:g} times as large"
+        return MapFit(None, "its sigmas are too small", factor)
+    return MapFit(None)
+
+
+def first_start(sequence: Sequence) -> FoundStart | None:
+    """Start in the map; None where the sightings give none."""
+    locator = MapLocator(sequence.calibration)
+    for window in first_windows(sequence):
+        # at the end of each window instead of each frame
+        if any([*locator.frames_seen(window)]):
+            start = located(locator.newest(), locator.map)
+            if start is not None:
+                return start
+    return None
+
+
+def sightings_of(sequence: Sequence, known: KnownMap) -> list[MapSighting]:
+    """The newest sightings of a map's landmarks at the end of the part of the log that counts."""
+    locator = MapLocator(sequence.calibration.model_copy(update={"map": known}))
+    for window in first_windows(sequence):
+        for _ in locator.frames_seen(window):
+            pass
+    return locator.newest()
+
+
+def first_windows(sequence: Sequence) -> Iterator[Measurements]:
+    """Measurements of the part of a log that counts."""
+    step_ns = round(WINDOW_S * 1e9)
+    last_ns = min(sequence.end_ns, sequence.start_ns + round(LONGEST_S * 1e9))
+    instants_ns = np.arange(sequence.start_ns + step_ns, last_ns + step_ns, step_ns)
+    return sequence.replay(np.minimum(instants_ns, last_ns))
+
+
+def evidence(sightings: list[MapSighting], known: KnownMap) -> float:
+    """Logarithm of the evidence of the best start; minus infinity without one."""
+    starts = candidates(map_data(sightings, known)) if sightings else []
+    return starts[0].log_evidence if starts else -math.inf
+
+
+def fits(sightings: list[MapSighting], known: KnownMap) -> bool:
+    """Check that sightings give a start, by enough landmarks and more than half of those that were seen."""
+    start = located(sightings, known)
+    if start is None:
+        return False
+    seen = len({sighting.row for sighting in sightings})
+    return len(start.agreeing) >= FEWEST and 2 * len(start.agreeing) > seen
+
+
+def undone(known: KnownMap, T: np.ndarray) -> KnownMap:
+    """The map with all places multiplied by a matrix."""
+    places = np.array(known.positions_m) @ T.T
+    all_T = np.kron(np.eye(len(places)), T)
+    return KnownMap.of(known.ids, places, covariance_m2=all_T @ known.joint() @ all_T.T)
+
+
+def remedy_of(known: KnownMap, T: np.ndarray) -> str:
+    """The first landmark as it should be in the file."""
+    place = ", ".join(f"{value:.2f}" for value in T @ known.positions_m[0])
+    return f"landmark {known.ids[0]} at ({place}) m, and all others alike"
