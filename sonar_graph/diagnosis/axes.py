@@ -7,7 +7,7 @@ right ones leave only gravity and its slow turning::
 
 Differences of means over a second are linear in the entries of P: for each of 48 G the sum of squares is a quadratic
 form in them, so that 48 P cost as much as one. A wrong G tilts gravity and turns accelerations, a wrong P only what the
-Doppler log measures, so that the two are told apart where the vehicle turns and moves.
+Doppler log measures, so that the two differ where the vehicle turns and moves.
 """
 
 from collections.abc import Iterator
@@ -173,7 +173,7 @@ class SharedRows:
         runs = list(runs_of(t, holes))
         if not runs:
             return None
-        # rows of the Doppler log are among the ends of the steps, so that none is interpolated
+        # rows of the Doppler log are among the ends of the steps, so that nothing is interpolated
         steps = np.maximum(np.ceil(np.diff(t) / STEP_S), 1).astype(int)
         row = np.concatenate([[0], np.cumsum(steps)])
         grid_s = np.interp(np.arange(row[-1] + 1), row, t)

@@ -252,7 +252,7 @@ def cause_of(
 
 
 def step_text(found: Match, sigma: float, unit: str) -> str:
-    """Size and times of steps of a sensor beyond its reference; empty: there are none."""
+    """Size and times of steps of a sensor beyond its reference; empty without any."""
     texts = list[str]()
     for whole in found.whole:
         x = turned_to(whole.y, whole.shifted(np.zeros(1))[0])
@@ -263,7 +263,7 @@ def step_text(found: Match, sigma: float, unit: str) -> str:
 
 
 def velocity_steps(sequence: Sequence) -> Finding | None:
-    """Steps of the Doppler log that the accelerometers do not feel; None: there are none, or they cannot be told."""
+    """Steps of the Doppler log that the accelerometers do not feel; None without any, or where they cannot be found."""
     motion = BodyMotion.of(sequence)
     if motion is None or motion.felt is None:
         return None

@@ -28,7 +28,7 @@ from sonar_graph.navigation.alignment import Estimate1D
 Values = NDArray[np.floating | np.complexfloating]
 LAGS_S = np.arange(-4.0, 4.01, 0.25)
 BLOCKS = (12, 6)
-"""Numbers of blocks of a stretch, of which the larger variance counts."""
+"""Numbers of blocks of a stretch; the larger variance counts."""
 FEWEST_ROWS = 8
 ROUNDS = 4
 OUTLYING = 6.0

@@ -199,7 +199,7 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
     by_dvl = np.abs(np.einsum("ak,ka->k", moved, (u[i] + u[j]) / 2))
     measured = np.abs(seen.range_m[j] - seen.range_m[i])
     least = calibration.sonar.range_sigma_m
-    # the range of a landmark abeam hardly changes: a change below the noise is none
+    # the range of a landmark abeam hardly changes: a change below the noise does not count
     return max(float(np.median(measured)), least), float(np.median(by_dvl))
 
 

@@ -175,7 +175,7 @@ class DvlAdapter(Adapter):
         return velocity * self.scale, {fault: is_few}
 
     def _is_filled(self, table: FieldTable, path: str) -> bool:
-        """Tell whether the driver fills a field, as far as it may be unfilled."""
+        """True where the driver fills a field, as far as it may be unfilled."""
         return path not in self.may_be_unfilled or bool(table.column(path).any())
 
     def _filled(self, table: FieldTable) -> Masks:
@@ -187,7 +187,7 @@ class DvlAdapter(Adapter):
         }
 
     def _is_marked(self, table: FieldTable) -> bool:
-        """Tell whether the driver marks some messages as valid and others as invalid."""
+        """True where the driver marks some messages as valid and others as invalid."""
         return self.lock == "marked" or any(
             valid.any() and not valid.all() for valid in self._filled(table).values()
         )
@@ -227,7 +227,7 @@ class DvlAdapter(Adapter):
         return faults
 
     def _may_count(self, is_good: Mask) -> bool:
-        """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
+        """True where a sign counts: the driver fills its field, since some message is good by it."""
         return self.lock == "signs" or bool(is_good.any())
 
     def with_marks_alone(self) -> DvlAdapter:
@@ -236,7 +236,7 @@ class DvlAdapter(Adapter):
         return self.model_copy(update={"lock": lock})
 
     def accepts(self, fault: str) -> str | None:
-        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        """Setting with which messages that are left out for a fault are used; None without one."""
         if fault.endswith("below 0"):
             return "altitude = false"
         if fault.startswith("with ") and " not " in fault and fault != NOT_FINITE:
