@@ -18,6 +18,7 @@ from sonar_graph.diagnosis.causes import (
     OF_FIXES,
     OF_RANGES,
     PITCH,
+    SONAR_TURN,
     Advice,
     Cause,
     cause_of,
@@ -343,10 +344,10 @@ RANGE = SIGHTINGS(
     scale_key="range_scale",
     # landmarks are wrong by the error of the whole range, not of its changes
     reach=lambda sequence, _: typical_sighting(sequence)[0],
-    causes=(OF_RANGES,),
+    causes=(OF_RANGES, SONAR_TURN),
     sense=lambda _: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards?",
-        f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}",
+        f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}, its yaw changed by 3.1416",
     ),
     scaled=lambda config, gain: Advice(
         "",
@@ -901,9 +902,16 @@ def position_findings(
             gravity=Gravity.GRAVE,
         )
         return
+    if rows[0].estimate.reason.startswith("too few"):
+        yield from rows
+        return
+    distance = distance_finding(right, fixes, motion, config)
+    # a scale moves fixes away from the start as well
+    if rows[0].acts and distance.acts:
+        yield replace(rows[0], gravity=Gravity.GRAVE)
+        return
     yield from rows
-    if not rows[0].estimate.reason.startswith("too few"):
-        yield distance_finding(right, fixes, motion, config)
+    yield distance
 
 
 def led_to_fixes(

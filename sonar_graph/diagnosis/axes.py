@@ -76,6 +76,7 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     if rows is None:
         return None
     candidates = signed_permutations()
+    handed = np.linalg.det(candidates)
     ones = np.ones((len(candidates), 1))
     entries = np.hstack([ones, candidates.reshape(-1, 9)])  # (48, 10)
     squares = np.empty((48, 48))
@@ -89,11 +90,15 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
     is_clear = squares[0, 0] > LEAST_RATIO * best
     is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
-    if not (is_better and is_clear and is_fit):
+    if not (is_better and is_clear):
         return AxesMatch.as_read()
+    if not is_fit:
+        turned = best_turn(
+            rows, candidates[handed > 0][squares[0, handed > 0].argmin()]
+        )
+        return turned or AxesMatch.as_read()
     # of candidates that fit as well the one that changes least
     changes_least = np.trace(candidates, axis1=1, axis2=2)
-    handed = np.linalg.det(candidates)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
 
     def preference(pair: list[int]) -> tuple[float, float, float]:
@@ -107,6 +112,29 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_sure = not any((rival == other).all() for rival in rivals)
     ratio = float(np.sqrt(squares[0, 0] / squares[g, p]))
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
+
+
+def best_turn(rows: "SharedRows", near: Floats) -> AxesMatch | None:
+    """Rotation of the Doppler log, near a candidate, that no permutation describes; None where it fits badly.
+
+    Such as that of a log that looks down and is turned by 45 degrees.
+    """
+    from scipy.optimize import minimize
+
+    Q = rows.quadratic_form(np.eye(3))
+
+    def square(rotvec: Floats) -> float:
+        R = Rotation.from_rotvec(rotvec).as_matrix() @ near
+        entries = np.append(1.0, R)  # (10,)
+        return float(entries @ Q @ entries)
+
+    found = minimize(square, np.zeros(3))
+    if found.fun > MOST_LEFT * least_of(Q):
+        return None
+    as_read = np.append(1.0, np.eye(3))
+    ratio = float(np.sqrt(as_read @ Q @ as_read / found.fun))
+    R = Rotation.from_rotvec(found.x).as_matrix() @ near
+    return AxesMatch(np.eye(3), R, ratio)
 
 
 def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float | None:

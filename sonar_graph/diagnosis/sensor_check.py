@@ -51,7 +51,7 @@ from sonar_graph.diagnosis.findings import (
     worst_first,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, weighted
 from sonar_graph.diagnosis.start import (
     ARM,
     LARGE_TURN_RAD,
@@ -74,7 +74,7 @@ from sonar_graph.diagnosis.start import (
 from sonar_graph.diagnosis.start_place import start_place_findings
 from sonar_graph.diagnosis.turn_rate import turn_rate_finding
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair, is_heading_stated
-from sonar_graph.diagnosis.units import force_scale, wrong_units
+from sonar_graph.diagnosis.units import coarse_findings, force_scale, wrong_units
 from sonar_graph.logs import (
     DRIFTING,
     FELT_ALONG,
@@ -183,6 +183,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     sequence = without_gravity(without_stuck(sequence))
     if reason := spoilt_by(sequence):
         return [Finding("sensors with each other", unknown(reason))]
+    if coarse := coarse_findings(sequence):
+        return coarse
     forces, sequence = force_findings(sequence, config)
     axes, sequence = tried_axes(sequence, config)
     match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
@@ -213,6 +215,9 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     estimates, sources = surest_bias(match, tilt)
     motion = BodyMotion.of(right)
     up = UPRIGHT if motion is None else np.median(motion.up, axis=0)
+    of_heading = None if motion is None else vertical_bias(right, motion)
+    if of_heading is not None:
+        estimates = with_vertical(estimates, of_heading.estimate, up)
     D_heading = up * right.duration_s  # (3,)
     bias = bias_findings(estimates, sources, right.calibration.imu, D_heading)
     right, estimates = without_acting_bias(right, estimates)
@@ -300,6 +305,8 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     right = without_gravity(without_stuck(sequence))
     if spoilt_by(right):
         return []
+    if coarse := coarse_findings(right):
+        return coarse
     forces, right = force_findings(right, config)
     axes, right = tried_axes(right, config)
     if rates := rate_findings(right, config):
@@ -549,6 +556,8 @@ def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
 
 def axes_cause(found: AxesMatch) -> str:
     """How much better the axes of the Doppler log fit the IMU."""
+    if np.abs(found.dvl).max(axis=1).min() < 1.0:
+        return f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about turned axes"
     return (
         f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes "
         f"({', '.join(signed_axes(found.dvl))})"
@@ -757,6 +766,21 @@ def surest_bias(
         pairs.append((bias, source))
     (x, of_x), (y, of_y), (z, of_z) = pairs
     return (x, y, z), (of_x, of_y, of_z)
+
+
+def with_vertical(bias: Estimates3D, vertical: Estimate1D, up: Floats) -> Estimates3D:
+    """Biases with the weighted mean of both estimates about the vertical; as they are where these contradict each other."""
+    if not vertical.is_known or not all(one.is_known for one in bias):
+        return bias
+    axis = int(np.argmax(np.abs(up)))
+    beside = sum(one.value * up[k] for k, one in enumerate(bias) if k != axis)
+    by_heading = (vertical.value - beside) / up[axis]
+    apart = replace(vertical, value=by_heading - bias[axis].value)
+    if matters(apart, LEAST_BIAS_RAD_S, bias[axis].sigma):
+        return bias
+    estimates = [(bias[axis].value, bias[axis].sigma), (by_heading, vertical.sigma)]
+    x, y, z = (weighted(estimates) if k == axis else one for k, one in enumerate(bias))
+    return x, y, z
 
 
 def without_acting_bias(

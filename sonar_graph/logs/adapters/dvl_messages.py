@@ -89,6 +89,8 @@ LEAST_STEP_M_S = 0.05
 """Steps below this are no sign: at such speeds a row of zeros does little harm."""
 FEWEST_STEPS = 10
 """Fewest steps from which usual ones are known."""
+LEAST_CHANGING = 0.9
+"""Share of the axes that change where a velocity is not repeated."""
 LEAST_REPEATED = 0.2
 """Share of rows, and of values, that a driver repeats which holds velocities between measurements."""
 SAID_INVALID = "with a covariance that says invalid"
@@ -324,7 +326,8 @@ def repeats(velocity: Floats) -> Mask:
     """Rows, shape (n,), that repeat the velocity of the row before, where the driver does so all the time.
 
     Such a driver publishes at its own rate, or once for each of two reports of the instrument, and holds the velocity
-    between. A sensor that got stuck once repeats one value, which is not the driver's habit.
+    between. A sensor that got stuck once repeats one value, which is not the driver's habit. A coarse sensor repeats
+    rows too, and changes along single axes.
     """
     is_equal = (velocity[1:] == velocity[:-1]).all(axis=1) & velocity[1:].any(axis=1)
     is_same = np.concatenate([[False], is_equal])
@@ -332,4 +335,6 @@ def repeats(velocity: Floats) -> Mask:
     lengths = np.diff([*np.flatnonzero(~is_same), len(velocity)])
     shares = (is_same.mean(), (lengths > 1).mean())
     is_habit = min(shares) >= LEAST_REPEATED and len(lengths) >= FEWEST_STEPS
+    changes = np.diff(velocity, axis=0)[~is_equal] != 0
+    is_habit &= bool(changes[:, changes.any(axis=0)].mean() >= LEAST_CHANGING)
     return is_same & is_habit
