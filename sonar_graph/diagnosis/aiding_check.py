@@ -18,6 +18,7 @@ from sonar_graph.diagnosis.causes import (
     OF_FIXES,
     OF_RANGES,
     PITCH,
+    SONAR_TURN,
     Advice,
     Cause,
     cause_of,
@@ -51,7 +52,11 @@ from sonar_graph.diagnosis.signals import (
     match,
     root_mean_square,
 )
-from sonar_graph.diagnosis.start import LEAST_BIAS_RAD_S, turned_mounting
+from sonar_graph.diagnosis.start import (
+    LARGE_TURN_RAD,
+    LEAST_BIAS_RAD_S,
+    turned_mounting,
+)
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, Floats, PositionFixes
 from sonar_graph.models import wrap_angle
@@ -63,16 +68,17 @@ HEADING_SENSE = "heading: turn over that of the gyros"
 VERTICAL_BIAS = "gyro bias about the vertical"
 HEADING_TURN = "heading: turn towards the positions"
 LARGEST_GAIN_SIGMA = 0.12
-"""Of a gain that is told: 1 and -1 are sixteen sigmas apart."""
+"""Of a gain that is shown: 1 and -1 are sixteen sigmas apart."""
 LARGEST_LAG_SIGMA_S = 0.5
 LARGEST_HEADING_SIGMA_RAD = 0.25
 OTHER_UNIT = 1.3
-"""Gain, either way, from which on a unit is asked for, not a scale."""
+"""Gain, either way, from which on a unit is suspected, not a scale."""
 SLIPPING_UNIT = 3.0
 """The same for sightings of a vehicle on wheels, which slip."""
-UNIT_TOLERANCE = 0.1
+UNIT_TOLERANCE = 0.03
+MOST_UNIT_TOLERANCE = 0.1
 HARDLY = 0.25
-"""Gain below which a sensor is said to hardly change."""
+"""Gain below which a sensor counts as one that can hardly change."""
 LEAST_MOVED = 1.0
 """Motion in sigmas of a row, below which nothing is known of a sensor."""
 STUCK_MOVED = 10.0
@@ -86,8 +92,6 @@ GRAVE_ERROR = 5.0
 CLIMB_S = 40.0
 """Time in which a vehicle climbs or dives by much more than the Doppler log's noise adds up to."""
 FEWEST_DEPTHS = 30
-LARGE_TURN_RAD = np.radians(10.0)
-"""Of the heading against positions: beyond, a run's result is of little worth."""
 LENGTHS = {
     "mm": 1e-3,
     "cm": 1e-2,
@@ -134,7 +138,7 @@ class Check:
     causes: tuple[Cause, ...] = ()
     """What else may be wrong."""
     step_unit: str = ""
-    """Unit of steps; empty: there are none to look for."""
+    """Unit of steps; empty where steps are not looked for."""
 
     @property
     def is_sighting(self) -> bool:
@@ -336,14 +340,14 @@ RANGE = SIGHTINGS(
     name="ranges to landmarks",
     compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=True),
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
-    units=LENGTHS,
+    units=LENGTHS | {"the way there and back": 0.5, "half of the range": 2.0},
     scale_key="range_scale",
     # landmarks are wrong by the error of the whole range, not of its changes
     reach=lambda sequence, _: typical_sighting(sequence)[0],
-    causes=(OF_RANGES,),
+    causes=(OF_RANGES, SONAR_TURN),
     sense=lambda _: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards?",
-        f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}",
+        f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}, its yaw changed by 3.1416",
     ),
     scaled=lambda config, gain: Advice(
         "",
@@ -423,6 +427,10 @@ def findings_of(
     error = abs(size - 1.0) * check.reach(sequence, found)
     # a scale matters only where its error shows beside the noise of a row
     is_off = matters(replace(gain, value=size - 1.0), check.least_scale)
+    # another sense or unit has been named, where the changes fit one
+    if is_off and not 1 / OTHER_UNIT < gain.value < OTHER_UNIT:
+        reason = f"its few changes do not follow {check.against}"
+        return [Finding(quantity, unknown(reason))]
     acts = is_off and error > sigma and not check.slips(sequence)
     if acts:
         advice = check.scaled(config, size)
@@ -448,7 +456,7 @@ def grave_fault(
     sigma = check.sigma(sequence)
     # a wrong unit may make a gain small too
     is_flat = size + 4 * gain.sigma < HARDLY and found.moved > STUCK_MOVED * sigma
-    if is_flat and not unit_of(check, size):
+    if is_flat and not unit_of(check, gain):
         verb = "turns" if check is HEADING else "changes"
         cause = f"it hardly {verb} where {check.against} do: stuck, or not of the body"
         return Advice(cause, unused(check.role))
@@ -461,13 +469,13 @@ def grave_fault(
     if is_opposite and is_borne_out:
         return check.sense(config)
     # a gain without a unit's name may have another cause
-    return odd_gain(check, found, sequence, config) if unit_of(check, size) else None
+    return odd_gain(check, found, sequence, config) if unit_of(check, gain) else None
 
 
 def odd_gain(
     check: Check, found: Match, sequence: Sequence, config: LogConfig
 ) -> Advice | None:
-    """A gain that is surely far from 1 of a sensor that agrees with its reference otherwise; None: there is none."""
+    """A gain that is surely far from 1 of a sensor that agrees with its reference otherwise; None without one."""
     gain = found.gain
     size = abs(gain.value)
     other_unit = SLIPPING_UNIT if check.slips(sequence) else OTHER_UNIT
@@ -492,17 +500,19 @@ def other_values(check: Check, found: Match, sigma: float) -> Advice | None:
     )
 
 
-def unit_of(check: Check, gain: float) -> str:
-    """The unit that a gain looks like; empty: none."""
-    near = {unit: abs(np.log(gain * factor)) for unit, factor in check.units.items()}
+def unit_of(check: Check, gain: Estimate1D) -> str:
+    """The unit that a gain looks like, within its interval; empty: none."""
+    size = max(abs(gain.value), 1e-12)
+    near = {unit: abs(np.log(size * factor)) for unit, factor in check.units.items()}
     unit = min(near, key=near.__getitem__, default="")
-    return unit if unit and near[unit] < UNIT_TOLERANCE else ""
+    tolerance = max(UNIT_TOLERANCE, ACTING_SIGMAS * gain.sigma / size)
+    return unit if unit and near[unit] < min(tolerance, MOST_UNIT_TOLERANCE) else ""
 
 
 def unit_advice(check: Check, found: Match, config: LogConfig) -> Advice:
     """Question for the unit, and the line."""
     gain = abs(found.gain.value)
-    unit = unit_of(check, gain)
+    unit = unit_of(check, found.gain)
     if not unit and gain < 1 and matters(found.lag, check.least_lag_s):
         return Advice(
             f"it follows {check.against} {found.lag.value:.2g} s late and {gain:.2g} times as far: smoothed by the sensor "
@@ -774,8 +784,12 @@ def heading_turn(
     rows = motion.stretches(t, level, motion.reference(path))
     turn = match(rows, find_lag=False)
     angle = unknown("too little motion beside positions")
-    # a way that fits badly has no direction
-    if turn.misfit < MOST_MISFIT and 0.5 < turn.gain.value < 2.0:
+    # north and east exchanged are a fault of the positions; a way that fits badly has no direction
+    if (
+        not turn.is_mirrored
+        and turn.misfit < MOST_MISFIT
+        and 0.5 < turn.gain.value < 2.0
+    ):
         angle = turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, angle.reason)
     allowed = right.calibration.heading.bias_sigma_rad
     row = Finding(
@@ -792,12 +806,14 @@ def heading_turn(
     vertical = vertical_bias(right, motion)
     is_biased = vertical is not None and vertical.acts
     first = "once the gyro bias is put right, which comes first, " if is_biased else ""
+    sigma = float(np.hypot(right.calibration.heading.sigma_rad, allowed))
+    large_rad = min(LARGE_TURN_RAD, GRAVE_ERROR * sigma)
     yield replace(
         row,
         cause=f"{first}either its world, north or mounting is another",
         line=f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}; or the Doppler log is turned on the "
         f"vehicle: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}",
-        gravity=gravity_of(True, abs(angle.value) > LARGE_TURN_RAD),
+        gravity=gravity_of(True, abs(angle.value) > large_rad),
     )
 
 
@@ -809,6 +825,8 @@ LARGEST_JUMPING_SHARE = 0.2
 FEWEST_JUMPS = 6
 NEAR_START = 6
 """Number of fixes about the start whose median is compared with it."""
+SEEN_WITHIN_S = 60.0
+"""Time after the start in which gyros do not turn the path."""
 FARTHEST_ORIGIN_M = 1e5
 """No vehicle of a run goes so far; coordinates of a map grid begin beyond."""
 
@@ -884,42 +902,91 @@ def position_findings(
             gravity=Gravity.GRAVE,
         )
         return
+    if rows[0].estimate.reason.startswith("too few"):
+        yield from rows
+        return
+    distance = distance_finding(right, fixes, motion, config)
+    # a scale moves fixes away from the start as well
+    if rows[0].acts and distance.acts:
+        yield replace(rows[0], gravity=Gravity.GRAVE)
+        return
     yield from rows
-    if not rows[0].estimate.reason.startswith("too few"):
-        yield distance_finding(right, fixes, config)
+    yield distance
+
+
+def led_to_fixes(
+    right: Sequence, fixes: PositionFixes, motion: BodyMotion
+) -> tuple[Floats, float] | None:
+    """Median offset of the fixes of a minute from the path that leads to them from the start, shape (3,), and its sigma, m.
+
+    None where the owner does not state the start's place and heading, or fixes are too few.
+    """
+    start = right.calibration.start
+    is_stated = {"position_m", "rpy_rad"} <= start.model_fields_set
+    if not is_stated or start.source != "stated":
+        return None
+    begin_s = float(motion.since_origin(np.array([right.start_ns]))[0])
+    t = motion.since_origin(fixes.stamps_ns)
+    path = motion.path_m * np.exp(1j * start.rpy_rad[2])
+    moved = motion.reference(path)(t)
+    inside = np.isfinite(moved) & (motion.part_at(t) == 0)
+    inside &= (t >= begin_s) & (t <= begin_s + SEEN_WITHIN_S) & is_level_fix(fixes)
+    if np.count_nonzero(inside) < NEAR_START:
+        return None
+    x, y, _ = start.position_m
+    placed = fixes.position_m[inside] @ [1.0, 1j, 0.0] - (x + 1j * y)
+    off = placed - moved[inside]
+    median_off = np.array([np.median(off.real), np.median(off.imag), 0.0])
+    way = float(np.median(np.abs(moved[inside])))
+    antenna_m = float(np.hypot(*right.calibration.positions.antenna_m[:2]))
+    parts = (
+        level_sigma_m(right.calibration.positions.sigma_m) / 2,
+        level_sigma_m(start.position_sigma_m),
+        way * start.rpy_sigma_rad[2],
+        antenna_m,
+    )
+    return median_off, float(np.linalg.norm(parts))
 
 
 def distance_finding(
-    right: Sequence, fixes: PositionFixes, config: LogConfig
+    right: Sequence, fixes: PositionFixes, motion: BodyMotion | None, config: LogConfig
 ) -> Finding:
-    """Distance of the first fixes from the start, and whether they begin far from it or from the world's origin."""
+    """Distance of the first fixes from the start, and whether they begin far from it or from the world's origin.
+
+    From a start with a stated heading the path leads to the fixes of a minute; else the way to the first ones is allowed.
+    """
     calibration = right.calibration
+    start = calibration.start
+    noise_m = level_sigma_m(calibration.positions.sigma_m)
+    start_m = level_sigma_m(start.position_sigma_m)
     order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
     near = np.median(fixes.position_m[order], axis=0)
-    from_start_m = float(np.hypot(*(near - calibration.start.position_m)[:2]))
-    from_origin_m = float(np.hypot(*near[:2]))
-    noise_m = level_sigma_m(calibration.positions.sigma_m)
+    off = near - start.position_m
     # how far the vehicle can be from the start by then
     path_m = float(way_m(right, fixes.stamps_ns[order]).max())
-    start_m = level_sigma_m(calibration.start.position_sigma_m)
-    allowed_m = 5.0 * float(np.hypot(noise_m, start_m)) + path_m
+    from_origin_m = float(np.hypot(*near[:2]))
+    sigma_m = float(np.hypot(noise_m, start_m))
+    allowed_m = 5.0 * sigma_m + path_m
+    led = None if motion is None else led_to_fixes(right, fixes, motion)
+    if led is not None:
+        off, sigma_m = led
+        allowed_m = 5.0 * sigma_m + FARTHEST_FROM_START_M
+    from_start_m = float(np.hypot(*off[:2]))
     quantity = "position fixes: distance from the start"
-    row = Finding(quantity, Estimate1D(from_start_m, noise_m), "m", NO_NEED)
-    far = {}
-    if from_origin_m > FARTHEST_ORIGIN_M:
-        far["the origin of the world"] = from_origin_m
+    row = Finding(quantity, Estimate1D(from_start_m, sigma_m), "m", NO_NEED)
     if from_start_m > allowed_m:
-        far["the start"] = from_start_m
-    if not far:
+        place = f"{from_start_m:.3g} m from the start"
+        more = "moves them to the start; or state another start"
+    elif from_origin_m > FARTHEST_ORIGIN_M:
+        place = f"{from_origin_m:.3g} m from the origin of the world"
+        more = "moves the origin to the first; the start likewise"
+        off = near
+    else:
         return row
-    place, distance_m = far.popitem()  # the start comes before the origin
     before = np.array(config.table("positions").get("origin_m", np.zeros(3)), float)
-    origin = numbers(before + np.round(near), 0)
     return replace(
         row,
-        cause=f"they begin {distance_m:.3g} m from {place}, the way to them is {path_m:.3g} m: a map grid (UTM), or another "
-        "scale or place?",
-        line=f"`origin_m = {origin}` under [positions] {IN_LOG_CONFIG} moves the origin to the first; or state the "
-        "start there",
+        cause=f"they begin {place}, beyond their noise and the way to them: a map grid (UTM), or another scale or place?",
+        line=f"`origin_m = {numbers(before + off, 1)}` under [positions] {IN_LOG_CONFIG} {more}",
         gravity=Gravity.GRAVE,
     )

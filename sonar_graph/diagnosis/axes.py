@@ -7,7 +7,7 @@ right ones leave only gravity and its slow turning::
 
 Differences of means over a second are linear in the entries of P: for each of 48 G the sum of squares is a quadratic
 form in them, so that 48 P cost as much as one. A wrong G tilts gravity and turns accelerations, a wrong P only what the
-Doppler log measures, so that the two are told apart where the vehicle turns and moves.
+Doppler log measures, so that the two differ where the vehicle turns and moves.
 """
 
 from collections.abc import Iterator
@@ -76,6 +76,7 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     if rows is None:
         return None
     candidates = signed_permutations()
+    handed = np.linalg.det(candidates)
     ones = np.ones((len(candidates), 1))
     entries = np.hstack([ones, candidates.reshape(-1, 9)])  # (48, 10)
     squares = np.empty((48, 48))
@@ -89,11 +90,15 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
     is_clear = squares[0, 0] > LEAST_RATIO * best
     is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
-    if not (is_better and is_clear and is_fit):
+    if not (is_better and is_clear):
         return AxesMatch.as_read()
+    if not is_fit:
+        turned = best_turn(
+            rows, candidates[handed > 0][squares[0, handed > 0].argmin()]
+        )
+        return turned or AxesMatch.as_read()
     # of candidates that fit as well the one that changes least
     changes_least = np.trace(candidates, axis1=1, axis2=2)
-    handed = np.linalg.det(candidates)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
 
     def preference(pair: list[int]) -> tuple[float, float, float]:
@@ -107,6 +112,29 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_sure = not any((rival == other).all() for rival in rivals)
     ratio = float(np.sqrt(squares[0, 0] / squares[g, p]))
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
+
+
+def best_turn(rows: "SharedRows", near: Floats) -> AxesMatch | None:
+    """Rotation of the Doppler log, near a candidate, that no permutation describes; None where it fits badly.
+
+    Such as that of a log that looks down and is turned by 45 degrees.
+    """
+    from scipy.optimize import minimize
+
+    Q = rows.quadratic_form(np.eye(3))
+
+    def square(rotvec: Floats) -> float:
+        R = Rotation.from_rotvec(rotvec).as_matrix() @ near
+        entries = np.append(1.0, R)  # (10,)
+        return float(entries @ Q @ entries)
+
+    found = minimize(square, np.zeros(3))
+    if found.fun > MOST_LEFT * least_of(Q):
+        return None
+    as_read = np.append(1.0, np.eye(3))
+    ratio = float(np.sqrt(as_read @ Q @ as_read / found.fun))
+    R = Rotation.from_rotvec(found.x).as_matrix() @ near
+    return AxesMatch(np.eye(3), R, ratio)
 
 
 def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float | None:
@@ -173,7 +201,7 @@ class SharedRows:
         runs = list(runs_of(t, holes))
         if not runs:
             return None
-        # rows of the Doppler log are among the ends of the steps, so that none is interpolated
+        # rows of the Doppler log are among the ends of the steps, so that nothing is interpolated
         steps = np.maximum(np.ceil(np.diff(t) / STEP_S), 1).astype(int)
         row = np.concatenate([[0], np.cumsum(steps)])
         grid_s = np.interp(np.arange(row[-1] + 1), row, t)

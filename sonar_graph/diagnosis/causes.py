@@ -41,6 +41,7 @@ AS_GOOD = 1.1
 LEAST_DRIFT_M_S = 0.03
 """Of a height: the vertical velocity of a Doppler log that is turned by two degrees at 1 m/s."""
 LEAST_PITCH_RAD = np.radians(3.0)
+LEAST_SONAR_TURN_RAD = np.radians(5.0)
 LEAST_DEVIATION_RAD = np.radians(3.0)
 LEAST_CURRENT_M_S = 0.05
 BEST_NOISE_M_S = 0.01
@@ -121,6 +122,15 @@ def of_scale(stretch: SignalStretch) -> Values:
     return np.column_stack([x, of_way(stretch)[:, 2]])
 
 
+def of_sonar_turn(stretch: SignalStretch) -> Values:
+    """Changes of ranges to landmarks 90 degrees to the left, and those as seen, shape (n, 2).
+
+    Turned by an angle a, ranges change by ``cos(a) x + sin(a) x_left``.
+    """
+    x = stretch.shifted(np.zeros(1))[0]
+    return np.column_stack([of_way(stretch)[:, 3], x])
+
+
 def drift_advice(q: Values, _: Calibration) -> Advice:
     """A height that drifts."""
     return Advice(
@@ -168,6 +178,18 @@ def pitched_one(
     return [right if f is found else f for f in findings], is_imu
 
 
+def sonar_turn_advice(q: Values, calibration: Calibration) -> Advice:
+    """Ranges that change as if the landmarks were seen in another direction."""
+    turn_rad = float(np.arcsin(np.clip(q[0].real, -1.0, 1.0)))
+    rpy_rad = turned_mounting(calibration.sonar.mounting, turn_rad)
+    side = "left" if turn_rad > 0 else "right"
+    return Advice(
+        f"ranges change as for landmarks {abs(np.degrees(turn_rad)):.2g}° further to the {side}: the sonar is turned on the "
+        "vehicle, or its azimuths have another zero",
+        f"`sonar.mounting.rpy_rad = {numbers(rpy_rad, 4)}` {IN_CALIBRATION}",
+    )
+
+
 def deviation_advice(q: Values, _: Calibration) -> Advice:
     """A compass whose error depends on its heading."""
     largest_deg = float(np.degrees(np.linalg.norm(q)))
@@ -212,6 +234,14 @@ DEVIATION = Cause(
     least=lambda known: max(LEAST_DEVIATION_RAD, 2.0 * known.heading.bias_sigma_rad),
     advice=deviation_advice,
 )
+SONAR_TURN = Cause(
+    "turn of the sonar",
+    "°",
+    of_sonar_turn,
+    wanted=1,
+    least=lambda _: LEAST_SONAR_TURN_RAD,
+    advice=sonar_turn_advice,
+)
 CURRENT = partial(
     Cause, "current", "m/s", least=lambda _: LEAST_CURRENT_M_S, advice=current_advice
 )
@@ -252,7 +282,7 @@ def cause_of(
 
 
 def step_text(found: Match, sigma: float, unit: str) -> str:
-    """Size and times of steps of a sensor beyond its reference; empty: there are none."""
+    """Size and times of steps of a sensor beyond its reference; empty without any."""
     texts = list[str]()
     for whole in found.whole:
         x = turned_to(whole.y, whole.shifted(np.zeros(1))[0])
@@ -263,7 +293,7 @@ def step_text(found: Match, sigma: float, unit: str) -> str:
 
 
 def velocity_steps(sequence: Sequence) -> Finding | None:
-    """Steps of the Doppler log that the accelerometers do not feel; None: there are none, or they cannot be told."""
+    """Steps of the Doppler log that the accelerometers do not feel; None without any, or where they cannot be found."""
     motion = BodyMotion.of(sequence)
     if motion is None or motion.felt is None:
         return None

@@ -15,7 +15,7 @@ from sonar_graph.navigation.alignment import Estimate1D
 INTERVAL_SIGMAS = 1.96
 """Half width of printed intervals, 95 %."""
 ACTING_SIGMAS = 4.5
-"""A log has some twenty numbers: of faultless logs fewer than one in a thousand asks for an action by chance."""
+"""A log has some twenty numbers: of faultless logs fewer than one in a thousand needs an action by chance."""
 NO_NEED = "no need to act"
 ALSO = "put right by the line above"
 IN_CALIBRATION = "in the calibration (--calibration FILE)"
@@ -23,7 +23,7 @@ IN_LOG_CONFIG = "in the log configuration (--log-config FILE)"
 
 
 class Gravity(IntEnum):
-    """What a finding asks for, the worst last."""
+    """What a finding calls for, the worst last."""
 
     FINE = 0
     """Nothing need be done, or the quantity is unknown."""
@@ -106,7 +106,7 @@ class Finding:
 
 
 def gravity_of(acts: object, grave: object = True) -> Gravity:
-    """Class of a finding that asks for an action, or for none."""
+    """Class of a finding by whether it needs an action."""
     if not acts:
         return Gravity.FINE
     return Gravity.GRAVE if grave else Gravity.ACT

@@ -78,7 +78,7 @@ class BodyMotion:
         imu = sequence.imu
         body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
         unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
-        force = imu.specific_force @ body_R_imu.T
+        force = filled(imu.specific_force) @ body_R_imu.T
         path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, force))
         t = path.since_origin(dvl.stamps_ns)  # (n,)
         rows = path.covers(t) & np.isfinite(dvl.velocity).all(axis=1)
@@ -194,6 +194,15 @@ class BodyMotion:
         return found
 
 
+def filled(values: Floats) -> Floats:
+    """Rows, some of them not measured, shape (n, 3), with these linear between the others."""
+    is_measured = np.isfinite(values).all(axis=1)
+    if is_measured.all() or not is_measured.any():
+        return values
+    row = np.arange(len(values))
+    return columns_at(row, row[is_measured], values[is_measured])
+
+
 def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
     """Rate about the vertical at the IMU's samples, shape (n,), rad/s, with up known at times t."""
     up_at_imu = columns_at(path.seconds, t, up_in_path)
@@ -208,7 +217,7 @@ def felt_gravity(
     """Gravity in the frame of the path at times t, shape (n, 3), upwards; v is C v. None without it in the forces."""
     if not (np.isfinite(path.impulse).all() and calibration.use_gravity):
         return None
-    # a window that goes over a hole of the IMU would hold what nobody measured
+    # a window that goes over a hole of the IMU would hold what was not measured
     begin = np.maximum(t - UP_OVER_S / 2, part_edges(path, t, "left"))
     end = np.minimum(t + UP_OVER_S / 2, part_edges(path, t, "right"))
     gained = path.linear_at(end, path.impulse) - path.linear_at(begin, path.impulse)

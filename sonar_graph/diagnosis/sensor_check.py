@@ -20,7 +20,6 @@ from sonar_graph.diagnosis.aiding_check import (
     DEPTH,
     HEADING,
     HEADING_TURN,
-    LARGE_TURN_RAD,
     POSITIONS,
     RANGE,
     VERTICAL_BIAS,
@@ -33,7 +32,7 @@ from sonar_graph.diagnosis.aiding_check import (
     vertical_bias,
 )
 from sonar_graph.diagnosis.axes import AxesMatch, match_axes, turns_less_than_body
-from sonar_graph.diagnosis.causes import pitched_one, velocity_steps
+from sonar_graph.diagnosis.causes import PITCH, pitched_one, velocity_steps
 from sonar_graph.diagnosis.findings import (
     ALSO,
     IN_CALIBRATION,
@@ -52,13 +51,15 @@ from sonar_graph.diagnosis.findings import (
     worst_first,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match
+from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, weighted
 from sonar_graph.diagnosis.start import (
     ARM,
+    LARGE_TURN_RAD,
     LEAST_BIAS_RAD_S,
     LEAST_HEADING_RAD,
     NO_GRAVITY,
     StartTilt,
+    acting_bias,
     bias_findings,
     find_start_heading,
     find_start_tilt,
@@ -66,13 +67,17 @@ from sonar_graph.diagnosis.start import (
     lever_findings,
     tilt_findings,
     turned_mounting,
+    with_bias,
     with_fitted,
+    without_bias,
 )
 from sonar_graph.diagnosis.start_place import map_findings, start_place_findings
 from sonar_graph.diagnosis.turn_rate import turn_rate_finding
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair, is_heading_stated
-from sonar_graph.diagnosis.units import force_scale, wrong_units
+from sonar_graph.diagnosis.units import coarse_findings, force_scale, wrong_units
 from sonar_graph.logs import (
+    DRIFTING,
+    FELT_ALONG,
     OTHER_WAYS,
     STEPPED_BACK,
     axis_doubts,
@@ -116,6 +121,7 @@ CERTAIN_SIGMAS = 4.0
 PAIRED_SIGMAS = 2.0
 LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
+UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 
 
@@ -177,6 +183,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     sequence = without_gravity(without_stuck(sequence))
     if reason := spoilt_by(sequence):
         return [Finding("sensors with each other", unknown(reason))]
+    if coarse := coarse_findings(sequence):
+        return coarse
     forces, sequence = force_findings(sequence, config)
     axes, sequence = tried_axes(sequence, config)
     match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
@@ -205,7 +213,14 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         right = sequence
     tilt = find_start_tilt(right)
     estimates, sources = surest_bias(match, tilt)
-    bias = bias_findings(estimates, sources, sequence.calibration.imu)
+    motion = BodyMotion.of(right)
+    up = UPRIGHT if motion is None else np.median(motion.up, axis=0)
+    of_heading = None if motion is None else vertical_bias(right, motion)
+    if of_heading is not None:
+        estimates = with_vertical(estimates, of_heading.estimate, up)
+    D_heading = up * right.duration_s  # (3,)
+    bias = bias_findings(estimates, sources, right.calibration.imu, D_heading)
+    right, estimates = without_acting_bias(right, estimates)
     by_motion = motion_findings(right, config, estimates)
     of_vertical = [f for f in by_motion if f.quantity == VERTICAL_BIAS]
     # one row on the bias that is known is enough
@@ -214,6 +229,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     # one line for all axes
     if any(f.acts for f in of_vertical):
         bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
+    if any(f.acts and f.quantity.endswith(PITCH.name) for f in by_motion):
+        lever = [Finding(ARM, unknown("IMU or Doppler log is pitched"), "m")]
     reference = list(reference_findings(right, config, tilt))
     if is_heading_stated(right):
         pitch = tilt.angle(1)
@@ -227,6 +244,13 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     is_sound = not any(finding.grave for finding in by_motion)
     of_map = list(map_findings(right)) if is_sound else []
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
+    if of_dvl[0].acts and (role := drifting_role(sequence)):
+        cause = f"stamps of [{role}] drift from the times of recording, or jump"
+        line = f'`stamp = "log"` under [{role}] {IN_LOG_CONFIG}'
+        of_dvl[0] = replace(of_dvl[0], cause=cause, line=line)
+        lever = [Finding(ARM, unknown("the stamps drift"), "m")]
+        # other sensors look late as well
+        by_motion = [f for f in by_motion if not f.quantity.endswith(": delay")]
     of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
     return [
         *forces,
@@ -242,7 +266,7 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
 
 
 def spoilt_by(sequence: Sequence) -> str:
-    """Fault of rows that spoils every comparison, and that is named where rows are checked; empty: there is none."""
+    """Fault of rows that spoils every comparison, and that is named where rows are checked; empty without one."""
     if STEPPED_BACK in sequence.notes.get("log.doubtful", ""):
         return STEPPED_BACK
     calibration = sequence.calibration
@@ -253,7 +277,19 @@ def spoilt_by(sequence: Sequence) -> str:
     force = sequence.imu.specific_force
     mounting = calibration.imu.mounting
     gravity = gravity_warning(force, mounting, calibration.gravity_m_s2) or ""
-    return gravity if OTHER_WAYS in gravity else ""
+    return gravity if OTHER_WAYS in gravity or FELT_ALONG in gravity else ""
+
+
+def drifting_role(sequence: Sequence) -> str:
+    """``dvl`` or ``imu``, whichever alone has stamps that drift from the times of recording; else empty."""
+    faults = sequence.notes.get("log.stamps", "").split("; ")
+    is_drifting = {
+        role: any(DRIFTING in one and one.startswith(f"{role}:") for one in faults)
+        for role in ("dvl", "imu")
+    }
+    if is_drifting["dvl"] == is_drifting["imu"]:
+        return ""
+    return "dvl" if is_drifting["dvl"] else "imu"
 
 
 def rate_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
@@ -273,6 +309,8 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
     right = without_gravity(without_stuck(sequence))
     if spoilt_by(right):
         return []
+    if coarse := coarse_findings(right):
+        return coarse
     forces, right = force_findings(right, config)
     axes, right = tried_axes(right, config)
     if rates := rate_findings(right, config):
@@ -307,7 +345,7 @@ def by_late_imu(
 
 def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
     """Rows of the middle `LONGEST_S` of a longer log, to which the fit of the Doppler log is limited for its cost."""
-    imu = sequence.imu
+    imu = without_bias(sequence.imu, sequence.calibration)
     dvl = sequence.dvl
     first_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     last_ns = int(min(imu.stamps_ns[-1], dvl.stamps_ns[-1]))
@@ -338,7 +376,7 @@ def without_stuck(sequence: Sequence) -> Sequence:
 
 
 def without_gravity(sequence: Sequence) -> Sequence:
-    """The sequence as if its owner had said so, where gravity was taken out of the specific forces."""
+    """The sequence as if its owner had stated so, where gravity was taken out of the specific forces."""
     if not lacks_gravity(sequence):
         return sequence
     calibration = sequence.calibration.model_copy(update={"use_gravity": False})
@@ -522,6 +560,8 @@ def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
 
 def axes_cause(found: AxesMatch) -> str:
     """How much better the axes of the Doppler log fit the IMU."""
+    if np.abs(found.dvl).max(axis=1).min() < 1.0:
+        return f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about turned axes"
     return (
         f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes "
         f"({', '.join(signed_axes(found.dvl))})"
@@ -576,7 +616,9 @@ def motion_findings(
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
     found += start_depth_findings(right)
-    has_up = not lacks_gravity(right)
+    # vehicles on wheels stay level
+    has_up = motion.felt is not None
+    has_up |= right.calibration.odometry_interpolation != "linear"
     for check in (DEPTH, RANGE, AZIMUTH):
         match = matches[check]
         # without gravity the tilt of the vehicle is unknown
@@ -640,7 +682,7 @@ def dvl_findings(
 
 
 def brought_apart(before: Sequence, after: Sequence) -> str:
-    """Names of sensors that agree with the motion less after a correction than before it; empty: there are none."""
+    """Names of sensors that agree with the motion less after a correction than before it; empty without any."""
     first = BodyMotion.of(before)
     second = BodyMotion.of(after)
     if first is None or second is None:
@@ -730,6 +772,35 @@ def surest_bias(
     return (x, y, z), (of_x, of_y, of_z)
 
 
+def with_vertical(bias: Estimates3D, vertical: Estimate1D, up: Floats) -> Estimates3D:
+    """Biases with the weighted mean of both estimates about the vertical; as they are where these contradict each other."""
+    if not vertical.is_known or not all(one.is_known for one in bias):
+        return bias
+    axis = int(np.argmax(np.abs(up)))
+    beside = sum(one.value * up[k] for k, one in enumerate(bias) if k != axis)
+    by_heading = (vertical.value - beside) / up[axis]
+    apart = replace(vertical, value=by_heading - bias[axis].value)
+    if matters(apart, LEAST_BIAS_RAD_S, bias[axis].sigma):
+        return bias
+    estimates = [(bias[axis].value, bias[axis].sigma), (by_heading, vertical.sigma)]
+    x, y, z = (weighted(estimates) if k == axis else one for k, one in enumerate(bias))
+    return x, y, z
+
+
+def without_acting_bias(
+    sequence: Sequence, bias: Estimates3D
+) -> tuple[Sequence, Estimates3D]:
+    """The sequence with the bias that its line states, and what is left of the bias."""
+    calibration = sequence.calibration
+    stated = with_bias(bias, calibration.imu)
+    x, y, z = (
+        replace(one, value=one.value - acting.value)
+        for one, acting in zip(bias, acting_bias(bias, calibration.imu), strict=True)
+    )
+    calibration = calibration.model_copy(update={"imu": stated})
+    return replace(sequence, calibration=calibration), (x, y, z)
+
+
 def reference_findings(
     right: Sequence, config: LogConfig, tilt: StartTilt
 ) -> Iterator[Finding]:
@@ -737,7 +808,7 @@ def reference_findings(
     start = right.calibration.start
     reference = right.true_poses
     if reference is None:
-        yield from tilt_findings(tilt, start, start.rpy_rad[2])
+        yield from tilt_findings(tilt, right.calibration, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, reference, right.calibration)
     offset = with_instant(found.offset, right.imu)
@@ -757,7 +828,7 @@ def reference_findings(
     # rows on the start must not contradict each other
     is_wrong = heading is not None and heading.acts
     yaw_rad = heading.rpy_rad[2] if heading and is_wrong else start.rpy_rad[2]
-    yield from tilt_findings(tilt, start, yaw_rad)
+    yield from tilt_findings(tilt, right.calibration, yaw_rad)
     if heading is not None:
         yield heading.finding(tilt)
 

@@ -67,13 +67,19 @@ def sighting_changes(
     lever = mounting.translation()
     # a sonar's image has no elevation: landmarks are taken as level with it
     azimuth = sign * seen.azimuth_rad[i]
-    ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
-    place = lever + (seen.range_m[i, None] * ahead) @ R.T  # (k, 3)
+
+    def place_of(azimuth: Floats) -> Floats:
+        """Landmarks in the body at the first sighting, shape (k, 3)."""
+        ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
+        return np.asarray(lever + (seen.range_m[i, None] * ahead) @ R.T)
+
+    as_seen = place_of(azimuth)
+    to_the_left = place_of(azimuth + np.pi / 2)
     path = motion.reference(motion.path_m)
     yaw = motion.reference(motion.yaw_rad)
     height = motion.reference(motion.height_m)
 
-    def after(at: Floats) -> Floats:
+    def after(at: Floats, place: Floats = as_seen) -> Floats:
         """Landmarks in the sonar at the second sighting, at times of any shape (..., k); NaN: unknown."""
         t_j = np.asarray(at)
         t_i = t_j - (t[j] - t[i])
@@ -87,8 +93,9 @@ def sighting_changes(
         found[motion.part_at(t_i) != motion.part_at(t_j)] = np.nan
         return np.asarray(found)
 
-    def by_range(at: Floats) -> Floats:
-        return np.asarray(np.linalg.norm(after(at), axis=-1) - seen.range_m[i])
+    def by_range(at: Floats, place: Floats = as_seen) -> Floats:
+        found = after(at, place)
+        return np.asarray(np.linalg.norm(found, axis=-1) - seen.range_m[i])
 
     def by_azimuth(at: Floats) -> Floats:
         found = after(at)
@@ -96,16 +103,19 @@ def sighting_changes(
         return np.asarray(wrap_angle(turned))
 
     def by_others(at: Floats) -> Floats:
-        """What a current of 1 m/s along each axis of the path, and a height of sqrt(2) m, take off a range, shape (k, 3).
+        """What a current of 1 m/s along each axis of the path, and a height of sqrt(2) m, take off a range, shape (k, 4).
+
+        The last column is the change of a range whose landmark is 90 degrees to the left.
 
         A landmark at a height h over the sonar comes nearer by cos(e) times as much, ``1 - h^2 / (2 r^2)``.
         """
-        level = place[:, 0] + 1j * place[:, 1]
+        level = as_seen[:, 0] + 1j * as_seen[:, 1]
         towards = level * np.exp(1j * yaw(at - (t[j] - t[i]))) / np.abs(level)
         apart_s = (t[j] - t[i])[:, None]
         of_height = by_range(at) / seen.range_m[i] ** 2
         by_current = apart_s * np.column_stack([towards.real, towards.imag])
-        return np.asarray(-np.column_stack([by_current, of_height]))
+        turned = by_range(at, to_the_left)
+        return np.column_stack([-by_current, -of_height, turned])
 
     changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     longer = seen.range_m[j] - seen.range_m[i]

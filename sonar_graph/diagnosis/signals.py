@@ -28,7 +28,7 @@ from sonar_graph.navigation.alignment import Estimate1D
 Values = NDArray[np.floating | np.complexfloating]
 LAGS_S = np.arange(-4.0, 4.01, 0.25)
 BLOCKS = (12, 6)
-"""Numbers of blocks of a stretch, of which the larger variance counts."""
+"""Numbers of blocks of a stretch; the larger variance counts."""
 FEWEST_ROWS = 8
 ROUNDS = 4
 OUTLYING = 6.0
@@ -363,7 +363,10 @@ def steps(
     t = seconds[known]
     excess = as_columns(y - x)[known]
     near = median_changes(excess, STEP_ROWS)
-    size = np.minimum(near, median_changes(excess, 3 * STEP_ROWS))
+    wide = median_changes(excess, 3 * STEP_ROWS)
+    size = np.minimum(near, wide)
+    # what drifts away changes by three times as much
+    size[near < wide / 2] = 0.0
     size[size < ratio * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
     typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
     least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)

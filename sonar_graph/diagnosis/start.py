@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, ImuCalibration, Mounting, Start
+from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     NO_NEED,
@@ -43,6 +43,8 @@ LEAST_LEVER_M = 0.05
 """A turn of 0.2 rad/s makes 0.01 m/s of it, the noise of a good Doppler log."""
 LEAST_BIAS_RAD_S = 1e-4
 """The Earth's rotation, 7.3e-5 rad/s, may be in the bias."""
+LARGE_TURN_RAD = np.radians(10.0)
+"""Of a heading, of a mounting, of the start: beyond, results are doubtful."""
 AXES = "xyz"
 ARM = "lever arm from IMU to DVL"
 BIAS = "gyro bias"
@@ -57,7 +59,7 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
     if not any(estimate.is_known for estimate in found.lever):
         return [Finding(ARM, found.lever[0], "m")]
     given = given_arm(calibration)
-    # the line has all three axes, of which those that fit stay as they are
+    # the line has all three axes; those that fit stay as they are
     wrong = arm_error(found, calibration)
     imu = np.subtract(calibration.imu.mounting.translation_m, wrong)
     dvl = np.add(calibration.dvl.mounting.translation_m, wrong)
@@ -94,25 +96,59 @@ def arm_error(found: DvlMatch, calibration: Calibration) -> Floats:
 
 
 def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
-    """Calibration with the changes that the findings advise: place of the IMU, sigma of the gyro bias."""
+    """Calibration with the place of the IMU that the findings advise."""
     imu = calibration.imu
     place = np.subtract(imu.mounting.translation_m, arm_error(found, calibration))
     moved = imu.mounting.model_copy(update={"translation_m": tuple(place.tolist())})
-    sigma = imu.gyro_bias_sigma
-    if any(matters(bias, LEAST_BIAS_RAD_S, sigma) for bias in found.gyro_bias):
-        sigma = largest(found.gyro_bias)
-    changed = imu.model_copy(update={"mounting": moved, "gyro_bias_sigma": sigma})
+    changed = imu.model_copy(update={"mounting": moved})
     return calibration.model_copy(update={"imu": changed})
 
 
+def without_bias(imu: Imu, calibration: Calibration) -> Imu:
+    """Rows whose rates are less the bias that the calibration states."""
+    unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
+    return replace(imu, angular_velocity=unbiased)
+
+
+def acting_bias(bias: Estimates3D, imu: ImuCalibration) -> list[Estimate1D]:
+    """Biases along the axes of the body that the calibration does not allow; zero, and sure, along the other axes."""
+    none = Estimate1D(0.0, 0.0)
+    sigma = imu.gyro_bias_sigma
+    return [one if matters(one, LEAST_BIAS_RAD_S, sigma) else none for one in bias]
+
+
+def with_bias(bias: Estimates3D, imu: ImuCalibration) -> ImuCalibration:
+    """Calibration with the bias and its sigma that the findings advise."""
+    acting = acting_bias(bias, imu)
+    along_imu = imu.mounting.pose().rotation().matrix().T @ [
+        one.value for one in acting
+    ]
+    whole = np.add(imu.gyro_bias_rad_s, along_imu)
+    sigma = max(imu.gyro_bias_sigma, *(one.sigma for one in acting))
+    update = {"gyro_bias_rad_s": tuple(whole.tolist()), "gyro_bias_sigma": sigma}
+    return imu.model_copy(update=update)
+
+
 def bias_findings(
-    bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration
+    bias: Estimates3D,
+    sources: tuple[str, str, str],
+    imu: ImuCalibration,
+    D_heading: Floats,
 ) -> list[Finding]:
-    """One row for each body axis with its source, such as "from 12 s of rest"; a single row where no axis is known."""
+    """One row for each body axis with its source, such as "from 12 s of rest"; a single row where no axis is known.
+
+    ``D_heading``: derivative of the heading at the end by the bias, shape (3,), s. Gravity holds roll and pitch.
+    """
     if not any(estimate.is_known for estimate in bias):
         return [Finding(BIAS, bias[0], "rad/s")]
     allowed = imu.gyro_bias_sigma
-    line = f"`imu.gyro_bias_sigma = {largest(bias):.2g}` {IN_CALIBRATION}, for estimators that find the bias"
+    right = with_bias(bias, imu)
+    line = (
+        f"`imu.gyro_bias_rad_s = {numbers(right.gyro_bias_rad_s, 5)}` and "
+        f"`imu.gyro_bias_sigma = {right.gyro_bias_sigma:.2g}` {IN_CALIBRATION}"
+    )
+    turned_rad = D_heading @ [one.value for one in acting_bias(bias, imu)]
+    is_grave = abs(turned_rad) > LARGE_TURN_RAD
     rows = list[Finding]()
     for axis, estimate, source in zip(AXES, bias, sources, strict=True):
         fits = (
@@ -121,14 +157,10 @@ def bias_findings(
         row = Finding(f"{BIAS}, {axis}", estimate, "rad/s", fits)
         if matters(estimate, LEAST_BIAS_RAD_S, allowed):
             cause = f"{source}, beyond the calibration's sigma of {allowed:.2g}"
-            row = replace(row, cause=cause, line=line, gravity=gravity_of(True, False))
+            gravity = gravity_of(True, is_grave)
+            row = replace(row, cause=cause, line=line, gravity=gravity)
         rows.append(row)
     return said_once(rows)
-
-
-def largest(bias: Estimates3D) -> float:
-    """Largest of the biases that are known, without sign."""
-    return max((abs(one.value) for one in bias if one.is_known), default=0.0)
 
 
 def turned_mounting(
@@ -145,8 +177,6 @@ FEWEST_HEADINGS = 5
 RESTS_S = (10, 20, 40, 80, 160)
 """Tried lengths of a rest at the start; the longest that holds counts."""
 LEAST_TILT_RAD = np.radians(0.25)
-LARGE_TILT_RAD = np.radians(10.0)
-"""Of the stated start against gravity: beyond, gravity is taken for motion, and results are doubtful."""
 LEAST_HEADING_RAD = np.radians(1.0)
 """Smaller errors are hidden by others."""
 TURN_OVER_NS = NS_PER_S
@@ -155,11 +185,11 @@ LEAST_SPREAD_RAD = np.radians(0.1)
 
 @dataclass(frozen=True)
 class StartTilt:
-    """Alignment at the start of a log, or the reason why there is none."""
+    """Alignment at the start of a log, or the reason why it is missing."""
 
     tilt: InitialTilt | None
     said: str
-    """Source, such as "from 20 s of rest", or the reason why there is none."""
+    """Source, such as "from 20 s of rest", or the reason why it is missing."""
     is_rest: bool = False
 
     def angle(self, axis: int) -> Estimate1D:
@@ -170,7 +200,7 @@ class StartTilt:
         return Estimate1D(value, float(np.sqrt(self.tilt.covariance[axis, axis])))
 
     def gyro_bias(self) -> Estimates3D | None:
-        """Bias from a rest; None in motion, where the whole drive tells more than its first minute."""
+        """Bias from a rest; None in motion, where the whole drive shows more than its first minute."""
         if self.tilt is None or not self.is_rest:
             return None
         sigmas = np.sqrt(np.diag(self.tilt.covariance)[2:]).tolist()
@@ -208,7 +238,7 @@ def lacks_gravity(sequence: Sequence) -> bool:
 
 
 def rest_tilt(sequence: Sequence) -> StartTilt:
-    """Alignment at the longest rest at the start, or why there is none."""
+    """Alignment at the longest rest at the start, or why it is missing."""
     found = StartTilt(None, "no rows")
     for rest_s in RESTS_S:
         imu, dvl = beginning(sequence, rest_s)
@@ -263,8 +293,14 @@ def turn_by_heading(
     return replace(tilt, gyro_bias=tilt.gyro_bias - rate * up, covariance=covariance)
 
 
-def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Finding]:
-    """One row each for roll and pitch, and a line for the calibration with this heading; a single row without them."""
+def tilt_findings(
+    found: StartTilt, calibration: Calibration, yaw_rad: float
+) -> list[Finding]:
+    """One row each for roll and pitch, and a line for the calibration with this heading; a single row without them.
+
+    Where a start is stated, gravity differs from it by a wrong start or by a wrong mounting of the IMU.
+    """
+    start = calibration.start
     roll = found.angle(0)
     pitch = found.angle(1)
     if found.tilt is None:
@@ -273,6 +309,12 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
         f"`start.rpy_rad = {numbers((roll.value, pitch.value, yaw_rad), 4)}`, `start.rpy_sigma_rad = "
         f"[{roll.sigma:.2g}, {pitch.sigma:.2g}, {start.rpy_sigma_rad[2]:.2g}]` {IN_CALIBRATION}"
     )
+    if start.source == "stated" and "rpy_rad" in start.model_fields_set:
+        turned = calibration.imu.mounting
+        for axis, angle, given in zip("xy", (roll, pitch), start.rpy_rad, strict=False):
+            rpy_rad = turned_mounting(turned, angle.value - given, axis)
+            turned = turned.model_copy(update={"rpy_rad": rpy_rad})
+        line += f" or, if that start is sure, `imu.mounting.rpy_rad = {numbers(turned.rpy_rad, 4)}`"
     rows = list[Finding]()
     for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
         given = start.rpy_rad[axis]
@@ -286,7 +328,7 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
         )
         if matters(error, LEAST_TILT_RAD, start.rpy_sigma_rad[axis]):
             cause = f"{found.said}, not {stated}"
-            gravity = gravity_of(True, abs(error.value) > LARGE_TILT_RAD)
+            gravity = gravity_of(True, abs(error.value) > LARGE_TURN_RAD)
             row = replace(row, cause=cause, line=line, gravity=gravity)
         rows.append(row)
     return said_once(rows)
@@ -350,8 +392,8 @@ def beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | Non
     """Rows of so long from the start on."""
     before_ns = sequence.start_ns - 1
     until_ns = sequence.start_ns + round(seconds * NS_PER_S)
-    imu = sequence.imu.between(before_ns, until_ns)
-    return imu, sequence.dvl.between(before_ns, until_ns)
+    imu = without_bias(sequence.imu, sequence.calibration)
+    return imu.between(before_ns, until_ns), sequence.dvl.between(before_ns, until_ns)
 
 
 def without_advice(error: AlignmentError) -> str:

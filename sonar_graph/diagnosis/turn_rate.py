@@ -42,9 +42,9 @@ LEAST_NOISE_M_S = 0.01
 LARGEST_SCALE_SIGMA = 0.05
 """Of the Doppler log's scale along the velocity, up to which it is divided out."""
 LARGEST_SCALE = 0.2
-"""Deviation of that scale beyond which it is none."""
+"""Deviation of that scale beyond which it is wrong."""
 UNKNOWN_SCALE = 0.05
-"""Sigma of that scale where the speed is too even to tell it."""
+"""Sigma of that scale where the speed is too even to show it."""
 NOISE_RATIO = 3.0
 """Accelerations over `UP_OVER_S` by the Doppler log are so many of its sigmas off, with what the hull swings."""
 SCATTERED = 2.0
@@ -111,7 +111,7 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
 
 
 def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
-    """Rate about the vertical that accelerometers and Doppler log contradict; None: it is right, or cannot be told.
+    """Rate about the vertical that accelerometers and Doppler log contradict; None: it is right, or cannot be found.
 
     A scale is one that the data bear out: with it the contradiction is gone. Without one the rate counts as wrong only
     where r is larger across the velocity than along it.

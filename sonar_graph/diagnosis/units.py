@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sonar_graph.diagnosis.findings import (
+    IN_CALIBRATION,
     IN_LOG_CONFIG,
     NO_NEED,
     Finding,
@@ -43,6 +44,9 @@ USUAL_SPEED_M_S = 3.0
 MEDIAN_ROWS = 9
 LARGEST_RANGE_RATIO = 10.0
 """Changes of range by the Doppler log over those measured: 1 but for noise and turns, 100 in cm/s."""
+COARSE_SIGMAS = 5.0
+FEWEST_CHANGES = 5
+STEP_TOLERANCE = 0.01
 HIGH_PERCENTILE = 95.0
 LEAST_SECONDS = 30
 LEAST_TILTING_RAD_S = 0.02
@@ -54,6 +58,71 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Velocities, rates and specific forces in an implausible unit; the configured scales enter the lines."""
     checks = (velocity_unit, rate_unit, force_unit)
     return [finding for check in checks for finding in check(sequence, config)]
+
+
+def coarse_findings(sequence: Sequence) -> list[Finding]:
+    """Velocities and rates that come in steps far above their stated noise, rounded or cut by a driver.
+
+    Where noise is above the step of a sensor, rows differ and means are right. Else a cut towards zero takes half of a
+    step off most rows.
+    """
+    calibration = sequence.calibration
+    if calibration.odometry_interpolation != "linear":
+        return []
+    imu = sequence.imu
+    interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
+    gyro_sigma = calibration.imu.gyro_noise_density / np.sqrt(max(interval_s, 1e-9))
+    dvl_sigma = max(calibration.dvl.velocity_sigma_m_s)
+    of_dvl = "`dvl.velocity_sigma_m_s = [{0:.2g}, {0:.2g}, {0:.2g}]`"
+    rows = [
+        ("DVL", "m/s", sequence.dvl.velocity, dvl_sigma, of_dvl),
+        (
+            "gyro",
+            "rad/s",
+            imu.angular_velocity,
+            gyro_sigma,
+            "`imu.gyro_bias_sigma = {0:.2g}`",
+        ),
+    ]
+    if sequence.depth is not None:
+        depth_sigma = calibration.depth.sigma_m
+        of_depth = "`depth.sigma_m = {0:.2g}`"
+        z_m = sequence.depth.z_m[:, None]
+        rows.append(("depth", "m", z_m, depth_sigma, of_depth))
+    found = list[Finding]()
+    for name, unit, values, sigma, line in rows:
+        step = coarse_step(values)
+        if step / 2 <= COARSE_SIGMAS * sigma:
+            continue
+        finding = Finding(
+            f"{name}: resolution",
+            Estimate1D(step, 0.0),
+            unit,
+            cause=f"values come in steps, most rows repeat, and the stated noise of {sigma:.2g} is far below: rounded or "
+            "cut by the driver",
+            consequence=f"an error of {step / 2:.2g} typically where they are cut",
+            line=f"record all digits, or state {line.format(step / 2)} {IN_CALIBRATION}",
+            gravity=Gravity.GRAVE,
+        )
+        found.append(finding)
+    return found
+
+
+def coarse_step(values: Floats) -> float:
+    """Largest step of the axes on which most of the rows, shape (n, k), repeat the one before; 0 without such an axis."""
+    steps = np.abs(np.diff(values, axis=0))
+    steps = steps[np.isfinite(steps).all(axis=1)]
+    coarsest = 0.0
+    for column in steps.T:
+        changes = column[column > 0]
+        if not FEWEST_CHANGES <= len(changes) < len(column) / 2:
+            continue
+        step = float(changes.min())
+        # noise of a sensor that stood still has no step in common
+        multiples = changes / step
+        if np.abs(multiples - np.round(multiples)).max() < STEP_TOLERANCE:
+            coarsest = max(coarsest, step)
+    return coarsest
 
 
 def unit_finding(sensor: str, cause: str, line: str) -> Finding:
@@ -199,7 +268,7 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
     by_dvl = np.abs(np.einsum("ak,ka->k", moved, (u[i] + u[j]) / 2))
     measured = np.abs(seen.range_m[j] - seen.range_m[i])
     least = calibration.sonar.range_sigma_m
-    # the range of a landmark abeam hardly changes: a change below the noise is none
+    # the range of a landmark abeam hardly changes: a change below the noise does not count
     return max(float(np.median(measured)), least), float(np.median(by_dvl))
 
 

@@ -6,7 +6,7 @@ from sonar_graph import at_first_use
 
 if TYPE_CHECKING:
     from sonar_graph.logs.amending import Amended, write_amended
-    from sonar_graph.logs.checks import OTHER_WAYS, STEPPED_BACK, axis_doubts, gravity_warning, is_without_gravity, stuck_quantities, unfelt_zeros  # noqa: E501
+    from sonar_graph.logs.checks import DRIFTING, FELT_ALONG, OTHER_WAYS, STEPPED_BACK, axis_doubts, gravity_warning, is_without_gravity, stuck_quantities, unfelt_zeros  # noqa: E501
     from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
     from sonar_graph.logs.live_record import DROPPED_TOPIC, LATENESS, LIVE_RATE, LiveRecord, dropped_in, pinned
     from sonar_graph.logs.reading import Assembly, read_log, row_notes, rows_of
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = at_first_use(__name__)
 __all__ = [
-    "Amended", "Assembly", "Choice", "DETECTIONS", "DROPPED_TOPIC", "ImagesAlone", "LATENESS", "LIVE_RATE",
-    "LiveRecord", "LogSummary", "METADATA", "OTHER_WAYS", "PICTURES", "PartialCalibration", "Picture", "ROLES",
+    "Amended", "Assembly", "Choice", "DETECTIONS", "DRIFTING", "DROPPED_TOPIC", "FELT_ALONG", "ImagesAlone", "LATENESS",
+    "LIVE_RATE", "LiveRecord", "LogSummary", "METADATA", "OTHER_WAYS", "PICTURES", "PartialCalibration", "Picture", "ROLES",
     "STEPPED_BACK", "TopicSummary", "Window", "axis_doubts", "choose_each", "choose_topics", "detection_messages",
     "dropped_in", "gravity_warning", "inspect_log", "is_without_gravity", "joined_calibration", "lacking_navigation",
     "landmark_map_message", "landmark_markers", "no_images", "pinned", "read_images_alone", "read_log",

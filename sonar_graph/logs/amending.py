@@ -44,10 +44,10 @@ _Message = tuple[int, int, int, bytes, int]
 
 @dataclass
 class Amended:
-    """Account of a log that was written anew."""
+    """Account of a log that was rewritten."""
 
     replaced: Counter[str] = field(default_factory=Counter)
-    """Number of messages left out because their topic was written anew."""
+    """Number of messages left out because their topic was rewritten."""
     notes: dict[str, str] = field(default_factory=dict)
     """Parts that could not be copied, by subject as in `Recording.notes`."""
 
@@ -71,7 +71,7 @@ def write_amended(
     target
         Another file; one that exists is replaced when the new one is complete.
     added
-        Messages on topics that the log does not have, or that are written anew.
+        Messages on topics that the log does not have, or that are rewritten.
     more
         The same for messages that do not fit into memory at once, such as images: entries of one topic in the order of
         time, each taken when the one before is written.
@@ -133,7 +133,7 @@ class _AmendedCopy:
         writer = self._writer.mcap
         amended = self._amended
         damage = Damage()
-        # those of ``more`` are asked first: their topic is taken before the log's are copied
+        # those of ``more`` go first: their topic is taken before the log's are copied
         merged = heapq.merge(
             self._streamed(more),
             self._recorded(),
@@ -222,7 +222,7 @@ class _AmendedCopy:
                 yield int(time_ns[row]), channel, published_ns, payload, number
 
     def _channel(self, piece: ChunkPart, passage: Passage) -> int | None:
-        """Channel of messages in the copy; None where their topic is written anew."""
+        """Channel of messages in the copy; None where their topic is rewritten."""
         first_ns = int(piece.found.log_times_ns.min())
         self._beginning_ns = (
             first_ns

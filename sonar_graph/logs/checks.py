@@ -26,6 +26,7 @@ MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
 LEAST_PART_UPWARDS = 0.7
 """Part of the typical specific force that must point up in the body."""
+FELT_ALONG = "gravity is felt along"
 OTHER_WAYS = "specific forces point another way from row to row"
 SAME_DIRECTION = 0.5
 """Length of the typical force over the typical length, below which rows contradict each other."""
@@ -71,6 +72,7 @@ _ROTATIONS = {
 
 
 DAY_S = 86_400.0
+DRIFTING = "stamps and recording drift apart"
 
 
 def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
@@ -105,7 +107,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
         float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:])
     )
     if abs(last_s - first_s) > LARGEST_LAG_CHANGE_S:
-        yield f"stamps and recording drift apart by {abs(last_s - first_s):.3g} s: a clock jumped or runs wrong"
+        yield f"{DRIFTING} by {abs(last_s - first_s):.3g} s: a clock jumped or runs wrong"
 
 
 def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
@@ -242,7 +244,7 @@ def gravity_warning(
     """Warning when the median specific force, shape (n, 3), is not gravity upwards in the body; None: nothing is wrong.
 
     Vehicles that can be navigated at all are near level most of the time. A force that differs from gravity by more
-    than a fifth says nothing about axes, but something about units.
+    than a fifth is a wrong unit, not a wrong axis.
     """
     measured = specific_force[np.isfinite(specific_force).all(axis=1)]
     if not len(measured):
@@ -271,7 +273,7 @@ def gravity_warning(
     advice = 'give rotation = "frd", or linear_acceleration_scale = -1 where only the sign is wrong'
     if rotation is not None:
         advice = f"give rotation = {rotation} or the IMU's mounting"
-    return f"gravity is felt along {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
+    return f"{FELT_ALONG} {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
 
 
 def row_doubts(
@@ -284,7 +286,7 @@ def row_doubts(
     """
     gravity_m_s2 = calibration.gravity_m_s2
     mounting = calibration.imu.mounting
-    # its owner has said that gravity was taken out
+    # its owner has stated that gravity was taken out
     is_said = not calibration.use_gravity
     is_said &= is_without_gravity(imu.specific_force, gravity_m_s2)
     gravity = gravity_warning(imu.specific_force, mounting, gravity_m_s2)
@@ -461,7 +463,7 @@ def burst_period_s(stamps_ns: Ints) -> float:
 
 
 def axes_warning(adapter: Adapter) -> str | None:
-    """Warning for a type whose definition has z down, read as z up; for a DVL of which no mounting is known."""
+    """Warning for a type whose definition has z down, read as z up; for a DVL without a known mounting."""
     if adapter.type not in Z_DOWN_TYPES or adapter.rotation != "flu":
         return None
     return (
@@ -471,7 +473,7 @@ def axes_warning(adapter: Adapter) -> str | None:
 
 
 def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
-    """Warning about single samples, shape (n, 3), that differ from both neighbours, which agree; None: there is none.
+    """Warning about single samples, shape (n, 3), that differ from both neighbours, which agree; None without one.
 
     ``e_k = |w_k - (w_k-1 + w_k+1) / 2|`` is a spike above the least of `SPIKES` and `SPIKE_RATIO` times its 99 %
     quantile, where ``|w_k+1 - w_k-1| < e_k / 2``.
@@ -503,10 +505,10 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
 def stuck_warning(
     stamps_ns: Ints, values: Floats, quantity: str, way_m: Floats | None = None
 ) -> str | None:
-    """Warning about stretches of rows, shape (n, k), that are equal to the bit, zeros or not; None: there are none.
+    """Warning about stretches of rows, shape (n, k), that are equal to the bit, zeros or not; None without any.
 
     Such rows are used as they are. A coarse sensor may look the same. With ``way_m``, the way of the vehicle until each
-    row, shape (n,), a stretch counts only where the vehicle is not at rest, and where its m of n rows, of which a share p
+    row, shape (n,), a stretch counts only where the vehicle is not at rest, and where its m of n rows, with a share p that
     repeats the row before, come by chance less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
     differs = np.any(values[1:] != values[:-1], axis=1)
@@ -541,7 +543,7 @@ def stuck_warning(
 
 
 def runs_of(differs: NDArray[np.bool_]) -> tuple[Ints, Ints]:
-    """First and last rows of runs of equal rows, of which ``differs`` tells each row but the first from the one before."""
+    """First and last rows of runs of equal rows; ``differs``: whether each row but the first differs from the one before."""
     first = np.concatenate([[0], np.flatnonzero(differs) + 1])
     last = np.concatenate([first[1:] - 1, [len(differs)]])
     return first, last
@@ -601,7 +603,7 @@ def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, NDArray[np.bool_]]:
 
 
 def stuck_doubt(stamps_ns: Ints, stuck: NDArray[np.bool_], quantity: str) -> str | None:
-    """Doubt about a quantity with stuck rows, shape (n,); None: there are none."""
+    """Doubt about a quantity with stuck rows, shape (n,); None without any."""
     if not stuck.any():
         return None
     edges = np.diff(np.concatenate([[0], stuck.astype(int), [0]]))

@@ -304,7 +304,7 @@ def inspect_log(
 
 
 def _summarise(topic: Topic) -> TopicSummary:
-    if not len(topic):  # none of its messages is what its definition says
+    if not len(topic):  # none of its messages is as its definition has it
         counts = (f"{count} messages {fault}" for fault, count in topic.unsound.items())
         lost = f"has {', '.join(counts)}"
         return TopicSummary(topic.name, topic.type_name, topic.encoding, refusal=lost)

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 DROPPED_TOPIC = "/sonar_graph/dropped"
 LIVE_RATE = "live.rate_hz"
 LATENESS = "live.lateness_s"
-"""Notes that say how often the live estimator was asked, and its lateness budget."""
+"""Notes on how often the live estimator was queried, and its lateness budget."""
 NEWEST_FRAMES = "live.newest_frames_ns"
 """Note with the log time of the newest transforms that the calibration was gathered from; later ones did not count."""
 

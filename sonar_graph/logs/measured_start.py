@@ -24,7 +24,7 @@ from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.numerics import running_rotations
 
 NEAREST_ROWS = 5
-"""Rows about the start of which the median counts, so that one wrong row does not."""
+"""Rows about the start whose median counts, so that one wrong row does not."""
 WIDER = 3.0
 """Factor from a row's sigma to the start's: the rows are measurements too, and so count twice by a ninth only."""
 LEVEL_S = 20.0

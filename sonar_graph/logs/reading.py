@@ -1,7 +1,7 @@
 """Reading of logs: a `Sequence` from the topics of an MCAP file.
 
 The topics are chosen by role (`sonar_graph.logs.roles`), their messages read by adapters (`sonar_graph.logs.adapters`),
-and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of the sequence, under ``log.*``, say what
+and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of the sequence, under ``log.*``, state what
 was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md).
 """
 
@@ -125,7 +125,7 @@ NOISE_FIELDS = {
     "positions": ("covariance_m2", "positions.sigma_m"),
     "detections": ("range_azimuth_cov", "sonar.range_sigma_m and azimuth_sigma_rad"),
 }
-"""Column of each block that says its noise, and the calibration's fields that count where it is NaN."""
+"""Column of each block that states its noise, and the calibration's fields that count where it is NaN."""
 
 
 def read_log(
@@ -150,19 +150,19 @@ def read_log(
     path
         An MCAP file.
     calibration
-        A `Calibration` replaces everything that the file says. A `PartialCalibration`, or the path of a TOML or JSON
+        A `Calibration` replaces everything that the file states. A `PartialCalibration`, or the path of a TOML or JSON
         file of one, goes before it, field by field.
         Without either the file's record holds; without a record, defaults with the mountings of ``/tf_static``.
     topics
         Topics by role (``imu``, ``dvl``, ``depth``, ``heading``, ``positions``, ``detections``, ``truth``,
-        ``true_landmarks``), where several fit or none is found by type and name; they go before those of `config`.
+        ``true_landmarks``), where several fit or nothing is found by type and name; they go before those of `config`.
     config
         Description of the topics of a foreign log, or the path of a TOML file with one.
     window
         Part of the recording to read: a `TimeWindow`, or start and end in seconds from its beginning, ``(0, 10)``.
         ``/tf_static`` and other latched topics are read whenever recorded.
     salvage
-        Read what is whole of a file that is damaged in its middle; the note ``log.damage`` says what is lost.
+        Read what is whole of a file that is damaged in its middle; the note ``log.damage`` states what is lost.
     progress
         Called with the bytes read so far and the bytes in all.
 
@@ -272,7 +272,7 @@ class Assembly:
 
     ``sonar`` is the frame of the sonar that took images (`sonar_frame`).
 
-    Raises LogError when no message of a needed topic is what its definition says, and CalibrationError when the
+    Raises LogError when no message of a needed topic is as its definition has it, and CalibrationError when the
     calibration in the log is invalid, or becomes so by the user's changes.
     """
 
@@ -453,7 +453,7 @@ class Assembly:
         else:
             values = getattr(rows, VALUES[role]).reshape(len(rows), -1)
             stuck = repeats(values, moved, least)
-            # of a few rows none is beside enough others, and the first fix on the Earth is the origin, exactly 0
+            # a few rows are not beside enough others, and the first fix on the Earth is the origin, exactly 0
             is_on_earth = getattr(self.adapters[role], "geodetic", None) is not None
             if len(rows) >= FEWEST_JUDGED and not is_on_earth:
                 zeros = unlikely_zeros(values, moved, least)
@@ -524,7 +524,7 @@ class Assembly:
         )
 
     def _useless(self, role: str) -> LogError:
-        """Refusal of a topic of which no message can be used."""
+        """Refusal of a topic without a usable message."""
         topic = self.topics[role]
         faults = self._dropped.get(role, {})
         keys = ", ".join(filter(None, map(self.adapters[role].accepts, faults)))
@@ -722,7 +722,7 @@ def unsaid_noise(
 ) -> Iterator[str]:
     """Sensors with rows of unknown covariance, for which the noise of the calibration counts; blocks by role.
 
-    With ``only_partly`` those of which other rows say one: a sensor that mostly knows its noise and here does not.
+    With ``only_partly`` those whose other rows state one: a sensor that mostly knows its noise and here does not.
     """
     for role, (column, fields) in NOISE_FIELDS.items():
         if blocks.get(role) is None:

@@ -47,12 +47,12 @@ class Role:
     is_required: bool = False
 
     def may_play(self, topic: Topic) -> bool:
-        """Tell whether a topic's name allows the role: what is called truth is no measurement."""
+        """True where a topic's name allows the role: what is called truth is no measurement."""
         is_truth = any(word in topic.name.lower() for word in TRUTH_WORDS)
         return self.name in ("truth", "true_landmarks") or not is_truth
 
     def fits(self, topic: Topic, *, general: bool) -> bool:
-        """Tell whether a topic fits one of the shipped adapters, of those that are general or of the others."""
+        """True where a topic fits one of the shipped adapters, of those that are general or of the others."""
         name = topic.name.lower()
         kind = short_name(topic.type_name)
         return self.may_play(topic) and any(
@@ -83,7 +83,7 @@ class Choice:
     candidates: tuple[str, ...] = ()
     """Topics that fit, where they are several."""
     could_be: tuple[str, ...] = ()
-    """Topics of a fitting type whose names do not say that they play the role."""
+    """Topics of a fitting type whose names do not show that they play the role."""
     is_off: bool = False
     """The user wants nothing to play it."""
 
@@ -126,7 +126,7 @@ def refusal(topic: Topic) -> str | None:
 
 
 def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
-    """Adapter for a topic in a role, or the reason why there is none."""
+    """Adapter for a topic in a role, or the reason why it is missing."""
     # first what no role can read
     if (reason := refusal(topic)) is not None:
         return reason
@@ -152,7 +152,7 @@ def choose_topic(
     config: LogConfig = _DEFAULTS,
     wanted: str | None = None,
 ) -> Choice:
-    """Choose the topic for a role and its adapter; where there is none, the choice has a reason instead of an error.
+    """Choose the topic for a role and its adapter; without one, the choice has a reason instead of an error.
 
     A topic that the user ``wanted`` goes before that of the configuration, and this before a search by type. A
     configuration that names fields which the messages do not have is refused.
@@ -236,7 +236,7 @@ Window = TimeWindow | tuple[float | str | None, float | str | None]
 
 
 def as_window(value: Window | None, call: str) -> TimeWindow | None:
-    """A time window; an `ArgumentError` that names the ``call`` where a value is none."""
+    """A time window; an `ArgumentError` that names the ``call`` where a value is no time."""
     if isinstance(value, TimeWindow | None):
         return value
     if isinstance(value, tuple | list) and len(value) == 2:
@@ -310,7 +310,7 @@ def choose_each(
 ) -> dict[str, Choice]:
     """Choose the topic for each role (`choose_topic`).
 
-    Of several orientations that of the topic in use as IMU is the heading, with the stamps and axes said of the IMU.
+    Of several orientations that of the topic in use as IMU is the heading, with the stamps and axes stated for the IMU.
     """
     choices = {
         name: choose_topic(ROLES[name], recording, config, wanted.get(name))

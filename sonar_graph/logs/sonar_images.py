@@ -61,9 +61,9 @@ def lacking_navigation(
     config: LogConfig | None = None,
     window: TimeWindow | None = None,
 ) -> list[str]:
-    """Roles of `NAVIGATION` that no topic of a log plays, where the user did not ask for one.
+    """Roles of `NAVIGATION` that no topic of a log plays, where the user did not name one.
 
-    Of several that fit, the user is asked when the log is read.
+    Of several that fit, reading the log refuses and lists them.
     """
     config = config or LogConfig()
     # types are enough: nothing is decompressed
@@ -89,7 +89,7 @@ def read_images_alone(
     window: TimeWindow | None = None,
     salvage: bool = False,
 ) -> ImagesAlone:
-    """Read the setup of a log of which only the sonar images are used.
+    """Read the setup of a log that is used for its sonar images alone.
 
     Parameters are those of `read_sonar_frames`, with the fields of a calibration that go before the log's own.
 
@@ -172,7 +172,7 @@ def joined_calibration(
     """JSON of the calibration of a navigation, with what images of another log know of their sonar.
 
     What the user gives goes before both. The sonar's mounting is that of the navigation's record or ``/tf_static``, or
-    else that of the images'; where nothing states one, none is stated. ``topic`` is that of the images.
+    else that of the images'; without either it stays unstated. ``topic`` is that of the images.
     """
     known = recorded_fields(navigation)
     own = recorded_fields(images).get(SONAR, {})
@@ -232,10 +232,10 @@ def read_sonar_frames(
     Raises
     ------
     MissingTopicError
-        When the topic that was asked for is not there, or is none that can be read.
+        When the wanted topic is missing, or cannot be read.
     LogError
         When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
-        image is not what its message says (without ``refused``). A log without sonar images gives no block.
+        image is not as its message states (without ``refused``). A log without sonar images gives no block.
     """
     call = "read_sonar_frames"
     path = as_path(path, f"{call}(path)")

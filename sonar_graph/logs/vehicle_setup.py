@@ -38,7 +38,7 @@ METADATA = "sonar_graph"
 """Name of the metadata record with name, calibration and notes."""
 BODY_FRAME = "base_link"
 BODY_FRAMES = (BODY_FRAME, "base_footprint")
-"""Names of the body's frame, of which the first counts that is there."""
+"""Names of the body's frame; the first that is there counts."""
 POSE_FIELDS = tuple(
     f"transforms.transform.{part}.{axis}"
     for part, axes in (("translation", "xyz"), ("rotation", "xyzw"))
@@ -61,7 +61,7 @@ MOUNTING_FIELDS = {
     "positions": "antenna_m",
     "sonar": MOUNTING,
 }
-"""Field of each sensor's section that says where the sensor is."""
+"""Field of each sensor's section that states where the sensor is."""
 
 
 def static_frames(recording: Recording) -> FrameTree:
@@ -176,7 +176,7 @@ def _ancestors(frame: str, frames: FrameTree) -> list[str]:
 
 
 def _pose_in(ancestor: str, names: list[str], frames: FrameTree) -> gtsam.Pose3:
-    """``ancestor_T_frame`` of the first of the names, each of which hangs on the next."""
+    """``ancestor_T_frame`` of the first of the names, where each frame hangs on the next."""
     pose = gtsam.Pose3()
     for name in names[: names.index(ancestor)]:
         parent, parent_T_name = frames[name]
@@ -275,7 +275,7 @@ class PartialCalibration:
         return cls.parse(values, str(path))
 
     def over(self, other: PartialCalibration) -> PartialCalibration:
-        """These fields, and those of another where these say nothing."""
+        """These fields, and those of another where these are unset."""
         return PartialCalibration(
             _over(other.values, self.values), f"{self.source}, else {other.source}"
         )
@@ -285,7 +285,7 @@ class PartialCalibration:
         return list(_paths(self.values))
 
     def before(self, source: str) -> str:
-        """Source of a calibration of which these fields go before those of another source."""
+        """Source of a calibration whose fields here go before those of another source."""
         return f"from {self.source}: {', '.join(self.fields()) or 'nothing'}; else {source}"
 
 
@@ -310,7 +310,7 @@ def gathered(
     Mountings of ``/tf_static`` are by sensor; of ``depth`` and ``positions`` only the translation counts.
     Fields that together are no calibration are a CalibrationError, which names the user's source.
     """
-    # a start that nobody states is not set
+    # an unstated start is not set
     values = Calibration().model_dump(exclude={"start"})
     for sensor, mounting in mountings.items():
         field = MOUNTING_FIELDS[sensor]
@@ -326,7 +326,7 @@ def gathered(
 
 
 def recorded_calibration(calibration: Calibration) -> str:
-    """JSON of a calibration for a log's record, without what nobody stated of the start."""
+    """JSON of a calibration for a log's record, without the unstated part of the start."""
     said = calibration.start.model_fields_set
     exclude: dict[str, bool | set[str]] = {}
     if "start" not in calibration.model_fields_set:
@@ -350,7 +350,7 @@ def static_mounting(path: Path, frame: str) -> Mounting | None:
 
 
 def with_fields(recorded: Values, *changes: Values) -> str:
-    """JSON of a record's calibration with further fields, of which the later ones count."""
+    """JSON of a record's calibration with further fields; later ones count."""
     for change in changes:
         recorded = _over(recorded, change)
     return json.dumps(recorded)
@@ -416,7 +416,7 @@ def read_calibration(recording: Recording) -> Calibration | None:
 
 
 def is_described(recording: Recording) -> bool:
-    """Tell whether a log's record states all of a calibration, as `write_log` does, not only what was added to it."""
+    """True where a log's record states all of a calibration, as `write_log` does, not only what was added to it."""
     try:
         recorded = read_calibration(recording)
     except CalibrationError:

@@ -250,7 +250,7 @@ class Layer:
 
     @property
     def is_shown(self) -> bool:
-        """Tell whether it is on from the start; what another layer shows already is off."""
+        """True where it is on from the start; what another layer shows already is off."""
         return not self.topic.endswith(("/odometry", "/smoothed"))
 
     @property

@@ -59,7 +59,7 @@ from sonar_graph.states import LandmarkMap, Trajectory
 
 WORLD_FRAME = "map"
 NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
-"""Covariance by which ROS marks values that are none."""
+"""Covariance by which ROS marks values as not measured."""
 _SECONDS = np.iinfo(np.int32)
 
 
@@ -139,7 +139,7 @@ def imu_messages(topic: str, imu: Imu) -> Outgoing:
     # ROS marks an acceleration that was not measured by -1 in its covariance
     unmeasured = np.isnan(imu.specific_force).all(axis=1)
     values: dict[str, Value] = {
-        # not measured, but a quaternion of zeros is none and viewers refuse it
+        # not measured, but a quaternion of zeros is invalid and viewers refuse it
         "orientation.w": 1.0,
         "orientation_covariance": NOT_MEASURED[None, :],
         "linear_acceleration_covariance": np.outer(unmeasured, NOT_MEASURED),
@@ -162,7 +162,7 @@ def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
 
 
 def depth_messages(topic: str, depth: Depth) -> Outgoing:
-    """``PoseWithCovarianceStamped`` of which only z counts; it keeps every bit of a height, a pressure does not."""
+    """``PoseWithCovarianceStamped`` whose z alone counts; it keeps every bit of a height, a pressure does not."""
     covariances = np.zeros((len(depth), 6, 6))
     # zeros mean unknown in ROS
     covariances[:, 2, 2] = np.nan_to_num(depth.variance_m2, posinf=np.inf)
@@ -177,7 +177,7 @@ def heading_messages(topic: str, heading: Heading) -> Outgoing:
 
 
 def fix_messages(topic: str, fixes: PositionFixes) -> Outgoing:
-    """``PoseWithCovarianceStamped`` of which the position counts, and the upper left of the covariance."""
+    """``PoseWithCovarianceStamped`` whose position counts, and the upper left of the covariance."""
     is_known = ~np.isnan(fixes.covariance_m2).any(axis=(1, 2))
     covariances = np.zeros((len(fixes), 6, 6))
     covariances[is_known, :3, :3] = fixes.covariance_m2[is_known]
@@ -188,7 +188,7 @@ def fix_messages(topic: str, fixes: PositionFixes) -> Outgoing:
 def _upright_poses(
     topic: str, stamps_ns: Ints, values: Mapping[str, Value], covariances: Floats
 ) -> Outgoing:
-    """Poses without a turn, of which a part is measured; covariances of shape (n, 6, 6)."""
+    """Poses without a turn, measured in part; covariances of shape (n, 6, 6)."""
     pose: dict[str, Value] = {
         "pose.pose.orientation.w": 1.0,
         "pose.covariance": covariances.reshape(-1, 36),

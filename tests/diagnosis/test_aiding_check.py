@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
-from sonar_graph.diagnosis import aiding_check, doubts
+from sonar_graph.diagnosis import aiding_check, check_sensors, doubts
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.units import force_scale
 from sonar_graph.logs.adapters.log_config import LogConfig
@@ -148,16 +148,16 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
     config = LogConfig.parse({"positions": {"origin_m": [1.0, 2.0, 3.0]}}, "x")
     *_, finding = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
     assert finding.acts
-    assert "from the start, the way to them is" in finding.advice
+    assert "from the start, beyond their noise" in finding.advice
     assert line_of(finding)["origin_m"] == pytest.approx(
-        grid + RIGHT.truth.positions[0] + [1, 2, 3], abs=2.0
+        np.add(grid, (1, 2, 3)), abs=2.0
     )
     started = RIGHT.calibration.start.model_copy(update={"position_m": tuple(grid)})
     begun = replace(
         RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": started})
     )
     *_, finding = aiding_check.position_findings(fixed(begun, origin=grid), config)
-    assert "from the origin of the world, the way to them is" in finding.advice
+    assert "from the origin of the world, beyond their noise" in finding.advice
     few = fixed(RIGHT, every_s=1000.0)
     assert [one.text() for one in aiding_check.position_findings(few, config)] == [
         "cannot be told: too few rows beside its reference"
@@ -418,6 +418,22 @@ def test_a_delay_of_the_sonar_is_found_by_the_turns_between_sightings(late_s: fl
     assert delay.acts == (late_s > 0)
     if late_s:
         assert line_of(delay)["stamp_offset_s"] == pytest.approx(-late_s, abs=0.1)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3, -0.6])
+def test_a_turned_sonar_is_named_with_the_mounting_that_puts_it_right(turn_rad: float):
+    run = simulate_mission(MissionOptions(seed=5, duration_s=120.0))
+    seen = run.detections
+    assert seen is not None
+    turned = replace(seen, azimuth_rad=seen.azimuth_rad + turn_rad)
+    found = [f for f in check_sensors(replace(run, detections=turned)) if f.acts]
+    if not turn_rad:
+        assert not found
+        return
+    assert found[0].quantity == "ranges to landmarks: turn of the sonar"
+    mounting = tomllib.loads(found[0].line.split("`")[1])["sonar"]["mounting"]
+    before = run.calibration.sonar.mounting.rpy_rad[2]
+    assert mounting["rpy_rad"][2] == pytest.approx(before - turn_rad, abs=0.06)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, ImuCalibration, Start
+from sonar_graph.calibration import (
+    STANDARD_GRAVITY,
+    Calibration,
+    ImuCalibration,
+    Mounting,
+    Start,
+)
 from sonar_graph.diagnosis.findings import Finding, with_interval
 from sonar_graph.diagnosis.start import (
     StartHeading,
@@ -18,6 +24,7 @@ from sonar_graph.diagnosis.start import (
     find_start_tilt,
     lever_findings,
     tilt_findings,
+    with_bias,
     with_fitted,
 )
 from sonar_graph.measurements import Dvl, Heading, Imu
@@ -41,6 +48,7 @@ GIVEN = parse(
     "by hand",
 )
 """An arm of (-1.5, 0.1, 0.3) m."""
+A_MINUTE = np.array([0.0, 0.0, 60.0])
 
 
 def match(
@@ -87,7 +95,7 @@ def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_
     assert "`imu.mounting.translation_m = [0.500, -0.400, 0.000]`" in rows[1].advice
     rows = [
         *lever_findings(match((UNKNOWN,) * 3), GIVEN),
-        *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu),
+        *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu, A_MINUTE),
     ]
     assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
     assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
@@ -111,28 +119,46 @@ def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(
     assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
 
 
-def test_a_bias_beyond_its_sigma_asks_for_one_that_holds_the_largest():
+def test_a_bias_beyond_its_sigma_is_stated_along_the_axes_of_the_imu():
     sources = ("from 20 s of rest", "from turns", "from turns")
-    biases = arm(1e-3, 1.5e-4, -4e-3, sigma=1e-5)
-    rows = bias_findings(biases, sources, GIVEN.imu)
+    biases = arm(1e-3, 1.5e-4, -4e-3, sigma=1e-4)
+    body_R_imu = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    imu = GIVEN.imu.model_copy(
+        update={
+            "gyro_bias_rad_s": (0.0, 0.0, 5e-4),
+            "mounting": Mounting(rpy_rad=(0.0, 0.0, np.pi / 2)),
+        }
+    )
+    rows = bias_findings(biases, sources, imu, A_MINUTE)
     assert [row.acts for row in rows] == [True, False, True]
     assert "from 20 s of rest" in rows[0].text()
-    assert lines_of(rows[0])[0] == {"imu": {"gyro_bias_sigma": 0.004}}
+    stated, sigma = (line["imu"] for line in lines_of(rows[0]))
+    expected = body_R_imu.T @ [1e-3, 0.0, -4e-3] + [0.0, 0.0, 5e-4]
+    assert stated["gyro_bias_rad_s"] == pytest.approx(expected, abs=1e-6)
+    assert sigma["gyro_bias_sigma"] == 1e-4
     assert rows[2].advice == "put right by the line above"
-    changed = with_fitted(match(arm(-1.5, 0.1, 0.3), biases), GIVEN).imu
-    assert changed.gyro_bias_sigma == 0.004
-    assert not any(row.acts for row in bias_findings(biases, sources, changed))
+    # 0.24 rad over a minute
+    assert rows[0].grave
+    assert not bias_findings(biases, sources, imu, A_MINUTE / 10)[0].grave
+    left = arm(0.0, 1.5e-4, 0.0, sigma=1e-4)
+    changed = with_bias(biases, imu)
+    rows = bias_findings(left, sources, changed, A_MINUTE)
+    assert not any(row.acts for row in rows)
     # the rotation of the Earth is no fault of a gyro
     fibre = ImuCalibration(gyro_bias_sigma=3e-6)
-    assert not any(
-        row.acts
-        for row in bias_findings(arm(7.3e-5, 0.0, -7.3e-5, sigma=1e-5), sources, fibre)
-    )
-    assert bias_findings(arm(1.2e-4, 0.0, 0.0, sigma=1e-5), sources, fibre)[0].acts
+    turn = arm(7.3e-5, 0.0, -7.3e-5, sigma=1e-5)
+    assert not any(row.acts for row in bias_findings(turn, sources, fibre, A_MINUTE))
+    more = arm(1.2e-4, 0.0, 0.0, sigma=1e-5)
+    assert bias_findings(more, sources, fibre, A_MINUTE)[0].acts
 
 
 ROLL, PITCH, BIAS = 0.12, -0.07, np.array([3e-4, -2e-4, 1e-4])
 NS = 1_000_000_000
+
+
+def started(**start: object) -> Calibration:
+    """Calibration with a stated start."""
+    return Calibration(start=Start(source="stated", **start))
 
 
 def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequence:
@@ -232,19 +258,22 @@ def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion
 
 def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
     found = find_start_tilt(resting(50.0))
-    rows = tilt_findings(found, Start(rpy_rad=(0.0, PITCH, 0.3)), yaw_rad=0.9)
+    rows = tilt_findings(found, started(rpy_rad=(0.0, PITCH, 0.3)), yaw_rad=0.9)
     assert [row.acts for row in rows] == [True, False]
     assert "from 40 s of rest, not the calibration's +0.00°" in rows[0].text()
     assert "the calibration's -4.01° fits, no need to act" in rows[1].text()
-    rpy, sigma = (line["start"] for line in lines_of(rows[0]))
+    *of_start, of_imu = lines_of(rows[0])
+    rpy, sigma = (line["start"] for line in of_start)
+    mounting = of_imu["imu"]["mounting"]["rpy_rad"]
+    assert mounting == pytest.approx([ROLL, 0.0, 0.0], abs=5e-3)
     assert rpy["rpy_rad"] == pytest.approx([ROLL, PITCH, 0.9], abs=5e-3)
     assert sigma["rpy_sigma_rad"] == pytest.approx(
         [found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05
     )
-    right = Start(
+    right = started(
         rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"])
     )
-    for fits in (right, Start(rpy_sigma_rad=(0.1, 0.1, 0.1))):
+    for fits in (right, started(rpy_sigma_rad=(0.1, 0.1, 0.1))):
         assert not any(row.acts for row in tilt_findings(found, fits, 0.9))
 
 
@@ -261,7 +290,7 @@ def test_what_speaks_against_both_ways_is_said_in_one_row():
     )
     found = find_start_tilt(blind)
     assert found.tilt is None
-    (row,) = tilt_findings(found, Start(), 0.0)
+    (row,) = tilt_findings(found, Calibration(), 0.0)
     assert row.text() == "cannot be told: no accelerometers"
     assert not row.acts
     run = resting(4.0)
@@ -306,9 +335,8 @@ def test_a_wrong_heading_has_the_roll_and_pitch_of_the_alignment_also_where_the_
     heading = StartHeading(
         (ROLL - 0.04, PITCH + 0.03, 0.9), (1.0, 2.0, -3.0), Estimate1D(0.2, 0.002)
     )
-    assert not any(
-        row.acts for row in tilt_findings(found, Start(rpy_rad=(ROLL, PITCH, 0.7)), 0.9)
-    )
+    right = started(rpy_rad=(ROLL, PITCH, 0.7))
+    assert not any(row.acts for row in tilt_findings(found, right, 0.9))
     row = heading.finding(found)
     rpy, place = (line["start"] for line in lines_of(row))
     expected = [found.angle(0).value, found.angle(1).value, 0.9]

@@ -572,4 +572,25 @@ def test_a_heading_that_drifts_against_a_bias_by_the_drive_is_wrong_and_not_the_
     (drift,) = (found for found in acting if found.quantity == "heading: drift")
     assert drift.estimate.value == pytest.approx(-drift_rad_s, abs=0.003)
     assert "`use = false` under [heading]" in drift.line
-    assert not any("gyro_bias_rad_s" in found.line for found in acting)
+    (line,) = (found.line for found in acting if "gyro_bias_rad_s" in found.line)
+    stated = tomllib.loads(line.split("`")[1])["imu"]["gyro_bias_rad_s"]
+    assert stated == pytest.approx(bias_rad_s, abs=1e-3)
+
+
+@pytest.mark.parametrize("sensor", ["DVL", "gyro", "depth", "none"])
+def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> None:
+    run = RIGHT
+    if sensor == "DVL":
+        velocity = np.trunc(10.0 * run.dvl.velocity) / 10.0
+        run = replace(run, dvl=replace(run.dvl, velocity=velocity))
+    elif sensor == "gyro":
+        rate = np.trunc(20.0 * run.imu.angular_velocity) / 20.0
+        run = replace(run, imu=replace(run.imu, angular_velocity=rate))
+    elif sensor == "depth":
+        assert run.depth is not None
+        run = replace(
+            run, depth=replace(run.depth, z_m=np.trunc(run.depth.z_m * 2) / 2)
+        )
+    findings = sensor_check.check_sensors(run)
+    found = [f.quantity for f in findings if f.acts]
+    assert found == ([] if sensor == "none" else [f"{sensor}: resolution"])

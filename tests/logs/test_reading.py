@@ -360,7 +360,7 @@ TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
     "degrees": (
         {"azimuth_rad": [-40.0, 1.0]},
         3,
-        "1 of 3 rows have an azimuth beyond ±3.14 rad (up to 40)",
+        "1 of 3 rows have an azimuth beyond a full turn in rad (up to 40)",
     ),
     "97 %": ({"id_probability": [97.0, 0.5]}, 2, POSTERIOR),
     "negative": ({"id_probability": [0.5, -0.1]}, 2, POSTERIOR),

@@ -200,7 +200,7 @@ class Adapter(Section):
         return [path for path in paths if field_of(path)[0] not in known]
 
     def refusal(self, topic: Topic) -> str | None:  # noqa: ARG002  # for subclasses
-        """Reason why messages with all fields play no role, which completes "/imu ..."; None: there is none."""
+        """Reason why messages with all fields play no role, which completes "/imu ..."; None without one."""
         return None
 
     def table(self, topic: Topic) -> MessageTable:
@@ -216,7 +216,7 @@ class Adapter(Section):
         return next(filter(None, named), "")
 
     def accepts(self, fault: str) -> str | None:
-        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        """Setting with which messages that are left out for a fault are used; None without one."""
         return 'stamp = "log"' if fault == SAME_STAMP else None
 
     def assumption(self, gravity_m_s2: float) -> str | None:  # noqa: ARG002  # for subclasses
@@ -275,7 +275,7 @@ class CovarianceFields(PathSection):
     PATHS = ("fields",)
 
     fields: tuple[str, ...] = Field(min_length=1, max_length=3)
-    """One field: a row-major matrix (3x3, or 6x6 of which the first three rows count), or one number for all axes.
+    """One field: a row-major matrix (3x3, or the first three rows of 6x6), or one number for all axes.
     Three fields: one an axis, each a number or a row."""
     meaning: Literal["variance", "standard deviation"] = "variance"
     """Of standard deviations only the diagonal is used, squared."""

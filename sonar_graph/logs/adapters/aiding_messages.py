@@ -50,7 +50,7 @@ World = Literal["enu", "ned"]
 ENU_R = {"enu": np.eye(3), "ned": ENU_R_NED}
 """``enu_R_world`` of each kind of world."""
 STEEPEST_RAD = np.radians(80.0)
-"""Pitch above which roll and yaw are hardly told apart."""
+"""Pitch above which roll and yaw are hardly distinct."""
 NO_MEASUREMENT = "whose orientation is no measurement"
 _WHOLE_CIRCLE = 2 * np.pi + 0.1
 
@@ -73,7 +73,7 @@ class HeadingAdapter(Adapter):
     variance: CovarianceFields | None = None
     """One field with the yaw's variance, rad²; without it, or where not above 0, the calibration's noise holds."""
     needs_variance: bool = False
-    """Messages that state no variance are no measurements: drivers fill an orientation that is none."""
+    """Messages that state no variance are no measurements: drivers fill orientations that nothing measured."""
     status: str | None = None
     """Field that is -1 where the orientation was not measured."""
 
@@ -84,7 +84,7 @@ class HeadingAdapter(Adapter):
         return self
 
     def accepts(self, fault: str) -> str | None:
-        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        """Setting with which messages that are left out for a fault are used; None without one."""
         if fault == NO_MEASUREMENT:
             return "needs_variance = false, status = false"
         return super().accepts(fault)
@@ -103,7 +103,7 @@ class HeadingAdapter(Adapter):
         )
 
     def is_measured(self, table: FieldTable) -> Mask:
-        """Mask of messages that say that yaw is measured, shape (n,)."""
+        """Mask of messages that state that yaw is measured, shape (n,)."""
         is_measured = np.ones(len(table), bool)
         if self.status is not None:
             is_measured &= table.column(self.status) != -1
@@ -149,13 +149,20 @@ class HeadingAdapter(Adapter):
                     f"({self.variance.fields[0]}): estimators do not use them"
                 )
         if self.yaw is not None:
-            angles = np.abs(table.column(self.yaw) * self.scale)
-            largest = float(np.max(angles, initial=0.0, where=np.isfinite(angles)))
-            if largest > _WHOLE_CIRCLE:
+            angles = table.column(self.yaw) * self.scale
+            angles = angles[np.isfinite(angles)]
+            largest = float(np.max(np.abs(angles), initial=0.0))
+            if largest > _WHOLE_CIRCLE and not is_unwrapped(angles):
                 yield (
                     f"{self.yaw} is up to {largest:.4g}, more than a whole circle in rad: degrees? "
                     f"`scale = {self.scale * np.pi / 180:.6g}` under [heading] in the log configuration"
                 )
+
+
+def is_unwrapped(angles: Floats) -> bool:
+    """True for angles in rad, shape (n,), that begin within a circle and leave it in small steps, turn by turn."""
+    steps = np.abs(np.diff(angles))
+    return bool(abs(angles[0]) < _WHOLE_CIRCLE and np.all(steps < np.pi / 2))
 
 
 def not_zero(quaternions: Floats) -> Mask:
@@ -216,7 +223,7 @@ class GeodeticFields(PathSection):
         return np.column_stack([place, height]), is_fix
 
     def beyond(self, table: FieldTable) -> str:
-        """Remark about latitudes that are none, for rows without a fix; empty where there are few."""
+        """Remark about latitudes beyond 90 degrees, for rows without a fix; empty where there are few."""
         latitude = np.abs(table.column(self.latitude).astype(float))
         if self.unit != "deg" or not np.median(latitude) > 90.0:
             return ""

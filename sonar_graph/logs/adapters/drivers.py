@@ -45,13 +45,13 @@ _OWN_DETECTIONS = "sonar_graph_msgs/msg/LandmarkDetections"
 
 @dataclass(frozen=True)
 class Shipped:
-    """An adapter, and the topics for which it is taken without being asked for."""
+    """An adapter, and the topics for which it is taken by default."""
 
     adapter: Adapter
     words: tuple[str, ...] = ()
-    """Words of which the topic's name must contain one; none: any name fits."""
+    """The topic's name must contain one of these words; none: any name fits."""
     is_general: bool = False
-    """The type says little about the sensor: the adapter counts only where no topic of a more telling type fits."""
+    """The type hardly shows the sensor: the adapter counts only where no topic of a more specific type fits."""
 
 
 def _shipped(role: str, entry: dict[str, Any]) -> Iterator[Shipped]:

@@ -89,6 +89,8 @@ LEAST_STEP_M_S = 0.05
 """Steps below this are no sign: at such speeds a row of zeros does little harm."""
 FEWEST_STEPS = 10
 """Fewest steps from which usual ones are known."""
+LEAST_CHANGING = 0.9
+"""Share of the axes that change where a velocity is not repeated."""
 LEAST_REPEATED = 0.2
 """Share of rows, and of values, that a driver repeats which holds velocities between measurements."""
 SAID_INVALID = "with a covariance that says invalid"
@@ -175,7 +177,7 @@ class DvlAdapter(Adapter):
         return velocity * self.scale, {fault: is_few}
 
     def _is_filled(self, table: FieldTable, path: str) -> bool:
-        """Tell whether the driver fills a field, as far as it may be unfilled."""
+        """True where the driver fills a field, as far as it may be unfilled."""
         return path not in self.may_be_unfilled or bool(table.column(path).any())
 
     def _filled(self, table: FieldTable) -> Masks:
@@ -187,7 +189,7 @@ class DvlAdapter(Adapter):
         }
 
     def _is_marked(self, table: FieldTable) -> bool:
-        """Tell whether the driver marks some messages as valid and others as invalid."""
+        """True where the driver marks some messages as valid and others as invalid."""
         return self.lock == "marked" or any(
             valid.any() and not valid.all() for valid in self._filled(table).values()
         )
@@ -227,7 +229,7 @@ class DvlAdapter(Adapter):
         return faults
 
     def _may_count(self, is_good: Mask) -> bool:
-        """Tell whether a sign counts: the driver fills its field, since some message is good by it."""
+        """True where a sign counts: the driver fills its field, since some message is good by it."""
         return self.lock == "signs" or bool(is_good.any())
 
     def with_marks_alone(self) -> DvlAdapter:
@@ -236,7 +238,7 @@ class DvlAdapter(Adapter):
         return self.model_copy(update={"lock": lock})
 
     def accepts(self, fault: str) -> str | None:
-        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        """Setting with which messages that are left out for a fault are used; None without one."""
         if fault.endswith("below 0"):
             return "altitude = false"
         if fault.startswith("with ") and " not " in fault and fault != NOT_FINITE:
@@ -324,7 +326,8 @@ def repeats(velocity: Floats) -> Mask:
     """Rows, shape (n,), that repeat the velocity of the row before, where the driver does so all the time.
 
     Such a driver publishes at its own rate, or once for each of two reports of the instrument, and holds the velocity
-    between. A sensor that got stuck once repeats one value, which is not the driver's habit.
+    between. A sensor that got stuck once repeats one value, which is not the driver's habit. A coarse sensor repeats
+    rows too, and changes along single axes.
     """
     is_equal = (velocity[1:] == velocity[:-1]).all(axis=1) & velocity[1:].any(axis=1)
     is_same = np.concatenate([[False], is_equal])
@@ -332,4 +335,6 @@ def repeats(velocity: Floats) -> Mask:
     lengths = np.diff([*np.flatnonzero(~is_same), len(velocity)])
     shares = (is_same.mean(), (lengths > 1).mean())
     is_habit = min(shares) >= LEAST_REPEATED and len(lengths) >= FEWEST_STEPS
+    changes = np.diff(velocity, axis=0)[~is_equal] != 0
+    is_habit &= bool(changes[:, changes.any(axis=0)].mean() >= LEAST_CHANGING)
     return is_same & is_habit

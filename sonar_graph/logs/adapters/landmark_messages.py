@@ -352,11 +352,12 @@ def detection_warnings(
     for fault, has_it in faults.items():
         if has_it.any():
             yield f"{share(has_it)} rows have {fault}: estimators do not use them"
-    beyond = np.abs(detections.azimuth_rad) > np.pi
-    if beyond.any():
+    # some drivers count azimuths from 0 to a full turn
+    if not is_azimuth.all():
         yield (
-            f"{share(beyond)} rows have an azimuth beyond ±3.14 rad (up to "
-            f"{np.abs(detections.azimuth_rad).max():.3g}): degrees? Beyond a full turn they are not used"
+            f"{share(~is_azimuth)} rows have an azimuth beyond a full turn in rad (up to "
+            f"{np.abs(detections.azimuth_rad).max():.3g}): not used; degrees? `azimuth_scale = 0.0174533` under "
+            "[detections] in the log configuration"
         )
     tracked = detections.track != NO_TRACK
     # one frame sees an object once
@@ -480,7 +481,7 @@ class LandmarkRowsAdapter(Adapter):
         table: FieldTable,
         setup: Setup,  # noqa: ARG002  # of all adapters
     ) -> Fit[LandmarkMap]:
-        """Map of the rows, of which each has another identity."""
+        """Map of the rows, whose identities all differ."""
         ids = _whole(table, self.id)
         positions = table.beside(self.position) * self.scale
         fit = np.flatnonzero((ids >= 0) & ~not_finite(positions))
@@ -502,7 +503,7 @@ class LandmarkRowsAdapter(Adapter):
 
 
 def _whole(table: FieldTable, path: str) -> Ints:
-    """A column of integers; -1 where there is none."""
+    """A column of integers; -1 without one."""
     values = np.nan_to_num(table.column(path), nan=-1.0)
     wrong = values[values != np.floor(values)]
     if len(wrong):

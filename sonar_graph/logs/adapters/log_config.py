@@ -1,4 +1,4 @@
-"""Log configuration: what a user says about the topics of a log, one TOML table a role.
+"""Log configuration: what a user states about the topics of a log, one TOML table a role.
 
 A table of a shipped type changes only what it names; for any other type it names the fields. ``false`` takes away what
 the shipped adapter has (docs/tutorials/04_your_own_log.md)::
@@ -86,7 +86,7 @@ class LogConfig:
         return config
 
     def table(self, role: str) -> Table:
-        """Table of a role; empty where there is none."""
+        """Table of a role; empty without one."""
         return self.tables.get(role, {})
 
     def number(self, role: str, key: str, default: float) -> float:
@@ -103,7 +103,7 @@ class LogConfig:
         )
 
     def adapters(self, role: str, type_name: str) -> list[Adapter]:
-        """Adapters for one type: the shipped ones, changed as the table says, or the table's own."""
+        """Adapters for one type: the shipped ones, changed by the table, or the table's own."""
         table = self.table(role)
         bases = shipped_for(role, type_name)
         if not bases and "type" in table:
@@ -168,7 +168,7 @@ def shipped_for(role: str, type_name: str) -> list[Adapter]:
 
 
 def shipped_like(role: str, type_name: str, definition: Struct) -> Adapter | None:
-    """Shipped adapter for a type whose fields are all in the definition; None where there is none."""
+    """Shipped adapter for a type whose fields are all in the definition; None without one."""
     return next(
         (
             base
@@ -180,9 +180,9 @@ def shipped_like(role: str, type_name: str, definition: Struct) -> Adapter | Non
 
 
 def read_log_config(path: Path) -> LogConfig:
-    """Read a TOML file that says what the topics of a log are.
+    """Read a TOML file that states what the topics of a log are.
 
-    A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
+    A LogError where it cannot be read, is not TOML, or states something impossible; it names table and key.
     """
     return LogConfig.parse(read_toml(path), str(path))
 

@@ -72,9 +72,9 @@ class FieldTable(ABC):
 
 
 class MessageTable(FieldTable):
-    """All messages of a topic whose fields of interest have the same size in each, stamped as an `Adapter` says.
+    """All messages of a topic whose fields of interest have the same size in each, stamped as an `Adapter` states.
 
-    A LogError names file, topic and field where the messages are not what their definition says.
+    A LogError names file, topic and field where the messages are not as their definition has them.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class MessageTable(FieldTable):
             )
 
     def has(self, path: str) -> bool:
-        """Tell whether every message has a field with values."""
+        """True where every message has a field with values."""
         return all(field_of(path)[0] in group.layout.columns for group in self.groups)
 
     def column(self, path: str) -> NDArray[Any]:

@@ -21,7 +21,7 @@ SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """Type of a sample, as numpy names it, for each number in marine_acoustic_msgs/SonarImageData."""
 GAIN_BYTES = 4
 KINDS = ("sample_type", "sample_bytes", "big_endian", "row_gains", "row_bytes")
-"""Attributes with the fields that say what samples are, and how they lie."""
+"""Attributes with the fields that state what samples are, and how they lie."""
 Refused = Callable[[int, str], None]
 """Called with the stamp of a message and the reason why it is no image."""
 
@@ -62,7 +62,7 @@ class SonarAdapter(Adapter):
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"
     """range-major: all beams of the first range, then of the next, which is what drivers do (also where the message's
-    comment says otherwise); beam-major: all ranges of the first beam first."""
+    comment states otherwise); beam-major: all ranges of the first beam first."""
     ranges: str | None = None
     """Array field with the middle of each range bin, metres."""
     range_resolution: str | None = None
@@ -80,9 +80,9 @@ class SonarAdapter(Adapter):
     sample_bytes: str | None = None
     """Field with the number of bytes of an unsigned sample, instead; without either they are bytes."""
     big_endian: str | None = None
-    """Field that says whether samples are big-endian."""
+    """Field that states whether samples are big-endian."""
     row_gains: str | None = None
-    """Field that says whether each row begins with its gain, a uint32; samples are divided by its square root."""
+    """Field that states whether each row begins with its gain, a uint32; samples are divided by its square root."""
     row_bytes: str | None = None
     """Field with the number of bytes of a row, gain and padding included."""
 

@@ -126,7 +126,7 @@ class ImuAdapter(Adapter):
             yield f"{names} are not finite in {share(bad)} messages: taken as not measured there"
 
     def accepts(self, fault: str) -> str | None:
-        """Setting with which messages that are left out for a fault are used; None: there is none."""
+        """Setting with which messages that are left out for a fault are used; None without one."""
         if fault == WITHOUT_RATE:
             return "angular_velocity_status = false"
         return super().accepts(fault)
@@ -164,14 +164,14 @@ class ImuAdapter(Adapter):
         return _Signals(rate, force, no_rate, no_force, denied)
 
     def _is_force_unfilled(self, found: _Signals) -> bool:
-        """Tell whether the force is zero in all messages, which not even free fall gives."""
+        """True where the force is zero in all messages, which not even free fall gives."""
         measured = found.force[~found.no_force]
         is_zero = bool(len(measured)) and not measured.any()
         return is_zero and not self.are_zeros_measured
 
 
 def _changes(values: Floats) -> bool:
-    """Tell whether values, shape (n, 3), change from row to row, as measured ones do."""
+    """True where values, shape (n, 3), change from row to row, as measured ones do."""
     finite = values[np.isfinite(values).all(axis=1)]
     return len(finite) > 1 and bool(
         (finite[1:] != finite[:-1]).any(axis=1).mean() > 0.5

@@ -112,7 +112,7 @@ def parse_definition(type_name: str, text: str) -> Struct:
 
 @lru_cache(maxsize=256)
 def _parsed(type_name: str, text: str) -> Struct | str:
-    """Tree of a message type, or the fault of its text; both are remembered, since every role asks."""
+    """Tree of a message type, or the fault of its text; both are remembered, since every role needs them."""
     if len(text) > _LONGEST_TEXT:
         return f"the definition of {type_name} has {len(text)} characters, and at most {_LONGEST_TEXT} are read"
     texts = _sections(text)

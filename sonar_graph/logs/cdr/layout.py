@@ -353,7 +353,7 @@ class UnsoundMessageError(Exception):
 
 
 def layout_of(plan: Plan, payload: memoryview) -> Layout:
-    """Layout of a payload; an UnsoundMessageError where it is not plain CDR or not as long as its definition says."""
+    """Layout of a payload; an UnsoundMessageError where it is not plain CDR or not as long as its definition requires."""
     if len(payload) < HEADER_BYTES:
         raise UnsoundMessageError("without an encapsulation header")
     order = _BYTE_ORDERS.get(bytes(payload[:2]))

@@ -52,7 +52,7 @@ class Messages:
         return len(self.rows)
 
     def __getitem__(self, path: str) -> NDArray[Any]:
-        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays; a KeyError where none is."""
+        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays; a KeyError without one."""
         column = self.layout.column(path)
         # a copy only where the values do not lie evenly
         values = _view(self.payloads, column)
@@ -80,7 +80,7 @@ class Messages:
         ]
 
     def first_string(self, path: str) -> str:
-        """A string field's value in the first message; empty where there is none."""
+        """A string field's value in the first message; empty without one."""
         if path not in self.layout.columns:
             return ""
         first = Messages(self.rows[:1], self.payloads[:1], self.layout)

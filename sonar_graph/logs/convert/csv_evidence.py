@@ -78,7 +78,7 @@ def time_units(
     # a Doppler log that fits no unit must not decide about the IMU
     dvls = [table for table in fits if roles[table] == "dvl"]
     complete = [unit for unit in possible if all(possible[unit][dvl] for dvl in dvls)]
-    # an IMU of 1 Hz in seconds looks like one of 1 kHz in milliseconds: a date tells them apart
+    # an IMU of 1 Hz in seconds looks like one of 1 kHz in milliseconds: a date shows which
     last = times[lead][-1]
     dated = [u for u in complete if _DATES_S[0] < last * TIMES[u] < _DATES_S[1]]
     chosen = dated or complete or list(possible)

@@ -97,7 +97,7 @@ class CsvFile:
             raise self._fault("is a folder; expected a text file with a table")
         form = self.form
         try:
-            # "replace": a degree sign of another encoding in a comment harms nobody
+            # "replace": a degree sign of another encoding in a comment does no harm
             with regular(self.path).open(
                 encoding=form.encoding, errors="replace"
             ) as stream:

@@ -49,7 +49,7 @@ class DamagedFrameError(Exception):
 
 
 def refuse_header(kind: str, faults: Mapping[str, bool]) -> None:
-    """Refuse a header of which some faults, by their texts, are true."""
+    """Refuse a header where some faults, by their texts, are true."""
     if any(faults.values()):
         texts = ", ".join(text for text, is_true in faults.items() if is_true)
         raise DamagedFrameError(f"{kind} with {texts}")

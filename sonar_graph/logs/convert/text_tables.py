@@ -22,7 +22,7 @@ class NumberTable(NamedTuple):
 def read_table(
     path: Path, columns: tuple[str, ...], delimiter: str = "space"
 ) -> NumberTable:
-    """Read a table of some columns, of which the first is a time in seconds or a number.
+    """Read a table of some columns, the first of them a time in seconds or a number.
 
     Raises `DatasetError` when the file is missing, has no row, or a row does not hold a finite number for each column.
     """

@@ -97,7 +97,7 @@ def _named_parts(folder: Path) -> list[Path]:
 
 
 def _span_ns(file: Path) -> tuple[int, int | None]:
-    """Times of the first message and, where the file's summary says it, of the last."""
+    """Times of the first message and, where the file's summary has it, of the last."""
     with LogFile(file) as log:
         statistics = log.summary.statistics if log.summary else None
         end_ns = int(statistics.message_end_time) if statistics else None

@@ -119,7 +119,7 @@ def find_messages(data: bytes | memoryview, *, is_covered: bool = False) -> Cont
     bounds = np.array(record_starts(data), np.int64)  # (n + 1,)
     opcodes = np.frombuffer(data, np.uint8)[bounds[:-1]]  # (n,)
     is_message = opcodes == Opcode.MESSAGE
-    # a message that is shorter than its own fields is none, and what follows it is not to be trusted
+    # a message that is shorter than its own fields is invalid, and what follows it is not to be trusted
     is_short = is_message & (np.diff(bounds) < _MESSAGE.itemsize)
     if is_short.any():
         whole = int(np.argmax(is_short))

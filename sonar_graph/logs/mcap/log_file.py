@@ -26,7 +26,7 @@ from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC, START_BYTES, kind_an
 HEAD = struct.Struct("<BQ")
 """Opcode of a record, and number of bytes of its content."""
 LARGEST_BYTES = 1 << 28
-"""Most bytes of one record, and of a chunk without compression; a stated size could ask for all memory."""
+"""Most bytes of one record, and of a chunk without compression; a stated size could claim all memory."""
 LARGEST_RATIO = 64
 """Bytes of messages for each byte of a log; samples of an IMU at rest, each with its stamp, compress by some thirty."""
 SMALLER_CHUNKS = (
@@ -87,7 +87,7 @@ class LogFile:
         """End of the data by the summary; without a summary that of the file."""
         try:
             self.fault = self._read_summary()
-            """Damage of the end of the file; None where there is none."""
+            """Damage of the end of the file; None without one."""
         except Exception as error:  # the package raises whatever its parts raise
             self.fault = f"its summary is damaged: {error or type(error).__name__}"
 
@@ -102,14 +102,14 @@ class LogFile:
         self._stream.close()
 
     def read(self, at: int, count: int) -> bytes:
-        """Bytes from an offset on; fewer than asked for at the end of the file.
+        """Bytes from an offset on; fewer at the end of the file.
 
         A LogError where they are more than `LARGEST_BYTES`.
         """
         if at >= self.size:  # a damaged length may point anywhere
             return b""
         count = min(count, self.size - at)
-        # a damaged length could ask for all memory
+        # a damaged length could claim all memory
         if count > LARGEST_BYTES:
             raise LogError(
                 f"{self.path}: bytes {at} to {at + count} are one record, and at most {LARGEST_BYTES} are read at "

@@ -167,7 +167,7 @@ class Passage:
                     content = find_messages(unpack_beginning(chunk))
                 elif chunk.uncompressed_crc:  # its length is not confirmed
                     content = find_messages(unpack_whole(chunk), is_covered=True)
-        # a cut end misleads nobody, so it is no hole that must be accepted by --salvage
+        # a cut end misleads no reader, so it is no hole that must be accepted by --salvage
         if is_cut:
             reason = f"the file is cut off: its last whole record ends at byte {hole.at} of {hole.end}"
             if content is not None and content.channels:
@@ -297,7 +297,7 @@ class Passage:
             unprotected.append("messages lie outside chunks")
         unprotected += [f"metadata record {name!r}" for name in self._unsealed]
         damage.unprotected = unprotected
-        # where something is skipped or lost, the CRC over all data says nothing about the rest
+        # where something is skipped or lost, the CRC over all data does not cover the rest
         if unprotected and not self.skipped and not damage.losses and self._data_end:
             self._check_data(self._data_end)
 
@@ -334,9 +334,9 @@ class Recording:
     chunks: int = 0
     """Number of chunks in the file."""
     skipped_chunks: int = 0
-    """Number of skipped chunks, which hold nothing that was asked for; their CRCs are not checked."""
+    """Number of skipped chunks, which hold nothing that is wanted; their CRCs are not checked."""
     part: str | None = None
-    """Text of the wanted time, if not all was asked for."""
+    """Text of the wanted time, if not all is wanted."""
 
     @property
     def ending(self) -> str | None:

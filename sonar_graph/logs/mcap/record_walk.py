@@ -52,7 +52,7 @@ _ANY = re.compile(_AMONG_CHUNKS.pattern + b"|" + _LOOSE, re.DOTALL)
 
 
 class Record(NamedTuple):
-    """Place of a record in the file, of a run of loose ones (opcode ``MESSAGE``), or of bytes that are none."""
+    """Place of a record in the file, of a run of loose ones (opcode ``MESSAGE``), or of bytes that are no record."""
 
     opcode: int
     at: int
@@ -165,7 +165,7 @@ class RecordWalk:
         In a file with chunks, bytes that look like a message are not trusted: they may lie within a damaged chunk.
         """
         self._has_chunks |= self._file.read(at, 1) == bytes([Opcode.CHUNK])
-        # a loose record cannot be told from one within a chunk
+        # a loose record looks like one within a chunk
         pattern = _AMONG_CHUNKS if self._has_chunks else _ANY
         # small blocks: hostile files have many heads, and each search reads a block again
         for block_at in range(at + 1, self._stop_at, _BLOCK):
@@ -177,7 +177,7 @@ class RecordWalk:
         return self._stop_at
 
     def _is_found(self, record: Record) -> bool:
-        """Tell whether a record is one, and not bytes within a damaged chunk that look like its head."""
+        """True where a record is one, and not bytes within a damaged chunk that look like its head."""
         if record.opcode == Opcode.METADATA and record.end <= self._stop_at:
             with suppress(LogError):
                 parse(Metadata.read, content_of(self._file, record))

@@ -57,7 +57,7 @@ def _passages(
     progress: Progress | None,
     damage: Damage,
 ) -> Iterator[tuple[LogFile, Passage]]:
-    """A passage through each file of a log; its damage is added to that of the log when the next is asked for.
+    """A passage through each file of a log; its damage is added to that of the log when the next begins.
 
     A file that cannot be opened is a loss with the name of the file, and a LogError where there is no other.
     """

@@ -137,7 +137,7 @@ def recording(
 
 
 def header_of(path: Path) -> Header | None:
-    """Header of an MCAP file, which states the profile and the library that wrote it; None where there is none."""
+    """Header of an MCAP file, which states the profile and the library that wrote it; None without one."""
     with regular(path).open("rb") as stream, suppress(Exception):
         # the package raises whatever its parts raise
         return make_reader(stream).get_header()
