@@ -1,13 +1,10 @@
 """Every refusal of input names cause, file, topic and field, and what accepts it, in at most 300 characters."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import LONGEST
 from tests.logs.adapters.conftest import at, dvl, imu, rows_of
 from tests.logs.conftest import vector
@@ -104,82 +101,3 @@ def test_a_refusal_names_its_cause_and_what_accepts_the_input(
     without_folder = str(refusal.value).replace(f"{foreign.folder}/", "")
     assert without_folder.startswith(("log.mcap: ", "log.toml: "))
     assert len(without_folder) <= LONGEST
-
-
-def test_what_a_refusal_names_accepts_the_input(foreign: Any) -> None:
-    """Each line is written as it was named."""
-    water = [imu(ROWS), dvl(ROWS, velocity_mode=2)]
-    assert (
-        len(foreign.read(*water, toml="[dvl]\nvalid_where = {}").dvl.stamps_ns) == ROWS
-    )
-    denied = [imu(ROWS, **{f"at_{row}": DENIED for row in range(ROWS)}), dvl(ROWS)]
-    assert (
-        len(
-            foreign.read(
-                *denied, toml="[imu]\nangular_velocity_status = false"
-            ).imu.stamps_ns
-        )
-        == ROWS
-    )
-    packets = (
-        PACKET_TABLE
-        + 'velocity = ["velocity[0]", "velocity[1]", "velocity[2]"]\nstamp = "log"'
-    )
-    assert len(foreign.read(imu(ROWS), PACKETS, toml=packets).dvl.stamps_ns) == ROWS
-    invalid = rows_of(
-        "/dvl", "stonefish_ros2/msg/DVL", [{"velocity_covariance": [-1.0] * 9}] * ROWS
-    )
-    unknown = '[dvl]\ncovariance = {negative = "unknown", zero = "unknown"}'
-    assert len(foreign.read(imu(ROWS), invalid, toml=unknown).dvl.stamps_ns) == ROWS
-
-
-ENCODINGS: dict[str, tuple[str, str, str]] = {
-    "protobuf": (
-        "protobuf",
-        "protobuf",
-        r"has messages in protobuf; only ROS 2 CDR is read: record ROS 2 messages, or",
-    ),
-    "json": (
-        "json",
-        "jsonschema",
-        r"has messages in json; .*tables for `sonar-graph convert csv`",
-    ),
-    "ros1": (
-        "ros1",
-        "ros1msg",
-        r"has ROS 1 messages: `sonar-graph convert rosbag .*log\.mcap -o OUT\.mcap`",
-    ),
-    "idl": (
-        "cdr",
-        "ros2idl",
-        r"has a definition in ros2idl; only ros2msg is read: record it where",
-    ),
-    "none": (
-        "cdr",
-        "",
-        r"has no definition of its messages: record ROS 2 messages, or write tables",
-    ),
-}
-
-
-@pytest.mark.parametrize(
-    ("encoding", "schema", "named"), ENCODINGS.values(), ids=ENCODINGS
-)
-def test_messages_of_other_encodings_are_refused_with_the_way_to_read_them(
-    tmp_path: Path, encoding: str, schema: str, named: str
-) -> None:
-    with (tmp_path / "log.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("x", "test")
-        number = (
-            writer.register_schema("sensor_msgs/msg/Imu", schema, b"float64 x")
-            if schema
-            else 0
-        )
-        writer.add_message(
-            writer.register_channel("/imu", encoding, number), 1, b"\0\1\0\0", 1
-        )
-        writer.finish()
-    with pytest.raises(LogError, match=named) as refusal:
-        read_log(tmp_path / "log.mcap")
-    assert len(str(refusal.value).replace(f"{tmp_path}/", "")) <= LONGEST

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.landmark_messages import range_and_azimuth
 from sonar_graph.logs.adapters.vehicle_messages import body_to_ros
 
@@ -294,13 +293,6 @@ def test_results_that_are_no_detections_are_refused(
 ) -> None:
     with pytest.raises(LogError, match=message):
         foreign.read(entry, toml=toml)
-
-
-def test_a_text_class_is_no_damage_of_an_intact_log(foreign: Any) -> None:
-    summary = inspect_log(foreign.write(imu(), dvl(), one(("buoy", 0.9))))
-    assert summary.damage == ()
-    (reason,) = summary.unusable
-    assert "class 'buoy' is no integer identity" in reason
 
 
 @given(st.tuples(*[st.floats(-10, 10)] * 3), st.integers(0, 1000))

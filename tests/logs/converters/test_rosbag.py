@@ -191,18 +191,6 @@ def test_what_unpacks_to_more_than_the_limit_is_refused_with_limit_and_remedy(
     assert [path.name for path in tmp_path.iterdir()] == ["bag"]
 
 
-def test_an_unpacked_file_alone_is_read(tmp_path, decoded):
-    """As the advice about files that are too large says."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    writer = Ros2Writer(
-        tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3
-    )
-    write_bag(writer, store, messages(store, ros1=False))
-    (database,) = (tmp_path / "ros2").glob("*.db3")
-    database = database.rename(tmp_path / "alone.db3")
-    assert convert_rosbag(database, tmp_path / "new.mcap").messages == 6
-
-
 @pytest.mark.parametrize("unpack", [limited_bz2, limited_lz4, limited_zstd])
 def test_a_chunk_that_is_cut_off_is_no_chunk(unpack):
     pack = {
