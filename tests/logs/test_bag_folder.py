@@ -147,10 +147,6 @@ FAULTS = {
         lambda path: path.unlink(),
         r"dive is damaged: dive_4\.mcap: is missing",
     ),
-    "empty": (
-        lambda path: path.write_bytes(b""),
-        r"dive is damaged: dive_4\.mcap: is not an MCAP file but empty",
-    ),
     "cut": (
         cut,
         r"dive is damaged: dive_4\.mcap: bytes \d+ to \d+: the file is cut off",

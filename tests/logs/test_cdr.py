@@ -267,16 +267,6 @@ LENGTHS = [[4 * (b - a) for a, b in pairwise(cuts)] for cuts in CUTS]
 NAMES, ENDLESS = parsed("string[4] names"), parsed("P[4000000000] points", P="string s")
 MANY: dict[str, tuple[Struct, list[bytes]]] = {
     "cut": (DEFINITION, [whole()[:45]] * 21_000),
-    "boolean": (DEFINITION, [poked(17, 2)] * 21_000),
-    "length": (
-        DEFINITION,
-        [START + struct.pack("<I", 16 + i % 3) + bytes(40) for i in range(300)] * 70,
-    ),
-    "many layouts": (
-        DEFINITION,
-        [whole(s="a" * (4 * i), flags=np.zeros((1, 4 * (300 - i)))) for i in range(300)]
-        * 70,
-    ),
     "an array without end": (
         ENDLESS,
         [START + bytes(80)],

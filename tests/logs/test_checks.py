@@ -399,7 +399,10 @@ def test_magnitudes_without_a_sign_are_named_and_a_vehicle_that_only_goes_ahead_
 
 @pytest.mark.parametrize(
     ("has_depth", "sigma_m_s", "is_named"),
-    [(True, 0.01, True), (False, 0.01, False), (True, 1.0, False)],
+    [
+        (True, 0.01, True),
+        (False, 0.01, False),
+    ],
 )
 def test_a_velocity_without_a_vertical_part_is_wrong_where_the_vehicle_dives(
     has_depth: bool, sigma_m_s: float, is_named: bool

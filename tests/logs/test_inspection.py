@@ -254,7 +254,6 @@ def test_topics_that_cannot_be_decoded_are_counted_and_listed_with_the_reason_an
 BROKEN = [
     ("/imu", "imu", "angular_velocity", "their definition does"),
     ("/pressure", "depth", "z_m", "their definition does"),
-    ("/landmarks", "detections", "range_m", "track"),
 ]
 
 

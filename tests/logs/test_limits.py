@@ -123,10 +123,7 @@ ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
         ("rotation", np.nan, TRANSLATION),
         ("rotation", np.inf, TRANSLATION),
         ("rotation", 0.0, ROTATION + "0"),
-        ("rotation", 1e200, ROTATION),
-        ("translation", np.nan, TRANSLATION),
         ("translation", 1e300, r"dvl: is .* m from base_link"),
-        ("translation", 2000.0, r"dvl: is .* m from base_link"),
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(

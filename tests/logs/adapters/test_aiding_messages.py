@@ -271,10 +271,6 @@ def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(
     [
         ('[heading]\ntype = "a/msg/B"', "give either orientation"),
         ('[positions]\ntype = "a/msg/B"', "give either position"),
-        (
-            '[truth]\ntype = "a/msg/B"\norientation = ["a", "b", "c", "d"]',
-            "give either position",
-        ),
     ],
 )
 def test_a_table_without_a_source_of_its_numbers_is_refused(

@@ -47,38 +47,15 @@ REFUSALS: dict[str, Refusal] = {
     "velocities through water": (
         [imu(ROWS), dvl(ROWS, velocity_mode=2)], "",
         r"topic /dvl: none of its 20 messages can be used: 20 with velocity_mode not 1; `valid_where = \{\}` under"),
-    "a flag that is never true": (
-        [imu(ROWS), rows_of("/dvl", "dvl_msgs/msg/DVL", [{"velocity": vector(1, 2, 3)}] * ROWS)], "",
-        r"topic /dvl: none .* 20 with velocity_valid not true; `valid_where = \{\}` under \[dvl\]"),
-    "covariances that call all invalid": (
-        [imu(ROWS), rows_of("/dvl", "stonefish_ros2/msg/DVL", [{"velocity_covariance": [-1.0] * 9}] * ROWS)], "",
-        r'`covariance = \{negative = "unknown", zero = "unknown"\}` under \[dvl\]'),
     "rates that are not measured": (
         [imu(ROWS, **{f"at_{row}": DENIED for row in range(ROWS)}), dvl(ROWS)], "",
         r"topic /imu: none .* 20 without angular rate; `angular_velocity_status = false` under \[imu\]"),
-    "one stamp for all": (
-        [imu(ROWS), ("/dvl", "marine_acoustic_msgs/msg/Dvl", [{"header": at(0), "velocity_mode": 2}] * ROWS)], "",
-        r"topic /dvl: none"),
     "no header": (
         [imu(ROWS), PACKETS], PACKET_TABLE + 'velocity = ["velocity[0]", "velocity[1]", "velocity[2]"]',
         r'topic /pd0: its provider_dvl/msg/PD0Packet has no field header\.stamp\.sec; stamp = "log", or the name'),
-    "an array for a number": (
-        [imu(ROWS), PACKETS],
-        PACKET_TABLE + 'stamp = "log"\nvelocity = ["velocity", "velocity[1]", "velocity[2]"]',
-        r"topic /pd0: field velocity of .* is an array of 4; name one element, such as velocity\[0\]"),
-    "an element that is not there": (
-        [imu(ROWS), PACKETS],
-        PACKET_TABLE + 'stamp = "log"\nvelocity = ["velocity[0]", "velocity[1]", "velocity[9]"]',
-        r"topic /pd0: field velocity\[9\] of .* has 4 elements"),
     "a field that is not there": (
         [imu(ROWS), PACKETS], PACKET_TABLE + 'velocity = ["velocit[0]", "velocity[1]", "velocity[2]"]',
         r"log\.toml: \[dvl\] velocity: .* has no field velocit\[0\]; did you mean velocity[?] it has: timestamp"),
-    "two sensors": (
-        [imu(ROWS), ("/imu2", *imu(ROWS)[1:]), dvl(ROWS)], "",
-        r"for imu, 2 topics fit: /imu, /imu2; choose one: --topic imu=/imu"),
-    "no Doppler log": (
-        [imu(ROWS), *[(f"/twist_{i}", TWIST, [{"header": at(0)}]) for i in range(9)]],
-        "", r"nothing for dvl: no .*--topic dvl=/twist_0.*`sonar-graph inspect .* --toml` begins"),
     "no common time": (
         [imu(ROWS), ("/dvl", "marine_acoustic_msgs/msg/Dvl", LATER)], "",
         r'IMU from .* DVL from .*no common time; .*stamp = "log" under .* See stamp, stamp_unit_s and stamp_offset_s'),

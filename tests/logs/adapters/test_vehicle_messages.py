@@ -185,8 +185,6 @@ CASES: dict[str, Case] = {
 }
 REFUSED = {
     "a name": (one(("buoy", 0.9)), "", r"""class 'buoy' is no integer identity.*ids = \{"buoy" = 1\}"""),
-    "digits": (one((DIGITS, 0.9)), "", r"has an identity of 2\^56 or more"),
-    "digits of a name": (one(("b", 0.9)), f'[detections]\nids = {{"b" = {DIGITS}}}', r"has an identity of 2\^56 or mo"),
     "no posterior": (one(("1", 0.9), ("2", 0.8)), "", r"/landmarks: scores of one detection add up to 1\.7"),
 }
 AXES: dict[str, tuple[str, Rotation, list[float], Rotation]] = {

@@ -284,7 +284,11 @@ def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "form", ["%m/%d/%Y %H:%M:%S.@", "%H:%M:%S.@", "%Y-%m-%d", "%d.%m.%Y %H:%M"]
+    "form",
+    [
+        "%m/%d/%Y %H:%M:%S.@",
+        "%H:%M:%S.@",
+    ],
 )
 def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form):
     d = dive()
