@@ -18,9 +18,8 @@ from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.settings import nested, settings_of
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate
 from sonar_graph.testing import check_consistent, laws
 from sonar_graph.testing.drives import small_world, still_world
@@ -319,26 +318,3 @@ def test_what_a_policy_does_not_read_is_refused_by_name(
     with pytest.raises(EstimatorError) as refused:
         make_params(Isam2, given, "isam2")
     assert fault in str(refused.value)
-
-
-def test_a_section_keeps_its_default_policy_where_none_is_given() -> None:
-    params = Isam2Params(
-        **nested({"identity.longest_wait_s": 3.0, "kernel.width": 2.0})
-    )
-    assert params.identity.policy == "robust"
-    assert params.identity.longest_wait_s == 3.0
-    assert params.model_dump()["kernel"] == {"shape": "cauchy", "width": 2.0}
-    assert Isam2Params(**params.model_dump(mode="json")) == params
-
-
-def test_the_listing_has_every_setting_once_with_its_policy() -> None:
-    listed = {setting.name: setting for setting in settings_of(Isam2Params)}
-    assert len(listed) == len(settings_of(Isam2Params)) == 24
-    assert listed["smoother.lag_s"].default == 15.0
-    assert listed["identity.policy"].default == "robust"
-    assert listed["identity.gate_probability"].meaning.endswith(
-        'Only with policy = "gate".'
-    )
-    assert listed["identity.minimum_probability"].meaning.endswith(
-        'Only with policy = "robust" or "gate".'
-    )

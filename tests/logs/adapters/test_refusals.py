@@ -6,7 +6,7 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.roles import LONGEST
-from tests.logs.adapters.conftest import at, dvl, imu, rows_of
+from tests.logs.adapters.conftest import at, dvl, imu
 from tests.logs.conftest import vector
 
 ROWS = 20
