@@ -2,10 +2,8 @@
 
 import json
 import re
-import sys
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -336,46 +334,3 @@ def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(
         assert run("recognise", lane_log, "-o", out, "--report", page, *more) == 0
         assert f"Page: {page}" in capsys.readouterr().out
         assert 'id="track-0"' in page.read_text()
-
-
-class Decoder:
-    """In place of AcTag: sees tag 5 in every frame."""
-
-    def __init__(self, **settings: object) -> None:
-        self.settings = settings
-
-    def run_detection(self, image: np.ndarray) -> list:
-        corners = np.array([[1.9, 0.1], [2.0, 0.1], [2.0, 0.0], [1.9, 0.0]])
-        return [[5, corners, corners]] if image.any() else []
-
-
-def test_tags_are_written_as_landmarks_where_actag_is_installed(
-    lane_log, run, tmp_path, monkeypatch, capsys
-):
-    written = tmp_path / "tags.mcap"
-    monkeypatch.setitem(sys.modules, "actag", None)
-    assert run("recognise", lane_log, "-o", written, "--recogniser", "actag") == 2
-    assert "sonar-graph[actag]" in " ".join(capsys.readouterr().err.split())
-    assert not written.exists()
-    monkeypatch.setitem(sys.modules, "actag", SimpleNamespace(AcTag=Decoder))
-    assert (
-        run(
-            "recognise",
-            lane_log,
-            "-o",
-            written,
-            "--recogniser",
-            "actag",
-            "--set",
-            "tag_size_m=0.15",
-        )
-        == 0
-    )
-    sequence = read_log(written)
-    found = sequence.detections
-    assert len(found) > 50
-    assert set(found.candidate_ids.ravel().tolist()) == {5}
-    np.testing.assert_allclose(found.range_m, 1.95)
-    np.testing.assert_allclose(found.azimuth_rad, 0.05)
-    assert "AcTag" in sequence.notes["detections.rule"]
-    assert "0.15 m" in sequence.notes["detections.designs"]
