@@ -304,7 +304,7 @@ def at_no_stated_start(run: Sequence, source: str) -> Sequence:
 
 @pytest.mark.parametrize(
     ("off_m", "source", "line"),
-    [(40.0, "fixes", "use = false"), (0.1, "fixes", ""), (40.0, "stated", "origin_m")],
+    [(40.0, "fixes", "use = false"), (40.0, "stated", "origin_m")],
 )
 def test_depths_at_another_height_than_the_fixes_are_wrong_unless_they_begin_at_a_stated_start(
     off_m: float, source: str, line: str

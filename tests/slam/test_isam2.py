@@ -256,33 +256,13 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"identity.view_range_m": 5.0},
         'policy = "max-mixture" has it',
     ),
-    "unknown landmarks in a mixture": (
-        {"identity.policy": "max-mixture", "identity.unknown.policy": "associate"},
-        'no such field with policy = "max-mixture"; identity.policy = "robust" or "gate" has it',
-    ),
     "association without its policy": (
         {"identity.unknown.sightings": 3},
         'identity.unknown.policy = "associate" has',
     ),
-    "belief in a mixture": (
-        {"identity.policy": "max-mixture", "identity.minimum_probability": 0.9},
-        '"gate" has it',
-    ),
-    "memory of a whole history": (
-        {"history.remembered_s": 30.0},
-        'history.policy = "bounded" has it',
-    ),
-    "width of no kernel": (
-        {"kernel.shape": "none", "kernel.width": 2.0},
-        'kernel.shape = "huber" or "cauchy" has it',
-    ),
     "mixture in a bounded history": (
         {"identity.policy": "max-mixture", "history.policy": "bounded"},
         'history.policy = "bounded" cannot be with identity.policy = "max-mixture", which chooses anew in the whole',
-    ),
-    "a mixture in a bounded history": (
-        {"identity.policy": "max-mixture", "history.policy": "bounded"},
-        'policy = "max-mixture", which',
     ),
     "no such policy": (
         {"identity.policy": "gcn"},
@@ -296,17 +276,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"smother.lag_s": 3},
         "smother: there is no such field; did you mean smoother?",
     ),
-    "no such setting": (
-        {"smoother": {"lag": 3}},
-        "smoother.lag: there is no such field; did you mean lag_s? smoother has",
-    ),
     "its section is missing": (
         {"unknown.density_m2": 1, "lag_s": 20},
         "lag_s: there is no such field; did you mean smoother.lag_s? it has: keyframes, smoother, history, kernel",
-    ),
-    "out of range": (
-        {"identity.policy": "gate", "identity.gate_probability": 2},
-        "identity.gate_probability: expected a number",
     ),
 }
 

@@ -165,7 +165,10 @@ def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
 
 @pytest.mark.parametrize(
     "cov",
-    [np.zeros((2, 2)), np.diag([1.0, -1.0]), np.ones((2, 2)), np.diag([1.0, np.nan])],
+    [
+        np.zeros((2, 2)),
+        np.diag([1.0, -1.0]),
+    ],
 )
 def test_noise_that_is_no_covariance_is_refused_where_gtsam_takes_it(cov):
     assert gtsam.noiseModel.Gaussian.Covariance(cov, False) is not None
