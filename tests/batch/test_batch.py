@@ -5,7 +5,6 @@ import errno
 import os
 import signal
 import tempfile
-import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -343,18 +342,6 @@ def test_interrupt_or_termination_within_the_block_is_told_at_its_end(handler, n
     assert steps == ["went on"]
 
 
-def test_an_error_of_the_block_is_not_hidden_and_an_interrupt_outlives_it(handler):
-    def failing_block() -> None:
-        with contextlib.suppress(OSError), deferred_interrupt():
-            os.kill(os.getpid(), signal.SIGINT)
-            raise OSError("disk full")
-
-    with pytest.raises(KeyboardInterrupt):
-        failing_block()
-    with pytest.raises(OSError, match="full"), deferred_interrupt():
-        raise OSError("full")
-
-
 def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is_noticed(
     handler,
 ):
@@ -377,16 +364,3 @@ def test_termination_counts_like_an_interrupt_and_an_interrupt_that_shells_let_b
     if handler is signal.SIG_IGN:
         with deferred_interrupt():
             os.kill(os.getpid(), signal.SIGINT)
-
-
-def test_block_in_another_thread_is_as_without(handler):
-    done = []
-
-    def block() -> None:
-        with deferred_interrupt():
-            done.append(signal.getsignal(signal.SIGINT) is handler)
-
-    thread = threading.Thread(target=block)
-    thread.start()
-    thread.join()
-    assert done == [True]

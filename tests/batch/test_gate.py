@@ -8,9 +8,7 @@ import pytest
 from regression_gate import GateVerdict, bless, gate
 
 from sonar_graph.batch.recorded import RecordedBatch
-from sonar_graph.errors import EvaluationError
 from tests.recorded_batches import (
-    ASKED,
     LOGS,
     changed,
     drawn_batch,
@@ -21,7 +19,6 @@ from tests.recorded_batches import (
 )
 
 ATE = "causal.ate_se2_m"
-YAW = "causal.yaw_rmse_rad"
 
 
 @pytest.fixture
@@ -45,11 +42,6 @@ def judged(before: RecordedBatch, after: RecordedBatch, folder: Path) -> GateVer
 def level(batch: RecordedBatch, column: str, value: float) -> RecordedBatch:
     """The batch, had a column the same value in every run."""
     return updated(batch, lambda _: {column: value})
-
-
-def factor_of(row: int, factor: float, others: float = 1.0) -> np.ndarray:
-    """Factors of the 24 runs of a contestant, of which one stands out."""
-    return np.where(np.arange(24) == row, factor, others)
 
 
 def noise(seed: int, mean: float, runs: int = 24) -> np.ndarray:
@@ -113,101 +105,6 @@ def test_a_run_that_fails_now_or_lost_a_score_does_not_pass_and_says_why(
         verdict = judged(before, after, tmp_path)
         assert verdict.passed
         assert not verdict.look_at
-
-
-@pytest.mark.parametrize(("seeds", "has_test"), [(2, False), (3, True)])
-def test_three_cases_have_a_test_and_two_are_neither_tested_nor_unmoved(
-    tmp_path, seeds, has_test
-):
-    batch = drawn_batch(seeds)
-    verdict = judged(batch, batch, tmp_path)
-    assert verdict.untested == ([] if has_test else batch.contestants)
-    assert verdict.has_test is has_test
-    assert verdict.unmoved == (batch.contestants if has_test else [])
-
-
-@pytest.mark.parametrize(("logs", "passes"), [(2, True), (3, False), (9, False)])
-def test_recorded_logs_are_cases_of_one_test(tmp_path, logs, passes):
-    batch = drawn_batch(1, logs=tuple(f"dive {n}" for n in range(logs)))
-    batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
-    verdict = judged(batch, changed(batch, "isam2", ATE, noise(1, 1.5, logs)), tmp_path)
-    assert verdict.passed is passes
-    found = {(one.log, one.contestant, one.column) for one in verdict.worsenings}
-    assert found == (set() if passes else {("all logs", "isam2", ATE)})
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "said"),
-    [
-        ("rate_hz", 4.0, "rate_hz is 4.0, in the reference 2.0"),
-        ("options", {"laps": 2}, "options.laps is 2, in the reference 1"),
-        ("options", {}, "options.laps is not given, in the reference 1"),
-        ("settings", {"lag_s": 5}, "settings.lag_s is 5, in the reference not given"),
-        (
-            "landmarks",
-            {"spacing_m": 25},
-            "landmarks.spacing_m is 25, in the reference not given",
-        ),
-        ("landmarks", {}, "landmarks is {}, in the reference not given"),
-        (
-            "settings",
-            {"lag_s": None},
-            "settings.lag_s is null, in the reference not given",
-        ),
-        ("files", {"log": "abc"}, 'files.log is "abc", in the reference not given'),
-    ],
-)
-def test_other_experiments_under_the_same_names_are_refused(
-    batch, reference, field, value, said
-):
-    asked = json.dumps(ASKED | {field: value})
-    other = [
-        *batch.runs[:4],
-        replace(batch.runs[4], texts={"asked": asked}),
-        *batch.runs[5:],
-    ]
-    with pytest.raises(
-        EvaluationError,
-        match=re.escape(f"basin, isam2, seed 1: {said}; these are different"),
-    ):
-        gate(replace(batch, runs=other), reference)
-
-
-def test_what_is_no_reference_is_refused(batch, reference, tmp_path):
-    for runs, told in (
-        (
-            [replace(run, texts={}) for run in batch.runs],
-            "basin, dead-reckoning, seed 0: the results have no column",
-        ),
-        ([failed(run) for run in batch.runs], "none of its 72 runs ended"),
-    ):
-        with pytest.raises(EvaluationError, match=told):
-            bless(replace(batch, runs=runs), tmp_path / "none.json")
-    fewer, other = replace(batch, runs=batch.runs[1:]), tmp_path / "other.json"
-    with pytest.raises(
-        EvaluationError,
-        match="1 of its runs are not in the batch, first basin, dead-reckoning, seed",
-    ):
-        gate(fewer, reference)
-    assert judged(fewer, batch, tmp_path).new == ["basin, dead-reckoning, seed 0"]
-    for content, told in (
-        ('{"format": "something else"}', r"other\.json: format is 'something else'"),
-        (
-            '{"format": "sonar_graph batch reference 1", "runs": []}',
-            "make it again with bless",
-        ),
-    ):
-        other.write_text(content)
-        with pytest.raises(EvaluationError, match=told):
-            gate(batch, other)
-
-
-def test_a_run_that_did_not_end_leaves_no_score_in_a_reference(batch, tmp_path):
-    ended_late = [replace(batch.runs[0], status="timeout"), *batch.runs[1:]]
-    bless(replace(batch, runs=ended_late), tmp_path / "reference.json")
-    content = json.loads((tmp_path / "reference.json").read_text())
-    assert content["runs"][0]["scores"] == {}
-    assert content["versions"] == batch.runs[0].texts
 
 
 def slower(batch: RecordedBatch, factor: float) -> RecordedBatch:

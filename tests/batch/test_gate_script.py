@@ -83,38 +83,6 @@ def test_a_batch_passes_by_the_reference_that_it_became_and_a_worse_one_fails(
     assert "Hardly different from the reference: dead-reckoning" in said
 
 
-@pytest.mark.parametrize("content", ['{"a": 1}', "words", "[]"])
-def test_a_json_file_of_others_is_replaced_only_when_asked_for(
-    content, tmp_path, capsys
-):
-    mine = tmp_path / "mine.json"
-    mine.write_text(content)
-    folder = written_batch(tmp_path / "batch")
-    assert run("bless", folder, mine) == 2
-    said = "and sonar-graph did not write it; choose another name, or give --overwrite"
-    assert said in capsys.readouterr().err
-    assert mine.read_text() == content
-    assert run("bless", folder, mine, "--overwrite") == 0
-    assert run("bless", folder, mine) == 0
-
-
-def test_an_incomplete_batch_is_neither_blessed_nor_judged(tmp_path, capsys):
-    reference, incomplete = (
-        tmp_path / "reference.json",
-        written_batch(tmp_path / "incomplete", not_run=3),
-    )
-    assert run("bless", incomplete, reference) == 2
-    assert not reference.exists()
-    run("bless", written_batch(tmp_path / "whole"), reference)
-    capsys.readouterr()
-    assert run("judge", incomplete, reference) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "3 of 16 runs have not been done" in line
-    assert line.endswith(
-        "give the bench command that began it again: it goes on from there"
-    )
-
-
 def install(site: Path, default: float) -> None:
     info = site / "noisy-1.0.dist-info"
     info.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,3 @@
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +18,6 @@ from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
-
-Planned = Callable[..., PlannedRun]
 
 
 def numbers(row: dict[str, Any]) -> dict[str, Any]:
@@ -202,20 +198,3 @@ def test_estimator_that_changes_during_a_run_gives_no_result(
         match=r"the code changed during a run: estimator_source \w+, planned with ",
     ):
         perform(run, tmp_path / "after")
-
-
-def test_estimator_is_loaded_between_two_looks_at_its_source(
-    planned, tmp_path, monkeypatch
-):
-    run, order = planned(), []
-    monkeypatch.delitem(sys.modules, "baselines.dead_reckoning")
-    for name in ("versions_of", "load_estimator", "run_estimator", "sources_now"):
-        real = getattr(one_run, name)
-
-        def noted(*given: Any, name: str = name, real: Any = real, **named: Any) -> Any:
-            order.append(name)
-            return real(*given, **named)
-
-        monkeypatch.setattr(one_run, name, noted)
-    perform(run, tmp_path / "run")
-    assert order == ["versions_of", "load_estimator", "run_estimator", "sources_now"]

@@ -15,7 +15,6 @@ from permutation import (
     families,
     with_all_logs,
 )
-from regression_gate import movable, worse_groups
 from scipy import stats
 
 from sonar_graph.batch.recorded import ALL_LOGS
@@ -96,31 +95,6 @@ def drawn(rng: np.random.Generator, seeds: int, *, lost: float, worse: float = 0
     return with_all_logs(
         {group: dict(enumerate(values.tolist())) for group, values in groups.items()}
     )
-
-
-def share_of_failures(
-    seeds: int, *, lost: float, worse: float = 0.0, batches: int = 150
-) -> float:
-    rng = np.random.default_rng(7)
-    batch = [drawn(rng, seeds, lost=lost, worse=worse) for _ in range(batches)]
-    return float(
-        np.mean(
-            [bool(worse_groups(ratios, families(movable(ratios)))) for ratios in batch]
-        )
-    )
-
-
-@pytest.mark.parametrize("lost", [0.0, 0.1])
-@pytest.mark.parametrize("seeds", [1, 3, 5, 8])
-def test_another_draw_of_the_same_fails_in_no_more_than_five_per_cent(seeds, lost):
-    assert (
-        share_of_failures(seeds, lost=lost) <= stats.binom.ppf(0.999, 150, 0.05) / 150
-    )
-
-
-@pytest.mark.parametrize(("seeds", "least"), [(3, 0.6), (5, 0.8), (8, 0.95)])
-def test_half_as_large_again_is_found_with_few_seeds(seeds, least):
-    assert share_of_failures(seeds, lost=0.0, worse=0.5, batches=60) >= least
 
 
 def noise(scatter: float, seed: int, cases: int = 8) -> np.ndarray:

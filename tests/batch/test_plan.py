@@ -263,16 +263,6 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
     assert hashed() == before
 
 
-def test_hash_of_a_module_is_of_its_file(tmp_path, hashed, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    hashes = [hashed()]
-    for text in ("a = 1\n", "a = 2\n"):
-        (tmp_path / "hashed_package.py").write_text(text)
-        hashes.append(hashed())
-    assert hashes[0] == ""
-    assert len(set(hashes)) == 3
-
-
 def test_hash_is_taken_once_in_a_process_and_a_look_at_the_disk_sees_a_change_of_equal_size_and_time(
     package, hashed
 ):

@@ -161,26 +161,3 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
         if option.name == "topics"
     )
     assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
-
-
-def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs():
-    """A command that joins later must not be forgotten."""
-    writing = {
-        path[-1]
-        for path, c in commands().items()
-        if any(option.name == "output" for option in c.params)
-    }
-    of_folders, of_nothing = {"mrclam", "dlr", "akit", "stpere"}, {"basin", "demo"}
-    converted = {"rosbag", "didson", "aris", "oculus", "victoria-park"}
-    # and live, in tests/live
-    tried = converted | {
-        "compare",
-        "recognise",
-        "landmarks",
-        "calibrate",
-        "join",
-        "label",
-    }
-    # test_show, test_own_files, test_bench
-    elsewhere = {"run", "live", "figures", "csv", "bench"}
-    assert writing == tried | of_folders | of_nothing | elsewhere

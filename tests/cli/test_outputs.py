@@ -7,8 +7,8 @@ import pytest
 from mcap.writer import Writer
 
 from sonar_graph.cli.compare import names_written
-from sonar_graph.cli.outputs import writable_folder, writable_log
-from sonar_graph.errors import EvaluationError, LogError
+from sonar_graph.cli.outputs import writable_folder
+from sonar_graph.errors import EvaluationError
 from sonar_graph.files import LOCK, MANIFEST
 
 QUICK = ("--estimators", "dead-reckoning")
@@ -52,18 +52,6 @@ def test_a_log_made_from_a_file_never_replaces_it(
             r"sonar-graph: \S+: is what is read, .*choose another name.*\n",
             capsys.readouterr().err,
         )
-    assert basin.read_bytes() == before
-
-
-def test_neither_of_two_logs_that_are_joined_is_replaced(basin, run, tmp_path, capsys):
-    before, other = basin.read_bytes(), tmp_path / "other.mcap"
-    other.write_bytes(before)
-    for order in ((basin, other), (other, basin)):
-        for output in (basin, *links(basin, tmp_path)):
-            assert run("join", *order, "-o", output, "--overwrite") == 2
-            assert "is what is read" in capsys.readouterr().err
-            if output != basin:
-                output.unlink()
     assert basin.read_bytes() == before
 
 
@@ -223,24 +211,6 @@ def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_
         assert {basin, unreadable, there} == set(tmp_path.iterdir())
         assert not list(there.iterdir())
     assert run("compare", basin, "-o", tmp_path / "made" / "below", *QUICK) == 0
-
-
-def test_to_look_whether_a_place_can_be_written_makes_no_folder_that_another_command_may_find(
-    tmp_path, monkeypatch
-):
-    """Two commands begin at once in a new folder: neither removes it before the other has written to it."""
-    made = []
-    monkeypatch.setattr("os.mkdir", lambda path, *_: made.append(path))
-    assert writable_log(tmp_path / "new" / "below" / "log.mcap")
-    assert not made
-    (tmp_path / "words").write_text("words")
-    (tmp_path / "link").symlink_to("nowhere")
-    for place in ("words", "words/below", "link", "link/below"):
-        with pytest.raises(
-            LogError,
-            match=r"log\.mcap: cannot be written: (Not a directory|No such file)",
-        ):
-            writable_log(tmp_path / place / "log.mcap")
 
 
 OURS = [

@@ -9,7 +9,6 @@ import pytest
 
 from sonar_graph.calibration import Calibration, PositionCalibration
 from sonar_graph.diagnosis import check_sensors
-from sonar_graph.diagnosis.signals import SignalStretch, explained, steps
 from sonar_graph.measurements import Depth, Floats, Heading, PositionFixes
 from sonar_graph.sequence import Sequence
 
@@ -142,36 +141,3 @@ def test_velocities_that_jump_without_a_force_have_lost_the_bottom():
 
 def test_right_sensors_have_no_cause():
     assert not [found.quantity for found in check_sensors(observed()) if found.acts]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_noise_a_walk_and_the_wrong_scale_of_a_vehicle_that_stops_and_goes_are_no_steps(
-    seed: int,
-):
-    rng = np.random.default_rng(seed)
-    t = np.arange(600) * 0.2
-    x = np.cumsum(np.where((t // 20) % 3 == 1, 0.2, 0.0))
-    noise = 0.02 * rng.standard_normal(600)
-    walk = np.cumsum(0.01 * rng.standard_normal(600))
-    assert not steps(t, x + noise + walk, x, 0.02)
-    assert not steps(t, 1.5 * x + noise, x, 0.02)
-    (step,) = steps(t, x + noise + walk + 1.0 * (t >= 50.0), x, 0.02)
-    assert step.seconds == pytest.approx(50.0, abs=0.4)
-    assert step.size == pytest.approx(1.0, abs=0.2)
-
-
-def test_what_a_column_explains_is_found_beside_another_that_counts_in_any_case():
-    t = np.arange(600) * 0.2
-    rng = np.random.default_rng(0)
-    y = np.sin(t) + 0.03 * t + 0.5 * np.cos(0.3 * t) + 0.02 * rng.standard_normal(600)
-
-    def columns(stretch: SignalStretch) -> Floats:
-        return np.column_stack([np.cos(0.3 * stretch.seconds), stretch.seconds])
-
-    found = explained([SignalStretch(t, y, np.sin)], columns, 1)
-    assert found is not None
-    assert found.q[0] == pytest.approx(0.5, abs=4 * found.sigmas[0])
-    assert found.is_clear
-    of_nothing = explained([SignalStretch(t, np.sin(t), np.sin)], columns, 1)
-    assert of_nothing is not None
-    assert not of_nothing.is_clear

@@ -15,9 +15,8 @@ from sonar_graph.calibration import (
     Mounting,
     Start,
 )
-from sonar_graph.diagnosis.findings import Finding, with_interval
+from sonar_graph.diagnosis.findings import Finding
 from sonar_graph.diagnosis.start import (
-    StartHeading,
     StartTilt,
     bias_findings,
     find_start_heading,
@@ -102,23 +101,6 @@ def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_
     assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
 
 
-@pytest.mark.parametrize(
-    ("error_m", "sigma_m", "acts"),
-    [(0.04, 0.01, False), (0.06, 0.01, True), (0.5, 0.3, False)],
-)
-def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(
-    error_m: float, sigma_m: float, acts: bool
-):
-    (row, *_) = lever_findings(
-        match(arm(-1.5 + error_m, 0.1, 0.3, sigma=sigma_m)), GIVEN
-    )
-    assert row.acts == acts
-    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s", (
-        "digits that the interval supports"
-    )
-    assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
-
-
 def test_a_bias_beyond_its_sigma_is_stated_along_the_axes_of_the_imu():
     sources = ("from 20 s of rest", "from turns", "from turns")
     biases = arm(1e-3, 1.5e-4, -4e-3, sigma=1e-4)
@@ -181,16 +163,6 @@ def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequ
 def assert_tilt(found: StartTilt, roll_pitch: tuple[float, float]) -> None:
     for axis, true in enumerate(roll_pitch):
         assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
-
-
-@pytest.mark.parametrize(("rest_s", "used"), [(15.0, 10), (50.0, 40)])
-def test_a_rest_at_the_start_is_used_as_long_as_it_lasts(rest_s: float, used: int):
-    found = find_start_tilt(resting(rest_s))
-    assert found.said == f"from {used} s of rest"
-    assert_tilt(found, (ROLL, PITCH))
-    bias = found.gyro_bias()
-    for one, true in zip(bias, BIAS, strict=True):
-        assert abs(one.value - true) < 4 * one.sigma < 4 * 1.2e-4
 
 
 @pytest.mark.parametrize(
@@ -327,24 +299,3 @@ def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float
     assert found.rpy_rad[2] == pytest.approx(
         0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6
     )
-
-
-def test_a_wrong_heading_has_the_roll_and_pitch_of_the_alignment_also_where_the_calibrations_fit():
-    """The reference's contradict the row of the alignment; they are written only where there is none."""
-    found = find_start_tilt(resting(50.0))
-    heading = StartHeading(
-        (ROLL - 0.04, PITCH + 0.03, 0.9), (1.0, 2.0, -3.0), Estimate1D(0.2, 0.002)
-    )
-    right = started(rpy_rad=(ROLL, PITCH, 0.7))
-    assert not any(row.acts for row in tilt_findings(found, right, 0.9))
-    row = heading.finding(found)
-    rpy, place = (line["start"] for line in lines_of(row))
-    expected = [found.angle(0).value, found.angle(1).value, 0.9]
-    assert rpy["rpy_rad"] == pytest.approx(expected, abs=1e-4)
-    assert place["position_m"] == [1.0, 2.0, -3.0]
-    assert "with roll and pitch from 40 s of rest" in row.text()
-    alone = heading.finding(StartTilt(None, "no rows"))
-    assert lines_of(alone)[0]["start"]["rpy_rad"] == pytest.approx(
-        heading.rpy_rad, abs=1e-4
-    )
-    assert "roll and pitch" not in alone.text()

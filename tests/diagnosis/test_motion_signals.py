@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import aiding_check
-from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
+from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Heading, LandmarkDetections
@@ -70,15 +70,6 @@ def test_a_hole_of_the_imu_breaks_the_motion_and_a_reference_is_unknown_in_it():
     assert all(part.seconds[-1] <= 41 or part.seconds[0] >= 45 for part in rows)
 
 
-def test_a_hole_between_two_rows_of_the_doppler_log_breaks_the_motion():
-    """It is no gap of the log, whose rows are 0.2 s apart."""
-    whole = motion_of(RUN)
-    assert set(whole.parts) == {0}
-    motion = motion_of(without_imu(RUN, 40.0, 40.3))
-    assert set(motion.parts) == {0, 1}
-    assert np.diff(motion.seconds).max() < 1.0
-
-
 @pytest.mark.parametrize("angle", [-0.7, 0.5 * np.pi])
 def test_velocities_turned_on_the_body_turn_the_path(angle: float):
     """To the left where the angle is positive; the arm to the log is taken off before."""
@@ -92,24 +83,6 @@ def test_velocities_turned_on_the_body_turn_the_path(angle: float):
     length_m = np.abs(motion_of(ahead).path_m).max()
     expected = motion_of(ahead).path_m * np.exp(1j * angle)
     assert np.abs(motion_of(turned).path_m - expected).max() < 0.05 * length_m
-
-
-def test_a_gap_of_the_doppler_log_breaks_the_motion_too():
-    t = (RUN.dvl.stamps_ns - RUN.dvl.stamps_ns[0]) * 1e-9
-    run = replace(RUN, dvl=RUN.dvl.rows((t <= 40.0) | (t >= 46.0)))
-    motion = motion_of(run)
-    assert set(motion.parts) == {0, 1}
-    assert np.isnan(motion.reference(motion.height_m)(np.array([43.0]))).all()
-
-
-def test_stretches_are_no_longer_than_they_may_be_and_lose_no_row():
-    motion = motion_of(RUN)
-    inside = np.linspace(motion.seconds[0], motion.seconds[-1], 301)
-    for longest_s, count in ((STRETCH_S, 1), (40.0, 3)):
-        rows = motion.stretches(inside, inside, motion.reference(inside), longest_s)
-        assert len(rows) == count
-        assert sum(len(part.seconds) for part in rows) == len(inside)
-        assert all(np.ptp(part.seconds) <= longest_s for part in rows)
 
 
 @pytest.mark.parametrize("is_broken", [True, False])
@@ -147,15 +120,6 @@ def by_hand(seconds: np.ndarray, parts: list[int], height_m: np.ndarray) -> Body
         path_m=0.5 * seconds + 0j,
         ahead_m=0.5 * seconds,
     )
-
-
-def test_an_instant_at_a_row_is_in_the_part_of_the_row() -> None:
-    seconds = np.array([0.0, 1.0, 5.0, 6.0])
-    motion = by_hand(seconds, [0, 0, 1, 1], 0 * seconds)
-    assert motion.part_at(seconds).tolist() == [0, 0, 1, 1]
-    path = motion.reference(motion.path_m)
-    np.testing.assert_array_equal(path(seconds), motion.path_m)
-    assert np.isnan(path(np.array([1.5, 4.9]))).all()
 
 
 @pytest.mark.parametrize("climb_m_s", [0.2, -0.2])

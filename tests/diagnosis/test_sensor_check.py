@@ -242,23 +242,6 @@ def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told:
         assert is_told or "steady, but at 0.8 m/s" in found[name].text()
 
 
-@pytest.mark.parametrize(
-    ("factor", "acts"),
-    [(0.5, True), (0.75, False), (1.0, False), (1.35, False), (2.0, True)],
-)
-def test_a_density_matters_by_half_as_much_again_either_way(factor: float, acts: bool):
-    """100 s of rest at 100 Hz, which tells a density to some percent."""
-    rng, n, given = np.random.default_rng(1), 10_000, RIGHT.calibration.imu
-    rate, force = factor * 10 * rng.standard_normal((2, n, 3))
-    run = with_rows(
-        given.gyro_noise_density * rate,
-        given.accel_noise_density * force,
-        np.zeros((500, 3)),
-    )
-    for finding in sensor_check.noise_findings(run):
-        assert finding.acts == acts, finding.text()
-
-
 def told(
     *values: float, sigma: float = 1e-3
 ) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
@@ -357,10 +340,6 @@ SPEEDS = [
     (20.1, "cm/s", 100, 0.01), (299.0, "cm/s", 100, 0.01), (301.0, "mm/s", 1000, 0.001), (2900.0, "mm/s", 1000, 0.001),
     (9e5, "mm/s", 1000, 0.001),  # no unit makes it slow: the smallest
 ]
-FORCES = [
-    ("g", 9.80665, (0.81, 1.0, 1.19)), ("mg", 9.80665e-3, (0.992, 1.0, 1.19)), ("cm/s²", 0.01, (0.81, 1.0, 1.008)),
-    ("mm/s²", 0.001, (0.81, 1.0, 1.19)),
-]
 # fmt: on
 
 
@@ -382,18 +361,6 @@ SLOW = simulate_mission(
 )
 
 
-@pytest.mark.parametrize("factor", [1.0, 5.0, 30.0, 100.0])
-def test_velocities_that_a_vehicle_has_are_in_another_unit_where_ranges_change_by_a_tenth(
-    factor: float,
-):
-    run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=factor * SLOW.dvl.velocity))
-    measured_m, by_dvl_m = range_changes(run)
-    assert by_dvl_m / measured_m == pytest.approx(factor, rel=0.4)
-    (said,) = [fault.advice for fault in wrong_units(run, LogConfig())] or [""]
-    assert ("cm/s? `scale = 0.01`" in said) == (factor > 10.0)
-    assert ("ranges to landmarks change by" in said) == (factor > 10.0)
-
-
 def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_or_landmarks_few():
     rng, velocity = np.random.default_rng(0), SLOW.dvl.velocity
     spikes = velocity + 8.0 * (rng.random((len(velocity), 1)) < 0.2)
@@ -413,18 +380,6 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     assert range_changes(replace(SLOW, detections=few)) is None
     assert not wrong_units(replace(SLOW, detections=few, dvl=far), LogConfig())
     assert not wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
-
-
-@pytest.mark.parametrize(("unit", "factor", "shares"), FORCES)
-def test_a_force_is_in_the_unit_that_brings_it_nearest_to_gravity(unit, factor, shares):
-    """Between mg and cm/s², which differ by a fiftieth, an accelerometer within a hundredth decides."""
-    for share in shares:
-        (fault,) = units(force=share * 9.80665 / factor)
-        assert fault.quantity == "accelerometer: unit"
-        assert f"instead of 9.807 m/s²: {unit}?" in fault.advice
-        assert line_of(fault) == pytest.approx(
-            {"linear_acceleration_scale": factor}, rel=1e-5
-        )
 
 
 def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
@@ -486,34 +441,6 @@ def test_readings_that_never_change_have_no_noise_to_be_told():
     assert by_name(list(sensor_check.noise_findings(moved)))[
         "gyro noise density"
     ].estimate.is_known
-
-
-def test_what_the_configuration_scales_is_taken_over():
-    imu = {"angular_velocity_scale": -1.0, "linear_acceleration_scale": 2.0}
-    faults = units(speed=200.0, turn=20.0, force=1.0, dvl={"scale": 3.0}, imu=imu)
-    assert [fault.quantity for fault in faults] == [
-        "DVL: unit",
-        "gyro: unit",
-        "accelerometer: unit",
-    ]
-    speed, turn, force = map(line_of, faults)
-    assert speed == pytest.approx({"scale": 0.03})
-    assert turn == pytest.approx({"angular_velocity_scale": -np.pi / 180}, rel=1e-4)
-    assert force == pytest.approx({"linear_acceleration_scale": 19.6133})
-
-
-def test_a_twentieth_of_spikes_and_rows_that_were_not_measured_in_full_count_for_nothing():
-    """A vector without one component looks shorter than it is; without any row there is nothing to say."""
-    few, many = (np.where(np.arange(N) < k, 1e4, 0.1) for k in (4, 7))
-    assert not units(speed=few, turn=few)
-    assert [fault.quantity for fault in units(speed=many, turn=many)] == [
-        "DVL: unit",
-        "gyro: unit",
-    ]
-    force = vectors(9.8).copy()
-    force[: N - 10] = [np.nan, 0.0, 1.0]
-    assert not units(force=force)
-    assert not units(force=np.nan)
 
 
 @pytest.mark.parametrize("sensor", ["imu", "dvl"])

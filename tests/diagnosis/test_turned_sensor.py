@@ -15,7 +15,6 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from .test_sensor_check import line_of
 
 WORLD = simulate_mission(MissionOptions(seed=4, duration_s=60, landmarks=40))
-ANGLES = (np.pi / 2, -0.7)
 OTHER = {"imu": "dvl", "dvl": "imu"}
 
 
@@ -66,9 +65,10 @@ def with_measured_start(run: Sequence) -> Sequence:
     return replace(run, calibration=calibration)
 
 
-@pytest.mark.parametrize("role", ["imu", "dvl"])
-@pytest.mark.parametrize("yaw_rad", ANGLES)
-@pytest.mark.parametrize("witness", ["sonar", "fixes"])
+@pytest.mark.parametrize(
+    ("role", "yaw_rad", "witness"),
+    [("imu", np.pi / 2, "sonar"), ("dvl", -0.7, "sonar"), ("imu", -0.7, "fixes")],
+)
 def test_a_third_sensor_shows_which_is_turned_and_its_line_puts_all_right(
     role: str, yaw_rad: float, witness: str
 ) -> None:

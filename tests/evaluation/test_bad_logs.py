@@ -1,15 +1,13 @@
 """Logs with images as they come from real dives: damaged, cut off, with a window that changes, with two sonars."""
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.recognition.recognition_record import NO_FLOOR, Recognition
@@ -63,29 +61,6 @@ def plain(lane, tmp_path_factory) -> Recognition:
     return recognised(lane, tmp_path_factory.mktemp("plain"))
 
 
-def test_a_window_that_changes_costs_one_frame_and_tracks_go_on(lane, tmp_path, plain):
-    frames = [
-        cropped(f, 450) if 20 <= k < 45 else f for k, f in enumerate(frames_of(lane))
-    ]
-    found = recognised(lane, tmp_path, frames)
-    stamps = [int(frames[k].stamps_ns[0]) for k in (20, 21, 45)]
-    assert [stamp for stamp, _ in found.warnings] == stamps
-    words = [
-        "used if it comes again",
-        "window changed: 96 x 450",
-        "window changed: 96 x 512",
-    ]
-    assert all(
-        word in reason for word, (_, reason) in zip(words, found.warnings, strict=True)
-    )
-    assert sure(found) == sure(plain)
-    reported = Counter(found.detections.stamps_ns.tolist())
-    for stamp in stamps[
-        1:
-    ]:  # a track that began anew would not be reported in its first frames
-        assert reported[stamp] == Counter(plain.detections.stamps_ns.tolist())[stamp]
-
-
 def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
     frames = [cropped(f, 450) if k % 2 else f for k, f in enumerate(frames_of(lane))]
     found = recognised(lane, tmp_path, frames)
@@ -108,18 +83,6 @@ def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):
     assert len(found.detections) >= len(plain.detections) - 3
 
 
-def test_a_message_that_is_no_image_is_named_and_the_others_are_used(
-    lane, tmp_path, plain
-):
-    whole = sonar_image_messages(TOPIC, lane.one(30)).payloads
-    found = recognised(lane, tmp_path, payloads=np.ascontiguousarray(whole[:, :-1000]))
-    ((stamp, reason),) = found.warnings
-    assert stamp == lane.frames.stamps_ns[30]
-    assert "image.data" in reason
-    assert found.frames == COUNT
-    assert len(found.detections) >= len(plain.detections) - 3
-
-
 def test_bad_frames_are_never_drawn(lane, tmp_path):
     frames = [
         replace(f, intensity=np.full(f.intensity.shape, np.nan, np.float32))
@@ -128,38 +91,6 @@ def test_bad_frames_are_never_drawn(lane, tmp_path):
     found = recognised(lane, tmp_path, frames)
     assert found.pictures == []
     assert found.outcomes == {"frame not used: samples that are not finite": 12}
-
-
-def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(
-    lane, tmp_path, plain
-):
-    log = tmp_path / "log.mcap"
-    messages = [
-        sonar_image_messages(topic, f)
-        for f in frames_of(lane)
-        for topic in (TOPIC, "/other/image")
-    ]
-    write_log(log, lane.sequence, messages)
-    sequence, done = read_log(log), []
-    with pytest.raises(
-        LogError,
-        match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar=",
-    ):
-        recognise_images(log, sequence, progress=done.append)
-    assert done == []
-    assert recognise_images(log, sequence, topic=TOPIC).frames == COUNT
-    with pytest.raises(
-        MissingTopicError, match="/none was chosen but is not in the log"
-    ):
-        recognise_images(log, sequence, topic="/none")
-
-
-def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
-    log = write(lane, tmp_path / "log.mcap")
-    window = TimeWindow(Instant.parse("2"), Instant.parse("8"))
-    found = recognise_images(log, read_log(log, window=window), window=window)
-    assert 28 <= found.frames <= 31
-    assert not [reason for _, reason in found.warnings if "out of order" in reason]
 
 
 def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp_path):

@@ -4,23 +4,19 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
+from sonar_graph.errors import EvaluationError, UnknownEstimatorError
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.scores import (
-    detection_scores,
     landmark_scores,
-    resource_scores,
 )
 from sonar_graph.logs import read_log, write_log
 from sonar_graph.measurements import Measurements
 from sonar_graph.report import sentences
 from sonar_graph.report.figures.maps import true_landmarks_drawn
 from sonar_graph.report.landmark_table import landmark_table
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import Estimate, LandmarkMap, Trajectory
 from sonar_graph.testing import small_world
 
 from .conftest import Offset, straight_sequence
@@ -149,63 +145,6 @@ def test_truth_with_positions_only_scores_positions_alone(install):
     assert np.isnan(partial.errors["offset"]["causal"].yaw_rad).all()
 
 
-def test_of_a_truth_whose_heights_nobody_measured_x_and_y_alone_count(install):
-    whole = straight_sequence()
-    level = whole.truth.positions * [1.0, 1.0, 0.0] + [0.0, 0.0, 7.0]
-    flat = replace(whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, level))
-    judged = compare(flat, ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}})
-    errors, scores = judged.errors["offset"]["causal"], judged.scores["offset"]
-    assert errors.position_dof == 2
-    np.testing.assert_array_equal(errors.position_m[:, 2], 0.0)
-    off = np.hypot(*errors.position_m[:, :2].T)
-    assert scores["causal.ate_raw_m"].value == pytest.approx(np.sqrt(np.mean(off**2)))
-    assert "rms of horizontal position error" in scores["causal.ate_raw_m"].protocol
-    assert "position (x and y)" in scores["causal.nees_position"].protocol
-    assert (
-        "not measured: errors and NEES are of x and y"
-        in judged.sequence.notes["truth.height"]
-    )
-    for known in (
-        whole,
-        replace(
-            flat,
-            truth=replace(flat.truth, positions=level + np.arange(len(level))[:, None]),
-        ),
-    ):
-        assert "truth.height" not in compare(known, ["offset"]).sequence.notes
-
-
-def test_ignored_detections_are_neither_used_nor_refused():
-    n = 3
-    unpredicted = (np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan))
-    log = DetectionLog(
-        np.arange(n),
-        np.ones(n, int),
-        *unpredicted,
-        [Outcome.IGNORED] * 2 + [Outcome.NO_IDENTITY],
-    )
-    scores = detection_scores(log)
-    kinds = ("used", "refused", "unnamed")
-    assert [scores[f"detections.{kind}"].value for kind in kinds] == [0, 0, 1]
-    assert "of 3, 2 of which" in scores["detections.refused"].protocol
-    assert "detections.nis" not in scores
-
-
-def test_bands_are_of_independent_samples_and_spatial_runs_score_height_too(install):
-    comparison = compare(straight_sequence(planar=False), ["offset"])
-    scores = comparison.scores["offset"]
-    assert comparison.errors["offset"]["causal"].position_dof == 3
-    assert scores["causal.nees_position"].value == pytest.approx(1 / 3)
-    assert scores["causal.nees_position"].interval == (
-        0.0,
-        pytest.approx(chi2.ppf(0.975, 3) / 3),
-    )
-    assert "worth 1 independent samples" in scores["causal.nees_position"].protocol
-    assert scores["detections.nis"].interval == pytest.approx(
-        tuple(chi2.ppf([0.025, 0.975], 4) / 4)
-    )
-
-
 def test_all_are_scored_at_the_instants_that_all_have(install):
     class Late(Offset):
         def process(self, measurements: Measurements) -> Estimate | None:
@@ -259,19 +198,6 @@ def test_without_truth_or_with_too_little_the_rest_is_scored_and_it_is_said(inst
     assert comparison.environment["scored instants"].startswith("1 of 40 instants")
 
 
-def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
-    class Modest(Offset):
-        def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
-            return replace(
-                super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan)
-            )
-
-    install(modest=Modest)
-    scores = compare(straight_sequence(), ["modest"]).scores["modest"]
-    assert "causal.ate_raw_m" in scores
-    assert "causal.nees_position" not in scores
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "said"),
     [
@@ -279,7 +205,6 @@ def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
         ((["offset", "offset"],), EvaluationError, "more than once: offset"),
         ((["offset"], {"ekf": {}}), EvaluationError, "settings for ekf"),
         ((["offset", "nobody"],), UnknownEstimatorError, "nobody"),
-        ((["offset"], {"offset": {"colour": 1}}), EstimatorError, "colour"),
         (("offset",), TypeError, r"estimators is a list: give \['offset'\]"),
     ],
 )
@@ -300,25 +225,6 @@ def test_mistakes_of_the_user_are_raised_before_anything_runs(
             TypeError, match="expected a Sequence, not str; read_log gives one"
         ):
             call("dive.mcap")
-
-
-def test_times_by_hand():
-    run = RunResult(
-        "by hand",
-        {},
-        "ok",
-        update_s=np.array([0.001, 0.002, 0.003, 0.010]),
-        finish_s=0.984,
-    )
-    value = {
-        key: score.value for key, score in resource_scores(run, log_s=50.0).items()
-    }
-    assert value["time.update_median_ms"] == pytest.approx(2.5)
-    assert value["time.update_p99_ms"] == pytest.approx(3.0 + 0.97 * 7.0)
-    assert value["time.update_max_ms"] == pytest.approx(10.0)
-    assert value["time.total_s"] == pytest.approx(1.0)
-    assert value["time.real_time_factor"] == pytest.approx(50.0)
-    assert "memory.peak_mb" not in value
 
 
 def test_progress_names_the_estimator_and_the_environment_versions_machine_date_and_command(

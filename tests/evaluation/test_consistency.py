@@ -82,25 +82,6 @@ def test_nees_of_samples_from_the_reported_covariance_is_chi_square(dof):
     assert below_median == pytest.approx(0.5, abs=0.03)
 
 
-def test_unknown_or_singular_covariances_have_no_nees():
-    covs = np.array([np.full((2, 2), np.nan), np.zeros((2, 2)), np.eye(2)])
-    squares = consistency.normalised_squares(np.ones((3, 2)), covs)
-    np.testing.assert_array_equal(np.isnan(squares), [True, True, False])
-    assert squares[2] == pytest.approx(2.0)
-    assert np.isnan(consistency.mean_normalised(squares[:2], 2))
-
-
-@given(st.integers(1, 500), st.integers(1, 6))
-def test_anees_interval_contains_one_and_narrows_with_runs_to_the_textbooks(runs, dof):
-    # Bar-Shalom et al. 2001, example 5.4.2: 50 runs of 2 degrees of freedom, chi-square(100) in [74.2, 129.6].
-    assert 100 * np.array(consistency.anees_interval(50, 2)) == pytest.approx(
-        [74.2, 129.6], abs=0.05
-    )
-    low, high = consistency.anees_interval(runs, dof)
-    narrower_low, narrower_high = consistency.anees_interval(4 * runs, dof)
-    assert low < narrower_low < 1 < narrower_high < high
-
-
 def drawn(rng: np.random.Generator, n: int, dof: int, tau: float) -> np.ndarray:
     """Normalised errors that forget themselves over ``tau`` instants."""
     kept = np.exp(-1 / tau)
@@ -184,24 +165,6 @@ def test_bins_are_those_of_another_implementation(n, seed):
     assert found.expected_error == pytest.approx(expected)
 
 
-def test_confidence_is_that_of_the_most_probable_class_none_of_them_included():
-    ids, probabilities = (
-        np.tile([4, 9], (3, 1)),
-        np.array([[0.1, 0.7], [0.3, 0.1], [0.5, 0.5]]),
-    )
-    detections = LandmarkDetections(
-        np.zeros(3, int),
-        np.ones(3),
-        np.zeros(3),
-        np.zeros((3, 2, 2)),
-        ids,
-        probabilities,
-    )
-    confidence, named = consistency.confidences(detections)
-    assert confidence == pytest.approx([0.7, 0.6, 0.5])
-    assert named.tolist() == [9, consistency.NONE, 4]
-
-
 MOUNTING = Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.5, 0.1))
 LANDMARKS_M = np.array([[3.0, 0.5, -1.0], [5.0, -2.0, -1.1]])
 IDS = np.array([11, 7])
@@ -282,23 +245,6 @@ def test_azimuths_are_compared_round_the_circle_and_what_lies_outside_the_truth_
         consistency.UNJUDGED
     ]
     assert consistency.reliability_of(early) is None
-
-
-def test_a_sequence_is_judged_by_what_is_true():
-    """One right at 0.95, one taken for another at 0.85, one that is none and called so at 0.75, one left out."""
-    r, a = seen_at(2 * 10**8, LANDMARKS_M[0])
-    there, away, unclear = (
-        (2 * 10**8, r, a),
-        (2 * 10**8, r, a + 0.6 / r),
-        (2 * 10**8, r + 0.25, a),
-    )
-    run = run_with(
-        [there, there, away, unclear], [11, 7, 11, 11], [0.95, 0.85, 0.25, 0.5]
-    )
-    found = consistency.reliability_of(run)
-    assert found.count.tolist() == [0] * 7 + [1, 1, 1]
-    assert found.right[7:].tolist() == [1.0, 0.0, 1.0]
-    assert found.expected_error == pytest.approx((0.25 + 0.85 + 0.05) / 3)
 
 
 def test_nothing_is_judged_without_truth():

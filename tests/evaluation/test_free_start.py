@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Start
+from sonar_graph.calibration import Calibration
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.metrics import Alignment
 from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.tables import FITTED
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.sentences import doubt_lines, remarks
 from sonar_graph.states import Trajectory
@@ -21,8 +20,6 @@ FAR = Alignment(
     np.array([4.6e5, -4.7e6, 30.0]),
 )
 UNKNOWN = Calibration()
-ONLY_HEADING = Calibration(start=Start(rpy_rad=(0.0, 0.0, 0.0)))
-STATED = Calibration(start=Start(position_m=(0.0, 0.0, 0.0), rpy_rad=(0.0, 0.0, 0.0)))
 
 
 @pytest.fixture(scope="module")
@@ -88,23 +85,6 @@ def test_errors_of_an_unknown_world_are_those_of_a_known_one(known, orientation)
     )
 
 
-def test_a_start_that_is_stated_is_held_against_the_truth(known):
-    found = judged(known, STATED, FAR)
-    assert FITTED not in found.sequence.notes
-    assert value(found, "isam2", "ate_raw_m") > 1e6
-
-
-def test_a_heading_that_was_measured_is_kept_and_only_the_position_fitted(known):
-    beside = Alignment(np.eye(3), FAR.translation)
-    found = judged(known, ONLY_HEADING, beside)
-    assert value(found, "isam2", "ate_raw_m") == pytest.approx(
-        value(known, "isam2", "ate_raw_m"), abs=0.05
-    )
-    assert "no position of the start" in found.sequence.notes[FITTED]
-    turned = judged(known, ONLY_HEADING, FAR)
-    assert value(turned, "isam2", "ate_raw_m") > 3.0
-
-
 def test_every_word_of_the_page_says_what_was_brought_where(known):
     fitted, told = (
         "the truth brought into the estimates&#39; world",
@@ -115,11 +95,3 @@ def test_every_word_of_the_page_says_what_was_brought_where(known):
     plain = render_report(known)
     assert fitted not in plain
     assert "not aligned" in plain
-
-
-def test_judging_again_moves_nothing(known):
-    once = judged(known, UNKNOWN, FAR)
-    again = judge(once.sequence, once.instants_ns, once.runs)
-    np.testing.assert_array_equal(
-        again.sequence.truth.positions, once.sequence.truth.positions
-    )

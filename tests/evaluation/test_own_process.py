@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from sonar_graph.errors import EstimatorError
@@ -188,25 +187,6 @@ def test_the_end_of_a_process_is_the_failure_of_its_run_alone(
     assert "theirs" not in sys.modules
 
 
-def test_results_of_classes_of_its_own_are_taken_as_ours(plugin, mission):
-    own, theirs = compare(mission, ["dead-reckoning", "their-subclassing"]).runs
-    assert own.smoothed.covariances.tobytes() == theirs.smoothed.covariances.tobytes()
-    assert type(theirs.smoothed) is type(own.smoothed)
-    assert "theirs" not in sys.modules
-
-
-def test_processes_that_an_estimator_leaves_behind_end_with_its_own(
-    plugin, mission, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("SONAR_GRAPH_CHILD", str(tmp_path / "child"))
-    assert run_estimator(mission, "their-leaving").status == "ok"
-    child = int((tmp_path / "child").read_text())
-    assert (
-        not psutil.pid_exists(child)
-        or psutil.Process(child).status() == psutil.STATUS_ZOMBIE
-    )
-
-
 @pytest.mark.parametrize("failure", [RuntimeError, None])
 def test_an_interrupt_that_compiled_code_swallows_is_no_failure_of_the_estimator(
     mission, monkeypatch, failure
@@ -221,10 +201,3 @@ def test_an_interrupt_that_compiled_code_swallows_is_no_failure_of_the_estimator
     monkeypatch.setattr("baselines.dead_reckoning.DeadReckoning.process", swallow)
     with pytest.raises(KeyboardInterrupt):
         compare(mission, ["dead-reckoning"])
-
-
-def test_sys_exit_while_it_is_loaded_is_told_as_such(plugin, mission, monkeypatch):
-    monkeypatch.setenv("SONAR_GRAPH_MEDDLES", "1")
-    check_request("their-exits")
-    run = run_estimator(mission, "their-exits")
-    assert (run.status, "it calls sys.exit(7)" in run.reason) == ("failed", True)

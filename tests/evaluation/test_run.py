@@ -5,19 +5,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import gtsam
-import numba
 import numpy as np
 import pytest
 
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
-from sonar_graph.estimator import load_estimator, withheld_of
 from sonar_graph.evaluation import run as run_module
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.run import PeakMemory, run_estimator
 from sonar_graph.evaluation.scored_instants import MAPS_KEPT, kept_map_instants
-from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.navigation import Odometry
-from sonar_graph.states import Estimate, LandmarkMap, Refusal, RefusedRow, Trajectory
+from sonar_graph.states import LandmarkMap
 
 from .conftest import Offset, straight_sequence
 
@@ -132,47 +128,6 @@ def test_nothing_of_the_instance_that_warms_up_reaches_the_result(ran, fails):
     assert calls == [(i, 10) for i in range(1, 11)]
 
 
-def test_time_in_which_numba_compiles_in_an_update_is_not_counted(ran):
-    """A loop that only a later step needs; the sleep beside it counts."""
-    compiling_s = []
-
-    def process(self, measurements):
-        if len(self.estimates) == 30:
-            began = time.perf_counter()
-            numba.njit(lambda x: x + 1.0 if x > 0 else -x)(1.5)
-            compiling_s.append(time.perf_counter() - began)
-            time.sleep(0.02)
-        return Offset.process(self, measurements)
-
-    update_s = ran(process=process).update_s
-    assert 0.02 <= update_s[30] < 0.02 + 0.5 * compiling_s[-1]
-
-
-def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(ran):
-    """Ten frames name nothing, then five name a landmark: it is still warming up when that is seen again."""
-    sequence = straight_sequence()
-    stamps_ns = sequence.imu.stamps_ns[5:155:10]
-    n = len(stamps_ns)
-    probable = np.where(np.arange(n) < 10, 0.2, 0.9)[:, None]
-    noise, ids = np.full((n, 2, 2), np.nan), np.full((n, 1), 7)
-    unsure = LandmarkDetections(
-        stamps_ns, np.ones(n), np.zeros(n), noise, ids, probable
-    )
-    assert ran(replace(sequence, detections=unsure)).status == "ok"
-    warmed_up, judged = (one.seen for one in ran.made)
-    assert warmed_up[-1].end_ns >= stamps_ns[11]
-    assert len(warmed_up) < len(judged)
-
-
-def test_results_are_what_the_estimator_said(ran):
-    result = ran(settings={"offset_m": 0.4})
-    np.testing.assert_allclose(result.causal.positions[:, 1], 0.4)
-    np.testing.assert_allclose(result.smoothed.positions[:, 1], 0.2)
-    assert result.params == {"offset_m": 0.4, "sigma_m": 0.3}
-    assert result.landmarks is not None
-    assert result.detections is not None
-
-
 def test_only_calls_of_the_estimator_are_timed(ran):
     before = time.perf_counter()
     result = ran(
@@ -189,48 +144,6 @@ def test_only_calls_of_the_estimator_are_timed(ran):
     told = ran(landmarks=slow(Offset.landmarks, 0.1))
     assert len(told.maps) > 3
     assert told.update_s.max() < 0.08, "asking for the map on the way is not timed"
-
-
-def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(ran):
-    result = ran(
-        process=failing_after(6, ZeroDivisionError("the matrix\n  is singular"))
-    )
-    assert result.status == "failed"
-    assert (
-        result.reason
-        == "3.500 s after the start (4500000000 ns): ZeroDivisionError: the matrix is singular"
-    )
-    assert result.causal is None
-    assert len(result.update_s) == 6
-
-
-@pytest.mark.parametrize("can_tell", [True, False])
-def test_a_run_names_what_was_refused_and_withheld_even_where_it_fails(ran, can_tell):
-    told = {
-        "refused": [RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)],
-        "withheld": ["landmark 3; open: z"],
-    }
-
-    def telling(what: str):
-        return lambda _: told[what] if can_tell else 1 / 0
-
-    methods = {"refused_rows": telling("refused"), "withheld": telling("withheld")}
-    result = ran(process=failing_after(6, ValueError("singular")), **methods)
-    assert "ValueError: singular" in result.reason
-    for what, known in told.items():
-        assert getattr(result, what) == (known if can_tell else [])
-    if can_tell:
-        assert ran(**methods).withheld == told["withheld"], "also in runs that end"
-    assert (ran().refused, ran().withheld) == ([], []), "telling is optional"
-    assert (
-        withheld_of(
-            load_estimator("dead-reckoning")(
-                straight_sequence().calibration,
-                Odometry(straight_sequence().calibration),
-            )
-        )
-        == []
-    )
 
 
 NAN_POSE = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))
@@ -338,24 +251,6 @@ def test_the_map_is_kept_on_the_way_as_it_was_known_then(ran):
     assert [known.stamp_ns for known in only_last.maps] == [
         only_last.causal.stamps_ns[-1]
     ]
-
-
-def test_no_map_is_asked_for_before_the_first_estimate(ran):
-    def process(self, measurements) -> Estimate | None:
-        estimate = Offset.process(self, measurements)
-        return None if len(self.estimates) < 30 else estimate
-
-    def landmarks(self) -> LandmarkMap:
-        assert len(self.estimates) >= 30, "nothing is known yet"
-        return Offset.landmarks(self)
-
-    result = ran(
-        process=process,
-        landmarks=landmarks,
-        trajectory=lambda self: Trajectory.from_estimates(self.estimates[29:]),
-    )
-    assert (result.status, result.reason) == ("ok", "")
-    assert 0 < len(result.maps) < MAPS_KEPT
 
 
 def test_what_an_estimator_does_to_its_measurements_no_other_sees(ran):

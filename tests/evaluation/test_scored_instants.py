@@ -1,26 +1,16 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from sonar_graph.devices.landmark_designs import OWN_DESIGNS
 from sonar_graph.evaluation.metrics import landmark_errors, rmse
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.scored_instants import (
-    DURATION_S,
     ESTIMATED_XY_M,
-    IDS,
-    MAP_TIMES_S,
     TRUE_XY_M,
     map_instants,
     published_maps,
-    repeats_published,
-    rows_at,
     scored_instants,
 )
-from sonar_graph.simulation.basin import LANDMARKS_XY_M, BasinOptions, simulate_basin
-from sonar_graph.states import LandmarkMap, Trajectory
-from tests.synthetic import basin_comparison
+from sonar_graph.states import Trajectory
 
 
 def trajectory(seconds: list[float]) -> Trajectory:
@@ -81,25 +71,6 @@ def test_every_instant_is_scored_or_left_out_for_one_reason(
     assert said in str(scored)
 
 
-def test_rows_are_found_by_stamp():
-    rows = rows_at(trajectory(DENSE), seconds(0.5, 2.0))
-    np.testing.assert_allclose(rows.positions[:, 0], [0.5, 2.0])
-
-
-@pytest.mark.parametrize("duration_s", [2039.0, 203.9])
-def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s):
-    scale = duration_s / 2039.0
-    asked = seconds(*(7.0 + np.linspace(0, duration_s, 4079)[1:]))
-    kept = map_instants(asked, int(seconds(7.0)[0]))
-    assert set(kept.tolist()) <= set(asked.tolist())
-    np.testing.assert_allclose(
-        (kept - seconds(7.0)) * 1e-9,
-        np.array([833.1, 1369.4, 2039.0]) * scale,
-        atol=0.26 * scale,
-    )
-    assert kept[-1] == asked[-1]
-
-
 def test_few_instants_are_each_kept_once():
     np.testing.assert_array_equal(map_instants(seconds(1.0), 0), seconds(1.0))
     assert len(map_instants(seconds(), 0)) == 0
@@ -125,33 +96,3 @@ def test_published_errors_are_those_of_the_published_table():
     assert errors.aligned_rmse_m == pytest.approx(complex_rms(aligned))
     stated = complex_rms(estimated - true), complex_rms(shifted), complex_rms(aligned)
     assert stated == pytest.approx((0.227, 0.115, 0.093), abs=5e-4)
-
-
-def test_only_the_same_landmarks_of_its_design_repeat_the_published_experiment():
-    """The simulated basin does; height does not matter."""
-    assert 0 < MAP_TIMES_S[0] < MAP_TIMES_S[1] < MAP_TIMES_S[2] == DURATION_S
-    np.testing.assert_array_equal(LANDMARKS_XY_M, TRUE_XY_M)
-    assert repeats_published(simulate_basin(BasinOptions(duration_s=120, laps=1)))
-    true, run = published_maps()[1], basin_comparison(4).sequence
-    for change, repeats in (
-        ({}, True),
-        ({"positions": true.positions + np.array([0.0, 0.0, -1.7])}, True),
-        ({"positions": true.positions + np.array([0.0, 0.005, 0.0])}, False),
-        ({"ids": IDS + 1}, False),
-    ):
-        assert (
-            repeats_published(replace(run, true_landmarks=replace(true, **change)))
-            == repeats
-        ), change
-    assert not repeats_published(replace(run, true_landmarks=None))
-    assert not repeats_published(
-        replace(
-            run,
-            true_landmarks=LandmarkMap(
-                np.arange(1, 6), np.zeros((5, 3)), np.zeros((5, 3, 3))
-            ),
-        )
-    )
-    assert not repeats_published(
-        replace(run, true_landmarks=true, notes={OWN_DESIGNS: "1: ring, of mine.toml"})
-    )

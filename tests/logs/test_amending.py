@@ -112,35 +112,6 @@ def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_adde
     assert not is_own_log(source)
 
 
-def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(
-    tmp_path,
-):
-    """Two topics in one chunk, whose times go to and fro."""
-    times_ns = [70, 10, 40, 40, 90, 10, 40]
-    with writing(tmp_path / "a.mcap") as writer:
-        channels = [
-            writer.register_channel(topic, "json", 0) for topic in ("/one", "/other")
-        ]
-        for number, time_ns in enumerate(times_ns):
-            writer.add_message(channels[number % 2], time_ns, b"{}", time_ns, number)
-    write_amended(tmp_path / "a.mcap", tmp_path / "b.mcap", [landmarks(50)])
-    with (tmp_path / "b.mcap").open("rb") as stream:
-        messages = [
-            (m.log_time, m.sequence)
-            for _, _, m in make_reader(stream).iter_messages(log_time_order=False)
-        ]
-    assert messages == [
-        (10, 1),
-        (10, 5),
-        (40, 2),
-        (40, 3),
-        (40, 6),
-        (50, 0),
-        (70, 0),
-        (90, 4),
-    ]
-
-
 @pytest.mark.parametrize("share", [0.3, 0.77])
 def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
     tmp_path, share
@@ -172,23 +143,6 @@ def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
         r"cut off.*what is there spans ([0-9.]+) s", amended.notes["log.ending"]
     )
     assert float(span_s) == pytest.approx(last_ns * 1e-9, abs=1e-3)
-
-
-def test_a_hole_is_refused_and_with_salvage_what_is_whole_is_copied(tmp_path):
-    source = foreign_log(tmp_path / "a.mcap")
-    data = bytearray(source.read_bytes())
-    data[len(data) // 4] ^= 0xFF  # within a chunk
-    (tmp_path / "hole.mcap").write_bytes(data)
-    with pytest.raises(LogError, match=r"hole.mcap is damaged.*--salvage"):
-        write_amended(tmp_path / "hole.mcap", tmp_path / "b.mcap", [])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "hole.mcap"]
-    amended = write_amended(
-        tmp_path / "hole.mcap", tmp_path / "b.mcap", [], salvage=True
-    )
-    assert "lost" in amended.notes["log.damage"]
-    before, after = content(source), content(tmp_path / "b.mcap")
-    assert 300 < len(after["/one"]) < len(before["/one"])
-    assert all(message in before["/one"] for message in after["/one"])
 
 
 def test_the_log_itself_and_topics_that_are_there_are_refused_unless_these_are_written_anew(

@@ -5,15 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Chunk
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
 from sonar_graph.live.live_messages import recorded_messages
-from sonar_graph.logs import inspect_log, read_log, write_amended, write_log
+from sonar_graph.logs import inspect_log, read_log, write_log
 from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, log_parts, stream
-from sonar_graph.logs.mcap.bag_folder import earlier_parts
-from sonar_graph.logs.mcap.chunks import unpack_beginning
 from sonar_graph.logs.mcap.scanning import scan
 from sonar_graph.testing import small_world
 
@@ -140,16 +137,6 @@ def test_a_part_of_the_time_is_counted_from_the_first_file(whole, folder):
         scan(folder, lambda _: Keep.ALL, TimeWindow.parse("50", None))
 
 
-def test_streaming_and_amending_take_a_folder_too(whole, folder, tmp_path):
-    counts: dict[str, int] = {}
-    for piece in stream(folder, lambda _: Keep.ALL):
-        counts[piece.name] = counts.get(piece.name, 0) + len(piece)
-    assert counts == {name: len(rows) for name, rows in contents(whole).items()}
-    write_amended(folder, tmp_path / "copy.mcap", [])
-    assert contents(tmp_path / "copy.mcap") == contents(whole)
-    assert read_log(tmp_path / "copy.mcap").calibration == read_log(whole).calibration
-
-
 def cut(path: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 3])
@@ -159,10 +146,6 @@ FAULTS = {
     "missing": (
         lambda path: path.unlink(),
         r"dive is damaged: dive_4\.mcap: is missing",
-    ),
-    "empty": (
-        lambda path: path.write_bytes(b""),
-        r"dive is damaged: dive_4\.mcap: is not an MCAP file but empty",
     ),
     "cut": (
         cut,
@@ -224,29 +207,3 @@ def test_other_folders_are_refused_with_what_to_do(folder, tmp_path):
         LogError, match=r"empty: is a folder without metadata\.yaml and \.mcap files"
     ):
         read_log(tmp_path / "empty")
-
-
-@pytest.mark.parametrize(
-    ("gap_ns", "is_part"), [(0, True), (10_000_000, True), (-1, False), (10**12, False)]
-)
-def test_a_file_before_is_a_part_where_it_ends_as_the_next_begins(
-    tmp_path, gap_ns: int, is_part: bool
-) -> None:
-    """Files that overlap are two recordings of one name."""
-    second = 1_000_000_000
-    for name, begin_ns in (("dive_0", second), ("dive_1", 2 * second + gap_ns)):
-        with (tmp_path / f"{name}.mcap").open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            channel = writer.register_channel("/a", "json", 0)
-            for at_ns in (begin_ns, begin_ns + second):
-                writer.add_message(channel, at_ns, b"{}", at_ns)
-            writer.finish()
-    found = earlier_parts(tmp_path / "dive_1.mcap")
-    assert [path.name for path in found] == ["dive_0.mcap"] * is_part
-
-
-def test_a_chunk_that_is_cut_off_in_its_first_record_has_none() -> None:
-    data = bytes([0]) + (100).to_bytes(8, "little") + b"cut off"
-    chunk = Chunk("", data, 0, 0, 0, len(data))
-    assert unpack_beginning(chunk) == b""

@@ -1,11 +1,7 @@
 """Reading ends, in time and memory that a log's size allows, whatever a file claims."""
 
-import contextlib
 import os
 import struct
-import time
-import tracemalloc
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,11 +15,9 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
-from sonar_graph.logs.cdr import parse_definition
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap import Keep, chunks, scanning
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
-from sonar_graph.logs.mcap.log_file import LogFile
 from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
@@ -80,19 +74,6 @@ def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_
         assert "is lost" in loss.reason
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_a_chunk_that_is_cut_off_is_unpacked_no_further_than_its_stated_size(
-    tmp_path: Path, compression: str
-) -> None:
-    size = 1 << 28
-    path = log_with_chunk(tmp_path / "log.mcap", bytes(size), compression, 1000)
-    os.truncate(path, path.stat().st_size - 100)
-    tracemalloc.start()
-    assert scanning.scan(path, lambda _: Keep.ALL).damage.ending is not None
-    assert tracemalloc.get_traced_memory()[1] < size / 8
-    tracemalloc.stop()
-
-
 def test_messages_far_larger_than_their_file_are_refused(
     tmp_path: Path, monkeypatch: Any, make_sequence: Any
 ) -> None:
@@ -133,57 +114,6 @@ def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
         text_of(path)
 
 
-SLOW: dict[str, str] = {
-    "line feeds": "float64 a\n" + "=" * 80 + "\n" * 300_000 + "x",
-    "separators": ("=" * 80 + "\n") * 12_000,
-    "spaces": "float64 a" + " " * 900_000,
-    "fields": "\n".join(f"float64 f{i}" for i in range(60_000)),
-    "an array": f"float64[{'9' * 5000}] a",
-}
-
-
-@pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
-def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(
-    text: str,
-) -> None:
-    began = time.process_time()
-    for kind in ("p/msg/A", "p/msg/B"):
-        for _ in range(5):
-            with contextlib.suppress(LogError):
-                parse_definition(kind, text)
-    assert time.process_time() - began < 2.0
-
-
-def test_sections_apart_by_blank_lines_and_spaces_are_the_same_definition() -> None:
-    plain = "q/B b\n" + "=" * 80 + "\nMSG: q/B\nint32 c\n"
-    spaced = plain.replace("\n", "  \r\n\n\t\n")
-    found = [
-        parse_definition(f"p/msg/{name}", text).fields[0]
-        for name, text in (("A", plain), ("C", spaced))
-    ]
-    assert [
-        (one.name, one.kind.name, one.kind.fields[0].name)
-        for one in found
-        if not isinstance(one.kind, str)
-    ] == [("b", "q/B", "c")] * 2
-
-
-def test_many_ends_of_the_data_are_no_more_work_than_a_few(tmp_path: Path) -> None:
-    end = struct.pack("<BQI", 15, 4, 0)
-    footer = struct.pack("<BQQQI", 2, 20, 30, 0, zlib.crc32(b"other"))
-    (tmp_path / "log.mcap").write_bytes(
-        MCAP_MAGIC
-        + struct.pack("<BQII", 1, 8, 0, 0)
-        + end * 200_000
-        + footer
-        + MCAP_MAGIC
-    )
-    began = time.process_time()
-    with LogFile(tmp_path / "log.mcap") as file:
-        assert file.fault == "its summary is damaged: the CRC does not fit"
-    assert time.process_time() - began < 2.0
-
-
 ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
 
 
@@ -193,10 +123,7 @@ ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
         ("rotation", np.nan, TRANSLATION),
         ("rotation", np.inf, TRANSLATION),
         ("rotation", 0.0, ROTATION + "0"),
-        ("rotation", 1e200, ROTATION),
-        ("translation", np.nan, TRANSLATION),
         ("translation", 1e300, r"dvl: is .* m from base_link"),
-        ("translation", 2000.0, r"dvl: is .* m from base_link"),
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(

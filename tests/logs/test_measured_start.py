@@ -1,19 +1,17 @@
 """A start that is not stated is measured: height by depth, level by gravity, yaw and place where sensors know them."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DepthCalibration, Start
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.measurements import (
     Depth,
     Dvl,
     Floats,
-    Heading,
     Imu,
     PositionFixes,
 )
@@ -73,30 +71,6 @@ def test_each_part_of_the_start_is_within_its_sigma_of_the_truth(
     )
 
 
-def test_without_fixes_and_headings_the_world_begins_at_the_vehicle_at_its_depth() -> (
-    None
-):
-    blocks = {role: rows for role, rows in moving().items() if role != "positions"}
-    start = with_measured_start(Calibration(), blocks)[0].start
-    assert start.source == "vehicle"
-    assert start.position_m[:2] == (0.0, 0.0)
-    assert start.position_m[2] == pytest.approx(-14.0, abs=0.1)
-    assert start.rpy_rad[2] == 0.0
-    np.testing.assert_allclose(start.rpy_rad[:2], RPY[:2], atol=0.01)
-
-
-def test_the_port_of_the_depth_sensor_is_allowed_for() -> None:
-    blocks = {
-        role: rows
-        for role, rows in moving((0.0, 0.0, 0.0)).items()
-        if role != "positions"
-    }
-    port = Calibration(depth=DepthCalibration(port_m=(0.0, 0.0, 0.6)))
-    assert with_measured_start(port, blocks)[0].start.position_m[2] == pytest.approx(
-        -14.6, abs=0.1
-    )
-
-
 def test_what_is_stated_stays_and_the_rest_is_measured() -> None:
     blocks = moving()
     place = Calibration(start=Start(position_m=(1.0, 2.0, 3.0)))
@@ -109,28 +83,3 @@ def test_what_is_stated_stays_and_the_rest_is_measured() -> None:
     assert not is_whole(
         of_place.model_construct(position_m=(0.0, 0.0, 0.0), _fields_set={"position_m"})
     )
-
-
-def test_without_gravity_in_the_accelerometers_level_is_taken_with_a_wide_sigma() -> (
-    None
-):
-    blocks = moving()
-    blocks["imu"] = replace(
-        blocks["imu"], specific_force=blocks["imu"].specific_force / 9.80665
-    )
-    start = with_measured_start(Calibration(), blocks)[0].start
-    assert start.rpy_rad[:2] == (0.0, 0.0)
-    assert start.rpy_sigma_rad[:2] == (0.1, 0.1)
-
-
-def test_first_headings_and_fixes_count_less_the_way_since_the_start() -> None:
-    """Headings two seconds apart of a vehicle that turns by 0.1 rad/s; fixes of one that moves 0.8 m in a second."""
-    blocks = moving()
-    seconds = np.arange(0.0, 60.0, 2.0)
-    yaw_rad = RPY[2] + 0.1 * seconds
-    blocks["heading"] = Heading(
-        np.asarray(seconds * 1e9, np.int64), yaw_rad, np.full(30, 0.01)
-    )
-    start = with_measured_start(Calibration(), blocks)[0].start
-    assert start.rpy_rad[2] == pytest.approx(RPY[2], abs=0.01)
-    np.testing.assert_allclose(start.position_m, (100.0, 50.0, -14.0), atol=0.6)

@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,11 +22,9 @@ from sonar_graph.logs.result_log import source_names, write_result
 from sonar_graph.logs.viewer_messages import (
     GREY,
     PICTURES,
-    UNKNOWN_DIAMETER_M,
     Layer,
     Picture,
     Scene,
-    ellipsoids,
     foxglove_layout,
     landmark_markers,
     picture_messages,
@@ -291,14 +288,6 @@ def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(
 # --- ellipsoids -----------------------------------------------------------------------------------------------------
 
 
-def test_unknown_covariances_are_small_spheres_and_landmarks_known_exactly_can_still_be_seen() -> (
-    None
-):
-    diameters, _ = ellipsoids(np.array([np.full((3, 3), np.nan), np.zeros((3, 3))]))
-    np.testing.assert_allclose(diameters[0], UNKNOWN_DIAMETER_M)
-    assert (diameters[1] > 0).all()
-
-
 def drawn(folder: Path, messages: Outgoing) -> list[Any]:
     """Messages of one topic as another library decodes them."""
     write_recording(folder / "a.mcap", [messages], {})
@@ -428,115 +417,7 @@ SAME_NAME = ("Path", "Odometry", "MarkerArray")
 DRAWN_BY_RVIZ = {f"rviz_default_plugins/{kind}": kind for kind in SAME_NAME}
 DRAWN_BY_RVIZ["rviz_default_plugins/PoseWithCovariance"] = "PoseWithCovarianceStamped"
 """By plugins_description.xml of rviz_default_plugins."""
-DRAWN_BY_FOXGLOVE = {"Path", "PoseWithCovarianceStamped", "MarkerArray"}
 """Of the types that we write; nav_msgs/Odometry is not drawn by Lichtblick 1.28."""
-COLOUR = re.compile(r"#[0-9a-f]{6}([0-9a-f]{2})?")
-
-
-def value_at(message: Any, path: str) -> Any:
-    for name, index in re.findall(r"(\w+)(?:\[(\d+)\])?", path):
-        message = getattr(message, name)
-        message = message[int(index)] if index else message
-    return message
-
-
-def test_foxglove_layout_shows_what_the_panel_can_draw_of_this_result_in_its_frames(
-    result: Any,
-) -> None:
-    topics = result.view["topics"]
-    assert set(topics) == {
-        topic for topic, kind in result.types.items() if kind in DRAWN_BY_FOXGLOVE
-    }
-    shown = {topic for topic, settings in topics.items() if settings["visible"] is True}
-    assert set(topics) - shown == {"/isam2/smoothed", "/ekf_slam/smoothed"}
-    transforms = [
-        t
-        for m in result.messages["/tf"] + result.messages["/tf_static"]
-        for t in m.transforms
-    ]
-    frames = {t.child_frame_id for t in transforms} | {
-        t.header.frame_id for t in transforms
-    }
-    named = {result.view["followTf"], result.view["layers"]["grid"]["frameId"]}
-    named |= {name.removeprefix("frame:") for name in result.view["transforms"]}
-    assert named <= frames
-
-
-def test_every_panel_of_the_foxglove_layout_is_placed_once_and_every_plotted_path_leads_to_a_number(
-    result: Any,
-) -> None:
-    def panels(node: Any) -> Iterator[str]:
-        if isinstance(node, str):
-            yield node
-        else:
-            assert node["direction"] in ("row", "column")
-            assert 0 < node["splitPercentage"] < 100
-            yield from panels(node["first"])
-            yield from panels(node["second"])
-
-    configs = result.layout["configById"]
-    assert sorted(panels(result.layout["layout"])) == sorted(configs)
-    assert {name.split("!")[0] for name in configs} == {"3D", "Plot"}
-    assert {
-        "configById",
-        "globalVariables",
-        "userNodes",
-        "playbackConfig",
-        "layout",
-    } == set(result.layout)
-    plotted = [
-        path
-        for name, panel in configs.items()
-        if name[:4] == "Plot"
-        for path in panel["paths"]
-    ]
-    assert [path["label"] for path in plotted] == [
-        "ground_truth",
-        "ekf_slam",
-        "isam2",
-        "ekf_slam",
-        "isam2",
-    ]
-    for path in plotted:
-        topic, field = re.fullmatch(r"(/[\w/]+)\.(.*)", path["value"]).groups()  # type: ignore[union-attr]
-        assert isinstance(value_at(result.messages[topic][0], field), float)
-
-
-def test_an_estimator_has_one_colour_everywhere(result: Any) -> None:
-    topics, seen = result.view["topics"], set()
-    for name in ("isam2", "ekf_slam", "ground_truth"):
-        marker = result.messages[f"/{name}/landmarks"][0].markers[0].color
-        colour = "#" + "".join(
-            f"{round(255 * part):02x}" for part in (marker.r, marker.g, marker.b)
-        )
-        layer = topics[f"/{name}/path"]["gradient"][0]
-        assert COLOUR.fullmatch(layer)
-        assert layer[:7] == colour
-        seen.add(colour)
-    assert len(seen) == 3
-
-
-def test_rviz_has_one_display_of_the_right_kind_for_each_topic_in_the_frame_of_its_messages(
-    result: Any,
-) -> None:
-    displays = result.rviz["Displays"]
-    drawn = {
-        d["Topic"]["Value"]: DRAWN_BY_RVIZ[d["Class"]] for d in displays if "Topic" in d
-    }
-    assert drawn == {
-        topic: kind for topic, kind in result.types.items() if kind != "TFMessage"
-    }
-    others = {d["Class"] for d in displays if "Topic" not in d}
-    assert others == {"rviz_default_plugins/Grid", "rviz_default_plugins/TF"}
-    assert all(d["Enabled"] is d["Value"] for d in displays)
-    assert len({d["Name"] for d in displays}) == len(displays)
-    headers = {
-        m.header.frame_id
-        for topic, ms in result.messages.items()
-        if topic.endswith("/path")
-        for m in ms
-    }
-    assert headers == {result.rviz["Global Options"]["Fixed Frame"]}
 
 
 def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
@@ -560,29 +441,6 @@ def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
 
 
 # --- size -----------------------------------------------------------------------------------------------------------
-
-
-def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(
-    result: Any,
-) -> None:
-    """The last pose, at (119, 0, 0), is farthest from the noise of the truth around the origin."""
-    scene = Scene.around(
-        [np.array([[100.0, 20, -5], [-3, 0, 0]]), np.array([[np.nan, 1e9, 0]])]
-    )
-    assert scene.centre_m == (48.5, 10.0, -2.5)
-    assert scene.size_m == 103
-    camera = result.view["cameraState"]
-    assert 55 < camera["targetOffset"][0] < 61
-    assert camera["near"] < camera["distance"] < camera["far"]
-    assert camera["distance"] * np.tan(np.deg2rad(camera["fovy"] / 2)) > 0.5 * 119
-    view = result.rviz["Views"]["Current"]
-    assert view["Focal Point"]["X"] == camera["targetOffset"][0]
-    assert view["Distance"] == camera["distance"]
-    heights = {
-        m.scale.z for m in result.messages["/isam2/landmarks"][0].markers if m.text
-    }
-    assert heights
-    assert all(0.01 < height_m / camera["distance"] < 0.05 for height_m in heights)
 
 
 def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_truth_is_left(

@@ -29,14 +29,6 @@ def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory, stamps, seed):
     np.testing.assert_array_equal(numbers[:, 3:], written.quaternions_xyzw)
 
 
-def test_lines_are_those_that_tum_describes(tmp_path):
-    pose = Trajectory.without_covariances(
-        np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:]
-    )
-    write_tum(tmp_path / "t.tum", pose)
-    assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1 2 3.5 0 0 0 1\n"
-
-
 def test_evo_reads_the_same_poses(make_sequence, tmp_path):
     truth = make_sequence().truth
     write_tum(tmp_path / "t.tum", truth)

@@ -1,6 +1,5 @@
 """Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
 
-import json
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -14,17 +13,11 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import (
     Calibration,
-    DepthCalibration,
-    DvlCalibration,
-    ImuCalibration,
     Mounting,
     SonarCalibration,
-    Start,
 )
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.scanning import scan
-from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
@@ -35,14 +28,12 @@ from sonar_graph.logs.vehicle_setup import (
     encode_mountings,
     gathered,
     mounting_of,
-    static_frames,
 )
 from sonar_graph.logs.writing import (
     dvl_messages,
     imu_messages,
     sonar_image_messages,
     static_message,
-    write_log,
 )
 
 TREE_M = (1.0, 2.0, 3.0)
@@ -68,33 +59,6 @@ def written(
 
 
 # --- mountings ------------------------------------------------------------------------------------------------------
-
-ANGLES = st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3))
-OFFSETS = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-5, 5))
-
-
-@given(ANGLES, OFFSETS, OFFSETS)
-def test_mountings_survive_tf_static(
-    make_sequence: Any,
-    tmp_path_factory: Any,
-    rpy: tuple[float, ...],
-    lever: tuple[float, ...],
-    port: tuple[float, ...],
-) -> None:
-    mounting = Mounting(translation_m=lever, rpy_rad=rpy)
-    tree = Calibration(
-        dvl=DvlCalibration(mounting=mounting), depth=DepthCalibration(port_m=port)
-    )
-    path = written(tmp_path_factory.mktemp("log") / "a.mcap", make_sequence(), tree)
-    found = read_log(path).calibration
-    assert found.dvl.mounting.pose().equals(mounting.pose(), 1e-9)
-    assert found.imu.mounting.pose().equals(gtsam.Pose3(), 1e-9)
-    assert (
-        mounting_of(
-            "depth", static_frames(scan(path, lambda _: Keep.ALL))
-        ).translation_m
-        == port
-    )
 
 
 def test_the_sonar_of_images_is_mounted_where_tf_static_says_without_detections(
@@ -138,26 +102,6 @@ def test_the_sonar_of_images_is_mounted_where_tf_static_says_without_detections(
     assert stated.calibration.sonar.mounting.rpy_rad == (0.0, 0.0, 1.0)
 
 
-def test_a_frame_that_does_not_hang_on_the_body_has_no_mounting() -> None:
-    step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0, 0]))
-    frames = {
-        "a": ("base_link", step),
-        "b": ("elsewhere", step),
-        "c": ("d", step),
-        "d": ("c", step),
-    }
-    assert (
-        mounting_of("a", frames)
-        == mounting_of("/a", frames)
-        == Mounting(translation_m=(1, 0, 0))
-    )
-    assert mounting_of("base_link", frames) == Mounting()
-    assert mounting_of("b", frames) is None
-    assert mounting_of("c", frames) is None, "a loop ends"
-    several = {"a/dvl": ("a/base_link", step), "b/dvl": ("b/base_link", step)}
-    assert mounting_of("dvl", several) is None, "several vehicles have it"
-
-
 STEP = gtsam.Pose3(gtsam.Rot3.Rz(0.5), np.array([1.0, 0.0, -0.2]))
 BELOW = gtsam.Pose3(gtsam.Rot3.Rx(0.1), np.array([0.0, 0.0, 0.3]))
 NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsam.Pose3]] = {
@@ -187,30 +131,6 @@ def test_a_frame_is_found_below_the_body_of_any_name(
     found = mounting_of(frame, frames)
     assert found is not None
     assert found.pose().equals(body_T_sensor, 1e-12)
-
-
-def test_a_sensor_whose_frame_hangs_nowhere_is_named_with_the_lines_that_place_it(
-    bench: Any, make_sequence: Any, tmp_path: Path
-) -> None:
-    path = bench.write(*bench.basics())
-    assert (
-        "no transform from dvl_link to base_link (the log has no /tf_static): mounting taken as zero; give [dvl] "
-        in (read_log(path).notes["log.warnings"])
-    )
-    with_tree = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": [
-        bench.transform("base_link", "imu_link", (0, 0, 0))]}]))  # fmt: skip
-    warning = read_log(with_tree).notes["log.warnings"]
-    assert (
-        "dvl: no transform from dvl_link to base_link: mounting taken as zero; give [dvl] mounting in a file"
-        in warning
-    )
-    assert "imu: no transform" not in warning
-    stated = {
-        name: {"mounting": {"translation_m": [0, 0, 0]}} for name in ("imu", "dvl")
-    }
-    assert "no transform" not in read_log(path, calibration=said(**stated)).notes.get(
-        "log.warnings", ""
-    )
 
 
 def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench: Any) -> None:
@@ -315,67 +235,6 @@ def test_every_field_comes_from_the_first_that_says_it(
         }
     expected |= {"depth.port_m": TREE_M} if "depth" in in_tree else {}
     assert found == expected | of_record | of_file
-
-
-def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything(
-    make_sequence: Any, tmp_path: Path
-) -> None:
-    sequence = make_sequence()
-    write_log(tmp_path / "a.mcap", sequence)
-    assert read_log(tmp_path / "a.mcap").calibration == sequence.calibration
-    found = read_log(tmp_path / "a.mcap", calibration=said(gravity_m_s2=9.7))
-    assert found.calibration.gravity_m_s2 == 9.7
-    expected = "from vehicle.toml: gravity_m_s2; else from the log"
-    assert found.notes["log.calibration"] == expected
-    given = read_log(tmp_path / "a.mcap", calibration=Calibration())
-    assert (given.calibration, given.name) == (Calibration(), sequence.name)
-    assert given.notes["log.calibration"] == "given by the caller"
-    mounting = Mounting(translation_m=TREE_M)
-    tree = Calibration(
-        imu=ImuCalibration(mounting=mounting), dvl=DvlCalibration(mounting=mounting)
-    )
-    # says little
-    record = {
-        "calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})
-    }
-    calibration = read_log(
-        written(tmp_path / "b.mcap", sequence, tree, record)
-    ).calibration
-    assert calibration.imu.mounting.translation_m == (7, 8, 9)
-    assert calibration.dvl.mounting.translation_m == TREE_M
-
-
-def test_a_sensor_mounted_by_the_file_is_not_told_to_be_missing(bench: Any) -> None:
-    log = bench.write(*bench.basics())
-    other = said(gravity_m_s2=9.81)  # says nothing of how the instrument sits
-    for calibration, is_said in (
-        (None, False),
-        (said(dvl={"mounting": {"rpy_rad": [0, 0, 1]}}), True),
-        (other, False),
-    ):
-        notes = read_log(log, calibration=calibration).notes
-        assert ("dvl (dvl_link)" in notes["log.calibration"]) is not is_said
-        assert ("z downwards" in notes.get("log.warnings", "")) is not is_said
-        assert "imu (imu_link)" in notes["log.calibration"]
-
-
-@pytest.mark.parametrize(
-    "calibration",
-    [Calibration(), Calibration(start=Start())],
-    ids=["no start", "the default"],
-)
-def test_a_start_is_stated_in_a_log_that_was_read_where_somebody_stated_it(
-    make_sequence: Any, tmp_path: Path, calibration: Calibration
-) -> None:
-    write_log(tmp_path / "log.mcap", replace(make_sequence(), calibration=calibration))
-    again = read_log(tmp_path / "log.mcap").calibration
-    assert again == calibration
-    assert ("start" in again.model_fields_set) == (
-        "start" in calibration.model_fields_set
-    )
-    assert ("position_m" in again.start.model_fields_set) == (
-        "start" in calibration.model_fields_set
-    )
 
 
 def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:

@@ -24,12 +24,10 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs.mcap.log_file import LogFile, open_seal
 from sonar_graph.logs.mcap.writer import (
     Attachment,
-    Outgoing,
     recording,
     write_recording,
 )
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.logs.writing import (
     pose_messages,
     sonar_image_messages,
@@ -167,17 +165,6 @@ def write_frames(path: Path, *blocks: SonarFrames) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", [*KINDS, ">u2", ">f4"])
-def test_frames_are_read_as_they_were_written(tmp_path, kind):
-    written = frames(kind)
-    (read,) = read_sonar_frames(write_frames(tmp_path / "log.mcap", written))
-    np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
-    np.testing.assert_array_equal(read.intensity, written.intensity)
-    assert read.intensity.dtype == written.intensity.dtype.newbyteorder("<")
-    np.testing.assert_array_equal(read.ranges_m, written.ranges_m.astype(np.float32))
-    np.testing.assert_allclose(read.azimuths_rad, written.azimuths_rad, atol=1e-15)
-
-
 def test_another_library_sees_what_the_message_defines(tmp_path):
     written = frames()
     (messages,) = decode(write_frames(tmp_path / "log.mcap", written)).values()
@@ -279,25 +266,6 @@ def test_profile_index_counts_metadata_and_attachments_are_those_of_a_ros_2_reco
         "application/json",
         b'{"a": 1}',
     )
-
-
-def test_messages_lie_in_the_order_of_their_times_and_those_of_one_instant_in_that_of_the_list(
-    tmp_path: Path,
-) -> None:
-    times_ns = np.repeat([20, 10], 50)
-    first, second = (
-        Outgoing(n, "std_msgs/msg/Header", times_ns, np.zeros((100, 9), np.uint8))
-        for n in ("/a", "/b")
-    )
-    write_recording(tmp_path / "a.mcap", [first, second], {})
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        found = [
-            (m.log_time, c.topic)
-            for _, c, m in make_reader(stream).iter_messages(log_time_order=False)
-        ]
-    assert found == [
-        (time, topic) for time in (10, 20) for topic in ("/a", "/b") for _ in range(50)
-    ]
 
 
 def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> None:

@@ -76,19 +76,6 @@ def test_zeros_without_lock_are_found_at_every_rate_and_place(
     assert (found == ((t >= begin_s) & (t < end_s))).all()
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0])
-@pytest.mark.parametrize("late_s", [0.0, 0.1])
-def test_zeros_of_a_vehicle_that_rests_are_measured(
-    rate_hz: float, late_s: float
-) -> None:
-    """Also by a Doppler log without noise, whose stamps are late."""
-    run = drive(rate_hz, stop, noise_m_s=0.0)
-    assert (~run.dvl.velocity.any(axis=1)).sum() >= 14 * rate_hz
-    late = run.dvl.stamps_ns + round(late_s * SECOND)
-    dvl = replace(run.dvl, stamps_ns=late)
-    assert not unfelt_zeros(run.imu, dvl, run.calibration).any()
-
-
 def without_record(source: Path, target: Path) -> None:
     """The messages of a log alone, as a vehicle records them: rows of a log with a calibration were chosen before."""
     with source.open("rb") as stream, target.open("wb") as out:

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import itertools
 import math
 import re
 from dataclasses import replace
@@ -130,15 +129,6 @@ def test_no_mean_is_given_over_survivors_and_the_tables_say_why():
     )
     assert cell.text.startswith("no value")
     assert cell.note == "6 of 10 without a value"
-
-
-def test_a_column_that_a_contestant_cannot_have_is_a_dash_without_a_complaint():
-    cells = cells_of(
-        tables.accuracy_table(BATCH, metrics_of(["landmarks.se2_m"])[0]),
-        "dead-reckoning",
-    )
-    assert [cell.text for cell in cells[3:]] == ["\N{EN DASH}"] * 3
-    assert all(not cell.note for cell in cells)
 
 
 def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
@@ -278,40 +268,6 @@ def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
         )
 
 
-def test_every_run_is_listed_once_and_leads_to_its_log():
-    batch = drawn_batch(4)
-    lists = tables.run_lists(batch, metrics_of(METRICS))
-    links = [
-        cell.link
-        for _, table in lists
-        for line in table.rows
-        for cell in line
-        if cell.link
-    ]
-    assert sorted(links) == sorted(run.log_file for run in batch.runs)
-    cells = itertools.chain(*tables.accuracy_table(batch, ATE).rows)
-    assert {cell.link for cell in cells if cell.link} == {
-        f"#{table.name}" for _, table in lists
-    }
-
-
-def test_sections_of_a_table_stand_in_its_csv_and_latex():
-    """Of two scores of one name a paper must say which is causal."""
-    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
-    columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
-    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 1: "Smoothed"})
-    assert [row["section"] for row in rows_of(table)] == ["Causal", "Smoothed"]
-    lines = as_latex(table).splitlines()
-    assert (
-        lines.index(r"\multicolumn{2}{l}{\textit{Causal}} \\")
-        == lines.index(r"RMSE & 1.0 \\") - 1
-    )
-    assert (
-        lines.index(r"\multicolumn{2}{l}{\textit{Smoothed}} \\")
-        == lines.index(r"RMSE & 0.5 \\") - 1
-    )
-
-
 def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_from_names(
     tmp_path,
 ):
@@ -365,38 +321,6 @@ def test_angles_are_degrees_for_people_and_radians_in_files():
         cell_of(summary.overview_table(BATCH, YAW, {}), LOGS[0], "Causal", "isam2").text
         == expected
     )
-
-
-def test_failures_are_counted_by_estimator_with_their_logs():
-    batch = with_failures(BATCH, "ekf-slam", LOGS[1], 3)
-    assert summary.failures_told(batch) == [
-        f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."
-    ]
-    batch = drawn_batch(1, logs=tuple("abcdefg"))
-    for log in batch.logs:
-        batch = with_failures(batch, "isam2", log, 1)
-    assert summary.failures_told(batch) == [
-        "isam2: 7 of 7 runs did not end (a, b, c and 4 more)."
-    ]
-
-
-@pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
-def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(
-    fewest, blind
-):
-    batch = drawn_batch(20)
-    batch = replace(
-        batch,
-        runs=[run for run in batch.runs if run.log == LOGS[0] or run.seed < fewest],
-    )
-    for name, kind in itertools.product(("isam2", "ekf-slam"), KINDS):
-        batch = changed(batch, name, f"{kind}.ate_se2_m", 1e-3)
-    tests = compared_runs(batch)
-    assert len(tests) == 12
-    assert (tests[KEY, LOGS[1], "isam2"][1] < 0.05) is not blind
-    told = summary.power_told(tests)
-    assert bool(told) is blind
-    assert not any(LOGS[0] + " (" in one for one in told)
 
 
 @pytest.mark.parametrize(
@@ -461,25 +385,6 @@ def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chan
         == f"no value {summary.HIGHER}"
     )
     assert "higher with isam2" in heads_of(batch)[0], "who never ended is not left out"
-
-
-def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
-    same = updated(
-        BATCH,
-        lambda run: {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]},
-        ("ekf-slam",),
-    )
-    table = overview_of(same)
-    smoothed = [
-        column.heading.removesuffix(" (reference)")
-        for column in table.columns
-        if column.over == "Smoothed"
-    ]
-    assert smoothed == ["dead-reckoning", "isam2"]
-    assert (
-        next(column.heading for column in table.columns if column.over == "Causal")
-        == "dead-reckoning (reference)"
-    )
 
 
 def test_the_sentence_counts_logs_where_somebody_is_told_apart():

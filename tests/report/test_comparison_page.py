@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
     aligned_to_truth,
-    compact_table,
     compare,
-    judge,
     landmark_errors,
     rmse,
 )
@@ -30,10 +27,8 @@ from sonar_graph.report.comparison_page import (
 )
 from sonar_graph.report.figures import reliability_figure
 from sonar_graph.simulation import BasinOptions, simulate_basin
-from sonar_graph.states import Outcome
 from sonar_graph.table import Table
 from tests.synthetic import (
-    REFUSALS,
     basin_comparison,
     only,
     with_failure,
@@ -73,16 +68,6 @@ def test_every_run_score_protocol_and_file_appears(comparison, page):
         "runs/ekf-slam/result.json",
     } <= addresses
     assert "runs/dead-reckoning/landmarks.csv" not in addresses
-
-
-def test_every_reason_of_refusal_is_counted(comparison, page):
-    log = comparison.runs[0].detections
-    for outcome in [Outcome.USED, Outcome.NEW, *REFUSALS]:
-        assert re.search(
-            rf"{re.escape(outcome.value.capitalize())} {log.outcomes.count(outcome)} \(",
-            page.text,
-        )
-    assert f"All detections {len(log)}" in page.text
 
 
 def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the_top(
@@ -266,33 +251,6 @@ def test_aligned_errors_and_maps_are_those_of_the_aligned_scores(
             assert rmse(found.horizontal_m) == pytest.approx(wanted.value)
 
 
-def test_errors_are_the_same_after_alignment_wherever_the_estimates_world_lies(
-    comparison, aligned
-):
-    """Law: a rotation about the vertical and a shift of a run changes nothing of its aligned view."""
-    turn = Rotation.from_euler("z", 0.7)
-    moved = []
-    for run in comparison.runs:
-        paths = {
-            kind: replace(
-                path,
-                positions=turn.apply(path.positions) + np.array([3.0, -2.0, 0.0]),
-                quaternions_xyzw=(turn * path.rotations()).as_quat(),
-            )
-            for kind, path in (("causal", run.causal), ("smoothed", run.smoothed))
-        }
-        moved.append(replace(run, **paths))
-    judged = judge(comparison.sequence, comparison.instants_ns, moved)
-    again = aligned_to_truth(judged)
-    for name, series in aligned.errors.items():
-        for field in ("position_m", "position_sigma_m", "yaw_rad"):
-            np.testing.assert_allclose(
-                getattr(again.errors[name]["causal"], field),
-                getattr(series["causal"], field),
-                atol=1e-9,
-            )
-
-
 def test_without_truth_there_is_no_aligned_view_and_the_plots_name_the_reason():
     blind = basin_comparison(60, truth=False)
     assert aligned_to_truth(blind) is None
@@ -312,15 +270,6 @@ def test_a_filter_as_published_is_named_so_with_its_fair_neighbour(comparison):
     assert "ekf-slam as published" in text
     assert "The fair neighbour is invariant-ekf" in text
     assert "The fair neighbour" not in Page(render_report(comparison)).text
-
-
-def test_the_first_table_has_at_most_six_columns_that_state_their_alignment(comparison):
-    for aligned, world in ((True, "aligned"), (False, "not aligned")):
-        columns = compact_table(comparison, aligned=aligned).columns
-        assert len(columns) <= 6
-        headings = [column.heading for column in columns if "(m)" in column.heading]
-        assert len(headings) == 3
-        assert all(heading.endswith(f", {world} (m)") for heading in headings)
 
 
 def texts(table: Table) -> dict[str, list[str]]:
@@ -409,18 +358,6 @@ def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognit
     assert (counts[:4, 1] == 0).all()
     assert counts[4].tolist()[:2] == [0, 0]
     assert counts[4, 2] > 2
-
-
-def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised):
-    detections = recognised.sequence.detections
-    swapped = replace(detections, candidate_ids=detections.candidate_ids % 4 + 1)
-    before = recognition_content(recognised)
-    after = recognition_content(
-        replace(recognised, sequence=replace(recognised.sequence, detections=swapped))
-    )
-    for what in (f"landmark {k}" for k in (1, 2, 3, 4)):
-        right, wrong, none = texts(before["named"])[what]
-        assert texts(after["named"])[what] == [wrong, right, none]
 
 
 def test_a_folder_that_cannot_be_written_is_named_in_one_line(tmp_path) -> None:

@@ -7,10 +7,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
@@ -20,12 +19,10 @@ from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
     arrange,
     blank_panels,
-    colour,
     evenly,
     inline_svg,
     logarithmic,
     sized,
-    thinned,
 )
 from sonar_graph.report.figures.error_figures import errors_cut_off
 from sonar_graph.report.figures.illustrations import illustrations
@@ -33,7 +30,6 @@ from sonar_graph.report.figures.maps import (
     enlargement,
     growth_figure,
     map_figure,
-    paths_cut_off,
 )
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
@@ -78,32 +74,6 @@ def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_
         sequence=replace(comparison.sequence, truth=None, true_landmarks=None),
     )
     assert draw(empty) is None
-
-
-def test_height_is_drawn_of_three_dimensional_runs_and_no_error_without_truth():
-    figure = figures.bounds_figure(basin_comparison(60, planar=False))
-    assert "error in z (m)" in {panel.get_ylabel() for panel in figure.axes}
-    comparison = basin_comparison(60, truth=False)
-    assert [draw for draw in FIGURES if draw(comparison) is None] == [
-        *(figures.error_figure, figures.bounds_figure, figures.nees_figure)
-    ]
-
-
-def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its_view(
-    comparison,
-):
-    panel = map_figure(comparison).axes[0]
-    assert panel.get_aspect() == 1
-    assert {text.get_text() for text in panel.texts} == {"1", "2", "3", "4"}
-    shown = panel.get_legend_handles_labels()[1]
-    assert "isam2, smoothed" in shown
-    assert "ekf-slam, smoothed" not in shown
-    *_, run = comparison.runs
-    away = replace(run.causal, positions=run.causal.positions + np.array([500.0, 0, 0]))
-    gone = with_run(comparison, replace(run, causal=away, smoothed=None))
-    assert np.ptp(map_figure(gone).axes[0].get_xlim()) < 20
-    assert paths_cut_off(gone) == ["dead-reckoning"]
-    assert paths_cut_off(only(comparison, "isam2")) == []
 
 
 def test_names_of_crowded_landmarks_are_short_and_neither_overlap_nor_cover_a_mark():
@@ -159,39 +129,6 @@ def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     assert corners.y1 == pytest.approx(
         chi2.ppf(0.95, 1) ** 0.5 * errors.position_sigma_m[:, 0].max()
     )
-
-
-def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
-    errors = comparison.errors["isam2"]["causal"]
-    unknown = {
-        name: np.nan * getattr(errors, name)
-        for name in ("position_sigma_m", "yaw_sigma_rad")
-    }
-    silent = replace(
-        only(comparison, "isam2"),
-        errors={"isam2": {"causal": replace(errors, **unknown)}},
-    )
-    assert not any(panel.collections for panel in figures.bounds_figure(silent).axes)
-    assert any(panel.collections for panel in figures.bounds_figure(comparison).axes)
-
-
-def test_errors_of_all_runs_share_their_axes_and_grow_over_the_distance_travelled(
-    comparison,
-):
-    figure = figures.error_figure(comparison)
-    over_time, over_distance = figure.axes[:2]
-    truth = comparison.sequence.truth
-    travelled = np.linalg.norm(
-        np.diff(truth.at(comparison.instants_ns).positions, axis=0), axis=1
-    ).sum()
-    for line, run in zip(over_distance.lines, comparison.runs, strict=True):
-        errors = comparison.errors[run.estimator]["causal"]
-        np.testing.assert_allclose(
-            line.get_ydata().max(), np.hypot(*errors.position_m[:, :2].T).max()
-        )
-        np.testing.assert_allclose(line.get_xdata()[-1], travelled)
-    assert over_time.get_ylim() == over_distance.get_ylim()
-    assert figure.axes[2].get_ylim()[1] >= 0
 
 
 def test_a_run_that_is_far_worse_leaves_the_picture_and_is_named(comparison):
@@ -270,31 +207,6 @@ def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
         assert inside.mean() == pytest.approx(0.95, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "draw", [map_figure, figures.yaw_figure, figures.timing_figure]
-)
-def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
-    failed = with_failure(comparison, "isam2", "lost")
-    used = {
-        to_hex(line.get_color()) for panel in draw(failed).axes for line in panel.lines
-    }
-    assert colour(0) not in used
-    assert {colour(1), colour(2)} <= used
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(4, 60))
-@settings(deadline=None)
-def test_thinning_keeps_ends_and_extremes(values, points):
-    series = np.array(values)
-    rows = thinned(series, points)
-    assert len(rows) <= points + 2
-    assert rows[0] == 0
-    assert rows[-1] == len(series) - 1
-    assert np.all(np.diff(rows) > 0)
-    assert series[rows].max() == series.max()
-    assert series[rows].min() == series.min()
-
-
 @given(st.integers(0, 5000), st.integers(2, 900))
 def test_even_choice_keeps_the_ends(n, points):
     rows = evenly(n, points)
@@ -324,25 +236,6 @@ def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
             ]
         runs.append(replace(run, maps=maps))
     return replace(comparison, runs=runs)
-
-
-def test_each_panel_shows_what_was_known_then():
-    comparison = grown()
-    figure = growth_figure(comparison)
-    panels = np.array(figure.axes).reshape(2, 3)
-    stamps = sorted({known.stamp_ns for run in comparison.runs for known in run.maps})
-    for row, run in enumerate(comparison.runs[:2]):
-        for column, (panel, stamp_ns) in enumerate(
-            zip(panels[row], stamps, strict=True)
-        ):
-            lines = {line.get_label(): line for line in panel.get_lines()}
-            until = run.causal.positions[run.causal.stamps_ns <= stamp_ns]
-            path = np.column_stack(lines["causal estimate"].get_data())
-            np.testing.assert_allclose(path, until[:, :2])
-            assert len(lines["estimated landmarks"].get_xdata()) == 2 + column
-            assert (
-                sum(isinstance(patch, Ellipse) for patch in panel.patches) == 2 + column
-            )
 
 
 def test_ellipses_are_as_large_as_the_caption_says():

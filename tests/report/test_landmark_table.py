@@ -7,7 +7,6 @@ from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.report.landmark_table import (
     MOST_LANDMARKS,
-    PAPER,
     landmark_table,
     landmarks_left_out,
 )
@@ -114,28 +113,6 @@ def test_totals_are_the_scores_and_landmarks_beyond_what_a_page_holds_are_counte
         "no map, no table"
     )
     assert landmark_table(by_hand(mapped(), mapped((1, 0.0, 0.0)))) is None
-
-
-def test_only_the_repeated_experiment_has_the_papers_column():
-    other, same = landmark_table(basin_comparison(60)), landmark_table(repeated())
-    assert PAPER not in [column.heading for column in other.columns]
-    assert [column.heading for column in same.columns[2:]] == [
-        "isam2",
-        "ekf-slam",
-        "dead-reckoning",
-        PAPER,
-    ]
-    rows = rows_of(repeated())
-    assert [row[-1] for row in rows[:4]] == [
-        "4.81 (-0.19)",
-        "-0.07 (-0.07)",
-        "6.74 (-0.26)",
-        "-5.01 (-0.01)",
-    ]
-    assert [row[-1] for row in rows[8:]] == ["0.227", "0.093", "-0.3013", "-0.1758"]
-    assert {row[4] for row in rows[:8]} == {"-"}, (
-        "a dead reckoning has no map, but a path"
-    )
 
 
 @pytest.mark.parametrize("begins_later", [0, 3])

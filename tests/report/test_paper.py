@@ -47,23 +47,6 @@ def test_every_figure_is_there_as_svg_and_pdf_in_the_widths_of_a_journal_with_it
         assert b"/FontFile2" in pdf, "a TrueType font, embedded"
 
 
-def test_every_table_is_there_as_latex_and_csv_and_the_document_shows_all_with_the_protocol(
-    folder,
-):
-    document, protocol = (
-        (folder / name).read_text("utf-8") for name in ("paper.tex", "protocol.txt")
-    )
-    tables = {path.stem for path in (folder / "tables").glob("*.tex")}
-    assert tables == {path.stem for path in (folder / "tables").glob("*.csv")}
-    assert set(re.findall(r"\\input\{tables/(.*?)\.tex\}", document)) == tables
-    figures = {path.stem for path in (folder / "figures").glob("*.pdf")}
-    assert (
-        set(re.findall(r"\\includegraphics\{figures/(.*?)\.pdf\}", document)) == figures
-    )
-    assert "aligned by SE(2)" in protocol
-    assert all(f"% {line}" in document for line in protocol.splitlines() if line)
-
-
 def test_the_same_result_gives_the_same_files_and_only_own_files_are_replaced(tmp_path):
     comparison = basin_comparison(60)
     write_paper(comparison, tmp_path)

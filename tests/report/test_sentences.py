@@ -103,35 +103,6 @@ def test_a_nees_is_marked_outside_its_interval_and_never_without(
     assert "▲ over-confident, ▼ over-cautious" in text
 
 
-def test_what_is_lost_or_looks_wrong_in_a_log_is_told():
-    sequence = basin_comparison(60).sequence
-    notes = {
-        "log.ending": "the file is cut off at byte 7",
-        "log.damage": "bytes 3 to 5: chunk 2 is lost",
-        "log.warnings": "imu: 1 angular rate stands out",
-        "log.gaps": "dvl: no velocity 10.000 to 30.000 s after the start",
-        "log.dropped": "dvl: 5 with values that are not finite",
-        "log.noise": "dvl: 5 of 5 rows say no covariance",
-    }
-    text = printed(
-        replace(
-            basin_comparison(60),
-            sequence=replace(sequence, detections=None, notes=notes),
-        ),
-        120,
-    )
-    for line in (
-        "Log: the file is cut off at byte 7",
-        "Log: bytes 3 to 5: chunk 2 is lost",
-        "Warning: imu: 1 angular rate stands out",
-        "Warning: dvl: no velocity 10.000 to 30.000 s after the start",
-        "Log, left out: dvl: 5 with values that are not finite",
-        "without them nothing corrects the drift.",
-    ):
-        assert line in " ".join(text.split())
-    assert "say no covariance" not in text
-
-
 def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of_the_report():
     comparison = basin_comparison(60)
     assert published_counterpart(comparison) is None
@@ -242,11 +213,6 @@ def test_without_detections_the_drift_is_explained_and_without_errors_the_headli
     [
         (19, {}, None),
         (21, {}, "identities are wrong, or noise is set far too small"),
-        (
-            30,
-            {"identity": {"policy": "gate"}},
-            'wrong (try identity.policy = "max-mixture"), or noise is set far too',
-        ),
     ],
 )
 def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(
@@ -273,34 +239,6 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(
     assert detection_scores(few)["detections.nis"].verdict == (
         "" if told else "over-cautious"
     )
-
-
-def test_what_ekf_slam_used_beside_the_paper_is_named():
-    comparison = basin_comparison(60)
-    run = replace(comparison.runs[1], params={"far_views": True})
-    gaps = comparison.sequence  # a velocity every 30 s
-    known = gaps.calibration
-    patient = known.dvl.model_copy(update={"gap_s": 31.0})
-    steady = replace(gaps, calibration=known.model_copy(update={"dvl": patient}))
-    for sequence, params, is_named in (
-        (gaps, run.params, True),
-        (gaps, {}, False),
-        (steady, run.params, False),
-    ):
-        one = with_run(
-            replace(comparison, sequence=sequence), replace(run, params=params)
-        )
-        sentence = sentences.beside_the_paper(one)
-        assert ("far_views" in sentence) == is_named
-        assert ("no sample for long" in sentence) == (sequence is gaps)
-        assert "gravity" in sentence
-        bare = replace(
-            sequence,
-            depth=None,
-            calibration=sequence.calibration.model_copy(update={"use_gravity": False}),
-        )
-        assert "gravity" not in sentences.beside_the_paper(replace(one, sequence=bare))
-    assert sentences.beside_the_paper(only(comparison, "isam2")) is None
 
 
 def with_map(
@@ -395,9 +333,6 @@ def test_without_true_landmarks_the_innovations_of_used_detections_tell():
         )
 
 
-LISTED = [(2, "1 and 2"), (5, "1, 2, 3, 4 and 5"), (6, "1, 2, 3, 4, 5 and 1 more")]
-
-
 BEFORE = [Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED]
 NAMELESS = [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT]
 """Outcomes before an identity mattered, and those of detections without one that can be used."""
@@ -464,42 +399,6 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     assert (
         "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
     )
-
-
-def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_warnings():
-    said = {subject: f"<{subject}>" for subject in sentences.SAID_NOTES}
-    notes = said | {"log.topics": "imu: /imu", "log.noise": "dvl"}
-    assert [line.partition(": ")[2] for line in sentences.doubt_lines(notes)] == list(
-        said.values()
-    )
-    assert sentences.warning_lines(notes) == [
-        "Doubtful: <log.doubtful>",
-        *(
-            f"Warning: <log.{name}>"
-            for name in ("sensors", "start_pose", "warnings", "gaps")
-        ),
-    ]
-
-
-def test_a_line_names_sensor_stamp_reason_distance_and_runs():
-    start_ns = basin_comparison(60).sequence.start_ns
-    comparison = refusing(
-        [outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam"
-    )
-    assert sentences.refusal_lines(comparison) == [
-        f"Warning: dvl, 1.234 s: {Refusal.OUTLIER} (squared distance 513); isam2, ekf-slam",
-        f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2, ekf-slam",
-    ]
-    many = refusing([outlier(start_ns + k * NS, 60.0 + k) for k in range(20)], "isam2")
-    assert sentences.refusal_lines(many) == [
-        f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
-    ]
-    own, other = (
-        refusing([outlier(0)], "isam2"),
-        refusing([outlier(0, 70.0)], "ekf-slam"),
-    )
-    both = sentences.refusal_lines(with_run(own, other.runs[1]))
-    assert [line.rsplit("; ")[-1] for line in both] == ["isam2", "ekf-slam"]
 
 
 def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_nothing_was():

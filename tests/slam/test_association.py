@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
-from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.models import ACCEPTED, identify
 from sonar_graph.slam.landmarks.mixture import (
     LEAST_LANDMARKS,
@@ -19,7 +19,6 @@ from sonar_graph.slam.landmarks.tracked import (
     NO_LANDMARK,
     UNDECIDED,
     decide,
-    second_rows_of_tracks,
 )
 from sonar_graph.slam.landmarks.unknown import (
     UNPAIRED,
@@ -104,23 +103,6 @@ def test_weights_are_a_distribution_with_none_impossible(
     assert weights.min() >= min(0.5 * q / count, 0.5 * q) * (1 - 1e-9)
 
 
-def test_what_is_no_landmark_is_not_stated() -> None:
-    assert statement([5, -1, 3], [0.0, 0.9, 0.1]).probability == {3: 0.1}
-    assert statement([-1], [1.0]).favourite is None
-
-
-NAMED = [
-    ([0.97, 0.01], 5), ([0.2, 0.2], None), ([0.4, 0.1], None), ([0.5, 0.5], None), ([0.1, 0.6], 3), ([0.0, 0.0], None),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("probability", "named"), NAMED)
-def test_only_what_is_more_probable_than_all_else_is_named(
-    probability: list[float], named: int | None
-) -> None:
-    assert statement([5, 3][: len(probability)], probability).favourite == named
-
-
 @pytest.mark.parametrize(
     ("belief", "decided"),
     [
@@ -140,26 +122,6 @@ def test_what_reaches_the_least_probability_is_decided(
 
 
 FLAT = [0.2] * 4
-TRACKS = [3, 3, NO_TRACK, 8]
-BELIEFS = [[0.9, 0, 0, 0], [0, 0, 0.8, 0], [1.0, 0, 0, 0], FLAT]
-
-
-@pytest.mark.parametrize(
-    ("tracks", "beliefs", "ids", "identity", "kept"),
-    [
-        (TRACKS, BELIEFS, [4, 5, 6, 7], 6, [1, 2, 3]),
-        (TRACKS, BELIEFS, [4, 5, 6, 7], 4, [0, 2, 3]),
-        ([3, 3], [FLAT, [0, 0.8, 0, 0]], [4, 5, 6, 7], UNDECIDED, [1]),
-        ([3, 3], [FLAT, FLAT], [4, 5, 6, 7], UNDECIDED, [0]),
-        ([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]], [0] * 4, 0, [1]),
-    ],
-)
-def test_of_a_track_the_row_stays_that_its_identity_explains_best(
-    tracks, beliefs, ids, identity, kept
-):
-    rows = detected(0, np.ones((len(tracks), 2)), ids, beliefs, tracks)
-    reasons = second_rows_of_tracks(rows, dict.fromkeys(tracks, identity))
-    assert [k for k, why in enumerate(reasons) if why is None] == kept
 
 
 PROBABILITY = 0.95
@@ -288,17 +250,3 @@ def test_two_that_share_a_wide_error_support_each_other():
     given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])
     assert given_the_other > np.log(3.0) > together / 2
     assert drop_unlikely(case, both, np.log(np.full(2, 3.0))).size == 0
-
-
-def test_a_pair_that_the_others_contradict_is_dropped():
-    """The third lies where the common error of the first two does not let it be."""
-    expected = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    z = expected + np.array([[0.8, 0.0], [0.8, 0.0], [-0.3, 0.6]])
-    shared = np.tile(np.eye(2), (3, 1))
-    cov = shared @ shared.T + 1e-4 * np.eye(6)
-    case = Innovations(
-        z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (3, 1, 1))
-    )
-    assert drop_unlikely(
-        case, Pairing((0, 1, 2), 0.0), np.log(np.full(3, 0.2))
-    ).landmarks == (0, 1, UNPAIRED)

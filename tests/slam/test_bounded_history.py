@@ -1,20 +1,18 @@
 """What leaves the window is given up, and nothing but that."""
 
-import gc
 from functools import cache
 
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate, Outcome
 
 from .late_identities import SURE, on_the_rail
-from .made import isam2_params, ran
+from .made import ran
 from .rail import STEP_S, rail
 
 LAG_S = 5.0
@@ -74,26 +72,6 @@ def test_poses_that_left_are_least_squares_as_far_as_the_lag_reached():
     assert estimator.landmarks().positions[:, 0] == pytest.approx(
         [all_mean["l4"], all_mean["l7"]], abs=1e-7
     )
-
-
-def test_nothing_grows_with_the_run():
-    """Factors, variables and Python objects after three minutes are as many as after two; of a whole history not."""
-    sequence = simulate_mission(MissionOptions(duration_s=180.0))
-    sizes = []
-    params = isam2_params(history__policy="bounded", smoother__lag_s=LAG_S)
-    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), params)
-    for step in sequence.replay(sequence.instants(2.0)):
-        estimator.process(step)
-        if round((step.end_ns - sequence.start_ns) * 1e-9, 3) in (120.0, 179.0):
-            gc.collect()
-            held = [estimator.graph.size(), estimator.values.size()]
-            sizes.append([*held, len(gc.get_objects())])
-    before, after = np.array(sizes)
-    assert (after[:2] < 2.0 * before[:2] + 15).all()
-    assert after[2] - before[2] < 1000
-    whole, _ = run(sequence, "whole")
-    assert whole.graph.size() > 2 * after[0]
-    assert whole.values.size() > 3 * after[1]
 
 
 def seven_after(belief: list[float], frames: int) -> Sequence:

@@ -124,20 +124,10 @@ def test_a_keyframe_is_known_by_its_stamp_as_by_its_number():
 
 REFUSED = [
     ({"keyframe": 999}, r"there is no keyframe 999; it has 0 to \d+"),
-    ({"keyframe": -1}, r"there is no keyframe -1; it has 0 to \d+"),
     ({"landmark": 77}, r"landmark 77 is not in the graph; it holds [\d, ]+$"),
-    ({"landmark": -1}, r"landmark -1 is not in the graph"),
     ({"stamp_ns": 5}, r"no keyframe at 5 ns; the nearest are at \d+ ns"),
     (
-        {"stamp_ns": "after the second"},
-        r"no keyframe at \d+ ns; the nearest are at \d+ and \d+ ns",
-    ),
-    (
         {},
-        r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark",
-    ),
-    (
-        {"keyframe": 1, "landmark": 2},
         r"marginal\(\) is of one variable; give one of keyframe, stamp_ns and landmark",
     ),
     (
@@ -149,10 +139,6 @@ REFUSED = [
         {"landmarks": 4},
         r"landmarks: expected a list of integers, such as \[1, 2\], not 4",
     ),
-    ({"landmarks": ["4"]}, "landmarks: expected a list of integers"),
-    ({"keyframes": 0.0}, "keyframes: expected a list of integers"),
-    ({"keyframes": [0.5]}, "keyframes: expected a list of integers"),
-    ({"stamps_ns": [1.5]}, "stamps_ns: expected a list of integers"),
     (
         {"landmarks": [4], "over": "whole"},
         'over is \'whole\'; expected "window" or "history"',

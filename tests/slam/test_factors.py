@@ -9,12 +9,10 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
-from sonar_graph.models import HUBER_WIDTHS, RobustKernel, range_azimuth
+from sonar_graph.models import RobustKernel, range_azimuth
 from sonar_graph.slam import factors
 from sonar_graph.slam.factors import SightingStack
 from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
@@ -236,37 +234,6 @@ def test_a_heading_bias_turns_about_the_estimated_vertical():
     assert np.allclose(*errors, atol=1e-12)
 
 
-@pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
-def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
-    """GTSAM's own choice drops them where all are below 1e-9."""
-    motion = replace(some_motion(3), covariance=random_covariance(6, sigma))
-    pose = POSES["random"]
-    off = sigma * np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0])
-    values = values_of(
-        X0=pose,
-        X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)),
-        B0=motion.bias,
-    )
-    expected = 0.5 * off @ np.linalg.solve(motion.covariance, off)
-    for factor in (
-        factors.odometry(X(0), X(1), motion),
-        OdometryWithBias(X(0), X(1), B(0), motion),
-    ):
-        assert factor.error(values) == pytest.approx(expected, rel=1e-5)
-    start = Start(
-        position_sigma_m=(2e-5, 1e-5, 3e-5),
-        rpy_sigma_rad=(1e-5,) * 3,
-        rpy_rad=(0.4, -0.6, 2.2),
-    )
-    moved = start.pose().compose(
-        gtsam.Pose3(
-            gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))
-        )
-    )
-    prior = factors.start_prior(X(0), Calibration(start=start))
-    assert prior.error(values_of(X0=moved)) == pytest.approx(0.5, rel=1e-5)
-
-
 @poses
 @given(
     azimuth=st.floats(-1.13, 1.13),
@@ -294,25 +261,6 @@ def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(
     assert predicted == pytest.approx([range_m, azimuth], abs=1e-6)
 
 
-@given(st.floats(-1.13, 1.13), st.floats(-0.12, 0.12), st.floats(-0.9, 0.9))
-@settings(max_examples=20)
-def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(
-    azimuth, elevation, correlation
-):
-    pose = POSES["random"]
-    off = np.array([0.03, -0.01])
-    cov = correlated(correlation)
-    z = np.array([2.0, azimuth]) - off
-    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
-    sighting = factors.CorrelatedSighting(
-        X(0), L(0), BODY_T_SONAR, z, plain(factors.gaussian(cov))
-    )
-    assert np.allclose(sighting.unwhitenedError(values), off, atol=1e-9)
-    assert sighting.error(values) == pytest.approx(
-        0.5 * off @ np.linalg.solve(cov, off), rel=1e-6
-    )
-
-
 def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is said."""
     pose = POSES["random"]
@@ -337,36 +285,6 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     assert np.sort(np.linalg.eigvalsh(silent))[1:] == pytest.approx(
         [1 / 0.02**2, 1 / (0.009 * 2) ** 2], rel=0.02
     )
-
-
-def efficiency(k: float, d: int) -> float:
-    """Of Huber's mean of d-dimensional Gaussian noise of length r: ``(E psi')^2 / E psi^2``, by Stein's lemma."""
-
-    def mean(f):
-        return sum(
-            quad(lambda r: f(r) * chi(d).pdf(r), *ends)[0] for ends in ((0, k), (k, 20))
-        )
-
-    slope = mean(lambda r: min(r, k) * r) / d
-    square = mean(lambda r: min(r, k) ** 2) / d
-    return slope**2 / square
-
-
-@pytest.mark.parametrize("d", [1, 3])
-def test_the_kernel_of_headings_and_fixes_is_95_percent_efficient(d):
-    """A width of the other one is not; far off the loss is ``k (r - k / 2)``."""
-    k = HUBER_WIDTHS[d]
-    (other,) = [width for dimension, width in HUBER_WIDTHS.items() if dimension != d]
-    assert efficiency(k, d) == pytest.approx(0.95, abs=1e-4)
-    assert abs(efficiency(other, d) - 0.95) > 0.01
-    if d == 1:
-        factor = factors.heading(X(0), B(0), 1.0, 0.1)
-    else:
-        factor = factors.position(
-            X(0), np.array([6.0, 0.0, 8.0]), np.zeros(3), np.eye(3)
-        )
-    values = values_of(X0=gtsam.Pose3(), B0=np.zeros(11))
-    assert factor.error(values) == pytest.approx(k * (10.0 - k / 2))
 
 
 @poses
@@ -438,15 +356,6 @@ def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
     assert graph.error(values_of(X0=pose)) < 1e-6
     off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
     assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
-
-
-def test_the_floor_holds_the_height_of_a_landmark_alone():
-    factor = factors.floor_prior(L(0), -1.7, 0.01)
-    values = values_of(L0=np.array([40.0, -30.0, -1.68]))
-    assert factor.error(values) == pytest.approx(0.5 * 2**2, rel=1e-5)
-    assert np.diag(information([factor], values, [L(0)])) == pytest.approx(
-        [0, 0, 1e4], abs=1e-8
-    )
 
 
 def test_start_sigmas_of_position_are_along_the_worlds_axes():

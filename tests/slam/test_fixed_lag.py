@@ -67,26 +67,3 @@ def test_a_window_counts_factors_outside_of_it_once(outside, variance_m2, is_by_
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(
         expected * np.eye(3), rel=1e-6
     )
-
-
-@pytest.mark.parametrize("is_by_qr", [False, True])
-def test_a_marginal_holds_where_it_was_made(
-    is_by_qr: bool,
-):
-    """One prior is at 0 m, of a point that has left, and one at 3 m, equally certain."""
-    graph = graph_of(
-        [
-            point_prior(L(1), ORIGIN, 0.6),
-            near(1, 2, 0.8),
-            point_prior(L(2), np.full(3, 3.0), 1.0),
-        ]
-    )
-    window = FixedLagWindow(Thresholds(1e-6, 1e-6), 1e9, is_by_qr=is_by_qr)
-    window.begin(graph, {}, values_of(L1=ORIGIN, L2=ORIGIN), {L(2): 0.0})
-    for _ in range(2):
-        window.update({}, gtsam.Values(), {L(2): 0.0}, 1e9, removed=())
-    assert not window.holds(L(1))
-    assert window.linearised_at.atPoint3(L(2)) == pytest.approx(
-        np.full(3, 1.5), abs=1e-5
-    )
-    assert window.estimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))

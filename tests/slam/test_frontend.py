@@ -6,14 +6,14 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
-from sonar_graph.calibration import DvlCalibration, FloorPrior, Start
+from sonar_graph.calibration import Start
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
-from .dive import CALIBRATION, FLOOR, NS, SONAR, T0_NS, Dive, spherical
-from .graphs import block_of, factors_of
-from .made import detected, polar, smoother_with
+from .dive import CALIBRATION, SONAR, Dive, spherical
+from .graphs import block_of
+from .made import polar, smoother_with
 
 BEAM = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
 """Centre beam of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
@@ -79,13 +79,6 @@ def test_the_gate_is_the_chi_square_quantile(beyond):
     )
 
 
-def test_a_frame_before_the_start_is_unlocated():
-    dive = Dive()
-    dive.sightings.add(detected(T0_NS - 1, [(3.0, 0.0), (2.0, 0.0)], [[5], [6]], [0.9]))
-    assert dive.outcomes == [Outcome.UNLOCATED] * 2
-    assert dive.smoother.graph.size() == 0
-
-
 def test_a_frame_older_than_what_was_processed_is_late():
     dive = Dive()
     dive.see(3.0, (5, 3.0, 0.0))
@@ -93,59 +86,6 @@ def test_a_frame_older_than_what_was_processed_is_late():
     dive.see(2.99, (5, 3.0, 0.0), (6, 2.0, 0.0))
     assert dive.outcomes == [Outcome.NEW, Outcome.LATE, Outcome.LATE]
     assert dive.smoother.graph.size() == before
-
-
-@pytest.mark.parametrize("told", [None, np.diag([0.1**2, 0.05**2])])
-def test_a_covariance_in_the_log_goes_before_that_of_the_calibration(told):
-    dive = dive_with(start=CERTAIN)
-    dive.see(0.0, (5, 3.0, 0.0), cov=told)
-    dive.see(0.0, (5, 3.0, 0.0), cov=told)
-    sigma = [0.02, 0.01] if told is None else [0.1, 0.05]
-    S = dive.sightings.journal.log().innovation_covs[-1]
-    assert np.sqrt(np.diag(S)) == pytest.approx(np.sqrt(2) * np.array(sigma), rel=0.01)
-
-
-def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
-    """0.35 s of a Doppler log of 0.2 m/s: the range factor has the noise of `PredictedView.blurred`."""
-    sigmas = []
-    for after_s in (0.0, 0.35):
-        off_it = dive_with(dvl=DvlCalibration(velocity_sigma_m_s=(0.2, 0.2, 0.2)))
-        off_it.see(after_s, (5, 3.0, 0.0))
-        ranges = [
-            f
-            for f in factors_of(off_it.smoother.graph)
-            if isinstance(f, gtsam.RangeFactorWithTransform3D)
-        ]
-        sigmas += [factor.noiseModel().sigma() for factor in ranges]
-    motion = off_it.keyframes.motion_since_newest(T0_NS + round(0.35 * NS))
-    assert sigmas[0] == pytest.approx(SONAR.range_sigma_m)
-    assert sigmas[1] == pytest.approx(
-        np.sqrt(SONAR.range_sigma_m**2 + motion.covariance[3, 3]), rel=1e-2
-    )
-    assert sigmas[1] > 1.5 * sigmas[0]
-
-
-def test_a_known_floor_gives_the_elevation():
-    dive = dive_with(floor=FLOOR)
-    truth = np.array([2.6, 0.9, FLOOR.z_m])
-    dive.see(0.0, (5, *spherical(0.0, truth)))
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
-    assert dive.smoother.graph.size() == 2 + 4
-    settle(dive)
-    assert np.sqrt(
-        dive.smoother.marginals.marginalCovariance(L(5))[2, 2]
-    ) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
-
-
-def test_a_landmark_off_the_floor_does_not_drag_the_vehicle_there():
-    """0.5 rad below the centre beam is seven sigmas of the aperture, which has a factor then, and the floor none."""
-    dive = dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01))
-    without = Dive()
-    for each in (dive, without):
-        each.see(0.0, (5, 3.0, 0.0))
-        settle(each)
-    assert dive.smoother.graph.equals(without.smoother.graph, 1e-12)
-    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
 
 
 def waiting(greatest_gain: float) -> Dive:
@@ -170,17 +110,3 @@ def test_sightings_wait_until_together_they_add_enough_information():
     dive.see(0.0, (5, 9.0, 0.0))
     assert 0.02**2 / range_variance(dive) == pytest.approx(5, rel=1e-3)
     assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 6 + [Outcome.GATED]
-
-
-@pytest.mark.parametrize("what", ["keyframe", "landmark"])
-def test_what_waits_is_used_with_the_next_keyframe_or_landmark(what):
-    dive = waiting(1e9)
-    for _ in range(3):
-        dive.see(0.0, (5, 3.0, 0.0))
-    assert range_variance(dive) == pytest.approx(0.02**2, rel=1e-3)
-    if what == "keyframe":
-        dive.keyframes.advance(T0_NS + 5 * NS)
-        dive.keyframes.update_if_due()
-    else:
-        dive.see(0.0, (6, 3.0, 0.3))
-    assert range_variance(dive) == pytest.approx(0.02**2 / 4, rel=0.01)

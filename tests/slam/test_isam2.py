@@ -18,9 +18,8 @@ from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.settings import nested, settings_of
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate
 from sonar_graph.testing import check_consistent, laws
 from sonar_graph.testing.drives import small_world, still_world
@@ -257,33 +256,13 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"identity.view_range_m": 5.0},
         'policy = "max-mixture" has it',
     ),
-    "unknown landmarks in a mixture": (
-        {"identity.policy": "max-mixture", "identity.unknown.policy": "associate"},
-        'no such field with policy = "max-mixture"; identity.policy = "robust" or "gate" has it',
-    ),
     "association without its policy": (
         {"identity.unknown.sightings": 3},
         'identity.unknown.policy = "associate" has',
     ),
-    "belief in a mixture": (
-        {"identity.policy": "max-mixture", "identity.minimum_probability": 0.9},
-        '"gate" has it',
-    ),
-    "memory of a whole history": (
-        {"history.remembered_s": 30.0},
-        'history.policy = "bounded" has it',
-    ),
-    "width of no kernel": (
-        {"kernel.shape": "none", "kernel.width": 2.0},
-        'kernel.shape = "huber" or "cauchy" has it',
-    ),
     "mixture in a bounded history": (
         {"identity.policy": "max-mixture", "history.policy": "bounded"},
         'history.policy = "bounded" cannot be with identity.policy = "max-mixture", which chooses anew in the whole',
-    ),
-    "a mixture in a bounded history": (
-        {"identity.policy": "max-mixture", "history.policy": "bounded"},
-        'policy = "max-mixture", which',
     ),
     "no such policy": (
         {"identity.policy": "gcn"},
@@ -297,17 +276,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"smother.lag_s": 3},
         "smother: there is no such field; did you mean smoother?",
     ),
-    "no such setting": (
-        {"smoother": {"lag": 3}},
-        "smoother.lag: there is no such field; did you mean lag_s? smoother has",
-    ),
     "its section is missing": (
         {"unknown.density_m2": 1, "lag_s": 20},
         "lag_s: there is no such field; did you mean smoother.lag_s? it has: keyframes, smoother, history, kernel",
-    ),
-    "out of range": (
-        {"identity.policy": "gate", "identity.gate_probability": 2},
-        "identity.gate_probability: expected a number",
     ),
 }
 
@@ -319,26 +290,3 @@ def test_what_a_policy_does_not_read_is_refused_by_name(
     with pytest.raises(EstimatorError) as refused:
         make_params(Isam2, given, "isam2")
     assert fault in str(refused.value)
-
-
-def test_a_section_keeps_its_default_policy_where_none_is_given() -> None:
-    params = Isam2Params(
-        **nested({"identity.longest_wait_s": 3.0, "kernel.width": 2.0})
-    )
-    assert params.identity.policy == "robust"
-    assert params.identity.longest_wait_s == 3.0
-    assert params.model_dump()["kernel"] == {"shape": "cauchy", "width": 2.0}
-    assert Isam2Params(**params.model_dump(mode="json")) == params
-
-
-def test_the_listing_has_every_setting_once_with_its_policy() -> None:
-    listed = {setting.name: setting for setting in settings_of(Isam2Params)}
-    assert len(listed) == len(settings_of(Isam2Params)) == 24
-    assert listed["smoother.lag_s"].default == 15.0
-    assert listed["identity.policy"].default == "robust"
-    assert listed["identity.gate_probability"].meaning.endswith(
-        'Only with policy = "gate".'
-    )
-    assert listed["identity.minimum_probability"].meaning.endswith(
-        'Only with policy = "robust" or "gate".'
-    )

@@ -9,16 +9,13 @@ import pytest
 from gtsam.symbol_shorthand import B, X
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import (
     Calibration,
     DepthCalibration,
     DvlCalibration,
     ImuCalibration,
-    Mounting,
     PlanarMotion,
-    SonarCalibration,
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu
@@ -95,94 +92,11 @@ def factor_of(keyframes: Keyframes, kind: type) -> gtsam.NonlinearFactor:
     return factor
 
 
-def error_of(keyframes: Keyframes, kind: type) -> np.ndarray:
-    return factor_of(keyframes, kind).unwhitenedError(keyframes.smoother.values)
-
-
-def test_one_is_set_at_the_first_node_after_the_longest_interval():
-    keyframes = driven(Calibration(imu=NO_BIAS), 5.0)
-    assert seconds(keyframes) == [0.0, 2.0, 4.0]
-    assert keyframes.newest_key == keyframes.oldest_key(1.9) == X(2)
-    assert keyframes.oldest_key(2.0) == X(1)
-    assert keyframes.newest_s == pytest.approx(T0_NS * 1e-9 + 4.0)
-
-
 def see(keyframes: Keyframes, after_s: float) -> PreintegratedMotion:
     """A frame comes: the motion to it from what is then the newest keyframe."""
     stamp = int(at(after_s)[0])
     keyframes.advance(stamp)
     return keyframes.set_for_frame(stamp, keyframes.motion_since_newest(stamp))
-
-
-def noisy_keyframes(
-    share: float, axis: int = 0, turn_rad_s: float = 0.0, **calibration
-) -> Keyframes:
-    """0.3 m/s along an axis at 5 Hz: the displacement's variance grows by 0.018 m^2 a second."""
-    dvl = DvlCalibration(velocity_sigma_m_s=tuple(0.01 + 0.29 * np.eye(3)[axis]))
-    exact_gyro = ImuCalibration(gyro_noise_density=1e-12, gyro_bias_sigma=0.0)
-    keyframes = keyframes_of(
-        Calibration(**({"imu": exact_gyro, "dvl": dvl} | calibration)),
-        POLICY.model_copy(update={"motion_noise_share": share}),
-    )
-    keyframes.add(level_imu(1.99, turn_rad_s * np.eye(3)[axis]), steady_dvl(1.99), None)
-    return keyframes
-
-
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(("blurred_s", "expected"), [(0.55, [0.0]), (0.57, [0.0, 0.4])])
-def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share(
-    blurred_s, expected, axis
-):
-    """A tenth of (0.3178 m)^2 is 0.0101 m^2, reached after 0.561 s; it sits at the newest reached node."""
-    sonar = SonarCalibration(
-        range_sigma_m=np.sqrt(0.018 * 0.561 / 0.1), azimuth_sigma_rad=1e3
-    )
-    keyframes = noisy_keyframes(0.1, axis, sonar=sonar)
-    motion = see(keyframes, blurred_s)
-    assert seconds(keyframes) == pytest.approx(expected)
-    assert motion.i_T_j.translation() == pytest.approx(
-        [0.5 * (blurred_s - expected[-1]), 0, 0]
-    )
-    assert motion.covariance[3 + axis, 3 + axis] == pytest.approx(
-        0.018 * (blurred_s - expected[-1])
-    )
-
-
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(
-    ("density", "bias_sigma", "azimuth_sigma_rad", "expected"),
-    [
-        (0.1, 0.0, 0.20, [0.0, 0.4]),
-        (0.1, 0.0, 0.22, [0.0]),
-        (1e-12, 0.1, 0.1, [0.0, 0.4]),
-        (1e-12, 0.1, 0.15, [0.0]),
-    ],
-    ids=["noise", "noise under the share", "bias", "bias under the share"],
-)
-def test_the_turn_by_noise_or_unknown_bias_is_compared_with_azimuth(
-    density, bias_sigma, azimuth_sigma_rad, expected, axis
-):
-    """Noise of 0.1 rad/s/sqrt(Hz): 0.0045 rad^2 after 0.45 s, a tenth of (0.21 rad)^2; of a bias (0.045 rad)^2.
-
-    The latter about the axis of a turn; about others much of it cancels.
-    """
-    keyframes = noisy_keyframes(
-        0.1,
-        axis,
-        10.0,
-        imu=ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias_sigma),
-        dvl=EXACT_DVL,
-        sonar=SonarCalibration(range_sigma_m=1e3, azimuth_sigma_rad=azimuth_sigma_rad),
-    )
-    see(keyframes, 0.45)
-    assert seconds(keyframes) == pytest.approx(expected)
-
-
-def test_with_no_share_every_frame_brings_one_if_a_node_was_reached_since():
-    keyframes = noisy_keyframes(0.0)
-    for after_s in (0.2, 0.3, 0.35, 0.41, 1.0):
-        see(keyframes, after_s)
-    assert seconds(keyframes) == pytest.approx([0.0, 0.2, 0.4, 1.0])
 
 
 def test_every_keyframe_has_its_odometry_gravity_and_plane():
@@ -209,15 +123,6 @@ def test_every_keyframe_has_its_odometry_gravity_and_plane():
         ]
 
 
-def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
-    start = Start(rpy_rad=(0.1, -0.2, 0.5))
-    level = level_imu(2.0)
-    up_in_body = Rotation.from_euler("xyz", start.rpy_rad).inv().apply([0, 0, G])
-    felt = replace(level, specific_force=np.tile(up_in_body, (len(level), 1)))
-    keyframes = driven(Calibration(imu=NO_BIAS, start=start), 2.0, felt=felt)
-    assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 1e-9
-
-
 def test_gravity_has_the_velocity_noise_of_both_ends():
     """Beside what the IMU adds: the change of a velocity with these sigmas at its ends, over 2 s and g."""
     ends = np.array([(0.1, 0.1), (0.2, 0.2), (0.1, 0.2), (0.2, 0.1)])
@@ -235,23 +140,6 @@ def test_gravity_has_the_velocity_noise_of_both_ends():
     assert np.diff(variances) == pytest.approx(
         np.diff((ends**2).sum(axis=1)) / (2.0 * G) ** 2, rel=1e-3, abs=1e-9
     )
-
-
-def test_velocity_is_taken_to_the_imu_before_gravity_is():
-    """A vehicle that begins to turn accelerates an IMU off its centre: without the lever arm up would seem to lean."""
-    arm = 2.0
-    alpha = 0.05
-    calibration = Calibration(
-        imu=NO_BIAS.model_copy(update={"mounting": Mounting(translation_m=(arm, 0, 0))})
-    )
-    t = np.arange(41) / 20
-    force = np.column_stack(
-        [-((alpha * t) ** 2) * arm, np.full(41, alpha * arm), np.full(41, G)]
-    )
-    felt = Imu(at(*t), np.outer(alpha * t, [0, 0, 1.0]), force)
-    keyframes = driven(calibration, 2.0, velocity=(0, 0, 0), felt=felt)
-    assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 2e-5
-    assert alpha * arm / G > 1e-2
 
 
 def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
@@ -453,24 +341,6 @@ def test_a_depth_in_a_gap_has_the_walk_of_the_velocity(
     assert tie.noiseModel().sigmas()[2] ** 2 == pytest.approx(
         1e-4 + walked_m2 + doppler_m2, rel=1e-3
     )
-
-
-@pytest.mark.parametrize("headings_s", [[1.5], [1.5, 3.0, 5.0]])
-def test_a_heading_in_a_gap_is_tied_to_the_keyframe_by_the_gyros(headings_s):
-    """No velocity is needed for that; what a gyro bias may have turned since then counts as noise."""
-    keyframes = keyframes_over_gaps(5.0)
-    n = len(headings_s)
-    keyframes.add(
-        None, None, None, Heading(at(*headings_s), np.zeros(n), np.full(n, 0.02))
-    )
-    keyframes.advance(int(at(6.3)[0]))
-    (tie,) = [
-        f
-        for f in factors_of(keyframes.smoother.graph)
-        if list(f.keys()) == [X(1), B(0)] and f.dim() == 1
-    ]
-    variance = tie.noiseModel().noise().covariance().item()
-    assert variance == pytest.approx(0.02**2 / n, rel=1e-3)
 
 
 @given(

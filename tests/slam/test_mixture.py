@@ -142,13 +142,6 @@ def losses(kernel: Kernel, noise: Floats) -> Floats:
     return np.array(found)
 
 
-@pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
-def test_the_mixtures_loss_is_that_of_the_graphs_factors(kernel: Kernel) -> None:
-    """Of independent noise under every kernel."""
-    theirs, ours = losses(kernel, np.diag(np.diag(R))).T
-    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7)
-
-
 def test_a_new_detections_components_are_predictive_densities() -> None:
     """Of three landmarks, one of them across the cut of the azimuth; of one that is not in the graph, and of none."""
     rng = np.random.default_rng(2)
@@ -168,7 +161,7 @@ def test_a_new_detections_components_are_predictive_densities() -> None:
     assert found.keys() == {7, 4, 9, 5, None}
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""
     values = world()

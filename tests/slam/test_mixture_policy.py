@@ -12,15 +12,11 @@ from sonar_graph.measurements import Floats
 from sonar_graph.models import Kernel
 from sonar_graph.slam import (
     GaussianKernel,
-    KeyframeParams,
     MixtureIdentity,
     RobustIdentity,
     RobustKernel,
 )
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
-from sonar_graph.slam.landmarks.landmark_graph import (
-    AmendableJournal,
-)
 from sonar_graph.slam.landmarks.mixture import (
     TrackedObject,
 )
@@ -28,7 +24,6 @@ from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import Outcome
 
-from . import dive as dive_module
 from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 
@@ -107,15 +102,6 @@ def test_wrong_names_cost_nothing_and_accepting_them_does(kernel: Kernel) -> Non
     assert worst_landmark_m(misnamed("robust")[0]) > right_m + 0.1
 
 
-def test_right_names_give_the_graph_of_a_policy_that_accepts_them() -> None:
-    worlds = [misnamed(policy, share=0.0)[0] for policy in ("max-mixture", "robust")]
-    assert worlds[0].outcomes == worlds[1].outcomes
-    for i in PLACES:
-        np.testing.assert_allclose(
-            *(w.sightings.smoothed().values.atPoint3(L(i)) for w in worlds), atol=1e-3
-        )
-
-
 @pytest.mark.parametrize("can_move", [True, False])
 def test_a_landmark_that_begins_in_a_wrong_place_is_moved(
     can_move: bool, monkeypatch
@@ -161,44 +147,9 @@ def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:
     assert np.linalg.norm(values.atPoint3(L(9)) - PLACES[9]) < 0.1
 
 
-LAG_S = 1.0
-
-
 def at(after_s: float, landmark_id: int, off: Floats = np.zeros(2)) -> Floats:  # noqa: B008
     """What is seen, without noise."""
     return np.array([spherical(0.5 * after_s, PLACES[landmark_id]) + off])
-
-
-def short_lived(monkeypatch: pytest.MonkeyPatch) -> Dive:
-    """A keyframe each frame, a second in the window."""
-    monkeypatch.setattr(
-        dive_module,
-        "POLICY",
-        KeyframeParams(max_interval_s=1.0, motion_noise_share=0.0),
-    )
-    return Dive(
-        CALIBRATION.model_copy(update={"floor": FLOOR}), MixtureIdentity(), lag_s=LAG_S
-    )
-
-
-def test_a_renamed_track_is_revised_also_outside_the_window(
-    monkeypatch,
-) -> None:
-    """An equal one, of no track and as wrongly named, is not."""
-    world = short_lived(monkeypatch)
-    for k in (1, 2):
-        show(world, 0.3 * k, at(0.3 * k, 7), [4], [2])
-    for k in range(3, 12):
-        show(world, 0.3 * k, at(0.3 * k, 9), [9], [-1])
-    first = world.sightings.policy.objects[0]
-    assert world.sightings.policy.landmark_of(first) == 4
-    show(world, 3.6, at(3.6, 7), [7], [2])
-    assert world.sightings.policy.landmark_of(first) == 7
-    assert world.sightings.landmarks.ids == [7, 9]
-
-
-def recorded(journal: AmendableJournal, seen: Sighting) -> Sighting:
-    return replace(seen, row=journal.record(seen.stamp_ns, 7, Outcome.WAITING))
 
 
 # A small world, in which all choices can be tried --------------------------------------------------------------------

@@ -14,12 +14,10 @@ from scipy.linalg import block_diag
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
     Contradictions,
-    elevation_on_floor,
     locate,
     locate_jacobians,
     range_azimuth,
     range_azimuth_jacobians,
-    wrap_angle,
 )
 from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.slam.prediction import PredictedView, Source, Tie, weigh
@@ -79,41 +77,6 @@ def test_a_located_point_is_seen_there_with_numerical_derivatives(
     )
     check_derivative(lambda xi: locate(sonar(xi), *view), G_pose, np.zeros(6))
     check_derivative(lambda at: locate(world_T_sonar, *at), G_view, view)
-
-
-@given(st.floats(-100.0, 100.0))
-def test_a_wrapped_angle_is_the_same_direction(angle):
-    wrapped = wrap_angle(angle)
-    assert -math.pi < wrapped <= math.pi
-    assert math.remainder(wrapped - angle, 2 * math.pi) == pytest.approx(0.0, abs=1e-12)
-
-
-@given(
-    st.floats(-0.3, 0.3), st.floats(0.2, 0.9), st.floats(-3, 3), st.floats(-0.2, 0.2), st.floats(-0.12, 0.12),
-    st.floats(1.0, 3.0),
-)  # fmt: skip
-def test_elevation_on_the_floor_is_that_of_a_point_on_it(
-    roll, pitch, yaw, azimuth, elevation, range_m
-):
-    world_T_sonar = gtsam.Pose3(
-        gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([1.0, -2.0, 3.0])
-    )
-    floor_z = locate(world_T_sonar, range_m, azimuth, elevation)[2]
-    found = elevation_on_floor(world_T_sonar, range_m, azimuth, floor_z, 0.244)
-    assert found is not None
-    assert abs(found) <= abs(elevation) + 1e-7
-    assert locate(world_T_sonar, range_m, azimuth, found)[2] == pytest.approx(
-        floor_z, abs=1e-9
-    )
-
-
-@pytest.mark.parametrize("floor_z", [-0.2, -5.0, 4.0])
-def test_a_floor_outside_the_aperture_gives_no_elevation(floor_z):
-    world_T_sonar = gtsam.Pose3(gtsam.Rot3.Pitch(math.radians(30)), np.zeros(3))
-    assert elevation_on_floor(world_T_sonar, 2.0, 0.0, -1.0, 0.244) == pytest.approx(
-        0.0, abs=1e-12
-    )
-    assert elevation_on_floor(world_T_sonar, 2.0, 0.0, floor_z, 0.244) is None
 
 
 BODY_T_SONAR = gtsam.Pose3(
@@ -209,25 +172,6 @@ def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed
         assert np.allclose(S, expected, rtol=1e-6, atol=1e-12)
         assert together[k] == pytest.approx(z, abs=1e-12)
         assert cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] == pytest.approx(S, rel=1e-9)
-
-
-@keyframes
-def test_the_variance_of_a_height_is_that_of_keyframe_and_motion(keyframe):
-    """By differences of the world z of a point that moves with the body."""
-    view, motion, _, joint = some_view(keyframe, True)
-    body = keyframe.compose(motion.i_T_j)
-    q = np.array([1.5, -0.4, -0.8])
-
-    def z(change: Floats) -> float:
-        return moved(
-            keyframe, motion, change[:6], np.zeros(11), change[6:]
-        ).transformFrom(q)[2]
-
-    J = central_differences(z, np.zeros(12))
-    expected = J[:6] @ joint.at(X(2), X(2)) @ J[:6] + J[6:] @ motion.covariance @ J[6:]
-    assert view.height_variances(body.transformFrom(q)[None])[0] == pytest.approx(
-        expected, rel=1e-6
-    )
 
 
 @keyframes

@@ -47,28 +47,6 @@ def along(direction: list[float], sigma: float) -> gtsam.NonlinearFactor:
     return gtsam.CustomFactor(isotropic(1, sigma), [L(1)], error)
 
 
-@pytest.mark.parametrize("tilt", [1e-2, 1e-4, 1e-6])
-def test_nearly_the_same_is_not_the_same(tilt: float) -> None:
-    """Two directions apart by a small angle hold both, however badly; the same direction twice holds one."""
-    made = [along([0.0, 0.0, 1.0], 0.1), along([1.0, 1.0, 0.0], 0.1)]
-    assert (
-        left_open(graph_of([*made, along([1.0, 1.0 + tilt, 0.0], 0.1)]), HERE, [L(1)])
-        == []
-    )
-    (open_,) = left_open(graph_of([*made, along([1.0, 1.0, 0.0], 0.1)]), HERE, [L(1)])
-    np.testing.assert_allclose(open_.directions @ [1.0, 1.0, 0.0], 0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize("sigma", [1e-6, 1.0, 1e6])
-def test_what_is_open_does_not_depend_on_how_surely_the_rest_is_held(
-    sigma: float,
-) -> None:
-    made = [along([0.0, 0.0, 1.0], sigma), along([1.0, 0.0, 0.0], 1.0)]
-    (open_,) = left_open(graph_of(made), HERE, [L(1)])
-    np.testing.assert_allclose(np.abs(open_.directions), [[0.0, 1.0, 0.0]], atol=1e-9)
-    assert left_open(graph_of([*made, along([0.0, 1.0, 0.0], 1.0)]), HERE, [L(1)]) == []
-
-
 def test_a_range_leaves_open_what_is_across_it() -> None:
     """Of the landmark when the pose is known; what is said too weakly counts as not said."""
     distance = gtsam.RangeFactor3D(X(0), L(1), 2.0, isotropic(1, 0.1))
@@ -187,7 +165,10 @@ def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
 
 @pytest.mark.parametrize(
     "cov",
-    [np.zeros((2, 2)), np.diag([1.0, -1.0]), np.ones((2, 2)), np.diag([1.0, np.nan])],
+    [
+        np.zeros((2, 2)),
+        np.diag([1.0, -1.0]),
+    ],
 )
 def test_noise_that_is_no_covariance_is_refused_where_gtsam_takes_it(cov):
     assert gtsam.noiseModel.Gaussian.Covariance(cov, False) is not None

@@ -19,7 +19,7 @@ from sonar_graph.slam.landmarks.landmark_graph import (
 )
 from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
 from sonar_graph.slam.landmarks.unknown import place
-from sonar_graph.slam.smoother import Changed, Sightline
+from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import Outcome
 
 from .made import graph_of, plain, polar, pose_prior, smoother_with, values_of
@@ -137,22 +137,6 @@ def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(
             errors(expected, ids, landmarks)
         )
         assert landmarks.ids == landmarks.smoother.landmark_ids == ids
-
-
-def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
-    """So it is not alone with one that came later, and stays when that one goes."""
-    landmarks = begun()
-    first, second, third = (sighting_of(7, k, None, landmarks) for k in (0, 1, 4))
-    other = sighting_of(9, 3, None, landmarks)
-    change(landmarks, [(first, 7), (second, 7), (third, 7), (other, 9)])
-    assert landmarks.sizes() == {7: 3, 9: 1}
-    landmarks.follow(Changed([], set(), {X(0), X(1)}))
-    assert landmarks.sizes() == {7: 2, 9: 1}
-    assert landmarks.is_rooted(7)
-    assert not landmarks.is_rooted(9)
-    change(landmarks, [(third, None), (other, None)])
-    assert landmarks.sizes() == {7: 1}
-    assert landmarks.any_sighting(7) is first
 
 
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))

@@ -9,8 +9,6 @@ from sonar_graph.models import RobustKernel
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import (
     Sightline,
-    Smoother,
-    SmootherParams,
     batch_solution,
 )
 from sonar_graph.slam.smoother.batch_solution import solve
@@ -65,20 +63,6 @@ def test_on_the_rail_window_and_history_are_least_squares(lag_s):
         )
 
 
-def test_covariances_are_those_of_where_the_window_has_settled():
-    """A landmark that is pulled away by decimetres lies at other angles to all that see it."""
-    fed = in_the_basin(12, FOREVER_S)
-    keys = [X(11), L(3)]
-    fed.add({"prior": point_prior(L(5), np.array([2.6, 4.3, -0.8]), 0.01)})
-    fed.smoother.update(11.0)
-    fed.joint(*keys)
-    fed.smoother.settle(11.0)
-    expected = fed.dense(fed.smoother.values, *keys)
-    assert np.allclose(
-        fed.joint(*keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max()
-    )
-
-
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 1.1], ids=["in the window", "not in it"])
 def test_a_joint_covariance_of_any_poses_is_that_of_all_factors(lag_s):
     fed = in_the_basin(15, lag_s)
@@ -103,24 +87,6 @@ def with_ranges(gone: list[tuple[int, int]], *new: tuple[int, int, float]) -> Ra
         NUMBERS.displacements_m,
         [*(r for r in NUMBERS.ranges if r[:2] not in gone), *new],
     )
-
-
-@pytest.mark.parametrize(
-    ("lag_s", "oldest"),
-    [(FOREVER_S, 7), (2.6, 17), (2.6, 7)],
-    ids=["all", "recent", "marginalised"],
-)
-def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest):
-    """Least squares without those ranges; the history is not solved for it."""
-    fed = on_the_rail(NODES, lag_s)
-    fed.smoother.solve_history()
-    gone = [(k, i) for k in range(oldest, NODES) for i in (4, 7)]
-    solved = counted(monkeypatch, batch_solution, "descended")
-    removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
-    assert len(removed) == len(gone)
-    fed.smoother.exchange(END_S, removed)
-    assert not solved
-    assert_all_is_least_squares(fed, with_ranges(gone))
 
 
 class Refusing:
@@ -203,13 +169,6 @@ def test_a_hold_that_is_over_ends_after_an_exchange(later_s):
     assert_is_least_squares(fed, numbers, NODES)
 
 
-def test_on_the_rail_restarts_of_a_bounded_window_change_nothing(monkeypatch):
-    solved = counted(monkeypatch, batch_solution, "descended")
-    fed = on_the_rail(61, 3.1, stale_shift_m=1e-9, is_bounded=True)
-    assert len(solved) >= 3
-    assert_is_least_squares(fed, rail(61)[1], 61)
-
-
 def test_drift_beyond_what_cholesky_takes_is_survived():
     """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother agrees with algebra."""
     smoother = smoother_with(FOREVER_S, 1e-3, NEVER_M)
@@ -260,22 +219,6 @@ def seen_from_origin(landmark: int, z: np.ndarray) -> FactorGroup:
     )
     made["prior"] = point_prior(key, np.array([10.0, 0.0, 0.0]), 5.0)
     return FactorGroup(made, (key, Sightline(X(0), gtsam.Pose3(), z)))
-
-
-def test_a_landmark_does_not_stay_where_a_wrong_first_sighting_placed_it():
-    """Two later sightings agree on another place; the robust kernel has a second minimum at the first one."""
-    wrong = np.array([10.0, 0.7])
-    right = np.array([10.0, 0.0])
-    smoother = Smoother(SmootherParams())
-    smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 0.01)})
-    smoother.add_landmark(L(0), 10.0 * np.array([np.cos(0.7), np.sin(0.7), 0.0]))
-    for k, z in enumerate((wrong, right, right)):
-        group = seen_from_origin(0, z)
-        smoother.add(group.factors, group.seen, gain=100.0)
-        smoother.update(float(k))
-    azimuth_rad = np.arctan2(*smoother.estimates.atPoint3(L(0))[1::-1])
-    assert abs(azimuth_rad) < 0.05
 
 
 def test_sightings_that_share_a_factor_have_the_information_of_their_own_factors():

@@ -248,22 +248,6 @@ def test_a_track_waits_for_an_identity_no_longer_than_asked(
     assert dive.sightings.log().outcomes == outcomes
 
 
-@pytest.mark.parametrize("lag_s", [1e9, 0.5], ids=["in the window", "left it"])
-def test_late_sightings_pass_the_gate_one_by_one(lag_s: float):
-    """Also at keyframes that have left the window; what they were of meanwhile does not matter."""
-    dive = Dive(lag_s=lag_s)
-    for after_s in (0.0, 0.2, 0.4):
-        see(dive, after_s, SURE[5])
-    for after_s, off_m in ((6.0, 0.0), (6.2, 3.0)):
-        see(dive, after_s, FLAT if lag_s > 1.0 else SURE[6], track=4, off_m=off_m)
-    see(dive, 9.0, SURE[5], track=4)
-    assert dive.outcomes[3:] == [
-        USED_LATER if lag_s > 1.0 else Outcome.MOVED,
-        Outcome.GATED,
-        USED,
-    ]
-
-
 NODES = 10
 ROWS = len(rail(NODES)[1].ranges)
 BELIEFS_OF_REPEATED_TRACKS = [*SURE.values(), FLAT, [0.0] * 4, [0.0, 0.9, 0.0, 0.05]]

@@ -257,19 +257,6 @@ def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(
     assert named.landmark_id is None, "the landmark is named elsewhere in the frame"
 
 
-@pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
-@pytest.mark.parametrize("share", [0.98, 1.02])
-def test_a_candidate_known_to_a_tenth_of_its_range_begins_a_landmark(
-    range_m: float, share: float
-) -> None:
-    """One sighting in an aperture whose standard deviation is about 0.1 rad."""
-    made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
-    sighting = Sighting(
-        1, 1, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.4])), NOISE, None
-    )
-    assert made.is_placed([sighting]) == (share < 1.0)
-
-
 PROBABILITY = 0.99
 NOISE_M = 0.02
 

@@ -187,35 +187,6 @@ def test_positions_on_the_earth_become_metres_from_an_origin(
         )
 
 
-@pytest.mark.parametrize(
-    "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
-)
-def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(
-    foreign: Any, said: dict[str, float]
-) -> None:
-    log = foreign.write(oriented(YAW, **said), dvl())
-    assert foreign.read(oriented(YAW, **said), dvl()).heading is None
-    (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]
-    assert role.topic is None
-    assert "/imu says of no orientation that it is measured" in role.reason
-    assert "needs_variance = false" in role.reason
-
-
-def test_rows_without_a_variance_and_with_the_nose_up_are_counted(foreign: Any) -> None:
-    up = oriented(Rotation.from_euler("ZYX", [0.5, -1.5, 0.0]))
-    none = oriented(YAW, variance=0.0)
-    mixed = ("/imu", IMU, [*oriented(YAW)[2], *up[2], *none[2]])
-    for row, message in enumerate(mixed[2]):
-        message["header"] = {
-            "stamp": {"sec": 1_700_000_000, "nanosec": row * 10**8},
-            "frame_id": "imu_link",
-        }
-    sequence = foreign.read(mixed, dvl())
-    assert len(sequence.heading) == 2
-    said = "heading: 2 whose orientation is no measurement, 2 with the nose too steep for a heading"
-    assert said in sequence.notes["log.dropped"]
-
-
 def test_of_several_orientations_that_of_the_imu_in_use_counts(foreign: Any) -> None:
     entries = [oriented(YAW), oriented(Rotation.identity(), topic="/imu/second"), dvl()]
     for topic, yaw_rad in (("/imu", 0.5), ("/imu/second", 0.0)):
@@ -300,10 +271,6 @@ def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(
     [
         ('[heading]\ntype = "a/msg/B"', "give either orientation"),
         ('[positions]\ntype = "a/msg/B"', "give either position"),
-        (
-            '[truth]\ntype = "a/msg/B"\norientation = ["a", "b", "c", "d"]',
-            "give either position",
-        ),
     ],
 )
 def test_a_table_without_a_source_of_its_numbers_is_refused(
@@ -355,14 +322,3 @@ def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
     stated = foreign.read(*aided(), calibration=calibration)
     assert stated.calibration.start.rpy_rad == (0, 0, 1)
     assert stated.notes["log.start"].startswith("of the start only rpy_rad stated")
-
-
-def test_a_start_without_headings_or_fixes_stays_that_of_the_calibration(
-    foreign: Any,
-) -> None:
-    assert (
-        foreign.read(dvl(), imu()).calibration.start == foreign.read().calibration.start
-    )
-    only_fixes = foreign.read(*aided()[1:]).calibration.start
-    assert only_fixes.rpy_rad == (0, 0, 0)
-    assert only_fixes.position_m == (3, 4, 0.5)

@@ -135,36 +135,6 @@ def test_velocities_without_bottom_lock_are_left_out_as_each_driver_marks_them(
     )
 
 
-def test_signs_of_no_lock_are_warned_of_with_the_key_that_uses_the_messages(
-    foreign: Any,
-) -> None:
-    lost_altitude = report(lost={"altitude": -1.0})
-    warning = foreign.read(imu(ROWS), lost_altitude, tree("dvl_link", w=1.0)).notes[
-        "log.warnings"
-    ]
-    assert "20 of 60 messages with altitude below 0: left out" in warning
-    assert "`altitude = false` under [dvl]" in warning
-    sequence = foreign.read(
-        imu(ROWS),
-        lost_altitude,
-        tree("dvl_link", w=1.0),
-        toml="[dvl]\naltitude = false",
-    )
-    assert len(sequence.dvl.stamps_ns) == ROWS
-
-
-def test_a_vehicle_that_stops_slowly_keeps_its_zeros(foreign: Any) -> None:
-    speeds = np.concatenate(
-        [np.zeros(10), np.linspace(0, 0.5, 25), np.linspace(0.5, 0, 25)]
-    )
-    rows = [
-        {"velocity": vector(speed, 0, 0), "velocity_mode": 1, "num_good_beams": 4}
-        for speed in speeds
-    ]
-    sequence = foreign.read(imu(ROWS), rows_of("/dvl", MARINE, rows, "dvl_link"))
-    assert len(sequence.dvl.stamps_ns) == ROWS
-
-
 def test_a_velocity_mode_that_is_never_filled_does_not_count(foreign: Any) -> None:
     entry = report(sent={"velocity_mode": 0}, lost={})
     sequence = foreign.read(imu(ROWS), entry, tree("dvl_link", w=1.0))
@@ -172,34 +142,6 @@ def test_a_velocity_mode_that_is_never_filled_does_not_count(foreign: Any) -> No
     assert (
         "velocity_mode and beam_velocities_valid are 0 in every message"
         in sequence.notes["log.warnings"]
-    )
-
-
-@pytest.mark.parametrize("times", [2, 5])
-def test_a_driver_that_holds_the_velocity_between_measurements_gives_each_once(
-    foreign: Any, times: int
-) -> None:
-    """Water Linked's driver publishes ``~/odom`` once for each of two reports."""
-    rows = [
-        {
-            "twist": {"twist": {"linear": velocity(row // times)}},
-            "child_frame_id": "dvl_link",
-        }
-        for row in range(ROWS)
-    ]
-    odometry = rows_of("/dvl/odom", "nav_msgs/msg/Odometry", rows, "odom")
-    sequence = foreign.read(imu(ROWS), odometry, tree("dvl_link", w=1.0))
-    np.testing.assert_array_equal(sequence.dvl.stamps_ns, foreign.stamps(ROWS)[::times])
-    assert "that repeat the velocity before" in sequence.notes["log.dropped"]
-
-
-def test_a_sensor_that_got_stuck_once_is_no_driver_that_holds_velocities(
-    foreign: Any,
-) -> None:
-    stuck = report(lost={"velocity": velocity(20)})
-    assert (
-        len(foreign.read(imu(ROWS), stuck, tree("dvl_link", w=1.0)).dvl.stamps_ns)
-        == ROWS
     )
 
 
@@ -229,20 +171,6 @@ def test_an_imu_that_denies_all_that_it_measures_is_used_with_a_warning(
         "`angular_velocity_status = false, linear_acceleration_status = false`"
         in sequence.notes["log.warnings"]
     )
-
-
-def test_accelerations_of_zero_that_are_called_not_measured_are_not(
-    foreign: Any,
-) -> None:
-    rows = [
-        turning(row, linear_acceleration_covariance=[-1.0] + [0.0] * 8)
-        for row in range(ROWS)
-    ]
-    sequence = foreign.read(
-        rows_of("/imu", "sensor_msgs/msg/Imu", rows, "imu_link"), report(lost={})
-    )
-    assert np.isnan(sequence.imu.specific_force).all()
-    assert "not measured) in every" not in sequence.notes.get("log.warnings", "")
 
 
 def test_a_log_that_this_package_wrote_keeps_every_velocity(tmp_path: Path) -> None:

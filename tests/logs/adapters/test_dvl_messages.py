@@ -235,21 +235,10 @@ def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_n
             "is an array of 4; name one",
         ),
         (
-            packets([PAIR]),
-            OF_ARRAY,
-            r"/pd0: its provider_dvl/msg/PD0Packet has no field header\.stamp\.sec",
-        ),
-        (
-            packets([PAIR]),
-            OF_ARRAY.replace("velocity[2]", "speed"),
-            r"\[dvl\] velocity: .*PD0Packet has no field spee",
-        ),
-        (
             packets([PAIR * [1, *[np.nan] * 3]] * 5),
             OF_BEAMS,
             "none of its 5 messages can be used: 5 with fewer than 3 valid beams",
         ),
-        (twists("/wheels"), "", "/wheels only if chosen: --topic dvl=/wheels"),
     ],
 )
 def test_what_cannot_be_a_doppler_log_is_named(

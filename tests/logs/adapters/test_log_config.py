@@ -16,27 +16,13 @@ from sonar_graph.logs.adapters.log_config import (
     table_text,
     toml_value,
 )
-from sonar_graph.logs.inspection import inspect_log
-
-from .conftest import dvl, imu, rows_of
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
 # fmt: off
 MISTAKES: dict[str, tuple[str | None, str]] = {
     "no such role": ("[sonra]\n", r"there is no role \[sonra\]; tables are for imu, dvl, depth"),
     "no table": ('imu = "/imu"', r"imu: expected a table, \[imu\]"),
-    "unknown key": ('[dvl]\ntopc = "/dvl"',
-        r"\[dvl\] topc: there is no such field; did you mean topic\? it has: type, topic, .*velocity"),
-    "unknown type": ('[imu]\ntype = "my_msgs/msg/Gyro"',
-        r"\[imu\] angular_velocity: is missing; .*no adapter is shipped for my_msgs/msg/Gyro"),
-    "unknown type without fields": ('[imu]\ntype = "my_msgs/msg/Imu"',
-        r"\[imu\] angular_velocity: is missing.*linear_acceleration: is missing"),
-    "key of an inner table": ("[dvl]\ncovariance = {kind = 1}",
-        r"\[dvl\] covariance\.kind: there is no such field; covariance has: fields, meaning"),
     "unknown axes": ('[imu]\nrotation = "ned"', r"\[imu\] rotation.*'flu' or 'frd'.*not 'ned'"),
-    "two angles": ("[imu]\nrotation = [1, 2]", r"\[imu\] rotation"),
-    "meaning of a shipped type": (DVL + 'covariance = {meaning = "sigma"}',
-        r"\[dvl\] covariance\.meaning: expected 'variance' or 'standard deviation', not 'sigma'"),
     "no velocity": ('[dvl]\ntype = "my_msgs/msg/Dvl"', r"\[dvl\] .*give velocity = \[x, y, z\] fields"),
     "pressure and height": ('[depth]\ntype = "sensor_msgs/msg/FluidPressure"\nheight = "data"',
         r"\[depth\] .*give either"),
@@ -47,24 +33,9 @@ MISTAKES: dict[str, tuple[str | None, str]] = {
 }
 NO_TOPIC: dict[str, str] = {
     '[dvl]\ntopic = "/missing"': "nothing for dvl: /missing was chosen but is not in the log",
-    '[depth]\ntopic = "/missing"': "nothing for depth: /missing was chosen",
-    '[dvl]\ntopic = "/imu"': "/imu was chosen but is a sensor_msgs/msg/Imu; no adapter of role dvl reads it, it is a "
-                             "type of role imu",
     '[dvl]\ntype = "dvl_msgs/msg/DVL"': "nothing for dvl: no dvl_msgs/msg/DVL, which .* asks for",
     '[dvl]\ntopic = "/dvl"\ntype = "dvl_msgs/msg/DVL"':
         "/dvl was chosen but is a marine_acoustic_msgs/msg/Dvl, and .* asks for a dvl_msgs/msg/DVL",
-}
-NO_FIELD: dict[str, str] = {
-    '[imu]\nangular_velocity = ["angular_velocity.x", "angular_velocity.y", "angular_velocity.w"]':
-        r"\[imu\] angular_velocity: sensor_msgs/Imu has no field angular_velocity\.w; did you mean "
-        r"angular_velocity\.[xyz]\? it has: .*angular_velocity_covariance\[9\]",
-    '[imu]\nstamp = "header.time"': r"\[imu\] stamp: .* has no field header\.time; .*header\.stamp\.sec",
-    '[imu]\nframe_id_field = "frame"': r"\[imu\] frame_id_field: .* has no field frame; .*header\.frame_id",
-    '[dvl]\ntopic = "/dvl"\ngood_beams = "beams"': r"\[dvl\] good_beams: .* has no field beams; .*num_good_beams",
-    "[dvl]\nvalid_where = {lock = true}": r"\[dvl\] valid_where: .* has no field lock; .*velocity_mode",
-    '[dvl]\ncovariance = {fields = ["velocity_cov"]}':
-        r"\[dvl\] covariance\.fields: .* has no field velocity_cov; did you mean velocity_covar\?",
-    DVL + 'altitude = "height"': r"\[dvl\] altitude: .* has no field height; ",
 }
 # fmt: on
 
@@ -87,63 +58,6 @@ def test_a_topic_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(MissingTopicError, match=message):
         foreign.read(toml=toml)
-
-
-@pytest.mark.parametrize(("toml", "message"), NO_FIELD.items())
-def test_a_field_that_messages_do_not_have_is_named_with_file_table_and_key(
-    foreign: Any, tmp_path: Path, toml: str, message: str
-) -> None:
-    with pytest.raises(LogError, match=rf"log\.toml: {message}") as told:
-        foreign.read(toml=toml)
-    with pytest.raises(LogError) as inspected:
-        inspect_log(tmp_path / "log.mcap", read_log_config(tmp_path / "log.toml"))
-    assert str(inspected.value) == str(told.value)
-
-
-def test_a_table_changes_only_what_it_names() -> None:
-    config = LogConfig.parse(
-        {"dvl": {"scale": 2.0, "covariance": {"zero": "invalid"}, "good_beams": False}},
-        "x",
-    )
-    (adapter,) = config.adapters("dvl", "marine_acoustic_msgs/msg/Dvl")
-    (shipped, *_) = (offer.adapter for offer in SHIPPED["dvl"])
-    changed = {
-        name
-        for name in type(adapter).model_fields
-        if getattr(adapter, name) != getattr(shipped, name)
-    }
-    assert changed == {"scale", "covariance", "good_beams"}
-    assert adapter.covariance.fields == ("velocity_covar",)  # type: ignore[attr-defined]
-
-
-def test_what_a_file_says_counts_is_told_and_gives_way_to_the_command_line(
-    foreign: Any,
-) -> None:
-    notes = foreign.read(
-        toml='[dvl]\nrotation = "frd"\ngood_beams = false\n[imu]\ntopic = "/imu"'
-    ).notes
-    assert notes["log.adapters"] == 'dvl: rotation = "frd", good_beams = false'
-    assert "log.adapters" not in foreign.read().notes
-    pressure = rows_of(
-        "/bar30", "sensor_msgs/msg/FluidPressure", [{"fluid_pressure": 2e5}]
-    )
-    assert foreign.read(pressure).depth is not None
-    assert foreign.read(pressure, toml="[depth]\nuse = false").depth is None
-    _, kind, messages = dvl()
-    entries = (imu(), ("/a", kind, messages[:2]), ("/b", kind, messages))
-    assert len(foreign.read(*entries, toml='[dvl]\ntopic = "/a"').dvl) == 2
-    assert (
-        len(
-            foreign.read(*entries, toml='[dvl]\ntopic = "/a"', topics={"dvl": "/b"}).dvl
-        )
-        == 5
-    )
-    # fields of a topic that is not meant do not matter
-    toml = '[dvl]\ntopic = "/dvl"\ngood_beams = "num_good_beams"\nstamp = "log"\nframe_id_field = false'
-    twist = rows_of(
-        "/dvl/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", [{}] * 2
-    )
-    assert len(foreign.read(twist, toml=toml).dvl) == 5
 
 
 SHIPPED_ADAPTERS = [

@@ -6,7 +6,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Slerp
 
 from sonar_graph.logs.adapters.geodesy import east_north_up
-from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
+from sonar_graph.logs.convert.akit import read_akit
 
 LATITUDE = 0.5733
 
@@ -59,26 +59,6 @@ def test_axes_times_and_start_are_those_of_the_files(folder):
     assert np.allclose(
         sequence.calibration.start.position_m, sequence.truth.positions[1]
     )
-
-
-def test_attitude_by_hand():
-    for roll, pitch, yaw, body, world in (
-        (0, 0, 0, [1, 0, 0], [0, 1, 0]),  # north
-        (0, 0, np.pi / 2, [0, 1, 0], [0, 1, 0]),  # heading east, left is north
-        (0, np.pi / 2, 0, [1, 0, 0], [0, 0, 1]),  # nose up
-        (
-            np.pi / 2,
-            0,
-            0,
-            [0, 1, 0],
-            [0, 0, 1],
-        ),  # right side down, heading north: left is up
-    ):
-        assert np.allclose(
-            enu_R_flu(*np.array([[roll], [pitch], [yaw]])).apply(body),
-            world,
-            atol=1e-12,
-        )
 
 
 @given(st.floats(-1.3, 1.3), st.floats(-3, 3))

@@ -346,68 +346,6 @@ def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path)
     assert "notes.md: has no line with numbers" in text
 
 
-OF_IMU = "time,positionX,positionY,positionZ,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
-
-
-@pytest.mark.parametrize(
-    ("tables", "live"),
-    [
-        ({"a_imu.log": OF_IMU, "b_dgps.log": "time,latitude,longitude"}, "b_dgps.log"),
-        (
-            {"a_places.log": "time,x,y,z", "b_dgps.log": "time,latitude,longitude"},
-            "b_dgps.log",
-        ),
-        ({"a_imu.log": OF_IMU}, None),
-        ({"a_imu.log": OF_IMU, "b_places.log": "time,x,y,z"}, "b_places.log"),
-        ({"a_imu.log": OF_IMU.replace("X,", "X [m],")}, "a_imu.log"),
-    ],
-)
-def test_a_template_prefers_latitudes_and_asks_about_places_that_an_imu_measures(
-    tmp_path, tables, live
-):
-    for name, header in tables.items():
-        (tmp_path / name).write_text(
-            f"{header}\n" + ",".join("1" for _ in header.split(",")) + "\n"
-        )
-    text = csv_template([tmp_path])
-    fixes = tomllib.loads(text).get("positions")
-    assert (fixes and fixes["file"]) == live
-    if live is None:
-        assert "# [positions]  # in the table of an IMU" in text
-        assert '# position = ["positionX", "positionY", "positionZ"]' in text
-
-
-def test_columns_without_names_are_numbered_and_rows_that_say_invalid_are_left_out(
-    tmp_path,
-):
-    (tmp_path / "log.txt").write_text(
-        "% a log\n0 1 2 3 4 5 6\n1 1 2 3 4 5 6\n2 nan 2 3 4 5 6\n"
-    )
-    (tmp_path / "dvl.txt").write_text(
-        "0 10 20 30 true\n1 10 20 30 false\n2 10 20 30 true\n"
-    )
-    config = {
-        "stamp": 1,
-        "imu": {
-            "file": "log.txt",
-            "angular_velocity": [2, 3, 4],
-            "linear_acceleration": [5, 6, 7],
-        },
-        "dvl": {
-            "file": "dvl.txt",
-            "velocity": [2, 3, 4],
-            "scale": "cm/s",
-            "valid_where": {"5": True},
-        },
-    }
-    found = read_csv(tmp_path, config)
-    assert found.imu.angular_velocity.tolist() == [[1, 2, 3], [1, 2, 3]]
-    assert found.dvl.stamps_ns.tolist() == [0, 2 * 10**9]
-    np.testing.assert_allclose(found.dvl.velocity[0], [0.1, 0.2, 0.3])
-    assert "dvl: 1 with 5 not true" in found.notes["csv.left_out"]
-    assert "not finite" in found.notes["csv.left_out"]
-
-
 def test_truth_from_roll_pitch_yaw_and_geodetic_minutes(tmp_path):
     (tmp_path / "imu.csv").write_text("time,a,b,c\n0,0,0,1\n9,0,0,1\n")
     (tmp_path / "gt.csv").write_text(

@@ -137,17 +137,6 @@ def test_excel_in_german_with_semicolons_decimal_commas_and_degree_signs(
     assert_is(guessed(folder, tmp_path), d)
 
 
-def test_a_byte_order_mark_and_times_of_day_and_seconds_with_commas(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "dvl")
-    for name in ("imu", "dvl"):
-        path = folder / f"{name}.csv"
-        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
-    k = d.slow
-    write(folder / "depth.csv", '"time","Depth (ft)"', d.s[k], d.depth[k] / 0.3048)
-    assert_is(guessed(folder, tmp_path), d)
-
-
 def test_matlab_writetable_with_its_dates_and_mangled_units(folder, tmp_path):
     d = dive()
     k = d.slow
@@ -157,25 +146,6 @@ def test_matlab_writetable_with_its_dates_and_mangled_units(folder, tmp_path):
     header = "Time,vel_x_mm_s_,vel_y_mm_s_,vel_z_mm_s_,depth_m_"
     columns = (*(1000 * d.velocity[k]).T, d.depth[k])
     write(folder / "dvl.txt", header, stamps[k], *columns)
-    assert_is(guessed(folder, tmp_path), d)
-
-
-def test_pandas_with_an_index_and_an_outer_merge(folder, tmp_path):
-    d = dive()
-    stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@+00:00", 6)
-    is_slow = np.arange(ROWS) % 10 == 0
-
-    def sparse(column):
-        return [
-            repr(float(value)) if slow else ""
-            for value, slow in zip(column, is_slow, strict=True)
-        ]
-
-    header = ",timestamp,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z,vel_x,vel_y,vel_z,depth"
-    index = [str(row) for row in range(ROWS)]
-    slow = [sparse(column) for column in (*d.velocity.T, d.depth)]
-    path = folder / "merged.csv"
-    write(path, header, index, stamps, *d.rate.T, *d.force.T, *slow)
     assert_is(guessed(folder, tmp_path), d)
 
 
@@ -195,22 +165,6 @@ def test_linkquest_navquest_whose_flag_marks_rows_without_lock(folder, tmp_path)
     np.testing.assert_allclose(
         sequence.dvl.velocity, d.velocity[k][flag == 1], atol=1e-3
     )
-
-
-@pytest.mark.parametrize("name", ["error_flag", "bottom_lost_status"])
-def test_the_mark_of_valid_rows_is_known_from_the_velocities_beside_it(
-    folder, tmp_path, name
-):
-    d = dive()
-    plain(folder, d, "imu", "depth")
-    k = d.slow
-    lost = np.zeros(ROWS)[k]
-    lost[5:9] = 1
-    velocity = np.where(lost[:, None] == 1, -32.768, d.velocity[k])
-    header = f"time,vel_x,vel_y,vel_z,{name}"
-    write(folder / "dvl.csv", header, d.s[k], *velocity.T, lost)
-    assert template(folder)[1]["dvl"]["valid_where"] == {name: 0}
-    assert len(guessed(folder, tmp_path).dvl) == len(lost) - 4
 
 
 def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
@@ -260,33 +214,6 @@ def test_units_of_times_follow_from_the_rates_of_imu_and_doppler_log_together(
     )
 
 
-def test_an_imu_that_may_be_of_1_hz_or_of_1_khz_is_asked_about(folder, tmp_path):
-    d = dive(1.0, every=10)
-    plain(folder, d, "imu", "dvl", "depth")
-    text, _ = template(folder)
-    assert '# stamp_unit_s = ...  # which unit? "s" or "ms"' in text
-    with pytest.raises(LogError, match=r'stamp_unit_s = "ms"` .*`stamp_unit_s = "s"`'):
-        guessed(folder, tmp_path)
-    stated = guessed(folder, tmp_path, 'stamp_unit_s = "s"\n' + text)
-    assert stated.duration_s == pytest.approx(ROWS, abs=20)
-    d.s += EPOCH_S
-    plain(folder, d, "imu", "dvl", "depth")
-    assert "which unit?" not in template(folder)[0]
-
-
-def test_depths_in_another_unit_of_time_are_refused_where_nothing_states_it(folder):
-    d = dive()
-    plain(folder, d, "imu", "dvl")
-    plain(folder, d, "depth", scale=1e3)
-    config = {
-        "imu": {"file": "imu.csv", "angular_velocity": [2, 3, 4], "linear_acceleration": [5, 6, 7]},
-        "dvl": {"file": "dvl.csv", "velocity": [2, 3, 4]},
-        "depth": {"file": "depth.csv", "height": 2, "scale": -1},
-    }  # fmt: skip
-    with pytest.raises(LogError, match=r'depth\.csv: \[depth\].*stamp_unit_s = "ms"'):
-        read_csv(folder, config)
-
-
 def test_a_header_that_states_a_unit_which_the_steps_contradict_is_asked_about(
     folder, tmp_path
 ):
@@ -317,92 +244,7 @@ def test_a_column_that_never_changes_is_no_motion(folder, name, header):
     assert f"# [{name}]  # never changes" in text
 
 
-def test_accelerations_that_are_zero_throughout_are_those_of_no_accelerometer(
-    folder, tmp_path
-):
-    d = dive()
-    d.force[:] = 0
-    plain(folder, d, "imu", "dvl", "depth")
-    text, config = template(folder)
-    assert "imu" not in config
-    assert "linear_acceleration = false" in text
-    sequence = guessed(folder, tmp_path, uncommented(text, "imu"))
-    assert np.isnan(sequence.imu.specific_force).all()
-
-
-def test_two_files_that_fit_alike_are_both_named(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "dvl", "depth")
-    (folder / "imu_2.csv").write_text((folder / "imu.csv").read_text())
-    text, config = template(folder)
-    assert "imu" not in config
-    assert text.count("# [imu]  # which of imu.csv, imu_2.csv? uncomment one") == 2
-    assert_is(guessed(folder, tmp_path, uncommented(text, "imu")), d)
-
-
-def test_a_turn_rate_is_no_heading_and_a_set_point_no_depth(folder):
-    d = dive()
-    plain(folder, d, "imu", "dvl")
-    header = "time,yaw_rate,depth_setpoint,heading_error"
-    write(folder / "control.csv", header, d.s, d.rate[:, 0], d.depth, d.rate[:, 1])
-    _, config = template(folder)
-    assert not {"heading", "depth"} & config.keys()
-
-
-def test_slow_velocities_in_millimetres_or_centimetres_are_asked_about(folder):
-    d = dive()
-    plain(folder, d, "imu", "depth")
-    k = d.slow
-    write(folder / "dvl.csv", "time,u,v,w", d.s[k], *(100 * d.velocity[k]).T)
-    text, config = template(folder)
-    assert "dvl" not in config
-    assert "# [dvl]  # unit of velocity: cm/s or mm/s?" in text
-
-
-def test_forces_and_bearings_without_a_unit_are_known_by_their_size_and_fast_turns_asked(
-    folder, tmp_path
-):
-    d = dive()
-    plain(folder, d, "dvl", "depth")
-    header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
-    columns = (d.s, *d.rate.T, *(d.force / 9.80665).T)
-    write(folder / "imu.csv", header, *columns)
-    np.testing.assert_allclose(
-        guessed(folder, tmp_path).imu.specific_force, d.force, atol=1e-9
-    )
-    write(folder / "imu.csv", header, d.s, *np.degrees(d.rate).T, *d.force.T)
-    text, config = template(folder)
-    assert "imu" not in config
-    assert "# [imu]  # unit of angular_velocity: deg/s or mrad/s?" in text
-
-
 # --- tables of other tools, and what they must not be taken for -------------------------------------------------------
-
-
-def test_velocities_along_the_world_are_no_positions(folder):
-    d = dive()
-    plain(folder, d, "imu", "depth")
-    k = d.slow
-    header = "time,vel_east,vel_north,vel_up"
-    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T)
-    _, config = template(folder)
-    assert not {"positions", "truth"} & config.keys()
-
-
-def test_a_rate_of_depth_and_the_depth_of_the_water_are_no_depths(folder):
-    d = dive()
-    plain(folder, d, "imu", "dvl")
-    header = "time,depth_rate,water_depth,depth_above_bottom"
-    write(folder / "nav.csv", header, d.s, d.rate[:, 0], d.depth + 9, d.depth)
-    assert "depth" not in template(folder)[1]
-
-
-def test_depths_below_zero_count_upwards(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "dvl")
-    k = d.slow
-    write(folder / "depth.csv", "time,depth (ft)", d.s[k], -d.depth[k] / 0.3048)
-    assert_is(guessed(folder, tmp_path), d)
 
 
 def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path):
@@ -442,7 +284,11 @@ def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "form", ["%m/%d/%Y %H:%M:%S.@", "%H:%M:%S.@", "%Y-%m-%d", "%d.%m.%Y %H:%M"]
+    "form",
+    [
+        "%m/%d/%Y %H:%M:%S.@",
+        "%H:%M:%S.@",
+    ],
 )
 def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form):
     d = dive()
@@ -451,26 +297,6 @@ def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, fo
     write(folder / "imu.csv", header, dates(d.s, form), *d.rate.T, *d.force.T)
     with pytest.raises(LogError, match=r"is no time; expected a number .* or a date"):
         guessed(folder, tmp_path)
-
-
-def test_days_since_another_epoch_are_no_seconds(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "dvl", scale=1 / 86_400)
-    with pytest.raises(LogError, match="stamp_unit_s"):
-        guessed(folder, tmp_path)
-
-
-def test_velocities_over_the_bottom_come_before_those_through_water(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "depth")
-    k = d.slow
-    names = [f"{kind}_vel_{axis}" for kind in ("water", "bottom") for axis in "xyz"]
-    header = ",".join(["time", *names])
-    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T / 2, *d.velocity[k].T)
-    assert_is(guessed(folder, tmp_path), d)
-    short = header.replace("bottom_vel", "spare")
-    write(folder / "dvl.csv", short, d.s[k], *d.velocity[k].T / 2, *d.velocity[k].T)
-    assert "dvl" not in template(folder)[1]
 
 
 def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
@@ -483,17 +309,6 @@ def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
         LogError, match=r"depth\.csv, line 2: .*'4,000\.0' is no number"
     ):
         guessed(folder, tmp_path)
-
-
-@pytest.mark.parametrize("filled", [0, 59, None])
-def test_a_last_cell_may_be_empty_in_any_row(folder, tmp_path, filled):
-    d = dive()
-    plain(folder, d, "imu", "dvl")
-    k = d.slow
-    cells = ["12.5" if row == filled else "" for row in range(len(d.s[k]))]
-    header = "time,depth,temperature"
-    write(folder / "depth.csv", header, d.s[k], d.depth[k], cells)
-    assert_is(guessed(folder, tmp_path), d)
 
 
 def test_a_column_of_validity_is_proposed_and_missed_where_it_is_not_used(

@@ -6,8 +6,6 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from sonar_graph.errors import DatasetError
@@ -16,12 +14,9 @@ from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.planar import (
     read_dlr,
     read_victoria_park,
-    twists_of_steps,
 )
 from sonar_graph.logs.convert.text_tables import read_table
 
-metres = st.floats(-10, 10)
-turns = st.one_of(st.floats(-3.1, 3.1), st.floats(-2e-4, 2e-4), st.just(0.0))
 COV = "1e-5 2e-6 2e-5 3e-6 4e-6"
 STRAIGHT, RIGHT = f"STEP image 0 -1 0 {COV} 1e-4", f"STEP image 0 -1 {np.pi / 2} {COV}"
 
@@ -44,23 +39,6 @@ def hold_past_motions(sequence):
 
 def motion_of(velocity, rate):
     return expm(np.array([[0, -rate, velocity[0]], [rate, 0, velocity[1]], [0, 0, 0]]))
-
-
-@given(metres, metres, turns)
-def test_twist_held_over_the_step_makes_the_step_and_its_noise(dx, dy, turn):
-    cov = np.diag([4e-4, 2e-4, 0.0])
-    cov[0, 1] = cov[1, 0] = 1e-4
-    (velocity,), (velocity_cov,), (rate,) = twists_of_steps(
-        np.array([[dx, dy, turn]]), cov[None]
-    )
-    assert np.allclose(
-        motion_of(velocity, rate),
-        gtsam.Pose2(dx, dy, turn).matrix(),
-        rtol=0,
-        atol=1e-11,
-    )
-    V = np.column_stack([motion_of(axis, rate)[:2, 2] for axis in np.eye(2)])
-    assert np.allclose(V @ velocity_cov @ V.T, cov[:2, :2], rtol=0, atol=1e-12)
 
 
 # ---- axes and identities of DLR
@@ -92,13 +70,6 @@ def test_ahead_is_minus_y_and_angles_grow_to_the_right_in_the_file(tmp_path):
     assert s.detections.range_m == pytest.approx([2, np.sqrt(5)])
     assert s.detections.azimuth_rad == pytest.approx([0, -np.arctan(0.5)])
     assert s.detections.stamps_ns.tolist() == [10**9, 2 * 10**9]
-
-
-def test_several_identities_share_and_none_is_none(tmp_path):
-    point = "LANDMARK_C 0 -2 0.9 1e-3 0 5e-3"
-    d = dlr(tmp_path, STRAIGHT, f"{point} 4 9", f"{point} -1", f"{point} 7").detections
-    assert d.candidate_ids.tolist() == [[4, 9], [-1, -1], [7, -1]]
-    assert d.id_probability.tolist() == [[0.5, 0.5], [0, 0], [1, 0]]
 
 
 # ---- the recorded runs
@@ -187,61 +158,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_command_holds_from_its_stamp_to_the_next_and_so_does_its_noise(folder):
-    """0.1 m/s for 0.2 s, then 0.2 m/s for 0.1 s while turning 0.05 rad; the last command governs nothing."""
-    sequence = read_mrclam(folder, 1)
-    end = chain(hold_past_motions(sequence))[-1]
-    radius = 0.2 / 0.5
-    expected = [0.02 + radius * np.sin(0.05), radius * (1 - np.cos(0.05))]
-    assert np.allclose(end[:2, 2], expected, rtol=0, atol=1e-9)
-    assert np.arctan2(end[1, 0], end[0, 0]) == pytest.approx(0.05)
-    assert sequence.calibration.odometry_interpolation == "hold-past"
-    # slip grows with time: the distance has variance sum(var * dt²) = q² T however T is divided
-    dt = np.diff(sequence.dvl.stamps_ns) * 1e-9
-    assert np.sum(sequence.dvl.velocity_cov[1:, 0, 0] * dt**2) == pytest.approx(
-        0.02**2 * dt.sum()
-    )
-
-
-def test_of_commands_with_one_stamp_the_last_holds(folder):
-    (folder / "Robot1_Odometry.dat").write_text(
-        f"{T0}.1 0.1 0\n{T0}.2 0.9 0.9\n{T0}.2 0.3 0.4\n{T0}.3 0 0\n"
-    )
-    sequence = read_mrclam(folder, 1)
-    assert sequence.dvl.velocity[:, 0].tolist() == [0.1, 0.1, 0.3]
-    assert sequence.imu.angular_velocity[:, 2].tolist() == [0.0, 0.0, 0.4]
-
-
-def test_times_subjects_and_coordinates_stay_the_data_sets_own_and_robots_are_left_out(
-    folder,
-):
-    sequence = read_mrclam(folder, 1)
-    stamps = [T0 * NS + 100_000_000, T0 * NS + 300_000_000, T0 * NS + 400_000_000]
-    assert sequence.imu.stamps_ns.tolist() == sequence.dvl.stamps_ns.tolist() == stamps
-    d, landmarks = sequence.detections, sequence.true_landmarks
-    assert d.stamps_ns.tolist() == [T0 * NS + 120_000_000, T0 * NS + 250_000_000]
-    assert (d.candidate_ids.tolist(), d.id_probability.tolist()) == (
-        [[6], [20]],
-        [[1], [1]],
-    )
-    assert (d.range_m.tolist(), d.azimuth_rad.tolist()) == ([1.0, 2.0], [-0.2, 0.1])
-    assert np.isnan(d.range_azimuth_cov).all()
-    assert "1 of other robots, 1 with unknown" in sequence.notes["detections"]
-    assert landmarks.ids.tolist() == [6, 20]
-    assert landmarks.positions.tolist() == [[3.0, 4.0, 0.0], [1.5, -2.5, 0.0]]
-    assert np.allclose(landmarks.covariances[0], np.diag([9e-6, 16e-6, 0]))
-
-
-def test_start_is_the_truth_at_the_first_command_across_the_wrap(folder):
-    """Half way from heading 3 to -3 by the short way is pi."""
-    sequence = read_mrclam(folder, 1)
-    start, truth = sequence.calibration.start, sequence.truth
-    assert truth.positions.tolist() == [[1.0, 2.0, 0.0], [3.0, 2.0, 0.0]]
-    assert np.allclose(truth.rotations()[0].apply([1, 0, 0]), [np.cos(3), np.sin(3), 0])
-    assert np.allclose(start.position_m, [2.0, 2.0, 0.0])
-    assert abs(start.rpy_rad[2]) == pytest.approx(np.pi)
-
-
 def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder):
     (folder / "Robot1_Groundtruth.dat").write_text(f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n")
     # of another robot
@@ -301,14 +217,6 @@ def wrapped(angle):
 # ---- what is refused
 
 
-def test_comments_and_blank_lines_are_passed_over(tmp_path):
-    path = tmp_path / "t.dat"
-    path.write_text("# time value\n\n  1.5 \t -2\n # again\n2.5 3e1\n")
-    table = read_table(path, ("time", "value"))
-    assert np.array_equal(table.values, [[1.5, -2.0], [2.5, 30.0]])
-    assert table.stamps_ns.tolist() == [1_500_000_000, 2_500_000_000]
-
-
 STEP, EDGE = f"STEP image 0 0 0 {COV} 1e-4\n", "ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n"
 IMU, DVL, GT = (f"Trajectory2/{kind}_trajectory2.csv" for kind in ("IMU", "DVL", "GT"))
 AKIT = {
@@ -355,13 +263,6 @@ READERS = {
         MRCLAM | {"empty/a": ""},
     ),
 }
-
-
-@pytest.mark.parametrize("name", ["dlr", "park", "akit", "mrclam"])
-def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
-    read, files = READERS[name]
-    write(tmp_path, files)
-    assert len(read(tmp_path).imu) > 0
 
 
 @pytest.mark.parametrize(

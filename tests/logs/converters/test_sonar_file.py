@@ -1,7 +1,6 @@
 """Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is told."""
 
 import re
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,11 +13,9 @@ from typer.testing import CliRunner
 from sonar_graph.cli.main import app
 from sonar_graph.errors import DatasetError, LogError
 from sonar_graph.logs.convert.didson_aris import convert_didson
-from sonar_graph.logs.convert.sonar_file import ByteSource, Lost
 from sonar_graph.logs.sonar_images import read_sonar_frames
 
 from .sonar_recordings import (
-    START_NS,
     STEP_NS,
     Aris,
     Converted,
@@ -26,7 +23,6 @@ from .sonar_recordings import (
     Oculus,
     converted,
     images,
-    put,
 )
 
 COUNT, MIB = 7, 1 << 20
@@ -171,53 +167,6 @@ def test_of_a_cut_file_every_complete_frame_is_read(tmp_path, ending, part):
         assert f"bytes {length - rest} to {length - 1}: " in said
 
 
-@each_kind
-@in_one_folder
-@given(
-    st.floats(0, 1, exclude_max=True),
-    st.integers(1, 3000),
-    st.one_of(st.none(), st.integers(0, 255)),
-)
-def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_the_one_before(
-    tmp_path, ending, part, count, fill
-):
-    """Where the next header is not found in its place, nobody can say that the frame before is whole."""
-    head, *frames = PIECES[ending]
-    size, content = len(frames[0]), b"".join(frames)
-    at = size + int(part * (COUNT - 3) * size)
-    foreign, last = (
-        (b"", at + count - 1) if fill is None else (bytes([fill]) * count, at)
-    )
-    numbers, said = read(
-        tmp_path,
-        [head, content[:at], foreign, content[at + (count if fill is None else 0) :]],
-        ending,
-    )
-    assert set(EVERY) - set(numbers) <= set(range(at // size - 1, last // size + 1))
-    assert "bytes" in said
-
-
-@each_kind
-def test_a_setting_that_stays_changed_is_believed(tmp_path, ending):
-    head, *frames = PIECES[ending]
-    changed = other_settings(dict.fromkeys(range(3, COUNT), 4))(frames, ending)
-    result = converted(tmp_path, b"".join([head, *changed]), ending)
-    assert which(result) == EVERY
-    assert len(result.blocks) == 2
-    assert result.blocks[0].ranges_m[-1] != result.blocks[1].ranges_m[-1]
-
-
-def test_a_clock_that_is_set_back_loses_nothing(tmp_path):
-    head, *frames = PIECES["aris"]
-    for i in range(4, COUNT):
-        frame = bytearray(frames[i])
-        put(frame, 20, "Q", int.from_bytes(frame[20:28], "little") - 3_600_000_000)
-        frames[i] = bytes(frame)
-    assert (
-        sorted(which(converted(tmp_path, b"".join([head, *frames]), "aris"))) == EVERY
-    )
-
-
 @pytest.mark.parametrize("ending", ["ddf", "aris"])
 def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, ending):
     head, *frames = PIECES[ending]
@@ -232,55 +181,7 @@ def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, en
     assert f"{len(head) - 300} bytes too short" in result.done.shortcomings()[0]
 
 
-def test_a_pattern_is_found_wherever_it_is_and_reading_ends_with_the_file(tmp_path):
-    """Also across the places where one read ends and the next begins, and where it overlaps itself."""
-    places = [0, 7, MIB - 3, MIB + 1, 2 * MIB - 1, 2 * MIB + 1, 3 * MIB, 3 * MIB + 2]
-    content = bytearray(3 * MIB + 5)
-    for at in places:
-        content[at : at + 3] = b"aba"
-    path = tmp_path / "a.bin"
-    path.write_bytes(content)
-    with ByteSource(path) as source:
-        assert list(source.places(b"aba", 0)) == places
-        assert list(source.places(b"aba", 8)) == places[2:]
-        assert list(source.places(b"abb", 0)) == []
-        end = source.size
-        read = source.read(7, 3), source.read(end - 3, 9), source.read(end, 1)
-        assert (end, *read) == (len(content), b"aba", b"aba", b"")
-    assert str(Lost(10, 20, "because")) == "bytes 10 to 19: because"
-
-
 # ---- conversion to a log
-
-
-def long_recording(path: Path, frames: int) -> Path:
-    """Frames of 96 x 512 that differ in number and time only."""
-    kind = Ddf(np.broadcast_to(np.zeros((1, 96, 512), np.uint8), (frames, 96, 512)))
-    with path.open("wb") as stream:
-        stream.writelines(
-            kind.frame(i) if i >= 0 else kind.file_header() for i in range(-1, frames)
-        )
-    return path
-
-
-def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_path):
-    told: list[tuple[int, int]] = []
-    log = tmp_path / "dive.mcap"
-    # imports and caches
-    convert_didson(long_recording(tmp_path / "short.ddf", 200), log)
-    source = long_recording(tmp_path / "dive.ddf", 800)
-    size = source.stat().st_size
-    tracemalloc.start()
-    convert_didson(source, log, lambda done, total: told.append((done, total)))
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 32e6 < size
-    assert len(told) > 2
-    assert told == sorted(told)
-    assert {total for _, total in told} == {size}
-    assert told[-1] == (size, size)
-    stamps_ns = np.concatenate([block.stamps_ns for block in read_sonar_frames(log)])
-    assert np.sort(stamps_ns).tolist() == [START_NS + i * STEP_NS for i in range(800)]
 
 
 def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(

@@ -94,19 +94,6 @@ def test_window_codes_of_a_didson_are_metres_at_1465_m_s(
     assert "1500 m/s" in warm.notes["sonar.ranges"]
 
 
-def test_ranges_of_an_aris_are_half_the_way_of_sound(tmp_path):
-    """Bin i is sampled from delay + i period to the next, and sound goes there and back."""
-    recording = Aris(
-        images(2, 128, 600), delay_us=1700, period_us=5, sound_speed=1480.0
-    )
-    ranges_m = log_of(tmp_path, recording).frames.ranges_m
-    np.testing.assert_allclose(
-        ranges_m[[0, 599]],
-        [(1700 + 2.5) * 740e-6, (1700 + 599 * 5 + 2.5) * 740e-6],
-        rtol=1e-6,
-    )
-
-
 MARKED = np.zeros((1, 96, 512), np.uint8)
 MARKED[0, 0] = 255
 
@@ -139,21 +126,6 @@ def test_azimuths_are_positive_to_the_left(tmp_path, recording, first_deg, last_
         )
 
 
-@pytest.mark.parametrize(
-    ("recording", "subject", "words"),
-    [
-        (Ddf(images(3, 96, 64)), "time", "UTC"),
-        (Aris(images(3, 48, 64), mode=1), "time", "since 1970"),
-        (Oculus(images(3, 16, 8), gamma_code=127), "time", "switched on"),
-        (Oculus(images(3, 16, 8), gamma_code=127), "scale", "0.498"),
-    ],
-)
-def test_the_kind_of_time_and_the_scale_are_in_the_notes(
-    tmp_path, recording, subject, words
-):
-    assert words in log_of(tmp_path, recording).notes[f"sonar.{subject}"]
-
-
 def test_the_log_says_the_scale_of_the_samples(tmp_path):
     for recording, span_db in (
         (Ddf(images(1, 96, 64)), 90),
@@ -173,21 +145,6 @@ def test_the_log_says_the_scale_of_the_samples(tmp_path):
         ).image
         assert (image.scale, image.full_scale) == ("linear", full_scale)
         assert image.gamma == pytest.approx(gamma, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("system", "high", "frequency_hz"),
-    [(1, 1, 3e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)],
-)
-def test_frequency_and_speed_of_sound_are_in_the_messages(
-    tmp_path, decoded, system, high, frequency_hz
-):
-    log_of(tmp_path, Aris(images(1, 128, 64), system=system, high=high))
-    ((message,),) = decoded(tmp_path / "dive.mcap").values()
-    assert (
-        message.ping_info.frequency,
-        message.ping_info.sound_speed,
-    ) == pytest.approx((frequency_hz, 1482.5))
 
 
 # ---- damage of each kind
@@ -231,15 +188,6 @@ REFUSED = [
     ("aris", b"SO" * 4000, "DDF"),
     ("raw", b"DDF\x05" + bytes(4000), "no Oculus ping"),
 ]
-LOST_PINGS = [  # place in a ping, kind of number, number
-    (122 - 8,  "I", 100,          "an image of 100 bytes"),   (122 - 4, "I", 2177,  "a message of 2177 bytes"),
-    (122 - 12, "I", 150,          "an image from byte 150"),  (122 - 12, "I", 2049, "a message of"),
-    (122 + 4,  "h", -8000, "bearings that do not increase"),  (122, "h", -9100,     "bearings that do not increase"),
-    (97,       "B", 2,            "3 bytes a sample"),        (98, "d", 5.0,        "bins of 5 m"),
-    (98,       "d", float("nan"), "bins of nan m"),           (106, "H", 0,         "0 ranges"),
-    (108,      "H", 2000,         "2000 beams"),              (85, "d", 15.0,       "sound speed of 15"),
-    *((length, "", None, "cut off") for length in (3, 16, 60, 130, 150)),
-]
 # fmt: on
 
 
@@ -256,52 +204,7 @@ def test_other_files_and_headers_that_make_no_sense_are_refused_by_name(
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(("at", "layout", "value", "words"), LOST_PINGS)
-def test_a_ping_whose_header_makes_no_sense_is_lost(tmp_path, at, layout, value, words):
-    _, *pings = Oculus(images(4, 16, 8)).pieces()
-    broken = bytearray(pings[1])
-    if value is None:
-        pings[3] = pings[3][:at]
-    else:
-        put(broken, at, layout, value)
-    done = converted(
-        tmp_path, b"".join([pings[0], bytes(broken), *pings[2:]]), "raw"
-    ).done
-    assert done.frames == 3
-    assert words in str(done.lost[0])
-
-
 # ---- messages and clocks of an Oculus
-
-
-def test_only_the_older_clock_wraps_around_and_time_goes_on_there(tmp_path):
-    """It has 32 bits, and begins anew after 4.3 s: here between the first and the second ping."""
-    for version in (0, 2):
-        stamps_ns = log_of(
-            tmp_path, Oculus(images(60, 16, 8), version=version)
-        ).frames.stamps_ns
-        np.testing.assert_allclose(np.diff(stamps_ns), STEP_NS, atol=1)
-        assert stamps_ns[0] == pytest.approx(2**32 - 100_000_000, abs=1)
-    first = Oculus(images(1, 16, 8), version=2, first_clock=10**12)
-    second = Oculus(
-        images(1, 16, 8, seed=1),
-        version=2,
-        first_clock=10**12 + 10**10,
-        first_number=501,
-    )
-    stamps_ns = converted(
-        tmp_path, first.content() + second.content(), "raw"
-    ).frames.stamps_ns
-    assert stamps_ns.tolist() == [10**12, 10**12 + 10**10]
-
-
-@pytest.mark.parametrize("kind", ["u1", "u2"])
-def test_gains_of_the_rows_are_taken_out(tmp_path, kind):
-    pictures = images(3, 16, 4).astype(kind)
-    frames = log_of(
-        tmp_path, Oculus(pictures, gains=np.array([1, 4, 9, 16], np.uint32))
-    ).frames
-    np.testing.assert_allclose(frames.intensity, pictures / [1, 2, 3, 4], rtol=1e-6)
 
 
 def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(
@@ -330,23 +233,6 @@ def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only
         )
         np.testing.assert_array_equal(result.frames.intensity, pictures)
         assert [str(loss) for loss in result.done.lost] == lost
-
-
-def test_frames_that_were_not_recorded_are_counted_but_not_where_numbers_begin_anew(
-    tmp_path,
-):
-    _, *pings = Oculus(images(6, 16, 8)).pieces()
-    done = converted(tmp_path, b"".join(pings[:2] + pings[4:]), "raw").done
-    assert (done.frames, done.lost) == (4, [])
-    assert done.shortcomings() == [
-        "missing: the numbers of 2 frames between the first and the last"
-    ]
-    anew = Oculus(images(3, 16, 8, seed=1), first_number=7).pieces()
-    assert converted(tmp_path, b"".join(pings[:3] + anew), "raw").done.missing == 0
-    promised = log_of(tmp_path, Ddf(images(3, 48, 64), high=0, promised=5)).done
-    assert promised.shortcomings() == [
-        "missing: 2 of 5 frames that the file's header names"
-    ]
 
 
 @pytest.mark.recording

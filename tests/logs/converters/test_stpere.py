@@ -1,13 +1,9 @@
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from sonar_graph.errors import DatasetError
 from sonar_graph.evaluation.metrics import horizontal_aligned_rmse
-from sonar_graph.logs.convert import read_csv
-from sonar_graph.logs.convert.stpere import GYRO_Z_BIAS_RAD_S, read_stpere
+from sonar_graph.logs.convert.stpere import read_stpere
 
 T0 = 1_000
 MINUTE_M = 1852.0
@@ -83,41 +79,6 @@ def test_axes_units_and_biases_are_those_found_in_the_data(folder):
     assert sequence.calibration.start.rpy_sigma_rad[2] == pytest.approx(
         shared_and_own
     ), "the start is a compass' row"
-
-
-def test_the_lines_of_the_page_on_data_sets_read_the_tables_as_the_converter_does(
-    folder,
-):
-    page = (Path(__file__).parents[3] / "docs" / "theory" / "datasets.md").read_text(
-        encoding="utf-8"
-    )
-    (lines,) = re.findall(
-        r"### St. Pere from its tables.*?```toml\n(.*?)```", page, re.DOTALL
-    )
-    (folder / "stpere.toml").write_text(lines)
-    found, expected = read_csv(folder, folder / "stpere.toml"), read_stpere(folder)
-    body_R_imu, body_R_dvl = (
-        section.mounting.pose().rotation().matrix()
-        for section in (expected.calibration.imu, expected.calibration.dvl)
-    )
-    np.testing.assert_array_equal(found.imu.stamps_ns, expected.imu.stamps_ns)
-    np.testing.assert_array_equal(found.dvl.stamps_ns, expected.dvl.stamps_ns)
-    # taken off by the converter, as the mean of the level forces is
-    bias = np.array([0.0, 0.0, GYRO_Z_BIAS_RAD_S])
-    of_body = (expected.imu.angular_velocity + bias) @ body_R_imu.T
-    np.testing.assert_allclose(found.imu.angular_velocity, of_body, atol=1e-9)
-    np.testing.assert_allclose(
-        found.imu.specific_force[:, 2], expected.imu.specific_force[:, 2], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        found.dvl.velocity, expected.dvl.velocity @ body_R_dvl.T, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        found.heading.yaw_rad, expected.heading.yaw_rad, atol=1e-5
-    )
-    np.testing.assert_allclose(
-        found.truth.positions, expected.truth.positions, atol=1e-6
-    )
 
 
 def test_a_missing_file_or_folder_is_named(folder):
