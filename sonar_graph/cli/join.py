@@ -230,7 +230,7 @@ def look(
                 else replace(seen, range_m=float(block.ranges_m.mean()))
             )
             for frame in one_by_one(block):
-                step = motions.look(frame)
+                step = motions.add(frame)
                 seen.stamps_ns.append(int(frame.stamps_ns[0]))
                 seen.steps.extend([step] if step is not None else [])
             progress("laying frames upon each other", len(seen.stamps_ns), 0)

@@ -49,7 +49,7 @@ LONGEST_LAG = 25
 """Steps over which residuals may repeat each other."""
 STRETCHES = 8
 """Stretches of the jackknife."""
-CANNOT_TELL = "the images cannot tell the offset of their clock"
+UNDETERMINED = "the images do not determine the offset of their clock"
 AS_STATED = "state it with --offset SECONDS, to be added to the images' stamps"
 
 
@@ -134,7 +134,7 @@ def estimate_offset(
     known = [step for step in steps if step.is_measured]
     if len(known) < LEAST_STEPS:
         raise LogError(
-            f"{CANNOT_TELL}: {len(known)} of {len(steps)} steps between them could be measured, and {LEAST_STEPS} are "
+            f"{UNDETERMINED}: {len(known)} of {len(steps)} steps between them could be measured, and {LEAST_STEPS} are "
             f"needed; {AS_STATED}"
         )
     # the navigation is moved by every offset of the search
@@ -161,7 +161,7 @@ def estimate_offset(
     is_covered = counts >= max(LEAST_STEPS, LEAST_SHARE * counts.max())
     if not is_covered.any():
         raise LogError(
-            f"{CANNOT_TELL}: within {search_s:g} s of {around_s:+.3f} s fewer than {LEAST_STEPS} steps between them "
+            f"{UNDETERMINED}: within {search_s:g} s of {around_s:+.3f} s fewer than {LEAST_STEPS} steps between them "
             f"lie in IMU and Doppler log; {AS_STATED}"
         )
     likely = np.where(is_covered, 0.0, -np.inf)
@@ -182,7 +182,7 @@ def estimate_offset(
     # the top may lie beyond the search
     if best in (0, len(found) - 1):
         raise LogError(
-            f"{CANNOT_TELL}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; give a longer "
+            f"{UNDETERMINED}: the likeliest, {offsets_s[best]:+.2f} s, is at the end of the search; give a longer "
             f"--search SECONDS, or {AS_STATED}"
         )
     seconds = _top(offsets_s, found)
@@ -194,7 +194,7 @@ def estimate_offset(
     )
     if nats < LEAST_NATS or sigma_s > LARGEST_SIGMA_S:
         raise LogError(
-            f"{CANNOT_TELL}: {seconds:+.2f} s ± {sigma_s:.2f} s is only exp({nats:.1f}) times as likely as others "
+            f"{UNDETERMINED}: {seconds:+.2f} s ± {sigma_s:.2f} s is only exp({nats:.1f}) times as likely as others "
             f"(a steady motion, or images that show it badly); {AS_STATED}"
         )
     fitted = _fitted(z, f := moved(seconds))

@@ -255,7 +255,7 @@ class ImageMotions:
         """True for an instant before that of the last frame, or at it."""
         return self._stamp_ns is not None and stamp_ns < self._stamp_ns
 
-    def look(self, frame: SonarFrames) -> PlanarStep | None:
+    def add(self, frame: SonarFrames) -> PlanarStep | None:
         """Lay a block of one frame upon the frame before."""
         stamp_ns = int(frame.stamps_ns[0])
         self.step = None
@@ -303,7 +303,7 @@ class ImageMotions:
         return self.step
 
     def at(self, stamp_ns: int) -> tuple[SonarStep | None, FloorView | None]:
-        """Motion to the frame that was looked at last, and view of the floor, if height and tilt are stated."""
+        """Motion to the last frame, and view of the floor, if height and tilt are stated."""
         assert stamp_ns == self._stamp_ns
         return (
             SonarStep.none() if self.step is None else self._sonar_step(self.step)

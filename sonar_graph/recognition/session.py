@@ -340,7 +340,7 @@ class RecognitionSession:
             return RecognisedFrame.not_used(stamp_ns, f"{NOT_USED}: {reason}")
         self.frames += 1
         if isinstance(self._motions, ImageMotions):
-            self._motions.look(frame)
+            self._motions.add(frame)
         step, view = self._motions.at(stamp_ns)
         self.view = view
         if step is not None:

@@ -218,7 +218,7 @@ def test_a_file_of_a_sonar_is_converted_and_what_cannot_tell_must_be_stated(
         in capsys.readouterr().err
     )
     assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
-    assert "as stated; the images cannot tell" in capsys.readouterr().out
+    assert "as stated; the images do not determine" in capsys.readouterr().out
     assert sum(len(block) for block in read_sonar_frames(out)) == 6
     assert run("join", tmp_path / "dive.raw", both[1], "-o", out) == 2
     (tmp_path / "dive.raw").write_bytes(b"x")

@@ -98,7 +98,7 @@ def replaced(steps: list[PlanarStep], motions: Floats) -> list[PlanarStep]:
 def test_images_that_cannot_tell_are_refused_with_the_reason(lane, steps):
     noise = NOISE * np.random.default_rng(4).standard_normal((len(steps), 3))
     with pytest.raises(
-        LogError, match=r"cannot tell .*; state it with --offset SECONDS"
+        LogError, match=r"do not determine .*; state it with --offset SECONDS"
     ):
         estimated(lane, replaced(steps, noise), 0.0)
     with pytest.raises(
@@ -120,7 +120,7 @@ def test_the_motion_of_images_tells_the_offset(lane):
     seen = [
         step
         for row in range(len(lane.frames))
-        if (step := motions.look(lane.one(row))) is not None
+        if (step := motions.add(lane.one(row))) is not None
     ]
     found = estimated(lane, seen, -0.8)
     assert abs(found.seconds + 0.8) < 3 * found.sigma_s + 0.01

@@ -43,7 +43,7 @@ def in_plane(steps: list[gtsam.Pose3], level_R_sonar: Floats) -> Floats:
 
 
 def look_at_all(lane: Lane, motions: ImageMotions, rows: range) -> list:
-    return [step for row in rows if (step := motions.look(lane.one(row))) is not None]
+    return [step for row in rows if (step := motions.add(lane.one(row))) is not None]
 
 
 @pytest.mark.parametrize("is_floor_known", [True, False])
@@ -80,7 +80,7 @@ def test_a_frame_of_another_scene_is_not_laid_upon_the_one_before(lane):
     rng = np.random.default_rng(1)
     other = lane.one(3)
     noise = rng.rayleigh(40.0, other.intensity.shape).astype(np.uint8)
-    step = motions.look(
+    step = motions.add(
         SonarFrames(other.stamps_ns, noise, other.ranges_m, other.azimuths_rad)
     )
     assert not step.is_measured
