@@ -224,6 +224,7 @@ def longest_part(stamps_ns: Ints) -> tuple[int, int]:
     """First and last stamp of the part with the most rows between pauses."""
     # in float: differences of stamps of 1970 and 2200 do not fit into 64 bits
     pauses = np.flatnonzero(np.diff(stamps_ns.astype(np.float64)) > PAUSE_NS) + 1
+    # of a log in two parts the larger one counts
     first, end = max(
         pairwise([0, *pauses.tolist(), len(stamps_ns)]),
         key=lambda part: part[1] - part[0],

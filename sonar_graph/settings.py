@@ -273,6 +273,7 @@ def choice(name: str, known: Iterable[str], owner: str = "") -> str:
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Question after an unknown name whether the most similar known name is meant; a semicolon if none is similar."""
+    # one suggestion: the rest is in the list that follows
     similar = max(known, key=partial(_similarity, name), default="")
     return (
         f"; did you mean {similar}?"

@@ -188,6 +188,7 @@ class Trajectory:
                 f"Trajectory.from_poses: expected {n} poses, one a stamp, as gtsam.Pose3 or of shape (4, 4); "
                 f"as matrices they have shape {matrices.shape}"
             )
+        # NaN stands for unknown in all columns
         covs = np.full((n, 6, 6), np.nan) if covariances is None else covariances
         if np.shape(covs) != (n, 6, 6):
             raise MeasurementError(

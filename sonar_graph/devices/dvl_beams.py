@@ -55,9 +55,11 @@ def velocity_of_beams(
     """
     velocity = np.zeros((len(valid), 3))
     covariance = np.empty((len(valid), 3, 3))
+    # pings that lost the same beams share their geometry
     for pattern in np.unique(valid, axis=0):
         rows = (valid == pattern).all(axis=1)
         beams = directions[pattern]
+        # along an axis with a small eigenvalue the beams measure nothing
         geometry, axes = np.linalg.eigh(beams.T @ beams)
         is_measured = geometry > max(_LEAST_SHARE * geometry[-1], np.finfo(float).tiny)
         per_geometry = 1.0 / np.where(is_measured, geometry, 1.0)

@@ -100,6 +100,7 @@ def didson_azimuths(beams: int) -> Floats:
     array([-14.26,  14.25])
     """
     angles_deg = np.linspace(-16.0, 16.0, 32_001)
+    # tabulated to a thousandth of a degree, and read the other way
     numbers = np.polynomial.polynomial.polyval(angles_deg, _DIDSON_POLYNOMIALS[beams])
     from_left_deg = np.interp(np.arange(beams), numbers, angles_deg)
     return np.radians(-from_left_deg[::-1])
@@ -126,6 +127,7 @@ def aris_azimuths(beams: int, *, telephoto: bool) -> Floats | None:
     degree, rows = _ARIS_TABLES[beams, telephoto]
     number, angle_deg = np.array(rows).T
     if number[-1] < beams - 1:
+        # the lens is symmetric about its middle
         number = np.concatenate([number, beams - 1 - number[::-1]])
         angle_deg = np.concatenate([angle_deg, -angle_deg[::-1]])
     from_left_deg = make_interp_spline(number, angle_deg, k=degree)(np.arange(beams))

@@ -52,6 +52,7 @@ class OwnProcess:
             stdout=subprocess.PIPE,
             stderr=log,
             env=os.environ | dict(environment or {}),
+            # Ctrl-C in the terminal goes to the whole foreground group
             start_new_session=True,
         )
         assert self._process.stdin is not None
@@ -159,6 +160,7 @@ class _Plain(pickle.Pickler):
 def serve(handle: Callable[[Any, Tell], object]) -> NoReturn:
     """Answer requests until stdin ends; what ``handle`` raises is the answer."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    # whatever others' code prints must not end up among the answers
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     faulthandler.enable()
     requests: SimpleQueue[Any] = SimpleQueue()
