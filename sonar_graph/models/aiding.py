@@ -187,7 +187,7 @@ class Contradictions:
         )
 
     def messages(self) -> list[str]:
-        """A line for each sensor of which more than `CONTRADICTING_SHARE` of the rows contradict the estimate."""
+        """A line for each sensor that contradicts the estimate in more than `CONTRADICTING_SHARE` of its rows."""
         return [
             f"{self._far[sensor]} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
             + (

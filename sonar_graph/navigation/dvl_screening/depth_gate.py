@@ -69,7 +69,7 @@ REASONS = {
 
 
 class DepthSamples(NamedTuple):
-    """Samples of a block, of which the gate fills the last two columns."""
+    """Samples of a block. The gate fills the last two columns."""
 
     stamps_ns: Ints
     z_m: Floats
@@ -81,7 +81,9 @@ class DepthSamples(NamedTuple):
     def refused(self) -> list[RefusedRow]:
         """The samples that are not used, but for repeated ones."""
         columns = (
-            self.stamps_ns.tolist(), self.treatment.tolist(), self.distance.tolist()
+            self.stamps_ns.tolist(),
+            self.treatment.tolist(),
+            self.distance.tolist(),
         )
         return [
             RefusedRow("depth", stamp_ns, REASONS[treatment], distance)
