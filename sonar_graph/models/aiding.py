@@ -273,6 +273,7 @@ def bias_jacobian(
     rho_by_heading = outer(D_rho @ up, up)
     way = dR.T @ (body_p_dvl - dp) - body_p_dvl
     level_way = way - (vertical_j @ way) * vertical_j
+    # the compass does not change a motion
     D_b = np.zeros((6, BIASES))
     # b_tilt in the columns 0 to 2, b_heading in 3 to 5; when both change alike, the gyro bias does: the sum is D
     store(D_theta - theta_by_heading, D_b)
