@@ -226,47 +226,33 @@ def move(x: Floats, by: Floats) -> None:
 
 @compiled
 def observe(
-    x: Floats,
-    P: Floats,
-    at: int,
-    motion: Motion,
-    sonar: Sonar,
-    gate: float,
-    z: Floats,
-    R_z: Floats,
-) -> tuple[int, Floats, Floats]:
-    """Update by range and azimuth of a known landmark at ``x[at : at + 3]``; outcome, e of (7) and S."""
-    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
-    R, X, T = pose_after(x, motion)
-    sight = sight_of(R, X, mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
-    e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])  # (7)
-    H = np.zeros((2, len(x)))
-    # H_b T and H_p, row by row
-    store_row6(T.T @ sight.range_by_body, H, 0, 0)
-    store_row6(T.T @ sight.azimuth_by_body, H, 1, 0)
-    store_row(sight.range_by_point, H, 0, at)
-    store_row(sight.azimuth_by_point, H, 1, at)
-    noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
-    HP, S = innovation_of(P, H, noise)
-    S = symmetric(S)
-    # the kernel widens the noise of the detection, not that of the motion
-    outcome, widened = judged(e, S, R_z, gate, sonar.kernel_width)
-    if outcome != GATED:
-        move(x, correction(P, HP, S + widened, e))
-    return outcome, e, S
-
-
-@compiled
-def observe_frame(
     x: Floats, P: Floats, motion: Motion, sonar: Sonar, views: Views, sighted: Sighted
 ) -> None:
-    """Update by known landmarks of a frame in turn, and write outcomes and innovations."""
+    """Update by range and azimuth of known landmarks, one after the other; writes outcome, e of (7) and S of each."""
+    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
     for k in range(len(sighted.rows)):
         row = sighted.rows[k]
         at = MAP + LANDMARK * sighted.slots[k]
-        outcome, e, S = observe(
-            x, P, at, motion, sonar, sighted.gates[k], views.z[row], views.R_z[row]
-        )
+        z = views.z[row]
+        R_z = views.R_z[row]
+        R, X, T = pose_after(x, motion)
+        sight = sight_of(R, X, mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
+        e = np.array(
+            [z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)]
+        )  # (7)
+        H = np.zeros((2, len(x)))
+        # H_b T and H_p, row by row
+        store_row6(T.T @ sight.range_by_body, H, 0, 0)
+        store_row6(T.T @ sight.azimuth_by_body, H, 1, 0)
+        store_row(sight.range_by_point, H, 0, at)
+        store_row(sight.azimuth_by_point, H, 1, at)
+        noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
+        HP, S = innovation_of(P, H, noise)
+        S = symmetric(S)
+        # the kernel widens the noise of the detection, not that of the motion
+        outcome, widened = judged(e, S, R_z, sighted.gates[k], sonar.kernel_width)
+        if outcome != GATED:
+            move(x, correction(P, HP, S + widened, e))
         views.outcome[row] = outcome
         views.e[row] = e
         views.S[row] = S
@@ -364,7 +350,7 @@ class EkfSlam(FilterShell):
 
     def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
         """Update by range and azimuth of known landmarks, (6) and (7)."""
-        observe_frame(self._x, self._P, motion, self.sonar, views, sighted)
+        observe(self._x, self._P, motion, self.sonar, views, sighted)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats

@@ -108,7 +108,7 @@ class Views(NamedTuple):
 
 @compiled
 def in_frame(views: Views, first: int) -> Ints:
-    """Detections of a frame that are to be used, of which the first is given."""
+    """Detections of a frame that are to be used, from its first row on."""
     found = np.empty(len(views.stamp_ns), np.int64)
     n = 0
     for row in range(first, len(found)):

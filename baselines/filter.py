@@ -567,7 +567,7 @@ class FilterShell(ABC):
             if landmark_id in self._slots:
                 known.append(row)
                 continue
-            # seen for the first time
+            # seen for the first time: the rows before it count first
             self._observe(motion, views, known)
             known = []
             self.augment(motion, views.z[row], views.R_z[row])
@@ -589,6 +589,7 @@ class FilterShell(ABC):
             gates=np.array([self._gate(landmark_id) for landmark_id in ids]),
         )
         self.observe(motion, views, sighted)
+        # only landmarks of the map are compared with it
         if self._known.held:
             for row in rows:
                 self._judge_map(views, row)

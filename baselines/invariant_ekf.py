@@ -24,7 +24,7 @@ New landmark at ``g = X' + R' q(z)``, q the point of the body that is seen at z 
 
     xi_new = xi_0 + G_b eps + G_z dz                                                                           (6)
 
-Position of ``a = X' + R' q``, k = 0, or of a landmark ``a = x_k``, of which H_b is zero; heights are their last rows::
+Position of ``a = X' + R' q``, k = 0, or of a landmark ``a = x_k`` with zero H_b; heights are their last rows::
 
     H_theta = -[a]x,    H_xi_k = I                                                                             (7)
 
@@ -232,52 +232,34 @@ def store_by_biases(h_b: Vec6, D: Floats, H: Floats, row: int) -> None:
 
 @compiled
 def observe(
-    state: InvariantState,
-    k: int,
-    motion: Motion,
-    sonar: Sonar,
-    gate: float,
-    z: Floats,
-    R_z: Floats,
-) -> tuple[int, Floats, Floats]:
-    """Update by range and azimuth of a known landmark, (5); outcome, innovation and its covariance."""
-    at = BODY.start + POINT * k
-    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
-    R, X, D = pose_after(state, motion)
-    sight = sight_of(R, X, mount, vec(state.points[k]))
-    e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])
-    H = np.zeros((2, len(state.P)))
-    # a turn of everything about the origin changes no view: H_theta is zero
-    store_row(sight.range_by_point, H, 0, at)
-    store_row(sight.azimuth_by_point, H, 1, at)
-    store_row(-1.0 * sight.range_by_point, H, 0, BODY.start)
-    store_row(-1.0 * sight.azimuth_by_point, H, 1, BODY.start)
-    store_by_biases(sight.range_by_body, D, H, 0)
-    store_by_biases(sight.azimuth_by_body, D, H, 1)
-    noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
-    HP, S = innovation_of(state.P, H, noise)  # (9)
-    S = symmetric(S)
-    outcome, widened = judged(e, S, R_z, gate, sonar.kernel_width)
-    if outcome != GATED:
-        move(state, correction(state.P, HP, S + widened, e))
-    return outcome, e, S
-
-
-@compiled
-def observe_frame(
-    state: InvariantState,
-    motion: Motion,
-    sonar: Sonar,
-    views: Views,
-    sighted: Sighted,
+    state: InvariantState, motion: Motion, sonar: Sonar, views: Views, sighted: Sighted
 ) -> None:
-    """Update by known landmarks of a frame in turn, and write outcomes and innovations."""
+    """Update by range and azimuth of known landmarks, (5), in turn; writes outcome, innovation and covariance of each."""
+    mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
     for m in range(len(sighted.rows)):
         row = sighted.rows[m]
         k = 1 + sighted.slots[m]
-        outcome, e, S = observe(
-            state, k, motion, sonar, sighted.gates[m], views.z[row], views.R_z[row]
-        )
+        at = BODY.start + POINT * k
+        z = views.z[row]
+        R_z = views.R_z[row]
+        R, X, D = pose_after(state, motion)
+        sight = sight_of(R, X, mount, vec(state.points[k]))
+        e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])
+        H = np.zeros((2, len(state.P)))
+        # a turn of everything about the origin changes no view: H_theta is zero
+        store_row(sight.range_by_point, H, 0, at)
+        store_row(sight.azimuth_by_point, H, 1, at)
+        store_row(-1.0 * sight.range_by_point, H, 0, BODY.start)
+        store_row(-1.0 * sight.azimuth_by_point, H, 1, BODY.start)
+        store_by_biases(sight.range_by_body, D, H, 0)
+        store_by_biases(sight.azimuth_by_body, D, H, 1)
+        noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
+        HP, S = innovation_of(state.P, H, noise)  # (9)
+        S = symmetric(S)
+        # the kernel widens the noise of the detection, not that of the motion
+        outcome, widened = judged(e, S, R_z, sighted.gates[m], sonar.kernel_width)
+        if outcome != GATED:
+            move(state, correction(state.P, HP, S + widened, e))
         views.outcome[row] = outcome
         views.e[row] = e
         views.S[row] = S
@@ -363,7 +345,7 @@ class InvariantEkf(FilterShell):
 
     def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
         """Update by range and azimuth of known landmarks, (5)."""
-        observe_frame(self._state, motion, self.sonar, views, sighted)
+        observe(self._state, motion, self.sonar, views, sighted)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats

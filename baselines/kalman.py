@@ -32,23 +32,23 @@ class Judged(NamedTuple):
 
 
 @compiled
+def times(H: Floats, A: Floats) -> Floats:
+    """``H A`` for a Jacobian H, whose numbers are mostly zero."""
+    HA = np.zeros((len(H), A.shape[1]))
+    for r in range(len(H)):
+        for k in range(len(A)):
+            # a detection has nine numbers in each row of H
+            if H[r, k] != 0.0:
+                for j in range(A.shape[1]):
+                    HA[r, j] += H[r, k] * A[k, j]
+    return HA
+
+
+@compiled
 def innovation_of(P: Floats, H: Floats, R: Floats) -> tuple[Floats, Floats]:
     """``H P``, shape (m, n), and ``S = H P H^T + R``, shape (m, m)."""
-    m, n = H.shape
-    HP = np.zeros((m, n))
-    for r in range(m):
-        for k in range(n):
-            # most numbers of H are zero
-            if H[r, k] != 0.0:
-                for j in range(n):
-                    HP[r, j] += H[r, k] * P[k, j]
-    S = np.empty((m, m))
-    for r in range(m):
-        for c in range(m):
-            total = 0.0
-            for k in range(n):
-                total += HP[r, k] * H[c, k]
-            S[r, c] = total + R[r, c]
+    HP = times(H, P)
+    S = times(H, HP.T) + R  # (H P)^T = P H^T
     return HP, S
 
 
@@ -83,6 +83,7 @@ def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
     w = e.copy()  # L^-1 e
     Ke = np.zeros(len(P))
     for r in range(len(S)):
+        # a variance of zero or below, or no number
         if math.isnan(L[r, r]):
             raise LinAlgError("S is not positive definite")
         for k in range(r):
@@ -90,6 +91,7 @@ def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
             w[r] -= L[r, k] * w[k]
         V[r] /= L[r, r]
         w[r] /= L[r, r]
+        # each row of V is a scalar update
         for i in range(len(P)):
             v = V[r, i]
             Ke[i] += v * w[r]

@@ -187,7 +187,7 @@ class Contradictions:
         )
 
     def messages(self) -> list[str]:
-        """A line for each sensor of which more than `CONTRADICTING_SHARE` of the rows contradict the estimate."""
+        """A line for each sensor that contradicts the estimate in more than `CONTRADICTING_SHARE` of its rows."""
         return [
             f"{self._far[sensor]} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
             + (
@@ -273,6 +273,7 @@ def bias_jacobian(
     rho_by_heading = outer(D_rho @ up, up)
     way = dR.T @ (body_p_dvl - dp) - body_p_dvl
     level_way = way - (vertical_j @ way) * vertical_j
+    # the compass does not change a motion
     D_b = np.zeros((6, BIASES))
     # b_tilt in the columns 0 to 2, b_heading in 3 to 5; when both change alike, the gyro bias does: the sum is D
     store(D_theta - theta_by_heading, D_b)

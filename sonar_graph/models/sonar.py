@@ -108,12 +108,6 @@ def project_points(q: Floats) -> tuple[Floats, Floats]:
     return z, D_q
 
 
-def project(q: Floats) -> tuple[Floats, Floats]:
-    """`project_points` of one point, shape (3,): shapes (2,) and (2, 3)."""
-    z, D_q = project_points(np.ascontiguousarray(q)[None])
-    return z[0], D_q[0]
-
-
 class Mount(NamedTuple):
     """Sonar in the body, as arrays."""
 
@@ -379,6 +373,7 @@ def identify(
     """
     ids = np.empty(len(detections), np.int64)
     outcomes = np.full(len(detections), ACCEPTED, np.int8)
+    # several operations of NumPy: as long as all else here
     if not are_sound:
         outcomes[~detections.are_sound()] = UNSOUND
     rows = (detections.stamps_ns, detections.candidate_ids, detections.id_probability)
@@ -398,6 +393,7 @@ def _write_identities(
     """Fill what `identify` returns; outcomes other than `ACCEPTED` stay."""
     p = np.empty(len(ids))
     for row in range(len(ids)):
+        # of equal posteriors the first
         best = 0
         for k in range(1, candidates.shape[1]):
             if posterior[row, k] > posterior[row, best]:

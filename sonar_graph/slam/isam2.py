@@ -328,12 +328,12 @@ class Isam2:
         Returns
         -------
         JointCovariance
-            In the order of GTSAM's keys: landmarks, then keyframes, each by their numbers; ``rows`` says where.
+            In the order of GTSAM's keys: landmarks, then keyframes, each by their numbers; ``rows`` has their places.
 
         Raises
         ------
         EstimatorError
-            When something is not known, or has left the window; it says what there is.
+            When something is not known, or has left the window; the message lists what there is.
         """
         if over not in get_args(Over):
             raise EstimatorError(
@@ -361,7 +361,7 @@ class Isam2:
         return JointCovariance.of(marginals, sorted(keys))
 
     def _keyframe_at(self, stamp_ns: int) -> int:
-        """Number of the keyframe at a stamp; an `EstimatorError` names the nearest ones where there is none."""
+        """Number of the keyframe at a stamp; an `EstimatorError` names the nearest ones where it is missing."""
         existing_ns = self._keyframes.stamps_ns
         place = bisect_left(existing_ns, stamp_ns)
         if existing_ns[place : place + 1] == [stamp_ns]:

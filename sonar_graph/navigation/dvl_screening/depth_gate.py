@@ -69,7 +69,7 @@ REASONS = {
 
 
 class DepthSamples(NamedTuple):
-    """Samples of a block, of which the gate fills the last two columns."""
+    """Samples of a block. The gate fills the last two columns."""
 
     stamps_ns: Ints
     z_m: Floats
@@ -81,7 +81,9 @@ class DepthSamples(NamedTuple):
     def refused(self) -> list[RefusedRow]:
         """The samples that are not used, but for repeated ones."""
         columns = (
-            self.stamps_ns.tolist(), self.treatment.tolist(), self.distance.tolist()
+            self.stamps_ns.tolist(),
+            self.treatment.tolist(),
+            self.distance.tolist(),
         )
         return [
             RefusedRow("depth", stamp_ns, REASONS[treatment], distance)
@@ -130,11 +132,13 @@ def judge_until_refused(
             samples.distance[k] = math.nan
             continue
         longest_ns = LONG_NS
+        # the intervals of a slow log are long
         if interval_ns < LATEST_NS:
             longest_ns = max(LONG_NS, LONG_INTERVALS * interval_ns)
         if newest_ns > EARLIEST_NS:
             interval_ns = min(interval_ns, stamp_ns - newest_ns)
         else:
+            # the start counts as used so long before the first sample
             used = DepthChain(
                 stamp_ns - LONG_NS, used.z_m, used.variance_m2, used.length, False
             )
@@ -181,6 +185,7 @@ class DepthGate:
         )
         k = 0
         while k < n:
+            # a sample out of reach ends the compiled loop: chains are rare
             before_ns = self._used.stamp_ns
             k, self._used, self._newest_ns, self._interval_ns = judge_until_refused(
                 samples,

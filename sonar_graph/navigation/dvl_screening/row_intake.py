@@ -124,6 +124,7 @@ class RowIntake:
         samples = self._depth_gate.judge(depth)
         if not samples.treatment.any():
             return depth
+        # refused, or a stamp that repeats
         self._refused += samples.refused()
         is_used = samples.treatment == USED
         return depth.rows(is_used) if is_used.any() else None

@@ -223,7 +223,7 @@ class AmendableJournal(DetectionJournal):
     def amend(self, changed: Assignment) -> None:
         """Change the outcome of a row, and its landmark unless None.
 
-        The innovation is replaced too, by NaN if there is none: the earlier one was against another landmark.
+        The innovation is replaced too, by NaN if it is missing: the earlier one was against another landmark.
         """
         row = changed.sighting.row - self._forgotten
         if row < 0:

@@ -178,7 +178,7 @@ class Mixture:
         new = [i for i in posterior.probability if i not in set(ids)]
         totals = posterior.log_weights(ids + new, self._errors)
         totals[: len(ids)] += self._log_peak - half_log_det - losses
-        # a landmark that is not in the graph may be anywhere in view, as may what is none
+        # a landmark that is not in the graph may be anywhere in view, as may what is no landmark
         totals[len(ids) :] += self._errors.log_density
         return dict(zip([*ids, *new, None], totals.tolist(), strict=True))
 

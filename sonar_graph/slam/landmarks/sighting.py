@@ -106,7 +106,7 @@ class SightingFactors:
     def elevation_on(
         self, floor: FloorPrior | None, world_T_sonar: gtsam.Pose3, z: Floats
     ) -> float:
-        """Elevation (rad) of a floor at a range and azimuth; 0 where there is none, or not in the aperture."""
+        """Elevation (rad) of a floor at a range and azimuth; 0 without a floor in the aperture."""
         if floor is None:
             return 0.0
         return (
@@ -138,7 +138,7 @@ class Frame:
         return len(self.rows)
 
     def select(self, is_in: NDArray[np.bool_]) -> "Frame | None":
-        """Some of the detections; None where that is none."""
+        """Some of the detections; None for an empty selection."""
         if is_in.all():
             return self
         if not is_in.any():

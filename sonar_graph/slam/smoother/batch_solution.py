@@ -53,7 +53,7 @@ class Stack(Protocol):
 
 
 class StackedGraph:
-    """A graph, of which factors in Python that can be are evaluated together: those whose class has a `Stack`."""
+    """A graph whose factors in Python are evaluated together, where their class has a `Stack`."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
         self.factors = [graph.at(i) for i in range(graph.size())]
@@ -245,7 +245,7 @@ def misplaced(values: Known, sightlines: Sightlines) -> list[int]:
 def placed_again(
     values: gtsam.Values, sightlines: Sightlines, landmark_keys: list[int]
 ) -> gtsam.Values:
-    """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
+    """The values, with each of the landmarks at the median of the points that its sightings give from these poses."""
     placed = gtsam.Values(values)
     for key in landmark_keys:
         points = sighted_from(values, sightlines[key]).points()
@@ -286,13 +286,13 @@ class JointCovariance:
     """
 
     matrix: Floats
-    """Shape (n, n), in the order in which the variables were asked for."""
+    """Shape (n, n), in the order in which the variables were given."""
     rows: dict[int, int]
     """The first row of each variable, by key."""
 
     @classmethod
     def of(cls, marginals: Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
-        """Ask for poses (6 rows each), biases (11) and points (3)."""
+        """Compute that of poses (6 rows each), biases (11) and points (3)."""
         rows, n = {}, 0
         for key in keys:
             rows[key] = n
@@ -308,8 +308,8 @@ class JointCovariance:
 class KeptCovariance:
     """One joint covariance for all questions between two updates.
 
-    A question costs an elimination of most of the map, whatever it asks for. So the first question after an update also
-    asks for the landmarks that the next frame is likely to show.
+    Each joint covariance costs an elimination of most of the map, however small it is. So the first one after an update
+    includes the landmarks that the next frame is likely to show.
     """
 
     def __init__(self) -> None:
@@ -322,7 +322,7 @@ class KeptCovariance:
         keys: list[int],
         likely: Callable[[], list[int]],
     ) -> JointCovariance:
-        """Joint covariance of these variables, and possibly of more; ``likely`` names those asked for next."""
+        """Joint covariance of these variables, and possibly of more; ``likely`` names those that are needed next."""
         # the next joint covariance includes all variables since the update, so that no question is repeated
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
@@ -340,8 +340,8 @@ class KeptCovariance:
 class Marginals:
     """Marginal covariances of a graph, linearised at the values; by QR where Cholesky refuses.
 
-    GTSAM eliminates anew for each question, so that Cholesky may refuse one variable and not another. Each question
-    decides for itself: no answer depends on what was asked before.
+    GTSAM eliminates again for each covariance, so that Cholesky may refuse one variable and not another. The choice is
+    made for each covariance: no result depends on earlier calls.
     """
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:

@@ -96,7 +96,7 @@ class Sightline:
         return sighted_from(values, [self]).points()[0]
 
 
-class Sighted(NamedTuple):
+class SonarViews(NamedTuple):
     """Poses of the sonar, and what it measured from there, n times."""
 
     R: Floats
@@ -114,7 +114,7 @@ class Sighted(NamedTuple):
         return self.t + range_m * beam
 
 
-def sighted_from(values: Known, lines: Sequence[Sightline]) -> Sighted:
+def sighted_from(values: Known, lines: Sequence[Sightline]) -> SonarViews:
     """Sightings from where keyframes are estimated."""
     R = np.empty((len(lines), 3, 3))
     t = np.empty((len(lines), 3))
@@ -124,10 +124,10 @@ def sighted_from(values: Known, lines: Sequence[Sightline]) -> Sighted:
         R[k] = world_T_sonar.rotation().matrix()
         t[k] = world_T_sonar.translation()
         z[k] = line.z
-    return Sighted(R, t, z)
+    return SonarViews(R, t, z)
 
 
-def missed(sighted: Sighted, landmark: Floats) -> tuple[int, Floats]:
+def missed(sighted: SonarViews, landmark: Floats) -> tuple[int, Floats]:
     """Number of sightings with a point of the world behind, and the distance by which each misses the point, (n,), m.
 
     Behind is a right angle or more off the measured azimuth.

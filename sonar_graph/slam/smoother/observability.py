@@ -191,10 +191,9 @@ class Blame:
     def culprits(
         self, window: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> list[Withheld]:
-        """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
+        """New factors without which a window can be solved; empty where only the arithmetic fails.
 
-        An `EstimatorError` where a keyframe, or what was in
-        the window before, is left open.
+        Raises an `EstimatorError` where a keyframe, or what was in the window before, is left open.
         """
         graph, inside = (
             gtsam.NonlinearFactorGraph(window),

@@ -2,7 +2,7 @@
 
 Two solutions share the same factors (docs/theory/isam2.md). The *window* is GTSAM's iSAM2, updated with every keyframe.
 Its estimate is causal. The *history* is the batch solution of the whole graph by Levenberg-Marquardt, computed when a
-smoothed result is asked for. With a bounded history, a fixed-lag smoother takes the place of iSAM2, and the history is
+smoothed result is needed. With a bounded history, a fixed-lag smoother takes the place of iSAM2, and the history is
 the graph of its window: newer factors and the marginals of older ones.
 
 Two faults restart the window at the batch solution. An update has diverged if it increased the error of the graph. A
@@ -146,7 +146,7 @@ class Changed(NamedTuple):
 
 
 class Estimates:
-    """Newest estimate of each variable, computed when asked for and kept until the next update.
+    """Newest estimate of each variable, computed when it is needed and kept until the next update.
 
     Has the accessors of `gtsam.Values`. iSAM2 computes one variable in 15 µs, but all of a long run in milliseconds.
     """
@@ -716,7 +716,7 @@ class Smoother:
         ]
 
     def _asked_next(self) -> list[int]:
-        """Variables whose covariance will be asked for: newest keyframe and biases, and landmarks in reach."""
+        """Variables whose covariance is needed next: newest keyframe and biases, and landmarks in reach."""
         # first factors may have been withheld together with their variable
         newest = [
             key for key in (self._newest_pose, self._newest_bias) if key is not None
@@ -748,7 +748,7 @@ class Smoother:
     def solve_history(self) -> tuple[gtsam.Values, Marginals]:
         """Batch solution of the whole graph from the present estimate, and the source of its marginal covariances.
 
-        Ask that for ``marginalCovariance(key)`` or ``jointMarginalCovariance(keys)``.
+        The source has ``marginalCovariance(key)`` and ``jointMarginalCovariance(keys)``.
         """
         if self._solved is None:
             graph = self.graph
