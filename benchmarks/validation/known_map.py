@@ -15,8 +15,8 @@ without alignment. NEES are of the horizontal position and of the map's landmark
 over runs and instants +- 1.96 standard errors between runs. Two landmarks that *moved* are those that the dive sees most,
 each 1 m off in the map in a direction of its own; the start is known to 1 mm then, and the map is a survey of 0.05 m.
 They are *named* where the estimator names both, and no others, as moved, or as those that contradict the map. *Located*
-is a start once the estimator returns a pose, after the landmarks of all frames before and one of the last. It is *wrong* where it is over 1 m or 0.1 rad off, and outside the 1e-6
-ellipse of its covariance.
+is a start once the estimator returns a pose; its number of landmarks is that of all frames before, and one of the last. It
+is *wrong* where it is over 1 m or 0.1 rad off, and outside the 1e-6 ellipse of its covariance.
 
 ``--constants`` varies the constants of the library instead (`benchmarks/results/known_map_constants.md`).
 """

@@ -14,6 +14,8 @@ from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, with_option
 from sonar_graph.cli.outputs import progress_bars, working
 from sonar_graph.files import INTERRUPTED
 
+MOST_REASONS = 5
+
 
 @dataclass(frozen=True)
 class BenchOptions:
@@ -103,10 +105,21 @@ def bench(
         # the ordinary way waits for threads, also for those of workers that are gone
         os._exit(INTERRUPTED)
     only = options.only
-    counts = Counter(run.status for run in batch.runs if not only or run.key in only)
+    chosen = [run for run in batch.runs if not only or run.key in only]
+    counts = Counter(run.status for run in chosen)
     # those that ended first
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
+    reasons = Counter(
+        f"{run.status}: {run.reason}" for run in chosen if run.status != "ok"
+    )
+    for reason, number in reasons.most_common(MOST_REASONS):
+        echo(f"  {number} {reason}", err=True)
+    if len(reasons) > MOST_REASONS:
+        echo(
+            f"  and {len(reasons) - MOST_REASONS} other reasons, in the report",
+            err=True,
+        )
     echo(f"Results: {output / 'results.parquet'}")
     echo(f"Report: {write_report_of(output, overwrite=options.overwrite)}")
     if set(counts) - {"ok"}:
