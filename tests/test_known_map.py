@@ -8,6 +8,7 @@ import pytest
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, KnownMap, Start
+from sonar_graph.diagnosis.start_place import map_findings
 from sonar_graph.errors import LogError, SettingError
 from sonar_graph.estimator import known_map_of
 from sonar_graph.evaluation import compare
@@ -160,7 +161,7 @@ def test_none_has_moved_where_as_many_contradict_as_agree():
     known = judged([(1, RIGHT)] + [(0, WRONG)] * 9)
     assert known.moved == []
     assert known.messages()[0].startswith("landmarks 0 contradict the map")
-    assert known.messages()[1] == "landmarks of the map that were not seen: 2, 3, 4"
+    assert known.messages()[1] == "landmarks of the map that were not seen: 2..4"
 
 
 LOST = {"position_m": (300.0, -80.0, 0.0), "source": "map"}
@@ -235,6 +236,83 @@ def test_three_landmarks_that_agree_are_no_start_where_most_do_not(others, is_fo
     assert (found is not None) == is_found
     if found is not None:
         np.testing.assert_allclose(found.parameters, [0.0, *t], atol=0.5)
+
+
+def test_a_third_landmark_far_from_two_others_agrees_with_their_start():
+    """Two landmarks 1 m apart leave the heading to 0.1 rad, by which a third one 40 m away is metres off."""
+    places = np.array([[0.0, 0.0, -4.0], [1.0, 0.0, -4.0], [40.0, 5.0, -4.0]])
+    known = KnownMap.of(range(3), places, sigma_m=0.05)
+    S = np.diag([0.02**2, 0.05**2])
+    errors = np.array([[0.0, 0.1], [0.0, -0.05], [0.0, 0.0]])
+    sightings = [MapSighting(i, places[i, :2] + errors[i], S) for i in range(3)]
+    found = located(sightings, known)
+    assert found is not None
+    assert found.agreeing == {0, 1, 2}
+    np.testing.assert_allclose(found.parameters[0], 0.0, atol=0.01)
+
+
+def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    places[3, :2] += [6.0, -4.0]
+    wrong = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    estimator, told = run(EkfSlam, with_map(dive, wrong, unknown_start(dive)))
+    assert rms_m(dive, told) < 0.15
+    assert f"landmarks {known.ids[3]} no longer stand" in estimator.withheld()[0]
+
+
+FEET = 1.0 / 0.3048
+MISTAKEN = {
+    "upside down": (np.diag([1.0, 1.0, -1.0]), "z_m has the wrong sign"),
+    "feet": (FEET * np.eye(3), "it is in feet"),
+    "mirrored": (np.eye(3)[[1, 0, 2]], "x_m and y_m are swapped"),
+}
+
+
+@pytest.mark.parametrize(("T", "message"), MISTAKEN.values(), ids=MISTAKEN)
+def test_a_map_with_other_axes_or_units_is_named_with_the_remedy(dive, T, message):
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    mistaken = KnownMap.of(known.ids, places @ T.T, sigma_m=SIGMA_M)
+    (finding,) = map_findings(with_map(dive, mistaken, unknown_start(dive)))
+    assert finding.grave
+    assert message in finding.text()
+    x, y, z = places[0]
+    assert f"landmark 1 at ({x:.2f}, {y:.2f}, {z:.2f}) m" in finding.text()
+
+
+def test_a_right_map_has_no_finding(dive):
+    assert not list(map_findings(with_map(dive, surveyed(dive))))
+    assert not list(map_findings(with_map(dive, None)))
+
+
+def test_sigmas_of_a_map_that_are_too_small_are_named(dive):
+    errors = 0.4 * np.random.default_rng(5).standard_normal((12, 3))
+    known = KnownMap.of(
+        dive.true_landmarks.ids, dive.true_landmarks.positions + errors, sigma_m=0.02
+    )
+    (finding,) = map_findings(with_map(dive, known, unknown_start(dive)))
+    assert "its sigmas are too small" in finding.text()
+
+
+def test_a_stated_start_that_the_map_contradicts_is_named(dive):
+    start = dive.calibration.start
+    x, y, z = start.position_m
+    moved = start.model_copy(update={"position_m": (x + 20.0, y, z)})
+    (finding,) = map_findings(with_map(dive, surveyed(dive), moved))
+    assert f"not at ({x + 20.0:.2f}, {y:.2f}) m" in finding.text()
+    assert 'start.source = "map"' in finding.line
+
+
+def test_identities_of_another_map_are_named_before_the_run_and_by_it(dive):
+    known = surveyed(dive)
+    other = KnownMap.of(range(21, 33), known.positions_m, sigma_m=SIGMA_M)
+    said = "none of the map's identities 21..32 was seen; seen: 1..12"
+    (finding,) = map_findings(with_map(dive, other))
+    assert said in finding.text()
+    estimator, _ = run(EkfSlam, with_map(dive, other, unknown_start(dive)))
+    (message,) = estimator.withheld()
+    assert said.replace("the map's", "its") in message
 
 
 def test_a_second_dive_starts_with_the_map_of_the_first(dive, tmp_path):

@@ -6,13 +6,18 @@ import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, with_options
 from sonar_graph.cli.outputs import progress_bars, working
 from sonar_graph.files import INTERRUPTED
+
+if TYPE_CHECKING:
+    from sonar_graph.batch import RecordedRun
+
+MOST_REASONS = 5
 
 
 @dataclass(frozen=True)
@@ -103,14 +108,29 @@ def bench(
         # the ordinary way waits for threads, also for those of workers that are gone
         os._exit(INTERRUPTED)
     only = options.only
-    counts = Counter(run.status for run in batch.runs if not only or run.key in only)
+    chosen = [run for run in batch.runs if not only or run.key in only]
+    counts = Counter(run.status for run in chosen)
     # those that ended first
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
+    for line in reasons_told(chosen):
+        echo(line, err=True)
     echo(f"Results: {output / 'results.parquet'}")
     echo(f"Report: {write_report_of(output, overwrite=options.overwrite)}")
     if set(counts) - {"ok"}:
         raise typer.Exit(1)
+
+
+def reasons_told(runs: list[RecordedRun]) -> list[str]:
+    """A line for each reason why runs did not end well, with their number, the most frequent first."""
+    reasons = Counter(
+        f"{run.status}: {run.reason}" for run in runs if run.status != "ok"
+    )
+    lines = [
+        f"  {number} {reason}" for reason, number in reasons.most_common(MOST_REASONS)
+    ]
+    more = len(reasons) - MOST_REASONS
+    return [*lines, f"  and {more} other reasons, in the report"] if more > 0 else lines
 
 
 def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:

@@ -32,6 +32,8 @@ from sonar_graph.states import FIRST_ANONYMOUS_ID
 
 FARTHEST_M = 0.5
 """Distance of a start from the truth that a rough survey of both makes."""
+FARTHEST_RAD = 0.1
+"""The same for its heading, with landmarks that are some metres away."""
 STAMPS_S = 1.0
 """Error of the truth's stamps that is no error of the start."""
 SEEN_WITHIN_S = 60.0
@@ -89,7 +91,8 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
     off[1:] -= start.position_m[:2]
     stated = [start.rpy_sigma_rad[2], *start.position_sigma_m[:2]]
     P = fit.start.covariance + np.diag(np.square(stated))
-    if float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
+    is_near = np.hypot(*off[1:]) <= FARTHEST_M and abs(off[0]) <= FARTHEST_RAD
+    if is_near or float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
         return
     stated_x, stated_y, _ = start.position_m
     yield Finding(

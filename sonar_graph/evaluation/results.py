@@ -112,6 +112,11 @@ class RunResult:
             self.reason
             or f"{len(self.causal or ())} estimates, {len(self.landmarks or ())} landmarks"
         )
+        if self.withheld:
+            more = len(self.withheld) - 1
+            end += f"; {self.withheld[0]}" + (
+                f" ({more} more in withheld)" * (more > 0)
+            )
         return f"RunResult({self.estimator!r}: {self.status}, {end})"
 
 

@@ -1,8 +1,9 @@
 """Check of a known map against the sightings of a log: other identities, axes, units and sigmas, another start.
 
 Where the sightings give no start in the map (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
-that then gives a start, with three or more landmarks, is named. A wrong sign of the heights leaves the start where it is
-and spoils ranges. It is named where the evidence (2) of the best start is `ODDS` times as large without it.
+that then gives a start, with three or more landmarks, is named. A wrong sign of the heights may leave the start where it
+is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, or where the
+evidence (2) of the best start is `ODDS` times as large with it.
 """
 
 import math
@@ -45,6 +46,8 @@ MISTAKES = {
     "it is in millimetres": 0.001 * np.eye(3),
 }
 """Mistake of a map, and the matrix that undoes it."""
+MORE_SHOWN = 0.25
+"""Share of the sightings that the vertical aperture allows only with the other sign of the heights."""
 SIGMA_FACTOR = 10.0
 
 
@@ -64,24 +67,24 @@ def map_fit(sequence: Sequence) -> MapFit:
     known = sequence.calibration.map
     assert known is not None
     start = first_start(sequence)
-    newest = sightings_of(sequence, known)
-    if len({sighting.row for sighting in newest}) < FEWEST:
+    given = followed(sequence, known)
+    if len({sighting.row for sighting in given.newest()}) < FEWEST:
         return MapFit(start)
+    negated = followed(sequence, undone(known, Z_UP))
+    is_hidden = shown(negated) - shown(given) > MORE_SHOWN
+    gain = 0.0 if start is None else evidence(negated) - evidence(given)
+    if is_hidden or gain > math.log(ODDS):
+        return MapFit(start, NEGATED, remedy_of(known, Z_UP))
     if start is not None:
-        negated = undone(known, Z_UP)
-        others = sightings_of(sequence, negated)
-        gain = evidence(others, negated) - evidence(newest, known)
-        if gain > math.log(ODDS):
-            return MapFit(start, NEGATED, remedy_of(known, Z_UP))
         return MapFit(start)
     for mistake, T in MISTAKES.items():
-        corrected = undone(known, T)
-        if fits(sightings_of(sequence, corrected), corrected):
+        corrected = followed(sequence, undone(known, T))
+        if fits(corrected.newest(), corrected.map):
             return MapFit(None, mistake, remedy_of(known, T))
     looser = known.model_copy(
         update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
     )
-    if fits(newest, looser):
+    if fits(given.newest(), looser):
         factor = f"give sigmas up to {SIGMA_FACTOR:g} times as large"
         return MapFit(None, "its sigmas are too small", factor)
     return MapFit(None)
@@ -99,13 +102,13 @@ def first_start(sequence: Sequence) -> FoundStart | None:
     return None
 
 
-def sightings_of(sequence: Sequence, known: KnownMap) -> list[MapSighting]:
-    """The newest sightings of a map's landmarks at the end of the part of the log that counts."""
+def followed(sequence: Sequence, known: KnownMap) -> MapLocator:
+    """The sightings of a map's landmarks in the part of the log that counts."""
     locator = MapLocator(sequence.calibration.model_copy(update={"map": known}))
     for window in first_windows(sequence):
         for _ in locator.frames_seen(window):
             pass
-    return locator.newest()
+    return locator
 
 
 def first_windows(sequence: Sequence) -> Iterator[Measurements]:
@@ -116,10 +119,16 @@ def first_windows(sequence: Sequence) -> Iterator[Measurements]:
     return sequence.replay(np.minimum(instants_ns, last_ns))
 
 
-def evidence(sightings: list[MapSighting], known: KnownMap) -> float:
+def evidence(locator: MapLocator) -> float:
     """Logarithm of the evidence of the best start; minus infinity without one."""
-    starts = candidates(map_data(sightings, known)) if sightings else []
+    newest = locator.newest()
+    starts = candidates(map_data(newest, locator.map)) if newest else []
     return starts[0].log_evidence if starts else -math.inf
+
+
+def shown(locator: MapLocator) -> float:
+    """Share of the sightings whose landmark is within the sonar's vertical aperture by its height in the map."""
+    return float(np.mean([sighting.is_in_view for sighting in locator.sightings]))
 
 
 def fits(sightings: list[MapSighting], known: KnownMap) -> bool:

@@ -90,6 +90,8 @@ class MapSighting(NamedTuple):
     """Place in o, shape (2,), m."""
     S: Floats
     """Its covariance, shape (2, 2), m²."""
+    is_in_view: bool = True
+    """False where the height of the landmark in the map puts it outside of the sonar's vertical aperture."""
 
 
 class FoundStart(NamedTuple):
@@ -117,7 +119,7 @@ class MapLocator:
         self._rows = {landmark_id: row for row, landmark_id in enumerate(self.map.ids)}
         self._odometry = Odometry(calibration)
         self._start_ns: int | None = None
-        self._sightings: list[MapSighting] = []
+        self.sightings: list[MapSighting] = []
         self._others: set[int] = set()
         """Identities that were seen and are not in the map."""
         sonar = calibration.sonar
@@ -141,7 +143,7 @@ class MapLocator:
 
     def lacking(self) -> str:
         """What is missing for a start."""
-        seen = len({sighting.row for sighting in self._sightings})
+        seen = len({sighting.row for sighting in self.sightings})
         if not seen and self._others:
             return f"none of its identities {listed(self.map.ids)} was seen; seen: {listed(self._others)}"
         if seen < 2:
@@ -201,14 +203,15 @@ class MapLocator:
             R_z = frame.range_azimuth_cov[k]
             R_z = self._R_z if np.isnan(R_z).any() else R_z
             S = spread(o_T_body, o_T_sonar, point, R_z, C)
-            self._sightings.append(MapSighting(row, point[:2], S))
+            is_in_view = elevation_rad is not None
+            self.sightings.append(MapSighting(row, point[:2], S, is_in_view))
         return True
 
     def newest(self) -> list[MapSighting]:
         """The newest sightings, a few of each landmark, in the order of time."""
         count: Counter[int] = Counter()
         newest = []
-        for sighting in reversed(self._sightings):
+        for sighting in reversed(self.sightings):
             count[sighting.row] += 1
             if count[sighting.row] <= MOST_OF_LANDMARK:
                 newest.append(sighting)

@@ -2,6 +2,7 @@
 
 from typing import Annotated
 
+import pytest
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
@@ -101,3 +102,12 @@ def test_nothing_that_a_terminal_obeys_is_printed(capsys):
     said = capsys.readouterr().out
     assert said.count(r"a\u001b[2J\u009b31m\u202eb\u000d\u0000 5 °") == 1
     assert not set(said) & set("\x1b\x9b\u202e\r\x00")
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["label", "recognise", "calibrate", "join", "calibration", "simulate landmarks"],
+)
+def test_a_command_that_has_no_use_for_a_map_refuses_it(run, basin, capsys, command):
+    assert run(*command.split(), basin, "--map", basin) == 2
+    assert "No such option: --map" in capsys.readouterr().err

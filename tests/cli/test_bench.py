@@ -4,7 +4,8 @@ import sys
 
 import sonar_graph
 from sonar_graph.cli.arguments import printable
-from tests.recorded_batches import written_batch
+from sonar_graph.cli.bench import MOST_REASONS, reasons_told
+from tests.recorded_batches import drawn_batch, failed, written_batch
 
 
 def test_missing_packages_are_named_with_how_to_get_them(
@@ -36,3 +37,15 @@ def test_report_rebuilds_page_and_tables_of_a_batch_and_warns_of_an_incomplete_o
         "Warning: This batch is not complete: 3 of 16 runs have not been done (dead-reckoning 1 of 8"
         in said.err
     )
+
+
+def test_reasons_why_runs_did_not_end_well_are_counted():
+    good, *others = drawn_batch(seeds=4).runs
+    slow = [failed(run) for run in others[:3]]
+    lost = [failed(run, "failed", f"reason {k}") for k, run in enumerate(others[3:9])]
+    lines = reasons_told([good, *slow, *lost])
+    assert lines[0] == "  3 timeout: took longer than 60 s"
+    assert lines[1] == "  1 failed: reason 0"
+    assert len(lines) == MOST_REASONS + 1
+    assert lines[-1] == "  and 2 other reasons, in the report"
+    assert reasons_told([good]) == []
