@@ -38,6 +38,11 @@ LEAST_GAIN = 60.0
 """Least drop of chi-square, by the noise that the best candidate leaves; 48 candidates come by chance to some 15."""
 LEAST_RATIO = 1.3
 """Least ratio of the sums of squares as they are and at the best candidate."""
+OTHER_UNIT = 1.3
+"""Scale, either way, from which on a unit is suspected."""
+LEAST_TURN_RAD = np.radians(20.0)
+MOST_MISFIT = 0.1
+"""Largest share of the squares of the accelerations that the best matrix leaves."""
 MOST_LEFT = 1.6
 """Largest ratio of the sum of squares at the best candidate and with any matrix: beyond it no candidate fits."""
 
@@ -54,6 +59,10 @@ class AxesMatch:
     """Typical misfit as read over that of the candidates."""
     is_vertical_sure: bool = True
     """False where the sign of the Doppler log's vertical axis does not matter for the fit."""
+    scale: float = 1.0
+    """The body's velocity is so many times the one as read; 1 where that is no other unit."""
+    is_mixed: bool = False
+    """True where a matrix fits that is no rotation."""
 
     @classmethod
     def as_read(cls) -> "AxesMatch":
@@ -90,13 +99,10 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
     is_clear = squares[0, 0] > LEAST_RATIO * best
     is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
-    if not (is_better and is_clear):
-        return AxesMatch.as_read()
-    if not is_fit:
-        turned = best_turn(
-            rows, candidates[handed > 0][squares[0, handed > 0].argmin()]
-        )
-        return turned or AxesMatch.as_read()
+    if not (is_better and is_clear and is_fit):
+        right_handed = candidates[handed > 0]
+        near = right_handed[squares[0, handed > 0].argmin()]
+        return scaled_turn(rows, near)
     # of candidates that fit as well the one that changes least
     changes_least = np.trace(candidates, axis1=1, axis2=2)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
@@ -114,27 +120,44 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
-def best_turn(rows: "SharedRows", near: Floats) -> AxesMatch | None:
-    """Rotation of the Doppler log, near a candidate, that no permutation describes; None where it fits badly.
+def scaled_turn(rows: "SharedRows", near: Floats) -> AxesMatch:
+    """Scale and rotation of the Doppler log, near a candidate, that no permutation describes; as read where they fit badly.
 
-    Such as that of a log that looks down and is turned by 45 degrees.
+    Such as those of a log in knots, or of one that looks down and is turned by 45 degrees. A matrix that is neither, and
+    leaves little, mixes axes, as velocities along beams are mixed.
     """
     from scipy.optimize import minimize
 
     Q = rows.quadratic_form(np.eye(3))
+    least = least_of(Q)
+    as_read = np.append(1.0, np.eye(3))
+    before = float(as_read @ Q @ as_read)
+    is_better = before > MOST_LEFT * least
+    is_better &= before - least > LEAST_GAIN * least / rows.freedom
+    # late rows fit badly in any axes
+    if not is_better or least > MOST_MISFIT * Q[0, 0]:
+        return AxesMatch.as_read()
 
-    def square(rotvec: Floats) -> float:
-        R = Rotation.from_rotvec(rotvec).as_matrix() @ near
-        entries = np.append(1.0, R)  # (10,)
+    def axes_of(values: Floats) -> tuple[float, Floats]:
+        return float(np.exp(values[0])), Rotation.from_rotvec(values[1:]).as_matrix()
+
+    def square(values: Floats) -> float:
+        scale, R = axes_of(values)
+        entries = np.append(1.0, scale * R @ near)  # (10,)
         return float(entries @ Q @ entries)
 
-    found = minimize(square, np.zeros(3))
-    if found.fun > MOST_LEFT * least_of(Q):
-        return None
-    as_read = np.append(1.0, np.eye(3))
-    ratio = float(np.sqrt(as_read @ Q @ as_read / found.fun))
-    R = Rotation.from_rotvec(found.x).as_matrix() @ near
-    return AxesMatch(np.eye(3), R, ratio)
+    found = minimize(square, np.zeros(4))
+    ratio = float(np.sqrt(before / found.fun))
+    if found.fun > MOST_LEFT * least:
+        return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=True)
+    scale, R = axes_of(found.x)
+    R = R @ near
+    is_turned = np.trace(R) < 1.0 + 2.0 * np.cos(LEAST_TURN_RAD)
+    # the fit of mounting and scale finds what is small, and what is turned about the vertical
+    is_turned &= R[2, 2] < np.cos(LEAST_TURN_RAD)
+    if 1 / OTHER_UNIT < scale < OTHER_UNIT:
+        scale = 1.0
+    return AxesMatch(np.eye(3), R if is_turned else np.eye(3), ratio, scale=scale)
 
 
 def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float | None:
