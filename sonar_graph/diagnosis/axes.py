@@ -41,8 +41,10 @@ LEAST_RATIO = 1.3
 OTHER_UNIT = 1.3
 """Scale, either way, from which on a unit is suspected."""
 LEAST_TURN_RAD = np.radians(20.0)
-MOST_MISFIT = 0.1
+MOST_MISFIT = 0.05
 """Largest share of the squares of the accelerations that the best matrix leaves."""
+OTHER_MATRIX = 10.0
+"""Least ratio of the sums of squares as they are and at the best matrix, for a matrix that is no permutation."""
 MOST_LEFT = 1.6
 """Largest ratio of the sum of squares at the best candidate and with any matrix: beyond it no candidate fits."""
 
@@ -101,8 +103,10 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
     if not (is_better and is_clear and is_fit):
         right_handed = candidates[handed > 0]
-        near = right_handed[squares[0, handed > 0].argmin()]
-        return scaled_turn(rows, near)
+        return other_matrix(
+            rows.quadratic_form(np.eye(3)),
+            right_handed[squares[0, handed > 0].argmin()],
+        )
     # of candidates that fit as well the one that changes least
     changes_least = np.trace(candidates, axis1=1, axis2=2)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
@@ -120,44 +124,47 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
-def scaled_turn(rows: "SharedRows", near: Floats) -> AxesMatch:
-    """Scale and rotation of the Doppler log, near a candidate, that no permutation describes; as read where they fit badly.
+def other_matrix(Q: Floats, near: Floats) -> AxesMatch:
+    """Scale or rotation of the Doppler log, near a candidate, that no permutation describes; as read where they fit badly.
 
     Such as those of a log in knots, or of one that looks down and is turned by 45 degrees. A matrix that is neither, and
-    leaves little, mixes axes, as velocities along beams are mixed.
+    leaves little, mixes axes, as velocities along beams are mixed. Q: quadratic form of `SharedRows`.
     """
+    least = least_of(Q)
+    as_read = square_of(Q, np.eye(3))
+    most = MOST_LEFT * least
+    # late rows fit badly in any axes
+    if as_read < OTHER_MATRIX * least or least > MOST_MISFIT * Q[0, 0]:
+        return AxesMatch.as_read()
+    ratio = float(np.sqrt(as_read / least))
+    identity = np.eye(3).ravel()
+    scale = -float(Q[0, 1:] @ identity) / float(identity @ Q[1:, 1:] @ identity)
+    if square_of(Q, scale * np.eye(3)) < most:
+        is_unit = scale > 0 and not 1 / OTHER_UNIT < scale < OTHER_UNIT
+        return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)
+    R = turned(Q, near)
+    if square_of(Q, R) < most:
+        # a turn about the vertical is that of the fit of mountings
+        is_tilted = R[2, 2] < np.cos(LEAST_TURN_RAD)
+        return AxesMatch(np.eye(3), R if is_tilted else np.eye(3), ratio)
+    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=True)
+
+
+def turned(Q: Floats, near: Floats) -> Floats:
+    """Rotation near a candidate that fits best, shape (3, 3)."""
     from scipy.optimize import minimize
 
-    Q = rows.quadratic_form(np.eye(3))
-    least = least_of(Q)
-    as_read = np.append(1.0, np.eye(3))
-    before = float(as_read @ Q @ as_read)
-    is_better = before > MOST_LEFT * least
-    is_better &= before - least > LEAST_GAIN * least / rows.freedom
-    # late rows fit badly in any axes
-    if not is_better or least > MOST_MISFIT * Q[0, 0]:
-        return AxesMatch.as_read()
+    def square(rotvec: Floats) -> float:
+        return square_of(Q, Rotation.from_rotvec(rotvec).as_matrix() @ near)
 
-    def axes_of(values: Floats) -> tuple[float, Floats]:
-        return float(np.exp(values[0])), Rotation.from_rotvec(values[1:]).as_matrix()
+    found = minimize(square, np.zeros(3))
+    return np.asarray(Rotation.from_rotvec(found.x).as_matrix() @ near)
 
-    def square(values: Floats) -> float:
-        scale, R = axes_of(values)
-        entries = np.append(1.0, scale * R @ near)  # (10,)
-        return float(entries @ Q @ entries)
 
-    found = minimize(square, np.zeros(4))
-    ratio = float(np.sqrt(before / found.fun))
-    if found.fun > MOST_LEFT * least:
-        return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=True)
-    scale, R = axes_of(found.x)
-    R = R @ near
-    is_turned = np.trace(R) < 1.0 + 2.0 * np.cos(LEAST_TURN_RAD)
-    # the fit of mounting and scale finds what is small, and what is turned about the vertical
-    is_turned &= R[2, 2] < np.cos(LEAST_TURN_RAD)
-    if 1 / OTHER_UNIT < scale < OTHER_UNIT:
-        scale = 1.0
-    return AxesMatch(np.eye(3), R if is_turned else np.eye(3), ratio, scale=scale)
+def square_of(Q: Floats, P: Floats) -> float:
+    """Sum of squares of r(1, P), by the quadratic form of `SharedRows`."""
+    entries = np.append(1.0, P)  # (10,)
+    return float(entries @ Q @ entries)
 
 
 def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float | None:
