@@ -81,7 +81,9 @@ class DepthSamples(NamedTuple):
     def refused(self) -> list[RefusedRow]:
         """The samples that are not used, but for repeated ones."""
         columns = (
-            self.stamps_ns.tolist(), self.treatment.tolist(), self.distance.tolist()
+            self.stamps_ns.tolist(),
+            self.treatment.tolist(),
+            self.distance.tolist(),
         )
         return [
             RefusedRow("depth", stamp_ns, REASONS[treatment], distance)
