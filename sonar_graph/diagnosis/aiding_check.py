@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.diagnosis.causes import (
+    AS_GOOD,
     DEVIATION,
     DRIFT,
     OF_FIXES,
@@ -45,6 +46,7 @@ from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
+    STEP_RATIO,
     Match,
     SignalStretch,
     Values,
@@ -83,6 +85,7 @@ LEAST_MOVED = 1.0
 """Motion in sigmas of a row, below which nothing is known of a sensor."""
 STUCK_MOVED = 10.0
 """The same for a sensor that is stuck."""
+STEP_GAIN_ERROR = 0.1
 MOST_MISFIT = 0.3
 """Share of its changes that the reference does not explain, from which on a sensor contradicts it."""
 LARGEST_SCATTER = 10.0
@@ -413,7 +416,10 @@ def findings_of(
     row = Finding(quantity, gain, cause=NO_NEED)
     fault = grave_fault(check, replace(found, gain=gain), sequence, config)
     if fault is None:
-        by_cause = cause_of(check.name, check.causes, found, sequence.calibration)
+        # a gain that is a unit has no other cause, unless that fits better
+        most = 1 / AS_GOOD if unit_of(check, gain) else AS_GOOD
+        known = sequence.calibration
+        by_cause = cause_of(check.name, check.causes, found, known, most)
         if by_cause is not None:
             return [by_cause]
         fault = odd_gain(check, replace(found, gain=gain), sequence, config)
@@ -450,7 +456,7 @@ def findings_of(
 def grave_fault(
     check: Check, found: Match, sequence: Sequence, config: LogConfig
 ) -> Advice | None:
-    """Cause and line of a fault beyond doubt: stuck, a jump, another sense, or a unit with a name; None: none."""
+    """Cause and line of a fault beyond doubt: stuck, a jump, or another sense; None without one."""
     gain = found.gain
     size = abs(gain.value)
     sigma = check.sigma(sequence)
@@ -460,16 +466,18 @@ def grave_fault(
         verb = "turns" if check is HEADING else "changes"
         cause = f"it hardly {verb} where {check.against} do: stuck, or not of the body"
         return Advice(cause, unused(check.role))
-    if check.step_unit and (jumps := step_text(found, sigma, check.step_unit)):
+    # a wrong scale or delay shows in steps where the motion has some
+    is_right = abs(gain.value - 1.0) < STEP_GAIN_ERROR
+    is_right &= not matters(found.lag, check.least_lag_s)
+    ratio = 1.0 if is_right else STEP_RATIO
+    jumps = check.step_unit and step_text(found, sigma, check.step_unit, ratio)
+    if jumps:
         cause = f"it jumps against {check.against}, {jumps}"
         return Advice(cause, f"{unused(check.role)} leaves it out")
     # another sense or unit is one where the sensor agrees with it
     is_borne_out = found.misfit < MOST_MISFIT
     is_opposite = found.is_mirrored or (gain.is_known and gain.value < 0)
-    if is_opposite and is_borne_out:
-        return check.sense(config)
-    # a gain without a unit's name may have another cause
-    return odd_gain(check, found, sequence, config) if unit_of(check, gain) else None
+    return check.sense(config) if is_opposite and is_borne_out else None
 
 
 def odd_gain(
@@ -925,6 +933,8 @@ def led_to_fixes(
     is_stated = {"position_m", "rpy_rad"} <= start.model_fields_set
     if not is_stated or start.source != "stated":
         return None
+    if any(start_heading_findings(right, motion)):
+        return None
     begin_s = float(motion.since_origin(np.array([right.start_ns]))[0])
     t = motion.since_origin(fixes.stamps_ns)
     path = motion.path_m * np.exp(1j * start.rpy_rad[2])
@@ -986,7 +996,8 @@ def distance_finding(
     before = np.array(config.table("positions").get("origin_m", np.zeros(3)), float)
     return replace(
         row,
-        cause=f"they begin {place}, beyond their noise and the way to them: a map grid (UTM), or another scale or place?",
+        cause=f"they begin {place}, beyond their noise and the way to them: a map grid (UTM), or another scale, place or "
+        "start heading?",
         line=f"`origin_m = {numbers(before + off, 1)}` under [positions] {IN_LOG_CONFIG} {more}",
         gravity=Gravity.GRAVE,
     )

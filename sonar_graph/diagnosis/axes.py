@@ -38,6 +38,13 @@ LEAST_GAIN = 60.0
 """Least drop of chi-square, by the noise that the best candidate leaves; 48 candidates come by chance to some 15."""
 LEAST_RATIO = 1.3
 """Least ratio of the sums of squares as they are and at the best candidate."""
+OTHER_UNIT = 1.3
+"""Scale, either way, from which on a unit is suspected."""
+LEAST_TURN_RAD = np.radians(20.0)
+MOST_MISFIT = 0.05
+"""Largest share of the squares of the accelerations that the best matrix leaves."""
+OTHER_MATRIX = 10.0
+"""Least ratio of the sums of squares as they are and at the best matrix, for a matrix that is no permutation."""
 MOST_LEFT = 1.6
 """Largest ratio of the sum of squares at the best candidate and with any matrix: beyond it no candidate fits."""
 
@@ -54,6 +61,10 @@ class AxesMatch:
     """Typical misfit as read over that of the candidates."""
     is_vertical_sure: bool = True
     """False where the sign of the Doppler log's vertical axis does not matter for the fit."""
+    scale: float = 1.0
+    """The body's velocity is so many times the one as read; 1 where that is no other unit."""
+    is_mixed: bool = False
+    """True where a matrix fits that is no rotation."""
 
     @classmethod
     def as_read(cls) -> "AxesMatch":
@@ -90,13 +101,12 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
     is_clear = squares[0, 0] > LEAST_RATIO * best
     is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
-    if not (is_better and is_clear):
-        return AxesMatch.as_read()
-    if not is_fit:
-        turned = best_turn(
-            rows, candidates[handed > 0][squares[0, handed > 0].argmin()]
+    if not (is_better and is_clear and is_fit):
+        right_handed = candidates[handed > 0]
+        return other_matrix(
+            rows.quadratic_form(np.eye(3)),
+            right_handed[squares[0, handed > 0].argmin()],
         )
-        return turned or AxesMatch.as_read()
     # of candidates that fit as well the one that changes least
     changes_least = np.trace(candidates, axis1=1, axis2=2)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
@@ -114,27 +124,47 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
-def best_turn(rows: "SharedRows", near: Floats) -> AxesMatch | None:
-    """Rotation of the Doppler log, near a candidate, that no permutation describes; None where it fits badly.
+def other_matrix(Q: Floats, near: Floats) -> AxesMatch:
+    """Scale or rotation of the Doppler log, near a candidate, that no permutation describes; as read where they fit badly.
 
-    Such as that of a log that looks down and is turned by 45 degrees.
+    Such as those of a log in knots, or of one that looks down and is turned by 45 degrees. A matrix that is neither, and
+    leaves little, mixes axes, as velocities along beams are mixed. Q: quadratic form of `SharedRows`.
     """
+    least = least_of(Q)
+    as_read = square_of(Q, np.eye(3))
+    most = MOST_LEFT * least
+    # late rows fit badly in any axes
+    if as_read < OTHER_MATRIX * least or least > MOST_MISFIT * Q[0, 0]:
+        return AxesMatch.as_read()
+    ratio = float(np.sqrt(as_read / least))
+    identity = np.eye(3).ravel()
+    scale = -float(Q[0, 1:] @ identity) / float(identity @ Q[1:, 1:] @ identity)
+    if square_of(Q, scale * np.eye(3)) < most:
+        is_unit = scale > 0 and not 1 / OTHER_UNIT < scale < OTHER_UNIT
+        return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)
+    R = turned(Q, near)
+    if square_of(Q, R) < most:
+        # a turn about the vertical is that of the fit of mountings
+        is_tilted = R[2, 2] < np.cos(LEAST_TURN_RAD)
+        return AxesMatch(np.eye(3), R if is_tilted else np.eye(3), ratio)
+    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=True)
+
+
+def turned(Q: Floats, near: Floats) -> Floats:
+    """Rotation near a candidate that fits best, shape (3, 3)."""
     from scipy.optimize import minimize
 
-    Q = rows.quadratic_form(np.eye(3))
-
     def square(rotvec: Floats) -> float:
-        R = Rotation.from_rotvec(rotvec).as_matrix() @ near
-        entries = np.append(1.0, R)  # (10,)
-        return float(entries @ Q @ entries)
+        return square_of(Q, Rotation.from_rotvec(rotvec).as_matrix() @ near)
 
     found = minimize(square, np.zeros(3))
-    if found.fun > MOST_LEFT * least_of(Q):
-        return None
-    as_read = np.append(1.0, np.eye(3))
-    ratio = float(np.sqrt(as_read @ Q @ as_read / found.fun))
-    R = Rotation.from_rotvec(found.x).as_matrix() @ near
-    return AxesMatch(np.eye(3), R, ratio)
+    return np.asarray(Rotation.from_rotvec(found.x).as_matrix() @ near)
+
+
+def square_of(Q: Floats, P: Floats) -> float:
+    """Sum of squares of r(1, P), by the quadratic form of `SharedRows`."""
+    entries = np.append(1.0, P)  # (10,)
+    return float(entries @ Q @ entries)
 
 
 def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float | None:

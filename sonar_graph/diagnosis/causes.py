@@ -250,9 +250,16 @@ OF_RANGES = CURRENT(columns=of_way, wanted=2)
 
 
 def cause_of(
-    name: str, causes: tuple[Cause, ...], found: Match, calibration: Calibration
+    name: str,
+    causes: tuple[Cause, ...],
+    found: Match,
+    calibration: Calibration,
+    most: float = AS_GOOD,
 ) -> Finding | None:
-    """The cause that explains a sensor best; None: none does, or one that is too small to matter does as well."""
+    """The cause that explains a sensor best; None: none does, or one that is too small to matter does as well.
+
+    ``most``: largest ratio of the scatter to that of the best gain and delay.
+    """
     fits = list[tuple[Explained, Cause]]()
     for cause in causes:
         result = explained(found.stretches, cause.columns, cause.wanted)
@@ -261,7 +268,7 @@ def cause_of(
     if not fits:
         return None
     result, cause = min(fits, key=lambda fit: fit[0].after)
-    if result.after > AS_GOOD * found.scatter:
+    if result.after > most * found.scatter:
         return None
     for rival, other in fits:
         is_small = float(np.linalg.norm(rival.q)) < other.least(calibration)
@@ -281,12 +288,12 @@ def cause_of(
     )
 
 
-def step_text(found: Match, sigma: float, unit: str) -> str:
+def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
     """Size and times of steps of a sensor beyond its reference; empty without any."""
     texts = list[str]()
     for whole in found.whole:
         x = turned_to(whole.y, whole.shifted(np.zeros(1))[0])
-        for step in steps(whole.seconds, whole.y, x, sigma):
+        for step in steps(whole.seconds, whole.y, x, sigma, ratio):
             size = np.degrees(step.size) if unit == "°" else step.size
             texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
     return " and ".join(texts[:LONGEST_LIST])

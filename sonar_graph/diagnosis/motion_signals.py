@@ -199,7 +199,7 @@ def filled(values: Floats) -> Floats:
     is_measured = np.isfinite(values).all(axis=1)
     if is_measured.all() or not is_measured.any():
         return values
-    row = np.arange(len(values))
+    row = np.arange(len(values), dtype=np.float64)
     return columns_at(row, row[is_measured], values[is_measured])
 
 

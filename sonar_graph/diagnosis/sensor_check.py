@@ -100,6 +100,7 @@ from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
 ANY_AXES = "axes of gyros, accelerometers or Doppler log"
+NO_AXES = "no axes of the vehicle"
 CONTRADICTED = "they contradict each other"
 START_TILT = ("start roll", "start pitch")
 COMPARED = "log.compared"
@@ -117,6 +118,8 @@ LARGEST_DENSITY_RATIO = 1.5
 """Ratio to the calibration's density, either way, from which on a line is advised."""
 LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
+BIAS_SIGMA_RATIO = 1.4
+"""Root mean square of error over sigma of the fitted gyro bias: the fit takes errors of a Doppler log for white."""
 CERTAIN_SIGMAS = 4.0
 PAIRED_SIGMAS = 2.0
 LEAST_TOGETHER_S = 0.1
@@ -187,6 +190,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         return coarse
     forces, sequence = force_findings(sequence, config)
     axes, sequence = tried_axes(sequence, config)
+    if any(finding.estimate.reason == NO_AXES for finding in axes):
+        return [*forces, *axes]
     match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
     if matters(match.yaw, LARGE_TURN_RAD):
         pair = TurnedPair(sequence, match.yaw.value)
@@ -199,6 +204,10 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if rates := rate_findings(sequence, config):
         return [*forces, *axes, *rates]
     is_turned = any(finding.quantity == YAW for finding in axes)
+    x, y, z = (
+        replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias
+    )
+    match = replace(match, gyro_bias=(x, y, z))
     if lacks_gravity(sequence):
         match = replace(match, gyro_bias=(unknown(NO_GRAVITY),) * 3)
     of_dvl = dvl_findings(match, sequence, config)
@@ -313,6 +322,8 @@ def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
         return coarse
     forces, right = force_findings(right, config)
     axes, right = tried_axes(right, config)
+    if any(finding.estimate.reason == NO_AXES for finding in axes):
+        return [*forces, *axes]
     if rates := rate_findings(right, config):
         return worst_first([*forces, *axes, *rates])
     found = worst_first([*forces, *axes, *motion_findings(right, config)])
@@ -410,7 +421,7 @@ def no_axes_finding(quantity: str, cause: str) -> Finding:
     """Gyros, accelerometers and Doppler log that no axes bring together."""
     return Finding(
         quantity,
-        unknown("no axes of the vehicle"),
+        unknown(NO_AXES),
         cause=cause,
         line="name a `topic` under [dvl] or [imu] with values in axes of the vehicle or of the sensor "
         f"{IN_LOG_CONFIG}",
@@ -434,6 +445,14 @@ def axes_findings(
     found = match_axes(sequence.imu, sequence.dvl, calibration)
     if found is None:
         return [], sequence
+    if found.is_mixed:
+        cause = (
+            f"velocities change as the IMU measures, {found.ratio:.2g} times closer, "
+            "with axes that are no rotation: along beams, or of wrong scale"
+        )
+        return [no_axes_finding("DVL axes", cause)], sequence
+    if found.scale != 1.0:
+        return scaled_dvl(found, sequence, config)
     is_as_read = (found.gyro == np.eye(3)).all() and (found.dvl == np.eye(3)).all()
     if not is_as_read and found.ratio < CLEARLY_BETTER:
         cause = f"{CONTRADICTED}, and no axes fit clearly better"
@@ -464,6 +483,23 @@ def axes_findings(
         findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
+
+
+def scaled_dvl(
+    found: AxesMatch, sequence: Sequence, config: LogConfig
+) -> tuple[list[Finding], Sequence]:
+    """Another unit of the velocities, and the sequence with it put right."""
+    scale = config.number("dvl", "scale", 1.0) * found.scale
+    finding = Finding(
+        "DVL: unit",
+        unknown("wrong unit"),
+        cause=f"velocities change {1 / found.scale:.3g} times as much as the IMU measures",
+        line=f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}",
+        gravity=Gravity.GRAVE,
+    )
+    dvl = sequence.dvl
+    scaled = Dvl(dvl.stamps_ns, found.scale * dvl.velocity, dvl.velocity_cov)
+    return [finding], replace(sequence, dvl=scaled)
 
 
 def force_axes(

@@ -311,10 +311,13 @@ def tilt_findings(
     )
     if start.source == "stated" and "rpy_rad" in start.model_fields_set:
         turned = calibration.imu.mounting
-        for axis, angle, given in zip("xy", (roll, pitch), start.rpy_rad, strict=False):
-            rpy_rad = turned_mounting(turned, angle.value - given, axis)
+        for about, angle, stated_rad in zip(
+            "xy", (roll, pitch), start.rpy_rad, strict=False
+        ):
+            rpy_rad = turned_mounting(turned, angle.value - stated_rad, about)
             turned = turned.model_copy(update={"rpy_rad": rpy_rad})
-        line += f" or, if that start is sure, `imu.mounting.rpy_rad = {numbers(turned.rpy_rad, 4)}`"
+        of_imu = f"`imu.mounting.rpy_rad = {numbers(turned.rpy_rad, 4)}`"
+        line += f" or, if that start is sure, {of_imu}"
     rows = list[Finding]()
     for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
         given = start.rpy_rad[axis]

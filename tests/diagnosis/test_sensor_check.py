@@ -508,7 +508,7 @@ def test_a_heading_that_drifts_against_a_bias_by_the_drive_is_wrong_and_not_the_
 def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> None:
     run = RIGHT
     if sensor == "DVL":
-        velocity = np.trunc(10.0 * run.dvl.velocity) / 10.0
+        velocity = 0.2 * np.trunc(5.0 * run.dvl.velocity)
         run = replace(run, dvl=replace(run.dvl, velocity=velocity))
     elif sensor == "gyro":
         rate = np.trunc(20.0 * run.imu.angular_velocity) / 20.0
@@ -516,7 +516,7 @@ def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> N
     elif sensor == "depth":
         assert run.depth is not None
         run = replace(
-            run, depth=replace(run.depth, z_m=np.trunc(run.depth.z_m * 2) / 2)
+            run, depth=replace(run.depth, z_m=0.6 * np.trunc(run.depth.z_m / 0.6))
         )
     findings = sensor_check.check_sensors(run)
     found = [f.quantity for f in findings if f.acts]

@@ -336,5 +336,6 @@ def repeats(velocity: Floats) -> Mask:
     shares = (is_same.mean(), (lengths > 1).mean())
     is_habit = min(shares) >= LEAST_REPEATED and len(lengths) >= FEWEST_STEPS
     changes = np.diff(velocity, axis=0)[~is_equal] != 0
-    is_habit &= bool(changes[:, changes.any(axis=0)].mean() >= LEAST_CHANGING)
+    changes = changes[:, changes.any(axis=0)]
+    is_habit &= bool(changes.size and changes.mean() >= LEAST_CHANGING)
     return is_same & is_habit

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters.aiding_messages import is_unwrapped
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.measurements import UNMEASURED_M2
 
@@ -322,3 +323,11 @@ def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
     stated = foreign.read(*aided(), calibration=calibration)
     assert stated.calibration.start.rpy_rad == (0, 0, 1)
     assert stated.notes["log.start"].startswith("of the start only rpy_rad stated")
+
+
+def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not() -> None:
+    turns = np.linspace(0.3, 9.0, 50)
+    assert is_unwrapped(turns)
+    assert not is_unwrapped(np.degrees(turns))
+    assert not is_unwrapped(np.degrees(turns) % 360)
+    assert not is_unwrapped(turns + 90)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.logs import read_log, write_log
+from sonar_graph.logs.adapters.dvl_messages import repeats
 from sonar_graph.testing import small_world
 from tests.logs.adapters.conftest import imu, rows_of, tree
 from tests.logs.conftest import Entry, vector
@@ -186,3 +187,13 @@ def test_a_log_that_this_package_wrote_keeps_every_velocity(tmp_path: Path) -> N
     )
     with_whole = read_log(tmp_path / "own.mcap", calibration=world.calibration)
     np.testing.assert_array_equal(with_whole.dvl.velocity, velocity)
+
+
+def test_a_held_velocity_is_a_drivers_habit_and_a_coarse_one_is_none() -> None:
+    fine = np.random.default_rng(0).standard_normal((60, 3))
+    held = np.repeat(fine, 2, axis=0)
+    assert repeats(held).sum() == 60
+    t = np.arange(120) * 0.1
+    coarse = np.round(np.column_stack([np.sin(t), np.cos(0.7 * t), 0 * t]), 1)
+    assert (np.diff(coarse, axis=0) == 0).all(axis=1).sum() > 20
+    assert not repeats(coarse).any()
