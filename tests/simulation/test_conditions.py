@@ -124,19 +124,6 @@ def test_contrast_changes_bright_parts_and_not_the_plate():
     np.testing.assert_array_equal(worn.relief_m, FRESH.relief_m)
 
 
-def test_foam_stands_on_its_plate_with_its_face_where_it_was():
-    flush = landmark(foam_height_m=0.0)
-    deepest = landmark(foam_height_m=0.1)
-    for one in (FRESH, deepest):
-        np.testing.assert_array_equal(one.relief_m[FOAM], flush.relief_m[FOAM])
-    np.testing.assert_allclose(
-        FRESH.relief_m[PLATE], flush.relief_m[PLATE] - TRIANGLE.relief_m, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        deepest.relief_m[PLATE], flush.relief_m[PLATE] - TRIANGLE.height_m, atol=1e-6
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "share"), [("sediment", 0.25), ("sediment", 1.0), ("fouling", 0.4)]
 )
