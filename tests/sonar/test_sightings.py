@@ -135,33 +135,6 @@ def test_what_is_not_in_view_is_compared_with_nothing(
     )
 
 
-def test_candidates_of_one_frame_are_seen_as_each_alone(triangle):
-    """Of three the middle one is not in view, and its row of the others is not the frame's."""
-    places = [polar(xy) for xy in ((1.7, 0.07), (1.7, 0.75), (1.69, 0.04))]
-    look = CandidateFit(
-        FLUSH,
-        AppearanceParams(),
-        MODEL.model_copy(update={"height_bias_m": 0.02}),
-        APERTURE_RAD,
-    )
-
-    def seen(*of: tuple[float, float]) -> list[ObjectSighting]:
-        return look.at(
-            triangle,
-            frame(triangle),
-            VIEW,
-            candidates_at(*map(list, zip(*of, strict=True))),
-            np.arange(len(of)),
-        )
-
-    for one, (other,) in zip(seen(*places), map(seen, places), strict=True):
-        assert (one.fit is None) == (other.fit is None)
-        assert (one.range_m, one.azimuth_rad, one.range_per_height) == pytest.approx(
-            (other.range_m, other.azimuth_rad, other.range_per_height), rel=1e-12
-        )
-        np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
 def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image():
     """A design drawn in that plane is found; on the floor's grid it would be foreshortened."""
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
