@@ -95,7 +95,7 @@ def test_a_package_is_a_short_table_of_contents_with_few_modules(path: Path) -> 
     assert len([p for p in path.parent.glob("*.py") if p.name != "__init__.py"]) <= 13
 
 
-# Folders of which each imports files of the other. The list may only become shorter.
+# Folders that import files of each other. The list may only become shorter.
 KNOWN_MUTUAL_FOLDERS = {
     ("sonar_graph/navigation", "sonar_graph/navigation/dvl_screening"),
     ("sonar_graph/report", "sonar_graph/report/figures"),

@@ -22,7 +22,7 @@ from sonar_graph.measurements import (
 
 
 def depth(stamps_ns: list[int]) -> Depth:
-    """Rows whose height says which row they were."""
+    """Rows whose height is their number."""
     return Depth(
         np.array(stamps_ns),
         np.arange(len(stamps_ns), dtype=float),
@@ -272,7 +272,7 @@ def test_rows_after_the_end_of_a_call_are_refused_by_name(block):
 
 
 def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
-    """Unknown noise (NaN) is none of them, and of a covariance only what rounding of single precision explains."""
+    """Unknown noise (NaN) is not one of them, and of a covariance only what rounding of single precision explains."""
     sigmas = [np.nan, 0.01, 0.0, -1.0, np.inf]
     assert Heading(
         np.arange(5), np.zeros(5), np.array(sigmas)

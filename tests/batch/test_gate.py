@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from regression_gate import GateVerdict, bless, gate
 
-from sonar_graph.batch.recorded import RecordedBatch
+from sonar_graph.batch import RecordedBatch
 from tests.recorded_batches import (
     LOGS,
     changed,

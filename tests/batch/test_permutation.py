@@ -17,7 +17,7 @@ from permutation import (
 )
 from scipy import stats
 
-from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch import ALL_LOGS
 
 
 def family(beyond: np.ndarray, share: float = 1.0) -> Family:

@@ -55,7 +55,8 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
     store.write("done", OUTCOME)
     before = names(tmp_path)
     written = 0
-    write, write_text = Path.write_bytes, Path.write_text
+    write = Path.write_bytes
+    write_text = Path.write_text
 
     def full(self: Path, *content: Any) -> int:
         nonlocal written

@@ -1,4 +1,4 @@
-"""The calibration file to begin from says what there is, and changes nothing until somebody edits it."""
+"""The calibration file to begin from lists what there is, and changes nothing until it is edited."""
 
 import re
 import tomllib

@@ -1,4 +1,4 @@
-"""Wrong uses on the way from own files to a report: one line each, which names the place and says what to do."""
+"""Wrong uses on the way from own files to a report: one line each, with the place and what to do."""
 
 import re
 from dataclasses import replace
@@ -34,7 +34,8 @@ def rows(stamps_ns: np.ndarray, *columns: np.ndarray) -> list[str]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Tables and logs of one dive, good ones and spoilt ones."""
-    path, world = tmp_path_factory.mktemp("own"), small_world()
+    path = tmp_path_factory.mktemp("own")
+    world = small_world()
     imu = [
         "time,wx,wy,wz,ax,ay,az",
         *rows(
@@ -42,7 +43,10 @@ def folder(tmp_path_factory) -> Path:
         ),
     ]
     dvl = ["time,vx,vy,vz", *rows(world.dvl.stamps_ns, world.dvl.velocity)]
-    word, short, late, time = list(imu), list(imu), list(imu), list(imu)
+    word = list(imu)
+    short = list(imu)
+    late = list(imu)
+    time = list(imu)
     word[7] = word[7].replace(",", ",fast,", 1).rpartition(",")[0]
     short[9] = short[9].rpartition(",")[0]
     late[20], late[900] = late[900], late[20]

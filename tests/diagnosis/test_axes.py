@@ -1,4 +1,4 @@
-"""Axes of gyros and Doppler log: each wrong candidate is found, told apart, and a right log is left as it is."""
+"""Axes of gyros and Doppler log: each wrong candidate is found and distinguished, and a right log is left as it is."""
 
 from dataclasses import replace
 
@@ -13,9 +13,9 @@ from sonar_graph.diagnosis.axes import (
     signed_permutations,
     turns_less_than_body,
 )
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .test_sensor_check import line_of
 

@@ -10,10 +10,10 @@ from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import aiding_check
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Heading, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 RUN = simulate_mission(MissionOptions(seed=4, duration_s=100.0, landmarks=1))
 

@@ -9,22 +9,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.diagnosis import sensor_check
-from sonar_graph.diagnosis.findings import Finding, Gravity
+from sonar_graph.diagnosis import Finding, sensor_check
+from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import range_changes, wrong_units
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Heading, Imu
-from sonar_graph.navigation.alignment import InitialTilt
-from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
-from sonar_graph.navigation.alignment.time_offset import Estimate1D
+from sonar_graph.navigation.alignment import DvlMatch, Estimate1D, InitialTilt
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
 
 RIGHT = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
 SHORT = simulate_mission(MissionOptions(seed=4, duration_s=120, landmarks=1))
-OFFSET_S, YAW_RAD, SCALE = 0.4, np.radians(5), 1.04
+OFFSET_S = 0.4
+YAW_RAD = np.radians(5)
+SCALE = 1.04
 FAR_M = (0.9, 0.0, -0.7)
 """Where a calibration has the IMU that is at the origin; the Doppler log is at (-0.2, 0, -0.15) from it."""
 
@@ -91,10 +91,8 @@ def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
         for name, finding in found.items()
         if finding.acts and "`" in finding.advice
     }
-    shift_s, scale = (
-        lines["DVL against IMU: time offset"]["stamp_offset_s"],
-        lines["DVL scale"]["scale"],
-    )
+    shift_s = lines["DVL against IMU: time offset"]["stamp_offset_s"]
+    scale = lines["DVL scale"]["scale"]
     rpy = tuple(lines["DVL mounting yaw"]["dvl"]["mounting"]["rpy_rad"])
     place = tuple(
         lines["lever arm from IMU to DVL, x"]["imu"]["mounting"]["translation_m"]
@@ -233,8 +231,10 @@ def test_a_hole_of_the_imu_asks_for_nothing(
     ("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)]
 )
 def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told: bool):
-    rng, n = np.random.default_rng(0), 5000
-    force, rate = 0.05 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
+    rng = np.random.default_rng(0)
+    n = 5000
+    force = 0.05 * rng.standard_normal((n, 3))
+    rate = 0.01 * rng.standard_normal((n, 3))
     velocity = [speed_m_s, 0, 0] + 0.01 * rng.standard_normal((250, 3))
     found = by_name(sensor_check.check_sensors(with_rows(rate, force, velocity)))
     for name in ("gyro noise density", "accelerometer noise density"):
@@ -323,14 +323,10 @@ def units(
     **scales: dict[str, float],
 ) -> list[Finding]:  # fmt: skip
     """Wrong units of readings so long; a force may be rows."""
-    stamps_ns, forces = (
-        np.arange(N) * 10_000_000,
-        force if np.ndim(force) == 2 else vectors(force),
-    )
-    imu, dvl = (
-        Imu(stamps_ns, vectors(turn), forces),
-        Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan)),
-    )
+    stamps_ns = np.arange(N) * 10_000_000
+    forces = force if np.ndim(force) == 2 else vectors(force)
+    imu = Imu(stamps_ns, vectors(turn), forces)
+    dvl = Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan))
     sequence = Sequence("hand", Calibration(gravity_m_s2=gravity), imu, dvl)
     return wrong_units(sequence, LogConfig.parse(scales, "x"))
 
@@ -362,7 +358,8 @@ SLOW = simulate_mission(
 
 
 def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_or_landmarks_few():
-    rng, velocity = np.random.default_rng(0), SLOW.dvl.velocity
+    rng = np.random.default_rng(0)
+    velocity = SLOW.dvl.velocity
     spikes = velocity + 8.0 * (rng.random((len(velocity), 1)) < 0.2)
     for wrong in (velocity[:, [1, 2, 0]], -velocity, spikes):
         run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=wrong))
@@ -400,7 +397,7 @@ def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
 def test_slow_rates_in_degrees_are_told_by_gravity():
     """They tilt the vehicle 57 times farther than gravity turns in the accelerometers; radians, by as much.
 
-    A constant bias tilts nothing. Without accelerometers nothing is said.
+    A constant bias tilts nothing. Without accelerometers there is no finding.
     """
     imu = RIGHT.imu
     for turn, acts in ((np.degrees(1.0), True), (1.0, False)):

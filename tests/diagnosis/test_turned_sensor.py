@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.diagnosis import check_sensors
-from sonar_graph.diagnosis.findings import Finding
+from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Heading, PositionFixes
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .test_sensor_check import line_of
 

@@ -130,7 +130,8 @@ def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(
     plugin, mission
 ):
     own = ["dead-reckoning", "ekf-slam"]
-    alone, before = compare(mission, own), state()
+    alone = compare(mission, own)
+    before = state()
     together = compare(mission, [own[0], "their-meddling", own[1]])
     assert state() == before
     assert "theirs" not in sys.modules

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.evaluation import RunResult, run_estimator
 from sonar_graph.evaluation import run as run_module
-from sonar_graph.evaluation.results import RunResult
-from sonar_graph.evaluation.run import PeakMemory, run_estimator
+from sonar_graph.evaluation.run import PeakMemory
 from sonar_graph.evaluation.scored_instants import MAPS_KEPT, kept_map_instants
 from sonar_graph.states import LandmarkMap
 

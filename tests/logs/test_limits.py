@@ -15,13 +15,11 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
-from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap import Keep, chunks, scanning
+from sonar_graph.logs import PartialCalibration, inspect_log, read_log
+from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
-from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
-from sonar_graph.logs.vehicle_setup import PartialCalibration, encode_mountings
+from sonar_graph.logs.vehicle_setup import encode_mountings
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 
 LIMIT = 1 << 16
@@ -114,7 +112,8 @@ def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
         text_of(path)
 
 
-ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
+ROTATION = "a quaternion of length "
+TRANSLATION = "numbers that are not finite"
 
 
 @pytest.mark.parametrize(
@@ -129,7 +128,8 @@ ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
     make_sequence: Any, tmp_path: Path, of: str, value: float, message: str
 ) -> None:
-    sequence, path = make_sequence(), tmp_path / "log.mcap"
+    sequence = make_sequence()
+    path = tmp_path / "log.mcap"
     payload = bytearray(encode_mountings(Calibration())[0].tobytes())
     ends = [
         at

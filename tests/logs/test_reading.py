@@ -17,12 +17,9 @@ from sonar_graph.errors import (
     MissingTopicError,
     SonarGraphError,
 )
-from sonar_graph.logs.cdr.definitions import definition
-from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.vehicle_setup import PartialCalibration
-from sonar_graph.logs.writing import write_log
+from sonar_graph.logs import PartialCalibration, inspect_log, read_log, write_log
+from sonar_graph.logs.cdr import definition
+from sonar_graph.logs.mcap import Instant, TimeWindow
 
 from .conftest import T0_NS, Bench, chunk_indexes, flip, header
 
@@ -279,10 +276,8 @@ def test_a_message_that_breaks_its_rules_is_named(
 
 
 POSTERIOR = "1 with probabilities that are not between 0 and 1 or more than 1 in sum"
-RANGE, COVARIANCE = (
-    "a range that is not above 0 and at most 100 km",
-    "a covariance that is not positive definite",
-)
+RANGE = "a range that is not above 0 and at most 100 km"
+COVARIANCE = "a covariance that is not positive definite"
 TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
     "sound": ({}, 3, ""),
     "largest identity": ({"candidate_ids": [5, 2**56 - 1]}, 3, ""),
@@ -334,7 +329,8 @@ def test_detections_that_estimators_do_not_use_are_told_and_impossible_ones_left
     bench: Bench, changed: dict[str, Any], rows: int, account: str
 ) -> None:
     path = one_of(bench, **changed)
-    sequence, summary = read_log(path), inspect_log(path)
+    sequence = read_log(path)
+    summary = inspect_log(path)
     assert sequence.detections is not None
     assert len(sequence.detections) == rows
     told = [

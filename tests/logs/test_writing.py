@@ -21,19 +21,10 @@ from rosbags.highlevel import AnyReader
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.log_file import LogFile, open_seal
-from sonar_graph.logs.mcap.writer import (
-    Attachment,
-    recording,
-    write_recording,
-)
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import (
-    pose_messages,
-    sonar_image_messages,
-    static_message,
-    write_log,
-)
+from sonar_graph.logs import read_log, sonar_image_messages, write_log
+from sonar_graph.logs.mcap import Attachment, LogFile, recording, write_recording
+from sonar_graph.logs.mcap.log_file import open_seal
+from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.measurements import Imu
 from sonar_graph.states import Trajectory
 
@@ -69,7 +60,8 @@ def test_reading_what_was_written_is_the_identity(
     write_log(path, sequence)
     found = read_log(path)
     for name in BLOCKS:
-        expected, actual = getattr(sequence, name), getattr(found, name)
+        expected = getattr(sequence, name)
+        actual = getattr(found, name)
         assert (expected is None) == (actual is None), name
         for field in fields(expected) if expected is not None else ():
             np.testing.assert_array_equal(
@@ -181,7 +173,8 @@ def test_another_library_sees_what_the_message_defines(tmp_path):
     )
     # all beams of the first range first
     assert bytes(first.image.data) == written.intensity[0].T.tobytes()
-    left, right = first.beam_directions[0], first.beam_directions[-1]
+    left = first.beam_directions[0]
+    right = first.beam_directions[-1]
     assert (left.x, right.x) == (0, 0)
     assert left.y < 0 < right.y  # y is to the right
     np.testing.assert_allclose([left.z, right.z], np.cos(np.radians([14, 15])))
@@ -273,7 +266,8 @@ def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> N
         assert (file.summary is not None, file.fault) == (True, None)
         stated = int.from_bytes(file.read(file.data_end_at + 9, 4), "little")
         assert stated == zlib.crc32(file.read(0, file.data_end_at)) != 0
-    chunk, damaged = chunk_indexes(long_log)[1], tmp_path / "damaged.mcap"
+    chunk = chunk_indexes(long_log)[1]
+    damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(long_log.read_bytes())
     flip(damaged, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
     with (

@@ -13,16 +13,12 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.models.aiding import gravity_direction
+from sonar_graph.models import gravity_direction
 from sonar_graph.motion import earth_rate_in_world
 from sonar_graph.navigation import PreintegratedMotion
-from sonar_graph.navigation.alignment.allan import (
-    allan_deviation,
-    noise_densities,
-)
+from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, noise_densities
+from sonar_graph.navigation.alignment.allan import allan_deviation
 from sonar_graph.navigation.alignment.at_rest import (
-    InitialTilt,
-    align_at_rest,
     angles_by_up,
     earth_up_and_level,
     roll_and_pitch,
@@ -51,7 +47,7 @@ KNOWN = Calibration(imu=SENSORS)
 
 
 def rest(rng, yaw=0.0, earth=0.0, noise=1.0, rest_s=REST_S) -> Imu:
-    """What sensors with a noise say of a body with the attitude above."""
+    """Noisy readings of a body with the attitude above."""
     n = round(rest_s * HZ)
     world_R_body = Rotation.from_euler("ZYX", [yaw, PITCH, ROLL])
     rate = (
@@ -242,7 +238,7 @@ def up_of(roll: float, pitch: float, yaw: float = 0.7) -> np.ndarray:
 
 @pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
 def test_the_derivative_is_that_of_turning_up_a_little(roll, pitch):
-    """Along the sphere; a change of length is none of either angle."""
+    """Along the sphere; a change of length changes neither angle."""
     up = up_of(roll, pitch)
 
     def angles(phi: np.ndarray) -> tuple[float, float]:

@@ -6,6 +6,7 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.measurements import Depth, Dvl
+from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.dvl_screening.depth_gate import (
     DEPTH_GATE,
     UNSTATED_M,
@@ -17,7 +18,6 @@ from sonar_graph.navigation.dvl_screening.dvl_gate import (
     gate_velocities,
     needed,
 )
-from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.samples import VelocityRows
 from sonar_graph.states import Refusal
 

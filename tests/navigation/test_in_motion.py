@@ -14,10 +14,9 @@ from sonar_graph.calibration import (
     ImuCalibration,
     Mounting,
 )
-from sonar_graph.logs.convert.akit import read_akit
+from sonar_graph.logs.convert import read_akit
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.alignment import InitialTilt
-from sonar_graph.navigation.alignment.in_motion import align_in_motion
+from sonar_graph.navigation.alignment import InitialTilt, align_in_motion
 
 from .rows import dvl as dvl_rows
 from .ways import acceleration_at, attitude, rate_at, velocity_at
@@ -113,7 +112,7 @@ def test_a_noiseless_run_gives_what_was_put_in():
 
 
 def spoilt(dvl: Dvl, rows: np.ndarray) -> Dvl:
-    """These rows say what cannot be."""
+    """These rows hold impossible values."""
     return replace(dvl, velocity=np.where(rows[:, None], 50.0, dvl.velocity))
 
 

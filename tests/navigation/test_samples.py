@@ -16,11 +16,10 @@ from sonar_graph.calibration import (
     ImuCalibration,
     Mounting,
 )
-from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
+from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl
-from sonar_graph.navigation import samples
-from sonar_graph.navigation.dvl_screening.row_intake import RowIntake
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation import Odometry, samples
+from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, odometry_at_rest, stamps
@@ -104,7 +103,7 @@ def test_of_equal_stamps_the_first_counts():
     ("ratio", "is_sound"), [(1e-11, True), (1e-12, True), (0.0, False), (-1e-12, False)]
 )
 def test_a_covariance_is_valid_if_positive_definite_up_to_rounding(ratio, is_sound):
-    """In axes of which none is the log's."""
+    """In axes that differ from the log's."""
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
     rows = driven()
     rows.velocity_cov[7] = 1e-4 * (turn * [1.0, 1.0, ratio]) @ turn.T

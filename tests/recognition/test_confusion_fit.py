@@ -8,15 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
-from sonar_graph.logs.reading import read_log
+from sonar_graph.logs import read_log
 from sonar_graph.recognition import confusion_fit
-from sonar_graph.sonar.appearance import DesignFit, ObjectSighting
-from sonar_graph.sonar.bayes import IdentityParams, bounded_evidence
-from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
-from sonar_graph.sonar.evidence import EVIDENCE
-from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
+from sonar_graph.sonar import (
+    EVIDENCE,
+    Confusion,
+    IdentityParams,
+    ObjectSighting,
+    Recogniser,
+    RecogniserParams,
+    confusion_for,
+    soft_scores,
+)
+from sonar_graph.sonar.appearance import DesignFit
+from sonar_graph.sonar.bayes import bounded_evidence
 
 BOUND = np.array([0.003, 0.0008])
 MOVED = np.array([0.0, 0.004])
@@ -210,7 +217,7 @@ def _posteriors(fits: confusion_fit.LabelledFits, model: Confusion) -> np.ndarra
 
 
 def test_posteriors_of_tracks_are_calibrated_where_many_were_seen():
-    """Landmarks are a twelfth as many as unknown objects, as the prior says."""
+    """Landmarks are a twelfth as many as unknown objects, as the prior assumes."""
     of = [_fits(800, 4.0, seed) for seed in (0, 1)]
     rows = np.flatnonzero((of[0].label == 2) | (np.arange(2400) % 24 == 0))
     learnt, unseen = (some(fits, rows) for fits in of)
@@ -273,7 +280,7 @@ def test_sigmas_are_root_mean_squares_at_the_usual_bound():
     assert [model.range_sigma_m, model.across_sigma_m] == pytest.approx(
         sigmas, rel=0.05
     )
-    # of 600 tracks, one of which is lost to the height
+    # of 600 tracks; one is lost to the height
     squares = np.nansum(off.error_m**2, axis=0)
     # counts as eight tracks
     before = np.diag(PRIOR.range_azimuth_cov(BOUND[None], np.ones(1))[0])

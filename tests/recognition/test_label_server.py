@@ -1,4 +1,4 @@
-"""The page on which landmarks are labelled: who may ask it, what it saves, and the clicks of a real browser.
+"""The page on which landmarks are labelled: who may use it, what it saves, and the clicks of a real browser.
 
 Chromium comes from the system, as in tests/report/test_page_in_browser.py.
 """
@@ -19,13 +19,14 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from sonar_graph.recognition.label_server import (
+from sonar_graph.recognition import (
     LabelDesk,
+    Labels,
     LabelServer,
-    ShownFrame,
+    read_labels,
     shown_frames,
 )
-from sonar_graph.recognition.labels import Labels, read_labels
+from sonar_graph.recognition.label_server import ShownFrame
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import CalibrationError
-from sonar_graph.recognition import confusion_fit
-from sonar_graph.recognition.confusion_fit import true_objects
-from sonar_graph.recognition.labels import (
-    Label,
+from sonar_graph.recognition import (
     LabelledLog,
     Labels,
     calibrate_by_labels,
+    confusion_fit,
     read_labels,
 )
+from sonar_graph.recognition.confusion_fit import true_objects
+from sonar_graph.recognition.labels import Label
 
 CLICK_PIXELS_M = 0.005
 
 
 @pytest.fixture(scope="module")
 def clicks(lane, lane_log, lane_recognition) -> Labels:
-    """Landmarks clicked in every sixth frame, and what was tracked and is none, where it was reported."""
+    """Landmarks clicked in every sixth frame, and what was tracked and is no landmark, where it was reported."""
     given = []
     rng = np.random.default_rng(2)
     run = lane.sequence

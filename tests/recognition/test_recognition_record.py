@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.recognition.recognition_record import (
-    CANDIDATE_OFF_FLOOR,
+from sonar_graph.recognition import (
     DrawnFrame,
     Recognition,
     read_recognition,
     write_recognition,
 )
+from sonar_graph.recognition.recognition_record import CANDIDATE_OFF_FLOOR
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 

@@ -26,8 +26,7 @@ from sonar_graph.simulation.sensors import (
     seconds_since_start,
 )
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation, smooth_noise
-from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.tracker import SonarStep
+from sonar_graph.sonar import FloorView, SonarStep
 
 FLOOR_Z_M = -1.7
 MOUNTED = Calibration(
@@ -153,7 +152,7 @@ def test_motion_tilt_and_height_are_those_of_the_simulators_truth(path, exact):
 
 
 def numbers(steps: list[SonarStep | None], views: list[FloorView]) -> Floats:
-    """Everything that is told about each frame but the motion of the first, one row a frame."""
+    """All results of each frame but the motion of the first, one row a frame."""
     moved = [
         np.append(s.previous_T_sonar.matrix(), s.covariance) if s else np.zeros(52)
         for s in steps

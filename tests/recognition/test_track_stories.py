@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import RecognitionSession
-from sonar_graph.recognition.track_stories import MOST_EXAMPLES, TrackStories
-from sonar_graph.report.tracks.track_page import write_track_page
-from sonar_graph.sonar.recogniser import Recogniser
+from sonar_graph.recognition import Recognition, RecognitionSession, TrackStories
+from sonar_graph.recognition.track_stories import MOST_EXAMPLES
+from sonar_graph.report.tracks import write_track_page
+from sonar_graph.sonar import Recogniser
 from sonar_graph.states import LandmarkMap
 from tests.recognition.imaged_lane import Lane
 
@@ -81,7 +80,7 @@ def test_the_page_shows_every_track_with_picture_and_reasons(told, lane, tmp_pat
 
 
 def of_tracks(recognition: Recognition, count: int, none: int) -> Recognition:
-    """Detections of some tracks, of which some are of no landmark."""
+    """Detections of some tracks, some of no landmark."""
     row = recognition.detections.rows(np.zeros(1, np.int64))
     blocks = [
         replace(

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.scored_instants import published_maps
+from sonar_graph.evaluation import Comparison, published_maps
 from sonar_graph.report.landmark_table import (
     MOST_LANDMARKS,
     landmark_table,

@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.report import write_page
-from sonar_graph.report.batch_page import write_batch_report
+from sonar_graph.report import write_batch_report, write_page
 from tests.recorded_batches import LOGS, drawn_batch, with_failures
 from tests.synthetic import basin_comparison
 
@@ -31,7 +30,8 @@ AXE = Path(
         Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js",
     )
 )
-PHONE, DESKTOP = 390, 1280
+PHONE = 390
+DESKTOP = 1280
 SMALLEST_TEXT_PX = """Math.min(...[...document.querySelectorAll("svg text")].filter(one => one.checkVisibility())
   .map(one => parseFloat(getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().a, one.getScreenCTM().b)))"""
 VISIBLE_WORDS = "document.body.innerText.split(/\\s+/).filter(Boolean).length"
@@ -76,7 +76,7 @@ def browser() -> Iterator[Any]:
 def opened(
     browser: Any, file: Path, width: int, scheme: str = "light"
 ) -> Iterator[tuple[Any, list[str]]]:
-    """The page, and what its console says."""
+    """The page, and its console's messages."""
     page = browser.new_page(
         viewport={"width": width, "height": 900}, color_scheme=scheme
     )

@@ -5,7 +5,7 @@ import pytest
 
 from sonar_graph.errors import SimulationError
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, cruise_speed, simulate_basin
+from sonar_graph.simulation import BasinOptions, cruise_speed, simulate_basin
 
 
 @pytest.fixture(scope="module")

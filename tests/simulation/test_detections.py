@@ -8,8 +8,8 @@ from scipy import stats
 from sonar_graph.calibration import Mounting, SonarCalibration
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.simulation import detections as simulated
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.sensors import regular_stamps, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""A recording tells estimators the truth about its own errors, and nothing else changes when one thing does."""
+"""A recording gives estimators the true size of its errors, and nothing else changes when one thing does."""
 
 import gtsam
 import numpy as np
@@ -9,7 +9,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.simulation.options import IMU_PRESETS
 
 

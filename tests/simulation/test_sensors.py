@@ -1,4 +1,4 @@
-"""Sensors feel the true motion, plus exactly the errors that the calibration says."""
+"""Sensors feel the true motion, plus exactly the errors of the calibration."""
 
 import gtsam
 import numpy as np

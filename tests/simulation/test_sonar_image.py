@@ -10,19 +10,17 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarImage
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.sonar_image import scene
-from sonar_graph.simulation.sonar_image.frames import (
-    FrameSimulator,
-)
-from sonar_graph.simulation.sonar_image.imaging_sonar import (
+from sonar_graph.simulation import BasinOptions, simulate_basin
+from sonar_graph.simulation.sonar_image import (
     SONARS,
+    FrameSimulator,
     ImageOptions,
-    ImagingSonar,
+    scene,
 )
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImagingSonar
 
 HEIGHT_M = 0.95
 TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
@@ -411,7 +409,7 @@ WIDTH_M = 0.2
 
 
 def ramp(rise: float) -> scene.SeabedObject:
-    """Rises away from the sonar; only its middle scatters to speak of, by 60 dB over the floor."""
+    """Rises away from the sonar; only its middle scatters much, 60 dB over the floor."""
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         is_bright = (np.abs(x_m) < LENGTH_M / 2) & (np.abs(y_m) < WIDTH_M / 2)
@@ -424,7 +422,7 @@ def ramp(rise: float) -> scene.SeabedObject:
 
 
 def energy_of_ramp(rise: float, floor_reflection: float | None = None) -> float:
-    """Mean sum over all samples; scatterers are drawn anew for each frame."""
+    """Mean sum over all samples; scatterers are drawn again for each frame."""
     changes = {
         "shadows": False,
         "absorption_db_m": 0.0,

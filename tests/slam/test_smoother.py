@@ -8,11 +8,11 @@ from gtsam.symbol_shorthand import L, X
 from sonar_graph.models import RobustKernel
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import (
+    FactorGroup,
     Sightline,
     batch_solution,
+    solve,
 )
-from sonar_graph.slam.smoother.batch_solution import solve
-from sonar_graph.slam.smoother.factor_store import FactorGroup
 from sonar_graph.slam.smoother.factor_store import graph_of as graph_of_groups
 from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
 

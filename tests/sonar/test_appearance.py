@@ -6,22 +6,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats
+from sonar_graph.sonar import EVIDENCE, Confusion, FloorView, confusion_for
 from sonar_graph.sonar.appearance import (
     Appearance,
     DesignFit,
 )
-from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.evidence import (
-    BEHIND,
-    EVIDENCE,
-    FAR,
-    NEAR,
-    STEP,
-    Figures,
-)
-from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.evidence import BEHIND, FAR, NEAR, STEP, Figures
 from sonar_graph.sonar.templates import (
     Patch,
     PolarGrid,

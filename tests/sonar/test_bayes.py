@@ -5,16 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sonar_graph.sonar import EVIDENCE, Confusion, IdentityParams
 from sonar_graph.sonar.bayes import (
     Beliefs,
-    IdentityParams,
     bounded_evidence,
     independent_share,
     jeffrey,
     predict,
 )
-from sonar_graph.sonar.confusion import Confusion
-from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.tracker import Association
 
 seeds = st.integers(0, 2**32 - 1)
@@ -55,7 +53,7 @@ def test_rules_are_their_equations_with_an_index_for_everything(seed: int):
 
 @given(seeds)
 def test_evidence_is_bounded_and_the_order_of_frames_does_not_matter(seed: int):
-    """However many frames say the same, the odds are at most those of a track that always looked so."""
+    """However many frames agree, the odds are at most those of a track that always looked so."""
     log_odds = np.append(np.random.default_rng(seed).normal(0, 5, 2), 0.0)
     birth = np.array([0.25, 0.25, 0.5])
     n = np.array([1.0, 10.0, 1e9])

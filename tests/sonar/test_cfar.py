@@ -5,12 +5,11 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
-from sonar_graph.devices.landmark_designs import LandmarkDesign
+from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar import cfar
+from sonar_graph.sonar import FloorView, cfar
 from sonar_graph.sonar.appearance import AppearanceParams
-from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import (
     MEDIAN_TO_SIGMA,
     CandidateVerdict,

@@ -8,13 +8,11 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
+from sonar_graph.sonar import Fan, FloorView, with_lens
 from sonar_graph.sonar.geometry import (
-    Fan,
-    FloorView,
     point_covariances,
     points,
     ranges_azimuths_elevations,
-    with_lens,
 )
 
 angles = st.floats(-0.3, 0.3)

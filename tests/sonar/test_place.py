@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
@@ -16,14 +16,13 @@ from sonar_graph.simulation.sonar_image import (
     ImageOptions,
     place_landmark,
 )
+from sonar_graph.sonar import FloorView, confusion_for
 from sonar_graph.sonar.appearance import (
     Appearance,
     AppearanceParams,
     CandidateFit,
     DesignFit,
 )
-from sonar_graph.sonar.confusion import confusion_for
-from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.place import Grid, Lit, Relief
 from sonar_graph.sonar.templates import Patch, check_headings
 

@@ -1,22 +1,20 @@
-"""Laws of sightings: where candidates are, how certain that is, and what the designs say of them."""
+"""Laws of sightings: where candidates are, how certain that is, and their evidence of the designs."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
+from sonar_graph.sonar import Confusion, FloorView, ObjectSighting, confusion_for
 from sonar_graph.sonar.appearance import (
     CENTROID_SIGMA_M,
     AppearanceParams,
     CandidateFit,
     DesignFit,
-    ObjectSighting,
 )
-from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.geometry import FloorView
 
 from .polar_images import (
     AZIMUTHS_RAD,

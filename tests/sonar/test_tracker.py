@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from sonar_graph.errors import MeasurementError
+from sonar_graph.sonar import SonarStep
 from sonar_graph.sonar.tracker import (
     Expected,
-    SonarStep,
     Tracker,
     TrackingParams,
     TrackStates,

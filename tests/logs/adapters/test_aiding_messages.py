@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.inspection import inspect_log
+from sonar_graph.logs import inspect_log
 from sonar_graph.measurements import UNMEASURED_M2
 
 from .conftest import (
@@ -26,11 +26,9 @@ from .conftest import (
 
 FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
-FIX, POINT, TURNED = (
-    "sensor_msgs/msg/NavSatFix",
-    "geometry_msgs/msg/PointStamped",
-    "geometry_msgs/msg/QuaternionStamped",
-)
+FIX = "sensor_msgs/msg/NavSatFix"
+POINT = "geometry_msgs/msg/PointStamped"
+TURNED = "geometry_msgs/msg/QuaternionStamped"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DEFINITIONS[FIX] = interface(
     "std_msgs/Header header, sensor_msgs/NavSatStatus status, float64 latitude, float64 longitude, float64 altitude, "

@@ -28,7 +28,7 @@ def velocity(row: int) -> dict[str, float]:
 def report(
     *, lost: dict[str, Any], sent: dict[str, Any] | None = None, kind: str = MARINE
 ) -> Entry:
-    """Messages of a Doppler log, of which `LOST` have other fields."""
+    """Messages of a Doppler log; `LOST` have other fields."""
     common = (
         {
             "velocity_mode": 1,
@@ -65,7 +65,7 @@ def twists() -> Entry:
     )
 
 
-# Each driver has its own way to say that there is no bottom lock.
+# Each driver has its own mark of a missing bottom lock.
 WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
     "Water Linked, velocity report: zeros, one beam": (
         report(
@@ -158,7 +158,7 @@ DENIED = {
 def test_an_imu_that_denies_all_that_it_measures_is_used_with_a_warning(
     foreign: Any,
 ) -> None:
-    """A driver that has no covariances writes -1 into each, which by the definition says: not measured."""
+    """A driver that has no covariances writes -1 into each, which by the definition means: not measured."""
     rows = [
         turning(row, linear_acceleration=vector(0.1 * np.cos(row), 0, 9.8), **DENIED)
         for row in range(ROWS)

@@ -9,13 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.log_config import (
-    LogConfig,
-    read_log_config,
-    table_text,
-    toml_value,
-)
+from sonar_graph.logs.adapters import SHIPPED, LogConfig, read_log_config, table_text
+from sonar_graph.logs.adapters.log_config import toml_value
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
 # fmt: off

@@ -8,12 +8,10 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs import inspect_log, read_sonar_frames
+from sonar_graph.logs.adapters import SHIPPED, read_log_config
 from sonar_graph.logs.cdr import definition, encode, parse_definition
-from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap import Keep, Topic
-from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.measurements import Floats
 
 from .conftest import Entry, dvl, imu, rows_of, vector
@@ -80,10 +78,8 @@ def frames_in(
 
 
 ROWS = POLAR.T.astype("u1").tobytes()
-BEAM_MAJOR, LEFT = (
-    '[sonar]\nimage_order = "beam-major"',
-    '[sonar]\nbearing_positive = "left"',
-)
+BEAM_MAJOR = '[sonar]\nimage_order = "beam-major"'
+LEFT = '[sonar]\nbearing_positive = "left"'
 # fmt: off
 CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     "range by range": (images(image(ROWS)), "", POLAR, AZIMUTHS),

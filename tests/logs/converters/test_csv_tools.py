@@ -1,4 +1,4 @@
-"""Tables as tools write them are read right by the template's guess, or the template asks."""
+"""Tables as tools write them are read right by the template's guess, or the template has a question."""
 
 import re
 import tomllib

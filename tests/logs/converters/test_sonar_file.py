@@ -1,4 +1,4 @@
-"""Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is told."""
+"""Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is reported."""
 
 import re
 from collections.abc import Callable
@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
 from sonar_graph.errors import DatasetError, LogError
-from sonar_graph.logs.convert.didson_aris import convert_didson
-from sonar_graph.logs.sonar_images import read_sonar_frames
+from sonar_graph.logs import read_sonar_frames
+from sonar_graph.logs.convert import convert_didson
 
 from .sonar_recordings import (
     STEP_NS,
@@ -25,7 +25,8 @@ from .sonar_recordings import (
     images,
 )
 
-COUNT, MIB = 7, 1 << 20
+COUNT = 7
+MIB = 1 << 20
 EVERY = list(range(COUNT))
 PICTURES = images(COUNT, 48, 50)
 RECORDINGS = {
@@ -59,7 +60,7 @@ def which(result: Converted) -> list[int]:
 
 
 def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
-    """Numbers of the frames that were read, and what is said of the others; together they are all bytes."""
+    """Numbers of the frames that were read, and the messages about the others; together they are all bytes."""
     content = b"".join(pieces)
     result = converted(folder, content, ending)
     lost = sum(loss.end - loss.at for loss in result.done.lost)
@@ -187,7 +188,8 @@ def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, en
 def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(
     tmp_path,
 ):
-    log, source = tmp_path / "dive.mcap", tmp_path / "dive.ddf"
+    log = tmp_path / "dive.mcap"
+    source = tmp_path / "dive.ddf"
     log.write_bytes(b"precious")
     with pytest.raises(DatasetError, match=r"dive\.ddf: cannot be read: No such file"):
         convert_didson(source, log)
@@ -213,7 +215,8 @@ def run(*arguments: object, code: int = 0) -> str:
     ("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")]
 )
 def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
-    source, log = tmp_path / "dive.bin", tmp_path / "dive.mcap"
+    source = tmp_path / "dive.bin"
+    log = tmp_path / "dive.mcap"
     source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
     said = run("convert", kind, source, "-o", log)
     assert all(
@@ -226,7 +229,8 @@ def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
 
 def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path):
     header, *frames = Ddf(images(50, 96, 512)).pieces()
-    source, log = tmp_path / "dive.ddf", tmp_path / "dive.mcap"
+    source = tmp_path / "dive.ddf"
+    log = tmp_path / "dive.mcap"
     source.write_bytes(
         header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames))
     )
