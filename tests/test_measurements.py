@@ -124,16 +124,8 @@ def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
             "Dvl.velocity_cov: expected shape (5, 3, 3)",
         ),
         (
-            lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)),
-            "Depth.z_m: expected shape (5,), not (5, 1)",
-        ),
-        (
             lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)),
             "Heading.yaw_rad: expected shape (5,)",
-        ),
-        (
-            lambda n: PositionFixes(n, np.zeros((5, 2)), np.zeros((5, 3, 3))),
-            "position_m: expected shape (5, 3)",
         ),
     ],
 )
@@ -168,19 +160,10 @@ UNSAID = np.full((2, 2, 2), np.nan)
             {"candidate_ids": [[1.0, 2.0]] * 2},
             r"candidate_ids: expected integers, not float64",
         ),
-        (
-            {"candidate_ids": [["a", "b"]] * 2},
-            r"candidate_ids: expected integers, not <U1",
-        ),
         ({"range_m": ["near", "far"]}, r"range_m: expected numbers, not <U4"),
-        ({"track": [0.5, 1.5]}, r"track: expected integers, not float64"),
         (
             {"candidate_ids": [1, 2]},
             r"candidate_ids: expected shape \(n, k\).*not \(2,\)",
-        ),
-        (
-            {"id_probability": [[0.9]] * 2},
-            r"id_probability: expected shape \(n, k\).*not \(2, 1\)",
         ),
         (
             {"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))},
@@ -188,10 +171,6 @@ UNSAID = np.full((2, 2, 2), np.nan)
         ),
         (
             {"candidate_ids": [[1, 2], [1, 2**56]]},
-            r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
-        ),
-        (
-            {"candidate_ids": [[1, 2], [2**63 - 1, 2]]},
             r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
         ),
         ({"track": [[1], [2]]}, r"track: expected shape \(2,\), not \(2, 1\)"),
@@ -206,10 +185,6 @@ UNSAID = np.full((2, 2, 2), np.nan)
         (
             {"id_probability": [[0.9, 0.2], [0.9, 0.1]]},
             r"id_probability: row 0 .* more than 1 in sum",
-        ),
-        (
-            {"id_probability": [[0.9, -0.1], [0.9, 0.1]]},
-            r"id_probability: row 0 .* not between 0 and 1",
         ),
         ({"id_probability": [[np.nan, 0.1], [0.9, 0.1]]}, r"id_probability: row 0"),
     ],
