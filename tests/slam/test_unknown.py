@@ -307,3 +307,16 @@ def test_the_only_landmark_without_a_name_is_merged():
     estimator = run(sequence, **ASSOCIATED)
     assert Outcome.MOVED in estimator.detections().outcomes
     assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("share", [0.98, 1.02])
+def test_a_candidate_known_to_a_tenth_of_its_range_begins_a_landmark(
+    range_m: float, share: float
+) -> None:
+    """One sighting in an aperture whose standard deviation is about 0.1 rad."""
+    made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
+    sighting = Sighting(
+        1, 1, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.4])), NOISE, None
+    )
+    assert made.is_placed([sighting]) == (share < 1.0)

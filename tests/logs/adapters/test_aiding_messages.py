@@ -320,3 +320,17 @@ def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
     stated = foreign.read(*aided(), calibration=calibration)
     assert stated.calibration.start.rpy_rad == (0, 0, 1)
     assert stated.notes["log.start"].startswith("of the start only rpy_rad stated")
+
+
+@pytest.mark.parametrize(
+    "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
+)
+def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(
+    foreign: Any, said: dict[str, float]
+) -> None:
+    log = foreign.write(oriented(YAW, **said), dvl())
+    assert foreign.read(oriented(YAW, **said), dvl()).heading is None
+    (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]
+    assert role.topic is None
+    assert "/imu says of no orientation that it is measured" in role.reason
+    assert "needs_variance = false" in role.reason
