@@ -168,24 +168,6 @@ def test_recognise_adds_the_detections_of_a_log_or_of_frames(lane, tmp_path):
         recognise(frames)
 
 
-def test_pictures_come_once_a_second_and_show_what_was_recognised(
-    lane, lane_recognition
-):
-    pictures = lane_recognition.pictures
-    detections = lane_recognition.detections
-    assert len(pictures) > 20
-    assert np.diff([picture.stamp_ns for picture in pictures]).min() >= 10**9
-    assert all(picture.jpeg[:2] == b"\xff\xd8" for picture in pictures)
-    shown = [picture for picture in pictures if picture.landmark_ids]
-    assert len(shown) > 5
-    for picture in shown:
-        ids, probability = detections.rows(
-            detections.stamps_ns == picture.stamp_ns
-        ).most_probable()
-        assert picture.landmark_ids == tuple(ids.tolist())
-        assert picture.probabilities == tuple(probability.tolist())
-
-
 def bad_frames(lane: Lane, at: int) -> dict[str, SonarFrames]:
     """Frames that must not be used, each to come instead of frame ``at``; by words of the reason."""
     frame = lane.one(at)

@@ -42,23 +42,6 @@ def test_every_track_and_candidate_is_told_once_for_each_frame(told):
     )
 
 
-def test_a_track_ends_with_the_probabilities_of_its_last_detection(told):
-    recognition, stories = told
-    found = recognition.detections
-    sure = {
-        int(track): int(i)
-        for track, i, p in zip(found.track, *found.most_probable(), strict=True)
-        if p > 0.9
-    }
-    assert set(sure.values()) == {1, 2, 3, 4}
-    for track, landmark in sure.items():
-        story = stories.tracks[track]
-        assert int(np.argmax(story.beliefs)) + 1 == landmark
-        assert story.jpeg[:2] == b"\xff\xd8"
-        assert story.frames >= np.count_nonzero(found.track == track)
-        assert story.first_ns <= found.stamps_ns[found.track == track].min()
-
-
 def test_the_page_shows_every_track_with_picture_and_reasons(told, lane, tmp_path):
     recognition, stories = told
     write_track_page(
