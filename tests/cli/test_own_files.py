@@ -174,9 +174,7 @@ def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, ca
     )
 
 
-def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(
-    folder, tmp_path
-):
+def test_a_truth_of_tables_may_lack_its_orientation(folder, tmp_path):
     world = small_world()
     truth = ["time,x,y,z", *rows(world.truth.stamps_ns, world.truth.positions)]
     (tmp_path / "truth.csv").write_text("\n".join(truth) + "\n")
@@ -189,7 +187,7 @@ def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(
         read_csv(tables, tmp_path / "dive.toml")
 
 
-def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converted(
+def test_tables_with_another_unit_of_velocity_are_reported(
     run, folder, tmp_path, capsys
 ):
     (tmp_path / "dive.toml").write_text(IMU + DVL + "scale = 1000\n")
@@ -226,7 +224,7 @@ def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converte
 
 
 @pytest.mark.parametrize("command", ["run", "compare"])
-def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(
+def test_velocities_a_thousand_times_too_large_come_first(
     run, folder, tmp_path, command, capsys
 ):
     names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")

@@ -86,7 +86,7 @@ def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
     ).imu.mounting.translation_m == pytest.approx(places[0])
 
 
-def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_says_why():
+def test_an_unobservable_axis_of_the_lever_arm_keeps_its_value():
     rows = lever_findings(match((UNKNOWN, *arm(0.6, 0.3))), GIVEN)
     assert rows[0].text() == "cannot be told: too little turning"
     assert [row.acts for row in rows] == [False, True, False]
@@ -213,7 +213,7 @@ def test_a_slow_turn_that_the_heading_confirms_is_no_gyro_bias(
     )
 
 
-def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion_counts():
+def test_without_rest_the_first_minute_of_motion_gives_the_tilt():
     late = find_start_tilt(resting(15.0, lay_s=14.0))
     assert not late.is_rest
     assert "in motion" in late.said
@@ -228,7 +228,7 @@ def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion
         assert_tilt(found, rpy)
 
 
-def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
+def test_a_wrong_start_is_found_with_the_line_that_mends_it():
     found = find_start_tilt(resting(50.0))
     rows = tilt_findings(found, started(rpy_rad=(0.0, PITCH, 0.3)), yaw_rad=0.9)
     assert [row.acts for row in rows] == [True, False]

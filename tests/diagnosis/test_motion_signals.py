@@ -59,7 +59,7 @@ def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
     assert np.all(motion.parts == 0)
 
 
-def test_a_hole_of_the_imu_breaks_the_motion_and_a_reference_is_unknown_in_it():
+def test_an_imu_hole_splits_motion_and_reference():
     motion = motion_of(without_imu(RUN, 40.0, 46.0))
     assert set(motion.parts) == {0, 1}
     yaw = motion.reference(motion.yaw_rad)

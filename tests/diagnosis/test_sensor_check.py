@@ -142,7 +142,7 @@ def test_the_start_is_aligned_with_what_was_found_before(
     assert find_start_tilt(spoilt()).tilt is None
 
 
-def test_corrections_are_added_to_what_the_configuration_says_and_a_wrong_unit_is_named_alone():
+def test_corrections_add_to_those_of_the_configuration():
     config = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
     found = by_name(sensor_check.check_sensors(spoilt(), config))
     offset, scale = (
@@ -276,7 +276,7 @@ def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
     )
 
 
-def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
+def test_the_bias_of_smaller_sigma_wins_axis_by_axis():
     unknown = Estimate1D(np.nan, np.inf, "too little turning")
     nothing = told(0.0, 0.0, 0.0)
     x, y, _ = told(1.0, 2.0, 3.0, sigma=1e-4)
@@ -340,9 +340,7 @@ SPEEDS = [
 
 
 @pytest.mark.parametrize(("speed", "unit", "times", "scale"), SPEEDS)
-def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_three(
-    speed, unit, times, scale
-):
+def test_the_unit_of_a_speed_over_twenty_is_found(speed, unit, times, scale):
     (fault,) = units(speed=speed)
     assert fault.quantity == "DVL: unit"
     assert fault.advice.startswith(
@@ -357,7 +355,7 @@ SLOW = simulate_mission(
 )
 
 
-def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_or_landmarks_few():
+def test_ranges_decide_no_unit_with_wrong_axes_outliers_or_few_landmarks():
     rng = np.random.default_rng(0)
     velocity = SLOW.dvl.velocity
     spikes = velocity + 8.0 * (rng.random((len(velocity), 1)) < 0.2)
@@ -379,7 +377,7 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     assert not wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
 
 
-def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
+def test_usual_readings_raise_no_doubt_about_units():
     """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
     assert not units(speed=19.9, turn=1.99, force=9.0)
     for force in (0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6):
@@ -478,9 +476,7 @@ def test_of_forces_without_gravity_nothing_else_is_blamed() -> None:
     assert [finding.quantity for finding in found if finding.acts] == []
 
 
-def test_a_heading_that_drifts_against_a_bias_by_the_drive_is_wrong_and_not_the_gyros() -> (
-    None
-):
+def test_a_drifting_heading_is_a_fault_of_the_heading() -> None:
     bias_rad_s = np.array([0.002, -0.001, 0.003])
     drift_rad_s = 0.05
     imu = SHORT.imu

@@ -92,7 +92,7 @@ def test_without_a_third_sensor_both_are_named(role: str) -> None:
         assert f"`{name}.mounting.rpy_rad" in finding.line
 
 
-def test_a_heading_may_be_of_the_turned_imu_and_clears_the_doppler_log_alone() -> None:
+def test_a_heading_may_come_from_the_turned_imu() -> None:
     run = with_sensors(WORLD, sonar=False, fixes=True, heading=True)
     run = with_measured_start(run)
     (of_imu,) = acting(with_turned(run, "imu", np.pi / 2))

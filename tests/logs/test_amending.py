@@ -82,9 +82,7 @@ def landmarks(time_ns: int, topic: str = "/map") -> Outgoing:
 
 
 @pytest.mark.parametrize("profile", ["ros2", "", "x" * 40])
-def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_added(
-    tmp_path, profile
-):
+def test_an_amended_log_has_the_old_bytes_and_the_new_messages(tmp_path, profile):
     source = foreign_log(tmp_path / "a.mcap", profile=profile)
     amended = write_amended(
         source,
@@ -111,9 +109,7 @@ def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_adde
 
 
 @pytest.mark.parametrize("share", [0.3, 0.77])
-def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
-    tmp_path, share
-):
+def test_intact_messages_of_a_truncated_log_are_copied(tmp_path, share):
     """The length of what is there is counted from its first message."""
     whole = foreign_log(tmp_path / "a.mcap", tick_ns=100_000_000).read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -144,7 +140,7 @@ def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
     assert float(span_s) == pytest.approx(last_ns * 1e-9, abs=1e-3)
 
 
-def test_the_log_itself_and_topics_that_are_there_are_refused_unless_these_are_written_anew(
+def test_existing_topics_are_refused_unless_they_are_replaced(
     tmp_path,
 ):
     source = foreign_log(tmp_path / "a.mcap")
@@ -180,7 +176,7 @@ def test_a_damaged_attachment_is_left_out_and_named(tmp_path):
     assert content(tmp_path / "b.mcap")["attachments"] == []
 
 
-def test_messages_that_come_piece_by_piece_are_merged_and_their_topic_must_be_new(
+def test_messages_in_pieces_are_merged_under_a_new_topic(
     tmp_path,
 ):
     source = foreign_log(tmp_path / "source.mcap")

@@ -156,9 +156,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_part_that_is_missing_or_damaged_is_named_and_the_rest_is_read_if_asked_for(
-    folder, fault
-):
+def test_a_missing_part_is_an_error_unless_salvaged(folder, fault):
     with_metadata(folder)
     spoil, said = FAULTS[fault]
     spoil(folder / NAMES[4])

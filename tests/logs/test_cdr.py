@@ -128,9 +128,7 @@ def test_random_messages_decode_and_encode_as_with_two_other_libraries(
     assert tally == Tally(schemas * messages * 2)  # in both byte orders
 
 
-def test_messages_with_a_layout_each_are_read_like_those_that_share_one_and_byte_orders_told_apart() -> (
-    None
-):
+def test_any_layout_and_byte_order_gives_the_same_columns() -> None:
     splits = [(i, j) for i in range(1, 40) for j in range(1, 41 - i)] * 2
     lists = [["x" * i, "y" * j, "z" * (41 - i - j)] for i, j in splits]
     definition = parsed("string[] names\nfloat64 a")
@@ -277,7 +275,7 @@ MANY: dict[str, tuple[Struct, list[bytes]]] = {
 
 
 @pytest.mark.parametrize(("definition", "payloads"), MANY.values(), ids=MANY)
-def test_many_messages_that_are_broken_or_hardly_share_a_layout_take_no_longer_than_seconds(
+def test_many_broken_messages_are_read_in_seconds(
     definition: Struct, payloads: list[bytes]
 ) -> None:
     stacks = stacked(payloads)

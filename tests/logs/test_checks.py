@@ -396,7 +396,7 @@ def test_no_axis_of_a_whole_sensor_is_named_however_coarse_it_is(seed, step):
     assert not list(magnitudes(whole))
 
 
-def test_magnitudes_without_a_sign_are_named_and_a_vehicle_that_only_goes_ahead_is_not():
+def test_magnitudes_without_a_sign_raise_a_doubt():
     velocity = rates(1)
     assert len(list(magnitudes(np.abs(velocity)))) == 1
     velocity[:, 0] = np.abs(velocity[:, 0]) + 1.0
@@ -410,7 +410,7 @@ def test_magnitudes_without_a_sign_are_named_and_a_vehicle_that_only_goes_ahead_
         (False, 0.01, False),
     ],
 )
-def test_a_velocity_without_a_vertical_part_is_wrong_where_the_vehicle_dives(
+def test_a_constant_vertical_velocity_of_a_diving_vehicle_is_doubted(
     has_depth: bool, sigma_m_s: float, is_named: bool
 ):
     t = np.arange(2000) * 0.02
@@ -424,7 +424,7 @@ def test_a_velocity_without_a_vertical_part_is_wrong_where_the_vehicle_dives(
     ] * is_named
 
 
-def test_stamps_in_bursts_and_a_clock_that_steps_back_are_named_with_the_way_out():
+def test_stamps_in_bursts_and_clock_steps_are_reported():
     even_ns = np.arange(300) * 200_000_000
     burst_ns = even_ns // 10**9 * 10**9 + np.arange(300) % 5 * 100_000
     assert not list(stamp_doubts(even_ns, even_ns))

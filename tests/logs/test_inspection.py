@@ -230,7 +230,7 @@ def copied(source: Path, change: Change, *, beside: bool = False) -> Path:
     return target
 
 
-def test_topics_that_cannot_be_decoded_are_counted_and_listed_with_the_reason_and_do_not_touch_ours(
+def test_unreadable_topics_are_listed_with_the_reason(
     bench: Bench,
 ) -> None:
     path = bench.write(*bench.basics())

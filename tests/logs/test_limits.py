@@ -56,7 +56,7 @@ def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> P
     ("size", "stated"),
     [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)],
 )
-def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_is_unpacked(
+def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     compression: str,

@@ -380,7 +380,7 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
 # ---- files that are cut off
 
 
-def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(
+def test_a_truncated_file_is_read_up_to_the_cut(
     path: Path,
 ) -> None:
     written = write(path)
@@ -525,7 +525,7 @@ BEGINNING_NS = 1_700_000_000_000_000_001
         "x",
     ],
 )
-def test_a_number_is_seconds_from_the_beginning_a_date_without_a_zone_in_utc_and_all_else_refused(
+def test_a_window_takes_seconds_and_dates_and_refuses_all_else(
     text: str,
 ) -> None:
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9

@@ -79,7 +79,7 @@ def result(
     )
 
 
-def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_and_identities(
+def test_every_estimator_and_the_truth_are_in_the_result(
     result,
 ):
     each = (
@@ -105,7 +105,7 @@ def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_an
     assert len({(m.ns, m.id) for m in array.markers}) == 4
 
 
-def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_path_smoothed(
+def test_odometry_is_causal_and_the_last_path_smoothed(
     result,
 ):
     assert [m.pose.pose.position.x for m in result.messages["/isam2/odometry"]] == list(
@@ -128,7 +128,7 @@ def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_pat
     assert (pose.header.frame_id, odometry.child_frame_id) == ("map", "isam2/base_link")
 
 
-def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_message(
+def test_tf_is_one_tree_below_the_map(
     result,
 ):
     """The sensors follow the first estimator."""
@@ -169,7 +169,7 @@ def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_mess
     assert len(set.union(*instants)) == len(instants)
 
 
-def test_rosbags_re_encodes_all_messages_of_logs_and_results_to_the_same_bytes(
+def test_rosbags_re_encodes_every_message_to_the_same_bytes(
     result, make_sequence, tmp_path
 ):
     write_log(tmp_path / "log.mcap", make_sequence())
@@ -215,9 +215,7 @@ def turning(seed: int, n: int = 60) -> Trajectory:
     )
 
 
-def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoids(
-    make_sequence, tmp_path
-):
+def test_poses_survive_to_the_bit_in_a_result(make_sequence, tmp_path):
     sequence = make_sequence()
     causal = turning(1)
     smoothed = turning(2)
@@ -261,7 +259,7 @@ def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoid
 
 
 @given(st.lists(st.text(max_size=6), max_size=6))
-def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(
+def test_source_names_are_unique_ros_names(
     estimators,
 ):
     names = source_names(estimators)
@@ -299,7 +297,7 @@ def axes(marker: Any) -> Rotation:
     return Rotation.from_quat([q.x, q.y, q.z, q.w])
 
 
-def test_landmarks_are_drawn_as_ellipsoids_that_lie_as_their_covariances_where_known_below_their_identities(
+def test_landmarks_are_drawn_as_ellipsoids_of_their_covariance(
     tmp_path: Path,
 ) -> None:
     """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
@@ -435,9 +433,7 @@ def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
 # --- size -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_truth_is_left(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+def test_an_empty_scene_can_be_drawn(make_sequence: Any, tmp_path: Path) -> None:
     layer = Layer("/a/path", "nav_msgs/msg/Path", (1, 0, 0, 1))
     layout = foxglove_layout([layer], Scene.around([np.empty((0, 3))]))
     assert json.loads(json.dumps(layout, allow_nan=False))["configById"]["3D!result"][

@@ -55,7 +55,7 @@ def written(
 # --- mountings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_sonar_of_images_is_mounted_where_tf_static_says_without_detections(
+def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
     make_sequence: Any, tmp_path: Path
 ) -> None:
     sequence = replace(make_sequence(), detections=None)

@@ -221,7 +221,7 @@ def seen_from_origin(landmark: int, z: np.ndarray) -> FactorGroup:
     return FactorGroup(made, (key, Sightline(X(0), gtsam.Pose3(), z)))
 
 
-def test_sightings_that_share_a_factor_have_the_information_of_their_own_factors():
+def test_sightings_in_one_factor_keep_their_information():
     """Ten sightings of two landmarks from one keyframe, with robust kernels; then two leave, and three of a factor stay."""
     rng = np.random.default_rng(3)
     z = np.array([10.0, 0.1]) + rng.normal(0.0, [0.2, 0.04], (10, 2))

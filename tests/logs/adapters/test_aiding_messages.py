@@ -244,7 +244,7 @@ def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
     return rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", rows)
 
 
-def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(
+def test_a_constant_true_orientation_raises_a_doubt(
     foreign: Any,
 ) -> None:
     still = moving(0.3, 0.3, 0.3)
@@ -296,7 +296,7 @@ ANTENNA = "[positions]\nantenna_m = [1.0, 0.0, 0.0]\n"
 
 
 @pytest.mark.parametrize("wrong", [-1, 0, 4])
-def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
+def test_an_unknown_start_is_that_of_the_first_headings_and_fixes(
     foreign: Any, tmp_path: Any, wrong: int
 ) -> None:
     """With three times their sigma, of a vehicle at rest; one wrong row does not count."""

@@ -125,7 +125,7 @@ WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
 
 
 @pytest.mark.parametrize(("entry", "reason"), WITHOUT_LOCK.values(), ids=WITHOUT_LOCK)
-def test_velocities_without_bottom_lock_are_left_out_as_each_driver_marks_them(
+def test_velocities_without_bottom_lock_are_left_out(
     foreign: Any, entry: Entry, reason: str
 ) -> None:
     sequence = foreign.read(imu(ROWS), entry, tree("dvl_link", w=1.0))

@@ -215,9 +215,7 @@ CASES: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_notes(
-    foreign: Any, case: Case
-) -> None:
+def test_messages_of_any_driver_become_velocities(foreign: Any, case: Case) -> None:
     entries, *others = case
     foreign.check([imu(), *entries], *others)
 

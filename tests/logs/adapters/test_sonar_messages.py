@@ -170,7 +170,7 @@ def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
         [0, 1],
     ],
 )
-def test_each_message_that_is_no_image_is_refused_once_by_its_time_of_recording(
+def test_messages_that_are_no_image_are_refused_by_their_time(
     bad: list[int],
 ) -> None:
     """Several messages may share an instant, sound ones and others."""

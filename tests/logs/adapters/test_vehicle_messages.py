@@ -205,9 +205,7 @@ GRAVITY: dict[tuple[float, ...], str | None] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the_notes(
-    foreign: Any, case: Case
-) -> None:
+def test_messages_of_any_driver_become_measurements(foreign: Any, case: Case) -> None:
     sequence = foreign.check(*case)
     assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
     if (
@@ -219,7 +217,7 @@ def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the
 
 
 @pytest.mark.parametrize(("force", "warning"), GRAVITY.items(), ids=str)
-def test_gravity_that_is_not_felt_upwards_is_told_with_the_rotation_that_puts_it_right(
+def test_gravity_along_another_axis_is_reported_with_its_rotation(
     foreign: Any, force: tuple[float, ...], warning: str | None
 ) -> None:
     notes = foreign.check(

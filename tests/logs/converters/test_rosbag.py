@@ -106,9 +106,7 @@ def ros1_bag(tmp_path: Path) -> Path:
     return tmp_path / "old.bag"
 
 
-def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(
-    ros1_bag, tmp_path, decoded
-):
+def test_a_ros_1_bag_becomes_a_ros_2_log(ros1_bag, tmp_path, decoded):
     told = []
     done = convert_rosbag(
         ros1_bag, tmp_path / "new.mcap", lambda at, total: told.append((at, total))
@@ -160,7 +158,7 @@ PACKED = [
 
 @pytest.mark.parametrize(("mode", "plugin"), PACKED, ids=str)
 @pytest.mark.parametrize(("size", "is_read"), [(1000, True), (1 << 20, False)])
-def test_what_unpacks_to_more_than_the_limit_is_refused_with_limit_and_remedy(
+def test_input_beyond_the_limit_of_unpacking_is_refused(
     tmp_path, monkeypatch, mode, plugin, size, is_read
 ):
     limit = 1 << 18
@@ -221,9 +219,7 @@ def test_a_pipe_in_the_place_of_a_bag_or_in_it_is_refused(tmp_path, name):
         convert_rosbag(source, tmp_path / "new.mcap")
 
 
-def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_told(
-    tmp_path, decoded
-):
+def test_a_custom_type_keeps_its_definition(tmp_path, decoded):
     store = ros1_store()
     store.register(
         get_types_from_msg(
@@ -391,9 +387,7 @@ def test_messages_of_known_drivers_are_defined_where_a_bag_does_not(
     assert sequence.dvl.velocity[:, 0].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_types_of_unknown_drivers_are_defined_by_the_files_of_their_package(
-    tmp_path, decoded
-):
+def test_unknown_types_are_defined_by_files_of_their_package(tmp_path, decoded):
     store = get_typestore(Stores.ROS2_HUMBLE)
     text = "std_msgs/Header header\nfloat64 depth\n"
     store.register(get_types_from_msg(text, "own_msgs/msg/Depth"))

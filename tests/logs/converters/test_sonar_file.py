@@ -140,9 +140,7 @@ CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [
 
 
 @pytest.mark.parametrize(("ending", "name"), CASES)
-def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(
-    tmp_path, ending, name
-):
+def test_intact_frames_of_a_damaged_file_are_read(tmp_path, ending, name):
     damage, expected, told = (FAULTS | ARIS_FAULTS)[name]
     head, *frames = PIECES[ending]
     numbers, said = read(tmp_path, [head, *damage(frames, ending)], ending)
@@ -185,7 +183,7 @@ def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, en
 # ---- conversion to a log
 
 
-def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(
+def test_an_existing_log_survives_a_failed_conversion(
     tmp_path,
 ):
     log = tmp_path / "dive.mcap"
@@ -227,7 +225,7 @@ def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
     assert all(words in said for words in ("48 beams x 50 bins of uint8", "cut off"))
 
 
-def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path):
+def test_the_command_takes_the_speed_of_sound_and_shows_losses(tmp_path):
     header, *frames = Ddf(images(50, 96, 512)).pieces()
     source = tmp_path / "dive.ddf"
     log = tmp_path / "dive.mcap"

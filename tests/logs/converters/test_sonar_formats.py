@@ -208,7 +208,7 @@ def test_other_files_and_headers_that_make_no_sense_are_refused_by_name(
 # ---- messages and clocks of an Oculus
 
 
-def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(
+def test_messages_without_images_are_skipped(
     tmp_path,
 ):
     pictures = images(4, 16, 8)
