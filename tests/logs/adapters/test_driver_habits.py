@@ -186,3 +186,29 @@ def test_a_log_that_this_package_wrote_keeps_every_velocity(tmp_path: Path) -> N
     )
     with_whole = read_log(tmp_path / "own.mcap", calibration=world.calibration)
     np.testing.assert_array_equal(with_whole.dvl.velocity, velocity)
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_held_velocities_are_used_once(foreign: Any, times: int) -> None:
+    """Water Linked's driver publishes ``~/odom`` once for each of two reports."""
+    rows = [
+        {
+            "twist": {"twist": {"linear": velocity(row // times)}},
+            "child_frame_id": "dvl_link",
+        }
+        for row in range(ROWS)
+    ]
+    odometry = rows_of("/dvl/odom", "nav_msgs/msg/Odometry", rows, "odom")
+    sequence = foreign.read(imu(ROWS), odometry, tree("dvl_link", w=1.0))
+    np.testing.assert_array_equal(sequence.dvl.stamps_ns, foreign.stamps(ROWS)[::times])
+    assert "that repeat the velocity before" in sequence.notes["log.dropped"]
+
+
+def test_a_sensor_that_got_stuck_once_does_not_hold_velocities(
+    foreign: Any,
+) -> None:
+    stuck = report(lost={"velocity": velocity(20)})
+    assert (
+        len(foreign.read(imu(ROWS), stuck, tree("dvl_link", w=1.0)).dvl.stamps_ns)
+        == ROWS
+    )
