@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
-    from sonar_graph.recognition.recognition_record import Recognition
+    from sonar_graph.recognition import Recognition
 
     from .recognition.imaged_lane import Lane
 
@@ -90,7 +90,7 @@ def lane_log(lane: Lane, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def lane_recognition(lane: Lane) -> Recognition:
     """What is recognised in its images."""
-    from sonar_graph.recognition.session import RecognitionSession, one_by_one
+    from sonar_graph.recognition import RecognitionSession, one_by_one
 
     session = RecognitionSession(lane.sequence)
     for frame in one_by_one(lane.frames):

@@ -7,8 +7,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
-from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.results import Comparison, RunResult, Score
+from sonar_graph.evaluation import Comparison, RunResult, Score, judge
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import (

@@ -10,14 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.cli.main import main
+from sonar_graph.cli import main
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log
 from sonar_graph.recognition import RECOGNISERS, LandmarkRecogniser
-from sonar_graph.simulation.sonar_image.frames import FrameSimulator
-from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON, ImageOptions
-from sonar_graph.simulation.sonar_image.scene import place_landmark
+from sonar_graph.simulation.sonar_image import (
+    FrameSimulator,
+    ImageOptions,
+    place_landmark,
+)
+from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar import REPORTED, SonarStep
 
 PLUGIN = Path(__file__).parents[1] / "benchmarks" / "actag_plugin"
@@ -50,7 +53,7 @@ def made(**settings: Any) -> LandmarkRecogniser:
 
 
 class Decoder:
-    """In place of AcTag: gives what it is told, and remembers what it was given."""
+    """In place of AcTag: gives what it is set to, and remembers what it was given."""
 
     found: ClassVar[list[list[Any]]] = []
     settings: ClassVar[dict[str, Any]] = {}

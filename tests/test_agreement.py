@@ -1,4 +1,4 @@
-"""EKF-SLAM, the smoother and dead reckoning where they must say the same."""
+"""EKF-SLAM, the smoother and dead reckoning where they must agree."""
 
 from dataclasses import replace
 from typing import Any
@@ -148,7 +148,7 @@ def test_filters_judge_detections_as_the_smoother_or_as_published(params, kernel
 def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
     """Between nodes too, and in all that is known of the pose; by position fixes between nodes as well.
 
-    An azimuth says less of y from farther off, which filters do not linearise anew: 2e-6 of the variance of y.
+    An azimuth constrains y less from farther off, and filters do not re-linearise: 2e-6 of the variance of y.
     """
     sequence, _ = rail(NODES)
     truth = run(filters(sequence.calibration)[0], sequence)
@@ -259,7 +259,7 @@ def test_without_sightings_all_are_dead_reckoning():
 
 @pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
 def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind):
-    """A constant bias of which nothing is learnt: unknown, and the same at all times."""
+    """A constant, unobservable bias: unknown, and the same at all times."""
     sequence = winding(gyro_bias_sigma=2e-3)
     reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
     poses, covariances = difference(

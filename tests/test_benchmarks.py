@@ -105,7 +105,7 @@ QUICK = {
     "validation/batch_gate.py": Quick(
         ("--workers", "1"), ("told_power_median", "power_20_percent_20_seeds", "false_alarms_allowed", "passed"),
         ascending=((0, "power_50_percent_3_seeds"),)),
-    "validation/victoria_park.py": Quick(  # the other reading of the file's noise is another problem: it is told apart
+    "validation/victoria_park.py": Quick(  # the other reading of the file's noise is another problem: it is distinguished
         TWO_WORKERS, ascending=(
             (0.995, "cost_ratio", 1.005), ("landmark_rms_difference_m", 0.05), (1.015, "file_noise_cost_ratio"))),
     "performance/preintegration.py": Quick(

@@ -1,4 +1,4 @@
-"""Loops of estimators that another process compiles are found by this one, and a failure there harms nobody."""
+"""Loops of estimators that another process compiles are found by this one, and a failure there does no harm."""
 
 import os
 import subprocess

@@ -12,13 +12,13 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.estimator import load_estimator
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
-from sonar_graph.testing import laws
-from sonar_graph.testing.laws import (
+from sonar_graph.testing import (
     CHECKS,
     FILTER_CHECKS,
     Check,
     ContractError,
     check_estimator,
+    laws,
 )
 
 

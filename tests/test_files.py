@@ -123,7 +123,7 @@ def test_a_block_that_fails_changes_nothing_and_leaves_no_temporary_file(tmp_pat
 def test_an_interrupted_file_leaves_nothing_not_even_its_folder(
     tmp_path, monkeypatch, is_new
 ):
-    """A signal has no better moment: the file is there, and who asked for it does not know yet."""
+    """A signal has no better moment: the file is there, and the caller does not know yet."""
     path = tmp_path / "made" / "below" / "log.mcap"
     opened = os.open
     if not is_new:

@@ -22,21 +22,6 @@ PACKAGES = ("sonar_graph", "baselines")
 FILES = [
     path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))
 ]
-QUESTION_WORDS = {
-    "what",
-    "which",
-    "whether",
-    "how",
-    "of",
-    "those",
-    "it",
-    "that",
-    "where",
-    "who",
-    "whose",
-    "so",
-    "as",
-}
 ROOMS_WITH_EXAMPLES = (
     "testing",
     "navigation",
@@ -95,7 +80,7 @@ def test_a_package_is_a_short_table_of_contents_with_few_modules(path: Path) -> 
     assert len([p for p in path.parent.glob("*.py") if p.name != "__init__.py"]) <= 13
 
 
-# Folders of which each imports files of the other. The list may only become shorter.
+# Folders that import files of each other. The list may only become shorter.
 KNOWN_MUTUAL_FOLDERS = {
     ("sonar_graph/navigation", "sonar_graph/navigation/dvl_screening"),
     ("sonar_graph/report", "sonar_graph/report/figures"),
@@ -146,20 +131,6 @@ def test_names_of_files_and_of_public_classes_occur_once() -> None:
         if isinstance(node, ast.ClassDef)
     )
     assert [name for name, count in (stems + classes).items() if count > 1] == []
-
-
-def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
-    asking = []
-    total = 0
-    for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (
-                text := ast.get_docstring(node)
-            ):
-                total += 1
-                if text.split()[0].strip(":,.").lower() in QUESTION_WORDS:
-                    asking.append(f"{path.relative_to(ROOT)}: {text.splitlines()[0]}")
-    assert len(asking) <= 0.02 * total, "\n".join(asking)
 
 
 def test_the_front_door_loads_nothing_heavy() -> None:

@@ -1,4 +1,4 @@
-"""Compiled code: a user who waits is told, and its cache follows what it was compiled from."""
+"""Compiled code: a user who waits gets a message, and its cache follows what it was compiled from."""
 
 import importlib
 import os

@@ -1,4 +1,4 @@
-"""Biases of a run: what they do to a motion, by differences of motions of rows that have them; what gravity tells."""
+"""Biases of a run: what they do to a motion, by differences of motions of rows that have them; what gravity shows."""
 
 from dataclasses import replace
 
@@ -149,7 +149,7 @@ estimators = pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
 
 @pytest.mark.parametrize("kind", [DeadReckoning, InvariantEkf, Isam2])
 def test_gravity_tells_the_tilt_and_nothing_of_the_heading(kind):
-    """Rolled by 17 degrees it would tell the gyro's bias about the vertical, if that were there once."""
+    """Rolled by 17 degrees it would show the gyro's bias about the vertical, if that were there once."""
     with_it = known(gyro_bias_sigma=1e-2, gyro_bias_walk_density=0.0)
     without = with_it.model_copy(update={"use_gravity": False})
     both = [ran(kind, turning(calibration)) for calibration in (with_it, without)]

@@ -22,7 +22,7 @@ from sonar_graph.measurements import (
 
 
 def depth(stamps_ns: list[int]) -> Depth:
-    """Rows whose height says which row they were."""
+    """Rows whose height is their number."""
     return Depth(
         np.array(stamps_ns),
         np.arange(len(stamps_ns), dtype=float),
@@ -124,16 +124,8 @@ def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
             "Dvl.velocity_cov: expected shape (5, 3, 3)",
         ),
         (
-            lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)),
-            "Depth.z_m: expected shape (5,), not (5, 1)",
-        ),
-        (
             lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)),
             "Heading.yaw_rad: expected shape (5,)",
-        ),
-        (
-            lambda n: PositionFixes(n, np.zeros((5, 2)), np.zeros((5, 3, 3))),
-            "position_m: expected shape (5, 3)",
         ),
     ],
 )
@@ -168,19 +160,10 @@ UNSAID = np.full((2, 2, 2), np.nan)
             {"candidate_ids": [[1.0, 2.0]] * 2},
             r"candidate_ids: expected integers, not float64",
         ),
-        (
-            {"candidate_ids": [["a", "b"]] * 2},
-            r"candidate_ids: expected integers, not <U1",
-        ),
         ({"range_m": ["near", "far"]}, r"range_m: expected numbers, not <U4"),
-        ({"track": [0.5, 1.5]}, r"track: expected integers, not float64"),
         (
             {"candidate_ids": [1, 2]},
             r"candidate_ids: expected shape \(n, k\).*not \(2,\)",
-        ),
-        (
-            {"id_probability": [[0.9]] * 2},
-            r"id_probability: expected shape \(n, k\).*not \(2, 1\)",
         ),
         (
             {"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))},
@@ -188,10 +171,6 @@ UNSAID = np.full((2, 2, 2), np.nan)
         ),
         (
             {"candidate_ids": [[1, 2], [1, 2**56]]},
-            r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
-        ),
-        (
-            {"candidate_ids": [[1, 2], [2**63 - 1, 2]]},
             r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
         ),
         ({"track": [[1], [2]]}, r"track: expected shape \(2,\), not \(2, 1\)"),
@@ -206,10 +185,6 @@ UNSAID = np.full((2, 2, 2), np.nan)
         (
             {"id_probability": [[0.9, 0.2], [0.9, 0.1]]},
             r"id_probability: row 0 .* more than 1 in sum",
-        ),
-        (
-            {"id_probability": [[0.9, -0.1], [0.9, 0.1]]},
-            r"id_probability: row 0 .* not between 0 and 1",
         ),
         ({"id_probability": [[np.nan, 0.1], [0.9, 0.1]]}, r"id_probability: row 0"),
     ],
@@ -272,7 +247,7 @@ def test_rows_after_the_end_of_a_call_are_refused_by_name(block):
 
 
 def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
-    """Unknown noise (NaN) is none of them, and of a covariance only what rounding of single precision explains."""
+    """Unknown noise (NaN) is not one of them, and of a covariance only what rounding of single precision explains."""
     sigmas = [np.nan, 0.01, 0.0, -1.0, np.inf]
     assert Heading(
         np.arange(5), np.zeros(5), np.array(sigmas)

@@ -1,4 +1,4 @@
-"""The checks that users run on factors and covariances tell right from wrong."""
+"""The checks that users run on factors and covariances distinguish right from wrong."""
 
 import gtsam
 import numpy as np

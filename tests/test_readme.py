@@ -82,7 +82,7 @@ def test_example_calibration_is_one() -> None:
 
 
 def test_the_table_of_topics_has_every_type_and_word_that_is_found() -> None:
-    from sonar_graph.logs.adapters.drivers import SHIPPED
+    from sonar_graph.logs.adapters import SHIPPED
 
     names = {
         "imu": "IMU",

@@ -16,14 +16,13 @@ import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs import PartialCalibration, read_log
+from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.logs.convert.csv_log import parse_csv_config
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.vehicle_setup import PartialCalibration
+from sonar_graph.recognition import read_labels
 from sonar_graph.recognition.confusion_fit import LEAST_FRAMES
-from sonar_graph.recognition.labels import read_labels
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"
 TRUE_LANDMARKS = {1: (5.0, 0.0), 2: (7.0, -5.0), 3: (2.0, -7.0), 4: (0.0, -2.0)}
@@ -294,7 +293,7 @@ def test_page_on_tables_gives_the_simulated_run(
     for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
         words, _, target = line.partition(" > ")
         printed = output(tmp_path, "sonar-graph", *words.split())
-        if target:  # the guess is what the page says, but for the axes of the IMU
+        if target:  # the guess is that of the page, but for the axes of the IMU
             said = [
                 row.partition("  #")[0]
                 for row in printed.splitlines()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 
 @pytest.fixture(scope="module")

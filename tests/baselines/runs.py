@@ -1,4 +1,4 @@
-"""Runs of the filters on rows made by hand, and what is asked of their states."""
+"""Runs of the filters on rows made by hand, and the states that they must have."""
 
 import math
 from dataclasses import replace

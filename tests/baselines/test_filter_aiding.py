@@ -28,7 +28,7 @@ from .runs import (
 @slam_filters
 @pytest.mark.parametrize("is_late", [False, True], ids=["in time", "late"])
 def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind, is_late):
-    """Ten fixes at 9 s of a gap tell of the start rather less than an exact one; a heading is as good as elsewhere."""
+    """Ten fixes at 9 s of a gap constrain the start somewhat less than an exact one; a heading is as good as elsewhere."""
     fixes_ns = later(*np.linspace(9.0, 9.9, 10))
     unknown = np.full((10, 3, 3), math.nan)
     fixes = PositionFixes(
@@ -47,7 +47,7 @@ def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind, is_late):
 def test_a_late_fix_has_the_motion_backwards_with_its_covariance(
     monkeypatch,
 ):
-    """By differences of the inverse; it is asked for with the attitude at its start, that of the fix."""
+    """By differences of the inverse, for the attitude at its start, that of the fix."""
     told = []
     gyro, doppler = circle()
     nothing = np.zeros(6)
@@ -146,7 +146,7 @@ def test_a_late_fix_at_the_estimate_narrows_it_and_moves_nothing(kind, late_s):
 
 
 def assert_moved_by_a_late_fix(slam, late_s, now_s, *, is_used):
-    """A fix where the filter said that it was leaves the means, and makes the covariance less where it is used."""
+    """A fix at the filter's own estimate leaves the means, and makes the covariance less where it is used."""
     said = slam.trajectory()
     mean, P = means_and_covariance(slam)
     (then,) = np.flatnonzero(said.stamps_ns == later(late_s))

@@ -408,7 +408,7 @@ def gauge(axes):
 def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(
     angles, twist, view
 ):
-    """At any estimate, right or wrong: of ``P = N N^T`` prediction and updates leave all. Height and tilt are told."""
+    """At any estimate, right or wrong: of ``P = N N^T`` prediction and updates leave all. Height and tilt are observable."""
     motion = motion_of(twist, np.zeros((6, 6)))
     world = in_view(angles, motion, view)
     known = gauge(2) @ gauge(2).T

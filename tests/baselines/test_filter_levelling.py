@@ -1,4 +1,4 @@
-"""Laws of gravity, depth and plane, and of what measurements in a gap may tell."""
+"""Laws of gravity, depth and plane, and of the weight of measurements in a gap."""
 
 import math
 from dataclasses import replace

@@ -14,7 +14,7 @@ from baselines.ekf_slam import COMPASS, EkfSlam
 from baselines.events import Motion
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.measurements import Measurements
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Outcome
 
 from .runs import (

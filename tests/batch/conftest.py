@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs, source_hash, versions_of
+from sonar_graph.batch import plan_runs, read_suite
+from sonar_graph.batch.plan import source_hash, versions_of
 from sonar_graph.batch.store import PlannedRun
-from sonar_graph.batch.suite import read_suite
 
 WriteSuite = Callable[..., Path]
 
@@ -63,10 +63,8 @@ def misbehaving(tmp_path, monkeypatch):
     (about / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: misbehaving\nVersion: 1.0\n"
     )
-    points, code = (
-        ["[sonar_graph.estimators]", "broken = not_there:Broken"],
-        ["import os, signal, time"],
-    )
+    points = ["[sonar_graph.estimators]", "broken = not_there:Broken"]
+    code = ["import os, signal, time"]
     code += [
         "from pathlib import Path",
         "from baselines.dead_reckoning import DeadReckoning",

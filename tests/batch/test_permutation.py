@@ -17,7 +17,7 @@ from permutation import (
 )
 from scipy import stats
 
-from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch import ALL_LOGS
 
 
 def family(beyond: np.ndarray, share: float = 1.0) -> Family:
@@ -26,7 +26,7 @@ def family(beyond: np.ndarray, share: float = 1.0) -> Family:
     )
 
 
-def test_one_group_has_the_p_value_of_the_t_test_or_the_share_of_sign_changes_with_a_larger_mean():
+def test_one_group_has_the_p_value_of_a_t_test_or_of_sign_changes():
     beyond = np.array([0.3, 0.1, 0.5])
     expected = stats.ttest_1samp(beyond, 0.0, alternative="greater").pvalue
     assert family(beyond[:, None]).p_values[0] == pytest.approx(
@@ -42,7 +42,7 @@ def test_one_group_has_the_p_value_of_the_t_test_or_the_share_of_sign_changes_wi
     )
 
 
-def test_p_values_are_of_all_changes_or_those_that_are_drawn_shared_by_families_and_not_above_one():
+def test_p_values_come_from_all_sign_changes_or_a_sample():
     up = np.linspace(1.0, 2.0, ALL_SIGNS + 1)[:, None]
     assert family(up[:-1]).p_values[0] == 2.0**-10
     many = np.linspace(1.0, 2.0, 30)[:, None]

@@ -55,7 +55,8 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
     store.write("done", OUTCOME)
     before = names(tmp_path)
     written = 0
-    write, write_text = Path.write_bytes, Path.write_text
+    write = Path.write_bytes
+    write_text = Path.write_text
 
     def full(self: Path, *content: Any) -> int:
         nonlocal written
@@ -92,7 +93,7 @@ def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("act", ["discard", "write"])
-def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
+def test_a_process_killed_during_removal_leaves_a_run_whole_or_gone(
     tmp_path, monkeypatch, act
 ):
     store = Store(tmp_path)
@@ -114,7 +115,7 @@ def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
     assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
 
 
-def test_row_that_the_machine_lost_or_that_is_of_another_run_counts_as_not_done(
+def test_a_lost_or_foreign_row_counts_as_not_done(
     tmp_path,
 ):
     store = Store(tmp_path)
@@ -129,7 +130,7 @@ def test_row_that_the_machine_lost_or_that_is_of_another_run_counts_as_not_done(
     assert store.row("k") is store.row("other") is None
 
 
-def test_others_files_in_the_folder_of_a_run_or_beside_it_are_never_removed(tmp_path):
+def test_files_of_others_are_never_removed(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     (store.run_folder("k") / "log.txt").write_text("mine")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.cli.main import main
-from sonar_graph.logs.writing import write_log
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.cli import main
+from sonar_graph.logs import write_log
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 Run = Callable[..., int]
 

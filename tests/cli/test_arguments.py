@@ -18,7 +18,7 @@ from sonar_graph.cli.arguments import (
     parse_settings,
     with_options,
 )
-from sonar_graph.logs.vehicle_setup import PartialCalibration
+from sonar_graph.logs import PartialCalibration
 
 
 @given(

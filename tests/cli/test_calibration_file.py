@@ -1,4 +1,4 @@
-"""The calibration file to begin from says what there is, and changes nothing until somebody edits it."""
+"""The calibration file to begin from lists what there is, and changes nothing until it is edited."""
 
 import re
 import tomllib
@@ -31,9 +31,7 @@ def test_a_template_names_every_field_and_changes_none(run, capsys, tmp_path):
     assert {"z_m", "sigma_m"} <= values["floor"].keys()
 
 
-def test_a_template_of_a_log_gives_its_calibration_over_the_defaults_and_over_itself(
-    run, capsys, basin, tmp_path
-):
+def test_a_template_of_a_log_gives_its_calibration(run, capsys, basin, tmp_path):
     path = tmp_path / "vehicle.toml"
     path.write_text(printed(run, capsys, basin))
     stated = read_log(basin).calibration

@@ -1,4 +1,4 @@
-"""What ``--help`` says of every command."""
+"""The ``--help`` of every command."""
 
 import os
 import re
@@ -39,14 +39,10 @@ def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_co
     run, basin, tmp_path
 ):
     run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
-    heavy, cache = (
-        {"gtsam", "matplotlib", "numba", "numpy", "scipy"},
-        tmp_path / "cache",
-    )
-    park, report = (
-        ["convert", "victoria-park", "-o", str(tmp_path / "park.mcap")],
-        ["report", str(tmp_path)],
-    )
+    heavy = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}
+    cache = tmp_path / "cache"
+    park = ["convert", "victoria-park", "-o", str(tmp_path / "park.mcap")]
+    report = ["report", str(tmp_path)]
     for arguments, unused in ((["--help"], heavy), (park, {"numba"}), (report, set())):
         at_exit = f"lambda: print(sorted({unused} & set(sys.modules)), file=sys.stderr)"
         code = f"import atexit, sys, sonar_graph.cli; atexit.register({at_exit}); sonar_graph.cli.main({arguments})"
@@ -121,8 +117,8 @@ def test_examples_in_help_are_understood(tmp_path, monkeypatch):
 
 
 def test_help_names_defaults_presets_and_roles_as_they_are():
-    from sonar_graph.logs.roles import ROLES
-    from sonar_graph.simulation.basin import BasinOptions
+    from sonar_graph.logs import ROLES
+    from sonar_graph.simulation import BasinOptions
     from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
     from sonar_graph.simulation.sonar_image import SCENES, ImageOptions
 

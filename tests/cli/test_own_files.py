@@ -1,4 +1,4 @@
-"""Wrong uses on the way from own files to a report: one line each, which names the place and says what to do."""
+"""Wrong uses on the way from own files to a report: one line each, with the place and what to do."""
 
 import re
 from dataclasses import replace
@@ -34,7 +34,8 @@ def rows(stamps_ns: np.ndarray, *columns: np.ndarray) -> list[str]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Tables and logs of one dive, good ones and spoilt ones."""
-    path, world = tmp_path_factory.mktemp("own"), small_world()
+    path = tmp_path_factory.mktemp("own")
+    world = small_world()
     imu = [
         "time,wx,wy,wz,ax,ay,az",
         *rows(
@@ -42,7 +43,10 @@ def folder(tmp_path_factory) -> Path:
         ),
     ]
     dvl = ["time,vx,vy,vz", *rows(world.dvl.stamps_ns, world.dvl.velocity)]
-    word, short, late, time = list(imu), list(imu), list(imu), list(imu)
+    word = list(imu)
+    short = list(imu)
+    late = list(imu)
+    time = list(imu)
     word[7] = word[7].replace(",", ",fast,", 1).rpartition(",")[0]
     short[9] = short[9].rpartition(",")[0]
     late[20], late[900] = late[900], late[20]
@@ -170,9 +174,7 @@ def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, ca
     )
 
 
-def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(
-    folder, tmp_path
-):
+def test_a_truth_of_tables_may_lack_its_orientation(folder, tmp_path):
     world = small_world()
     truth = ["time,x,y,z", *rows(world.truth.stamps_ns, world.truth.positions)]
     (tmp_path / "truth.csv").write_text("\n".join(truth) + "\n")
@@ -185,7 +187,7 @@ def test_a_truth_of_tables_may_take_its_orientation_away_as_one_of_messages_may(
         read_csv(tables, tmp_path / "dive.toml")
 
 
-def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converted(
+def test_tables_with_another_unit_of_velocity_are_reported(
     run, folder, tmp_path, capsys
 ):
     (tmp_path / "dive.toml").write_text(IMU + DVL + "scale = 1000\n")
@@ -222,7 +224,7 @@ def test_tables_with_velocities_in_another_unit_are_named_when_they_are_converte
 
 
 @pytest.mark.parametrize("command", ["run", "compare"])
-def test_velocities_a_thousand_times_too_large_are_named_before_the_numbers(
+def test_velocities_a_thousand_times_too_large_come_first(
     run, folder, tmp_path, command, capsys
 ):
     names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")

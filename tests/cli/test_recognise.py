@@ -10,11 +10,10 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph import devices
-from sonar_graph.logs.mcap.writer import recording
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import sonar_image_messages
+from sonar_graph.logs import read_log, sonar_image_messages
+from sonar_graph.logs.mcap import recording
 from sonar_graph.recognition import confusion_fit
-from sonar_graph.sonar.confusion import read_confusion
+from sonar_graph.sonar import read_confusion
 from tests.recognition.imaged_lane import TOPIC
 
 QUICK = ("--estimators", "dead-reckoning")
@@ -46,11 +45,13 @@ def contents(path: Path) -> Counter[tuple[str, int, bytes]]:
 def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(
     lane_log, recognised, lane_recognition
 ):
-    before, after = contents(lane_log), contents(recognised)
+    before = contents(lane_log)
+    after = contents(recognised)
     assert before - after == Counter()
     added = after - before
     assert {topic for topic, _, _ in added} == {"/sonar/landmarks"}
-    found, expected = read_log(recognised).detections, lane_recognition.detections
+    found = read_log(recognised).detections
+    expected = lane_recognition.detections
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
     np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
     np.testing.assert_allclose(
@@ -92,10 +93,8 @@ def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, ca
         == 0
     )
     assert "Replaced: " in capsys.readouterr().out
-    one, other = (
-        read_log(recognised).detections,
-        read_log(tmp_path / "again.mcap").detections,
-    )
+    one = read_log(recognised).detections
+    other = read_log(tmp_path / "again.mcap").detections
     assert set(one.track.tolist()) == set(other.track.tolist())
     of_both = [
         (a, b)
@@ -191,10 +190,8 @@ def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(
     lane_log, run, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr("sonar_graph.cli.label.serve", lambda *_, **__: None)
-    designs, labels = (
-        Path(devices.__file__).with_name("default_landmarks.toml"),
-        tmp_path / "labels.json",
-    )
+    designs = Path(devices.__file__).with_name("default_landmarks.toml")
+    labels = tmp_path / "labels.json"
     assert (
         run("label", lane_log, "-o", labels, "--designs", designs, "--no-browser") == 0
     )
@@ -208,7 +205,8 @@ def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(
 def test_labels_take_the_place_of_a_truth_and_mistakes_with_them_are_named(
     lane, lane_log, run, tmp_path, capsys
 ):
-    model, given = tmp_path / "model.json", tmp_path / "labels.json"
+    model = tmp_path / "model.json"
+    given = tmp_path / "labels.json"
     stamp_ns = int(lane.frames.stamps_ns[40])
     given.write_text(json.dumps({"log": "lane.mcap", "labels": []}))
     for words, said in (
@@ -279,7 +277,8 @@ def test_designs_of_ones_own_and_settings_need_no_code(lane_log, run, tmp_path, 
 def test_images_alone_are_recognised_and_what_is_lost_is_said(
     lane, run, tmp_path, capsys
 ):
-    log, out = tmp_path / "sonar.mcap", tmp_path / "out.mcap"
+    log = tmp_path / "sonar.mcap"
+    out = tmp_path / "out.mcap"
     with recording(log, {}) as writer:
         writer.write([sonar_image_messages(TOPIC, lane.frames)])
     assert run("recognise", log, "-o", out, "--motion", "navigation") == 2
@@ -322,7 +321,8 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(
 def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(
     lane_log, run, tmp_path, capsys
 ):
-    page, out = tmp_path / "page.html", tmp_path / "out.mcap"
+    page = tmp_path / "page.html"
+    out = tmp_path / "out.mcap"
     page.write_text("mine")
     assert run("recognise", lane_log, "-o", out, "--report", page) == 2
     assert (

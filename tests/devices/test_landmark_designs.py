@@ -7,11 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sonar_graph.devices.landmark_designs import (
-    DEFAULT_DESIGNS,
-    LandmarkDesign,
-    load_designs,
-)
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.errors import CalibrationError
 
 HALF = """

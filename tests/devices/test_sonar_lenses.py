@@ -1,11 +1,7 @@
 import numpy as np
 import pytest
 
-from sonar_graph.devices.sonar_lenses import (
-    aris_azimuths,
-    didson_azimuths,
-    even_azimuths,
-)
+from sonar_graph.devices import aris_azimuths, didson_azimuths, even_azimuths
 
 
 @pytest.mark.parametrize(

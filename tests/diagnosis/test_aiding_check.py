@@ -12,10 +12,10 @@ from sonar_graph.calibration import Start
 from sonar_graph.diagnosis import aiding_check, check_sensors, doubts
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.units import force_scale
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Heading, PositionFixes
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .test_sensor_check import RIGHT, line_of, with_mounting
 
@@ -42,7 +42,7 @@ def compass(run: Sequence, yaw_of) -> Sequence:
 def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(
     gyro_bias: float, upside_down: bool
 ):
-    """Whatever the bias of the gyros, and however the IMU sits, as gravity tells."""
+    """Whatever the bias of the gyros, and however the IMU is mounted."""
     imu = replace(
         RIGHT.imu,
         angular_velocity=RIGHT.imu.angular_velocity + np.array([0.0, 0.0, gyro_bias]),
@@ -173,10 +173,12 @@ def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_pu
     places: str,
 ):
     """A Doppler log that is turned on the body is no turn of the heading."""
-    truth, off_rad = RIGHT.truth, 0.4
+    truth = RIGHT.truth
+    off_rad = 0.4
     rows = slice(0, len(truth), max(1, len(truth) // 1000))
     yaw_rad = truth.rotations().as_euler("ZYX")[rows, 0]
-    stamps_ns, positions = truth.stamps_ns[rows], truth.positions[rows]
+    stamps_ns = truth.stamps_ns[rows]
+    positions = truth.positions[rows]
     fixes = PositionFixes(stamps_ns, positions, np.full((len(positions), 3, 3), np.nan))
     velocity = Rotation.from_euler("z", -0.7).apply(RIGHT.dvl.velocity)
     run = with_mounting(

@@ -1,4 +1,4 @@
-"""Axes of gyros and Doppler log: each wrong candidate is found, told apart, and a right log is left as it is."""
+"""Axes of gyros and Doppler log: each wrong candidate is found and distinguished, and a right log is left as it is."""
 
 from dataclasses import replace
 
@@ -13,9 +13,9 @@ from sonar_graph.diagnosis.axes import (
     signed_permutations,
     turns_less_than_body,
 )
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .test_sensor_check import line_of
 
@@ -44,7 +44,7 @@ def spoilt(gyro: np.ndarray, dvl: np.ndarray) -> Sequence:
 
 
 @pytest.mark.parametrize("k", range(48))
-def test_every_axis_and_sign_of_the_gyros_is_found_and_the_doppler_log_left_alone(
+def test_every_axis_and_sign_of_the_gyros_is_found(
     k: int,
 ) -> None:
     G = signed_permutations()[k]
@@ -75,7 +75,7 @@ def test_without_accelerometers_or_motion_nothing_is_known() -> None:
 
 
 @pytest.mark.parametrize("given", [("x", "y", "z"), ("x", "-y", "z")])
-def test_a_gyro_whose_yaw_is_negated_is_named_first_with_the_line_that_mends_it(
+def test_a_negated_gyro_yaw_is_the_first_finding_with_its_line(
     given: tuple[str, str, str],
 ) -> None:
     """The line replaces that of the configuration."""

@@ -15,7 +15,7 @@ from sonar_graph.calibration import (
     Mounting,
     Start,
 )
-from sonar_graph.diagnosis.findings import Finding
+from sonar_graph.diagnosis import Finding
 from sonar_graph.diagnosis.start import (
     StartTilt,
     bias_findings,
@@ -27,11 +27,10 @@ from sonar_graph.diagnosis.start import (
     with_fitted,
 )
 from sonar_graph.measurements import Dvl, Heading, Imu
-from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
-from sonar_graph.navigation.alignment.time_offset import Estimate1D
+from sonar_graph.navigation.alignment import DvlMatch, Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
 
 UNKNOWN = Estimate1D(np.nan, np.inf, "too little turning")
@@ -87,7 +86,7 @@ def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
     ).imu.mounting.translation_m == pytest.approx(places[0])
 
 
-def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_says_why():
+def test_an_unobservable_axis_of_the_lever_arm_keeps_its_value():
     rows = lever_findings(match((UNKNOWN, *arm(0.6, 0.3))), GIVEN)
     assert rows[0].text() == "cannot be told: too little turning"
     assert [row.acts for row in rows] == [False, True, False]
@@ -134,7 +133,9 @@ def test_a_bias_beyond_its_sigma_is_stated_along_the_axes_of_the_imu():
     assert bias_findings(more, sources, fibre, A_MINUTE)[0].acts
 
 
-ROLL, PITCH, BIAS = 0.12, -0.07, np.array([3e-4, -2e-4, 1e-4])
+ROLL = 0.12
+PITCH = -0.07
+BIAS = np.array([3e-4, -2e-4, 1e-4])
 NS = 1_000_000_000
 
 
@@ -146,7 +147,8 @@ def started(**start: object) -> Calibration:
 def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequence:
     """Tilted and still for so long, then off at 0.4 m/s² for two seconds; the Doppler log may begin later."""
     rng = np.random.default_rng(2)
-    t, dvl_t = np.arange(0, duration_s, 0.01), np.arange(lay_s, duration_s, 0.2)
+    t = np.arange(0, duration_s, 0.01)
+    dvl_t = np.arange(lay_s, duration_s, 0.2)
     up = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
     off = ((t > rest_s) & (t < rest_s + 2.0))[:, None] * np.array([0.4, 0.0, 0.0])
     force = STANDARD_GRAVITY * up + off + 1.2e-2 * rng.standard_normal((len(t), 3))
@@ -185,11 +187,9 @@ def assert_tilt(found: StartTilt, roll_pitch: tuple[float, float]) -> None:
 def test_a_slow_turn_that_the_heading_confirms_is_no_gyro_bias(
     turn_rad_s, said_rad_s, left
 ):
-    """About the vertical of a tilted vehicle; and no turn without a heading that tells it from a bias."""
-    run, up = (
-        resting(50.0),
-        Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0]),
-    )
+    """About the vertical of a tilted vehicle; and no turn without a heading that distinguishes it from a bias."""
+    run = resting(50.0)
+    up = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
     turning = replace(
         run.imu, angular_velocity=run.imu.angular_velocity + turn_rad_s * up
     )
@@ -213,7 +213,7 @@ def test_a_slow_turn_that_the_heading_confirms_is_no_gyro_bias(
     )
 
 
-def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion_counts():
+def test_without_rest_the_first_minute_of_motion_gives_the_tilt():
     late = find_start_tilt(resting(15.0, lay_s=14.0))
     assert not late.is_rest
     assert "in motion" in late.said
@@ -228,7 +228,7 @@ def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion
         assert_tilt(found, rpy)
 
 
-def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
+def test_a_wrong_start_is_found_with_the_line_that_mends_it():
     found = find_start_tilt(resting(50.0))
     rows = tilt_findings(found, started(rpy_rad=(0.0, PITCH, 0.3)), yaw_rad=0.9)
     assert [row.acts for row in rows] == [True, False]
@@ -288,7 +288,8 @@ def test_what_speaks_against_both_ways_is_said_in_one_row():
 )
 def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float):
     """0.1 rad/s and an offset of 0.1 s: 0.01 rad beside a tenth of a degree, wherever the reference begins or ends."""
-    run, t = resting(50.0), np.arange(0.0, 60.01, 0.1)
+    run = resting(50.0)
+    t = np.arange(0.0, 60.01, 0.1)
     turning = Rotation.from_euler("z", 0.1 * (t + begin_s)[:, None]).as_quat()
     stamps_ns = run.start_ns + np.round(NS * (t + begin_s)).astype(np.int64)
     reference = Trajectory.without_covariances(

@@ -10,10 +10,10 @@ from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import aiding_check
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Heading, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 RUN = simulate_mission(MissionOptions(seed=4, duration_s=100.0, landmarks=1))
 
@@ -59,7 +59,7 @@ def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
     assert np.all(motion.parts == 0)
 
 
-def test_a_hole_of_the_imu_breaks_the_motion_and_a_reference_is_unknown_in_it():
+def test_an_imu_hole_splits_motion_and_reference():
     motion = motion_of(without_imu(RUN, 40.0, 46.0))
     assert set(motion.parts) == {0, 1}
     yaw = motion.reference(motion.yaw_rad)

@@ -9,22 +9,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.diagnosis import sensor_check
-from sonar_graph.diagnosis.findings import Finding, Gravity
+from sonar_graph.diagnosis import Finding, sensor_check
+from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import range_changes, wrong_units
-from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Heading, Imu
-from sonar_graph.navigation.alignment import InitialTilt
-from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
-from sonar_graph.navigation.alignment.time_offset import Estimate1D
+from sonar_graph.navigation.alignment import DvlMatch, Estimate1D, InitialTilt
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
 
 RIGHT = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
 SHORT = simulate_mission(MissionOptions(seed=4, duration_s=120, landmarks=1))
-OFFSET_S, YAW_RAD, SCALE = 0.4, np.radians(5), 1.04
+OFFSET_S = 0.4
+YAW_RAD = np.radians(5)
+SCALE = 1.04
 FAR_M = (0.9, 0.0, -0.7)
 """Where a calibration has the IMU that is at the origin; the Doppler log is at (-0.2, 0, -0.15) from it."""
 
@@ -91,10 +91,8 @@ def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
         for name, finding in found.items()
         if finding.acts and "`" in finding.advice
     }
-    shift_s, scale = (
-        lines["DVL against IMU: time offset"]["stamp_offset_s"],
-        lines["DVL scale"]["scale"],
-    )
+    shift_s = lines["DVL against IMU: time offset"]["stamp_offset_s"]
+    scale = lines["DVL scale"]["scale"]
     rpy = tuple(lines["DVL mounting yaw"]["dvl"]["mounting"]["rpy_rad"])
     place = tuple(
         lines["lever arm from IMU to DVL, x"]["imu"]["mounting"]["translation_m"]
@@ -144,7 +142,7 @@ def test_the_start_is_aligned_with_what_was_found_before(
     assert find_start_tilt(spoilt()).tilt is None
 
 
-def test_corrections_are_added_to_what_the_configuration_says_and_a_wrong_unit_is_named_alone():
+def test_corrections_add_to_those_of_the_configuration():
     config = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
     found = by_name(sensor_check.check_sensors(spoilt(), config))
     offset, scale = (
@@ -233,8 +231,10 @@ def test_a_hole_of_the_imu_asks_for_nothing(
     ("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)]
 )
 def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told: bool):
-    rng, n = np.random.default_rng(0), 5000
-    force, rate = 0.05 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
+    rng = np.random.default_rng(0)
+    n = 5000
+    force = 0.05 * rng.standard_normal((n, 3))
+    rate = 0.01 * rng.standard_normal((n, 3))
     velocity = [speed_m_s, 0, 0] + 0.01 * rng.standard_normal((250, 3))
     found = by_name(sensor_check.check_sensors(with_rows(rate, force, velocity)))
     for name in ("gyro noise density", "accelerometer noise density"):
@@ -276,7 +276,7 @@ def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
     )
 
 
-def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
+def test_the_bias_of_smaller_sigma_wins_axis_by_axis():
     unknown = Estimate1D(np.nan, np.inf, "too little turning")
     nothing = told(0.0, 0.0, 0.0)
     x, y, _ = told(1.0, 2.0, 3.0, sigma=1e-4)
@@ -323,14 +323,10 @@ def units(
     **scales: dict[str, float],
 ) -> list[Finding]:  # fmt: skip
     """Wrong units of readings so long; a force may be rows."""
-    stamps_ns, forces = (
-        np.arange(N) * 10_000_000,
-        force if np.ndim(force) == 2 else vectors(force),
-    )
-    imu, dvl = (
-        Imu(stamps_ns, vectors(turn), forces),
-        Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan)),
-    )
+    stamps_ns = np.arange(N) * 10_000_000
+    forces = force if np.ndim(force) == 2 else vectors(force)
+    imu = Imu(stamps_ns, vectors(turn), forces)
+    dvl = Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan))
     sequence = Sequence("hand", Calibration(gravity_m_s2=gravity), imu, dvl)
     return wrong_units(sequence, LogConfig.parse(scales, "x"))
 
@@ -344,9 +340,7 @@ SPEEDS = [
 
 
 @pytest.mark.parametrize(("speed", "unit", "times", "scale"), SPEEDS)
-def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_three(
-    speed, unit, times, scale
-):
+def test_the_unit_of_a_speed_over_twenty_is_found(speed, unit, times, scale):
     (fault,) = units(speed=speed)
     assert fault.quantity == "DVL: unit"
     assert fault.advice.startswith(
@@ -361,8 +355,9 @@ SLOW = simulate_mission(
 )
 
 
-def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_or_landmarks_few():
-    rng, velocity = np.random.default_rng(0), SLOW.dvl.velocity
+def test_ranges_decide_no_unit_with_wrong_axes_outliers_or_few_landmarks():
+    rng = np.random.default_rng(0)
+    velocity = SLOW.dvl.velocity
     spikes = velocity + 8.0 * (rng.random((len(velocity), 1)) < 0.2)
     for wrong in (velocity[:, [1, 2, 0]], -velocity, spikes):
         run = replace(SLOW, dvl=replace(SLOW.dvl, velocity=wrong))
@@ -382,7 +377,7 @@ def test_ranges_tell_nothing_of_units_where_axes_are_wrong_a_fifth_are_outliers_
     assert not wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
 
 
-def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
+def test_usual_readings_raise_no_doubt_about_units():
     """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
     assert not units(speed=19.9, turn=1.99, force=9.0)
     for force in (0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6):
@@ -400,7 +395,7 @@ def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
 def test_slow_rates_in_degrees_are_told_by_gravity():
     """They tilt the vehicle 57 times farther than gravity turns in the accelerometers; radians, by as much.
 
-    A constant bias tilts nothing. Without accelerometers nothing is said.
+    A constant bias tilts nothing. Without accelerometers there is no finding.
     """
     imu = RIGHT.imu
     for turn, acts in ((np.degrees(1.0), True), (1.0, False)):
@@ -481,9 +476,7 @@ def test_of_forces_without_gravity_nothing_else_is_blamed() -> None:
     assert [finding.quantity for finding in found if finding.acts] == []
 
 
-def test_a_heading_that_drifts_against_a_bias_by_the_drive_is_wrong_and_not_the_gyros() -> (
-    None
-):
+def test_a_drifting_heading_is_a_fault_of_the_heading() -> None:
     bias_rad_s = np.array([0.002, -0.001, 0.003])
     drift_rad_s = 0.05
     imu = SHORT.imu

@@ -73,7 +73,7 @@ def test_few_outliers_change_nothing_and_many_do(share: float, is_found: bool):
     assert (abs(found.gain.value - 1.0) < 0.02) == is_found
 
 
-def test_intervals_hold_the_truth_as_often_as_they_claim_with_correlated_errors():
+def test_intervals_cover_the_truth_with_correlated_errors():
     """Of 100 logs 95 % intervals hold 90 or more; sigmas by independent rows would hold far fewer."""
     held = 0
     naive = 0

@@ -64,7 +64,7 @@ def test_a_turn_that_forces_and_velocities_show_and_gyros_do_not_is_grave(spoil)
     [lambda rate: rate * [1.0, 1.0, 0.0], lambda rate: np.clip(rate, -0.1, 0.1)],
     ids=["dead", "clipped"],
 )
-def test_nothing_is_compared_with_gyros_whose_rows_show_the_fault_themselves(spoil):
+def test_gyros_with_dead_or_clipped_rows_are_not_compared(spoil):
     run = level_drive(0, spoil)
     (finding,) = check_sensors(run)
     assert "angular rate along z" in finding.estimate.reason
@@ -72,7 +72,7 @@ def test_nothing_is_compared_with_gyros_whose_rows_show_the_fault_themselves(spo
 
 
 @pytest.mark.parametrize("seed", [0])
-def test_angles_between_samples_are_named_with_the_factor_that_makes_them_rates(seed):
+def test_angle_increments_are_found_with_the_factor_to_rates(seed):
     run = level_drive(seed, lambda rate: rate / HZ, phase=float(seed))
     finding = check_sensors(run)[0]
     assert finding.quantity == TURN_RATE

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.diagnosis import check_sensors
-from sonar_graph.diagnosis.findings import Finding
+from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Heading, PositionFixes
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .test_sensor_check import line_of
 
@@ -93,7 +92,7 @@ def test_without_a_third_sensor_both_are_named(role: str) -> None:
         assert f"`{name}.mounting.rpy_rad" in finding.line
 
 
-def test_a_heading_may_be_of_the_turned_imu_and_clears_the_doppler_log_alone() -> None:
+def test_a_heading_may_come_from_the_turned_imu() -> None:
     run = with_sensors(WORLD, sonar=False, fixes=True, heading=True)
     run = with_measured_start(run)
     (of_imu,) = acting(with_turned(run, "imu", np.pi / 2))

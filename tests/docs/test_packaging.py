@@ -1,4 +1,4 @@
-"""Container file and conda recipe say what pyproject.toml says; neither is built here."""
+"""Container file and conda recipe agree with pyproject.toml; neither is built here."""
 
 import re
 import tomllib

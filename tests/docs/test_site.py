@@ -1,4 +1,4 @@
-"""The built site: no dead link, nothing from elsewhere, and in Chromium nothing said, cut off or inaccessible.
+"""The built site: no dead link, nothing from elsewhere, and in Chromium no console message, nothing cut off or inaccessible.
 
 ``make docs`` writes it to ``build/site``, or ``SONAR_GRAPH_SITE`` names its folder. It is opened as files, as a reader
 does who has no network.
@@ -24,7 +24,8 @@ BROWSER = next(
     None,
 )
 AXE = Path(os.environ.get("SONAR_GRAPH_AXE", ROOT / "node_modules/axe-core/axe.min.js"))
-PHONE, DESKTOP = 390, 1280
+PHONE = 390
+DESKTOP = 1280
 LOADED = {
     ("script", "src"),
     ("img", "src"),
@@ -163,7 +164,7 @@ def browser() -> Iterator[Any]:
 def opened(
     browser: Any, name: str, width: int, scheme: str = "light"
 ) -> Iterator[tuple[Any, list[str]]]:
-    """A page of the site, and what its console says."""
+    """A page of the site, and its console's messages."""
     page = browser.new_page(
         viewport={"width": width, "height": 900}, color_scheme=scheme
     )

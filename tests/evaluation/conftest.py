@@ -1,4 +1,4 @@
-"""Small sequences whose truth is known by hand, and estimators that do exactly what they are told."""
+"""Small sequences whose truth is known by hand, and estimators that do exactly what they are set to."""
 
 from collections.abc import Callable
 from typing import Any
@@ -71,7 +71,7 @@ def straight_sequence(
 
 
 class Offset:
-    """Says that it is beside the truth by a fixed amount; smoothing halves it."""
+    """Its estimates are beside the truth by a fixed amount; smoothing halves it."""
 
     class Params(Section):
         offset_m: float = 0.3

@@ -8,10 +8,9 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import sonar_image_messages, write_log
-from sonar_graph.recognition.recognition_record import NO_FLOOR, Recognition
-from sonar_graph.recognition.session import LEAPT, recognise_images
+from sonar_graph.logs import read_log, sonar_image_messages, write_log
+from sonar_graph.recognition import NO_FLOOR, Recognition, recognise_images
+from sonar_graph.recognition.session import LEAPT
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 COUNT = 70

@@ -1,4 +1,4 @@
-"""Where nobody stated the start, errors are those of the estimator, not of the unknown world."""
+"""Where the start is not stated, errors are those of the estimator, not of the unknown world."""
 
 from dataclasses import replace
 
@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.evaluation.comparison import judge
+from sonar_graph.evaluation import Comparison, judge
 from sonar_graph.evaluation.metrics import Alignment
-from sonar_graph.evaluation.results import Comparison
+from sonar_graph.report import doubt_lines
 from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.sentences import doubt_lines, remarks
+from sonar_graph.report.sentences import remarks
 from sonar_graph.states import Trajectory
 from tests.synthetic import basin_comparison
 
@@ -35,7 +35,8 @@ def judged(
     orientation: bool = True,
 ) -> Comparison:
     """The same runs where the truth is of another world."""
-    truth, sequence = known.sequence.truth, known.sequence
+    truth = known.sequence.truth
+    sequence = known.sequence
     turned = (Rotation.from_matrix(world.rotation) * truth.rotations()).as_quat()
     moved = Trajectory(
         truth.stamps_ns, world.apply(truth.positions), turned, truth.covariances

@@ -126,11 +126,10 @@ def state() -> tuple[object, ...]:
     )
 
 
-def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(
-    plugin, mission
-):
+def test_an_estimator_cannot_change_another_s_process(plugin, mission):
     own = ["dead-reckoning", "ekf-slam"]
-    alone, before = compare(mission, own), state()
+    alone = compare(mission, own)
+    before = state()
     together = compare(mission, [own[0], "their-meddling", own[1]])
     assert state() == before
     assert "theirs" not in sys.modules
@@ -142,9 +141,7 @@ def test_what_an_estimator_does_to_its_process_changes_no_other_ones_numbers(
                 assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
-def test_one_that_does_nothing_wrong_gives_the_numbers_that_it_gives_in_this_process(
-    plugin, mission, monkeypatch
-):
+def test_a_process_of_its_own_gives_the_same_numbers(plugin, mission, monkeypatch):
     steps = []
     apart = run_estimator(
         mission, "dead-reckoning", progress=lambda *step: steps.append(step)
@@ -188,9 +185,7 @@ def test_the_end_of_a_process_is_the_failure_of_its_run_alone(
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, None])
-def test_an_interrupt_that_compiled_code_swallows_is_no_failure_of_the_estimator(
-    mission, monkeypatch, failure
-):
+def test_an_interrupt_is_no_failure_of_the_estimator(mission, monkeypatch, failure):
     def swallow(*_: object) -> None:
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)

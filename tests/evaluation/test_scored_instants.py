@@ -1,13 +1,16 @@
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.metrics import landmark_errors, rmse
-from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation import (
+    RunResult,
+    landmark_errors,
+    map_instants,
+    published_maps,
+    rmse,
+)
 from sonar_graph.evaluation.scored_instants import (
     ESTIMATED_XY_M,
     TRUE_XY_M,
-    map_instants,
-    published_maps,
     scored_instants,
 )
 from sonar_graph.states import Trajectory
@@ -36,7 +39,7 @@ OCCLUDED, HIDDEN_SHORTLY = (
 SPARSE = [0.0, 1.0, 2.0, 3.0, 6.0, 7.0]
 # fmt: off
 SCORED = [
-    # asked, truth, of each run, scored, outside truth, in its gaps, not estimated, said
+    # requested, truth, of each run, scored, outside truth, in its gaps, not estimated, message
     ([-0.5, 0, 1, 3, 3.5], DENSE, [], [0, 1, 3], 2, 0, 0, "3 of 5 instants (left out: 2 outside the truth's time span"),
     ([0.5, 1.0, 1.5, 2.0], OCCLUDED, [], [0.5, 1.0, 2.0], 0, 1, 0, "1 in gaps of the truth longer than 0.5 s"),
     ([1.25], HIDDEN_SHORTLY, [], [1.25], 0, 0, 0, "1 of 1 instants"),

@@ -114,9 +114,3 @@ def test_the_last_steps_end_with_imu_and_doppler_log():
 def test_impossible_choices_are_refused(rate_hz, lateness_s):
     with pytest.raises(MeasurementError, match=r"rate|budget"):
         Arrivals(rate_hz, lateness_s)
-
-
-def test_a_row_that_waits_for_a_later_step_still_refuses_another_of_its_stamp():
-    arrivals = given(imu(0), dvl(0), imu(150), dvl(150))
-    assert ends_ms(arrivals) == [100]
-    assert arrivals.add(*imu(150)) == REPEATED

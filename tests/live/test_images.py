@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, recognise
-from sonar_graph.cli.main import main
-from sonar_graph.live import LiveOptions, LiveRun
-from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.cli import main
+from sonar_graph.live import LiveOptions, LiveRun, definition_of
 from sonar_graph.logs import LiveRecord, PartialCalibration
 from tests.live.traffic import messages_of
 
@@ -45,7 +44,8 @@ def test_who_recognises_live_without_a_height_over_the_floor_is_told(
         if knows_floor
         else None
     )
-    messages, said = messages_of(log, np.random.default_rng(0), 0.0), []
+    messages = messages_of(log, np.random.default_rng(0), 0.0)
+    said = []
     options = LiveOptions("dead-reckoning", calibration=given)
     with (
         LiveRecord(tmp_path / "record.mcap") as record,
@@ -66,7 +66,7 @@ def test_who_recognises_live_without_a_height_over_the_floor_is_told(
 def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path, log):
     """Each image is waited for; the images of the first two seconds, before the recogniser begins, are missing."""
     whole = recognise(log)
-    # messages do not say it
+    # messages do not contain it
     given = PartialCalibration.parse(read_log(log).calibration.model_dump(), "its log")
     messages = messages_of(log, np.random.default_rng(0), 0.0)
     last_ns = messages[0].arrival_ns + int(LOG_S * 1e9)
@@ -87,10 +87,8 @@ def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path, 
     assert len(outcome.causal) > 100
     recorded = read_log(tmp_path / "record.mcap")
     assert recorded.detections is not None
-    mine, theirs = (
-        recorded.detections,
-        whole.detections.between(0, int(recorded.detections.stamps_ns[-1])),
-    )
+    mine = recorded.detections
+    theirs = whole.detections.between(0, int(recorded.detections.stamps_ns[-1]))
     first = np.searchsorted(theirs.stamps_ns, mine.stamps_ns[0])
     assert len(mine) >= 5
     assert abs(len(mine) - (len(theirs) - first)) <= 2

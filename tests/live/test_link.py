@@ -16,15 +16,15 @@ from sonar_graph.live import (
     LiveRun,
     Message,
     Publisher,
+    definition_of,
     open_link,
     open_session,
     subscribe,
 )
 from sonar_graph.live.foxglove_link import FoxgloveLink
 from sonar_graph.live.outlets import DETECTED, TOPICS, ZenohOutlet
-from sonar_graph.live.zenoh_link import definition_of, parse_key, topic_key, type_hash
-from sonar_graph.logs import PartialCalibration
-from sonar_graph.logs.live_record import LiveRecord
+from sonar_graph.live.zenoh_link import parse_key, topic_key, type_hash
+from sonar_graph.logs import LiveRecord, PartialCalibration
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from tests.live.traffic import free_endpoint, messages_of
 
@@ -69,7 +69,8 @@ def foreign_publisher(endpoint, messages, ready):
     with zenoh.open(config) as session:
         ready["router"].set()
         ready["subscribed"].wait(60)
-        first_ns, begun_s = messages[0].arrival_ns, time.monotonic()
+        first_ns = messages[0].arrival_ns
+        begun_s = time.monotonic()
         for number, message in enumerate(messages):
             time.sleep(
                 max(
@@ -164,7 +165,8 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
     )
     last = odometry(heard[key][-1])
     at_ns = last.header.stamp.sec * 10**9 + last.header.stamp.nanosec
-    place, truth = last.pose.pose.position, mission.truth.at(np.array([at_ns]))
+    place = last.pose.pose.position
+    truth = mission.truth.at(np.array([at_ns]))
     assert np.linalg.norm(truth.positions[0] - [place.x, place.y, place.z]) < 0.1
 
 

@@ -1,4 +1,4 @@
-"""Predictions between estimates are dead reckoning, and their messages say the same numbers."""
+"""Predictions between estimates are dead reckoning, and their messages contain the same numbers."""
 
 import gtsam
 import mcap_ros2._dynamic as ros2
@@ -23,7 +23,8 @@ def predicted():
     estimator = load_estimator("dead-reckoning")(
         world.calibration, Odometry(world.calibration)
     )
-    predictor, pairs = Predictor(world.calibration), []
+    predictor = Predictor(world.calibration)
+    pairs = []
     for step in world.replay(world.instants(1.0)):
         predictor.add(step.imu, step.dvl)
         estimate = estimator.process(step)
@@ -48,7 +49,8 @@ def test_a_prediction_is_the_next_estimate_of_dead_reckoning():
 def test_frames_differ_by_the_newest_correction():
     """``world_T_body = map_T_odom odom_T_body``, also after an estimate that jumps; odom moves on smoothly."""
     world = small_world()
-    predictor, before = Predictor(world.calibration), None
+    predictor = Predictor(world.calibration)
+    before = None
     jump = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([5.0, 0.0, 0.0]))
     for k, step in enumerate(world.replay(world.instants(10.0))):
         predictor.add(step.imu, step.dvl)

@@ -18,7 +18,8 @@ def messages_of(
 
     Each is delayed by a time drawn evenly from 0 to ``delay_s``, and never overtakes one of its own topic.
     """
-    found, newest_ns = [], dict[str, int]()
+    found = []
+    newest_ns = dict[str, int]()
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             if not channel.topic.startswith(TRUTH):

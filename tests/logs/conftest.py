@@ -14,11 +14,8 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
-from sonar_graph.logs.cdr.definitions import definition
-from sonar_graph.logs.mcap.reader import Recording
-from sonar_graph.logs.mcap.scanning import scan
-from sonar_graph.logs.mcap.time_window import TimeWindow
-from sonar_graph.logs.mcap.topic import Keep, Topic
+from sonar_graph.logs.cdr import definition
+from sonar_graph.logs.mcap import Keep, Recording, TimeWindow, Topic, scan
 from sonar_graph.measurements import (
     Depth,
     Dvl,

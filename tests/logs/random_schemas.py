@@ -12,13 +12,8 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.interfaces import Typestore
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sonar_graph.logs.cdr.definitions import (
-    PRIMITIVES,
-    STRING,
-    Struct,
-    parse_definition,
-)
-from sonar_graph.logs.cdr.messages import Messages, decode, encode
+from sonar_graph.logs.cdr import Messages, Struct, decode, encode, parse_definition
+from sonar_graph.logs.cdr.definitions import PRIMITIVES, STRING
 
 ROOT = "fuzz_msgs/msg/Root"
 TEXTS = ["", "a", "base_link", "ψ → 深い", "with \0 inside", "\U0001f420", "x" * 40]
@@ -146,7 +141,8 @@ def leaves_of(
 ) -> dict[str, list[Any]]:
     """All values by path, in order, of a message as mcap-ros2-support decodes it; of arrays their lengths too."""
     for entry in definition.fields:
-        path, value = prefix + entry.name, getattr(message, entry.name)
+        path = prefix + entry.name
+        value = getattr(message, entry.name)
         elements = list(value) if entry.is_array else [value]
         if entry.is_array:
             found.setdefault(f"len {path}", []).append(len(elements))
@@ -162,7 +158,8 @@ def leaves_of(
 
 def paths_of(definition: Struct, prefix: str = "") -> tuple[dict[str, bool], list[str]]:
     """Fields that hold values, with whether those are strings; and arrays and sequences."""
-    values, arrays = dict[str, bool](), list[str]()
+    values = dict[str, bool]()
+    arrays = list[str]()
     for entry in definition.fields:
         path = prefix + entry.name
         arrays += [path] if entry.is_array else []
@@ -238,7 +235,8 @@ def check(schemas: int, messages: int, seed: int = 0) -> Tally:
         types = RandomTypes(rng)
         types.draw()
         schema = types.schema()
-        definition, store = parse_definition(ROOT, schema), typestore(types.texts)
+        definition = parse_definition(ROOT, schema)
+        store = typestore(types.texts)
         oracle = generate_dynamic(ROOT, schema)[ROOT]
         # two each share a layout
         shapes = [np.random.default_rng([number, i // 2]) for i in range(messages)]

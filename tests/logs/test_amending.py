@@ -1,4 +1,4 @@
-"""A log written anew: everything that was in it, and what was added; also where it is not whole."""
+"""A log written again: everything that was in it, and what was added; also where it is not whole."""
 
 import re
 import struct
@@ -10,11 +10,8 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.amending import write_amended
-from sonar_graph.logs.mcap.scanning import scan
-from sonar_graph.logs.mcap.topic import Keep
-from sonar_graph.logs.mcap.writer import Outgoing, is_own_log
-from sonar_graph.logs.writing import landmark_map_message
+from sonar_graph.logs import landmark_map_message, write_amended
+from sonar_graph.logs.mcap import Keep, Outgoing, is_own_log, scan
 from sonar_graph.states import LandmarkMap
 
 from .conftest import writing
@@ -85,9 +82,7 @@ def landmarks(time_ns: int, topic: str = "/map") -> Outgoing:
 
 
 @pytest.mark.parametrize("profile", ["ros2", "", "x" * 40])
-def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_added(
-    tmp_path, profile
-):
+def test_an_amended_log_has_the_old_bytes_and_the_new_messages(tmp_path, profile):
     source = foreign_log(tmp_path / "a.mcap", profile=profile)
     amended = write_amended(
         source,
@@ -95,7 +90,8 @@ def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_adde
         [landmarks(2005)],
         metadata={"more": {"key": "value"}},
     )
-    before, after = content(source), content(tmp_path / "b.mcap")
+    before = content(source)
+    after = content(tmp_path / "b.mcap")
     assert after.pop("/map")[1][:2] == (2005, 2005)
     (name, record) = after["metadata"].pop()
     assert (name, record["key"]) == ("more", "value")
@@ -113,15 +109,14 @@ def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_adde
 
 
 @pytest.mark.parametrize("share", [0.3, 0.77])
-def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
-    tmp_path, share
-):
+def test_intact_messages_of_a_truncated_log_are_copied(tmp_path, share):
     """The length of what is there is counted from its first message."""
     whole = foreign_log(tmp_path / "a.mcap", tick_ns=100_000_000).read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: int(share * len(whole))])
     amended = write_amended(cut, tmp_path / "b.mcap", [landmarks(15)])
-    before, after = content(tmp_path / "a.mcap"), content(tmp_path / "b.mcap")
+    before = content(tmp_path / "a.mcap")
+    after = content(tmp_path / "b.mcap")
     assert len(after["/map"]) == 2
     for topic in ("/one", "/other", "/bare"):
         assert after[topic] == before[topic][: len(after[topic])]
@@ -145,11 +140,12 @@ def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(
     assert float(span_s) == pytest.approx(last_ns * 1e-9, abs=1e-3)
 
 
-def test_the_log_itself_and_topics_that_are_there_are_refused_unless_these_are_written_anew(
+def test_existing_topics_are_refused_unless_they_are_replaced(
     tmp_path,
 ):
     source = foreign_log(tmp_path / "a.mcap")
-    once, twice = tmp_path / "once.mcap", tmp_path / "twice.mcap"
+    once = tmp_path / "once.mcap"
+    twice = tmp_path / "twice.mcap"
     write_amended(source, once, [landmarks(5)])
     with pytest.raises(LogError, match=r"/map .* is in the log already"):
         write_amended(once, twice, [landmarks(6)])
@@ -180,11 +176,12 @@ def test_a_damaged_attachment_is_left_out_and_named(tmp_path):
     assert content(tmp_path / "b.mcap")["attachments"] == []
 
 
-def test_messages_that_come_piece_by_piece_are_merged_and_their_topic_must_be_new(
+def test_messages_in_pieces_are_merged_under_a_new_topic(
     tmp_path,
 ):
     source = foreign_log(tmp_path / "source.mcap")
-    plain, streamed = tmp_path / "plain.mcap", tmp_path / "streamed.mcap"
+    plain = tmp_path / "plain.mcap"
+    streamed = tmp_path / "streamed.mcap"
     entries = [landmarks(time_ns) for time_ns in (5, 1005, 2005)]
     write_amended(source, plain, entries)
     write_amended(source, streamed, [], more=iter(entries))

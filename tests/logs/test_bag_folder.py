@@ -8,10 +8,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
-from sonar_graph.live.live_messages import recorded_messages
+from sonar_graph.live import recorded_messages
 from sonar_graph.logs import inspect_log, read_log, write_log
-from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, log_parts, stream
-from sonar_graph.logs.mcap.scanning import scan
+from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, log_parts, scan, stream
 from sonar_graph.testing import small_world
 
 METADATA = """rosbag2_bagfile_information:
@@ -105,7 +104,8 @@ def test_a_folder_is_the_single_file(whole, folder, is_listed):
         with_metadata(folder)
     assert [part.name for part in log_parts(folder)] == NAMES
     assert contents(folder) == contents(whole)
-    one, several = read_log(whole), read_log(folder)
+    one = read_log(whole)
+    several = read_log(folder)
     assert several.calibration == one.calibration
     assert several.name == one.name
     assert {k: v for k, v in several.notes.items() if k != "log.skipped"} == {
@@ -115,7 +115,8 @@ def test_a_folder_is_the_single_file(whole, folder, is_listed):
         for name, column in vars(block).items():
             np.testing.assert_array_equal(getattr(getattr(several, role), name), column)
     np.testing.assert_array_equal(several.truth.positions, one.truth.positions)
-    told, expected = inspect_log(folder), inspect_log(whole)
+    told = inspect_log(folder)
+    expected = inspect_log(whole)
     assert (told.topics, told.damage, told.warnings) == (
         expected.topics,
         expected.damage,
@@ -155,9 +156,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_part_that_is_missing_or_damaged_is_named_and_the_rest_is_read_if_asked_for(
-    folder, fault
-):
+def test_a_missing_part_is_an_error_unless_salvaged(folder, fault):
     with_metadata(folder)
     spoil, said = FAULTS[fault]
     spoil(folder / NAMES[4])

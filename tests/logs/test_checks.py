@@ -10,10 +10,10 @@ from sonar_graph.calibration import (
     DvlCalibration,
     ImuCalibration,
 )
-from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
+from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.errors import LogError
+from sonar_graph.logs import axis_doubts
 from sonar_graph.logs.checks import (
-    axis_doubts,
     clipped_axes,
     dead_axes,
     gap_warnings,
@@ -31,7 +31,8 @@ from sonar_graph.logs.checks import (
 from sonar_graph.logs.reading import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
 
-PINGS, SAMPLES = np.arange(1500) * 0.2, np.arange(30000) * 0.01
+PINGS = np.arange(1500) * 0.2
+SAMPLES = np.arange(30000) * 0.01
 NAN = (np.nan,) * 3
 
 
@@ -62,10 +63,12 @@ def without(times_s: Floats, *spans_s: tuple[float, float]) -> Floats:
 # --- gaps -----------------------------------------------------------------------------------------------------------
 
 GUESS = "the turn in between is guessed from the rates before and after"
-USUAL, SHORT = Calibration(), Calibration(dvl=DvlCalibration(gap_s=1.5))
+USUAL = Calibration()
+SHORT = Calibration(dvl=DvlCalibration(gap_s=1.5))
 STILL = Calibration(imu=ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0)))
 HELD = Calibration(odometry_interpolation="hold-past")
-HOLED, LATE = imu(without(SAMPLES, (100, 110))), dvl(without(PINGS, (100, 220)))
+HOLED = imu(without(SAMPLES, (100, 110)))
+LATE = dvl(without(PINGS, (100, 220)))
 HOLES = imu(without(SAMPLES, *((10.0 * k, 10.1 * k) for k in range(1, 7))))
 SLOWER = np.concatenate(
     [SAMPLES[:10000], 100 + 0.2 * np.arange(250), 150 + SAMPLES[:15000]]
@@ -214,7 +217,8 @@ def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -
 
 
 def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
-    rng, stamps_ns = np.random.default_rng(4), EVEN[0] + np.arange(1500) * SECOND // 5
+    rng = np.random.default_rng(4)
+    stamps_ns = EVEN[0] + np.arange(1500) * SECOND // 5
     way = 0.5 * (stamps_ns - stamps_ns[0]) * 1e-9
     fine = 3.0 + np.cumsum(0.003 * rng.standard_normal(1500))[:, None]
     for step_m, hangs_s in ((1e-4, 5.0), (0.01, 60.0)):
@@ -341,8 +345,10 @@ def test_measurements_with_which_no_estimator_could_begin_are_refused() -> None:
 
 def test_rows_that_do_not_say_their_noise_are_counted() -> None:
     five = np.arange(5.0)
-    doppler, depth = dvl(five), Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
-    known, ones = np.tile(np.eye(2), (5, 1, 1)), np.ones((5, 1))
+    doppler = dvl(five)
+    depth = Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
+    known = np.tile(np.eye(2), (5, 1, 1))
+    ones = np.ones((5, 1))
     detections = LandmarkDetections(
         stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones
     )
@@ -390,7 +396,7 @@ def test_no_axis_of_a_whole_sensor_is_named_however_coarse_it_is(seed, step):
     assert not list(magnitudes(whole))
 
 
-def test_magnitudes_without_a_sign_are_named_and_a_vehicle_that_only_goes_ahead_is_not():
+def test_magnitudes_without_a_sign_raise_a_doubt():
     velocity = rates(1)
     assert len(list(magnitudes(np.abs(velocity)))) == 1
     velocity[:, 0] = np.abs(velocity[:, 0]) + 1.0
@@ -404,7 +410,7 @@ def test_magnitudes_without_a_sign_are_named_and_a_vehicle_that_only_goes_ahead_
         (False, 0.01, False),
     ],
 )
-def test_a_velocity_without_a_vertical_part_is_wrong_where_the_vehicle_dives(
+def test_a_constant_vertical_velocity_of_a_diving_vehicle_is_doubted(
     has_depth: bool, sigma_m_s: float, is_named: bool
 ):
     t = np.arange(2000) * 0.02
@@ -418,7 +424,7 @@ def test_a_velocity_without_a_vertical_part_is_wrong_where_the_vehicle_dives(
     ] * is_named
 
 
-def test_stamps_in_bursts_and_a_clock_that_steps_back_are_named_with_the_way_out():
+def test_stamps_in_bursts_and_clock_steps_are_reported():
     even_ns = np.arange(300) * 200_000_000
     burst_ns = even_ns // 10**9 * 10**9 + np.arange(300) % 5 * 100_000
     assert not list(stamp_doubts(even_ns, even_ns))

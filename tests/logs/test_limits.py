@@ -1,7 +1,9 @@
 """Reading ends, in time and memory that a log's size allows, whatever a file claims."""
 
+import contextlib
 import os
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,12 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
-from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap import Keep, chunks, scanning
+from sonar_graph.logs import PartialCalibration, inspect_log, read_log
+from sonar_graph.logs.cdr import parse_definition
+from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
-from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
-from sonar_graph.logs.vehicle_setup import PartialCalibration, encode_mountings
+from sonar_graph.logs.vehicle_setup import encode_mountings
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 
 LIMIT = 1 << 16
@@ -55,7 +56,7 @@ def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> P
     ("size", "stated"),
     [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)],
 )
-def test_a_chunk_of_more_than_the_limit_is_lost_with_limit_and_remedy_before_it_is_unpacked(
+def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     compression: str,
@@ -114,7 +115,8 @@ def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
         text_of(path)
 
 
-ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
+ROTATION = "a quaternion of length "
+TRANSLATION = "numbers that are not finite"
 
 
 @pytest.mark.parametrize(
@@ -129,7 +131,8 @@ ROTATION, TRANSLATION = "a quaternion of length ", "numbers that are not finite"
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
     make_sequence: Any, tmp_path: Path, of: str, value: float, message: str
 ) -> None:
-    sequence, path = make_sequence(), tmp_path / "log.mcap"
+    sequence = make_sequence()
+    path = tmp_path / "log.mcap"
     payload = bytearray(encode_mountings(Calibration())[0].tobytes())
     ends = [
         at
@@ -157,3 +160,24 @@ def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
     assert read_log(
         path, calibration=stated
     ).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
+
+
+SLOW: dict[str, str] = {
+    "line feeds": "float64 a\n" + "=" * 80 + "\n" * 300_000 + "x",
+    "separators": ("=" * 80 + "\n") * 12_000,
+    "spaces": "float64 a" + " " * 900_000,
+    "fields": "\n".join(f"float64 f{i}" for i in range(60_000)),
+    "an array": f"float64[{'9' * 5000}] a",
+}
+
+
+@pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
+def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(
+    text: str,
+) -> None:
+    began = time.process_time()
+    for kind in ("p/msg/A", "p/msg/B"):
+        for _ in range(5):
+            with contextlib.suppress(LogError):
+                parse_definition(kind, text)
+    assert time.process_time() - began < 2.0

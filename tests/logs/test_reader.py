@@ -1,4 +1,4 @@
-"""MCAP files of every kind, whole and damaged: every message that is whole is read, and what is lost is told."""
+"""MCAP files of every kind, whole and damaged: every message that is whole is read, and what is lost is reported."""
 
 import re
 import struct
@@ -18,11 +18,8 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, IndexType
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.mcap.log_file import seal
-from sonar_graph.logs.mcap.scanning import scan, stream
-from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
-from sonar_graph.logs.mcap.topic import Damage, Keep
-from sonar_graph.logs.reading import read_log
+from sonar_graph.logs import read_log
+from sonar_graph.logs.mcap import Damage, Instant, Keep, TimeWindow, scan, seal, stream
 
 from .conftest import (
     Stored,
@@ -36,7 +33,9 @@ from .conftest import (
     writing,
 )
 
-NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
+NONE = CompressionType.NONE
+LZ4 = CompressionType.LZ4
+ZSTD = CompressionType.ZSTD
 
 
 def chunk_end(chunk: ChunkIndex) -> int:
@@ -129,17 +128,15 @@ def at_text(text: bytes, offset: int = 0, bit: int = 1) -> Callable[[Path], None
 
 
 def both_lengths(path: Path, number: int = 1) -> None:
-    """Both lengths of a chunk, so that nothing says where it ends."""
+    """Both lengths of a chunk, so that its end is unknown."""
     in_chunk(number, 1)(path)
     in_chunk(number, 9 + 32, 1)(path)
 
 
 def missing_in_chunk(number: int, count: int) -> Callable[[Path], object]:
     def cut_out(path: Path) -> None:
-        at, content = (
-            chunk_indexes(path)[number].chunk_start_offset + 200,
-            path.read_bytes(),
-        )
+        at = chunk_indexes(path)[number].chunk_start_offset + 200
+        content = path.read_bytes()
         path.write_bytes(content[:at] + content[at + count :])
 
     return cut_out
@@ -177,7 +174,7 @@ class Fault(NamedTuple):
     lost: int | None = (
         None  # the chunk whose messages are lost; without chunks, the message
     )
-    corrupt: str = ""  # what the losses must say; empty: there must be none
+    corrupt: str = ""  # what the losses must contain; empty: there must be none
     remark: str = ""
     options: Mapping[str, Any] = MappingProxyType({})
 
@@ -190,10 +187,8 @@ UNREPEATED = LOOSE | {
     "repeat_schemas": False,
 }
 SECOND = "chunk 2 is lost: .*; lost: 35 of /bytes, 35 of /json$"
-MOVED, ENDING = (
-    "bytes are missing or doubled in it",
-    "does not end as an MCAP file",
-)
+MOVED = "bytes are missing or doubled in it"
+ENDING = "does not end as an MCAP file"
 TWICE = r"schema 1 \(test_msgs/msg/Bytes\) is described in two ways; the first holds"
 FAULTS = {
     "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
@@ -226,7 +221,7 @@ FAULTS = {
     "a topic's name outside chunks": Fault(
         at_text(b"/bytes"), None, "", r"channel 1 \(/bytes\) is desc", LOOSE
     ),
-    # of 13 bytes it claims 29, of which 13 are there
+    # it claims 29 bytes and has 13
     "a length in a description": Fault(
         at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED
     ),
@@ -250,7 +245,8 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(
     fault = FAULTS[name]
     written = write(path, **fault.options)
     chunks = chunk_indexes(path)
-    lost, others = [], []
+    lost = []
+    others = []
     if fault.lost is not None:
         lost = chunk_of(path, fault.lost) if chunks else [written[fault.lost]]
         others = chunk_of(path, fault.lost, channel=2) if chunks else []
@@ -384,14 +380,16 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
 # ---- files that are cut off
 
 
-def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(
+def test_a_truncated_file_is_read_up_to_the_cut(
     path: Path,
 ) -> None:
     written = write(path)
-    chunks, content = chunk_indexes(path), path.read_bytes()
+    chunks = chunk_indexes(path)
+    content = path.read_bytes()
     for kept in (0.3, 0.6, 0.8):
         path.write_bytes(content[: int(len(content) * kept)])
-        found, recording = read(path), scan_all(path)
+        found = read(path)
+        recording = scan_all(path)
         assert 0 < len(found) < len(written)
         assert found == written[: len(found)]
         assert re.search(
@@ -418,7 +416,7 @@ def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(
 def test_half_a_chunk_gives_its_whole_messages(
     path: Path, compression: CompressionType
 ) -> None:
-    written = write(path, 60_000, chunk_size=1 << 20, compression=compression)
+    written = write(path, 12_000, chunk_size=1 << 18, compression=compression)
     second = chunk_indexes(path)[1]
     before = int(
         np.searchsorted([time for time, _ in written], second.message_start_time)
@@ -527,7 +525,7 @@ BEGINNING_NS = 1_700_000_000_000_000_001
         "x",
     ],
 )
-def test_a_number_is_seconds_from_the_beginning_a_date_without_a_zone_in_utc_and_all_else_refused(
+def test_a_window_takes_seconds_and_dates_and_refuses_all_else(
     text: str,
 ) -> None:
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9

@@ -17,12 +17,9 @@ from sonar_graph.errors import (
     MissingTopicError,
     SonarGraphError,
 )
-from sonar_graph.logs.cdr.definitions import definition
-from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.mcap.time_window import Instant, TimeWindow
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.vehicle_setup import PartialCalibration
-from sonar_graph.logs.writing import write_log
+from sonar_graph.logs import PartialCalibration, inspect_log, read_log, write_log
+from sonar_graph.logs.cdr import definition
+from sonar_graph.logs.mcap import Instant, TimeWindow
 
 from .conftest import T0_NS, Bench, chunk_indexes, flip, header
 
@@ -44,7 +41,7 @@ REFUSED_CHOICES: list[tuple[str, dict[str, str], type[Exception], str]] = [
 # fmt: on
 
 
-def test_the_topic_that_is_chosen_is_read_and_choices_that_cannot_be_are_refused(
+def test_the_chosen_topic_is_read_and_impossible_ones_are_refused(
     bench: Bench,
 ) -> None:
     fast = [bench.imu(T0_NS + i * STEP_NS, (0, 0, 7.0)) for i in range(5)]
@@ -127,7 +124,7 @@ def test_a_configuration_may_be_a_path_and_a_window_two_times(
     )
 
 
-def test_noise_of_zero_in_the_calibration_is_in_doubt_where_the_log_states_none(
+def test_zero_noise_raises_a_doubt_where_the_log_has_none(
     make_sequence: Any, tmp_path: Path
 ) -> None:
     write_log(tmp_path / "a.mcap", make_sequence())
@@ -206,7 +203,7 @@ def detected(bench: Bench, *frames: dict[str, Any]) -> Path:
     return bench.write(*bench.basics(), ("/landmarks", "detections", list(frames)))
 
 
-def test_detections_are_padded_to_the_most_candidates_and_keep_their_tracks(
+def test_detections_are_padded_and_keep_their_tracks(
     bench: Bench,
 ) -> None:
     """Also when messages of one log differ in having tracks."""
@@ -279,10 +276,8 @@ def test_a_message_that_breaks_its_rules_is_named(
 
 
 POSTERIOR = "1 with probabilities that are not between 0 and 1 or more than 1 in sum"
-RANGE, COVARIANCE = (
-    "a range that is not above 0 and at most 100 km",
-    "a covariance that is not positive definite",
-)
+RANGE = "a range that is not above 0 and at most 100 km"
+COVARIANCE = "a covariance that is not positive definite"
 TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
     "sound": ({}, 3, ""),
     "largest identity": ({"candidate_ids": [5, 2**56 - 1]}, 3, ""),
@@ -330,11 +325,12 @@ TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
 
 
 @pytest.mark.parametrize(("changed", "rows", "account"), TOLD.values(), ids=TOLD)
-def test_detections_that_estimators_do_not_use_are_told_and_impossible_ones_left_out(
+def test_unusable_detections_are_reported_and_impossible_ones_left_out(
     bench: Bench, changed: dict[str, Any], rows: int, account: str
 ) -> None:
     path = one_of(bench, **changed)
-    sequence, summary = read_log(path), inspect_log(path)
+    sequence = read_log(path)
+    summary = inspect_log(path)
     assert sequence.detections is not None
     assert len(sequence.detections) == rows
     told = [
@@ -368,7 +364,7 @@ def long(
     return sequence, path
 
 
-def test_a_cut_is_noted_a_hole_refused_unless_salvaged_and_a_wrong_calibration_never_read(
+def test_a_truncated_log_is_read_and_a_hole_needs_salvage(
     long: tuple[Any, Path],
     make_sequence: Any,
     tmp_path: Path,
@@ -402,7 +398,7 @@ def test_a_cut_is_noted_a_hole_refused_unless_salvaged_and_a_wrong_calibration_n
         read_log(path)
 
 
-def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(
+def test_a_start_pose_of_another_instant_is_noted(
     long: tuple[Any, Path],
 ) -> None:
     later = TimeWindow(Instant.parse("2"))

@@ -17,20 +17,23 @@ from rosbags.highlevel import AnyReader
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.logs.mcap.writer import Outgoing, write_recording
-from sonar_graph.logs.result_log import source_names, write_result
+from sonar_graph.logs import (
+    PICTURES,
+    Picture,
+    landmark_markers,
+    write_log,
+    write_result,
+)
+from sonar_graph.logs.mcap import Outgoing, write_recording
+from sonar_graph.logs.result_log import source_names
 from sonar_graph.logs.viewer_messages import (
     GREY,
-    PICTURES,
     Layer,
-    Picture,
     Scene,
     foxglove_layout,
-    landmark_markers,
     picture_messages,
     position_ellipsoids,
 )
-from sonar_graph.logs.writing import write_log
 from sonar_graph.states import LandmarkMap, Trajectory
 
 from .conftest import decode
@@ -43,7 +46,7 @@ NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0,
 
 
 def straight(offset_m: float, n: int = 100) -> Trajectory:
-    """A pose a second along x, heading to +y, with a covariance that tells its axes apart."""
+    """A pose a second along x, heading to +y, with a covariance that differs between axes."""
     positions = np.column_stack([np.arange(n) + offset_m, np.zeros(n), np.zeros(n)])
     quaternions = np.tile([0, 0, np.sqrt(0.5), np.sqrt(0.5)], (n, 1))
     covariances = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (n, 1, 1))
@@ -67,20 +70,16 @@ def result(
     path = tmp_path_factory.mktemp("result") / "result.mcap"
     write_result(path, make_sequence(), estimates)
     layout = json.loads(path.with_suffix(".foxglove.json").read_text("utf-8"))
-    rviz, messages = (
-        YAML(typ="safe").load(path.with_suffix(".rviz"))["Visualization Manager"],
-        decode(path),
-    )
-    types, view = (
-        {topic: type(ms[0]).__name__ for topic, ms in messages.items()},
-        layout["configById"]["3D!result"],
-    )
+    rviz = YAML(typ="safe").load(path.with_suffix(".rviz"))["Visualization Manager"]
+    messages = decode(path)
+    types = {topic: type(ms[0]).__name__ for topic, ms in messages.items()}
+    view = layout["configById"]["3D!result"]
     return SimpleNamespace(
         path=path, messages=messages, types=types, layout=layout, view=view, rviz=rviz
     )
 
 
-def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_and_identities(
+def test_every_estimator_and_the_truth_are_in_the_result(
     result,
 ):
     each = (
@@ -106,7 +105,7 @@ def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_an
     assert len({(m.ns, m.id) for m in array.markers}) == 4
 
 
-def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_path_smoothed(
+def test_odometry_is_causal_and_the_last_path_smoothed(
     result,
 ):
     assert [m.pose.pose.position.x for m in result.messages["/isam2/odometry"]] == list(
@@ -119,10 +118,8 @@ def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_pat
     assert [p.header.stamp.sec for p in last.poses] == list(
         range(1_700_000_000, 1_700_000_100)
     )
-    pose, odometry = (
-        result.messages["/isam2/pose"][0],
-        result.messages["/isam2/odometry"][0],
-    )
+    pose = result.messages["/isam2/pose"][0]
+    odometry = result.messages["/isam2/odometry"][0]
     for message in (pose, odometry):
         # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
         assert np.diag(np.reshape(message.pose.covariance, (6, 6))) == pytest.approx(
@@ -131,7 +128,7 @@ def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_pat
     assert (pose.header.frame_id, odometry.child_frame_id) == ("map", "isam2/base_link")
 
 
-def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_message(
+def test_tf_is_one_tree_below_the_map(
     result,
 ):
     """The sensors follow the first estimator."""
@@ -172,7 +169,7 @@ def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_mess
     assert len(set.union(*instants)) == len(instants)
 
 
-def test_rosbags_re_encodes_all_messages_of_logs_and_results_to_the_same_bytes(
+def test_rosbags_re_encodes_every_message_to_the_same_bytes(
     result, make_sequence, tmp_path
 ):
     write_log(tmp_path / "log.mcap", make_sequence())
@@ -218,15 +215,11 @@ def turning(seed: int, n: int = 60) -> Trajectory:
     )
 
 
-def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoids(
-    make_sequence, tmp_path
-):
-    sequence, causal, smoothed, path = (
-        make_sequence(),
-        turning(1),
-        turning(2),
-        straight(0),
-    )
+def test_poses_survive_to_the_bit_in_a_result(make_sequence, tmp_path):
+    sequence = make_sequence()
+    causal = turning(1)
+    smoothed = turning(2)
+    path = straight(0)
     unsure = Trajectory.without_covariances(
         path.stamps_ns, path.positions, path.quaternions_xyzw
     )
@@ -266,7 +259,7 @@ def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoid
 
 
 @given(st.lists(st.text(max_size=6), max_size=6))
-def test_source_names_are_ros_names_close_to_the_estimators_and_each_its_own(
+def test_source_names_are_unique_ros_names(
     estimators,
 ):
     names = source_names(estimators)
@@ -304,26 +297,23 @@ def axes(marker: Any) -> Rotation:
     return Rotation.from_quat([q.x, q.y, q.z, q.w])
 
 
-def test_landmarks_are_drawn_as_ellipsoids_that_lie_as_their_covariances_where_known_below_their_identities(
+def test_landmarks_are_drawn_as_ellipsoids_of_their_covariance(
     tmp_path: Path,
 ) -> None:
     """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
-    along, across = (
-        np.array([1.0, 1, 0]) / np.sqrt(2),
-        np.array([1.0, -1, 0]) / np.sqrt(2),
-    )
+    along = np.array([1.0, 1, 0]) / np.sqrt(2)
+    across = np.array([1.0, -1, 0]) / np.sqrt(2)
     stick = (
         np.outer(along, along)
         + 0.04 * np.outer(across, across)
         + 0.01 * np.diag([0, 0, 1.0])
     )
-    positions, covariances = (
-        np.array([[1.0, 2, 3], [4, 5, 6]]),
-        np.array([stick, np.full((3, 3), np.nan)]),
-    )
+    positions = np.array([[1.0, 2, 3], [4, 5, 6]])
+    covariances = np.array([stick, np.full((3, 3), np.nan)])
     landmarks = LandmarkMap(np.array([7, 2**40]), positions, covariances)
     (array,) = drawn(tmp_path, landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))
-    spaces, texts = [m.ns for m in array.markers], [m.text for m in array.markers]
+    spaces = [m.ns for m in array.markers]
+    texts = [m.text for m in array.markers]
     assert spaces == [
         "ellipsoid_95_percent",
         "covariance_unknown",
@@ -421,7 +411,7 @@ DRAWN_BY_RVIZ["rviz_default_plugins/PoseWithCovariance"] = "PoseWithCovarianceSt
 
 
 def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
-    """A subscriber that asks for more than is offered gets nothing at all."""
+    """A subscriber that requests more than is offered gets nothing at all."""
     with AnyReader([result.path]) as reader:
         offered = {
             c.topic: [q.durability.name for q in c.ext.offered_qos_profiles]
@@ -443,9 +433,7 @@ def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
 # --- size -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_scene_without_anything_can_be_drawn_and_without_any_estimate_the_truth_is_left(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+def test_an_empty_scene_can_be_drawn(make_sequence: Any, tmp_path: Path) -> None:
     layer = Layer("/a/path", "nav_msgs/msg/Path", (1, 0, 0, 1))
     layout = foxglove_layout([layer], Scene.around([np.empty((0, 3))]))
     assert json.loads(json.dumps(layout, allow_nan=False))["configById"]["3D!result"][

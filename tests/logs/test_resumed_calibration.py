@@ -4,7 +4,7 @@ from sonar_graph.calibration import Calibration, DepthCalibration, FloorPrior, S
 from sonar_graph.logs import LiveRecord, PartialCalibration
 
 
-def test_a_resumed_run_has_the_fields_of_its_record_but_of_sensors_that_it_did_not_use_and_the_users_go_before(
+def test_a_resumed_run_merges_its_record_with_the_user_s_calibration(
     tmp_path,
 ):
     """A depth sensor that did not come may still bring its place; the floor stays, and the user moves the start."""

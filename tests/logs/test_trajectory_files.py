@@ -5,7 +5,7 @@ from evo.tools import file_interface
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.logs.trajectory_files import write_landmarks_csv, write_tum
+from sonar_graph.logs import write_landmarks_csv, write_tum
 from sonar_graph.states import LandmarkMap, Trajectory
 
 STAMPS = st.lists(

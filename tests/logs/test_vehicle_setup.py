@@ -18,23 +18,17 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.roles import TF
-from sonar_graph.logs.sonar_images import read_images_alone
-from sonar_graph.logs.vehicle_setup import (
+from sonar_graph.logs import (
     METADATA,
     PartialCalibration,
-    encode_mountings,
-    gathered,
-    mounting_of,
-)
-from sonar_graph.logs.writing import (
-    dvl_messages,
-    imu_messages,
+    read_images_alone,
+    read_log,
     sonar_image_messages,
-    static_message,
 )
+from sonar_graph.logs.mcap import write_recording
+from sonar_graph.logs.roles import TF
+from sonar_graph.logs.vehicle_setup import encode_mountings, gathered, mounting_of
+from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 
 TREE_M = (1.0, 2.0, 3.0)
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
@@ -61,13 +55,11 @@ def written(
 # --- mountings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_sonar_of_images_is_mounted_where_tf_static_says_without_detections(
+def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
     make_sequence: Any, tmp_path: Path
 ) -> None:
-    sequence, mounting = (
-        replace(make_sequence(), detections=None),
-        Mounting(rpy_rad=(0.0, 0.5, 0.0)),
-    )
+    sequence = replace(make_sequence(), detections=None)
+    mounting = Mounting(rpy_rad=(0.0, 0.5, 0.0))
     frames = SonarFrames(
         sequence.imu.stamps_ns[:2],
         np.zeros((2, 3, 4), np.uint8),

@@ -21,19 +21,10 @@ from rosbags.highlevel import AnyReader
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.log_file import LogFile, open_seal
-from sonar_graph.logs.mcap.writer import (
-    Attachment,
-    recording,
-    write_recording,
-)
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import (
-    pose_messages,
-    sonar_image_messages,
-    static_message,
-    write_log,
-)
+from sonar_graph.logs import read_log, sonar_image_messages, write_log
+from sonar_graph.logs.mcap import Attachment, LogFile, recording, write_recording
+from sonar_graph.logs.mcap.log_file import open_seal
+from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.measurements import Imu
 from sonar_graph.states import Trajectory
 
@@ -69,7 +60,8 @@ def test_reading_what_was_written_is_the_identity(
     write_log(path, sequence)
     found = read_log(path)
     for name in BLOCKS:
-        expected, actual = getattr(sequence, name), getattr(found, name)
+        expected = getattr(sequence, name)
+        actual = getattr(found, name)
         assert (expected is None) == (actual is None), name
         for field in fields(expected) if expected is not None else ():
             np.testing.assert_array_equal(
@@ -117,9 +109,7 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
     assert tree.transforms[0].transform.translation.y == 0.2
 
 
-def test_a_stamp_or_sample_that_ros_cannot_express_and_a_file_that_cannot_be_written_are_named_and_nothing_is_left(
-    make_sequence, tmp_path
-):
+def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
     for stamp_ns in (2**31 * 10**9, -(2**31) * 10**9 - 1):
         sequence = replace(
             make_sequence(),
@@ -181,15 +171,14 @@ def test_another_library_sees_what_the_message_defines(tmp_path):
     )
     # all beams of the first range first
     assert bytes(first.image.data) == written.intensity[0].T.tobytes()
-    left, right = first.beam_directions[0], first.beam_directions[-1]
+    left = first.beam_directions[0]
+    right = first.beam_directions[-1]
     assert (left.x, right.x) == (0, 0)
     assert left.y < 0 < right.y  # y is to the right
     np.testing.assert_allclose([left.z, right.z], np.cos(np.radians([14, 15])))
 
 
-def test_messages_and_images_that_are_made_one_by_one_lie_in_the_order_of_their_times(
-    make_sequence, tmp_path
-):
+def test_messages_made_one_by_one_lie_in_the_order_of_time(make_sequence, tmp_path):
     sequence = make_sequence()
     blocks = [
         replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1])
@@ -237,7 +226,7 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_profile_index_counts_metadata_and_attachments_are_those_of_a_ros_2_recording(
+def test_a_recording_has_the_records_of_rosbag2(
     long_log: Path,
 ) -> None:
     with long_log.open("rb") as stream:
@@ -273,7 +262,8 @@ def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> N
         assert (file.summary is not None, file.fault) == (True, None)
         stated = int.from_bytes(file.read(file.data_end_at + 9, 4), "little")
         assert stated == zlib.crc32(file.read(0, file.data_end_at)) != 0
-    chunk, damaged = chunk_indexes(long_log)[1], tmp_path / "damaged.mcap"
+    chunk = chunk_indexes(long_log)[1]
+    damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(long_log.read_bytes())
     flip(damaged, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
     with (
@@ -283,7 +273,7 @@ def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> N
         list(make_reader(stream, validate_crcs=True).iter_messages())
 
 
-def test_latched_topics_offer_transient_local_in_numbers_that_all_rosbag2_read(
+def test_latched_topics_offer_transient_local_qos(
     long_log: Path,
 ) -> None:
     """Versions that would expect words read numbers when the record ``rosbag2`` has no metadata of theirs."""

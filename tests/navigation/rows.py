@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation import Odometry
 
 NS = 1_000_000_000
 T0_NS = 1_700_000_000 * NS
@@ -46,7 +46,7 @@ def dvl(stamps_ns: Ints, velocity: ArrayLike, cov: ArrayLike = np.nan) -> Dvl:
 
 
 def odometry_at_rest(*blocks: Dvl, calibration: Calibration | None = None) -> Odometry:
-    """Told inertial rows of 90 s at rest, then blocks of the Doppler log."""
+    """Given inertial rows of 90 s at rest, then blocks of the Doppler log."""
     odometry = Odometry(calibration or Calibration())
     odometry.add(imu(stamps(50, 90.0), 0.0), None)
     for block in blocks:

@@ -6,6 +6,7 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, DepthCalibration, Start
 from sonar_graph.measurements import Depth, Dvl
+from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.dvl_screening.depth_gate import (
     DEPTH_GATE,
     UNSTATED_M,
@@ -13,12 +14,10 @@ from sonar_graph.navigation.dvl_screening.depth_gate import (
 )
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
-    LONG_NS,
     GateResult,
     gate_velocities,
     needed,
 )
-from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.samples import VelocityRows
 from sonar_graph.states import Refusal
 
@@ -52,16 +51,6 @@ def judged(
     )
 
 
-def after_half_a_second(
-    u: np.ndarray, Q_u: np.ndarray, v: np.ndarray, Q_v: np.ndarray
-) -> float:
-    before = VelocityRows(np.array([0]), u[None], Q_u[None])
-    (distance,) = gate_velocities(
-        VelocityRows(np.array([NS // 2]), v[None], Q_v[None]), before, WALK, GATE
-    ).distance
-    return distance
-
-
 @pytest.mark.parametrize("seconds", [0.1, 1.0, 5.0, 30.0])
 def test_the_distance_is_that_of_the_formula(seconds):
     """A true velocity's passes the gate but once in a billion."""
@@ -71,41 +60,6 @@ def test_the_distance_is_that_of_the_formula(seconds):
         [0.0, expected(seconds, u, v)]
     )
     assert chi2(3).isf(1e-9) == pytest.approx(GATE, abs=0.05)
-
-
-def test_correlated_noise_counts_as_such():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        Q_u, Q_v = (1e-4 * (root @ root.T) for root in rng.standard_normal((2, 3, 3)))
-        u, v = 0.1 * rng.standard_normal((2, 3))
-        S = Q_u + Q_v + np.eye(3) * (WALK**2 * 0.5 + 0.15**2 * (u @ u))
-        assert after_half_a_second(u, Q_u, v, Q_v) == pytest.approx(
-            (v - u) @ np.linalg.solve(S, v - u)
-        )
-
-
-def test_rows_are_compared_with_the_last_one_believed():
-    """The second is not believed; the third is like the first, the fourth like the third."""
-    velocity = [[0.5, 0.0, 0.0], [9.0, 0.0, 0.0], [0.6, 0.0, 0.0], [0.7, 0.0, 0.0]]
-    d = judged([0, NS // 10, 2 * NS // 10, 3 * NS // 10], velocity).distance
-    variances = [
-        2e-4 + WALK**2 * 0.2 + (0.06 * 0.5) ** 2,
-        5e-4 + WALK**2 * 0.1 + (0.03 * 0.6) ** 2,
-    ]
-    assert d[1] > GATE
-    assert d[2] == pytest.approx(0.1**2 / variances[0])
-    assert d[3] == pytest.approx(0.1**2 / variances[1])
-
-
-def test_a_distance_at_the_gate_is_believed():
-    """Just inside it becomes the one that others are compared with, just outside it does not."""
-    spread = np.sqrt(1e-4 + 4e-4 + WALK**2 * 0.1)
-    for factor, believed in ((1 - 1e-9, True), (1 + 1e-9, False)):
-        jump = factor * np.sqrt(GATE) * spread
-        d = judged(
-            [0, NS // 10, 2 * NS // 10], [[0.0] * 3, [jump, 0.0, 0.0], [jump, 0.0, 0.0]]
-        ).distance
-        assert (d[2] == 0.0) == believed
 
 
 HZ = 7.0
@@ -203,17 +157,6 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
         assert used[~wrong].sum() >= np.count_nonzero(~wrong) - 2
 
 
-def test_a_slow_log_is_not_in_doubt_for_ever():
-    for seconds, hz, calls in (
-        (76.0, 0.25, 1),
-        (76.0, 0.25, 20),
-        (190.0, 0.1, 1),
-        (190.0, 0.1, 20),
-    ):
-        rows = start({}, speed=1.0, hz=hz, seconds=seconds)
-        assert told(rows, calls).rows()[3].tolist() == rows.stamps_ns.tolist()
-
-
 def after_gap(
     gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3
 ) -> tuple[Dvl, int]:
@@ -238,18 +181,6 @@ def test_wrong_rows_after_a_long_gap_are_refused_and_no_others(gap_s, wrong):
         odometry = told(rows, calls)
         assert refused(odometry, rows) == [first + row for row in wrong]
         assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
-
-
-def test_a_long_gap_lasts_until_its_end_is_confirmed():
-    rows, first = after_gap(30.0, {})
-    assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first
-    ended = told(rows.rows(slice(0, first + 2)))
-    assert ended.rows()[3][first:].tolist() == [rows.stamps_ns[first + 1]]
-    assert [(row.stamp_ns, row.reason) for row in ended.refused] == [
-        (rows.stamps_ns[first], Refusal.WAITED)
-    ]
-    rows, first = after_gap(LONG_NS / NS - 0.3, {})
-    assert len(told(rows.rows(slice(0, first + 1))).rows()[3]) == first + 1
 
 
 DEPTHS = Calibration(
@@ -304,26 +235,6 @@ def test_a_depth_passes_as_far_as_a_vehicle_gets_and_its_noise_goes():
 UNSTATED = Calibration(depth=DepthCalibration(sigma_m=0.1))
 
 
-def test_a_depth_that_hangs_stays_refused_until_right_ones_agree():
-    seconds = np.arange(1000.0)
-    for calibration in (DEPTHS, UNSTATED):
-        assert used(
-            seconds.tolist(), [-5.0] * 5 + [-900.0] * 5 + [-5.0] * 990, calibration
-        )[4:6] == [4, 10]
-    hangs = np.where(seconds < 900.0, -900.0, -25.0)
-    hangs[:5] = -5.0
-    assert used(seconds.tolist(), hangs.tolist()) == [*range(5), *range(902, 1000)]
-
-
-def test_depths_after_a_long_gap_are_near_the_last_or_agree():
-    seconds = [0.0, 0.2, 60.0, 61.0, 62.0, 63.0]
-    assert used(seconds, [-5.0, -5.0, -13.0, -13.0, -13.0, -13.0]) == [0, 1, 2, 3, 4, 5]
-    assert used(seconds, [-5.0, -5.0, -100.0, -5.0, -5.0, -5.0]) == [0, 1, 3, 4, 5]
-    assert used(seconds, [-5.0, -5.0, -100.0, -101.0, -102.0, -5.0]) == [0, 1, 4]
-    slow = np.arange(6) * 20.0  # its own interval is known from the third row on
-    assert used(slow.tolist(), (-5.0 - 1.5 * slow).tolist()) == [0, 2, 3, 4, 5]
-
-
 def test_a_chain_of_wrong_depths_is_overruled_by_a_longer_one():
     seconds = (np.arange(12) * 0.2).tolist()
     assert used(seconds, [-900.0] * 4 + [-5.0] * 8, UNSTATED) == [2, 3, *range(8, 12)]
@@ -332,20 +243,4 @@ def test_a_chain_of_wrong_depths_is_overruled_by_a_longer_one():
         assert used(seconds, [-5.0, -900.0, -900.0] * 4, calibration) == [0, 3, 6, 9]
     assert used([0.0, 1.0, 2.0, 10.0], [-100.0, -130.0, -130.0, -115.0], UNSTATED) == [
         3
-    ]
-
-
-def test_depths_are_in_order_each_stamp_once_and_sound():
-    odometry = Odometry(DEPTHS)
-    assert odometry.used_depths(
-        depths([1.0, 1.0, 2.0], [-5.0, -6.0, -5.0])
-    ).z_m.tolist() == [-5.0, -5.0]
-    assert odometry.used_depths(depths([1.5], [-5.0])) is None
-    assert odometry.used_depths(depths([3.0], [-5.0], 0.0)) is None
-    assert odometry.used_depths(depths([4.0], [-5.0], np.inf)) is None
-    assert odometry.used_depths(None) is None
-    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [
-        (at(1.5), Refusal.LATE),
-        (at(3.0), Refusal.UNSOUND),
-        (at(4.0), Refusal.UNSOUND),
     ]

@@ -169,23 +169,6 @@ def test_the_errors_of_walking_vehicles_are_as_large_as_their_covariance(
     check_consistent(np.array(squares), 3, confidence=0.999)
 
 
-@pytest.mark.parametrize(("until_s", "share"), [(16.0, 12.0), (15.0, 3.0)])
-def test_without_accelerometer_the_velocity_is_a_random_walk(until_s, share):
-    imu_rows, dvl_rows = Vehicle().rows()
-    exact = DVL.model_copy(
-        update={"velocity_sigma_m_s": (0.0,) * 3, "velocity_walk_density": 0.05}
-    )
-    found = motion(
-        ways.blinded(imu_rows),
-        dvl_rows,
-        Calibration(imu=QUIET, dvl=exact),
-        Vehicle.LOST_S,
-        until_s,
-    )
-    expected = 0.05**2 * (until_s - Vehicle.LOST_S) ** 3 / share
-    assert np.diag(found.covariance)[3:] == pytest.approx([expected] * 3)
-
-
 @pytest.mark.parametrize("turns_s", [(7.0, 9.0), (0.0, 6.5)])
 def test_in_a_gap_the_body_keeps_its_velocity_and_not_the_doppler_log(turns_s):
     """A vehicle on the spot begins or ends a turn in the gap; the log, a metre ahead of it, swings sideways."""
@@ -243,31 +226,6 @@ def test_the_square_of_a_gyro_bias_counts_in_the_height_s_variance():
     )
     claimed = at_rest(gap_s, gyro_bias_sigma=b, walk=1e4).covariance
     assert claimed[5, 5] == pytest.approx(moment_m2, rel=0.1)
-
-
-def test_a_line_with_less_doppler_noise_than_the_last_sample_replaces_it():
-    """A sample of 50 mm/s twice off after a second of zeros; a vehicle that hardly walks, and exact accelerometers."""
-    imu_ns = stamps(50.0, 9.0)
-    dvl_ns = stamps(5.0, 6.0)
-    velocity = np.zeros((len(dvl_ns), 3))
-    velocity[-1, 0] = 0.1
-    found = [
-        motion(
-            imu(imu_ns, 0.0),
-            dvl(dvl_ns, velocity),
-            Calibration(
-                imu=QUIET,
-                dvl=DvlCalibration(
-                    velocity_sigma_m_s=(0.05,) * 3, velocity_walk_density=walk
-                ),
-            ),
-            6.0,
-            7.0,
-        ).i_T_j.x()
-        for walk in (0.02, 1e3)
-    ]
-    assert found[0] == pytest.approx(found[1], abs=1e-4)
-    assert abs(found[1]) < 0.04
 
 
 KNOWN_START = Start(position_sigma_m=(0.0,) * 3, rpy_sigma_rad=(0.0,) * 3)
@@ -333,17 +291,6 @@ def test_a_line_needs_four_samples_over_a_second_that_inertial_rows_cover(
     found = at_rest_until(17.0, dvl_hz, count, imu_from_s, velocity_walk_density=0.1)
     walk_m = np.sqrt(0.1**2 * 7.0**3 / 3.0)
     assert (np.sqrt(found.covariance[3, 3]) < 0.1 * walk_m) == is_line
-
-
-def test_the_displacement_is_that_of_the_fitted_line():
-    """Samples of the last five seconds, off gravity's line, are fitted by least squares, as numpy does."""
-    noise = 0.01 * np.random.default_rng(0).standard_normal((41, 3))
-    found = at_rest_until(17.0, 4.0, noise=noise)
-    t = -np.arange(20, -1, -1) / 4.0
-    slope, level = np.polyfit(t, noise[-21:], 1)
-    assert found.i_T_j.translation() == pytest.approx(
-        7.0 * level + 7.0**2 / 2 * slope, abs=1e-6
-    )
 
 
 MS = 1_000_000
@@ -464,28 +411,3 @@ def test_a_coarse_gyros_rows_beside_a_hole_err_for_all_of_it(until_s, is_modelle
         )
     nees = np.mean(np.square(turned))
     assert nees == pytest.approx(1.0, abs=0.2) if is_modelled else nees > 4.0
-
-
-def test_in_a_hole_with_doppler_rows_the_way_is_by_these():
-    """Longer than a gap: the vehicle gets faster while nothing but the Doppler log tells."""
-    velocity = np.where(
-        (stamps(5, 8.0) - T0_NS)[:, None] * 1e-9 > 4.1, [0.6, 0.0, 0.0], [0.4, 0.0, 0.0]
-    )
-    found = moved(imu(stamps(100, BEGIN_S), 0.0), BEGIN_S, 7.1, None, velocity)
-    assert found.i_T_j.translation()[0] == pytest.approx(
-        0.4 * 1.0 + 0.5 * 0.2 + 0.6 * 2.9, abs=1e-6
-    )
-    assert np.sqrt(found.covariance[3, 3]) < 0.05
-
-
-def test_specific_force_is_not_measured_in_a_hole():
-    """Interpolated over it, it would be taken for gravity; over 80 ms it still is."""
-    for end_s, span_s, is_felt in (
-        (END_S, (1.0, 3.0), True),
-        (END_S, (2.0, 6.0), False),
-        (3.08, (2.0, 6.0), True),
-    ):
-        assert (
-            np.isfinite(moved(with_hole(end_s=end_s), *span_s).mean_specific_force)
-            == is_felt
-        ).all()

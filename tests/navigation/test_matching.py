@@ -12,23 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.alignment.dvl_imu import (
+from sonar_graph.navigation.alignment import (
     DvlMatch,
+    Estimate1D,
     InertialPath,
     match_dvl_to_imu,
-    stretches_of,
-    velocity_changes,
-)
-from sonar_graph.navigation.alignment.reference_offset import (
-    ReferenceMatch,
     match_reference_to_imu,
+    stretches_of,
 )
-from sonar_graph.navigation.alignment.time_offset import (
-    Estimate1D,
-    SampleSeries,
-)
+from sonar_graph.navigation.alignment.dvl_imu import velocity_changes
+from sonar_graph.navigation.alignment.reference_offset import ReferenceMatch
+from sonar_graph.navigation.alignment.time_offset import SampleSeries
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
 
 from .rows import dvl
@@ -117,7 +113,7 @@ def test_a_hole_ends_a_stretch_of_a_slow_doppler_log_too():
 
 
 def with_mounting(run: Sequence, **mounting: tuple[float, float, float]) -> Calibration:
-    """The run's calibration, which says that the IMU is mounted otherwise."""
+    """The run's calibration, with another mounting of the IMU."""
     moved = run.calibration.imu.mounting.model_copy(update=mounting)
     imu = run.calibration.imu.model_copy(update={"mounting": moved})
     return run.calibration.model_copy(update={"imu": imu})

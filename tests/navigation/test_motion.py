@@ -20,9 +20,7 @@ from sonar_graph.navigation import Odometry
 
 from . import ways
 from .rows import (
-    NS,
     T0_NS,
-    at,
     dead_reckoned,
     dense_covariance,
     dvl,
@@ -160,18 +158,6 @@ def test_the_bias_derivative_and_correction_are_those_of_integrating_again(way):
 
 
 @every_way
-def test_a_bias_that_is_removed_is_as_if_it_had_not_been(way):
-    imu, dvl = rows()
-    bias = np.array([0.03, -0.02, 0.04])
-    noise = {"velocity_sigma_m_s": ways.SIGMA_M_S, "imu": {"gyro_noise_density": 1e-3}}
-    clean = moved_by(way, imu, dvl, known=noise)
-    biased = moved_by(way, *spoilt(imu, dvl, "rate", bias), bias, known=noise)
-    assert biased.i_T_j.equals(clean.i_T_j, 1e-9)
-    assert biased.covariance == pytest.approx(clean.covariance, abs=1e-12)
-    assert np.array_equal(biased.bias, bias)
-
-
-@every_way
 def test_earths_rotation_is_removed_as_if_it_stood_still(way):
     """Exaggerated twentyfold, and known in the frame of the first node."""
     imu, dvl = rows()
@@ -189,22 +175,6 @@ def test_earths_rotation_is_removed_as_if_it_stood_still(way):
     assert found.i_T_j.equals(still.i_T_j, 8e-3 if way.until_s == ways.OPEN_S else 2e-3)
     assert found.i_T_j.rotation().equals(still.i_T_j.rotation(), 4e-4)
     assert not left_in.i_T_j.rotation().equals(still.i_T_j.rotation(), 1e-3)
-
-
-@every_way
-def test_rows_stamped_later_than_the_covering_one_change_nothing(way):
-    imu, dvl = rows()
-    is_open = way.until_s == ways.OPEN_S
-    way = way._replace(until_s=way.until_s + 0.03 * is_open)
-    noise = {
-        "velocity_sigma_m_s": ways.SIGMA_M_S,
-        "imu": {"gyro_noise_density": 1e-3, "accel_noise_density": 1e-2},
-    }
-    part = imu.between(-1, at(way.until_s) + (0 if is_open else NS // 10))
-    whole = moved_by(way, imu, dvl, known=noise)
-    cut = moved_by(way, part, dvl.between(0, at(way.until_s)), known=noise)
-    assert np.array_equal(whole.i_T_j.matrix(), cut.i_T_j.matrix())
-    assert np.array_equal(whole.covariance, cut.covariance)
 
 
 ONE_PLACE = {"body_p_imu": ways.BODY_P_DVL}
@@ -276,18 +246,3 @@ def test_noise_spreads_as_noise_of_every_sample_does(
         deviation[used], deviation[used]
     )
     assert np.abs(off).max() < tolerance
-
-
-@pytest.mark.parametrize("name", ["closed gap", "open gap"])
-def test_an_unknown_accelerometer_bias_spreads_as_moving_all_forces_does(name):
-    imu, dvl = rows()
-    way = WAYS[name]
-    step = 1e-4
-    base = moved_by(way, imu, dvl, known={"imu": {"accel_bias_sigma": 0.02}})
-    J = [
-        change_of(base, moved_by(way, *spoilt(imu, dvl, "force", step * a)))[3:] / step
-        for a in np.eye(3)
-    ]
-    assert base.covariance[3:, 3:] == pytest.approx(
-        0.02**2 * np.transpose(J) @ J, rel=2e-3, abs=1e-8
-    )

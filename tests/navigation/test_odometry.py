@@ -280,7 +280,7 @@ def without(rows, *spans_s: tuple[float, float]):
 
 
 def flickering(rows: Dvl, *spans_s: tuple[float, float]) -> Dvl:
-    """Rows of which those within some spans measured the vertical velocity alone."""
+    """Rows; those within some spans measured the vertical velocity alone."""
     whole = np.isin(rows.stamps_ns, without(rows, *spans_s).stamps_ns)[:, None]
     cov = np.where(whole[:, :, None], 1e-4 * np.eye(3), np.diag([1e4, 1e4, 1e-4]))
     return Dvl(
@@ -328,7 +328,7 @@ INSTANTS_MS = st.integers(0, 20_200) | st.integers(0, 100).map(
 
 
 def answers(odometry: Odometry, until_ns: int, asked_ns: int) -> list[np.ndarray]:
-    """What is told at an instant: epochs, and motions from the first and others, to epochs and another instant."""
+    """The answers at an instant: epochs, and motions from the first and others, to epochs and another instant."""
     if (first_ns := odometry.start_by(until_ns)) is None:
         return []
     epochs_ns, reached_ns = odometry.epochs_reached(first_ns - 1, until_ns)
@@ -374,7 +374,7 @@ def answers(odometry: Odometry, until_ns: int, asked_ns: int) -> list[np.ndarray
 def test_how_rows_are_cut_and_what_is_asked_in_between_change_no_bit(
     rows, earth, calls
 ):
-    """Also what comes in long before it is asked for, and what is kept of another question."""
+    """Also what comes in long before it is requested, and what is kept of another request."""
     calibration = Calibration(imu=NOISY, dvl=DVL)
     pieces = Odometry(calibration)
     after_ns = 0

@@ -3,7 +3,6 @@
 Rows that are not used are named; what is refused does not depend on how a log is cut.
 """
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,48 +16,13 @@ from sonar_graph.calibration import (
     ImuCalibration,
     Mounting,
 )
-from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
+from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl
-from sonar_graph.navigation import samples
-from sonar_graph.navigation.dvl_screening.row_intake import RowIntake
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation import Odometry, samples
+from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, odometry_at_rest, stamps
-
-
-def kept(*blocks: list[int]) -> samples.StampedRows:
-    """Values are the number of the block, so that it is seen which of equal stamps is there."""
-    rows = samples.StampedRows(np.empty((0, 3)), np.empty((0, 3, 3)))
-    for number, block in enumerate(blocks):
-        n = len(block)
-        rows.insert(
-            np.array(block),
-            np.full((n, 3), float(number)),
-            np.full((n, 3, 3), float(-number)),
-        )
-    return rows
-
-
-@given(
-    st.lists(
-        st.lists(st.integers(0, 40), min_size=1, unique=True).map(sorted),
-        min_size=1,
-        max_size=5,
-    )
-)
-def test_rows_are_those_of_all_blocks_in_order(blocks):
-    rows = kept(*blocks)
-    first = {}
-    for number, block in enumerate(blocks):
-        for stamp in block:
-            first.setdefault(stamp, number)
-    assert rows.stamps_ns.tolist() == sorted(first)
-    assert rows.values[0][:, 1].tolist() == [first[stamp] for stamp in sorted(first)]
-    assert rows.values[1][:, 2, 0].tolist() == [
-        -first[stamp] for stamp in sorted(first)
-    ]
-
 
 DVL_HZ = 5
 SECONDS = 6.0
@@ -105,29 +69,6 @@ def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_a_row_with_one_beam_did_not_measure_hides_no_outlier():
-    """Compared with a row that is blind to the side, any velocity to the side would pass."""
-    rows = driven(partial=(8,))
-    velocity = rows.velocity + 3.0 * np.outer(
-        np.arange(len(rows)) == 9, [0.0, 1.0, 0.0]
-    )
-    assert told(odometry_at_rest(replace(rows, velocity=velocity))) == [
-        (8, Refusal.INCOMPLETE),
-        (9, Refusal.OUTLIER),
-    ]
-
-
-def test_rows_of_few_beams_are_refused_and_change_nothing():
-    partial = (0, 1, 8, 9, 28, 29, 30)
-    rows = driven(partial=partial)
-    with_them = odometry_at_rest(rows.rows(slice(0, 9)), rows.rows(slice(9, None)))
-    without = odometry_at_rest(rows.rows(np.delete(np.arange(len(rows)), partial)))
-    assert told(with_them) == [(k, Refusal.INCOMPLETE) for k in partial]
-    assert np.isnan([row.distance for row in with_them.refused]).all()
-    for one, other in zip(with_them.rows()[:7], without.rows()[:7], strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_rows_are_late_up_to_the_settled_stamp():
     rows = driven()
     odometry = odometry_at_rest(rows.rows(np.delete(np.arange(12), 4)))
@@ -158,37 +99,11 @@ def test_of_equal_stamps_the_first_counts():
         np.testing.assert_array_equal(odometry.rows()[4], one.velocity)
 
 
-@pytest.mark.parametrize("missing", range(1, 9))
-def test_a_row_that_comes_after_later_ones_is_an_epoch_once_reached(
-    missing,
-):
-    """Nor is one of several that are known at once with the row that confirmed them."""
-    rows = driven()
-    rows = replace(rows, velocity=rows.velocity * 5.0)
-    inertial = imu(stamps(50, SECONDS), 0.0)
-    odometry = Odometry(Calibration())
-    odometry.add(inertial, rows.rows(np.arange(len(rows)) != missing))
-    odometry.add(None, rows.rows(slice(missing, missing + 1)))
-    epochs_ns, reached_ns = odometry.epochs_reached(0, T0_NS + 10 * NS)
-    assert np.array_equal(epochs_ns, rows.stamps_ns)
-    assert [
-        part.tolist() for part in odometry.epochs_reached(T0_NS + 10 * NS, T0_NS)
-    ] == [[], []]
-    assert reached_ns.tolist() == [
-        odometry.reached_ns(epoch_ns) for epoch_ns in epochs_ns.tolist()
-    ]
-    for until_ns in np.unique(reached_ns).tolist():
-        for instant_ns in (until_ns - 1, until_ns):
-            assert np.array_equal(
-                odometry.epochs(0, instant_ns), epochs_ns[reached_ns <= instant_ns]
-            )
-
-
 @pytest.mark.parametrize(
     ("ratio", "is_sound"), [(1e-11, True), (1e-12, True), (0.0, False), (-1e-12, False)]
 )
 def test_a_covariance_is_valid_if_positive_definite_up_to_rounding(ratio, is_sound):
-    """In axes of which none is the log's."""
+    """In axes that differ from the log's."""
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
     rows = driven()
     rows.velocity_cov[7] = 1e-4 * (turn * [1.0, 1.0, ratio]) @ turn.T
@@ -211,11 +126,6 @@ def test_rows_are_turned_into_body_axes_with_known_noise():
         assert intake.dvl.values[1][1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
 
 
-def test_held_velocities_may_jump():
-    held = Calibration(odometry_interpolation="hold-past")
-    assert not odometry_at_rest(driven(outliers=(5, 12)), calibration=held).refused
-
-
 def test_an_infinite_variance_is_a_direction_not_measured():
     whole = np.array([[2.0, 0.5, 0.1], [0.5, 3.0, 0.2], [0.1, 0.2, 4.0]])
     cov = np.array([whole, whole, np.full((3, 3), np.nan)])
@@ -230,19 +140,3 @@ def test_an_infinite_variance_is_a_direction_not_measured():
     )
     np.testing.assert_array_equal(found[2], unsaid)
     np.testing.assert_array_equal(samples.is_partial(cov), [False, True, False])
-
-
-def test_a_row_is_partial_whatever_its_axes():
-    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
-    for variances, partial in (
-        ((1e-4, 1e-4, UNMEASURED_M_S**2), True),
-        ((UNMEASURED_M_S**2, 1e-4, 1e-4), True),
-        ((1e-4, UNMEASURED_M_S**2, 1e-4), True),
-        ((0.2 * UNMEASURED_M_S**2,) * 3, True),
-        ((0.16 * UNMEASURED_M_S**2,) * 3, False),
-        ((np.nan,) * 3, False),
-    ):
-        assert (
-            samples.is_partial((turn * np.array(variances) @ turn.T)[None])[0]
-            == partial
-        )

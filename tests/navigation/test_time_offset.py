@@ -1,19 +1,16 @@
 """The fit against textbook generalised least squares, and the search on a signal against itself, shifted and noisy."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
 from sonar_graph.navigation.alignment.time_offset import (
-    Estimate1D,
     NormalEquations,
     OffsetFit,
     SampleSeries,
     fit,
-    rate_noise_power,
     search_offset,
 )
 
@@ -84,24 +81,6 @@ def test_fit_is_generalised_least_squares_with_walking_axes(walks):
     assert found.covariance == pytest.approx(covariance, rel=1e-6)
 
 
-def whitened_power(stretch: SampleSeries) -> float:
-    """``tr(P (K - D))`` with dense matrices, rows axis by axis; D is the covariance of differences of white samples."""
-    m = len(stretch.y)
-    B = by_axis(stretch.B)
-    K = block_diag(*[dense_covariance(m, walks) for walks in stretch.walks])
-    difference = block_diag(*[np.diff(np.eye(m + 1), axis=0)] * 3)
-    weight = np.linalg.inv(K)
-    P = weight - weight @ B @ np.linalg.inv(B.T @ weight @ B) @ B.T @ weight
-    return float(np.trace(P @ (K - difference @ difference.T)))
-
-
-def test_power_of_the_rates_noise_is_the_trace_with_dense_matrices():
-    stretches = [stretch_of(0, (True, True, False)), stretch_of(1, (True, True, True))]
-    assert rate_noise_power(stretches, RATIOS) == pytest.approx(
-        sum(map(whitened_power, stretches)), rel=1e-9
-    )
-
-
 def noisy_stretch(
     rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0
 ) -> SampleSeries:
@@ -154,21 +133,6 @@ def test_the_ratios_maximise_the_restricted_likelihood():
         assert restricted_likelihood(stretches, found * step) > restricted_likelihood(
             stretches, found
         )
-
-
-def test_a_stretch_own_parameter_that_is_there_twice_counts_once():
-    """As gravity and its turning do in a stretch of one difference: a basis of all columns would take rows away."""
-    stretches = [stretch_of(seed, (True, True, False)) for seed in range(3)]
-    twice = [
-        replace(s, B=np.concatenate([s.B, 3 * s.B[:, :, ::-1]], axis=2))
-        for s in stretches
-    ]
-    once, again = (fit(s, WIDE, RATIOS) for s in (stretches, twice))
-    assert again.parameters == pytest.approx(once.parameters, rel=1e-9)
-    assert again.covariance == pytest.approx(once.covariance, rel=1e-9)
-    assert rate_noise_power(twice, RATIOS) == pytest.approx(
-        rate_noise_power(stretches, RATIOS), rel=1e-9
-    )
 
 
 T_S = np.arange(200.0)
@@ -239,34 +203,3 @@ def test_the_range_ends_at_two_seconds(offset_s):
     assert found.is_known
     assert found.value == pytest.approx(offset_s, abs=0.01)
     assert "no best offset within ±2 s" in searched(swaying, 1.35 * offset_s).reason
-
-
-def test_a_motion_that_repeats_is_named_with_two_of_its_places():
-    """A turn in 1.2 s."""
-    phase = 2 * np.pi / 1.2
-    reason = searched(
-        lambda t_s: np.column_stack(
-            [np.sin(phase * t_s), np.cos(phase * t_s), 0 * t_s]
-        ),
-        0.3,
-    ).reason
-    one, other = (float(part.split(" s")[0]) for part in reason.split(" and "))
-    assert one != other
-    assert {one, other} <= {-0.9, 0.3, 1.5}
-
-
-@pytest.mark.parametrize(
-    ("sigma", "reason", "limited"),
-    [
-        (0.2, "", ""),
-        (0.3, "", "too little"),
-        (0.1, "no motion", "no motion"),
-        (0.3, "no motion", "no motion"),
-    ],
-)
-def test_what_is_too_unsure_is_not_known_and_keeps_the_first_reason(
-    sigma, reason, limited
-):
-    assert Estimate1D(1.0, sigma, reason).limited(0.2, "too little") == Estimate1D(
-        1.0, sigma, limited
-    )

@@ -9,22 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.mcap.writer import Outgoing
-from sonar_graph.logs.writing import sonar_image_messages, write_log
+from sonar_graph.logs import sonar_image_messages, write_log
+from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
 from sonar_graph.simulation.detections import world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, frame_stamps, record
-from sonar_graph.simulation.sonar_image.frames import (
+from sonar_graph.simulation.sonar_image import (
     FrameSimulator,
-    FrameTruth,
+    ImageOptions,
     image_along,
+    place_landmark,
+    scattered_objects,
 )
-from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
-from sonar_graph.simulation.sonar_image.scene import place_landmark, scattered_objects
+from sonar_graph.simulation.sonar_image.frames import FrameTruth
 from sonar_graph.simulation.vehicle import VehiclePath, drive, follow, smooth_noise
 
 LANDMARKS_XY_M = np.array([[2.4, 0.05], [4.0, -0.12], [5.6, 0.1], [6.4, -0.08]])
@@ -46,7 +47,7 @@ class Lane:
     path: VehiclePath
 
     def write(self, log: Path, frames: Iterable[SonarFrames] | None = None) -> Path:
-        """As a log, with images in the order given, whatever their stamps say."""
+        """As a log, with images in the order given, whatever their stamps."""
         blocks = (
             [self.one(row) for row in range(len(self.frames))]
             if frames is None

@@ -1,4 +1,4 @@
-"""The page on which landmarks are labelled: who may ask it, what it saves, and the clicks of a real browser.
+"""The page on which landmarks are labelled: who may use it, what it saves, and the clicks of a real browser.
 
 Chromium comes from the system, as in tests/report/test_page_in_browser.py.
 """
@@ -16,16 +16,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
 
-import numpy as np
 import pytest
 
-from sonar_graph.recognition.label_server import (
+from sonar_graph.recognition import (
     LabelDesk,
+    Labels,
     LabelServer,
-    ShownFrame,
+    read_labels,
     shown_frames,
 )
-from sonar_graph.recognition.labels import Labels, read_labels
+from sonar_graph.recognition.label_server import ShownFrame
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
@@ -69,16 +69,6 @@ def ask(
     except urllib.error.HTTPError as error:
         with error:
             return error.code, error.read()
-
-
-def test_shown_frames_are_a_period_apart_with_pixels_in_place(frames, lane):
-    stamps = np.array([frame.stamp_ns for frame in frames])
-    assert stamps[0] == lane.frames.stamps_ns[0]
-    assert np.diff(stamps).min() >= 500_000_000
-    for range_m, azimuth_rad in ((1.4, 0.1), (2.0, -0.2), (2.4, 0.0)):
-        found = frames[0].range_azimuth(*frames[0].fan.pixel(range_m, azimuth_rad))
-        np.testing.assert_allclose(found, (range_m, azimuth_rad), atol=0.003)
-    assert frames[0].range_azimuth(0.0, frames[0].fan.beam.shape[0] - 1.0) is None
 
 
 def test_only_who_knows_the_word_and_names_the_host_is_answered(server):

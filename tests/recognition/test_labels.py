@@ -1,6 +1,5 @@
 """Files of labels, and the model measured by a few of them against that by the whole truth."""
 
-import json
 import re
 from pathlib import Path
 
@@ -8,22 +7,22 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import CalibrationError
-from sonar_graph.recognition import confusion_fit
-from sonar_graph.recognition.confusion_fit import true_objects
-from sonar_graph.recognition.labels import (
-    Label,
+from sonar_graph.recognition import (
     LabelledLog,
     Labels,
     calibrate_by_labels,
+    confusion_fit,
     read_labels,
 )
+from sonar_graph.recognition.confusion_fit import true_objects
+from sonar_graph.recognition.labels import Label
 
 CLICK_PIXELS_M = 0.005
 
 
 @pytest.fixture(scope="module")
 def clicks(lane, lane_log, lane_recognition) -> Labels:
-    """Landmarks clicked in every sixth frame, and what was tracked and is none, where it was reported."""
+    """Landmarks clicked in every sixth frame, and what was tracked and is no landmark, where it was reported."""
     given = []
     rng = np.random.default_rng(2)
     run = lane.sequence
@@ -131,44 +130,14 @@ def test_labels_of_other_frames_designs_or_too_few_are_refused(lane, lane_log, c
     assert "label more with `sonar-graph label`" in said
 
 
-def test_labels_are_read_as_they_were_written_and_from_csv(clicks, lane_log, tmp_path):
-    clicks.write(tmp_path / "labels.json")
-    assert read_labels(tmp_path / "labels.json", lane_log) == clicks
-    assert json.loads((tmp_path / "labels.json").read_text())["labels"][0]["id"] in (
-        1,
-        2,
-        3,
-        4,
-    )
-    rows = [
-        f"{one.stamp_ns},{one.range_m!r},{one.azimuth_rad!r},{'' if one.id is None else one.id}"
-        for one in clicks.labels
-    ]
-    for encoding in ("utf-8", "utf-8-sig"):  # spreadsheets begin with a byte-order mark
-        (tmp_path / "labels.csv").write_text(
-            "\n".join(["stamp_ns,range_m,azimuth_rad,id", *rows]), encoding
-        )
-        assert read_labels(tmp_path / "labels.csv", lane_log) == clicks
-
-
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        (
-            "a.json",
-            "{",
-            "expected JSON as `sonar-graph label` writes it, or CSV with stamp_ns, range_m, azimuth_rad, id",
-        ),
         ("a.csv", "stamp_ns,range_m\n1,2", "no column azimuth_rad, id"),
         (
             "a.json",
             '{"log": "other.mcap", "labels": []}',
             "its labels are of other.mcap, not of lane.mcap",
-        ),
-        (
-            "a.json",
-            '{"log": "lane.mcap", "labels": [{"stamp_ns": 1, "range_m": -1, "azimuth_rad": 0, "id": 1}]}',
-            "range_m",
         ),
         (
             "a.csv",

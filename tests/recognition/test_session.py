@@ -6,14 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import write_log
+from sonar_graph.logs import read_log, write_log
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
-from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import (
+from sonar_graph.recognition import (
+    Recognition,
     RecognitionSession,
     one_by_one,
     recognise,
@@ -21,9 +20,7 @@ from sonar_graph.recognition.session import (
     with_detections,
 )
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
-from sonar_graph.sonar.bayes import IdentityParams
-from sonar_graph.sonar.confusion import confusion_for
-from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
+from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams, confusion_for
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 SURE = 0.9
@@ -169,24 +166,6 @@ def test_recognise_adds_the_detections_of_a_log_or_of_frames(lane, tmp_path):
         recognise([], lane.sequence)
     with pytest.raises(MeasurementError, match="need a sequence"):
         recognise(frames)
-
-
-def test_pictures_come_once_a_second_and_show_what_was_recognised(
-    lane, lane_recognition
-):
-    pictures = lane_recognition.pictures
-    detections = lane_recognition.detections
-    assert len(pictures) > 20
-    assert np.diff([picture.stamp_ns for picture in pictures]).min() >= 10**9
-    assert all(picture.jpeg[:2] == b"\xff\xd8" for picture in pictures)
-    shown = [picture for picture in pictures if picture.landmark_ids]
-    assert len(shown) > 5
-    for picture in shown:
-        ids, probability = detections.rows(
-            detections.stamps_ns == picture.stamp_ns
-        ).most_probable()
-        assert picture.landmark_ids == tuple(ids.tolist())
-        assert picture.probabilities == tuple(probability.tolist())
 
 
 def bad_frames(lane: Lane, at: int) -> dict[str, SonarFrames]:

@@ -3,8 +3,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sonar_graph.calibration import (
     Calibration,
@@ -17,7 +15,7 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu
-from sonar_graph.recognition.sonar_motion import SonarMotions, level_from_up
+from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.sensors import (
     dvl_readings,
@@ -26,8 +24,7 @@ from sonar_graph.simulation.sensors import (
     seconds_since_start,
 )
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation, smooth_noise
-from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.tracker import SonarStep
+from sonar_graph.sonar import FloorView, SonarStep
 
 FLOOR_Z_M = -1.7
 MOUNTED = Calibration(
@@ -153,7 +150,7 @@ def test_motion_tilt_and_height_are_those_of_the_simulators_truth(path, exact):
 
 
 def numbers(steps: list[SonarStep | None], views: list[FloorView]) -> Floats:
-    """Everything that is told about each frame but the motion of the first, one row a frame."""
+    """All results of each frame but the motion of the first, one row a frame."""
     moved = [
         np.append(s.previous_T_sonar.matrix(), s.covariance) if s else np.zeros(52)
         for s in steps
@@ -315,40 +312,3 @@ def test_doppler_noise_is_in_height_and_steps_gyro_noise_in_steps():
     np.testing.assert_allclose(
         step.covariance, expected, atol=0.03 * np.abs(expected).max()
     )
-
-
-def test_without_a_floor_below_or_depth_there_is_no_view(exact):
-    above, unknown = (
-        exact.calibration.model_copy(update={"floor": f})
-        for f in (FloorPrior(z_m=1, sigma_m=1), None)
-    )
-    for run in (
-        replace(exact, depth=None),
-        *(replace(exact, calibration=told) for told in (above, unknown)),
-    ):
-        assert along(run, frames_of(run, 1))[1] == [None]
-
-
-def test_only_instants_with_odometry_and_in_order_are_covered(exact):
-    motions = SonarMotions(exact)
-    stamps_ns = frames_of(exact, 3)
-    ends_ns = [exact.start_ns - 1, exact.start_ns, exact.end_ns, exact.end_ns + 1]
-    assert [motions.covers(stamp_ns) for stamp_ns in ends_ns] == [
-        False,
-        True,
-        True,
-        False,
-    ]
-    motions.at(stamps_ns[1])
-    assert motions.passed(stamps_ns[0])
-    assert [motions.covers(stamp_ns) for stamp_ns in stamps_ns] == [False, True, True]
-
-
-@given(st.floats(-0.5, 0.5), st.floats(-1.2, 1.2), st.floats(-3, 3))
-def test_level_axes_follow_from_up_alone(roll: float, pitch: float, yaw: float):
-    up = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix()[2]
-    found = level_from_up(up)
-    np.testing.assert_allclose(
-        found, gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix(), atol=1e-9
-    )
-    np.testing.assert_allclose(found @ up, [0, 0, 1], atol=1e-9)

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.scored_instants import published_maps
+from sonar_graph.evaluation import Comparison, published_maps
 from sonar_graph.report.landmark_table import (
     MOST_LANDMARKS,
     landmark_table,
@@ -92,7 +91,7 @@ def test_estimates_stand_beside_the_truth_with_their_difference(
     assert len(shown) == (len(expected) if true is None else 2 * len(true) + 2)
 
 
-def test_totals_are_the_scores_and_landmarks_beyond_what_a_page_holds_are_counted():
+def test_totals_are_the_scores_of_all_landmarks():
     comparison = basin_comparison(60)
     table = landmark_table(comparison)
     assert [column.heading for column in table.columns[2:]] == ["isam2", "ekf-slam"]

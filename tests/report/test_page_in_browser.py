@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.report import write_page
-from sonar_graph.report.batch_page import write_batch_report
+from sonar_graph.report import write_batch_report, write_page
 from tests.recorded_batches import LOGS, drawn_batch, with_failures
 from tests.synthetic import basin_comparison
 
@@ -31,7 +30,8 @@ AXE = Path(
         Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js",
     )
 )
-PHONE, DESKTOP = 390, 1280
+PHONE = 390
+DESKTOP = 1280
 SMALLEST_TEXT_PX = """Math.min(...[...document.querySelectorAll("svg text")].filter(one => one.checkVisibility())
   .map(one => parseFloat(getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().a, one.getScreenCTM().b)))"""
 VISIBLE_WORDS = "document.body.innerText.split(/\\s+/).filter(Boolean).length"
@@ -76,7 +76,7 @@ def browser() -> Iterator[Any]:
 def opened(
     browser: Any, file: Path, width: int, scheme: str = "light"
 ) -> Iterator[tuple[Any, list[str]]]:
-    """The page, and what its console says."""
+    """The page, and its console's messages."""
     page = browser.new_page(
         viewport={"width": width, "height": 900}, color_scheme=scheme
     )
@@ -89,7 +89,7 @@ def opened(
 
 
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
-def test_nothing_is_said_in_the_console_nothing_sticks_out_and_the_head_fits_a_screen(
+def test_the_console_is_silent_and_nothing_overflows(
     browser, page_file, page_of_many_logs, tmp_path, width
 ):
     wide = "document.documentElement.scrollWidth"
@@ -121,9 +121,7 @@ def test_nothing_is_said_in_the_console_nothing_sticks_out_and_the_head_fits_a_s
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
-def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(
-    browser, comparison_file, width, scheme
-):
+def test_the_first_screen_has_sentence_and_map(browser, comparison_file, width, scheme):
     box = "document.querySelector('{}').getBoundingClientRect()"
     with opened(browser, comparison_file, width, scheme) as (page, said):
         assert page.evaluate(
@@ -155,9 +153,7 @@ def test_a_comparison_shows_its_sentence_and_the_whole_map_on_the_first_screen(
 
 
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
-def test_one_switch_chooses_between_aligned_and_not_for_figures_tables_and_headline(
-    browser, comparison_file, width
-):
+def test_one_switch_aligns_figures_tables_and_headline(browser, comparison_file, width):
     seen = "[...document.querySelectorAll('{}')].map(one => one.checkVisibility())"
     with opened(browser, comparison_file, width) as (page, said):
         for chosen, other in (("aligned", "raw"), ("raw", "aligned")):
@@ -244,9 +240,7 @@ def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
     assert list(map(float, downwards)) == sorted(map(float, downwards), reverse=True)
 
 
-def test_a_number_of_runs_opens_the_list_of_them_and_data_of_a_figure_can_be_downloaded(
-    browser, page_file
-):
+def test_a_number_of_runs_opens_their_list(browser, page_file):
     with opened(browser, page_file, DESKTOP) as (page, _):
         page.locator("#table-failures tbody a").first.click()
         page.wait_for_function(

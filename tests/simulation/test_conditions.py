@@ -8,18 +8,16 @@ import pytest
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import SettingError
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.basin import (
-    FLOOR_Z_M,
+from sonar_graph.simulation import (
     LANDMARKS_XY_M,
-    UNKNOWN_OBJECTS,
-    YSHARK,
     BasinOptions,
     simulate_basin,
     simulate_basin_frames,
 )
+from sonar_graph.simulation.basin import FLOOR_Z_M, UNKNOWN_OBJECTS, YSHARK
 from sonar_graph.simulation.sonar_image import (
     SCENES,
     SONARS,
@@ -64,7 +62,7 @@ TRIANGLE = DEFAULT_DESIGNS[2]
 
 
 def mean_intensity(made: FrameSimulator, height_m: float, frames: int) -> Floats:
-    """Of one place, over scatterers drawn anew for each frame."""
+    """Of one place, over scatterers drawn again for each frame."""
     place = np.array([0.0, 0.0, height_m])
     levels = [made.level_db(place, TILT, n).astype(float) for n in range(frames)]
     return np.mean([10 ** (one / 10) for one in levels], axis=0)
@@ -122,19 +120,6 @@ def test_contrast_changes_bright_parts_and_not_the_plate():
     np.testing.assert_allclose(20 * np.log10(worn.amplitude[PLATE]), 0.0, atol=1e-4)
     np.testing.assert_array_equal(np.isnan(worn.amplitude), ~MATERIAL)
     np.testing.assert_array_equal(worn.relief_m, FRESH.relief_m)
-
-
-def test_foam_stands_on_its_plate_with_its_face_where_it_was():
-    flush = landmark(foam_height_m=0.0)
-    deepest = landmark(foam_height_m=0.1)
-    for one in (FRESH, deepest):
-        np.testing.assert_array_equal(one.relief_m[FOAM], flush.relief_m[FOAM])
-    np.testing.assert_allclose(
-        FRESH.relief_m[PLATE], flush.relief_m[PLATE] - TRIANGLE.relief_m, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        deepest.relief_m[PLATE], flush.relief_m[PLATE] - TRIANGLE.height_m, atol=1e-6
-    )
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from scipy import stats
 from sonar_graph.calibration import Mounting, SonarCalibration
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.simulation import detections as simulated
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.sensors import regular_stamps, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
 
@@ -174,18 +174,6 @@ def test_a_share_of_all_detections_names_nothing():
     assert (detect(anonymous_share=1.0).candidate_ids < 0).all()
 
 
-def test_landmarks_are_numbered_and_their_heights_obey_the_floor_prior():
-    xy = np.arange(2000.0).reshape(1000, 2)
-    landmarks = simulated.world_on_floor(
-        xy, -1.7, 0.03, np.random.default_rng(0)
-    ).landmark_map()
-    low, high = stats.chi2.interval(0.9999, 1000)
-    assert low < np.sum(((landmarks.positions[:, 2] + 1.7) / 0.03) ** 2) < high
-    np.testing.assert_array_equal(landmarks.positions[:, :2], xy)
-    assert landmarks.ids.tolist() == list(range(1, 1001))
-    assert np.isnan(landmarks.covariances).all()  # of truth
-
-
 NS = 1_000_000_000
 
 
@@ -199,24 +187,6 @@ def tracks_of(found: LandmarkDetections) -> list[LandmarkDetections]:
     return [
         found.rows(found.track == number) for number in range(found.track.max() + 1)
     ]
-
-
-def test_tracks_change_nothing_else():
-    plain = basin()
-    tracked = basin(tracks=True)
-    assert set(plain.track.tolist()) == {-1}
-    for name in (
-        "stamps_ns",
-        "range_m",
-        "azimuth_rad",
-        "candidate_ids",
-        "id_probability",
-    ):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(tracked, name))
-    false = plain.id_probability.max(axis=1) < 0.9
-    assert false.any()
-    np.testing.assert_array_equal(tracked.track < 0, false)
-    assert len(tracks_of(tracked)) >= 8
 
 
 def test_an_identity_comes_when_its_track_is_old_enough():

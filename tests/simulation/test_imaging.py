@@ -1,4 +1,4 @@
-"""Images belong to the run whose other sensors `simulate_basin` gives, and their truth says what is in them."""
+"""Images belong to the run whose other sensors `simulate_basin` gives, and their truth lists what is in them."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices.landmark_designs import OWN_DESIGNS
+from sonar_graph.devices import OWN_DESIGNS
 from sonar_graph.errors import CalibrationError, SimulationError
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import (
-    BasinOptions,
-    simulate_basin,
-    simulate_basin_frames,
-)
-from sonar_graph.simulation.sonar_image.frames import (
+from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.sonar_image import (
     FrameSimulator,
     ImagedFrames,
-    frame_truth,
+    ImageOptions,
 )
-from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
+from sonar_graph.simulation.sonar_image.frames import frame_truth
 from sonar_graph.simulation.sonar_image.scene import block, place
 
 SLOW = {"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0}

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import SimulationError
-from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import (
+    LandmarkOptions,
+    MissionOptions,
+    add_landmarks,
+    simulate_mission,
+)
 
 RECORDED = replace(
     simulate_mission(MissionOptions(seed=5, duration_s=120)),

@@ -1,4 +1,4 @@
-"""Sensors feel the true motion, plus exactly the errors that the calibration says."""
+"""Sensors feel the true motion, plus exactly the errors of the calibration."""
 
 import gtsam
 import numpy as np
@@ -57,17 +57,6 @@ def imu_of(
         still(), stamps_ns, calibration, G, np.random.default_rng(seed)
     )
     return imu.angular_velocity, imu.specific_force - [0, 0, G]
-
-
-def test_stamps_begin_at_the_epoch_and_stay_within_the_run():
-    stamps = sensors.regular_stamps(7.0, 10.0)
-    assert stamps[0] == sensors.EPOCH_NS
-    assert len(stamps) == 71
-    assert np.abs(np.diff(stamps) - 1e9 / 7).max() <= 1
-    assert (
-        sensors.regular_stamps(5.0, 10.0, offset_s=0.03)[-1]
-        <= sensors.EPOCH_NS + 10_000_000_000
-    )
 
 
 @given(st.tuples(st.floats(-3, 3), st.floats(-1.4, 1.4), st.floats(-3, 3)))

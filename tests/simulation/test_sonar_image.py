@@ -10,19 +10,17 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarImage
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.sonar_image import scene
-from sonar_graph.simulation.sonar_image.frames import (
-    FrameSimulator,
-)
-from sonar_graph.simulation.sonar_image.imaging_sonar import (
+from sonar_graph.simulation import BasinOptions, simulate_basin
+from sonar_graph.simulation.sonar_image import (
     SONARS,
+    FrameSimulator,
     ImageOptions,
-    ImagingSonar,
+    scene,
 )
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImagingSonar
 
 HEIGHT_M = 0.95
 TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
@@ -182,18 +180,6 @@ def test_level_over_range_is_that_of_spreading_absorption_and_gain():
     assert 10 * np.log10(smooth[2]) == pytest.approx(
         40 + 10 * np.log10(pattern[2]), abs=0.3
     )
-
-
-def test_absorption_is_what_gain_gives_back_and_noise_shows():
-    quiet = simulator(noise_db=15.0, absorption_db_m=0.0, floor_db=-60.0)
-    far = simulator(noise_db=15.0, absorption_db_m=0.8, floor_db=-60.0)
-    difference = level_db(far).mean(axis=0) - level_db(quiet).mean(axis=0)
-    np.testing.assert_allclose(difference, 2 * 0.8 * (far.ranges_m() - 2.0), atol=1e-3)
-    at_2_m = bins_at(far, 2.0)[0]
-    noise = np.mean(
-        [intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(5)]
-    )
-    assert 10 * np.log10(noise) == pytest.approx(15, abs=0.2)
 
 
 @pytest.mark.parametrize("height_m", [0.06])
@@ -379,14 +365,6 @@ def test_a_seed_gives_the_same_bytes_and_only_noise_differs():
         )
 
 
-def test_sonar_that_looks_up_or_lies_on_the_floor_sees_only_noise():
-    made = simulator(noise_db=15.0)
-    up = Rotation.from_euler("ZYX", [0, -40, 0], degrees=True)
-    for position, rotation in ((ABOVE, up), (0 * ABOVE, TILT)):
-        at_2_m = made.level_db(position, rotation, 0)[:, bins_at(made, 2.0)[0]]
-        assert 10 * np.log10(np.mean(10 ** (at_2_m / 10))) == pytest.approx(15, abs=1.5)
-
-
 @pytest.mark.parametrize("name", sorted(SONARS))
 def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypatch):
     sonar = SONARS[name]
@@ -431,7 +409,7 @@ WIDTH_M = 0.2
 
 
 def ramp(rise: float) -> scene.SeabedObject:
-    """Rises away from the sonar; only its middle scatters to speak of, by 60 dB over the floor."""
+    """Rises away from the sonar; only its middle scatters much, 60 dB over the floor."""
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         is_bright = (np.abs(x_m) < LENGTH_M / 2) & (np.abs(y_m) < WIDTH_M / 2)
@@ -444,7 +422,7 @@ def ramp(rise: float) -> scene.SeabedObject:
 
 
 def energy_of_ramp(rise: float, floor_reflection: float | None = None) -> float:
-    """Mean sum over all samples; scatterers are drawn anew for each frame."""
+    """Mean sum over all samples; scatterers are drawn again for each frame."""
     changes = {
         "shadows": False,
         "absorption_db_m": 0.0,

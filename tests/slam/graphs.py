@@ -1,4 +1,4 @@
-"""Sums of what the factors of a graph say, and differences between two graphs."""
+"""Sums of the information of a graph's factors, and differences between two graphs."""
 
 from collections.abc import Iterable
 

@@ -14,14 +14,15 @@ from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
-from sonar_graph.slam import Isam2, Isam2Params
-from sonar_graph.slam.prediction import PoseHistory
-from sonar_graph.slam.smoother import (
+from sonar_graph.slam import (
     BoundedHistory,
-    Smoother,
+    Isam2,
+    Isam2Params,
     SmootherParams,
     WholeHistory,
 )
+from sonar_graph.slam.prediction import PoseHistory
+from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Estimate
 
 POSES = {
@@ -74,7 +75,7 @@ def smoother_with(
     *,
     is_bounded: bool = False,
 ) -> Smoother:
-    """One that keeps all poses, never restarts and lets nothing wait, unless told so."""
+    """One that keeps all poses, never restarts and lets nothing wait, unless set so."""
     params = SmootherParams(
         lag_s=lag_s,
         relinearize_threshold=relinearize_threshold,

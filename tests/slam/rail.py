@@ -62,9 +62,9 @@ class Rail:
 
 
 def calibration() -> Calibration:
-    """Rotations are known; azimuth and elevation say nothing about x.
+    """Rotations are known; azimuth and elevation hold no information about x.
 
-    The azimuth says where landmarks are sideways, to some metres. By ranges alone y is open at y = 0, and where they do
+    The azimuth gives where landmarks are sideways, to some metres. By ranges alone y is open at y = 0, and where they do
     not fit yet, curvature makes Gauss-Newton wander off from there: a start of 1e-15 m is enough, with all poses kept.
     """
     return Calibration(

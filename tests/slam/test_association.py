@@ -106,7 +106,7 @@ def test_weights_are_a_distribution_with_none_impossible(
 @pytest.mark.parametrize(
     ("belief", "decided"),
     [
-        ([0.75, 0.0], 4),  # binary fractions: exactly as much as is asked
+        ([0.75, 0.0], 4),  # binary fractions: exactly at the threshold
         ([0.0, 0.75], 7),
         ([0.5, 0.25], UNDECIDED),
         ([0.125, 0.125], NO_LANDMARK),
@@ -236,7 +236,7 @@ def shifted() -> Innovations:
 
 
 def test_two_that_share_a_wide_error_support_each_other():
-    """One alone says nothing beside a rival of 0.2 a unit; two at the right distance from each other do.
+    """One alone has no weight beside a rival of 0.2 a unit; two at the right distance from each other do.
 
     Each given the other is denser than a rival of 3 a unit; where both are together is not.
     """

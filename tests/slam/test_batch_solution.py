@@ -6,13 +6,9 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam import factors
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.smoother.batch_solution import (
-    misplaced,
-    placed_again,
-    solve,
-)
-from sonar_graph.slam.smoother.factor_store import Sightline, Sightlines
+from sonar_graph.slam.smoother import Sightline, Smoother, solve
+from sonar_graph.slam.smoother.batch_solution import misplaced, placed_again
+from sonar_graph.slam.smoother.factor_store import Sightlines
 
 from .fed import FOREVER_S, SONAR, in_the_basin
 from .graphs import gtsams_solution

@@ -7,7 +7,7 @@ import pytest
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate, Outcome
 
@@ -37,7 +37,7 @@ def run(
 
 
 def test_causal_estimates_are_near_those_of_the_whole_history():
-    """They differ by what is linearised anew of a whole history alone."""
+    """They differ by what is re-linearised of a whole history alone."""
     (_, whole), (_, bounded) = (run(mission(), of) for of in ("whole", "bounded"))
     assert len(whole) == len(bounded) > 200
     for one, other in zip(whole, bounded, strict=True):

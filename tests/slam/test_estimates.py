@@ -10,7 +10,7 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.prediction import AnchoredPose, Tie
 from sonar_graph.slam.smoother import JointCovariance

@@ -262,7 +262,7 @@ def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(
 
 
 def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
-    """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is said."""
+    """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is there."""
     pose = POSES["random"]
     point = seen_from(pose, 0.2, 0.05, 2.0)
     upwards = seen_from(pose, 0.2, 0.05 + 1e-6, 2.0) - point
@@ -326,7 +326,7 @@ def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch)
 
 @poses
 def test_a_gravity_direction_that_does_not_fit_leaves_the_yaw_free(pose):
-    """GTSAM's factor with both directions in the world says the residual's square."""
+    """GTSAM's factor with both directions in the world has the residual's square."""
     sigma = 0.01
     up_in_body = pose.rotation().matrix().T @ [0, 0, 1.0]
     tilted = values_of(

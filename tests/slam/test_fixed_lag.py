@@ -1,4 +1,4 @@
-"""Windows begun anew where Cholesky gives up, and factors put in and taken out again."""
+"""Windows restarted where Cholesky gives up, and factors put in and taken out again."""
 
 import gtsam
 import numpy as np

@@ -13,16 +13,15 @@ from scipy.stats import chi2
 
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.estimator import make_params
-from sonar_graph.evaluation.consistency import normalised_squares
-from sonar_graph.logs.convert.mrclam import read_mrclam
+from sonar_graph.evaluation import normalised_squares
+from sonar_graph.logs.convert import read_mrclam
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate
-from sonar_graph.testing import check_consistent, laws
-from sonar_graph.testing.drives import small_world, still_world
+from sonar_graph.testing import check_consistent, laws, small_world, still_world
 
 from .graphs import gtsams_solution
 from .made import isam2_params, ran
@@ -106,7 +105,7 @@ def test_incremental_equals_batch_on_mrclam(unpacked):
 
 
 def test_the_final_answer_is_the_batch_solution(basin):
-    """Trajectory and landmarks with the default settings; the instants asked for are the keyframes' and others."""
+    """Trajectory and landmarks with the default settings; the requested instants are the keyframes' and others."""
     estimator, _ = ran(basin, 7.0)
     before = gtsam.Values(estimator.values)
     batch = gtsams_solution(estimator.graph, before, 1e-9)

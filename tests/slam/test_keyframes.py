@@ -21,7 +21,8 @@ from sonar_graph.calibration import (
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
 from sonar_graph.numerics import cross_matrix
-from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, average_at_end
+from sonar_graph.slam import KeyframeParams
+from sonar_graph.slam.keyframes import Keyframes, average_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
 
 from .graphs import factors_of
@@ -222,7 +223,7 @@ def keyframes_over_gaps(max_interval_s: float = 1e3) -> Keyframes:
 
 
 def shares(keyframes: Keyframes, at_s: list[float]) -> list[float]:
-    """Of the information of each motion to a frame, how much is told."""
+    """The used share of the information of each motion to a frame."""
     found = []
     for stamp_ns in at(*at_s).tolist():
         keyframes.advance(stamp_ns)

@@ -49,7 +49,7 @@ def watch(
     track: int = -1,
     surely: float = 1.0,
 ) -> None:
-    """A frame with the landmarks that are the keys, each named as the value says."""
+    """A frame with the landmarks that are the keys, each named by its value."""
     z = [
         spherical(0.5 * after_s, PLACES[i]) + [0.02, 0.01] * rng.standard_normal(2)
         for i in said

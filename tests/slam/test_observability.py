@@ -14,10 +14,9 @@ from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2, factors
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors
+from sonar_graph.slam.smoother import FactorGroup, Factors, Smoother
 from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open
 from sonar_graph.states import Estimate, Outcome, Refusal
 
@@ -48,7 +47,7 @@ def along(direction: list[float], sigma: float) -> gtsam.NonlinearFactor:
 
 
 def test_a_range_leaves_open_what_is_across_it() -> None:
-    """Of the landmark when the pose is known; what is said too weakly counts as not said."""
+    """Of the landmark when the pose is known; weak information counts as missing."""
     distance = gtsam.RangeFactor3D(X(0), L(1), 2.0, isotropic(1, 0.1))
     (across,) = left_open(graph_of([distance]), HERE, [L(1)])
     assert np.linalg.matrix_rank(across.directions) == 2

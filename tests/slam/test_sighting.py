@@ -12,12 +12,9 @@ from scipy.optimize import least_squares
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.landmarks.landmark_graph import (
-    AmendableJournal,
-    Assignment,
-    LandmarkGraph,
-)
-from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
+from sonar_graph.slam.landmarks import AmendableJournal, LandmarkGraph, SightingFactors
+from sonar_graph.slam.landmarks.landmark_graph import Assignment
+from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.landmarks.unknown import place
 from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import Outcome

@@ -8,11 +8,11 @@ from gtsam.symbol_shorthand import L, X
 from sonar_graph.models import RobustKernel
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import (
+    FactorGroup,
     Sightline,
     batch_solution,
+    solve,
 )
-from sonar_graph.slam.smoother.batch_solution import solve
-from sonar_graph.slam.smoother.factor_store import FactorGroup
 from sonar_graph.slam.smoother.factor_store import graph_of as graph_of_groups
 from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
 
@@ -221,7 +221,7 @@ def seen_from_origin(landmark: int, z: np.ndarray) -> FactorGroup:
     return FactorGroup(made, (key, Sightline(X(0), gtsam.Pose3(), z)))
 
 
-def test_sightings_that_share_a_factor_have_the_information_of_their_own_factors():
+def test_sightings_in_one_factor_keep_their_information():
     """Ten sightings of two landmarks from one keyframe, with robust kernels; then two leave, and three of a factor stay."""
     rng = np.random.default_rng(3)
     z = np.array([10.0, 0.1]) + rng.normal(0.0, [0.2, 0.04], (10, 2))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sonar_graph.measurements import NO_TRACK
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2, RobustKernel
 from sonar_graph.states import Outcome
 from sonar_graph.testing import laws
@@ -93,7 +93,7 @@ def test_on_the_rail_the_end_is_least_squares_with_the_right_identities(
     assert landmarks.covariances[:, 0, 0] == pytest.approx(
         [variance["l4"], variance["l7"]], rel=1e-3
     )
-    # across, ranges tell next to nothing
+    # across, ranges have next to no information
     live = [given.values.atPoint3(L(7))[0] for given in (estimator, known)]
     assert live[0] == pytest.approx(live[1], abs=1e-6)
     outcomes = assert_outcomes_account(estimator, sequence)
@@ -176,8 +176,8 @@ def answers(
 ) -> EstimatorRun:
     """At tens of seconds, of identities that are late, wrong and missing.
 
-    Calls every ten seconds, and asked only at the end; with a seed also calls a quarter to two seconds apart, of which
-    every eighth asks, and at every third frame. Frames fall on epochs, between rows of the IMU.
+    Calls every ten seconds, with one request at the end; with a seed also calls a quarter to two seconds apart:
+    requests come at every eighth call and every third frame. Frames fall on epochs, between rows of the IMU.
     """
     sequence = simulate_basin(
         BasinOptions(**BASIN, **TROUBLES["late and wrong"], anonymous_share=0.3)

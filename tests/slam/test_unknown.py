@@ -13,19 +13,17 @@ from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.calibration import SonarCalibration
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam.landmarks.landmark_graph import (
+from sonar_graph.simulation import BasinOptions, simulate_basin
+from sonar_graph.slam import AssociatedUnknown
+from sonar_graph.slam.landmarks import (
     AmendableJournal,
-    Assignment,
     LandmarkGraph,
-)
-from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, late_view
-from sonar_graph.slam.landmarks.unknown import (
-    ODDS,
-    AssociatedUnknown,
     NamelessLandmarks,
-    nearest_duplicates,
+    SightingFactors,
 )
+from sonar_graph.slam.landmarks.landmark_graph import Assignment
+from sonar_graph.slam.landmarks.sighting import Sighting, late_view
+from sonar_graph.slam.landmarks.unknown import ODDS, nearest_duplicates
 from sonar_graph.slam.smoother import JointCovariance, Sightline, Smoother
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
@@ -110,7 +108,7 @@ def test_without_names_the_basin_is_that_with_names():
 
 
 def test_where_all_are_named_nothing_changes():
-    """Bit for bit, with false detections too, of which a recogniser says that they are of no landmark it knows."""
+    """Bit for bit, with false detections too, which a recogniser reports as of no landmark it knows."""
     sequence = simulate_basin(BasinOptions(**TWO_LAPS, false_detections_per_frame=0.5))
     one = run(sequence, smoother__relinearize_threshold=1e-3)
     other = run(sequence, **ASSOCIATED)
@@ -309,3 +307,16 @@ def test_the_only_landmark_without_a_name_is_merged():
     estimator = run(sequence, **ASSOCIATED)
     assert Outcome.MOVED in estimator.detections().outcomes
     assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("share", [0.98, 1.02])
+def test_a_candidate_known_to_a_tenth_of_its_range_begins_a_landmark(
+    range_m: float, share: float
+) -> None:
+    """One sighting in an aperture whose standard deviation is about 0.1 rad."""
+    made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
+    sighting = Sighting(
+        1, 1, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.4])), NOISE, None
+    )
+    assert made.is_placed([sighting]) == (share < 1.0)

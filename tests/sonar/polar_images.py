@@ -4,9 +4,9 @@ from functools import cache
 
 import numpy as np
 
-from sonar_graph.devices.landmark_designs import LandmarkDesign
+from sonar_graph.devices import LandmarkDesign
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar import FloorView
 from sonar_graph.sonar.regions import Candidates, CandidateVerdict
 
 RANGES_M = 1.26 + 1.25 / 512 * (np.arange(512) + 0.5)

@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.devices import landmark_designs
-from sonar_graph.devices.landmark_designs import (
+from sonar_graph.devices import (
     DEFAULT_DESIGNS,
     LandmarkDesign,
+    landmark_designs,
     load_designs,
 )
 from sonar_graph.errors import CalibrationError
-from sonar_graph.sonar.confusion import (
+from sonar_graph.sonar import (
+    EVIDENCE,
     Confusion,
     confusion_for,
     mark_of,
@@ -23,7 +24,6 @@ from sonar_graph.sonar.confusion import (
     read_confusion,
     soft_scores,
 )
-from sonar_graph.sonar.evidence import EVIDENCE
 
 RING = LandmarkDesign(9, "ring", 0.3, np.zeros((4, 4)))
 DESIGNS = [RING, replace(RING, id=10)]

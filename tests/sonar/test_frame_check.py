@@ -5,7 +5,8 @@ import pytest
 
 from sonar_graph.calibration import SonarImage
 from sonar_graph.images import SonarFrames
-from sonar_graph.sonar.frame_check import FrameCheck, FrameVerdict
+from sonar_graph.sonar import FrameCheck
+from sonar_graph.sonar.frame_check import FrameVerdict
 
 GOOD = FrameVerdict()
 

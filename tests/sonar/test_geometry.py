@@ -8,13 +8,11 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
+from sonar_graph.sonar import Fan, FloorView, with_lens
 from sonar_graph.sonar.geometry import (
-    Fan,
-    FloorView,
     point_covariances,
     points,
     ranges_azimuths_elevations,
-    with_lens,
 )
 
 angles = st.floats(-0.3, 0.3)
@@ -82,17 +80,6 @@ def test_covariance_of_a_point_is_that_of_many_samples():
     sampled = np.cov(points(ra[:, 0], ra[:, 1], e).T)
     found = point_covariances(point(2.0, 0.2), R, np.array([0.12 / np.sqrt(12)]))[0]
     assert np.allclose(found, sampled, atol=0.02 * np.abs(sampled).max())
-
-
-def test_elevation_spread_on_a_floor_is_that_of_many_samples():
-    """Height and tilt drawn; the elevation of the floor at one pixel, from ``tilt - asin(h / r)``."""
-    rng = np.random.default_rng(2)
-    height = rng.normal(0.95, 0.02, 200_000)
-    tilt = rng.normal(np.radians(30), 0.01, 200_000)
-    sampled = np.std(tilt - np.arcsin(height / 2.0))
-    view = view_of(0.95, 0.0, np.radians(30))
-    found = view.elevation_sigmas(view.floor_points(np.array([2.0]), np.array([0.0])))
-    assert found[0] == pytest.approx(sampled, rel=0.02)
 
 
 def frames_of(azimuths_rad: np.ndarray, bins: int = 8) -> SonarFrames:

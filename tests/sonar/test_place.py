@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
@@ -16,16 +16,15 @@ from sonar_graph.simulation.sonar_image import (
     ImageOptions,
     place_landmark,
 )
+from sonar_graph.sonar import FloorView, confusion_for
 from sonar_graph.sonar.appearance import (
     Appearance,
     AppearanceParams,
     CandidateFit,
     DesignFit,
 )
-from sonar_graph.sonar.confusion import confusion_for
-from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.place import Grid, Lit, Relief
-from sonar_graph.sonar.templates import Patch, check_headings, drawn
+from sonar_graph.sonar.templates import Patch, check_headings
 
 from .polar_images import candidates_at
 
@@ -73,20 +72,6 @@ def place_in(
     )
 
 
-def test_a_metre_of_side_adds_what_the_templates_add_for_it():
-    """A relief of which the templates draw a side of two fine points, 7.5 mm, over the same figure without it."""
-    design = DEFAULT_DESIGNS[2]
-    flush, raised = (
-        drawn(replace(design, relief_m=relief_m), 0.3, SIDE, CELL_M, BLUR_M)[0]
-        for relief_m in (0.0, 0.012)
-    )
-    np.testing.assert_allclose(RELIEF.figure, flush, atol=1e-4)
-    is_bright = flush > 0.5 * flush.max()
-    np.testing.assert_allclose(
-        (0.0075 * RELIEF.side)[is_bright], (raised - flush)[is_bright], atol=0.8
-    )
-
-
 def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
     """By `scipy.optimize.least_squares` on the same tangents."""
     patch = patch_with((40, 0.7, 0.5, -9.0), (5, 6), 3.0, 2)
@@ -120,24 +105,6 @@ def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
         mean_square * np.diag(np.linalg.inv(found.jac.T @ found.jac))[4:]
     )
     np.testing.assert_allclose(bound, expected, rtol=0.03)
-
-
-def test_a_shadow_is_as_long_as_its_steps():
-    """Of foam with a straight far edge: so many half cells behind it are dark, wholly with little blur."""
-    square = LandmarkDesign(1, "square", 0.3, np.full((150, 150), 12.0))
-    for steps in (0, 1, 4, 11):
-        relief = Relief.of(square, 0.0, Grid(SIDE, CELL_M, (1e-4, 1e-4)), steps)
-        shades = (relief.shorter, relief.longer)
-        lengths = [one[:, SIDE // 2].sum() for one in shades]
-        np.testing.assert_allclose(lengths, [steps / 2, (steps + 1) / 2], atol=0.02)
-
-
-def test_nothing_in_view_has_no_bound_and_does_not_move():
-    place, bound = place_in(
-        np.zeros((47, 47), np.float32), (5, 6), np.zeros((47, 47), np.float32)
-    )
-    np.testing.assert_array_equal(place, (5, 6))
-    assert np.isinf(bound).all()
 
 
 def drawn_at(

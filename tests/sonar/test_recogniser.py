@@ -12,21 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar import recogniser as module
-from sonar_graph.sonar.cfar import DetectionParams
-from sonar_graph.sonar.confusion import confusion_for
-from sonar_graph.sonar.recogniser import (
+from sonar_graph.sonar import (
     REPORTED,
     RecognisedFrame,
     Recogniser,
     RecogniserParams,
-    each_once,
+    SonarStep,
+    confusion_for,
 )
-from sonar_graph.sonar.tracker import SonarStep
+from sonar_graph.sonar import recogniser as module
+from sonar_graph.sonar.cfar import DetectionParams
+from sonar_graph.sonar.recogniser import each_once
 
 from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, image_db, polar
 

@@ -1,22 +1,20 @@
-"""Laws of sightings: where candidates are, how certain that is, and what the designs say of them."""
+"""Laws of sightings: where candidates are, how certain that is, and their evidence of the designs."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
+from sonar_graph.sonar import Confusion, FloorView, ObjectSighting, confusion_for
 from sonar_graph.sonar.appearance import (
     CENTROID_SIGMA_M,
     AppearanceParams,
     CandidateFit,
     DesignFit,
-    ObjectSighting,
 )
-from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.geometry import FloorView
 
 from .polar_images import (
     AZIMUTHS_RAD,
@@ -133,33 +131,6 @@ def test_what_is_not_in_view_is_compared_with_nothing(
     np.testing.assert_allclose(
         found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2])
     )
-
-
-def test_candidates_of_one_frame_are_seen_as_each_alone(triangle):
-    """Of three the middle one is not in view, and its row of the others is not the frame's."""
-    places = [polar(xy) for xy in ((1.7, 0.07), (1.7, 0.75), (1.69, 0.04))]
-    look = CandidateFit(
-        FLUSH,
-        AppearanceParams(),
-        MODEL.model_copy(update={"height_bias_m": 0.02}),
-        APERTURE_RAD,
-    )
-
-    def seen(*of: tuple[float, float]) -> list[ObjectSighting]:
-        return look.at(
-            triangle,
-            frame(triangle),
-            VIEW,
-            candidates_at(*map(list, zip(*of, strict=True))),
-            np.arange(len(of)),
-        )
-
-    for one, (other,) in zip(seen(*places), map(seen, places), strict=True):
-        assert (one.fit is None) == (other.fit is None)
-        assert (one.range_m, one.azimuth_rad, one.range_per_height) == pytest.approx(
-            (other.range_m, other.azimuth_rad, other.range_per_height), rel=1e-12
-        )
-        np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image():

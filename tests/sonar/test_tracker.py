@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from sonar_graph.errors import MeasurementError
+from sonar_graph.sonar import SonarStep
 from sonar_graph.sonar.tracker import (
     Expected,
-    SonarStep,
     Tracker,
     TrackingParams,
     TrackStates,
@@ -142,62 +142,6 @@ def test_a_missed_track_loses_existence_as_bayes_says(
     assert found.frames_seen.tolist() == [frames]
 
 
-def test_a_track_starts_with_the_uncertainty_of_its_candidate():
-    found = Tracker().step(
-        candidates_at([2.0, 1.5, 2.0], [0.0, 0.1, 0.0], rejected=(0,)), None, FRAME_NS
-    )
-    assert found.candidate.tolist() == [1, 2]
-    assert found.position_m[0] == pytest.approx(
-        1.5 * np.array([np.cos(0.1), np.sin(0.1), 0.0])
-    )
-    assert np.allclose(
-        found.position_cov[1], np.diag([0.03**2, (2 * 0.015) ** 2, (2 * 0.07) ** 2])
-    )
-
-
-@pytest.mark.parametrize("is_compensated", [True, False])
-def test_motion_is_what_makes_a_track_persist(is_compensated):
-    """The sonar turns and moves 5 cm a frame; without the motion handed in (negative control) nothing persists."""
-    step = moved_by(0.05, 0.03, 0.05)
-    point = np.array([2.3, 0.5, 0.0])
-    tracker = Tracker()
-    ids = []
-    for k in range(6):
-        r, a = polar(point)
-        found = tracker.step(
-            candidates_at([r], [a]),
-            step if is_compensated else STILL,
-            (k + 1) * FRAME_NS,
-        )
-        ids.append(int(found.ids[found.candidate >= 0][0]))
-        point = step.previous_T_sonar.transformTo(point)
-    assert (len(set(ids)) == 1) is is_compensated
-    if is_compensated:
-        assert found.position_m[0] == pytest.approx(
-            step.previous_T_sonar.transformFrom(point), abs=1e-3
-        )
-
-
-def test_steps_join_as_samples_of_them_do():
-    one, two = (
-        SonarStep(moved_by(*by).previous_T_sonar, CORRELATED)
-        for by in ((0.3, 0.1, 0.4), (-0.1, 0.2, -0.9))
-    )
-    first = one.previous_T_sonar
-    second = two.previous_T_sonar
-    joined = one.then(two)
-    noise = np.random.default_rng(8).multivariate_normal(
-        np.zeros(12), np.kron(np.eye(2), CORRELATED), 8_000
-    )
-    sampled = [first.retract(n[:6]).compose(second.retract(n[6:])) for n in noise]
-    tangents = np.array(
-        [joined.previous_T_sonar.localCoordinates(pose) for pose in sampled]
-    )
-    assert np.allclose(
-        np.cov(tangents.T), joined.covariance, atol=0.05 * joined.covariance.max()
-    )
-
-
 def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
     rng = np.random.default_rng(9)
     step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
@@ -216,27 +160,6 @@ def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
         found.position_cov[0], expected, atol=0.06 * found.position_cov.max()
     )
     assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
-
-
-def test_a_density_is_normal_and_ends_at_the_gate():
-    """18 cm are 4.2 deviations of the innovation of a tracker; 14 cm are 3.3."""
-    expected = Expected.of(
-        track_at([1.9, 0.2, -0.3], CORRELATED[:3, :3]), np.diag([9e-4, 2e-4])
-    )
-    z = (
-        expected.z
-        + np.array([2.99, 3.01])[:, None] * np.linalg.cholesky(expected.S[0])[:, 0]
-    )
-    inside, outside = expected.densities(z, 9.0)[:, 0]
-    assert inside == pytest.approx(
-        multivariate_normal(expected.z[0], expected.S[0]).pdf(z[0]), rel=1e-9
-    )
-    assert outside == 0
-    for off_m, is_inside in ((0.18, False), (0.14, True)):
-        tracker = Tracker()
-        run(tracker, [[(2.0, 0.0)]])
-        found = tracker.step(candidates_at([2.0 + off_m], [0.0]), STILL, 2 * FRAME_NS)
-        assert bool(found.matrix[found.candidate == 0][0, 0] > 0) == is_inside
 
 
 def test_innovations_wrap_behind_the_sonar():

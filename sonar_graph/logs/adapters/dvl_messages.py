@@ -336,6 +336,7 @@ def repeats(velocity: Floats) -> Mask:
     shares = (is_same.mean(), (lengths > 1).mean())
     is_habit = min(shares) >= LEAST_REPEATED and len(lengths) >= FEWEST_STEPS
     changes = np.diff(velocity, axis=0)[~is_equal] != 0
-    changes = changes[:, changes.any(axis=0)]
-    is_habit &= bool(changes.size and changes.mean() >= LEAST_CHANGING)
+    changing_axes = changes[:, changes.any(axis=0)]
+    # a velocity that never changes has no such axis, and no mean
+    is_habit &= changing_axes.size > 0 and bool(changing_axes.mean() >= LEAST_CHANGING)
     return is_same & is_habit

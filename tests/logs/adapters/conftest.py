@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.logs.adapters.log_config import read_log_config
-from sonar_graph.logs.cdr.definitions import DEFINITIONS as ROS
-from sonar_graph.logs.reading import read_log
+from sonar_graph.logs import read_log
+from sonar_graph.logs.adapters import read_log_config
+from sonar_graph.logs.cdr import DEFINITIONS as ROS
 from tests.logs.conftest import Bench, Entry, header, vector
 
 T0_NS = 1_700_000_000_000_000_000

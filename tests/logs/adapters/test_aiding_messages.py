@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.aiding_messages import is_unwrapped
-from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.measurements import UNMEASURED_M2
 
 from .conftest import (
@@ -27,11 +27,9 @@ from .conftest import (
 
 FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
-FIX, POINT, TURNED = (
-    "sensor_msgs/msg/NavSatFix",
-    "geometry_msgs/msg/PointStamped",
-    "geometry_msgs/msg/QuaternionStamped",
-)
+FIX = "sensor_msgs/msg/NavSatFix"
+POINT = "geometry_msgs/msg/PointStamped"
+TURNED = "geometry_msgs/msg/QuaternionStamped"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DEFINITIONS[FIX] = interface(
     "std_msgs/Header header, sensor_msgs/NavSatStatus status, float64 latitude, float64 longitude, float64 altitude, "
@@ -247,7 +245,7 @@ def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
     return rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", rows)
 
 
-def test_a_true_orientation_that_never_changes_is_doubted_and_may_be_left_out(
+def test_a_constant_true_orientation_raises_a_doubt(
     foreign: Any,
 ) -> None:
     still = moving(0.3, 0.3, 0.3)
@@ -299,7 +297,7 @@ ANTENNA = "[positions]\nantenna_m = [1.0, 0.0, 0.0]\n"
 
 
 @pytest.mark.parametrize("wrong", [-1, 0, 4])
-def test_a_start_that_is_not_stated_is_that_of_the_first_headings_and_fixes(
+def test_an_unknown_start_is_that_of_the_first_headings_and_fixes(
     foreign: Any, tmp_path: Any, wrong: int
 ) -> None:
     """With three times their sigma, of a vehicle at rest; one wrong row does not count."""
@@ -331,3 +329,17 @@ def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not() -> No
     assert not is_unwrapped(np.degrees(turns))
     assert not is_unwrapped(np.degrees(turns) % 360)
     assert not is_unwrapped(turns + 90)
+
+
+@pytest.mark.parametrize(
+    "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
+)
+def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(
+    foreign: Any, said: dict[str, float]
+) -> None:
+    log = foreign.write(oriented(YAW, **said), dvl())
+    assert foreign.read(oriented(YAW, **said), dvl()).heading is None
+    (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]
+    assert role.topic is None
+    assert "/imu says of no orientation that it is measured" in role.reason
+    assert "needs_variance = false" in role.reason

@@ -29,7 +29,7 @@ def velocity(row: int) -> dict[str, float]:
 def report(
     *, lost: dict[str, Any], sent: dict[str, Any] | None = None, kind: str = MARINE
 ) -> Entry:
-    """Messages of a Doppler log, of which `LOST` have other fields."""
+    """Messages of a Doppler log; `LOST` have other fields."""
     common = (
         {
             "velocity_mode": 1,
@@ -66,7 +66,7 @@ def twists() -> Entry:
     )
 
 
-# Each driver has its own way to say that there is no bottom lock.
+# Each driver has its own mark of a missing bottom lock.
 WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
     "Water Linked, velocity report: zeros, one beam": (
         report(
@@ -126,7 +126,7 @@ WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
 
 
 @pytest.mark.parametrize(("entry", "reason"), WITHOUT_LOCK.values(), ids=WITHOUT_LOCK)
-def test_velocities_without_bottom_lock_are_left_out_as_each_driver_marks_them(
+def test_velocities_without_bottom_lock_are_left_out(
     foreign: Any, entry: Entry, reason: str
 ) -> None:
     sequence = foreign.read(imu(ROWS), entry, tree("dvl_link", w=1.0))
@@ -159,7 +159,7 @@ DENIED = {
 def test_an_imu_that_denies_all_that_it_measures_is_used_with_a_warning(
     foreign: Any,
 ) -> None:
-    """A driver that has no covariances writes -1 into each, which by the definition says: not measured."""
+    """A driver that has no covariances writes -1 into each, which by the definition means: not measured."""
     rows = [
         turning(row, linear_acceleration=vector(0.1 * np.cos(row), 0, 9.8), **DENIED)
         for row in range(ROWS)
@@ -197,3 +197,29 @@ def test_a_held_velocity_is_a_drivers_habit_and_a_coarse_one_is_none() -> None:
     coarse = np.round(np.column_stack([np.sin(t), np.cos(0.7 * t), 0 * t]), 1)
     assert (np.diff(coarse, axis=0) == 0).all(axis=1).sum() > 20
     assert not repeats(coarse).any()
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_held_velocities_are_used_once(foreign: Any, times: int) -> None:
+    """Water Linked's driver publishes ``~/odom`` once for each of two reports."""
+    rows = [
+        {
+            "twist": {"twist": {"linear": velocity(row // times)}},
+            "child_frame_id": "dvl_link",
+        }
+        for row in range(ROWS)
+    ]
+    odometry = rows_of("/dvl/odom", "nav_msgs/msg/Odometry", rows, "odom")
+    sequence = foreign.read(imu(ROWS), odometry, tree("dvl_link", w=1.0))
+    np.testing.assert_array_equal(sequence.dvl.stamps_ns, foreign.stamps(ROWS)[::times])
+    assert "that repeat the velocity before" in sequence.notes["log.dropped"]
+
+
+def test_a_sensor_that_got_stuck_once_does_not_hold_velocities(
+    foreign: Any,
+) -> None:
+    stuck = report(lost={"velocity": velocity(20)})
+    assert (
+        len(foreign.read(imu(ROWS), stuck, tree("dvl_link", w=1.0)).dvl.stamps_ns)
+        == ROWS
+    )

@@ -23,7 +23,8 @@ from .conftest import (
 
 VELOCITY = (1.0, 2.0, 3.0)
 KNOWN = [0.1, 0.01, 0, 0.01, 0.2, 0, 0, 0, 0.3]
-COV, UNKNOWN = np.reshape(KNOWN, (3, 3)), np.full((3, 3), np.nan)
+COV = np.reshape(KNOWN, (3, 3))
+UNKNOWN = np.full((3, 3), np.nan)
 DEVIATIONS = np.diag(np.sqrt(np.diag(COV)))
 INDEFINITE = [1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 # of one direction only, which is a covariance to rounding
@@ -108,7 +109,7 @@ def directed(across: float, down: float, **fields: Any) -> Entry:
 
 
 def packets(velocities: Any, first: float = 0.0, step: float = 0.0) -> Entry:
-    """Messages of a type of which nothing is known, without a header."""
+    """Messages of an unknown type, without a header."""
     rows = [
         {"timestamp": first + step * i, "range": [1.0] * 4, "velocity": list(v)}
         for i, v in enumerate(velocities)
@@ -185,7 +186,7 @@ CASES: dict[str, Case] = {
     "one direction": (
         [dvl(velocity_covar=ALONG.tolist())], FRD,
         {}, {"log.warnings": None, "log.noise": None}),
-    # a type of which nothing is known needs only its fields, and a stamp of any unit
+    # an unknown type needs only its fields, and a stamp of any unit
     **{f"own type, stamp {stamp}": (
         [packets([(1.0, 2.0, 3.0, 0.01)] * 3, first, step)], f"{OF_ARRAY}stamp = {stamp}",
         {"dvl.velocity": [VELOCITY] * 3, "dvl.velocity_cov": [UNKNOWN] * 3,
@@ -214,9 +215,7 @@ CASES: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_velocities_with_what_is_doubtful_in_the_notes(
-    foreign: Any, case: Case
-) -> None:
+def test_messages_of_any_driver_become_velocities(foreign: Any, case: Case) -> None:
     entries, *others = case
     foreign.check([imu(), *entries], *others)
 

@@ -9,13 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.log_config import (
-    LogConfig,
-    read_log_config,
-    table_text,
-    toml_value,
-)
+from sonar_graph.logs.adapters import SHIPPED, LogConfig, read_log_config, table_text
+from sonar_graph.logs.adapters.log_config import toml_value
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
 # fmt: off
@@ -70,9 +65,7 @@ SHIPPED_ADAPTERS = [
     SHIPPED_ADAPTERS,
     ids=lambda value: getattr(value, "type", value),
 )
-def test_every_adapter_that_comes_along_can_be_written_as_a_table_and_read_again(
-    role: str, adapter: Any
-) -> None:
+def test_every_shipped_adapter_survives_as_a_table(role: str, adapter: Any) -> None:
     values = tomllib.loads(table_text(role, "/a topic", adapter, None))
     config = LogConfig.parse(values, "x")
     assert adapter.model_copy(update={"topic": "/a topic"}) in config.adapters(

@@ -8,12 +8,10 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters.drivers import SHIPPED
-from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs import inspect_log, read_sonar_frames
+from sonar_graph.logs.adapters import SHIPPED, read_log_config
 from sonar_graph.logs.cdr import definition, encode, parse_definition
-from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap import Keep, Topic
-from sonar_graph.logs.sonar_images import read_sonar_frames
 from sonar_graph.measurements import Floats
 
 from .conftest import Entry, dvl, imu, rows_of, vector
@@ -80,10 +78,8 @@ def frames_in(
 
 
 ROWS = POLAR.T.astype("u1").tobytes()
-BEAM_MAJOR, LEFT = (
-    '[sonar]\nimage_order = "beam-major"',
-    '[sonar]\nbearing_positive = "left"',
-)
+BEAM_MAJOR = '[sonar]\nimage_order = "beam-major"'
+LEFT = '[sonar]\nbearing_positive = "left"'
 # fmt: off
 CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     "range by range": (images(image(ROWS)), "", POLAR, AZIMUTHS),
@@ -174,7 +170,7 @@ def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
         [0, 1],
     ],
 )
-def test_each_message_that_is_no_image_is_refused_once_by_its_time_of_recording(
+def test_messages_that_are_no_image_are_refused_by_their_time(
     bad: list[int],
 ) -> None:
     """Several messages may share an instant, sound ones and others."""

@@ -11,18 +11,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.adapters.landmark_messages import range_and_azimuth
-from sonar_graph.logs.adapters.vehicle_messages import body_to_ros
+from sonar_graph.logs.adapters import body_to_ros, range_and_azimuth
 
 from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
 
 FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
-ONE_ATMOSPHERE, TEN_METRES_OF_SEA = 101_325.0, 1025 * 9.80665 * 10
-POSE, POSE_WITH_COVARIANCE = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-)
+ONE_ATMOSPHERE = 101_325.0
+TEN_METRES_OF_SEA = 1025 * 9.80665 * 10
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 HALF = float(np.sqrt(0.5))
 NAN = float("nan")
 
@@ -207,9 +205,7 @@ GRAVITY: dict[tuple[float, ...], str | None] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the_notes(
-    foreign: Any, case: Case
-) -> None:
+def test_messages_of_any_driver_become_measurements(foreign: Any, case: Case) -> None:
     sequence = foreign.check(*case)
     assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
     if (
@@ -221,7 +217,7 @@ def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the
 
 
 @pytest.mark.parametrize(("force", "warning"), GRAVITY.items(), ids=str)
-def test_gravity_that_is_not_felt_upwards_is_told_with_the_rotation_that_puts_it_right(
+def test_gravity_along_another_axis_is_reported_with_its_rotation(
     foreign: Any, force: tuple[float, ...], warning: str | None
 ) -> None:
     notes = foreign.check(

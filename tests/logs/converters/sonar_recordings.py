@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
-from sonar_graph.logs.convert.oculus import convert_oculus
-from sonar_graph.logs.convert.sonar_file import SonarConversion
-from sonar_graph.logs.mcap.reader import Recording
-from sonar_graph.logs.mcap.scanning import scan
-from sonar_graph.logs.mcap.topic import Keep
-from sonar_graph.logs.sonar_images import read_sonar_frames
+from sonar_graph.logs import read_sonar_frames
+from sonar_graph.logs.convert import (
+    SonarConversion,
+    convert_aris,
+    convert_didson,
+    convert_oculus,
+)
+from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
 
 START = datetime(2014, 5, 6, 7, 8, 9, 250_000, tzinfo=UTC)
@@ -27,7 +28,7 @@ STEP_NS = 120_000_000
 
 
 def images(count: int, beams: int, samples: int, seed: int = 0) -> NDArray[np.uint8]:
-    """Frames (count, beams, samples) of which no two samples in a row are told apart by chance."""
+    """Random frames (count, beams, samples) without equal neighbours."""
     return np.random.default_rng(seed).integers(
         0, 256, (count, beams, samples), dtype=np.uint8
     )
@@ -255,7 +256,8 @@ class Converted:
 
 
 def converted(folder: Path, content: bytes, ending: str, **settings: Any) -> Converted:
-    source, log = folder / f"dive.{ending}", folder / "dive.mcap"
+    source = folder / f"dive.{ending}"
+    log = folder / "dive.mcap"
     source.write_bytes(content)
     done = CONVERTERS[ending](source, log, **settings)
     return Converted(done, list(read_sonar_frames(log)), scan(log, lambda _: Keep.NONE))

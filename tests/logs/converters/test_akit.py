@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Slerp
 
-from sonar_graph.logs.adapters.geodesy import east_north_up
-from sonar_graph.logs.convert.akit import read_akit
+from sonar_graph.logs.adapters import east_north_up
+from sonar_graph.logs.convert import read_akit
 
 LATITUDE = 0.5733
 
@@ -63,7 +63,9 @@ def test_axes_times_and_start_are_those_of_the_files(folder):
 
 @given(st.floats(-1.3, 1.3), st.floats(-3, 3))
 def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, longitude):
-    e2, a, d = 6.69437999014e-3, 6378137.0, 1e-6
+    e2 = 6.69437999014e-3
+    a = 6378137.0
+    d = 1e-6
     meridian = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5
     vertical = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
     heights = np.array([-5.0, -5.0, -5.0, -2.0])
@@ -148,10 +150,8 @@ class TestRecording:
 def sideways_error(sequence, lever, dvl_delay_s=0.0):
     """Standard deviation of the DVL's leftward velocity error, with the reference's delay taken out."""
     knots = sequence.truth.stamps_ns * 1e-9
-    position, attitude = (
-        CubicSpline(knots, sequence.truth.positions),
-        Slerp(knots, sequence.truth.rotations()),
-    )
+    position = CubicSpline(knots, sequence.truth.positions)
+    attitude = Slerp(knots, sequence.truth.rotations())
     rows = np.arange(5, 395)
     seconds = sequence.dvl.stamps_ns[rows] * 1e-9 + dvl_delay_s
     centre = np.round(seconds * 100).astype(int)

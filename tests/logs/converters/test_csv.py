@@ -40,7 +40,8 @@ def table(
 
 def world():
     """A world with everything that a table can hold, with covariances that tables do not have taken out."""
-    small, aided = small_world(), aided_world()
+    small = small_world()
+    aided = aided_world()
     seen = small.detections
     seen = LandmarkDetections(
         seen.stamps_ns, seen.range_m, seen.azimuth_rad, np.full((len(seen), 2, 2), np.nan),
@@ -97,7 +98,8 @@ def write_tables(folder: Path, s, *, frd: bool = False, sep: str = ",") -> None:
     table(
         folder / "fix.csv", "t,x,y,z", place, stamps_ns=s.positions.stamps_ns, sep=sep
     )
-    seen, k = s.detections, s.detections.candidate_ids.shape[1]
+    seen = s.detections
+    k = s.detections.candidate_ids.shape[1]
     azimuth = -np.degrees(seen.azimuth_rad) if frd else seen.azimuth_rad
     names = ",".join(
         [
@@ -285,7 +287,8 @@ HEADED = {
 def write_headed(folder: Path) -> None:
     stamps = {"vehicle_imu.csv": 1e6, "ctd.csv": 1e3}
     for name, header in HEADED.items():
-        sep, count = (";" if ";" in header else ","), len(re.split("[,;]", header))
+        sep = ";" if ";" in header else ","
+        count = len(re.split("[,;]", header))
         base = 1_900_000_000
         rows = [
             [repr(round((base + k) * stamps.get(name, 1))), *["0.5"] * (count - 1)]

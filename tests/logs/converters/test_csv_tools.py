@@ -1,4 +1,4 @@
-"""Tables as tools write them are read right by the template's guess, or the template asks."""
+"""Tables as tools write them are read right by the template's guess, or the template has a question."""
 
 import re
 import tomllib
@@ -200,7 +200,7 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
 
 @pytest.mark.parametrize(("imu_hz", "every"), [(1000.0, 200), (100.0, 20), (200.0, 40)])
 @pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e9])
-def test_units_of_times_follow_from_the_rates_of_imu_and_doppler_log_together(
+def test_units_of_times_follow_from_the_sensors_rates(
     folder, tmp_path, imu_hz, every, scale
 ):
     d = dive(imu_hz, every)
@@ -214,7 +214,7 @@ def test_units_of_times_follow_from_the_rates_of_imu_and_doppler_log_together(
     )
 
 
-def test_a_header_that_states_a_unit_which_the_steps_contradict_is_asked_about(
+def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(
     folder, tmp_path
 ):
     d = dive()

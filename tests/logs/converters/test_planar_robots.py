@@ -9,16 +9,17 @@ import pytest
 from scipy.linalg import expm
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.convert.akit import read_akit
-from sonar_graph.logs.convert.mrclam import read_mrclam
-from sonar_graph.logs.convert.planar import (
+from sonar_graph.logs.convert import (
+    read_akit,
     read_dlr,
+    read_mrclam,
     read_victoria_park,
 )
 from sonar_graph.logs.convert.text_tables import read_table
 
 COV = "1e-5 2e-6 2e-5 3e-6 4e-6"
-STRAIGHT, RIGHT = f"STEP image 0 -1 0 {COV} 1e-4", f"STEP image 0 -1 {np.pi / 2} {COV}"
+STRAIGHT = f"STEP image 0 -1 0 {COV} 1e-4"
+RIGHT = f"STEP image 0 -1 {np.pi / 2} {COV}"
 
 
 def chain(motions):
@@ -97,13 +98,13 @@ def recorded(request):
 def test_chain_of_relative_poses_is_the_composition_of_the_files_steps(recorded):
     """Composed in the file's own axes, and reflected once at the end; velocities taken as chords break the chain."""
     name, lines, sequence = recorded
-    kind, column, body_R_file = ("ODOMETRY", 3, np.eye(3))
+    kind = "ODOMETRY"
+    column = 3
+    body_R_file = np.eye(3)
     if name == "dlr":
-        kind, column, body_R_file = (
-            "STEP",
-            2,
-            np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, 1]]),
-        )
+        kind = "STEP"
+        column = 2
+        body_R_file = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, 1]])
     steps = [
         gtsam.Pose2(*map(float, line[column : column + 3])).matrix()
         for line in lines
@@ -193,13 +194,15 @@ class TestSet6:
         )
         assert sequence.true_landmarks.ids.tolist() == list(range(6, 21))
         assert T0 - 20 < sequence.start_ns / NS < T0 + 20
-        d, truth = sequence.detections, sequence.truth
+        d = sequence.detections
+        truth = sequence.truth
         d = d.rows(
             (d.stamps_ns >= truth.stamps_ns[0]) & (d.stamps_ns <= truth.stamps_ns[-1])
         )
         stamps, frame = np.unique(d.stamps_ns, return_inverse=True)
         frames = truth.at(stamps)
-        world_R_body, position = frames.rotations()[frame], frames.positions[frame]
+        world_R_body = frames.rotations()[frame]
+        position = frames.positions[frame]
         where = np.searchsorted(sequence.true_landmarks.ids, d.candidate_ids[:, 0])
         offset = world_R_body.inv().apply(
             sequence.true_landmarks.positions[where] - position
@@ -217,7 +220,8 @@ def wrapped(angle):
 # ---- what is refused
 
 
-STEP, EDGE = f"STEP image 0 0 0 {COV} 1e-4\n", "ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n"
+STEP = f"STEP image 0 0 0 {COV} 1e-4\n"
+EDGE = "ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n"
 IMU, DVL, GT = (f"Trajectory2/{kind}_trajectory2.csv" for kind in ("IMU", "DVL", "GT"))
 AKIT = {
     IMU: "h\n0,1,2,3,4,5,6\n",

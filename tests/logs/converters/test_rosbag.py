@@ -19,16 +19,9 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.convert import rosbag
-from sonar_graph.logs.convert.rosbag import (
-    convert_rosbag,
-    limited_bz2,
-    limited_lz4,
-    limited_zstd,
-)
-from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import write_log
+from sonar_graph.logs import inspect_log, read_log, write_log
+from sonar_graph.logs.convert import convert_rosbag, rosbag
+from sonar_graph.logs.convert.rosbag import limited_bz2, limited_lz4, limited_zstd
 from sonar_graph.testing import small_world
 
 T0_NS = 1_447_550_804_242_631_687
@@ -38,11 +31,10 @@ STEP_NS = 20_000_001
 def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
     """Topic, type and message: IMU, a camera whose fields have other names in ROS 2, and a latched transform."""
     types = store.types
-    vector, quaternion = (
-        types["geometry_msgs/msg/Vector3"],
-        types["geometry_msgs/msg/Quaternion"],
-    )
-    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    vector = types["geometry_msgs/msg/Vector3"]
+    quaternion = types["geometry_msgs/msg/Quaternion"]
+    time = types["builtin_interfaces/msg/Time"]
+    header = types["std_msgs/msg/Header"]
 
     def head(row: int) -> Any:
         stamp = time(*divmod(T0_NS + row * STEP_NS, 10**9))
@@ -53,7 +45,8 @@ def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
         )
 
     nine = np.arange(9.0)
-    imu, fixed = "sensor_msgs/msg/Imu", (nine, vector(0, 0, 9.8), nine)
+    imu = "sensor_msgs/msg/Imu"
+    fixed = (nine, vector(0, 0, 9.8), nine)
     rows = [
         types[imu](head(row), quaternion(0, 0, 0, 1), nine, vector(row, 2, 3), *fixed)
         for row in range(5)
@@ -113,9 +106,7 @@ def ros1_bag(tmp_path: Path) -> Path:
     return tmp_path / "old.bag"
 
 
-def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(
-    ros1_bag, tmp_path, decoded
-):
+def test_a_ros_1_bag_becomes_a_ros_2_log(ros1_bag, tmp_path, decoded):
     told = []
     done = convert_rosbag(
         ros1_bag, tmp_path / "new.mcap", lambda at, total: told.append((at, total))
@@ -167,12 +158,13 @@ PACKED = [
 
 @pytest.mark.parametrize(("mode", "plugin"), PACKED, ids=str)
 @pytest.mark.parametrize(("size", "is_read"), [(1000, True), (1 << 20, False)])
-def test_what_unpacks_to_more_than_the_limit_is_refused_with_limit_and_remedy(
+def test_input_beyond_the_limit_of_unpacking_is_refused(
     tmp_path, monkeypatch, mode, plugin, size, is_read
 ):
     limit = 1 << 18
     monkeypatch.setattr(rosbag, "LARGEST_BYTES", limit)
-    store, folder = get_typestore(Stores.ROS2_JAZZY), tmp_path / "bag"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    folder = tmp_path / "bag"
     writer = Ros2Writer(folder, version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     write_bag(
@@ -227,9 +219,7 @@ def test_a_pipe_in_the_place_of_a_bag_or_in_it_is_refused(tmp_path, name):
         convert_rosbag(source, tmp_path / "new.mcap")
 
 
-def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_told(
-    tmp_path, decoded
-):
+def test_a_custom_type_keeps_its_definition(tmp_path, decoded):
     store = ros1_store()
     store.register(
         get_types_from_msg(
@@ -397,9 +387,7 @@ def test_messages_of_known_drivers_are_defined_where_a_bag_does_not(
     assert sequence.dvl.velocity[:, 0].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_types_of_unknown_drivers_are_defined_by_the_files_of_their_package(
-    tmp_path, decoded
-):
+def test_unknown_types_are_defined_by_files_of_their_package(tmp_path, decoded):
     store = get_typestore(Stores.ROS2_HUMBLE)
     text = "std_msgs/Header header\nfloat64 depth\n"
     store.register(get_types_from_msg(text, "own_msgs/msg/Depth"))
@@ -475,7 +463,8 @@ def test_messages_that_are_compressed_one_by_one_are_read_as_they_are(
         (tmp_path / "dive.mcap").open("rb") as source,
         (tmp_path / "packed.mcap").open("wb") as target,
     ):
-        reader, writer = make_reader(source), McapWriter(target)
+        reader = make_reader(source)
+        writer = McapWriter(target)
         writer.start("ros2", "test")
         channels: dict[int, int] = {}
         for row, (schema, channel, message) in enumerate(reader.iter_messages()):
@@ -491,7 +480,8 @@ def test_messages_that_are_compressed_one_by_one_are_read_as_they_are(
                 channels[channel.id], message.log_time, payload, message.publish_time
             )
         writer.finish()
-    packed, plain = read_log(tmp_path / "packed.mcap"), read_log(tmp_path / "dive.mcap")
+    packed = read_log(tmp_path / "packed.mcap")
+    plain = read_log(tmp_path / "dive.mcap")
     for role in ("imu", "dvl", "depth", "truth"):
         for name, column in vars(getattr(plain, role)).items():
             np.testing.assert_array_equal(getattr(getattr(packed, role), name), column)

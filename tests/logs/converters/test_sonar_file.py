@@ -1,4 +1,4 @@
-"""Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is told."""
+"""Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is reported."""
 
 import re
 from collections.abc import Callable
@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
 from sonar_graph.errors import DatasetError, LogError
-from sonar_graph.logs.convert.didson_aris import convert_didson
-from sonar_graph.logs.sonar_images import read_sonar_frames
+from sonar_graph.logs import read_sonar_frames
+from sonar_graph.logs.convert import convert_didson
 
 from .sonar_recordings import (
     STEP_NS,
@@ -25,7 +25,8 @@ from .sonar_recordings import (
     images,
 )
 
-COUNT, MIB = 7, 1 << 20
+COUNT = 7
+MIB = 1 << 20
 EVERY = list(range(COUNT))
 PICTURES = images(COUNT, 48, 50)
 RECORDINGS = {
@@ -59,7 +60,7 @@ def which(result: Converted) -> list[int]:
 
 
 def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
-    """Numbers of the frames that were read, and what is said of the others; together they are all bytes."""
+    """Numbers of the frames that were read, and the messages about the others; together they are all bytes."""
     content = b"".join(pieces)
     result = converted(folder, content, ending)
     lost = sum(loss.end - loss.at for loss in result.done.lost)
@@ -139,9 +140,7 @@ CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [
 
 
 @pytest.mark.parametrize(("ending", "name"), CASES)
-def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(
-    tmp_path, ending, name
-):
+def test_intact_frames_of_a_damaged_file_are_read(tmp_path, ending, name):
     damage, expected, told = (FAULTS | ARIS_FAULTS)[name]
     head, *frames = PIECES[ending]
     numbers, said = read(tmp_path, [head, *damage(frames, ending)], ending)
@@ -184,10 +183,11 @@ def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, en
 # ---- conversion to a log
 
 
-def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(
+def test_an_existing_log_survives_a_failed_conversion(
     tmp_path,
 ):
-    log, source = tmp_path / "dive.mcap", tmp_path / "dive.ddf"
+    log = tmp_path / "dive.mcap"
+    source = tmp_path / "dive.ddf"
     log.write_bytes(b"precious")
     with pytest.raises(DatasetError, match=r"dive\.ddf: cannot be read: No such file"):
         convert_didson(source, log)
@@ -213,7 +213,8 @@ def run(*arguments: object, code: int = 0) -> str:
     ("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")]
 )
 def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
-    source, log = tmp_path / "dive.bin", tmp_path / "dive.mcap"
+    source = tmp_path / "dive.bin"
+    log = tmp_path / "dive.mcap"
     source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
     said = run("convert", kind, source, "-o", log)
     assert all(
@@ -224,9 +225,10 @@ def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
     assert all(words in said for words in ("48 beams x 50 bins of uint8", "cut off"))
 
 
-def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path):
+def test_the_command_takes_the_speed_of_sound_and_shows_losses(tmp_path):
     header, *frames = Ddf(images(50, 96, 512)).pieces()
-    source, log = tmp_path / "dive.ddf", tmp_path / "dive.mcap"
+    source = tmp_path / "dive.ddf"
+    log = tmp_path / "dive.mcap"
     source.write_bytes(
         header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames))
     )

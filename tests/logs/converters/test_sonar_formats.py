@@ -7,7 +7,7 @@ import pytest
 
 from sonar_graph.errors import DatasetError
 from sonar_graph.images import decibels
-from sonar_graph.logs.sonar_images import read_sonar_frames
+from sonar_graph.logs import read_sonar_frames
 
 from .sonar_recordings import (
     CONVERTERS,
@@ -150,7 +150,8 @@ def test_the_log_says_the_scale_of_the_samples(tmp_path):
 # ---- damage of each kind
 
 
-ONE_DDF, TWO_DDF = Ddf(images(1, 48, 64), high=0), Ddf(images(2, 96, 512))
+ONE_DDF = Ddf(images(1, 48, 64), high=0)
+TWO_DDF = Ddf(images(2, 96, 512))
 ONE_ARIS = Aris(images(1, 48, 64), mode=1)
 NOISE = np.random.default_rng(1).integers(0, 256, 200_000, dtype=np.uint8).tobytes()
 
@@ -207,12 +208,13 @@ def test_other_files_and_headers_that_make_no_sense_are_refused_by_name(
 # ---- messages and clocks of an Oculus
 
 
-def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(
+def test_messages_without_images_are_skipped(
     tmp_path,
 ):
     pictures = images(4, 16, 8)
     _, *pings = Oculus(pictures).pieces()
-    note, huge = no_ping(b"SO" * 6), bytearray(no_ping())
+    note = no_ping(b"SO" * 6)
+    huge = bytearray(no_ping())
     put(huge, 10, "I", 1 << 20)
     begin = len(note) + len(pings[0]) + len(note)
     for between, lost in (
@@ -240,7 +242,8 @@ def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only
     "name", ["sample.aris", "one_ping_8bit.raw", "three_pings_8bit.raw"]
 )
 def test_recordings_of_real_sonars_are_read_to_the_byte(recordings, tmp_path, name):
-    source, is_aris = recordings / "sonar" / name, name.endswith("aris")
+    source = recordings / "sonar" / name
+    is_aris = name.endswith("aris")
     done = CONVERTERS[name.split(".")[1]](source, tmp_path / "dive.mcap")
     (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
     bins, beams, head_bytes = (2000, 48, 1024) if is_aris else (703, 256, 2048)

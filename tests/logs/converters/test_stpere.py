@@ -3,7 +3,7 @@ import pytest
 
 from sonar_graph.errors import DatasetError
 from sonar_graph.evaluation.metrics import horizontal_aligned_rmse
-from sonar_graph.logs.convert.stpere import read_stpere
+from sonar_graph.logs.convert import read_stpere
 
 T0 = 1_000
 MINUTE_M = 1852.0
@@ -23,10 +23,8 @@ def folder(tmp_path):
     ]
     header = f"% time, [idSensor], {', '.join(of_three)}, \n"
     (tmp_path / "MTI.log").write_text(header + "\n".join(inertial))
-    ahead, rest = (
-        50 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)]),
-        "0 " * 17,
-    )
+    ahead = 50 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)])
+    rest = "0 " * 17
     doppler = [
         f"{T0 + k} 2007 3 16 13 0 {k} 9 9 9 1 {ahead[0]} {ahead[1]} 2 {int(k != 1)} {rest}"
         for k in range(4)
