@@ -237,9 +237,8 @@ def observe(
         R_z = views.R_z[row]
         R, X, T = pose_after(x, motion)
         sight = sight_of(R, X, mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
-        e = np.array(
-            [z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)]
-        )  # (7)
+        turned_rad = wrap_angle(z[1] - sight.azimuth_rad)
+        e = np.array([z[0] - sight.range_m, turned_rad])  # (7)
         H = np.zeros((2, len(x)))
         # H_b T and H_p, row by row
         store_row6(T.T @ sight.range_by_body, H, 0, 0)
