@@ -898,14 +898,20 @@ def position_findings(
         yield rows[0]
         return
     share, count = jumping_share(right, fixes)
-    if share > LARGEST_JUMPING_SHARE and share * count >= FEWEST_JUMPS:
+    # of another scale, fixes move farther than the vehicle too
+    is_scaled = rows[0].acts and not rows[0].grave
+    if (
+        not is_scaled
+        and share > LARGEST_JUMPING_SHARE
+        and share * count >= FEWEST_JUMPS
+    ):
         sigma = float(np.sqrt(share * (1 - share) / count))
         yield Finding(
             "position fixes: jumps",
             Estimate1D(100 * share, 100 * sigma),
             "%",
             cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart are farther from each other than the vehicle moves by its "
-            "Doppler log and their noise allows: angles, or of another thing?",
+            "Doppler log and their noise allows: angles, another scale, or of another thing?",
             line=f"{unused('positions')} leaves them out; or they are worse than `positions.sigma_m` {IN_CALIBRATION}",
             gravity=Gravity.GRAVE,
         )

@@ -446,6 +446,9 @@ def axes_findings(
     if found is None:
         return [], sequence
     if found.is_mixed:
+        # steps of a velocity fit no axes, and have a finding of their own
+        if velocity_steps(sequence) is not None:
+            return [], sequence
         cause = (
             f"velocities change as the IMU measures, {found.ratio:.2g} times closer, "
             "with axes that are no rotation: along beams, or of wrong scale"

@@ -12,7 +12,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import Finding, sensor_check
 from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
-from sonar_graph.diagnosis.units import range_changes, wrong_units
+from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_units
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Heading, Imu
 from sonar_graph.navigation.alignment import DvlMatch, Estimate1D, InitialTilt
@@ -501,16 +501,17 @@ def test_a_drifting_heading_is_a_fault_of_the_heading() -> None:
 def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> None:
     run = RIGHT
     if sensor == "DVL":
-        velocity = 0.2 * np.trunc(5.0 * run.dvl.velocity)
+        step = 12.0 * max(run.calibration.dvl.velocity_sigma_m_s)
+        wave = 1.0 + 0.5 * np.sin(np.arange(len(run.dvl)) / 50.0)
+        velocity = step * np.trunc(run.dvl.velocity * wave[:, None] / step)
         run = replace(run, dvl=replace(run.dvl, velocity=velocity))
     elif sensor == "gyro":
         rate = np.trunc(20.0 * run.imu.angular_velocity) / 20.0
         run = replace(run, imu=replace(run.imu, angular_velocity=rate))
     elif sensor == "depth":
         assert run.depth is not None
-        run = replace(
-            run, depth=replace(run.depth, z_m=0.6 * np.trunc(run.depth.z_m / 0.6))
-        )
-    findings = sensor_check.check_sensors(run)
-    found = [f.quantity for f in findings if f.acts]
+        step = 12.0 * run.calibration.depth.sigma_m
+        z_m = step * np.trunc(run.depth.z_m / step)
+        run = replace(run, depth=replace(run.depth, z_m=z_m))
+    found = [f.quantity for f in coarse_findings(run)]
     assert found == ([] if sensor == "none" else [f"{sensor}: resolution"])
