@@ -224,7 +224,7 @@ def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
 
 @pytest.mark.parametrize(("others", "is_found"), [(1, True), (7, False)])
 def test_three_landmarks_that_agree_are_no_start_where_most_do_not(others, is_found):
-    """Seven wrong identities of ten speak for a map of another place, one of four does not."""
+    """Seven wrong identities of ten mean a map of another place, one of four does not."""
     rng = np.random.default_rng(1)
     places = np.column_stack([rng.uniform(0, 100, (10, 2)), np.full(10, -4.0)])
     known = KnownMap.of(range(10), places, sigma_m=0.05)
@@ -407,7 +407,7 @@ def test_a_map_of_the_same_log_is_doubted_and_one_of_another_dive_is_not(tmp_pat
     assert "log.warnings" not in in_map(second, tmp_path / "map.toml").notes
 
 
-def test_the_page_of_a_located_dive_has_the_given_map_and_what_became_of_it(dive):
+def test_the_page_of_a_located_dive_shows_the_map(dive):
     """What moved comes first; estimates are shown in the map's world, without alignment."""
     known = surveyed(dive)
     places = np.array(known.positions_m)

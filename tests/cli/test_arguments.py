@@ -55,7 +55,7 @@ def test_settings_go_to_their_estimator_at_any_depth():
     }
 
 
-def test_topics_go_to_their_roles_and_calibrations_are_read_from_toml_and_json(
+def test_topics_go_to_their_roles(
     tmp_path,
 ):
     assert ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"]).choices == {
@@ -73,7 +73,7 @@ def test_topics_go_to_their_roles_and_calibrations_are_read_from_toml_and_json(
         )
 
 
-def test_fields_of_a_group_are_options_and_those_left_out_have_their_defaults():
+def test_fields_of_a_group_are_options():
     given: list[object] = []
 
     @with_options("end", "salvage")

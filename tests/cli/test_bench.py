@@ -21,9 +21,7 @@ def test_missing_packages_are_named_with_how_to_get_them(
     assert "pip install 'sonar-graph[bench]'" in capsys.readouterr().err
 
 
-def test_report_rebuilds_page_and_tables_of_a_batch_and_warns_of_an_incomplete_one(
-    run, tmp_path, capsys
-):
+def test_report_rebuilds_the_page_of_a_batch(run, tmp_path, capsys):
     for folder, warned in (
         (written_batch(tmp_path / "\udcff"), ""),
         (written_batch(tmp_path / "part", not_run=3), "3 of 16 runs"),

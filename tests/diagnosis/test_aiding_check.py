@@ -39,9 +39,7 @@ def compass(run: Sequence, yaw_of) -> Sequence:
 
 @pytest.mark.parametrize("upside_down", [False, True])
 @pytest.mark.parametrize("gyro_bias", [0.0, 0.01])
-def test_a_compass_that_turns_against_the_gyros_is_named_with_the_other_world(
-    gyro_bias: float, upside_down: bool
-):
+def test_a_compass_of_the_opposite_sense_is_found(gyro_bias: float, upside_down: bool):
     """Whatever the bias of the gyros, and however the IMU is mounted."""
     imu = replace(
         RIGHT.imu,
@@ -119,7 +117,7 @@ def test_a_doppler_log_of_one_row_or_a_few_tells_nothing_of_fixes(rows: int):
     assert finding.text().startswith("cannot be told: too few")
 
 
-def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_start():
+def test_fixes_in_a_map_grid_are_found_with_their_origin():
     grid = np.array([500_000.0, 4_670_000.0, 0.0])
     config = LogConfig.parse({"positions": {"origin_m": [1.0, 2.0, 3.0]}}, "x")
     *_, finding = aiding_check.position_findings(fixed(RIGHT, origin=grid), config)
@@ -141,7 +139,7 @@ def test_fixes_in_a_map_grid_are_named_with_the_origin_that_brings_them_to_the_s
 
 
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 30.0])
-def test_fixes_that_no_vehicle_can_follow_are_named_and_outliers_among_good_ones_are_not(
+def test_fixes_faster_than_any_vehicle_are_found_and_outliers_are_not(
     every_s: float,
 ):
     good = fixed(SLOW if every_s < 30 else RIGHT, sigma_m=2.5, every_s=every_s)
@@ -169,7 +167,7 @@ def yaw_of(run: Sequence) -> np.ndarray:
 
 
 @pytest.mark.parametrize("places", ["fixes", "true positions", "neither"])
-def test_a_heading_of_another_world_is_told_by_positions_with_the_offset_that_puts_it_right(
+def test_a_heading_with_an_offset_is_found_from_positions(
     places: str,
 ):
     """A Doppler log that is turned on the body is no turn of the heading."""
@@ -309,7 +307,7 @@ def at_no_stated_start(run: Sequence, source: str) -> Sequence:
     ("off_m", "source", "line"),
     [(40.0, "fixes", "use = false"), (40.0, "stated", "origin_m")],
 )
-def test_depths_at_another_height_than_the_fixes_are_wrong_unless_they_begin_at_a_stated_start(
+def test_depths_and_fixes_of_different_height_are_a_fault(
     off_m: float, source: str, line: str
 ):
     run = at_no_stated_start(fixed(RIGHT, sigma_m=0.3), source)

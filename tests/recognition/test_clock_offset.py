@@ -9,11 +9,12 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.measurements import Floats
-from sonar_graph.recognition.clock_offset import (
+from sonar_graph.recognition import (
     ClockOffset,
+    ImageMotions,
+    PlanarStep,
     estimate_offset,
 )
-from sonar_graph.recognition.image_motion import ImageMotions, PlanarStep
 from tests.recognition.imaged_lane import Lane
 
 RANGE_M = 1.9

@@ -8,17 +8,15 @@ import pytest
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.sonar_images import (
+from sonar_graph.logs import (
     ImagesAlone,
     lacking_navigation,
     read_images_alone,
+    read_log,
+    write_log,
 )
-from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats
-from sonar_graph.recognition.image_motion import ImageMotions
-from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import RecognitionSession
+from sonar_graph.recognition import ImageMotions, Recognition, RecognitionSession
 from tests.recognition.imaged_lane import Lane
 
 SURE = 0.9
