@@ -277,9 +277,11 @@ def update_numbers(
 ) -> None:
     """Update by direct measurements of m numbers of the state, at their places."""
     H = np.zeros((len(places), len(x)))
+    R = np.zeros((len(places), len(places)))
     for k in range(len(places)):
         H[k, places[k]] = 1.0
-    update(x, P, H, e, np.diag(variances))
+        R[k, k] = variances[k]
+    update(x, P, H, e, R)
 
 
 class EkfSlamParams(FilterParams):

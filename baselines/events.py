@@ -124,8 +124,8 @@ def in_frame(views: Views, first: int) -> Ints:
 @compiled
 def read_detections(
     range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Columns z, R_z, e and S of `Views`. Covariances are made symmetric, and are R_z where the log has none."""
+) -> tuple[Floats, Floats]:
+    """Columns z and R_z of `Views`. Covariances are made symmetric, and are R_z where the log has none."""
     z = np.empty((len(range_m), 2))
     noise = np.empty((len(range_m), 2, 2))
     for k in range(len(z)):
@@ -138,9 +138,7 @@ def read_detections(
         noise[k, 1, 1] = logged[k, 1, 1] if is_known else R_z[1, 1]
         noise[k, 0, 1] = across if is_known else R_z[0, 1]
         noise[k, 1, 0] = noise[k, 0, 1]
-    e = np.full((len(z), 2), math.nan)
-    S = np.full((len(z), 2, 2), math.nan)
-    return z, noise, e, S
+    return z, noise
 
 
 @compiled

@@ -363,12 +363,14 @@ class FilterShell(ABC):
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        z, R_z, e, S = read_detections(
+        z, R_z = read_detections(
             detections.range_m,
             detections.azimuth_rad,
             detections.range_azimuth_cov,
             self._R_z,
         )
+        e = np.full(z.shape, math.nan)
+        S = np.full(R_z.shape, math.nan)
         return Views(stamps_ns, ids, z, R_z, outcome, e, S)
 
     def _samples(

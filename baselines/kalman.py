@@ -58,7 +58,7 @@ def cholesky(S: Floats) -> Floats:
 
     For matrices of one to three rows LAPACK takes several times as long to call, and to compile.
     """
-    L = np.zeros_like(S)
+    L = np.zeros(S.shape)
     for i in range(len(S)):
         for j in range(i + 1):
             rest = S[i, j]
@@ -87,10 +87,13 @@ def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
         if math.isnan(L[r, r]):
             raise LinAlgError("S is not positive definite")
         for k in range(r):
-            V[r] -= L[r, k] * V[k]
             w[r] -= L[r, k] * w[k]
-        V[r] /= L[r, r]
         w[r] /= L[r, r]
+        for i in range(len(P)):
+            # loops over numbers: numba takes long to compile sums of rows
+            for k in range(r):
+                V[r, i] -= L[r, k] * V[k, i]
+            V[r, i] /= L[r, r]
         # each row of V is a scalar update
         for i in range(len(P)):
             v = V[r, i]

@@ -335,13 +335,18 @@ def compared_columns(
     z: Floats, expected: Floats, prior_cov: Floats, cov: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Columns of `Compared`."""
-    innovation = z - expected
-    S = prior_cov + cov
+    innovation = np.empty(z.shape)
+    S = np.empty(cov.shape)
     distance = np.empty(len(z))
     gain = np.empty(len(z))
     for k in range(len(z)):
-        innovation[k, 1] = wrap_angle(innovation[k, 1])
-        r, alpha = innovation[k]
+        r = z[k, 0] - expected[k, 0]
+        alpha = wrap_angle(z[k, 1] - expected[k, 1])
+        innovation[k, 0] = r
+        innovation[k, 1] = alpha
+        for i in range(2):
+            for j in range(2):
+                S[k, i, j] = prior_cov[k, i, j] + cov[k, i, j]
         a = S[k, 0, 0]
         b = S[k, 0, 1]
         c = S[k, 1, 1]
