@@ -143,11 +143,12 @@ def other_matrix(Q: Floats, near: Floats) -> AxesMatch:
         is_unit = scale > 0 and not 1 / OTHER_UNIT < scale < OTHER_UNIT
         return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)
     R = turned(Q, near)
-    if square_of(Q, R) < most:
-        # a turn about the vertical is that of the fit of mountings
-        is_tilted = R[2, 2] < np.cos(LEAST_TURN_RAD)
-        return AxesMatch(np.eye(3), R if is_tilted else np.eye(3), ratio)
-    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=True)
+    left = square_of(Q, R)
+    # a turn about the vertical is that of the fit of mountings
+    if left < most and R[2, 2] < np.cos(LEAST_TURN_RAD):
+        return AxesMatch(np.eye(3), R, ratio)
+    is_mixed = left > OTHER_MATRIX * least
+    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=is_mixed)
 
 
 def turned(Q: Floats, near: Floats) -> Floats:
