@@ -40,7 +40,6 @@ LEAST_RATIO = 1.3
 """Least ratio of the sums of squares as they are and at the best candidate."""
 OTHER_UNIT = 1.3
 """Scale, either way, from which on a unit is suspected."""
-LEAST_TURN_RAD = np.radians(20.0)
 MOST_MISFIT = 0.05
 """Largest share of the squares of the accelerations that the best matrix leaves."""
 OTHER_MATRIX = 10.0
@@ -143,11 +142,12 @@ def other_matrix(Q: Floats, near: Floats) -> AxesMatch:
         is_unit = scale > 0 and not 1 / OTHER_UNIT < scale < OTHER_UNIT
         return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)
     R = turned(Q, near)
-    if square_of(Q, R) < most:
-        # a turn about the vertical is that of the fit of mountings
-        is_tilted = R[2, 2] < np.cos(LEAST_TURN_RAD)
-        return AxesMatch(np.eye(3), R if is_tilted else np.eye(3), ratio)
-    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=True)
+    left = square_of(Q, R)
+    # level motion hardly shows a tilt, and a turn about the vertical is that of the fit of mountings
+    if left < most and R[2, 2] < 0:
+        return AxesMatch(np.eye(3), R, ratio)
+    is_mixed = left > OTHER_MATRIX * least
+    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=is_mixed)
 
 
 def turned(Q: Floats, near: Floats) -> Floats:
