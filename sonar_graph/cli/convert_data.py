@@ -14,6 +14,8 @@ from sonar_graph.cli.arguments import (
     echo,
     examples,
     existing_file,
+    nested_settings,
+    validated,
 )
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
 from sonar_graph.errors import LogError
@@ -30,8 +32,7 @@ datasets = typer.Typer(
     name="convert",
     help="Convert text tables, a ROS bag, a sonar's recording or a public data set to an MCAP log.",
     epilog=examples(
-        "sonar-graph convert victoria-park -o victoria_park.mcap",
-        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --set robot=3 -o mrclam_6_3.mcap",
         "sonar-graph convert csv imu.csv dvl.csv --toml > dive.toml",
         "sonar-graph convert csv imu.csv dvl.csv --config dive.toml -o dive.mcap",
         "sonar-graph convert rosbag dive.bag -o dive.mcap",
@@ -92,6 +93,7 @@ def csv(
         )
     if output is None:
         raise LogError("-o is missing; give the log to write, such as -o dive.mcap")
+    # the table is read before the log is written, so that a mistake leaves no log
     sequence = _convert(
         lambda: read_csv(tables, config), [*tables, config], output, overwrite
     )
@@ -109,101 +111,53 @@ def csv(
     echo(f"What is in it: sonar-graph inspect {output}")
 
 
-DatasetFolder = Annotated[
-    Path,
-    typer.Argument(
-        metavar="DATASET_DIR",
-        exists=True,
-        file_okay=False,
-        help="Folder of the data set.",
-    ),
-]
-
-
 @datasets.command(
     epilog=examples(
-        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap"
+        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --set robot=3 -o mrclam_6_3.mcap",
+        "sonar-graph convert dataset akit A-KIT --set trajectory=1 -o akit_1.mcap",
+        "sonar-graph convert dataset stpere StPereDataset -o stpere.mcap",
+        "sonar-graph convert dataset victoria-park -o victoria_park.mcap",
     )
 )
-def mrclam(
-    dataset: DatasetFolder,
+def dataset(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="akit, dlr, mrclam, stpere or victoria-park."
+        ),
+    ],
     output: OutputLog,
-    robot: Annotated[int, typer.Option(help="Robot, 1 to 5.")],
-    overwrite: Overwrite = False,
-) -> None:
-    """UTIAS multi-robot data set: odometry, ranges and bearings to landmarks, motion-capture truth."""
-    from sonar_graph.logs.convert import read_mrclam
-
-    _convert(lambda: read_mrclam(dataset, robot), [dataset], output, overwrite)
-
-
-@datasets.command(
-    "victoria-park",
-    epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"),
-)
-def victoria_park(
-    output: OutputLog,
-    source: Annotated[
+    folder: Annotated[
         Path | None,
-        typer.Option(
-            "--file",
+        typer.Argument(
+            metavar="[FOLDER]",
             exists=True,
-            dir_okay=False,
-            help="Default: the one which the gtsam package brings.",
+            help="Folder of the data set; victoria-park comes with gtsam.",
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="The robot of mrclam (1 to 5), the trajectory of akit (from 1 on).",
         ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Victoria Park: a truck among trees, odometry and landmarks, no truth."""
-    from sonar_graph.logs.convert import read_victoria_park
+    """A public data set: underwater vehicles (akit, stpere), robots indoors (mrclam, dlr), a truck (victoria-park)."""
+    from sonar_graph.batch import DATASETS
 
-    _convert(lambda: read_victoria_park(source), [source], output, overwrite)
-
-
-@datasets.command(epilog=examples("sonar-graph convert dlr DLR -o dlr.mcap"))
-def dlr(
-    dataset: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PATH",
-            exists=True,
-            help="Folder of the data set, or its map.circles file.",
-        ),
-    ],
-    output: OutputLog,
-    overwrite: Overwrite = False,
-) -> None:
-    """DLR Spatial Cognition: a robot in an office building, artificial landmarks with IDs, no truth."""
-    from sonar_graph.logs.convert import read_dlr
-
-    _convert(lambda: read_dlr(dataset), [dataset], output, overwrite)
-
-
-@datasets.command(
-    epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap")
-)
-def akit(
-    dataset: DatasetFolder,
-    output: OutputLog,
-    trajectory: Annotated[int, typer.Option(help="Trajectory, counted from 1.")],
-    overwrite: Overwrite = False,
-) -> None:
-    """A-KIT: an autonomous underwater vehicle at sea, fibre-optic IMU and DVL, navigation-system reference."""
-    from sonar_graph.logs.convert import read_akit
-
-    _convert(lambda: read_akit(dataset, trajectory), [dataset], output, overwrite)
-
-
-@datasets.command(
-    epilog=examples("sonar-graph convert stpere StPereDataset -o stpere.mcap")
-)
-def stpere(
-    dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = False
-) -> None:
-    """St. Pere: an underwater vehicle in a marina, cheap IMU, compass and DVL, satellite positions as truth."""
-    from sonar_graph.logs.convert import read_stpere
-
-    _convert(lambda: read_stpere(dataset), [dataset], output, overwrite)
+    if name not in DATASETS:
+        raise LogError(
+            f"there is no data set {name!r}; there are: {', '.join(DATASETS)}"
+        )
+    # the options of a data set are those of a suite of `bench`
+    given = {} if folder is None else {"folder": str(folder)}
+    options = validated(
+        DATASETS[name].options, given | nested_settings(settings), f"data set {name}"
+    )
+    _convert(lambda: DATASETS[name].read(options), [folder], output, overwrite)
 
 
 @datasets.command(
@@ -312,6 +266,7 @@ def _convert_file(
     output: Path,
     overwrite: bool,
 ) -> None:
+    # checked first: converting takes minutes
     path = writable_log(output, source, overwrite=overwrite)
     with progress_bars() as progress:
         done = convert(

@@ -1,15 +1,10 @@
-"""Consistency: NEES and NIS with their chi-square bounds, and the reliability of identity posteriors.
+"""Consistency: NEES and NIS with their chi-square bounds, and the true classes of detections.
 
 NEES and NIS: docs/theory/metrics.md (Bar-Shalom, Li, Kirubarajan 2001, section 5.4).
 
-Reliability: a detection belongs to the nearest true landmark within `SAME_M`, and to none if all are farther than
-`APART_M`; those in between are left out. Its confidence is the posterior of its most probable class, "none of them"
-included. With n_b of n detections in bin b of confidence, the expected calibration error is (Naeini et al., AAAI 2015)
-
-    ECE = sum_b n_b / n | mean confidence of b - share of right ones in b |
+A detection truly belongs to the nearest true landmark within `SAME_M`, and to none if all are farther than `APART_M`; those
+in between are left out. Its confidence is the posterior of its most probable class, "none of them" included.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,11 +20,12 @@ LEAST_SAMPLES = 10
 GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""
-BINS = 10
 SAME_M = 0.15
 APART_M = 0.40
-NONE, UNJUDGED = -1, -2
-"""True class of a detection that is of no landmark, and of one that is left out."""
+NONE = -1
+"""True class of a detection that is of no landmark."""
+UNJUDGED = -2
+"""True class of a detection that is left out."""
 
 
 def error_series(
@@ -192,7 +188,7 @@ def nis(log: DetectionLog) -> Floats:
 def mean_normalised(squares: Floats, dof: int) -> float:
     """Mean of the known values divided by the degrees of freedom: 1 is consistent, above is over-confident.
 
-    NaN when none is known.
+    NaN without a known value.
     """
     known = squares[np.isfinite(squares)]
     return float(known.mean() / dof) if known.size else float("nan")
@@ -220,54 +216,6 @@ def anees_interval(
     return chi_square_quantile(tail, total) / total, chi_square_quantile(
         1 - tail, total
     ) / total
-
-
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Confidence and truth by bins of equal width from 0 to 1."""
-
-    count: Ints
-    """Detections in each bin, shape (10,)."""
-    confidence: Floats
-    """Their mean confidence; NaN in an empty bin."""
-    right: Floats
-    """Share of them whose class is right; NaN in an empty bin."""
-
-    @property
-    def expected_error(self) -> float:
-        """The expected calibration error."""
-        return float(
-            np.nansum(self.count * np.abs(self.confidence - self.right))
-            / max(self.count.sum(), 1)
-        )
-
-
-def reliability(confidence: Floats, right: Floats) -> Reliability:
-    """Bins of detections, shape (n,) each."""
-    row = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
-    count = np.bincount(row, minlength=BINS)
-    some = np.maximum(count, 1)
-    means = [
-        np.where(count > 0, np.bincount(row, v, BINS) / some, np.nan)
-        for v in (confidence, right)
-    ]
-    return Reliability(count, *means)
-
-
-def reliability_of(sequence: Sequence) -> Reliability | None:
-    """Reliability of a sequence's detections; None without them, without true poses, or if none can be judged."""
-    if (
-        sequence.detections is None
-        or sequence.true_poses is None
-        or sequence.true_landmarks is None
-    ):
-        return None
-    labels = true_identities(sequence, sequence.detections)
-    judged = labels != UNJUDGED
-    if not judged.any():
-        return None
-    confidence, named = confidences(sequence.detections)
-    return reliability(confidence[judged], (named == labels)[judged].astype(float))
 
 
 def confidences(detections: LandmarkDetections) -> tuple[Floats, Ints]:
