@@ -10,23 +10,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.evaluation import (
-    NONE,
-    UNJUDGED,
     Comparison,
     aligned_to_truth,
     compact_table,
-    confidences,
     format_value,
     repeats_published,
     run_columns,
     score_keys,
     score_table,
-    true_identities,
     write_comparison,
     write_viewer_files,
 )
@@ -340,7 +333,6 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     return {
         "frames": found.frames,
         "detections": 0 if sequence.detections is None else len(sequence.detections),
-        "named": naming_table(sequence),
         "sure": SURE,
         "topic": PICTURES,
         "pictures": pictures,
@@ -370,41 +362,4 @@ def _of_truth(sequence: Sequence) -> str:
         "with ground truth"
         if sequence.true_poses
         else "with true positions, but no true orientation"
-    )
-
-
-def naming_table(sequence: Sequence) -> Table | None:
-    """Detections by their true class: named rightly, named wrongly, taken for no landmark; None without truth."""
-    if (
-        sequence.detections is None
-        or sequence.true_poses is None
-        or sequence.true_landmarks is None
-    ):
-        return None
-    # by place, since identities are what is judged
-    labels = true_identities(sequence, sequence.detections)
-    _, named = confidences(sequence.detections)
-
-    def counted(chosen: NDArray[np.bool_]) -> list[str]:
-        return [
-            str(int((chosen & (named != NONE)).sum())),
-            str(int((chosen & (named == NONE)).sum())),
-        ]
-
-    rows = []
-    for identity in sequence.true_landmarks.ids.tolist():
-        seen = labels == identity
-        right = int((seen & (named == identity)).sum())
-        rows.append(
-            [f"landmark {identity}", str(right), *counted(seen & (named != identity))]
-        )
-    rows.append(["no landmark", ABSENT, *counted(labels == NONE)])
-    if np.any(labels == UNJUDGED):
-        rows.append(["cannot be told", ABSENT, *counted(labels == UNJUDGED)])
-    title = "What detections truly are, and what was most probable for the recogniser"
-    return text_table(
-        "naming",
-        title,
-        ["Truly", "named rightly", "named wrongly", "taken for no landmark"],
-        rows,
     )

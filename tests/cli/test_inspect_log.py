@@ -119,6 +119,6 @@ def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
 
 def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
     log = tmp_path / "victoria_park.mcap"
-    assert run("convert", "victoria-park", "-o", log) == 0
+    assert run("convert", "dataset", "victoria-park", "-o", log) == 0
     assert "3640 landmark detections" in capsys.readouterr().out
     assert run("inspect", log) == 0

@@ -41,7 +41,7 @@ def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_co
     run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
     heavy = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}
     cache = tmp_path / "cache"
-    park = ["convert", "victoria-park", "-o", str(tmp_path / "park.mcap")]
+    park = ["convert", "dataset", "victoria-park", "-o", str(tmp_path / "park.mcap")]
     report = ["report", str(tmp_path)]
     for arguments, unused in ((["--help"], heavy), (park, {"numba"}), (report, set())):
         at_exit = f"lambda: print(sorted({unused} & set(sys.modules)), file=sys.stderr)"
