@@ -109,11 +109,8 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     page = Page(html)
     assert "<script" not in html
     assert page.text.count(REASON) == 3, "in a line, unfolded, and among the failures"
-    assert {"runs/ekf-slam/result.json"} == {
-        attrs["href"]
-        for attrs in page.named("a")
-        if "ekf-slam" in (attrs["href"] or "")
-    }
+    addresses = [attrs["href"] or "" for attrs in page.named("a")]
+    assert not any("ekf-slam" in address for address in addresses)
 
 
 UNMEASURED, ENDLESS = (
