@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,8 +14,6 @@ from sonar_graph.cli.arguments import (
     echo,
     examples,
     existing_file,
-    nested_settings,
-    validated,
 )
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
 from sonar_graph.errors import LogError
@@ -32,7 +30,7 @@ datasets = typer.Typer(
     name="convert",
     help="Convert text tables, a ROS bag, a sonar's recording or a public data set to an MCAP log.",
     epilog=examples(
-        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --set robot=3 -o mrclam_6_3.mcap",
+        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --number 3 -o mrclam_6_3.mcap",
         "sonar-graph convert csv imu.csv dvl.csv --toml > dive.toml",
         "sonar-graph convert csv imu.csv dvl.csv --config dive.toml -o dive.mcap",
         "sonar-graph convert rosbag dive.bag -o dive.mcap",
@@ -40,6 +38,14 @@ datasets = typer.Typer(
     ),
 )
 _MOST_LOSSES_SHOWN = 10
+# public data sets, and the arguments of their readers
+DATASETS = {
+    "akit": ("FOLDER", "--number"),
+    "dlr": ("FOLDER",),
+    "mrclam": ("FOLDER", "--number"),
+    "stpere": ("FOLDER",),
+    "victoria-park": (),
+}
 
 
 @datasets.command(
@@ -113,8 +119,8 @@ def csv(
 
 @datasets.command(
     epilog=examples(
-        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --set robot=3 -o mrclam_6_3.mcap",
-        "sonar-graph convert dataset akit A-KIT --set trajectory=1 -o akit_1.mcap",
+        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --number 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert dataset akit A-KIT --number 1 -o akit_1.mcap",
         "sonar-graph convert dataset stpere StPereDataset -o stpere.mcap",
         "sonar-graph convert dataset victoria-park -o victoria_park.mcap",
     )
@@ -135,29 +141,28 @@ def dataset(
             help="Folder of the data set; victoria-park comes with gtsam.",
         ),
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="The robot of mrclam (1 to 5), the trajectory of akit (from 1 on).",
-        ),
+    number: Annotated[
+        int | None,
+        typer.Option(help="Robot of mrclam (1 to 5), trajectory of akit (from 1 on)."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """A public data set: underwater vehicles (akit, stpere), robots indoors (mrclam, dlr), a truck (victoria-park)."""
-    from sonar_graph.batch import DATASETS
+    from sonar_graph.logs import convert
 
     if name not in DATASETS:
         raise LogError(
             f"there is no data set {name!r}; there are: {', '.join(DATASETS)}"
         )
-    # the options of a data set are those of a suite of `bench`
-    given = {} if folder is None else {"folder": str(folder)}
-    options = validated(
-        DATASETS[name].options, given | nested_settings(settings), f"data set {name}"
-    )
-    _convert(lambda: DATASETS[name].read(options), [folder], output, overwrite)
+    wanted = DATASETS[name]
+    given: dict[str, Any] = {"FOLDER": folder, "--number": number}
+    # an argument that is not used would look like one that had no effect
+    if [key for key, value in given.items() if value is not None] != list(wanted):
+        needs = " and ".join(wanted) or "neither FOLDER nor --number"
+        raise LogError(f"data set {name}: expected {needs}")
+    read = getattr(convert, f"read_{name.replace('-', '_')}")
+    arguments = [given[key] for key in wanted]
+    _convert(lambda: read(*arguments), [folder], output, overwrite)
 
 
 @datasets.command(

@@ -72,15 +72,15 @@ def landmarks(
 
 # written out, so that help need not import the simulator
 _OTHERS = (
-    "imu (hg1700 or mti1), dvl (workhorse or explorer), "
-    "gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
+    "imu, dvl, gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
     "range_sigma_m, azimuth_sigma_rad, detection_probability, wrong_id_rate, tracks, id_delay_s, wrong_id_share, "
     "anonymous_share, false_detections_per_frame, confident_false_fraction, start_position_sigma_m, "
     "start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with --images image.NAME: scene, contrast_db, plate_db, "
     "foam_height_m, sediment, fouling, texture_shape, texture_length_m, ripple_height_m, ripple_length_m, noise_db, "
     "strangers, attitude_error_deg, altitude_error_m, sonar, window_m, designs, speckle, side_lobes, cross_talk_db, "
     "measured_lens, floor_db, absorption_db_m, tvg_error_db, joints, shadows, multipath, surface_path_db, "
-    "floor_reflection, drop_probability, time_offset_s, sound_speed_error, stones, decoys. image.scene is a preset "
+    "floor_reflection, drop_probability, time_offset_s, sound_speed_error, stones, decoys. "
+    "imu: hg1700 (default) or mti1; dvl: workhorse (default) or explorer. image.scene is a preset "
     "of those from contrast_db to altitude_error_m: easy (default), murky, worn or hard. image.designs is a TOML "
     "file of at least four landmarks; the four lowest ids are laid, in their order"
 )

@@ -178,7 +178,7 @@ def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
     assert "The log has no ground truth" in page.text
     assert "Per update, median" in page.text
     assert "Position error, not aligned" not in page.text
-    assert len(page.named("svg")) == 5, "the map in two widths, and no aligned view"
+    assert len(page.named("svg")) == 4, "the map in two widths, and no aligned view"
     assert "show-raw" not in page.text
 
 
