@@ -173,12 +173,12 @@ def _run(
             }
             values[f"{key}_end_dof"] = float(dof)
     values |= {
-        "update_p50_ms": 1.0 + rng.random(),
-        "update_p99_ms": 4.0 + rng.random(),
+        "time.update_median_ms": 1.0 + rng.random(),
+        "time.update_p99_ms": 4.0 + rng.random(),
         "wall_s": 3.0,
         "cpu_s": 2.9,
     }
-    values["peak_memory_mb"] = 20.0
+    values["memory.peak_mb"] = 20.0
     key = f"{name}-{seed}-{len(log)}"
     texts = {"asked": json.dumps(ASKED)}
     return RecordedRun(

@@ -15,7 +15,7 @@ import numpy as np
 from common import conclude, make_parser, note, print_table
 from dask.system import CPU_COUNT
 
-from sonar_graph.batch import Batch, Where, limits_of, read_suite
+from sonar_graph.batch import Batch, Limits, Where, read_suite
 from sonar_graph.batch.store import PlannedRun, RunOutcome
 
 SUITE = """
@@ -70,7 +70,7 @@ def measure(suite: Path, folder: Path, workers: int) -> Stopwatch:
     file = read_suite(suite)
     watch = Stopwatch()
     with Batch.opened(file, folder) as batch:
-        batch.run(Where(workers), limits_of(file, None), watch.keep)
+        batch.run(Where(workers), Limits(file.suite.timeout_s), watch.keep)
     note(f"{workers} workers: {watch.total_s():.1f} s")
     return watch
 

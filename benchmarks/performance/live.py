@@ -156,7 +156,7 @@ def differing_bytes(live, record, folder, estimator):
     return count
 
 
-def one(folder, log, duration_s, estimator, rate, kill_at_s=None, is_cut=False):
+def one(folder, log, duration_s, estimator, rate, is_cut=False):
     """A live run, listened to, and the run on its record; of a log, or with ``is_cut`` of its beginning."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     result = {"estimator": estimator, "rate": rate}
@@ -172,20 +172,7 @@ def one(folder, log, duration_s, estimator, rate, kill_at_s=None, is_cut=False):
     time.sleep(1.0)
     before_s, begun_s = cpu_s(live.pid), time.monotonic()
     gate.touch()
-    if kill_at_s is not None:
-        time.sleep(kill_at_s)
-        killed_s = time.monotonic()
-        subprocess.run(["pkill", "-KILL", "-P", str(live.pid)], check=False)
-        live.kill()
-        live.communicate()
-        live = start_live(
-            folder / "resumed",
-            endpoint,
-            estimator,
-            ["--resume", str(folder / "live" / "record.mcap")],
-        )
-        result["resume_s"] = round(time.monotonic() - killed_s, 2)
-    place = folder / ("live" if kill_at_s is None else "resumed")
+    place = folder / "live"
     try:
         player.wait(timeout=duration_s / rate + (0.0 if is_cut else START_S))
     except subprocess.TimeoutExpired:
@@ -295,7 +282,6 @@ class Case(NamedTuple):
     estimator: str
     duration_s: float
     rate: float = 1.0
-    kill_at_s: float | None = None
     with_images: bool = False
 
     def is_met(self, result):
@@ -305,7 +291,7 @@ class Case(NamedTuple):
             is_met &= (
                 result["images"] == result["recognised"] + result["images_dropped"]
             )
-        elif self.rate == 1.0 and self.kill_at_s is None:
+        elif self.rate == 1.0:
             is_met &= (
                 result["stamp_to_pose_p99_ms"] <= result["bare_p99_ms"] + 10.0
                 and result["cpu_share"] <= 0.25
@@ -330,7 +316,6 @@ def main():
     cases = [
         Case("at its pace", first, long_s),
         *(Case("at its pace", name, short_s) for name in others),
-        Case("killed and resumed", first, 2 * short_s, kill_at_s=0.5 * short_s),
         Case("three times the pace", first, long_s / 2, rate=3.0),
         Case("with images", first, 40.0, with_images=True),
         Case(
@@ -349,7 +334,6 @@ def main():
                 case.duration_s,
                 case.estimator,
                 case.rate,
-                case.kill_at_s,
                 case.with_images,
             )
             result = {"case": case.name, "duration_s": case.duration_s} | one(

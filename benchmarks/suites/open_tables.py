@@ -16,8 +16,8 @@ TABLES = (
     ("Smoothed position, m", "smoothed.ate_se2_m", 3),
     ("Map, m", "landmarks.se2_m", 3),
     ("NEES of the causal position (1 fits)", "causal.nees_position", 3),
-    ("99 % of the updates, ms", "update_p99_ms", 2),
-    ("Memory that the run adds, MB", "peak_memory_mb", 2),
+    ("99 % of the updates, ms", "time.update_p99_ms", 2),
+    ("Memory that the run adds, MB", "memory.peak_mb", 2),
 )
 
 

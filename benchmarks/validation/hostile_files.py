@@ -649,7 +649,6 @@ OURS = (
     ),
     *(
         "result.rviz",
-        "runs/dead-reckoning/result.json",
         "runs/dead-reckoning/causal.tum",
         "results.parquet",
         "suite.toml",
@@ -664,7 +663,7 @@ OURS = (
 THEIRS = (
     *(
         "recognised/holiday.jpg",
-        "runs/mine/result.json",
+        "runs/mine/series.npz",
         "runs/mine/trajectory.tum",
         "runs/.partial-mine/a",
         "notes.txt",

@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table
@@ -39,9 +38,7 @@ from recognition_runs import NONE, UNJUDGED, Detections, Passes, Run, kept_run
 from scipy.stats import chi2
 
 import sonar_graph
-from sonar_graph.evaluation import Reliability
-from sonar_graph.evaluation.consistency import reliability
-from sonar_graph.report.figures import reliability_figure
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.simulation import BasinOptions
 from sonar_graph.simulation.sonar_image import ImageOptions
 
@@ -68,6 +65,41 @@ TARGETS = {
     "range_rms_m": (0.0, 0.015),
     "azimuth_rms_deg": (0.0, 0.5),
 }
+
+
+BINS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Confidence and truth by bins of equal width from 0 to 1."""
+
+    count: Ints
+    """Detections in each bin, shape (10,)."""
+    confidence: Floats
+    """Their mean confidence; NaN in an empty bin."""
+    right: Floats
+    """Share of them whose class is right; NaN in an empty bin."""
+
+    @property
+    def expected_error(self) -> float:
+        """The expected calibration error."""
+        return float(
+            np.nansum(self.count * np.abs(self.confidence - self.right))
+            / max(self.count.sum(), 1)
+        )
+
+
+def reliability(confidence: Floats, right: Floats) -> Reliability:
+    """Bins of detections, shape (n,) each."""
+    row = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
+    count = np.bincount(row, minlength=BINS)
+    some = np.maximum(count, 1)
+    means = [
+        np.where(count > 0, np.bincount(row, v, BINS) / some, np.nan)
+        for v in (confidence, right)
+    ]
+    return Reliability(count, *means)
 
 
 @dataclass(frozen=True)
@@ -312,13 +344,6 @@ def show(summaries: dict[str, Summary]) -> None:
     print_table((*headers, *errors), rows)
 
 
-def draw(ours: Summary, literal: Summary, path: Path) -> None:
-    """Reliability of both rules."""
-    for name, summary in (("ours", ours), ("2014", literal)):
-        figure: Figure = reliability_figure(summary.reliability)
-        figure.savefig(path.with_stem(f"{path.stem}-{name}"), dpi=120)
-
-
 def main() -> None:
     parser = make_parser(__doc__, workers=True)
     parser.add_argument(
@@ -328,9 +353,6 @@ def main() -> None:
         "--work",
         type=Path,
         help="keep what came of each basin in this folder, and go on from it",
-    )
-    parser.add_argument(
-        "--out", type=Path, help="write the reliability of both rules here (PNG)"
     )
     arguments = parser.parse_args()
     if arguments.work is not None:
@@ -349,9 +371,7 @@ def main() -> None:
         runs = in_parallel(case.run, seeds, arguments.workers, variant)
         summaries[f"ours, short, {variant}"] = summarise(runs, OURS)
     show(summaries)
-    ours, literal = summaries["ours"], summaries["2014, as printed"]
-    if arguments.out is not None:
-        draw(ours, literal, arguments.out)
+    ours = summaries["ours"]
     others = {
         name: summary.figures
         for name, summary in summaries.items()

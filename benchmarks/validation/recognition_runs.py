@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.evaluation import confidences
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.recognition.session import RecognitionSession, one_by_one
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
@@ -144,14 +143,16 @@ def _judged(
     )
     error = np.column_stack([error_r[each, nearest], error_a[each, nearest]])
     named, probability = found.most_probable()
-    confidence, most_probable = confidences(found)
+    none = 1.0 - found.id_probability.sum(axis=1)
+    confidence = np.maximum(probability, none)
+    is_named = probability >= none
     return Detections(
         np.full(len(found), stamp_s),
         found.track,
         named,
         probability,
         confidence,
-        most_probable > 0,
+        is_named,
         label,
         np.where(least[:, None] <= SAME_M, error, np.nan),
         found.range_azimuth_cov,

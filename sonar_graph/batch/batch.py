@@ -8,8 +8,8 @@ from __future__ import annotations
 import contextlib
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -48,9 +48,7 @@ def run_suite(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
-    timeout_s: float | None = None,
     retry_failed: bool = False,
-    only: Collection[str] = (),
     overwrite: bool = False,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> RecordedBatch:
@@ -69,12 +67,8 @@ def run_suite(
         Number of processes on this machine; None: one for each core.
     scheduler
         Address of a Dask scheduler, such as ``tcp://10.0.0.5:8786``, to be used instead.
-    timeout_s
-        Time limit of a run, in seconds; None: the suite's.
     retry_failed
         Do runs again that failed, timed out or were killed.
-    only
-        Keys of runs to do now, as `plan_runs` and the report give them; the others stay as they are. Empty: all.
     overwrite
         Replace suite and table in the folder also where they are another suite's, or not this package's.
     progress
@@ -89,11 +83,10 @@ def run_suite(
     Raises
     ------
     BatchError
-        When the suite has a mistake (with file, line and key), a key of ``only`` is of none of its runs, another batch
-        runs in the folder, it holds the batch of another suite, no worker can be had, or a package of the extra is
-        missing. Runs that are done are kept.
+        When the suite has a mistake (with file, line and key), another batch runs in the folder, it holds the batch of
+        another suite, no worker can be had, or a package of the extra is missing. Runs that are done are kept.
     KeyboardInterrupt
-        On Ctrl-C or SIGTERM, with a message that tells how many runs are done.
+        On Ctrl-C or SIGTERM, with the number of finished runs as message.
 
     Examples
     --------
@@ -127,20 +120,18 @@ def run_suite(
         )
     if lacking := [name for name in NEEDED_PACKAGES if find_spec(name) is None]:
         raise BatchError(f"bench needs {lacking[0]}, which is not installed: {INSTALL}")
-    file, folder = read_suite(Path(path)), Path(folder)
+    file = read_suite(Path(path))
+    folder = Path(folder)
     with Batch.opened(file, folder, overwrite=overwrite) as batch:
-        chosen = batch.chosen(only)
         if retry_failed:
-            batch.discard_failed(chosen)
+            batch.discard_failed()
         rows = batch.rows()
-        statuses = Counter(
-            str(rows[run.key]["status"]) for run in chosen if run.key in rows
-        )
+        statuses = Counter(str(row["status"]) for row in rows.values())
 
         def report() -> None:
             if progress is not None:
                 progress(
-                    statuses.total(), len(chosen), statuses.total() - statuses["ok"]
+                    statuses.total(), len(batch.runs), statuses.total() - statuses["ok"]
                 )
 
         def count(_run: PlannedRun, outcome: RunOutcome) -> None:
@@ -148,10 +139,10 @@ def run_suite(
             report()
 
         report()
-        limits = limits_of(file, timeout_s)
+        limits = Limits(file.suite.timeout_s, file.suite.memory_mb)
         try:
             with terminations_as_interrupts():
-                batch.run(Where(workers, scheduler), limits, count, chosen)
+                batch.run(Where(workers, scheduler), limits, count)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(batch.resuming()) from None
     return read_batch(folder)
@@ -211,33 +202,14 @@ class Batch:
             if (row := self.store.row(run.key)) is not None
         }
 
-    def chosen(self, keys: Collection[str]) -> list[PlannedRun]:
-        """Runs of these keys; all without a key.
+    def discard_failed(self) -> None:
+        """Remove runs that did not succeed, so that they are done again."""
+        for key, row in self.rows().items():
+            if row["status"] != "ok":
+                self.store.discard(key)
 
-        Raises `BatchError` where a key is of no run: a run of other code, settings or logs has another.
-        """
-        if unknown := sorted(set(keys) - {run.key for run in self.runs}):
-            raise BatchError(
-                f"{self.file.path}: none of its {len(self.runs)} runs has the key {unknown[0]}; keys stand in the "
-                "report, and change with the code, the settings, the versions and the contents of logs"
-            )
-        return [run for run in self.runs if not keys or run.key in keys]
-
-    def discard_failed(self, chosen: Sequence[PlannedRun]) -> None:
-        """Remove those that did not succeed, so that they are done again."""
-        rows = self.rows()
-        for run in chosen:
-            if run.key in rows and rows[run.key]["status"] != "ok":
-                self.store.discard(run.key)
-
-    def run(
-        self,
-        where: Where,
-        limits: Limits,
-        progress: Progress,
-        chosen: Sequence[PlannedRun] | None = None,
-    ) -> None:
-        """Do the runs that are not done, or those chosen of them, and write the table, also if the batch ends early.
+    def run(self, where: Where, limits: Limits, progress: Progress) -> None:
+        """Do the runs that are not done, and write the table, also if the batch ends early.
 
         Suite and table in the folder are replaced as soon as the first run of this plan is done, and not before. The
         table then names all runs, so a batch that is killed can be read without the code that planned it.
@@ -250,11 +222,7 @@ class Batch:
         from sonar_graph.batch import cluster  # Dask is of the extra `bench`
 
         done = self.rows()
-        missing = [
-            run
-            for run in (self.runs if chosen is None else chosen)
-            if run.key not in done
-        ]
+        missing = [run for run in self.runs if run.key not in done]
         has_table = self._write_table_if_possible()
 
         def kept(run: PlannedRun, outcome: RunOutcome) -> None:
@@ -283,7 +251,7 @@ class Batch:
             write_results(self.store, self.file.suite, self.runs)
 
     def _write_table_if_possible(self) -> bool:
-        """Write the table if any run is done and there is space; tell whether it was written."""
+        """Write the table if any run is done and there is space; True if it was written."""
         if not any(self.store.row(run.key) for run in self.runs):
             return False
         with contextlib.suppress(OSError):
@@ -293,11 +261,5 @@ class Batch:
 
 
 def _is_same(path: Path, file: SuiteFile) -> bool:
-    """Tell whether a file is the suite, such as the user's own in the folder that it is written to."""
+    """True if a file is the suite, such as the user's own in the folder that it is written to."""
     return path.is_file() and path.read_bytes() == file.text.encode()
-
-
-def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:
-    """Limits of a suite's runs; a given timeout replaces the suite's."""
-    limits = Limits(file.suite.timeout_s, file.suite.memory_mb)
-    return limits if timeout_s is None else replace(limits, timeout_s=timeout_s)

@@ -72,7 +72,7 @@ def run_batch(
 def keep(
     run: PlannedRun, future: Future[Any], store: Store, progress: Progress
 ) -> None:
-    """Write the outcome of a finished task to the store; a run whose workers were killed has a row that says so.
+    """Write the outcome of a finished task to the store; a run whose workers were killed has the status ``killed``.
 
     Raises `BatchError` when the worker could not do the run at all, or the store cannot be written.
     """
@@ -114,7 +114,7 @@ def _on_this_machine(workers: int) -> Iterator[Submit]:
 def _on_scheduler(address: str) -> Iterator[Submit]:
     """Let a scheduler that exists and has at least one worker do the runs.
 
-    Raises `BatchError` when there is none.
+    Raises `BatchError` without such a scheduler.
     """
     for name in list(logging.root.manager.loggerDict):
         if name.partition(".")[0] == "distributed":

@@ -18,21 +18,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sonar_graph.batch.plan import sources_now, versions_of
+from sonar_graph.batch.plan import versions_of
 from sonar_graph.batch.result_table import FINDINGS
 from sonar_graph.batch.sources import fingerprint, read_source, with_findings
 from sonar_graph.batch.store import PlannedRun, Preparation, Row, RunOutcome
-from sonar_graph.errors import BatchError, EstimatorError
-from sonar_graph.estimator import load_estimator
+from sonar_graph.errors import BatchError
 from sonar_graph.evaluation import (
     LIBRARIES,
     Comparison,
     describe_environment,
     judge,
     one_line,
-    run_estimator,
+    run_here,
     write_comparison,
 )
 from sonar_graph.files import LOCK, MANIFEST, READY, Tell, serve
@@ -66,8 +63,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
 
     Returns scores, times and versions. A log that cannot be read and an estimator that fails are rows with a reason.
     Raises `BatchError` when this process has other versions or another source than those that the run was planned with,
-    before the estimator is loaded or after the run, or when its files have another content, and `OSError` when the
-    folder cannot be written; neither is a result.
+    or when its files have another content, and `OSError` when the folder cannot be written; neither is a result.
     """
     # a worker of a cluster may have another checkout
     here = versions_of(run.estimator)
@@ -77,12 +73,6 @@ def perform(run: PlannedRun, folder: Path) -> Row:
             f"a worker has {_told(here, differing)}, planned with {_told(run.versions, differing)}; "
             "install the same everywhere and start the workers anew"
         )
-    target = run.versions["estimator_target"]
-    if (
-        target.partition(":")[0] not in sys.modules
-    ):  # imported between two looks at its source
-        with suppress(EstimatorError):  # it fails again in the run, with the reason
-            load_estimator(run.estimator)
     clock = Clock()
     # processor time is nearly free of the load of the machine, unlike the time of the clock
     cpu_before_s = time.process_time()
@@ -97,13 +87,8 @@ def perform(run: PlannedRun, folder: Path) -> Row:
             )
             instants_ns = sequence.instants(run.rate_hz)
         with clock.on("estimate_s"):
-            result = run_estimator(
-                sequence,
-                run.estimator,
-                run.overrides,
-                instants_ns=instants_ns,
-                is_apart=True,
-            )
+            # supervision has given this run a process of its own already
+            result = run_here(sequence, run.estimator, run.overrides, instants_ns)
         comparison = judge(sequence, instants_ns, [result])
         command = {"command": f"sonar-graph bench: run {run.key} of {run.suite}"}
         comparison = replace(comparison, environment=comparison.environment | command)
@@ -128,14 +113,6 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         row = measured(comparison)
         row |= {name: sequence.notes.get(f"log.{name}") for name in FINDINGS}
     row |= {**clock.seconds, "cpu_s": time.process_time() - cpu_before_s}
-    now = sources_now(target)  # modules may be imported as late as during the run
-    if differing := [
-        name for name in sorted(now) if now[name] != run.versions.get(name)
-    ]:
-        raise BatchError(
-            f"the code changed during a run: {_told(now, differing)}, planned with {_told(run.versions, differing)}; "
-            "leave it alone while a batch runs, and start the workers anew"
-        )
     return row
 
 
@@ -163,12 +140,11 @@ def warm_up(run: PlannedRun) -> None:
 def _sequence(
     kind: str, options: str, content: str, seed: int | None, landmarks: str
 ) -> Sequence:
-    """Sequence of a source; arguments are JSON texts. Equal arguments give the same object, which nobody changes.
+    """Sequence of a source; arguments are JSON texts. Equal arguments give the same object, which must not be changed.
 
-    Raises `BatchError` when files are not, before or after they were read, what they were when the run was planned.
+    Raises `BatchError` when files are not what they were when the run was planned.
     """
     values = json.loads(options)
-    _check_content(kind, values, content)
     sequence = read_source(kind, values, seed, json.loads(landmarks))
     sequence = with_findings(kind, values, sequence)
     _check_content(kind, values, content)
@@ -204,11 +180,6 @@ def measured(comparison: Comparison) -> Row:
         # numpy and GTSAM name it differently
         out_of_memory = "MemoryError" in run.reason or "bad_alloc" in run.reason
         row["status"] = "memory" if out_of_memory else "failed"
-    else:
-        # the longest update hangs on the machine; the 99th percentile is of the estimator
-        p50, p99 = np.quantile(run.update_s * 1e3, [0.5, 0.99]).tolist()
-        row |= {"peak_memory_mb": run.peak_memory_mb, "finish_s": run.finish_s}
-        row |= {"update_p50_ms": p50, "update_p99_ms": p99}
     row["scored_instants"] = 0
     # over seeds only the last instants are independent
     for kind, errors in comparison.errors.get(run.estimator, {}).items():

@@ -1,7 +1,7 @@
 """Plan of a suite: the list of its runs, each with a key.
 
-The key is a hash of everything that decides the numbers of a run, the source code included: a version number says
-nothing about a checkout that was changed. Decisions: docs/design/0011-batch.md.
+The key is a hash of everything that decides the numbers of a run, the source code included: a version number does
+not identify a checkout that was changed. Decisions: docs/design/0011-batch.md.
 """
 
 import hashlib
@@ -92,7 +92,7 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
     """
     contestants = contestants_of(file)
     rate_hz = file.suite.rate_hz
-    runs = []
+    by_key: dict[str, PlannedRun] = {}
     for source in sources_of(file):
         for seed, contestant in itertools.product(
             source.entry.seed_list(), contestants
@@ -139,12 +139,20 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
                 versions=versions,
                 asked=asked,
             )
-            runs.append(run)
-    return runs
+            # a run that is there twice would count its seed twice
+            twin = by_key.setdefault(run.key, run)
+            if twin is not run:
+                which = "" if seed is None else f", seed {seed}"
+                file.refuse(
+                    contestant.place if twin.log == run.log else source.place,
+                    f"{run.log!r}, {run.estimator}/{run.variant}{which}: is the same run as {twin.log!r}, "
+                    f"{twin.estimator}/{twin.variant}; leave one out",
+                )
+    return list(by_key.values())
 
 
 def contestants_of(file: SuiteFile) -> list[_Contestant]:
-    """Estimators with their settings, grids multiplied out; no two of one name or with equal settings.
+    """Estimators with their settings, grids multiplied out; no two of one name.
 
     Raises `BatchError` with file, line and key.
     """
@@ -176,24 +184,14 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
                     )
             variant = _label(entry.variant, chosen) or DEFAULT_VARIANT
             found.append(_Contestant(place, entry.name, variant, given, values))
-    # two contestants of one name could not be told apart in tables, two with equal settings cost time for
-    # nothing
+    # two contestants of one name would look the same in tables
     by_name: dict[str, _Contestant] = {}
-    by_settings: dict[str, str] = {}
     for contestant in found:
         name = f"{contestant.name}/{contestant.variant}"
         if by_name.setdefault(name, contestant) is not contestant:
             file.refuse(
                 contestant.place,
                 f"{name} is there twice; give variants names that differ, or leave one out",
-            )
-        settings = json.dumps(
-            [contestant.name, contestant.params], sort_keys=True, default=str
-        )
-        if (twin := by_settings.setdefault(settings, name)) != name:
-            file.refuse(
-                contestant.place,
-                f"{name} and {twin} have the same settings; leave one out",
             )
     name, _, variant = file.suite.reference.partition("/")
     if f"{name}/{variant or DEFAULT_VARIANT}" not in by_name:
@@ -206,9 +204,9 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
 
 
 def sources_of(file: SuiteFile) -> list[_Source]:
-    """Logs and simulations, grids multiplied out; no two of one name or with equal content for one seed.
+    """Logs and simulations, grids multiplied out; no two of one name.
 
-    An entry that says how to obtain its files is left out where they are absent.
+    An entry with `obtain` is left out where its files are absent.
 
     Raises `BatchError` with file, line and key.
     """
@@ -293,9 +291,8 @@ def sources_of(file: SuiteFile) -> list[_Source]:
             ("logs",),
             f"no data of any log is here; get {'; '.join(e.obtain for e in file.suite.logs)}",
         )
-    # two logs of one name share a panel, two with equal content count one seed twice
+    # two logs of one name would share a panel
     by_name: dict[str, _Source] = {}
-    by_content: dict[str, str] = {}
     for source in found:
         if source.name == ALL_LOGS:
             file.refuse(
@@ -307,18 +304,6 @@ def sources_of(file: SuiteFile) -> list[_Source]:
                 source.place,
                 f"two logs are called {source.name!r}; give them names that differ",
             )
-        for seed in source.entry.seed_list():
-            content = json.dumps(
-                [source.content, source.entry.landmarks, seed],
-                sort_keys=True,
-                default=str,
-            )
-            if (twin := by_content.setdefault(content, source.name)) != source.name:
-                which = "" if seed is None else f" with seed {seed}"
-                file.refuse(
-                    source.place,
-                    f"{source.name!r} and {twin!r} are the same{which}; leave one out",
-                )
     return found
 
 
@@ -331,7 +316,7 @@ def _combinations(
 ) -> Iterator[dict[str, Any]]:
     """Every combination of a grid's values.
 
-    Raises `BatchError` when a name is also fixed, or its values are none or not distinct.
+    Raises `BatchError` when a name is also fixed, has no values, or has a value twice.
     """
     for name, values in grid.items():
         at = (*place, "grid", *name.split("."))
@@ -402,13 +387,6 @@ def versions_of(estimator: str) -> dict[str, str]:
     }
 
 
-def sources_now(target: str) -> dict[str, str]:
-    """Both source hashes of `versions_of` as the disk has them now, for its ``estimator_target``."""
-    packages = {"source": "sonar_graph", "estimator_source": _package(target)}
-    hashes = {package: source_hash_now(package) for package in set(packages.values())}
-    return {name: hashes[package] for name, package in packages.items()}
-
-
 def _package(target: str) -> str:
     """Top-level package of an entry point's target."""
     return target.partition(":")[0].partition(".")[0]
@@ -419,16 +397,10 @@ def source_hash(package: str) -> str:
     """SHA-256 over names and content of the files of a top-level package or module, cut to `DIGITS`.
 
     Data in the package counts like code; bytecode, hidden files and the place of installation do not. The hash is taken
-    once in a process, before the first code of the package decides a number; `source_hash_now` tells whether it still
-    holds. The package is not imported.
+    once in a process, before the first code of the package decides a number. The package is not imported.
 
     Returns hexadecimal digits; empty if there is no such package.
     """
-    return source_hash_now(package)
-
-
-def source_hash_now(package: str) -> str:
-    """`source_hash` of the files on the disk at this moment; they are read again only if their stamps changed."""
     spec = find_spec(package)
     if spec is None:
         return ""

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.batch.store import LOG, NOT_RUN, ROW, RUNS, SUITE
+from sonar_graph.batch.suite import DEFAULT_METRICS
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import BATCH, Manifest, read_json
 from sonar_graph.measurements import Floats
@@ -24,13 +25,6 @@ from sonar_graph.measurements import Floats
 RESULTS = "results.parquet"
 SUITE_METADATA = b"sonar_graph.suite"
 DEFAULT_VARIANT = ("", "default")
-DEFAULT_METRICS = (
-    "causal.ate_se2_m",
-    "causal.ate_raw_m",
-    "causal.rpe_10s_m",
-    "causal.yaw_rmse_rad",
-    "landmarks.se2_m",
-)
 GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
 """Name for all logs of a batch taken together."""
@@ -104,7 +98,7 @@ class RecordedBatch:
     def _known_scores(
         self,
     ) -> tuple[set[tuple[str, str]], set[tuple[str, str]], set[str]]:
-        """Scores by log, scores by contestant, and contestants of which any run ended."""
+        """Scores by log, scores by contestant, and contestants with a run that ended."""
         ended = [run for run in self.runs if run.ended]
         return (
             {(key, run.log) for run in ended for key in run.values},

@@ -2,8 +2,8 @@
 
 ``results.parquet`` has one row for each planned run. Its columns are in this order: the run, its ending, versions,
 times, and then every score by its key, in alphabetical order. A value that was not measured is null. A run that was not
-done has the status ``not run`` and no numbers. The file's metadata have under ``sonar_graph.suite``, as JSON, the
-suite's name, description, reference, metrics and rate.
+done has the status ``not run`` and no numbers. The suite's name, description, reference, metrics and rate
+are JSON in the file's metadata, under ``sonar_graph.suite``.
 """
 
 import json
@@ -19,30 +19,11 @@ from sonar_graph.files import replacing
 
 KINDS = ("causal", "smoothed")
 UNITS = {"m": "m", "rad": "rad", "ms": "ms", "s": "s", "mb": "MB"}
-PROTOCOLS = {
-    "ate_raw_m": "Not aligned: root of the mean square of 3-D position errors.",
-    "ate_yaw_m": "Aligned by yaw and translation without scale (Umeyama 1991): rms of 3-D position errors.",
-    "ate_se2_m": "Aligned by SE(2) without scale (Umeyama 1991): rms of horizontal position errors.",
-    "ate_se3_m": "Aligned by SE(3) without scale (Umeyama 1991): rms of 3-D position errors.",
-    "rpe_1s_m": "Rms of the error of body-frame displacement over 1 s, overlapping pairs.",
-    "rpe_10s_m": "Rms of the error of body-frame displacement over 10 s, overlapping pairs.",
-    "rpe_1s_rad": "Rms of the error of heading change over 1 s, overlapping pairs.",
-    "rpe_10s_rad": "Rms of the error of heading change over 10 s, overlapping pairs.",
-    "yaw_rmse_rad": "Not aligned: rms of wrapped heading errors.",
-    "return_error_m": "Not aligned: norm of estimated minus true displacement from the first to the last instant.",
-    "raw_m": "Map at the end, landmarks matched by identity, not aligned: rms of horizontal errors.",
-    "se2_m": "Map at the end, landmarks matched by identity, aligned by SE(2): rms of horizontal errors.",
-    "nees_position": "Normalised squared error of position per degree of freedom, mean over the instants of a run.",
-    "nees_yaw": "Normalised squared error of heading, mean over the instants of a run.",
-}
 HIGHER_IS_BETTER = {"real_time_factor"}
 NO_BETTER = {"count", "used", "refused", "unnamed"}
 INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
-# columns of time and memory that every run has
-TIMINGS = (
-    *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
-    *("update_p50_ms", "update_p99_ms", "finish_s"),
-)
+# times that every run has
+TIMINGS = ("wall_s", "read_s", "estimate_s", "cpu_s")
 
 
 @dataclass(frozen=True)
@@ -98,8 +79,8 @@ class Metric:
     @property
     def protocol(self) -> str:
         """Definition in a sentence."""
-        said = PROTOCOLS.get(
-            self.name, f"As compare writes it: the run's comparison.json, {self.name}."
+        said = (
+            f"{self.label}, as compare defines it in the comparison.json of each run."
         )
         if set(self.keys) <= {""}:
             return said

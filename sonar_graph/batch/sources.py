@@ -45,7 +45,7 @@ _BLOCK_BYTES = 1 << 20
 
 
 class LogOptions(Section):
-    """An MCAP log with landmark detections, and options for reading it as of `sonar-graph compare`."""
+    """An MCAP log with landmark detections, with the reading options of `sonar-graph compare`."""
 
     log: str
     calibration: str | None = None

@@ -58,14 +58,10 @@ def exact_tail(ranks: Ranks, most: int) -> float:
     return float(chances.sum())
 
 
-def least_p(pairs: int) -> float:
-    """Smallest p value of the signed-rank test for a number of pairs, reached if all have one sign."""
-    return float(2.0 ** (1 - pairs)) if pairs else 1.0
-
-
 CONFIDENCE = 0.95
 # quantiles shown beside the median
-LOW, HIGH = 0.1, 0.9
+LOW = 0.1
+HIGH = 0.9
 
 
 @dataclass(frozen=True)
@@ -82,10 +78,6 @@ class SampleSummary:
     median: float
     low: float
     high: float
-    median_error: float
-    """`quantile_error` of the median; digits beyond it mean nothing."""
-    low_error: float
-    high_error: float
 
 
 @dataclass(frozen=True)
@@ -120,14 +112,10 @@ class PairedDifference:
     """Number of differences below zero."""
     mean: float
     """NaN if a pair lacks a value."""
-    rounding_error: float
-    """Standard error of the mean of pairs that have a value; for few pairs at least 1 % of the mean."""
     interval: tuple[float, float]
     """`mean_interval`; NaN if there are too few pairs or no mean."""
     median: float
     """Infinite if half of the pairs have no value on one side; NaN if that holds for both sides."""
-    median_error: float
-    """`quantile_error` of the median."""
     p_value: float
     """Two-sided signed-rank test, not corrected for other tests; NaN for too few pairs."""
 
@@ -181,9 +169,6 @@ def summarise(values: Floats) -> SampleSummary:
         median=median,
         low=low,
         high=high,
-        median_error=quantile_error(values, 0.5),
-        low_error=quantile_error(values, LOW),
-        high_error=quantile_error(values, HIGH),
     )
 
 
@@ -204,26 +189,6 @@ def quantile(values: Floats, share: float) -> float:
         if math.isfinite(below)
         else below
     )
-
-
-def quantile_error(values: Floats, share: float) -> float:
-    """Standard error of a quantile, for any distribution; NaN for one value or an infinite quantile.
-
-    The number of values below the true quantile is binomial with deviation ``sqrt(n q (1 - q))``; the error is half the
-    distance between the order statistics that many places below and above (David, Nagaraja 2003, section 7.1). If the
-    upper one is infinite, it is the distance to the lower one. For few values, two of which may agree by chance, it is
-    at least a hundredth of the quantile.
-    """
-    n = len(values)
-    middle = quantile(values, share)
-    if n < 2 or not math.isfinite(middle):
-        return math.nan
-    places = math.sqrt(n * share * (1 - share)) / (n - 1)
-    below = quantile(values, max(0.0, share - places))
-    above = quantile(values, min(1.0, share + places))
-    sides = [abs(side - middle) for side in (below, above) if math.isfinite(side)]
-    error = sum(sides) / len(sides) if sides else math.nan
-    return max(error, 0.01 * abs(middle)) if n < LEAST_PAIRS else error
 
 
 def standard_error(values: Floats) -> float:
@@ -259,9 +224,9 @@ def paired(
     own, reference
         Values of the same cases, in the same order.
     cases
-        Case of each pair: a seed, or the name of a log for runs without seeds. Pairs of one case depend on each other
-        and make one difference, their mean (infinite ones to the side that has more of them). None: each pair is a
-        case of its own.
+        Case of each pair: a seed, or the name of a log for runs without seeds. Pairs of one case depend on each other,
+        so they count as one difference: their mean. If some are infinite, the side with more infinite ones decides.
+        None: each pair is a case of its own.
 
     Examples
     --------
@@ -294,21 +259,15 @@ def paired(
         each = kinds.pop() if len(kinds) == 1 else "case"
     # a case is lost with any of its pairs
     without = int(lost.sum())
-    valued = differences[~lost]
     has_mean = len(differences) > 0 and not without
-    rounding_error = standard_error(valued)
-    if 1 < len(valued) < LEAST_PAIRS:  # two may agree by chance
-        rounding_error = max(rounding_error, 0.01 * abs(float(valued.mean())))
     return PairedDifference(
         pairs=len(differences),
         each=each,
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
-        rounding_error=rounding_error,
         interval=mean_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
-        median_error=quantile_error(differences, 0.5),
         p_value=signed_rank_p(differences),
     )
 

@@ -58,6 +58,7 @@ DEFAULT_METRICS = (
     "smoothed.ate_se2_m",
     "smoothed.ate_raw_m",
     "landmarks.se2_m",
+    "time.update_median_ms",
 )
 # every key that a score can have
 METRICS = tuple(
@@ -113,7 +114,7 @@ class LogEntry(Section):
         seeds = (
             value if isinstance(value, list) else [value] if value is not None else []
         )
-        # a number of seeds is a number of runs, which nobody wants by the million
+        # a number of seeds is a number of runs, and a million is a mistake
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
         if not are_numbers or len(set(seeds)) < len(seeds):
@@ -211,7 +212,7 @@ class SuiteFile:
         )
 
     def holds(self, name: str) -> bool:
-        """Tell whether a file or folder is where `find` looks for it."""
+        """True if a file or folder is where `find` looks for it."""
         return any((root / name).exists() for root in self._roots())
 
     def find(self, place: Place, name: str) -> str:
@@ -294,8 +295,8 @@ def read_suite(path: Path) -> SuiteFile:
 def line_of(text: str, place: Place) -> int:
     """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it.
 
-    The first lines of a document are a document too, unless a value goes on below them. So a key begins after the
-    longest such part that does not have it.
+    The first lines of a TOML document are a valid document too, unless a value continues below them. A key therefore
+    begins after the longest valid part that lacks it.
     """
     lines = text.splitlines(keepends=True)
     for length in range(len(place), 0, -1):

@@ -80,7 +80,7 @@ class Runner:
         return self._process.pid
 
     def is_fit(self) -> bool:
-        """Tell whether it can take a run: not after one of another package, which may have changed the process."""
+        """True if it can take a run: not after one of another package, which may have changed the process."""
         return not self._is_busy and not self._is_foreign and self._process.is_alive()
 
     def perform(self, run: PlannedRun, limits: Limits) -> RunOutcome:
@@ -152,7 +152,7 @@ class Runners:
     def perform(self, run: PlannedRun, limits: Limits) -> RunOutcome:
         """Do a run in one of the processes; a run that is killed is done once more.
 
-        The row of the outcome says where a run was killed again, took too long or needed too much memory.
+        The status in the row is ``killed``, ``timeout`` or ``memory`` where the run was ended.
         Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
         """
         reason = ""
@@ -173,7 +173,7 @@ class Runners:
         )
 
     def end(self) -> None:
-        """End all processes, also those that are at work: who waits for one gets an error."""
+        """End all processes, also busy ones: threads that wait for their answers get an error."""
         with self._lock:
             self._is_ended = True
             runners = [*self._idle, *self._busy]

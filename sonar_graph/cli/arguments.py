@@ -144,6 +144,7 @@ class ReadingOptions:
     def choices(self) -> dict[str, str]:
         """Topics by role, from texts such as ``imu=/imu/data``."""
         choices = {}
+        # a topic may contain an equals sign, a role may not
         for text in self.topics or []:
             role, _, topic = text.partition("=")
             if not role or not topic:
@@ -158,6 +159,7 @@ class ReadingOptions:
         """Description of the log's topics from a TOML file, if one is given."""
         from sonar_graph.logs.adapters import read_log_config
 
+        # without a description the topics are chosen by their types
         return None if self.log_config is None else read_log_config(self.log_config)
 
     @property
@@ -205,6 +207,7 @@ class ReadingOptions:
         from sonar_graph.logs import read_log
         from sonar_graph.map_file import in_map
 
+        # the map comes last: the start that the log states goes before one that is found in a map
         sequence = read_log(log, **self.of_log, salvage=self.salvage, progress=progress)
         return sequence if self.map is None else in_map(sequence, self.map)
 
@@ -262,10 +265,12 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
     """Values by name from texts such as ``laps=2``, read as TOML, or as plain text if they are no TOML."""
     settings: dict[str, Any] = {}
     for text in texts:
+        # blanks around the equals sign are common in shells
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals or not name:
             raise EstimatorError(f"--set {text}: expected name=value")
         parsed: Any = value
+        # several lines of TOML could set other names too
         if "\n" not in value:
             try:
                 # TOML gives numbers, lists and booleans their types
@@ -305,6 +310,7 @@ def estimator_settings(
 
     given = parse_settings(texts or [])
     for path in given:
+        # the first part is the estimator, further dots are sections of its settings
         estimator, dot, setting = path.partition(".")
         if dot and estimator not in names:
             hint = suggestion(estimator, names)
@@ -364,6 +370,7 @@ class PlainConsole(Console):
 
 def answers() -> Console:
     """Console for results on stdout; if that is no terminal, it is `FILE_WIDTH` wide."""
+    # numbers and paths keep the colour of the text around them
     console = PlainConsole(highlight=False)
     return (
         console

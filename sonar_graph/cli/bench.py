@@ -22,7 +22,7 @@ MOST_REASONS = 5
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Options for which runs of a suite are done, where, and for how long."""
+    """Options for where the runs of a suite are done."""
 
     workers: Annotated[
         int | None,
@@ -35,28 +35,12 @@ class BenchOptions:
             help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead.",
         ),
     ] = None
-    timeout_s: Annotated[
-        float | None,
-        typer.Option(
-            "--timeout",
-            metavar="S",
-            min=1e-3,
-            help="End a run after so long. Default: the suite's.",
-        ),
-    ] = None
     retry_failed: Annotated[
         bool,
         typer.Option(
             "--retry-failed", help="Do runs anew that failed, timed out or were killed."
         ),
     ] = False
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY",
-            help="Do only the run of this key, which the report lists; can be repeated.",
-        ),
-    ] = None
     overwrite: Overwrite = False
 
 
@@ -79,6 +63,7 @@ def bench(
     Writes report.html, its tables, results.parquet with one row a run, and runs/KEY/ with what compare writes and the
     log of the run.
     """
+    # loads Dask, which the other commands do not need
     from sonar_graph.batch import run_suite
 
     try:
@@ -97,9 +82,7 @@ def bench(
                 output,
                 workers=options.workers,
                 scheduler=options.scheduler,
-                timeout_s=options.timeout_s,
                 retry_failed=options.retry_failed,
-                only=options.only or (),
                 overwrite=options.overwrite,
                 progress=progress,
             )
@@ -107,16 +90,15 @@ def bench(
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
         # the ordinary way waits for threads, also for those of workers that are gone
         os._exit(INTERRUPTED)
-    only = options.only
-    chosen = [run for run in batch.runs if not only or run.key in only]
-    counts = Counter(run.status for run in chosen)
+    counts = Counter(run.status for run in batch.runs)
     # those that ended first
     told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
     echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
-    for line in reasons_told(chosen):
+    for line in reasons_told(batch.runs):
         echo(line, err=True)
     echo(f"Results: {output / 'results.parquet'}")
     echo(f"Report: {write_report_of(output, overwrite=options.overwrite)}")
+    # results are written all the same; scripts see the failure by the exit code
     if set(counts) - {"ok"}:
         raise typer.Exit(1)
 
@@ -144,6 +126,7 @@ def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
     )
 
     with working("drawing"):
+        # from the files alone, as `report` does later
         batch = read_batch(folder)
         page = write_batch_report(batch, folder, overwrite=overwrite)
     for sentence in [*missing_told(batch), *lost_told(batch)]:

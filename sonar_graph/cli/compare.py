@@ -1,4 +1,4 @@
-"""``sonar-graph run``, ``compare``, ``report``, ``demo`` and ``estimators``: from a log to a side-by-side report."""
+"""``sonar-graph run``, ``compare``, ``report``, ``figures``, ``demo`` and ``estimators``: from a log to a report."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ from sonar_graph.cli.recognise import (
     warn_of_other_designs,
 )
 from sonar_graph.cli.simulate import write_basin
-from sonar_graph.errors import EstimatorError, EvaluationError, LogError
-from sonar_graph.files import BATCH, COMPARISON, result_written
+from sonar_graph.errors import EstimatorError, LogError
+from sonar_graph.files import BATCH, COMPARISON, PAPER, result_written
 
 if TYPE_CHECKING:
     from sonar_graph.evaluation import Comparison
@@ -52,8 +52,6 @@ DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
 # exit code where results are written but sensors contradict each other beyond doubt, as of ``inspect``
 DOUBTFUL = 3
-# tolerance for the IMU's rate, which is counted from its stamps
-RATE_SLACK = 1.01
 LOG = "basin.mcap"
 PAGE = "report.html"
 # the three laps of the paper in less time; cheap sensors: gyros whose bias is that of switching on, a Doppler
@@ -125,17 +123,8 @@ def compare(
     """
     from sonar_graph.report import write_report
 
-    # blanks after commas are common
-    names = [name.strip() for name in estimators.split(",")]
-    again = next((name for name in names if names.count(name) > 1), None)
-    if not all(names):
-        raise EstimatorError(
-            f"--estimators {estimators!r}: a name is empty; expected names such as {DEFAULT_ESTIMATORS}"
-        )
-    if again is not None:
-        raise EstimatorError(
-            f"--estimators {estimators!r}: {again} is named twice; each runs once"
-        )
+    # blanks after commas are common, and a name that is given twice runs once
+    names = list(dict.fromkeys(name.strip() for name in estimators.split(",")))
     with (
         compared(log, output, names, reading, recognition, estimation) as comparison,
         working("writing results"),
@@ -156,11 +145,12 @@ def report(
     ],
     overwrite: Overwrite = False,
 ) -> None:
-    """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""
+    """Write report.html, and a batch's tables, again from what compare, run or bench left in a folder."""
     from sonar_graph.batch import is_batch
     from sonar_graph.evaluation import read_comparison
     from sonar_graph.report import write_page
 
+    # both kinds of results have the same command
     if is_batch(folder):
         with writable_folder(folder, [PAGE], kind=BATCH, overwrite=overwrite):
             page = write_report_of(folder)
@@ -169,6 +159,49 @@ def report(
         with working("drawing"), writable_folder(folder, [PAGE], overwrite=overwrite):
             page = write_page(comparison, folder)
     echo(f"Report: {page}")
+
+
+def figures(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR",
+            exists=True,
+            file_okay=False,
+            help="Folder that compare, run or bench wrote.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder to write to. Default: DIR/paper.",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write every figure as SVG and PDF and every table as CSV, in the widths and type of journals.
+
+    Beside them protocol.txt, with how each number was got and a caption for each figure.
+    """
+    from sonar_graph.batch import is_batch, read_batch
+    from sonar_graph.evaluation import read_comparison
+    from sonar_graph.report import write_paper
+
+    # beside the result, so that figures and numbers stay together
+    target = folder / "paper" if output is None else output
+    with (
+        working("drawing"),
+        writable_folder(target, [], kind=PAPER, overwrite=overwrite),
+    ):
+        document = write_paper(
+            read_batch(folder) if is_batch(folder) else read_comparison(folder),
+            target,
+            overwrite=overwrite,
+        )
+    echo(f"Figures and tables: {document}")
 
 
 def demo(
@@ -222,6 +255,7 @@ def run_basin(options: BasinOptions, names: list[str]) -> None:
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.simulation import simulate_basin
 
+    # the results are thrown away: only the compiled loops count
     compare_runs(simulate_basin(options), names)
 
 
@@ -234,6 +268,7 @@ def estimators() -> None:
     failed = False
     for name, point in installed_estimators().items():
         try:
+            # a plug-in that cannot be loaded must not hide the others
             settings = load_estimator(name).Params
         except EstimatorError as error:
             console.print(escape(str(error)), "", sep="\n", soft_wrap=True)
@@ -259,6 +294,7 @@ def names_written(output: Path, estimators: list[str]) -> list[str]:
     """Names of the files that a comparison of some estimators may write into a folder or replace there."""
     from sonar_graph.evaluation import result_names
 
+    # pictures are named by their stamps, so that only the folder has their names
     pictures = [
         path.relative_to(output).as_posix()
         for path in output.glob("recognised/*.jpg")
@@ -323,9 +359,8 @@ def prepared_log(
 
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
+    # the record of a live run gives the estimates of that run only at its rate
     rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
-    # more estimates than IMU samples would repeat each other
-    check_rate(rate_hz, sequence)
     with working("comparing sensors"):
         sequence = (
             trusted(sequence)
@@ -358,10 +393,7 @@ def compare_prepared(
 ) -> Comparison:
     """Compare estimators on a log that was read, with a progress bar for each."""
     from sonar_graph.evaluation import compare as compare_runs
-    from sonar_graph.evaluation import expense
 
-    if said := expense(prepared.sequence):
-        echo(f"A large log, {said}", err=True)
     with progress_bars() as progress:
         comparison = compare_runs(
             prepared.sequence,
@@ -373,31 +405,15 @@ def compare_prepared(
     return replace(comparison, recognition=prepared.recognition)
 
 
-def check_rate(rate_hz: float, sequence: Sequence) -> None:
-    """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log."""
-    stamps_ns = sequence.imu.stamps_ns
-    # a log of a few samples would have any rate, so it counts as one second long
-    imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
-    highest_hz = max(DEFAULT_RATE_HZ, imu_hz)
-    if rate_hz > highest_hz * RATE_SLACK:
-        raise EvaluationError(
-            f"--rate-hz {rate_hz:g}: the IMU of {sequence.name} measures {imu_hz:.4g} times a second; "
-            f"give at most {highest_hz:.4g}"
-        )
-
-
 def print_outcome(comparison: Comparison, place: str) -> None:
     """Print the table of scores and where the files are.
 
     Exit with 1 if a run failed, with the reason, and with 3 if sensors contradict each other beyond doubt.
     """
-    from sonar_graph.report import doubtful_lines, published_counterpart, summary
+    from sonar_graph.report import doubtful_lines, summary
 
     out = answers()
     out.print(summary(comparison))
-    counterpart = published_counterpart(comparison)
-    if counterpart is not None:
-        out.print(counterpart)
     echo(place)
     # results are written all the same: the others may be what was wanted
     failed = [run for run in comparison.runs if run.status == "failed"]
@@ -409,4 +425,5 @@ def print_outcome(comparison: Comparison, place: str) -> None:
         echo(
             "sonar-graph: the results are doubtful: see the first lines above", err=True
         )
+        # a script must not take doubtful numbers for results
         raise typer.Exit(DOUBTFUL)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -30,8 +30,7 @@ datasets = typer.Typer(
     name="convert",
     help="Convert text tables, a ROS bag, a sonar's recording or a public data set to an MCAP log.",
     epilog=examples(
-        "sonar-graph convert victoria-park -o victoria_park.mcap",
-        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --number 3 -o mrclam_6_3.mcap",
         "sonar-graph convert csv imu.csv dvl.csv --toml > dive.toml",
         "sonar-graph convert csv imu.csv dvl.csv --config dive.toml -o dive.mcap",
         "sonar-graph convert rosbag dive.bag -o dive.mcap",
@@ -39,6 +38,14 @@ datasets = typer.Typer(
     ),
 )
 _MOST_LOSSES_SHOWN = 10
+# public data sets, and the arguments of their readers
+DATASETS = {
+    "akit": ("FOLDER", "--number"),
+    "dlr": ("FOLDER",),
+    "mrclam": ("FOLDER", "--number"),
+    "stpere": ("FOLDER",),
+    "victoria-park": (),
+}
 
 
 @datasets.command(
@@ -92,6 +99,7 @@ def csv(
         )
     if output is None:
         raise LogError("-o is missing; give the log to write, such as -o dive.mcap")
+    # the table is read before the log is written, so that a mistake leaves no log
     sequence = _convert(
         lambda: read_csv(tables, config), [*tables, config], output, overwrite
     )
@@ -109,101 +117,52 @@ def csv(
     echo(f"What is in it: sonar-graph inspect {output}")
 
 
-DatasetFolder = Annotated[
-    Path,
-    typer.Argument(
-        metavar="DATASET_DIR",
-        exists=True,
-        file_okay=False,
-        help="Folder of the data set.",
-    ),
-]
-
-
 @datasets.command(
     epilog=examples(
-        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap"
+        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --number 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert dataset akit A-KIT --number 1 -o akit_1.mcap",
+        "sonar-graph convert dataset stpere StPereDataset -o stpere.mcap",
+        "sonar-graph convert dataset victoria-park -o victoria_park.mcap",
     )
 )
-def mrclam(
-    dataset: DatasetFolder,
-    output: OutputLog,
-    robot: Annotated[int, typer.Option(help="Robot, 1 to 5.")],
-    overwrite: Overwrite = False,
-) -> None:
-    """UTIAS multi-robot data set: odometry, ranges and bearings to landmarks, motion-capture truth."""
-    from sonar_graph.logs.convert import read_mrclam
-
-    _convert(lambda: read_mrclam(dataset, robot), [dataset], output, overwrite)
-
-
-@datasets.command(
-    "victoria-park",
-    epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"),
-)
-def victoria_park(
-    output: OutputLog,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--file",
-            exists=True,
-            dir_okay=False,
-            help="Default: the one which the gtsam package brings.",
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Victoria Park: a truck among trees, odometry and landmarks, no truth."""
-    from sonar_graph.logs.convert import read_victoria_park
-
-    _convert(lambda: read_victoria_park(source), [source], output, overwrite)
-
-
-@datasets.command(epilog=examples("sonar-graph convert dlr DLR -o dlr.mcap"))
-def dlr(
-    dataset: Annotated[
-        Path,
+def dataset(
+    name: Annotated[
+        str,
         typer.Argument(
-            metavar="PATH",
-            exists=True,
-            help="Folder of the data set, or its map.circles file.",
+            metavar="NAME", help="akit, dlr, mrclam, stpere or victoria-park."
         ),
     ],
     output: OutputLog,
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FOLDER]",
+            exists=True,
+            help="Folder of the data set; victoria-park comes with gtsam.",
+        ),
+    ] = None,
+    number: Annotated[
+        int | None,
+        typer.Option(help="Robot of mrclam (1 to 5), trajectory of akit (from 1 on)."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """DLR Spatial Cognition: a robot in an office building, artificial landmarks with IDs, no truth."""
-    from sonar_graph.logs.convert import read_dlr
+    """A public data set: underwater vehicles (akit, stpere), robots indoors (mrclam, dlr), a truck (victoria-park)."""
+    from sonar_graph.logs import convert
 
-    _convert(lambda: read_dlr(dataset), [dataset], output, overwrite)
-
-
-@datasets.command(
-    epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap")
-)
-def akit(
-    dataset: DatasetFolder,
-    output: OutputLog,
-    trajectory: Annotated[int, typer.Option(help="Trajectory, counted from 1.")],
-    overwrite: Overwrite = False,
-) -> None:
-    """A-KIT: an autonomous underwater vehicle at sea, fibre-optic IMU and DVL, navigation-system reference."""
-    from sonar_graph.logs.convert import read_akit
-
-    _convert(lambda: read_akit(dataset, trajectory), [dataset], output, overwrite)
-
-
-@datasets.command(
-    epilog=examples("sonar-graph convert stpere StPereDataset -o stpere.mcap")
-)
-def stpere(
-    dataset: DatasetFolder, output: OutputLog, overwrite: Overwrite = False
-) -> None:
-    """St. Pere: an underwater vehicle in a marina, cheap IMU, compass and DVL, satellite positions as truth."""
-    from sonar_graph.logs.convert import read_stpere
-
-    _convert(lambda: read_stpere(dataset), [dataset], output, overwrite)
+    if name not in DATASETS:
+        raise LogError(
+            f"there is no data set {name!r}; there are: {', '.join(DATASETS)}"
+        )
+    wanted = DATASETS[name]
+    given: dict[str, Any] = {"FOLDER": folder, "--number": number}
+    # an argument that is not used would look like one that had no effect
+    if [key for key, value in given.items() if value is not None] != list(wanted):
+        needs = " and ".join(wanted) or "neither FOLDER nor --number"
+        raise LogError(f"data set {name}: expected {needs}")
+    read = getattr(convert, f"read_{name.replace('-', '_')}")
+    arguments = [given[key] for key in wanted]
+    _convert(lambda: read(*arguments), [folder], output, overwrite)
 
 
 @datasets.command(
@@ -312,6 +271,7 @@ def _convert_file(
     output: Path,
     overwrite: bool,
 ) -> None:
+    # checked first: converting takes minutes
     path = writable_log(output, source, overwrite=overwrite)
     with progress_bars() as progress:
         done = convert(

@@ -1,4 +1,4 @@
-"""``sonar-graph inspect`` and ``calibration``: what a log has, whether sensors agree, what it says of itself."""
+"""``sonar-graph inspect`` and ``calibration``: content of a log, agreement of its sensors, its calibration."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from sonar_graph.logs import LogSummary
 
 # exit codes; 2 is a mistake of the user
-UNUSABLE, DOUBTFUL = 1, 3
+UNUSABLE = 1
+DOUBTFUL = 3
 HEAD = """\
 # Calibration for --calibration FILE. A line that is commented out has the default, which counts where neither this file
 # nor the log says something else. Units are in the names or after the lines; angles are in rad, lengths in m.
@@ -56,7 +57,7 @@ def inspect(
         bool, typer.Option("--json", help="Print everything as one JSON object.")
     ] = False,
 ) -> None:
-    """Say what is in a log: topics, rates, gaps, which topic would be used for what and why, what sensors disagree.
+    """Show what is in a log: topics, rates, gaps, which topic would be used for what and why, which sensors disagree.
 
     Ends with 0 where nothing is in doubt, 3 where the log can be used but something is in doubt (warnings, lines to
     act on, only sonar images), and 1 where it cannot be used as it is: no IMU or Doppler log, contradictions, damage.
@@ -66,13 +67,14 @@ def inspect(
 
     config = reading.config
     given = reading.given
+    # stamps and types alone, without the numbers in the messages: seconds for a large log
     summary = inspect_log(log, config, reading.choices, reading.window, given)
     if toml:
         echo(summary.toml, nl=False)
         return
     findings: list[Finding] = []
     grave: set[str] = set()
-    skipped = large = ""
+    skipped = ""
     # images alone can still be recognised
     is_usable = not (
         (summary.obstacles and not summary.has_images_alone)
@@ -85,19 +87,19 @@ def inspect(
         skipped = f"not compared: {', '.join(summary.obstacles)}"
     else:
         from sonar_graph.diagnosis import check_sensors
-        from sonar_graph.evaluation import expense
 
         is_read = False
         try:
             with working("comparing sensors"):
                 sequence = reading.read(log)
                 is_read = True
-                large = expense(sequence)
                 findings = check_sensors(sequence, config)
                 grave = {finding.quantity for finding in findings if finding.grave}
         # the tables above are worth printing all the same
         except SonarGraphError as error:
-            skipped, is_usable = f"not compared: {error}", is_usable and is_read
+            skipped = f"not compared: {error}"
+            is_usable = is_usable and is_read
+    # for programs: the same content, without the exit code changing
     if as_json:
         content = asdict(summary) | {
             "path": str(summary.path),
@@ -107,9 +109,9 @@ def inspect(
             "obstacles": summary.obstacles,
             "sensors": [finding.plain() for finding in findings],
         }
-        echo(strict_json(content | {"sensors_skipped": skipped, "large": large}))
+        echo(strict_json(content | {"sensors_skipped": skipped}))
     else:
-        print_summary(summary, findings, grave, skipped, large)
+        print_summary(summary, findings, grave, skipped)
     if not is_usable:
         raise typer.Exit(UNUSABLE)
     if (
@@ -125,7 +127,6 @@ def print_summary(
     findings: list[Finding],
     grave: set[str],
     skipped: str,
-    large: str = "",
 ) -> None:
     """Print the tables of a log, and a line for each note, finding and warning, as which ``grave`` quantities count."""
     console = answers()
@@ -137,6 +138,7 @@ def print_summary(
         f"[bold]{escape(summary.name or summary.path.name)}[/], {summary.duration_s:.1f} s\n",
         soft_wrap=True,
     )
+    # without a box, so that lines can be copied
     topics = Table(box=None, pad_edge=False)
     for heading in ("topic", "type"):
         topics.add_column(heading, overflow="fold")
@@ -179,6 +181,7 @@ def print_summary(
             escape(role.reason),
         )
     console.print(topics, "", roles, "", sep="\n")
+    # a table that is cut must not look complete
     if len(summary.topics) > len(shown):
         say(
             "not shown",
@@ -201,8 +204,6 @@ def print_summary(
                 "bold yellow" if finding.acts else "bold",
             )
         console.print()
-    if large:
-        say("large", large, "bold yellow")
     for rows in summary.left_out:
         say("left out", rows)
     for topic in shown:
@@ -227,6 +228,7 @@ def print_summary(
                 ),
                 soft_wrap=True,
             )
+        # the command can be copied as it is
         hint = escape(f"sonar-graph inspect {summary.path} --toml > log.toml")
         say_it = (
             "If it has IMU and Doppler log, say" if summary.has_images_alone else "Say"
@@ -253,7 +255,7 @@ def calibration(
         typer.Option("--template", help="Print all fields with units and defaults."),
     ] = False,
 ) -> None:
-    """Print a calibration file to edit: all fields with units, meaning and defaults, and what a log already says."""
+    """Print a calibration file to edit: all fields with units, meaning and defaults, and the values of a log."""
     from sonar_graph.calibration import Calibration
     from sonar_graph.logs import read_log
     from sonar_graph.settings import toml_template
@@ -266,10 +268,8 @@ def calibration(
     source = ""
     if log is not None:
         sequence = read_log(log, **reading.of_log)
-        stated, source = (
-            sequence.calibration,
-            f"# {log.name}: {sequence.notes['log.calibration']}\n",
-        )
+        stated = sequence.calibration
+        source = f"# {log.name}: {sequence.notes['log.calibration']}\n"
     elif reading.given is not None:
         raise CalibrationError("--calibration: give a log too, for which it counts")
     echo(

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -84,7 +81,7 @@ def join(
             metavar="IMAGES",
             exists=True,
             dir_okay=False,
-            help="Log with sonar images, or an .aris or .ddf file.",
+            help="MCAP log with sonar images, as `convert` makes of a sonar's recording.",
         ),
     ],
     navigation: Annotated[
@@ -110,57 +107,57 @@ def join(
         write_amended,
     )
 
+    # neither source may be replaced by the joined log
     path = writable_log(output, images, navigation, overwrite=options.overwrite)
     # before the images are read, which takes minutes
     refuse_images(navigation)
     sequence = reading.read(navigation)
     topic = reading.choices.get("sonar")
-    with as_log(images) as log:
-        alone = read_images_alone(log, topic=topic, salvage=reading.salvage)
-        seen = look(log, topic, alone.calibration, salvage=reading.salvage)
-        is_stated = options.offset is not None and options.search is None
-        around_s = options.offset or 0.0
-        search_s = options.search or SEARCH_S
-        require_overlap(
-            images,
+    alone = read_images_alone(images, topic=topic, salvage=reading.salvage)
+    seen = look(images, topic, alone.calibration, salvage=reading.salvage)
+    # with --search a stated offset is only where the search begins
+    is_stated = options.offset is not None and options.search is None
+    around_s = options.offset or 0.0
+    search_s = options.search or SEARCH_S
+    require_overlap(
+        images,
+        navigation,
+        sequence,
+        seen,
+        around_s,
+        0.0 if is_stated else search_s,
+    )
+    seconds, said = offset_of(seen, sequence, around_s, search_s, is_stated=is_stated)
+    shift_ns = round(seconds * NS_PER_S)
+    # the notes of both files are kept apart by their prefix
+    notes = {
+        f"images.{key}": note
+        for key, note in alone.notes.items()
+        if key != "log.skipped"
+    }
+    record = with_notes(
+        navigation,
+        notes | {"images.file": images.name, "images.clock_offset": said},
+    )
+    record |= {
+        "calibration": joined_calibration(images, navigation, topic, reading.given)
+    }
+    with progress_bars() as progress:
+        blocks = read_sonar_frames(
+            images, topic, salvage=reading.salvage, refused=lambda *_: None
+        )
+        amended = write_amended(
             navigation,
-            sequence,
-            seen,
-            around_s,
-            0.0 if is_stated else search_s,
+            path,
+            [],
+            more=on_the_clock(
+                blocks, shift_ns, lambda done: progress("writing (frames)", done, 0)
+            ),
+            metadata={METADATA: record},
+            salvage=reading.salvage,
         )
-        seconds, said = offset_of(
-            seen, sequence, around_s, search_s, is_stated=is_stated
-        )
-        shift_ns = round(seconds * NS_PER_S)
-        # the notes of both files are kept apart by their prefix
-        notes = {
-            f"images.{key}": note
-            for key, note in alone.notes.items()
-            if key != "log.skipped"
-        }
-        record = with_notes(
-            navigation,
-            notes | {"images.file": images.name, "images.clock_offset": said},
-        )
-        record |= {
-            "calibration": joined_calibration(log, navigation, topic, reading.given)
-        }
-        with progress_bars() as progress:
-            blocks = read_sonar_frames(
-                log, topic, salvage=reading.salvage, refused=lambda *_: None
-            )
-            amended = write_amended(
-                navigation,
-                path,
-                [],
-                more=on_the_clock(
-                    blocks, shift_ns, lambda done: progress("writing (frames)", done, 0)
-                ),
-                metadata={METADATA: record},
-                salvage=reading.salvage,
-            )
     echo(f"Clock offset, to be added to the stamps of {images.name}: {said}")
+    # frames outside have no motion, and cannot be tracked
     within = seen.count_within(sequence, shift_ns)
     echo(
         f"{len(seen.stamps_ns)} frames, {within} of them while IMU and Doppler log measure"
@@ -178,37 +175,6 @@ def refuse_images(navigation: Path) -> None:
         raise LogError(
             f"{navigation}: has {TOPIC} already; recognise it as it is, or give a log without images"
         )
-
-
-@contextmanager
-def as_log(images: Path) -> Iterator[Path]:
-    """The file with sonar images as an MCAP log, converted if its suffix is that of a sonar."""
-    from sonar_graph.logs.convert import convert_aris, convert_didson
-
-    # recordings of sonars are logs of their own formats
-    converters: dict[str, Callable[..., Any]] = {
-        ".aris": convert_aris,
-        ".ddf": convert_didson,
-    }
-    convert = converters.get(images.suffix.lower())
-    if convert is None and images.suffix.lower() != ".mcap":
-        raise LogError(
-            f"{images}: expected an .mcap, .aris or .ddf file; `sonar-graph convert oculus` makes a log of a recording "
-            "of an Oculus"
-        )
-    if convert is None:
-        yield images
-        return
-    with TemporaryDirectory() as folder, progress_bars() as progress:
-        log = Path(folder) / f"{images.stem}.mcap"
-        done = convert(
-            images,
-            log,
-            progress=lambda at, total: progress(f"converting {images.name}", at, total),
-        )
-        for line in done.shortcomings(3):
-            echo(line)
-        yield log
 
 
 def look(
@@ -255,34 +221,23 @@ def require_overlap(
         return
     apart_s = (sequence.start_ns - first_ns) * 1e-9
     raise LogError(
-        f"{images}: {stretch(first_ns, last_ns)}; {navigation}: {stretch(sequence.start_ns, sequence.end_ns)}: "
+        f"{images}: {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s; "
+        f"{navigation}: {sequence.start_ns * 1e-9:.3f} to {sequence.end_ns * 1e-9:.3f} s: "
         f"no common time{f' with an offset of {around_s:+.3f} s' if around_s else ''}; if clocks differ, give --offset "
         f"and --search SECONDS ({apart_s:+.3f} makes both begin together)"
     )
 
 
-def stretch(start_ns: int, end_ns: int) -> str:
-    """Begin and length of a recording; the begin as a date where the clock counts since 1970."""
-    seconds = start_ns * 1e-9
-    # a clock that counts from its own start has no date
-    is_dated = 1e8 < seconds < 1e11
-    begin = (
-        f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
-        if is_dated
-        else f"{seconds:.3f} s"
-    )
-    return f"{(end_ns - start_ns) * 1e-9:.0f} s from {begin} on"
-
-
 def offset_of(
     seen: Seen, sequence: Sequence, around_s: float, search_s: float, *, is_stated: bool
 ) -> tuple[float, str]:
-    """Offset in seconds, and what is to be said of it."""
+    """Offset in seconds, and its description."""
     from sonar_graph.recognition import estimate_offset
 
     estimate: ClockOffset | None = None
     try:
         with working("estimating the clock offset"):
+            # also where the offset is stated, so that a wrong one is noticed
             estimate = estimate_offset(
                 seen.steps, sequence, seen.range_m, around_s, search_s
             )
@@ -316,7 +271,8 @@ def on_the_clock(
         # a log in order of time can be written in one pass
         late = block.stamps_ns <= latest_ns
         if not late.all():
-            latest_ns, done = int(block.stamps_ns[-1]), done + len(block)
+            latest_ns = int(block.stamps_ns[-1])
+            done += len(block)
             kept = replace(
                 block,
                 stamps_ns=block.stamps_ns[~late] + shift_ns,

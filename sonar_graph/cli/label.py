@@ -85,6 +85,7 @@ def label(
     path = writable_file(
         output, ".json", are_labels, [log], overwrite=options.overwrite
     )
+    # the page offers the identities of these designs
     designs = options.designs
     known = DEFAULT_DESIGNS if designs is None else load_designs(designs)
     # labels are hours of work: an existing file is added to
@@ -101,6 +102,7 @@ def label(
         )
     if not frames:
         raise LogError(no_images(log, reading.window))
+    # the desk writes the file after every click
     desk = LabelDesk(frames, labels, path)
     with LabelServer(
         desk,
@@ -109,6 +111,7 @@ def label(
         options.port,
     ) as server:
         serve(server, path, labels, is_shown=not options.no_browser)
+    # calibrate must read the log as it was labelled
     repeated = {
         "--designs": designs,
         "--calibration": reading.calibration,
@@ -125,7 +128,7 @@ def label(
 
 
 def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) -> None:
-    """Serve until Ctrl-C, then say what there is."""
+    """Serve until Ctrl-C, then print the number of labels."""
     echo(
         f"{len(server.desk.frames)} frames, {len(labels.labels)} labels so far. The page: {server.address}"
     )

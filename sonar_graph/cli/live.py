@@ -81,21 +81,6 @@ class LiveEstimation:
         ),
     ] = 0.25
     settings: EstimatorSettings = None
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--topic", metavar="ROLE=TOPIC", help="Topic for a role; may be repeated."
-        ),
-    ] = None
-    log_config: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
-    ] = None
-    calibration: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
-    ] = None
-    map: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="As for `run`.")
-    ] = None
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -103,38 +88,13 @@ class LiveEstimation:
         given = estimator_settings(self.settings, [self.estimator])
         return given.get(self.estimator, {})
 
-    @property
-    def reading(self) -> ReadingOptions:
-        """Options for the topics and the calibration, as for a log."""
-        return ReadingOptions(
-            calibration=self.calibration,
-            topics=self.topics,
-            log_config=self.log_config,
-        )
 
-    @property
-    def given(self) -> PartialCalibration | None:
-        """Fields of the calibration, the map of landmarks among them."""
-        from sonar_graph.logs import PartialCalibration
-        from sonar_graph.map_file import read_map
-
-        given = self.reading.given
-        if self.map is None:
-            return given
-        known, warnings = read_map(self.map)
-        for line in warnings:
-            echo(line, err=True)
-        of_map = PartialCalibration(
-            {"map": known.model_dump(mode="json")}, str(self.map)
-        )
-        return of_map if given is None else of_map.over(given)
-
-
-@with_options()
+@with_options("start", "end", "salvage")
 def live(
     output: OutputFolder,
     link_options: LinkOptions,
     estimation: LiveEstimation,
+    reading: ReadingOptions,
     *,
     foxglove: Annotated[
         int | None,
@@ -143,15 +103,6 @@ def live(
             min=1,
             max=65535,
             help="Also serve Foxglove and Lichtblick on 127.0.0.1 (8765).",
-        ),
-    ] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RECORD",
-            exists=True,
-            dir_okay=False,
-            help="Go on after a crash, from its record and calibration.",
         ),
     ] = None,
     duration: Annotated[
@@ -168,33 +119,19 @@ def live(
 
     from sonar_graph.diagnosis import compared
     from sonar_graph.evaluation import RunResult, check_request, judge
-    from sonar_graph.live import (
-        LiveOptions,
-        LiveRun,
-        dropped_messages,
-        open_link,
-        open_outlets,
-        recorded_messages,
-    )
+    from sonar_graph.live import LiveOptions, LiveRun, open_link, open_outlets
     from sonar_graph.logs import LiveRecord, read_log
     from sonar_graph.report import doubt_lines, write_report
 
-    reading = estimation.reading
     estimator = estimation.estimator
     record = output / RECORD
+    # a record cannot be made again: it is never replaced
     if record.exists():
-        advice = (
-            f"continue it with --resume {record} and another folder"
-            if resume is None
-            else "name another folder"
-        )
-        raise LogError(f"{record}: a record is there already: {advice}")
+        raise LogError(f"{record}: a record is there already: name another folder")
     # before anything is written: a wrong setting leaves no folder
     overrides = estimation.overrides
     params = check_request(estimator, overrides)
-    given = estimation.given
-    if resume is not None:
-        given = LiveRecord.resumed_calibration(resume, given)
+    given = with_map(reading)
     options = LiveOptions(
         estimator,
         overrides,
@@ -219,15 +156,7 @@ def live(
                 written, link.definition_of, options, outlets, screen.say, screen.show
             ) as run,
         ):
-            if resume is not None:
-                last_ns = run.catch_up(
-                    recorded_messages(resume), dropped_messages(resume)
-                )
-                echo(
-                    f"resumed from {resume}: blind for {(time.time_ns() - last_ns) * 1e-9:.1f} s"
-                )
-            else:  # after a crash nobody waits for it
-                run.wait_for_recogniser()
+            run.wait_for_recogniser()
             gc.freeze()  # what was loaded is never looked at again, which would delay a pose
             link.listen(run.accept, run.wants)
             echo(
@@ -240,6 +169,7 @@ def live(
             screen.end()
             link.stop()
             outcome = run.finish()
+    # an empty record would stand in the way of the next run
     if not run.engine.topics:
         record.unlink()
         raise LogError(f"nothing was estimated: {run.lacking()}")
@@ -247,6 +177,7 @@ def live(
         raise LogError(
             f"nothing was estimated: {run.lacking()}; what came is in {record}"
         )
+    # losses are written down: they decide whether the run can be trusted
     counts = run.counts()
     write_json(output / COUNTS, {"estimator": estimator, "messages": counts})
     result = RunResult(
@@ -279,6 +210,22 @@ def live(
     echo(
         f"Results: {page}; the same estimates from the record: sonar-graph run {record} -o DIR"
     )
+
+
+def with_map(reading: ReadingOptions) -> PartialCalibration | None:
+    """Fields of the calibration that are given, the map of landmarks among them."""
+    from sonar_graph.logs import PartialCalibration
+    from sonar_graph.map_file import read_map
+
+    given = reading.given
+    if reading.map is None:
+        return given
+    known, warnings = read_map(reading.map)
+    for line in warnings:
+        echo(line, err=True)
+    fields = {"map": known.model_dump(mode="json")}
+    of_map = PartialCalibration(fields, str(reading.map))
+    return of_map if given is None else of_map.over(given)
 
 
 @dataclass(frozen=True)
@@ -390,6 +337,7 @@ class StatusLine:
         if not self._is_terminal:
             echo(status)
             return
+        # a longer status would wrap, and the next could not replace it
         width = shutil.get_terminal_size().columns
         echo_status(status[: width - 1])
         self._is_shown = True
@@ -424,6 +372,7 @@ def wait_for_listener(
     echo(f"waiting{limit} for a listener, such as: {command}")
     begin_s = time.monotonic()
     next_s = REMIND_S
+    # messages without a receiver would be missing from the rehearsal
     while not any(one.is_heard for one in publishers.values()):
         waited_s = time.monotonic() - begin_s
         if wait_s is not None and waited_s > wait_s:
@@ -439,7 +388,7 @@ def wait_for_listener(
 
 
 def unheard_lines(publishers: dict[str, Publisher]) -> list[str]:
-    """Line with the topics that nobody subscribes to; of topics of static frames zenoh does not know."""
+    """Line with the topics without a subscriber, but for static frames, whose subscribers zenoh does not report."""
     # static frames are latched, so their listeners come and go
     unheard = [
         topic
@@ -453,6 +402,7 @@ def topics_of(log: Path) -> dict[str, str]:
     """Types of the topics of a log that ROS 2 messages are on, by name."""
     from sonar_graph.logs.mcap import Keep, scan
 
+    # names and types alone: the messages are read while they are sent
     recording = scan(log, lambda _: Keep.NONE)
     return {
         name: topic.type_name

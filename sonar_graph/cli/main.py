@@ -17,14 +17,13 @@ import typer
 
 from sonar_graph.cli.arguments import examples, printable
 from sonar_graph.cli.bench import bench
-from sonar_graph.cli.compare import compare, demo, estimators, report, run
+from sonar_graph.cli.compare import compare, demo, estimators, figures, report, run
 from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import calibration, inspect
 from sonar_graph.cli.join import join
 from sonar_graph.cli.label import label
 from sonar_graph.cli.live import live, play
 from sonar_graph.cli.recognise import calibrate, recognise
-from sonar_graph.cli.show import figures, view
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
 from sonar_graph.files import (
@@ -78,13 +77,11 @@ EXAMPLES: dict[Callable[..., None], list[str]] = {
     play: ["dive.mcap", "dive.mcap --rate 3"],
     bench: [
         "suite.toml -o results",
-        "suite.toml -o results --workers 2 --timeout 600",
+        "suite.toml -o results --workers 2",
         "suite.toml -o results --scheduler tcp://10.0.0.5:8786",
-        "suite.toml -o again --only 0123456789abcdef0123",
     ],
     report: ["comparison"],
     figures: ["comparison", "comparison -o paper"],
-    view: ["comparison", "comparison --viewer browser"],
     estimators: [""],
     demo: ["-o demo"],
 }
@@ -131,12 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 check()
     except KeyboardInterrupt:
         code = INTERRUPTED
+    # a second Ctrl-C at the end must not print a traceback
     if arguments is None:
         signal.signal(signal.SIGINT, end_at_once)
     if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a word
         _complain("interrupted", INTERRUPTED)
     if arguments is None and sys.getprofile() is sys.gettrace() is None:
-        with contextlib.suppress(OSError):  # nobody reads it any more
+        with contextlib.suppress(OSError):  # its reader may be gone
             sys.stdout.flush()
         # the ordinary end takes a while, in which a Ctrl-C would have the last word
         os._exit(int(code or 0))
@@ -149,8 +147,9 @@ def _run(given: list[str]) -> int | None:
     except (SonarGraphError, OSError) as error:
         return _complain(str(error), MISTAKE)
     except Exception as error:
-        if not hasattr(error, "format_message"):  # not typer's own: nobody foresaw it
+        if not hasattr(error, "format_message"):  # not typer's own: an unforeseen error
             raise
+        # the help of a subcommand is more use than that of all
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "sonar-graph"
         return _complain(

@@ -21,7 +21,7 @@ OWN_PAGE = '<p class="kicker">sonar_graph recognition</p>'
 
 
 def writable_log(path: Path, *sources: Path | None, overwrite: bool = False) -> Path:
-    """Check that a log can be written as `writable_file`, say whether it replaces another, and return ``path``."""
+    """Check that a log can be written as `writable_file`, print whether it replaces another, and return ``path``."""
     from sonar_graph.logs.mcap import is_own_log
 
     writable_file(path, ".mcap", is_own_log, sources, overwrite=overwrite)
@@ -40,11 +40,12 @@ def writable_file(
 ) -> Path:
     """Check that a file can be written, and return ``path``.
 
-    A source, a file or folder, is never overwritten; a file that is not ``is_own``, only if asked for.
+    A source, a file or folder, is never overwritten; a file that is not ``is_own``, only with ``overwrite``.
 
     Raises `LogError` when it is a folder, has another suffix, is a source or a part of it, is a file that this package
     did not write, or its folder cannot be written to.
     """
+    # a wrong suffix would make a file that no other program opens
     if path.is_dir() or path.suffix != suffix:
         raise LogError(f"{path}: expected the name of a file that ends in {suffix}")
     if any(source is not None and _is_part_of(path, source) for source in sources):
@@ -100,6 +101,7 @@ def writable_folder(
                 f"{written}: is what is read, and would be overwritten; choose another folder with -o"
             )
     _require_writing_in(path, path, EvaluationError)
+    # locked until the block ends: two commands would mix their files
     with result_folder(path, kind, overwrite=overwrite) as folder:
         folder.require(names)
         yield path
@@ -117,7 +119,7 @@ def _is_part_of(path: Path, source: Path) -> bool:
 def _require_writing_in(
     folder: Path, path: Path, refusal: type[SonarGraphError]
 ) -> None:
-    """Try to write to a folder, or where it would be made; an error names the path that was asked for.
+    """Try to write to a folder, or where it would be made; an error names the path that was given.
 
     Nothing is made for that: another command may be about to write there.
     """
@@ -163,6 +165,7 @@ def progress_bars() -> Iterator[Report]:
             tasks[what] = bars.add_task(what, remark="")
         bars.update(tasks[what], completed=done, total=total or None, remark=remark)
 
+    # transient: a finished bar leaves no line among the answers
     with bars:
         yield show
 

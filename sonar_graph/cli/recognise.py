@@ -178,7 +178,7 @@ def recognise(
     reading: ReadingOptions,
     options: RecognitionChoices,
 ) -> None:
-    """Recognise landmarks in a log's sonar images; write the log anew with the detections in it.
+    """Recognise landmarks in a log's sonar images; write a copy of the log with the detections in it.
 
     Detections that an earlier recognise put into the log are replaced. Without IMU or Doppler log the motion is from
     the images.
@@ -204,6 +204,7 @@ def recognise(
         )
     # images alone are enough: their own motion stands in for navigation
     sequence, motion = with_motion(log, reading, options.motion)
+    # a mistake in a setting is reported before the images are read
     made = recognition.recogniser(
         sequence.calibration, options.settings, options.recogniser
     )
@@ -213,6 +214,7 @@ def recognise(
             f"--report shows the tracks of the recogniser of designs; {options.recogniser} has none"
         )
     found = recognise_log(log, sequence, reading, made, motion, stories)
+    # a log without images is a mistake here, but not for compare
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
@@ -240,6 +242,7 @@ def recognise(
     )
     for outcome, count in found.outcomes.most_common():
         out.print(f"  {count:6d}  {outcome}")
+    # images alone have no truth to compare with
     for line in found.naming(getattr(sequence, "true_landmarks", None)):
         if page is None or line != SEE_TRACKS:
             out.print(line, markup=False)
@@ -314,6 +317,7 @@ def calibrate(
     path = writable_file(
         output, ".json", is_model, sources, overwrite=options.overwrite
     )
+    # links and relative paths may name one file twice
     for row, log in enumerate(logs):
         if any(log.samefile(other) for other in logs[:row]):
             raise LogError(
@@ -381,7 +385,7 @@ def calibrate(
 def with_motion(
     log: Path, reading: ReadingOptions, motion: MotionFrom | None
 ) -> tuple[Run, MotionFrom]:
-    """Read what goes with a log's images, and say how the sonar's motion will be known."""
+    """Read what goes with a log's images, and choose the source of the sonar's motion."""
     from sonar_graph.logs import lacking_navigation, read_images_alone
 
     # without IMU or Doppler log only the images can give the motion
@@ -398,7 +402,7 @@ def with_motion(
 
 
 def without_navigation(found: Recognition, asked: str = "") -> list[str]:
-    """Lines on where the motion is from, and what is lost; ``asked`` says who left the log's navigation out."""
+    """Lines on the source of the motion, and what is lost; ``asked``: why the log's navigation is left out."""
     from sonar_graph.recognition import NO_FLOOR
 
     motion = found.notes["detections.motion"]

@@ -60,6 +60,7 @@ def landmarks(
     options = validated(LandmarkOptions, given, "landmarks")
     path = writable_log(output, log, overwrite=overwrite)
     with working("simulating"):
+        # on the true path, so that the recorded sensors keep their own errors
         sequence = add_landmarks(reading.read(log), options)
         write_log(path, sequence)
     detections = sequence.detections
@@ -71,14 +72,15 @@ def landmarks(
 
 # written out, so that help need not import the simulator
 _OTHERS = (
-    "gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
+    "imu, dvl, gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
     "range_sigma_m, azimuth_sigma_rad, detection_probability, wrong_id_rate, tracks, id_delay_s, wrong_id_share, "
     "anonymous_share, false_detections_per_frame, confident_false_fraction, start_position_sigma_m, "
     "start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with --images image.NAME: scene, contrast_db, plate_db, "
     "foam_height_m, sediment, fouling, texture_shape, texture_length_m, ripple_height_m, ripple_length_m, noise_db, "
     "strangers, attitude_error_deg, altitude_error_m, sonar, window_m, designs, speckle, side_lobes, cross_talk_db, "
     "measured_lens, floor_db, absorption_db_m, tvg_error_db, joints, shadows, multipath, surface_path_db, "
-    "floor_reflection, drop_probability, time_offset_s, sound_speed_error, stones, decoys. image.scene is a preset "
+    "floor_reflection, drop_probability, time_offset_s, sound_speed_error, stones, decoys. "
+    "imu: hg1700 (default) or mti1; dvl: workhorse (default) or explorer. image.scene is a preset "
     "of those from contrast_db to altitude_error_m: easy (default), murky, worn or hard. image.designs is a TOML "
     "file of at least four landmarks; the four lowest ids are laid, in their order"
 )
@@ -112,19 +114,6 @@ class BasinChoices:
     laps: Annotated[
         int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")
     ] = None
-    imu: Annotated[
-        str | None,
-        typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1."),
-    ] = None
-    dvl: Annotated[
-        str | None,
-        typer.Option(
-            help="Preset of the Doppler log: workhorse (default) or explorer."
-        ),
-    ] = None
-    no_bias: Annotated[bool, typer.Option("--no-bias", help="Gyros without bias.")] = (
-        False
-    )
     images: Annotated[
         bool,
         typer.Option(
@@ -150,14 +139,10 @@ class BasinChoices:
             "seed": self.seed,
             "duration_s": self.duration_s,
             "laps": self.laps,
-            "imu": self.imu,
-            "dvl": self.dvl,
         }
         values: dict[str, Any] = {
             name: value for name, value in flags.items() if value is not None
         }
-        if self.no_bias:
-            values["gyro_bias_scale"] = 0.0
         # a setting may name anything, and goes before the option of its name
         given = nested_settings(self.settings)
         if "image" in given and not self.images:
@@ -173,7 +158,7 @@ class BasinChoices:
     epilog=examples(
         "sonar-graph simulate basin -o basin.mcap",
         "sonar-graph simulate basin -o short.mcap --duration-s 300 --laps 1 --seed 7",
-        "sonar-graph simulate basin -o hard.mcap --imu mti1 --dvl explorer --set wrong_id_rate=0.05",
+        "sonar-graph simulate basin -o hard.mcap --set imu=mti1 --set dvl=explorer --set wrong_id_rate=0.05",
         "sonar-graph simulate basin -o images.mcap --images --duration-s 130 --laps 1",
         "sonar-graph simulate basin -o bare.mcap --images --set image.multipath=false --set image.stones=0",
         "sonar-graph simulate basin -o hard.mcap --images --set image.scene=hard --set image.contrast_db=-6",
@@ -187,6 +172,7 @@ def basin(
     """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections or images."""
     from sonar_graph.simulation import LANDMARKS_XY_M, designs_laid
 
+    # options are checked before the file
     world = options.of_basin()
     path = writable_log(output, overwrite=options.overwrite)
     write_basin(path, world)
@@ -200,7 +186,7 @@ def basin(
 
 
 def write_basin(path: Path, options: BasinOptions) -> None:
-    """Write the log of a simulated basin, with images if its options ask for them."""
+    """Write the log of a simulated basin, with images if its options have them."""
     from sonar_graph.logs import sonar_image_messages, write_log
     from sonar_graph.simulation import simulate_basin, simulate_basin_frames
     from sonar_graph.simulation.sonar_image import SONARS, SOUND_SPEED_M_S
@@ -214,6 +200,7 @@ def write_basin(path: Path, options: BasinOptions) -> None:
 
     def images() -> Iterator[Outgoing]:
         done = 0
+        # block by block: a run of images does not fit into memory
         for block in simulate_basin_frames(options):
             yield sonar_image_messages(
                 "/sonar/image",

@@ -47,9 +47,6 @@ from sonar_graph.version import __version__
 
 LOG = logging.getLogger("sonar_graph.evaluation")
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
-# time for a row of the IMU, time for a detection in the batch solutions that a smoother gives as maps (4.5 s
-# for 3,460 on one core), speed of memory, and what is worth a word before a comparison begins
-IMU_ROW_S, SOLVED_DETECTION_S, MEMORY_BYTES_S, LONG_S = 3e-5, 1.3e-3, 1e10, 30.0
 # fewer scored instants than this make no trajectory
 LEAST_INSTANTS = 2
 
@@ -93,7 +90,7 @@ def compare(
     overrides
         Settings that differ from the defaults, by name: ``{"isam2": {"identity.policy": "gate"}}``.
     rate_hz
-        Rate at which estimates are asked for, from the start on, Hz.
+        Rate of the estimates, from the start on, Hz.
     progress
         Called after each step with the estimator's name, the number of its steps done and their total.
 
@@ -172,7 +169,7 @@ def compare(
 
 
 def with_doubts(sequence: Sequence) -> Sequence:
-    """The sequence with notes of what its sensors contradict, which are logged too unless it had them before."""
+    """The sequence with notes on contradictions between its sensors; notes that it did not have before are logged."""
     found = compared(sequence)
     for subject in ("log.doubtful", "log.sensors"):
         # a sequence that had its notes was logged when they were made
@@ -194,45 +191,12 @@ def as_list(given: object) -> str:
     return f"[{name}]" if name else f'["isam2"], not {given!r:.60}'
 
 
-def expense(sequence: Sequence) -> str:
-    """Sentence with what a large sequence takes at least; empty for one that takes little.
-
-    Each estimator needs some `IMU_ROW_S` for a row. One that keeps the joint covariance of n landmarks has d² numbers,
-    ``d = 3 n + 15``, and goes over them twice for each detection. One that keeps all detections solves for them at each
-    map, some `SOLVED_DETECTION_S` for each.
-    """
-    rows = len(sequence.imu)
-    detections = sequence.detections
-    said = (
-        [f"{rows} IMU rows, about {rows * IMU_ROW_S / 60:.0f} min"]
-        if rows * IMU_ROW_S > LONG_S
-        else []
-    )
-    if detections is not None and len(detections):
-        ids = detections.candidate_ids
-        count = len(np.unique(ids[ids >= 0]))
-        # pose, velocity and biases beside three numbers a landmark
-        covariance_bytes = 8.0 * (3 * count + 15) ** 2
-        if len(detections) * SOLVED_DETECTION_S > LONG_S:
-            said.append(
-                f"{len(detections)} detections, at least {len(detections) * SOLVED_DETECTION_S / 60:.0f} min where an "
-                "estimator keeps and solves for all of them"
-            )
-        seconds = 2 * covariance_bytes * len(detections) / MEMORY_BYTES_S
-        if seconds > LONG_S:
-            said.append(
-                f"{count} landmark identities in {len(detections)} detections, at least {covariance_bytes / 1e9:.1f} "
-                f"GB and {seconds / 60:.0f} min where an estimator keeps their joint covariance"
-            )
-    return f"for each estimator: {'; '.join(said)}" if said else ""
-
-
 def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Comparison:
-    """Score runs that were all asked for estimates at these instants, shape (n,)."""
+    """Score runs with estimates at these instants, shape (n,)."""
     environment = describe_environment()
     # before any score: all are against the truth in the world of the estimates
     sequence = with_fitted_truth(sequence, instants_ns, runs)
-    # heights that nobody measured are all alike; true poses of a dive may be as well
+    # heights that were not measured are all alike; true poses of a dive may be as well
     true = sequence.truth
     is_flat = (
         true is not None

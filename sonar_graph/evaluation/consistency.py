@@ -1,23 +1,14 @@
-"""Consistency: NEES and NIS with their chi-square bounds, and the reliability of identity posteriors.
+"""Consistency: NEES and NIS with their chi-square bounds.
 
 NEES and NIS: docs/theory/metrics.md (Bar-Shalom, Li, Kirubarajan 2001, section 5.4).
-
-Reliability: a detection belongs to the nearest true landmark within `SAME_M`, and to none if all are farther than
-`APART_M`; those in between are left out. Its confidence is the posterior of its most probable class, "none of them"
-included. With n_b of n detections in bin b of confidence, the expected calibration error is (Naeini et al., AAAI 2015)
-
-    ECE = sum_b n_b / n | mean confidence of b - share of right ones in b |
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from sonar_graph.evaluation.metrics import yaw_errors_rad
 from sonar_graph.evaluation.results import ErrorSeries
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.measurements import Floats
 from sonar_graph.numerics import chi_square_quantile
-from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
 # with fewer independent samples a small normalised error is no sign of caution: slow errors pass through zero
@@ -25,11 +16,6 @@ LEAST_SAMPLES = 10
 GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""
-BINS = 10
-SAME_M = 0.15
-APART_M = 0.40
-NONE, UNJUDGED = -1, -2
-"""True class of a detection that is of no landmark, and of one that is left out."""
 
 
 def error_series(
@@ -192,7 +178,7 @@ def nis(log: DetectionLog) -> Floats:
 def mean_normalised(squares: Floats, dof: int) -> float:
     """Mean of the known values divided by the degrees of freedom: 1 is consistent, above is over-confident.
 
-    NaN when none is known.
+    NaN without a known value.
     """
     known = squares[np.isfinite(squares)]
     return float(known.mean() / dof) if known.size else float("nan")
@@ -220,95 +206,3 @@ def anees_interval(
     return chi_square_quantile(tail, total) / total, chi_square_quantile(
         1 - tail, total
     ) / total
-
-
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Confidence and truth by bins of equal width from 0 to 1."""
-
-    count: Ints
-    """Detections in each bin, shape (10,)."""
-    confidence: Floats
-    """Their mean confidence; NaN in an empty bin."""
-    right: Floats
-    """Share of them whose class is right; NaN in an empty bin."""
-
-    @property
-    def expected_error(self) -> float:
-        """The expected calibration error."""
-        return float(
-            np.nansum(self.count * np.abs(self.confidence - self.right))
-            / max(self.count.sum(), 1)
-        )
-
-
-def reliability(confidence: Floats, right: Floats) -> Reliability:
-    """Bins of detections, shape (n,) each."""
-    row = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
-    count = np.bincount(row, minlength=BINS)
-    some = np.maximum(count, 1)
-    means = [
-        np.where(count > 0, np.bincount(row, v, BINS) / some, np.nan)
-        for v in (confidence, right)
-    ]
-    return Reliability(count, *means)
-
-
-def reliability_of(sequence: Sequence) -> Reliability | None:
-    """Reliability of a sequence's detections; None without them, without true poses, or if none can be judged."""
-    if (
-        sequence.detections is None
-        or sequence.true_poses is None
-        or sequence.true_landmarks is None
-    ):
-        return None
-    labels = true_identities(sequence, sequence.detections)
-    judged = labels != UNJUDGED
-    if not judged.any():
-        return None
-    confidence, named = confidences(sequence.detections)
-    return reliability(confidence[judged], (named == labels)[judged].astype(float))
-
-
-def confidences(detections: LandmarkDetections) -> tuple[Floats, Ints]:
-    """Posterior of the most probable class, and that class (`NONE` for none of them), shapes (n,)."""
-    ids, probability = detections.most_probable()
-    none = 1.0 - detections.id_probability.sum(axis=1)
-    return np.maximum(probability, none), np.where(none > probability, NONE, ids)
-
-
-def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
-    """The true class of each detection, shape (n,): an identity, `NONE` or `UNJUDGED`."""
-    truth = sequence.true_poses
-    landmarks = sequence.true_landmarks
-    assert truth is not None
-    assert landmarks is not None
-    labels = np.full(len(detections), UNJUDGED)
-    within = (detections.stamps_ns >= truth.stamps_ns[0]) & (
-        detections.stamps_ns <= truth.stamps_ns[-1]
-    )
-    # detections of one frame share a stamp: the true pose is interpolated once for each frame
-    stamps_ns, frame = np.unique(detections.stamps_ns[within], return_inverse=True)
-    if not len(stamps_ns):
-        return labels
-    poses = truth.at(stamps_ns)
-    world_R_body = poses.matrices
-    mounting = sequence.calibration.sonar.mounting.pose()
-    origin = poses.positions + world_R_body @ mounting.translation()
-    from_sonar = landmarks.positions[None] - origin[:, None]
-    # landmarks in the sonar's frame, (detections, landmarks, 3)
-    q = np.einsum(
-        "nji,nmj->nmi", world_R_body @ mounting.rotation().matrix(), from_sonar
-    )[frame]
-    off_azimuth = (
-        np.arctan2(q[..., 1], q[..., 0]) - detections.azimuth_rad[within, None]
-    )
-    off_range = np.linalg.norm(q, axis=2) - detections.range_m[within, None]
-    # across the beam: the chord of the azimuth's error at the measured range
-    off = np.hypot(
-        off_range, detections.range_m[within, None] * 2 * np.sin(off_azimuth / 2)
-    )
-    nearest = off.min(axis=1)
-    found = np.where(nearest <= SAME_M, landmarks.ids[off.argmin(axis=1)], UNJUDGED)
-    labels[within] = np.where(nearest > APART_M, NONE, found)
-    return labels

@@ -1,7 +1,7 @@
-"""Truth in the world of the estimates, where nobody stated the start.
+"""Truth in the world of the estimates, where the start is not stated.
 
 Estimators begin at the start of the calibration. Where that is not stated, the world of the estimates is turned and
-moved against that of the truth by what nobody knows, and errors without alignment would be of that, not of the
+moved against that of the truth by an unknown amount, and errors without alignment would be of that, not of the
 estimator. So the truth is brought into the estimates' world, once for all runs::
 
     p_true -> R p_true + t,    R about the vertical,    sum_i | R p_true(t_i) + t - p(t_i) |^2 least in x and y,
@@ -9,8 +9,8 @@ estimator. So the truth is brought into the estimates' world, once for all runs:
 where t brings the beginning of the truth to that of the path, as covariances count from there. The path is that of the
 run that it fits best. A heading that the log measured at the start is kept: then R = 1.
 
-All scores and pictures are after that, and say so (`sonar_graph.evaluation.tables.unaligned`). Where a start is stated
-the truth stays: the start is part of what is judged.
+All scores and pictures are after that, and are labelled so (`sonar_graph.evaluation.tables.unaligned`). Where a start
+is stated the truth stays: the start is part of what is judged.
 """
 
 from dataclasses import replace
@@ -32,7 +32,7 @@ FEWEST = 3
 
 
 def free_start(calibration: Calibration) -> tuple[bool, bool]:
-    """Tell whether heading and position at the start are stated by nobody."""
+    """True for the heading and for the position at the start where they are not stated."""
     if "start" not in calibration.model_fields_set:
         return True, True
     start = calibration.start
@@ -48,7 +48,7 @@ def with_fitted_truth(
 ) -> Sequence:
     """Bring the truth into the world of the estimates, where the start is free; else the same sequence.
 
-    The note `FITTED` says by how much, and by whose path.
+    The note `FITTED` has the motion, and the run whose path it was fitted to.
     """
     is_turned, is_moved = free_start(sequence.calibration)
     truth = sequence.truth
@@ -99,7 +99,8 @@ def fit_from_beginning(true: Floats, path: Floats, *, is_turned: bool) -> Alignm
     begin_path = path[:FEWEST].mean(axis=0)
     turn = 0.0
     if is_turned:
-        (x, y), (u, v) = (true - begin).T[:2], (path - begin_path).T[:2]
+        x, y = (true - begin).T[:2]
+        u, v = (path - begin_path).T[:2]
         # the turn with the largest sum of scalar products, which is the least-squares fit in the plane
         turn = float(np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v)))
     R = Rotation.from_euler("z", turn).as_matrix()

@@ -27,7 +27,7 @@ FARTHEST_M = 1.0
 OUTLYING = 3 * 1.4826
 # fits to the better half
 CONCENTRATIONS = 10
-# with fewer landmarks none can be told to be the outlier
+# with fewer landmarks an outlier cannot be identified
 LEAST_OUTVOTING = 5
 
 
@@ -88,7 +88,8 @@ def umeyama(points: Floats, targets: Floats) -> tuple[Floats, Floats]:
         raise EvaluationError(
             f"alignment needs paired points, at least one; got {points.shape} and {targets.shape}"
         )
-    mean_x, mean_y = points.mean(axis=0), targets.mean(axis=0)  # (34), (35)
+    mean_x = points.mean(axis=0)  # (34)
+    mean_y = targets.mean(axis=0)  # (35)
     covariance = (targets - mean_y).T @ (points - mean_x) / len(points)  # (38)
     # the covariance need not have full rank: points may lie in one place or on one line
     U, _, Vt = np.linalg.svd(covariance)
@@ -165,27 +166,10 @@ def ate_se2_m(estimate: Trajectory, truth: Trajectory) -> float:
     return horizontal_aligned_rmse(estimate.positions, truth.positions)
 
 
-def ate_se3_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """Position rmse in three dimensions after the best SE(3) alignment, without scale."""
-    check_paired(estimate, truth)
-    return rmse(
-        align_se3(estimate.positions, truth.positions).apply(estimate.positions)
-        - truth.positions
-    )
-
-
 def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
     """Estimated minus true heading, wrapped, shape (n,)."""
     check_paired(estimate, truth)
     return wrap_angle(yaw_rad(estimate.matrices) - yaw_rad(truth.matrices))
-
-
-def return_error_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """Error of the displacement between the first and the last instant, in the world frame."""
-    check_paired(estimate, truth)
-    # a constant offset of the worlds cancels in the difference of the ends
-    offset = estimate.positions - truth.positions
-    return float(np.linalg.norm(offset[-1] - offset[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +215,7 @@ def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:
     delta_ns = round(delta_s * NS_PER_S)
     first = np.arange(len(stamps_ns))
     wanted = stamps_ns + delta_ns
-    # the samples on both sides of the wanted stamp, of which the nearer one is the partner
+    # of the samples on both sides of the wanted stamp the nearer one is the partner
     right = np.minimum(np.searchsorted(stamps_ns, wanted), len(stamps_ns) - 1)
     left = np.maximum(right - 1, 0)
     second = np.where(wanted - stamps_ns[left] < stamps_ns[right] - wanted, left, right)

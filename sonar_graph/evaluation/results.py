@@ -162,7 +162,7 @@ class Score:
         """The verdict of a normalised squared error on the reported covariances; empty for other scores.
 
         Above the score's interval the estimator is over-confident, below it over-cautious. Inside it is consistent,
-        unless the interval is wider than `TOLERATED_FACTOR`: then, and without an interval, nothing is said.
+        unless the interval is wider than `TOLERATED_FACTOR`: then, and without an interval, the verdict is empty.
         """
         if self.better != "inside" or math.isnan(self.value) or self.interval is None:
             return ""
@@ -266,7 +266,7 @@ class Comparison:
         Raises
         ------
         EvaluationError
-            When no run has a path, or `aligned` is asked for and no run has errors against a truth.
+            When no run has a path, or with `aligned` no run has errors against a truth.
 
         Examples
         --------

@@ -90,7 +90,7 @@ class PeakMemory:
             return
 
     def rise_mb(self) -> float:
-        """Megabytes (10⁶ bytes) at the peak above the start; NaN where the system does not tell."""
+        """Megabytes (10⁶ bytes) at the peak above the start; NaN where the system does not measure it."""
         return (
             # caches that the system took back make the difference negative
             max(_status_mb("VmHWM") - self._start_mb, 0.0)
@@ -189,7 +189,6 @@ def run_estimator(
     instants_ns: Ints | None = None,
     rate_hz: float = 2.0,
     interim_maps: bool = True,
-    is_apart: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RunResult:
     """Replay a sequence into an estimator and keep its estimates, with the duration of each call.
@@ -209,9 +208,9 @@ def run_estimator(
     overrides
         Settings that differ from the estimator's defaults, by dotted name: ``{"identity.policy": "gate"}``.
     instants_ns
-        Stamps at which estimates are asked for, increasing; None: ``sequence.instants(rate_hz)``.
+        Stamps of the estimates, increasing; None: ``sequence.instants(rate_hz)``.
     interim_maps
-        True to ask for the map before the end too. For a smoother each costs a solution of the whole history.
+        True to keep the map before the end too. For a smoother each costs a solution of the whole history.
     progress
         Called after each step with the number of steps done and their total.
 
@@ -239,13 +238,33 @@ def run_estimator(
     """
     require_sequence(sequence, "run_estimator(sequence, estimator)")
     name = name_of(estimator)
-    # the caller gives instants where several estimators must be asked at the same ones
+    # the caller gives instants where several estimators must have the same ones
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
     # code of another package may change numpy, the folder or the environment of this process
-    if not is_apart and isinstance(estimator, str) and is_foreign(name):
-        return _run_apart(
-            _Request(name, overrides or {}, sequence, instants, interim_maps), progress
-        )
+    if isinstance(estimator, str) and is_foreign(name):
+        request = _Request(name, overrides or {}, sequence, instants, interim_maps)
+        return _run_apart(request, progress)
+    return run_here(
+        sequence,
+        estimator,
+        overrides,
+        instants,
+        interim_maps=interim_maps,
+        progress=progress,
+    )
+
+
+def run_here(
+    sequence: Sequence,
+    estimator: EstimatorChoice,
+    overrides: dict[str, Any] | None,
+    instants_ns: Ints,
+    *,
+    interim_maps: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> RunResult:
+    """Do a run in this process, also of an estimator of another package; otherwise as `run_estimator`."""
+    name = name_of(estimator)
     try:
         kind = _loaded(estimator)
     except UnknownEstimatorError:
@@ -256,7 +275,11 @@ def run_estimator(
     # an estimator may write into the arrays that it gets, which the next one needs unchanged
     own = copy.deepcopy(sequence)
     replay = _Replay(
-        sequence, list(own.replay(instants)), name, candidate, interim_maps=interim_maps
+        sequence,
+        list(own.replay(instants_ns)),
+        name,
+        candidate,
+        interim_maps=interim_maps,
     )
     return replay.run(progress)
 
@@ -294,7 +317,7 @@ def check_request(
 
 @dataclass(frozen=True)
 class _Request:
-    """What a process of its own is asked for: a run, or without a sequence only the settings."""
+    """Request to a process of its own: a run, or without a sequence only the settings."""
 
     name: str
     overrides: dict[str, Any]
@@ -355,40 +378,19 @@ def serve_runs() -> None:
 
 def _answer(request: _Request, tell: Tell) -> object:
     """In a process of its own: do a run, or give the settings of one."""
-    # the estimator may be importable only through the path of who asked
+    # the estimator may be importable only through the path of the calling process
     sys.path[:] = request.path
     if request.sequence is None:
         return check_request(request.name, request.overrides, is_apart=True) or NOTHING
-    return run_estimator(
+    assert request.instants_ns is not None, "a run has instants"
+    return run_here(
         request.sequence,
         request.name,
         request.overrides,
-        instants_ns=request.instants_ns,
+        request.instants_ns,
         interim_maps=request.interim_maps,
-        is_apart=True,
         progress=lambda done, total: tell(_StepsDone(done, total)),
     )
-
-
-# blocks that an estimator may know nothing of
-AIDING = ("heading", "positions")
-
-
-class _Watched(Measurements):
-    """Measurements that remember which of `AIDING` they were asked for, so that what nobody uses is named."""
-
-    @classmethod
-    def of(cls, step: Measurements, asked: set[str]) -> "_Watched":
-        """The same measurements; ``asked`` grows by what is asked for."""
-        # the constructor would check all rows again, once a step
-        watched = object.__new__(cls)
-        vars(watched).update(vars(step), asked=asked)
-        return watched
-
-    def __getattribute__(self, name: str) -> Any:
-        if name in AIDING:
-            vars(self)["asked"].add(name)
-        return super().__getattribute__(name)
 
 
 class _Replay:
@@ -413,7 +415,6 @@ class _Replay:
         # the last map is the one of `_finish`
         interim_ns = kept_map_instants(ends_ns, sequence.start_ns).tolist()[:-1]
         self._map_at_ns = set(interim_ns if interim_maps else [])
-        self._asked: set[str] = set()
         self._maps: list[MapSoFar] = []
         # the reason of a failure names where the run was
         self._stage = "at the start"
@@ -441,15 +442,15 @@ class _Replay:
         ) as error:  # an estimator may fail in any way, and the others still run
             # the table has one line; whoever mends the estimator needs the traceback
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
-            told: dict[str, Any] = {}  # rows refused before are often why it failed
+            known: dict[str, Any] = {}  # rows refused before are often why it failed
             if estimator is not None:
                 with contextlib.suppress(Exception):
-                    told["refused"] = self._refused(estimator)
+                    known["refused"] = self._refused(estimator)
                 with contextlib.suppress(Exception):
-                    told["withheld"] = withheld_of(estimator)
+                    known["withheld"] = withheld_of(estimator)
             reason = f"{self._stage}: {one_line(error)}"
             return self._result(
-                "failed", reason, **told, peak_memory_mb=memory.rise_mb()
+                "failed", reason, **known, peak_memory_mb=memory.rise_mb()
             )
 
     def _fresh(self) -> Estimator:
@@ -492,15 +493,12 @@ class _Replay:
             compiling_s,
         )
 
-        # watching costs a Python call for every attribute: only where there is something to watch
-        is_aided = any(name in self._sequence.blocks() for name in AIDING)
         for done, step in enumerate(self._steps, start=1):
             end_ns = step.end_ns
-            given = _Watched.of(step, self._asked) if is_aided else step
             self._stage = f"{(end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({end_ns} ns)"
             # the clock without the time that numba has compiled until now
             before = time.perf_counter() - compiling_s()
-            estimate = estimator.process(given)
+            estimate = estimator.process(step)
             # a loop that numba compiles on its first call is no time of the estimator
             self._update_s.append(time.perf_counter() - compiling_s() - before)
             self._check_interrupt()
@@ -549,7 +547,7 @@ class _Replay:
             known_map=self._known_map(estimator, landmarks),
             detections=detections,
             refused=self._refused(estimator),
-            withheld=[*withheld_of(estimator), *self._ignored()],
+            withheld=withheld_of(estimator),
             maps=self._maps,
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,
@@ -570,15 +568,6 @@ class _Replay:
                 source += f", in the map of {given.source or 'no stated source'}"
             return known.model_copy(update={"source": source})
         return None
-
-    def _ignored(self) -> list[str]:
-        """Messages about blocks that the estimator never asked for."""
-        blocks = self._sequence.blocks()
-        return [
-            f"{name}: none of its {len(blocks[name])} rows is used; this estimator takes no {name}"
-            for name in AIDING
-            if name in blocks and name not in self._asked
-        ]
 
     def _refused(self, estimator: Estimator) -> list[RefusedRow]:
         """Rows that the replay left out, and those that the estimator names."""

@@ -20,8 +20,6 @@ from sonar_graph.states import LandmarkMap, Trajectory
 IDS = np.array([1, 2, 3, 4])
 TRUE_XY_M = np.array([[5.00, 0.00], [7.00, -5.00], [2.00, -7.00], [0.00, -2.00]])
 ESTIMATED_XY_M = np.array([[4.81, -0.07], [6.74, -5.01], [1.85, -6.85], [-0.14, -1.82]])
-RETURN_M = (-0.3013, -0.1758)
-"""Last minus first estimated position, x and y: error of the estimate and of steering back by hand together."""
 DURATION_S = 2039.0
 MAP_TIMES_S = (833.1, 1369.4, 2039.0)
 """Times of path and map in Fig. 4."""
@@ -138,7 +136,7 @@ def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
 
 def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
     """The `map_instants`, and `MAPS_KEPT` others at equal distances."""
-    # evenly in time, because asked instants are
+    # evenly in time, because the instants are
     rows = np.linspace(0, len(asked_ns), MAPS_KEPT + 1)[1:].astype(np.int64) - 1
     return np.union1d(map_instants(asked_ns, start_ns), asked_ns[rows[rows >= 0]])
 

@@ -18,11 +18,9 @@ from sonar_graph.evaluation.metrics import (
     FARTHEST_M,
     ate_raw_m,
     ate_se2_m,
-    ate_se3_m,
     ate_yaw_m,
     landmark_errors,
     relative_errors,
-    return_error_m,
     rmse,
     scored_map,
     yaw_errors_rad,
@@ -33,8 +31,8 @@ from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
-# time differences of the relative error, seconds
-RELATIVE_DELTAS_S = (1, 10)
+# time difference of the relative error, seconds
+RELATIVE_DELTA_S = 10
 ESTIMATES: dict[str, str] = {
     "causal": "Causal estimate (what could be known at each instant)",
     "smoothed": "Smoothed estimate (what is known at the end about each instant)",
@@ -61,7 +59,7 @@ def trajectory_scores(
 
     Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols, and
     ``world`` is `unaligned`. Scores that need true orientations are left out where the truth has positions only.
-    Without ``has_height`` the estimate has the truth's, and its errors are of x and y.
+    Without ``has_height`` the caller has set the estimate's heights to those of the truth, and errors are of x and y.
     """
     which = ESTIMATES[kind]
     # each protocol is one sentence that can be quoted alone
@@ -72,10 +70,7 @@ def trajectory_scores(
         ("ate_raw_m", ate_raw_m(estimate, truth), "m", f"{world}: rms of {space}"),
         ("ate_yaw_m", ate_yaw_m(estimate, truth), "m", f"aligned by yaw and translation {fitted} {space}"),
         ("ate_se2_m", ate_se2_m(estimate, truth), "m", f"aligned by SE(2) {fitted} horizontal position error"),
-        ("ate_se3_m", ate_se3_m(estimate, truth), "m", f"aligned by SE(3) {fitted} {space}"),
         ("yaw_rmse_rad", rmse(yaw_errors_rad(estimate, truth)), "rad", f"{world}: rms of wrapped heading error"),
-        ("return_error_m", return_error_m(estimate, truth), "m",
-         f"{world}: norm of estimated minus true displacement from the first to the last,"),
     ]  # fmt: skip
     scores = _finite(
         {
@@ -83,18 +78,18 @@ def trajectory_scores(
             for key, value, unit, rule in rules
         }
     )
-    for delta_s in RELATIVE_DELTAS_S:
-        # displacement is in the body frame, for which a true orientation is needed
-        relative = relative_errors(estimate, truth, delta_s)
-        if not len(relative) or not truth.has_orientation:
-            continue
-        pairs = f"over {len(relative)} overlapping pairs {delta_s} s apart, {over}"
-        scores[f"rpe_{delta_s}s_m"] = Score(
+    # displacement is in the body frame, for which a true orientation is needed
+    relative = relative_errors(estimate, truth, RELATIVE_DELTA_S)
+    if len(relative) and truth.has_orientation:
+        pairs = (
+            f"over {len(relative)} overlapping pairs {RELATIVE_DELTA_S} s apart, {over}"
+        )
+        scores["rpe_10s_m"] = Score(
             rmse(relative.translation_m),
             "m",
             f"{which}: rms of the error of body-frame displacement {pairs}.",
         )
-        scores[f"rpe_{delta_s}s_rad"] = Score(
+        scores["rpe_10s_rad"] = Score(
             rmse(relative.yaw_rad),
             "rad",
             f"{which}: rms of the error of heading change {pairs}.",

@@ -9,7 +9,6 @@
     DIR/runs/NAME/trajectory.tum, causal.tum, landmarks.csv
                                 the estimates, for other tools; absent when the run failed
     DIR/runs/NAME/map.toml      the landmarks with their joint covariance, for `--map` of another run
-    DIR/runs/NAME/result.json   settings, versions, timings, status and reason
     DIR/runs/NAME/series.npz    everything as arrays, with covariances
     DIR/result.mcap             all of it for viewers, with layouts for Foxglove and RViz beside it
 
@@ -19,7 +18,6 @@ absent object has no fields.
 """
 
 import io
-import json
 import zipfile
 from collections.abc import Iterable
 from dataclasses import MISSING, asdict, fields
@@ -31,7 +29,6 @@ from pydantic import TypeAdapter
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.results import (
     ByName,
     Comparison,
@@ -51,7 +48,6 @@ from sonar_graph.files import (
     write_json,
 )
 from sonar_graph.logs import Picture, write_landmarks_csv, write_result, write_tum
-from sonar_graph.logs.mcap import Attachment
 from sonar_graph.map_file import write_map
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
@@ -72,27 +68,23 @@ FORMAT = "sonar_graph comparison 1"
 INDEX = "comparison.json"
 SEQUENCE = "sequence.npz"
 RUNS = "runs"
-RESULT = "result.json"
 SERIES = "series.npz"
 RESULT_LOG = "result.mcap"
 PAGE = "report.html"
 # as `sonar_graph.recognition` names them, which is loaded where something was recognised
-RECOGNITION, PICTURE_FOLDER = "recognition.json", "recognised"
+RECOGNITION = "recognition.json"
+PICTURE_FOLDER = "recognised"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv", "map.toml")
 # types of what people may have edited in ``comparison.json``
-_SCORE, _TEXTS, _STATUS = (
-    TypeAdapter(Score),
-    TypeAdapter(dict[str, str]),
-    TypeAdapter(Literal["ok", "failed"]),
-)
+_SCORE = TypeAdapter(Score)
+_TEXTS = TypeAdapter(dict[str, str])
+_STATUS: TypeAdapter[Literal["ok", "failed"]] = TypeAdapter(Literal["ok", "failed"])
 
 
 def result_names(estimators: Iterable[str]) -> list[str]:
     """Names that a comparison of these estimators may write; pictures are named by their stamps."""
     of_runs = [
-        f"{RUNS}/{name}/{file}"
-        for name in estimators
-        for file in (*ESTIMATES, SERIES, RESULT)
+        f"{RUNS}/{name}/{file}" for name in estimators for file in (*ESTIMATES, SERIES)
     ]
     layouts = ("result.foxglove.json", "result.rviz")
     return [
@@ -129,7 +121,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     ...     sorted(path.name for path in Path(folder).glob("[!.]*"))
     ['comparison.json', 'runs', 'sequence.npz']
     """
-    # the name becomes a folder: one with a separator would leave the place that was asked for
+    # the name becomes a folder: one with a separator would leave the folder that was given
     names = [run.estimator for run in comparison.runs]
     for name in names:
         if name in ("", ".", "..") or any(
@@ -170,15 +162,16 @@ def _write(comparison: Comparison, folder: Path) -> None:
     for run in comparison.runs:
         _write_run(run, comparison, folder / RUNS / run.estimator)
         scores = comparison.scores.get(run.estimator, {})
-        entry = _state(run) | {
-            "scores": {key: asdict(score) for key, score in scores.items()}
+        entries[run.estimator] = {
+            "status": run.status,
+            "reason": run.reason,
+            "params": run.params,
+            "finish_s": run.finish_s,
+            "peak_memory_mb": run.peak_memory_mb,
+            "refused": [asdict(rows) for rows in gathered(run.refused)],
+            "withheld": run.withheld,
+            "scores": {key: asdict(score) for key, score in scores.items()},
         }
-        if run.estimator in comparison.errors:
-            errors = comparison.errors[run.estimator]
-            entry["errors"] = {
-                kind: _error_summary(series) for kind, series in errors.items()
-            }
-        entries[run.estimator] = entry
     if comparison.recognition is not None:
         from sonar_graph.recognition import write_recognition
 
@@ -205,7 +198,7 @@ def _write(comparison: Comparison, folder: Path) -> None:
 
 
 def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
-    """The files of one run: trajectories and map, all arrays, and ``result.json``."""
+    """The files of one run: trajectories and map for other tools, and all arrays."""
     if (
         run.smoothed is not None
         and run.causal is not None
@@ -219,56 +212,12 @@ def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
     _write_arrays(
         folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {}))
     )
-    scores = comparison.scores.get(run.estimator, {})
-    timings = {
-        key.removeprefix("time."): score.value
-        for key, score in scores.items()
-        if key.startswith("time.")
-    }
-    result = {
-        "estimator": run.estimator,
-        "sequence": comparison.sequence.name,
-        **_state(run),
-        "timings": timings | {"calls": len(run.update_s)},
-        "environment": comparison.environment,
-    }
-    write_json(folder / RESULT, result)
-
-
-def _state(run: RunResult) -> dict[str, Any]:
-    """Status, settings and refusals of a run, as ``comparison.json`` and ``result.json`` have them."""
-    return {
-        "status": run.status,
-        "reason": run.reason,
-        "params": run.params,
-        "finish_s": run.finish_s,
-        "peak_memory_mb": run.peak_memory_mb,
-        "refused": [asdict(rows) for rows in gathered(run.refused)],
-        "withheld": run.withheld,
-    }
-
-
-def _error_summary(series: ErrorSeries) -> dict[str, Any]:
-    """Raw errors by axis in a few numbers; the series itself is in the run's arrays."""
-    summary = {
-        "instants": len(series.stamps_ns),
-        "rms_xyz_m": [rmse(series.position_m[:, axis]) for axis in range(3)],
-        "max_position_m": float(np.linalg.norm(series.position_m, axis=1).max()),
-    }
-    # no true heading, so no error of heading; a null would look like a lost number
-    if np.isnan(series.yaw_rad).any():  # the truth has positions only
-        return summary
-    return summary | {
-        "rms_yaw_rad": rmse(series.yaw_rad),
-        "max_yaw_rad": float(np.abs(series.yaw_rad).max()),
-    }
 
 
 def write_viewer_files(comparison: Comparison, folder: Path) -> None:
     """Write ``result.mcap``, ``result.foxglove.json`` and ``result.rviz`` beside the files of `write_comparison`.
 
-    The JSON files of the folder are in ``result.mcap`` as attachments, settings and versions as metadata, so that it
-    can be understood alone.
+    Versions, date and command are in the metadata of ``result.mcap``.
 
     Raises
     ------
@@ -282,31 +231,16 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
         and run.smoothed is not None
         and run.landmarks is not None
     }
-    settings = {
-        f"settings of {run.estimator}": json.dumps(
-            run.params, default=str, ensure_ascii=False
-        )
-        for run in comparison.runs
-    }
-    names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
     # viewers show the pictures along the time of the run
     drawn = comparison.recognition.pictures if comparison.recognition else []
     pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
-    about = comparison.environment | settings
-    with result_written(folder, COMPARISON) as written:
-        # as written in this call, not yet in the folder: all files appear together
-        contents = {name: written.as_written(name).read_bytes() for name in names}
-        attachments = [
-            Attachment(name, "application/json", content)
-            for name, content in contents.items()
-        ]
+    with result_written(folder, COMPARISON):
         write_result(
             folder / RESULT_LOG,
             comparison.sequence,
             estimates,
-            about,
-            attachments,
-            pictures,
+            comparison.environment,
+            pictures=pictures,
         )
 
 
@@ -351,6 +285,7 @@ def read_comparison(folder: Path) -> Comparison:
 
 def _restore(index: dict[str, Any], folder: Path) -> Comparison:
     """The comparison that ``comparison.json`` and the arrays describe."""
+    of_sequence = _read_arrays(folder / SEQUENCE)
     runs: list[RunResult] = []
     scores: dict[str, dict[str, Score]] = ByName()
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
@@ -365,10 +300,11 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
             for key, score in entry["scores"].items()
         }
         scores[name] = ByName(restored)
-        if "errors" in entry:
-            series = {
-                kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS
-            }
+        series = {
+            kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS
+        }
+        # without a truth no run has errors, not even none
+        if len(of_sequence.get("truth.stamps_ns", ())):
             errors[name] = {
                 kind: known for kind, known in series.items() if known is not None
             }
@@ -377,14 +313,16 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         from sonar_graph.recognition import read_recognition
 
         recognition = read_recognition(folder)
-    arrays = _read_arrays(folder / SEQUENCE)
     entry = index["sequence"]
     calibration = parse(Calibration, entry["calibration"], str(folder / INDEX))
     return Comparison(
         sequence=_restore_sequence(
-            entry["name"], calibration, _TEXTS.validate_python(entry["notes"]), arrays
+            entry["name"],
+            calibration,
+            _TEXTS.validate_python(entry["notes"]),
+            of_sequence,
         ),
-        instants_ns=arrays["instants_ns"],
+        instants_ns=of_sequence["instants_ns"],
         runs=runs,
         scores=scores,
         errors=errors,

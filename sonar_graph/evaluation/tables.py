@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 FITTED = "truth.world"
 """Note of a sequence whose truth was brought into the world of the estimates."""
-HEIGHTS, NO_HEIGHTS = (
-    "truth.height",
-    "its heights are all alike, so not measured: errors and NEES are of x and y",
-)
+HEIGHTS = "truth.height"
 """Note of a sequence whose truth has positions without heights."""
+NO_HEIGHTS = (
+    "its heights are all alike, so not measured: errors and NEES are of x and y"
+)
 NOT_ALIGNED = "not aligned"
 RAW = "ate_raw_m"
 AS_PUBLISHED = "as published"
@@ -26,13 +26,9 @@ TRAJECTORY_LABELS = {
     "ate_raw_m": "Position error, not aligned (ATE, RMS)",
     "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
     "ate_se2_m": "Horizontal position error, SE(2) aligned (ATE, RMS)",
-    "ate_se3_m": "Position error, SE(3) aligned (ATE, RMS)",
-    "rpe_1s_m": "Drift over 1 s (RPE, RMS)",
     "rpe_10s_m": "Drift over 10 s (RPE, RMS)",
-    "rpe_1s_rad": "Yaw drift over 1 s (RPE, RMS)",
     "rpe_10s_rad": "Yaw drift over 10 s (RPE, RMS)",
     "yaw_rmse_rad": "Yaw error (RMS)",
-    "return_error_m": "Return error: last position",
     "nees_position": "Position NEES per degree of freedom",
     "nees_yaw": "Yaw NEES",
 }
@@ -73,7 +69,6 @@ BLOCKS = {
 }
 HEADLINES = {
     "ate_se2_m": "RMS after SE(2) alignment",
-    "ate_se3_m": "RMS after SE(3) alignment",
     "ate_yaw_m": "RMS after alignment of yaw and translation",
     "ate_raw_m": "RMS, not aligned",
 }

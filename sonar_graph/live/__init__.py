@@ -8,7 +8,7 @@ from sonar_graph import at_first_use
 if TYPE_CHECKING:
     from sonar_graph.live.arrivals import Arrivals
     from sonar_graph.live.engine import Engine, LiveOptions
-    from sonar_graph.live.live_messages import Message, dropped_messages, play_messages, recorded_messages
+    from sonar_graph.live.live_messages import Message, play_messages, recorded_messages
     from sonar_graph.live.node import LiveRun
     from sonar_graph.live.outlets import open_link, open_outlets
     from sonar_graph.live.predictor import Prediction, Predictor
@@ -18,6 +18,6 @@ else:
 
 __all__ = [
     "Arrivals", "DEFAULT_ROUTER", "Engine", "LiveOptions", "LiveRun", "Message", "Prediction", "Predictor", "Publisher",
-    "definition_of", "dropped_messages", "open_link", "open_outlets", "open_session", "play_messages",
+    "definition_of", "open_link", "open_outlets", "open_session", "play_messages",
     "recorded_messages", "subscribe",
 ]

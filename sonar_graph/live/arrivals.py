@@ -90,7 +90,7 @@ class Arrivals:
         """Newest stamp, and the arrival of the last message."""
 
     def expect(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Say what stamp is usual at a time of arrival, before the first message, whose own may be wrong."""
+        """Set the usual stamp at a time of arrival, before the first message, whose own may be wrong."""
         self._clock_ns = stamp_ns, arrival_ns
 
     def add(
@@ -102,7 +102,7 @@ class Arrivals:
     ) -> str | None:
         """Take in a message of a sensor, by its name in `Measurements`; the reason why it is refused, or None.
 
-        ``block``: its rows, all of this stamp; None of a sonar frame in which nothing was detected, which says that
+        ``block``: its rows, all of this stamp; None of a sonar frame in which nothing was detected, after which
         no detection up to its stamp will come.
         """
         newest_ns = stamp_ns
@@ -179,7 +179,7 @@ class Arrivals:
 
 
 def joined(parts: list[Any]) -> Any:
-    """One block in the order of stamps; of equal ones in that of arrival."""
+    """One block, sorted by stamp; rows with equal stamps stay in the order of arrival."""
     if len(parts) == 1:
         return parts[0]
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])

@@ -162,11 +162,8 @@ class Engine:
         self._sequence: dict[tuple[str, bytes], int] = {}
         self._detections: dict[int, list[tuple[str, int]]] = {}
 
-    def take(self, message: Message, dropped: str | None = None) -> list[Part]:
-        """Take in a message; the parts of it that count, at the end of the first seconds those of all until then.
-
-        ``dropped``: reason for which an earlier run, whose record this is, dropped it for being behind.
-        """
+    def take(self, message: Message) -> list[Part]:
+        """Take in a message; the parts of it that count, at the end of the first seconds those of all until then."""
         name = message.topic
         is_new = name not in self.topics
         if is_new:
@@ -183,9 +180,6 @@ class Engine:
         # of a sensor that began late
         if is_new and self._reader is not None:
             self._find_places()
-        if dropped == OVERLOADED:  # all other reasons are found again
-            self.drop(name, at_ns, OVERLOADED, message.arrival_ns)
-            return []
         if self._reader is None:
             self._first.append((message, at_ns))
             is_set_up = self._is_time(message) and self._set_up(self._first)
@@ -212,7 +206,7 @@ class Engine:
             yield from self._arrivals.rest()
 
     def without_detections(self, step: Measurements, arrival_ns: int) -> Measurements:
-        """A step without its detections, for an estimator that is behind; the record says so."""
+        """A step without its detections, for an estimator that is behind; the record names them."""
         if step.detections is not None:
             for stamp_ns in np.unique(step.detections.stamps_ns).tolist():
                 for topic, at_ns in self._detections.pop(stamp_ns, ()):
@@ -235,6 +229,7 @@ class Engine:
         )
         topic.is_latched = message.topic.endswith("_static")
         self.topics[message.topic] = topic
+        # the record must have the definition before the first message
         self._record.add_topic(topic)
 
     def _choices(self) -> dict[str, Choice]:
@@ -294,7 +289,7 @@ class Engine:
         return held
 
     def _is_time(self, message: Message) -> bool:
-        """Tell whether it is time to choose topics and calibration: some seconds of both sensors of the motion."""
+        """True when it is time to choose topics and calibration: some seconds of both sensors of the motion."""
         now_ns = message.arrival_ns
         if self._first_motion_ns is None:
             motion = [self._choices()[role] for role in MOTION]
@@ -322,7 +317,9 @@ class Engine:
         except LogError as error:  # several topics fit
             if self.options.topics.keys() - ROLES.keys():
                 raise
-            again = f"everything is recorded: end with Ctrl-C, and go on with --resume {self.record_path} and a choice"
+            again = (
+                "everything is recorded: end with Ctrl-C, and begin again with a choice"
+            )
             self.waits_for = f"{error}; {again}"
             return False
         # detections that break their own rules would make the topic useless
@@ -409,7 +406,7 @@ class Engine:
         return [part for one in found for part in self._parts(*one)]
 
     def _parts(self, message: Message, at_ns: int, found: list[Part]) -> list[Part]:
-        """Parts that are in time and can be read; a message of which none is, is dropped."""
+        """Parts that are in time and can be read; a message without such a part is dropped."""
         parts = []
         reasons = []
         for part in found:
@@ -431,7 +428,7 @@ class Engine:
 
 
 def _is_of_use(assembly: Assembly, role: str) -> bool:
-    """Tell whether an optional sensor has sent what its calibration needs: a sound message, and a fix on the Earth."""
+    """True if an optional sensor has sent what its calibration needs: a valid message, and a fix on the Earth."""
     topic = assembly.topics.get(role)
     if topic is None or role in MOTION or role not in BLOCKS:
         return True

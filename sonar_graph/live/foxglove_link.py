@@ -132,6 +132,7 @@ class FoxgloveLink:
                 if subscriptions:
                     wish = {"op": "subscribe", "subscriptions": subscriptions}
                     self._socket.send(json.dumps(wish))
+            # other opcodes are of services and parameters
             elif len(data) >= HEAD.size and data[0] == MESSAGE_DATA:
                 _, number, sent_ns = HEAD.unpack_from(data)
                 if number in topics:

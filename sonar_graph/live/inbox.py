@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator
 
 from sonar_graph.live.live_messages import Message
 
@@ -51,52 +50,36 @@ class Inbox:
 
 
 class Silence:
-    """Topics that have sent, and for how long nothing came of them; each silence is said once, and its end.
+    """Topics that have sent, and for how long nothing came of them; each silence is reported once.
 
     Examples
     --------
     >>> silence = Silence()
     >>> for at_s in (0.0, 1.0):
-    ...     silence.heard("/imu/data", at_s), silence.heard("/dvl/data", at_s)
-    >>> list(silence.lines({"/imu/data", "/dvl/data"}, at_s=4.0))
+    ...     silence.note("/imu/data", at_s), silence.note("/dvl/data", at_s)
+    >>> silence.note("/imu/data", 5.0)
+    >>> silence.lines({"/imu/data", "/dvl/data"}, at_s=7.0)
+    ['/dvl/data: nothing since 6 s']
+    >>> silence.lines({"/imu/data", "/dvl/data"}, at_s=8.0)
     []
-    >>> list(silence.lines({"/imu/data", "/dvl/data"}, at_s=7.0))
-    ['nothing comes any more since 6 s: does the sender run?']
-    >>> silence.heard("/imu/data", 9.0)
-    >>> list(silence.lines({"/imu/data", "/dvl/data"}, at_s=9.5))
-    ['/imu/data comes again, after 8 s', '/dvl/data: nothing since 8 s']
     """
 
     def __init__(self) -> None:
         self._heard_s: dict[str, float] = {}
-        self._ended: dict[str, float] = {}
-        """Silences that have ended, by topic, in seconds."""
         self._said: set[str] = set()
 
-    def heard(self, topic: str, at_s: float) -> None:
+    def note(self, topic: str, at_s: float) -> None:
         """Note that a message of a topic came."""
-        if topic in self._said:
-            self._said.discard(topic)
-            self._ended[topic] = at_s - self._heard_s[topic]
         self._heard_s[topic] = at_s
+        self._said.discard(topic)
 
-    def lines(self, topics: set[str], at_s: float) -> Iterator[str]:
-        """What there is to say about topics that should send all the time."""
-        for topic, after_s in self._ended.items():
-            yield f"{topic} comes again, after {after_s:.0f} s"
-        self._ended.clear()
-        known = {
+    def lines(self, topics: set[str], at_s: float) -> list[str]:
+        """A line for each of these topics that has become silent."""
+        silent = {
             topic: at_s - heard_s
             for topic, heard_s in self._heard_s.items()
-            if topic in topics
+            if topic in topics and at_s - heard_s > SILENT_S
         }
-        silent = {topic: for_s for topic, for_s in known.items() if for_s > SILENT_S}
-        new = silent.keys() - self._said
-        # where no topic sends any more, the link is at fault and not a sensor
-        if new and all(at_s - heard_s > SILENT_S for heard_s in self._heard_s.values()):
-            yield f"nothing comes any more since {min(silent.values()):.0f} s: does the sender run?"
-        else:
-            yield from (
-                f"{topic}: nothing since {silent[topic]:.0f} s" for topic in sorted(new)
-            )
-        self._said |= new
+        new = sorted(silent.keys() - self._said)
+        self._said |= silent.keys()
+        return [f"{topic}: nothing since {silent[topic]:.0f} s" for topic in new]

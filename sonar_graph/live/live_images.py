@@ -122,7 +122,7 @@ class LiveImages:
             yield self._seen.popleft()
 
     def failure(self) -> str | None:
-        """Why recognition has ended, said once; None: it has not."""
+        """Why recognition has ended, given once; None: it has not."""
         error = self._worker.error if self._worker and self._topic else None
         if self._is_off or error is None:
             return None

@@ -56,7 +56,7 @@ def gather(topic: Topic, payload: bytes, log_time_ns: int) -> None:
 
 
 def recorded_messages(path: Path) -> Iterator[Message]:
-    """Messages of a log in the order of the file, also of one that was cut off; what says what was dropped is left out.
+    """Messages of a log in the order of the file, also of one that was cut off; the topic of dropped messages is left out.
 
     Raises `LogError` when the file cannot be read, or is damaged in its middle.
     """

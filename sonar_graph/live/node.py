@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from itertools import islice
 from textwrap import shorten
 from typing import Self
@@ -51,11 +51,11 @@ FLUSH_S = 0.25
 FRAME_PERIOD_NS = 18_000_000
 """Least time between two transforms of the body, some 50 a second: tf interpolates between them."""
 STATE_S = 1.0
+MOST_DURATIONS = 20_000
 LINE_WIDTH = 200
 WAITING_S = 5.0
 """Time after which the user is told what is missing for an estimate."""
 MOST_STEPS_AT_ONCE = 50
-MOST_DURATIONS = 20_000
 WARM_UP = MissionOptions(
     duration_s=30.0, frame_rate_hz=10.0, dvl_dropouts_per_hour=500.0, dvl_dropout_s=3.0
 )
@@ -73,7 +73,7 @@ class LiveRun:
         Function that gives the definition of a message type.
     outlets
         Where messages are sent.
-    said
+    show_line
         Called with lines for the user.
     status
         Called with the line of each second, which replaces the one before; None: it is not made.
@@ -85,17 +85,16 @@ class LiveRun:
         definition_of: Callable[[str], str],
         options: LiveOptions,
         outlets: list[Outlet],
-        said: Callable[[str], None],
+        show_line: Callable[[str], None],
         status: Callable[[str], None] | None = None,
     ) -> None:
         self.inbox = Inbox()
         self.engine = Engine(record, definition_of, options)
-        self.predict_cpu_s: list[float] = []
-        """Durations of the newest predictions by this thread's own time, without what other threads take meanwhile."""
+        self._predict_cpu_s: deque[float] = deque(maxlen=MOST_DURATIONS)
         self._record = record
         self._options = options
         self._outlets = outlets
-        self._said = said
+        self._said = show_line
         self._status = status
         self._now = Status()
         self._types = wanted_types(options.config or LogConfig(), ROLES)
@@ -117,7 +116,6 @@ class LiveRun:
         self._predictor: Predictor | None = None
         self._silence = Silence()
         self._is_failed = False
-        self._is_quiet = False  # while what an earlier run had is taken in: nobody waits for those poses
         self._generation = -1
         self._done_s: dict[str, float] = {}
         """When each thing that is done now and then was done last."""
@@ -137,33 +135,13 @@ class LiveRun:
         return self._images.waiting
 
     def wants(self, topic: str, type_name: str) -> bool:
-        """Tell whether the messages of a topic may be of use."""
+        """True if the messages of a topic may be of use."""
         return not topic.startswith(OWN) and short_name(type_name) in self._types
 
     def accept(self, message: Message) -> None:
         """Put a message into the inbox, if it may be of use; called by the transport's thread."""
         if self.wants(message.topic, message.type_name):
             self.inbox.put(message)
-
-    def catch_up(
-        self, messages: Iterator[Message], dropped: Mapping[tuple[str, int], str]
-    ) -> int:
-        """Take the messages of an earlier record, with what was dropped then; the time of arrival of the last."""
-        last_ns = 0
-        self._is_quiet = True
-        worker = self._worker
-        for message in messages:
-            last_ns = max(last_ns, message.arrival_ns)
-            self._take(message, dropped.get((message.topic, message.arrival_ns)))
-            for step in self.engine.steps():
-                worker.add(step)
-            # an estimator that is behind would lose detections
-            while worker.error is None and (worker.waiting or worker.is_busy):
-                time.sleep(1e-4)
-            self._use_answers()
-        self._record.flush()
-        self._is_quiet = False
-        return last_ns
 
     def _lost(self) -> dict[str, int]:
         """Numbers of messages that were lost on the way, by topic."""
@@ -194,7 +172,7 @@ class LiveRun:
         """Take what has come, and send what follows from it."""
         messages = self.inbox.take(timeout_s)
         for message in messages:
-            self._silence.heard(message.topic, time.monotonic())
+            self._silence.note(message.topic, time.monotonic())
             self._take(message)
         # each message gives the steps that it completes; the rest of many comes now
         if not messages:
@@ -256,11 +234,11 @@ class LiveRun:
         self._worker.end()
         self._images.end()
 
-    def _take(self, message: Message, dropped: str | None = None) -> None:
+    def _take(self, message: Message) -> None:
         if message.topic in self._unused:
             return
         try:
-            parts = self.engine.take(message, dropped)
+            parts = self.engine.take(message)
         except LogError as error:
             if self.engine.calibration is None and message.topic in self.engine.topics:
                 raise
@@ -278,8 +256,7 @@ class LiveRun:
         is_ready = self.engine.calibration is not None
         if is_ready and self._generation != self.engine.generation:
             self._begin()
-        if not self._is_quiet:
-            self._images.take(message, parts)
+        self._images.take(message, parts)
         try:
             self._move_on(parts, message.arrival_ns)
         except Exception as error:  # only the pose at the rate of the IMU suffers
@@ -303,11 +280,11 @@ class LiveRun:
             rows = [part.block if part.role == role else None for role in MOTION]
             self._predictor.add(*rows)
             # of many rows at once only the newest pose is of use
-            if part.role == "imu" and part is parts[-1] and not self._is_quiet:
+            if part.role == "imu" and part is parts[-1]:
                 self._predict(self._predictor, arrival_ns)
 
     def _fault(self, what: str, error: Exception) -> None:
-        """Say once what went wrong with a topic, and go on."""
+        """Report once what went wrong with a topic, and go on."""
         if what not in self._faulty:
             self._faulty.add(what)
             self._said(
@@ -330,6 +307,7 @@ class LiveRun:
                 # the odometry after the newest has not come yet
                 if warning and not warning.startswith("detections:"):
                     self._said(f"warning: {warning}")
+        # an estimator has its calibration from its beginning
         self._worker.begin(self.engine.calibration)
         self._predictor = Predictor(self.engine.calibration)
         self._now.newest_ns = 0
@@ -337,11 +315,12 @@ class LiveRun:
         self._said(f"estimating by {self._options.estimator}; Ctrl-C ends")
 
     def _predict(self, predictor: Predictor, arrival_ns: int) -> None:
+        # of this thread alone: other threads take the processor meanwhile
         before_s = time.thread_time()
         at = predictor.predict()
         if at is None or at.stamp_ns <= self._now.newest_ns:
             return
-        self.predict_cpu_s.append(time.thread_time() - before_s)
+        self._predict_cpu_s.append(time.thread_time() - before_s)
         self._now.predicted(at)
         self._put("/sonar_graph/odometry", self._forms.odometry(at))
         if at.stamp_ns >= self._next_frame_ns:
@@ -378,7 +357,6 @@ class LiveRun:
         """Publish the state of the seconds since the last one, and give its line to the user."""
         dropped = self.engine.counts.dropped
         lost = self._lost()
-        p99_s = np.percentile(self.predict_cpu_s or [np.nan], 99)
         lists = {
             "lost": ", ".join(f"{name} {n}" for name, n in lost.items()),
             "dropped": ", ".join(
@@ -389,7 +367,7 @@ class LiveRun:
         values = {
             "latency_ms": f"{self._latency_ns * 1e-6:.1f}",
             "longest_update_ms": f"{self._longest_update_s * 1e3:.1f}",
-            "predictor_cpu_p99_us": f"{1e6 * p99_s:.0f}",
+            "predictor_cpu_p99_us": f"{1e6 * np.percentile(self._predict_cpu_s or [np.nan], 99):.0f}",
             "steps_waiting": str(self._worker.waiting),
             "images_waiting": str(self.images_waiting),
             "estimates": str(self._estimates),
@@ -407,7 +385,6 @@ class LiveRun:
             )
         self._latency_ns = 0
         self._longest_update_s = 0.0
-        del self.predict_cpu_s[:-MOST_DURATIONS]
 
     def _put(self, topic: str, payload: bytes) -> None:
         for outlet in self._outlets:

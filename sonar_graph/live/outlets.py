@@ -63,7 +63,7 @@ class Outlet(Protocol):
 
 
 class Form:
-    """A message of fixed layout whose stamp and numbers are replaced, since encoding anew takes ten times as long.
+    """A message of fixed layout whose stamp and numbers are replaced, since encoding a new one takes seven times as long.
 
     ``stamp`` and ``numbers`` are the paths of the seconds and of the first of the numbers, which follow each other.
     """
@@ -289,7 +289,7 @@ Link = ZenohLink | FoxgloveLink
 
 
 def open_link(endpoints: list[str], domain: int) -> Link:
-    """Link to a foxglove_bridge (``ws://...``), or to zenoh routers; a LogError where none is there."""
+    """Link to a foxglove_bridge (``ws://...``), or to zenoh routers; a LogError where it is not there."""
     bridges = [one for one in endpoints if one.startswith(("ws://", "wss://"))]
     if bridges and len(endpoints) > 1:
         raise LogError(
@@ -300,6 +300,7 @@ def open_link(endpoints: list[str], domain: int) -> Link:
 
 def open_outlets(link: Link, foxglove_port: int | None) -> list[Outlet]:
     """Outlets over zenoh, if that is the link, and, with a port, for viewers."""
+    # a foxglove_bridge takes no messages back
     outlets: list[Outlet] = (
         [ZenohOutlet(link.session, link.domain)] if isinstance(link, ZenohLink) else []
     )

@@ -107,6 +107,7 @@ class Predictor:
         # an estimate may be of an instant after the newest row
         newest_ns = max(self._newest_ns, estimate.stamp_ns)
         motion = self._odometry.motion(estimate.stamp_ns, newest_ns, BIAS)
+        # the covariance is of the body at the newest row
         A = motion.i_T_j.inverse().AdjointMap()
         world_T_body = estimate.world_T_body.compose(motion.i_T_j)
         odom_T_body = self._odom_T_estimate.compose(motion.i_T_j)

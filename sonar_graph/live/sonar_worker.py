@@ -29,7 +29,7 @@ OVERTAKEN = "overload: newer images came before it was recognised"
 
 
 class SonarBegin(NamedTuple):
-    """Request to begin with the calibration and the rows of the first seconds, and images with the form of one."""
+    """Request to begin: calibration and rows of the first seconds, and one image with the shape of all others."""
 
     sequence: Sequence
     frame: SonarFrames
@@ -106,6 +106,7 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
         gc.freeze()  # templates are never looked at again, which would delay an image
         return READY
     session = _Recogniser.session
+    # first the rows: the track needs the motion up to its image
     session.extend(request.imu, request.dvl, request.depth)
     frame: SonarFrames | None = request.frame
     if frame is None:

@@ -41,7 +41,7 @@ MOST_AT_ONCE = 100
 
 @dataclass(frozen=True)
 class Begin:
-    """Request to make an estimator anew."""
+    """Request to make a new estimator."""
 
     name: str
     overrides: dict[str, Any]
@@ -123,6 +123,7 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
         )
     found = []
     update_s = []
+    # each update is timed by itself, although steps come together
     for step in request:
         estimate = estimator.process(step)
         after_s = time.perf_counter()
@@ -187,7 +188,7 @@ class Worker:
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def begin(self, calibration: Calibration) -> None:
-        """Begin the run, also anew: steps that wait are forgotten, and those that follow may be many for a while."""
+        """Begin the run, or begin it again: steps that wait are forgotten, and those that follow may be many for a while."""
         with self._changed:
             self._begins = self._begin(calibration)
             self._is_catching_up = True
@@ -251,6 +252,7 @@ class Worker:
                 if begin is not None:
                     self._ask(begin)
                 if steps:
+                    # outside the lock: steps may be added while the estimator works
                     answer = self._ask(steps)
                     self._is_catching_up &= bool(self._waiting)
                     if self._begins is None:  # else it is of a run that is over

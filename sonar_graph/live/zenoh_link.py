@@ -206,7 +206,7 @@ class Publisher:
 
     @property
     def is_heard(self) -> bool:
-        """True while anybody subscribes to it; of a topic of static frames zenoh does not say."""
+        """True while anybody subscribes to it; False for static frames: zenoh does not report their subscribers."""
         status = getattr(self._publisher, "matching_status", None)
         return status is not None and bool(status.matching)
 

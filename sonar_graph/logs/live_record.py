@@ -21,20 +21,16 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
 from sonar_graph.logs.mcap import (
-    Keep,
     LogWriter,
     Recording,
     SchemaText,
     Topic,
     latched,
     own_schema,
-    scan,
 )
 from sonar_graph.logs.roles import DROPPED, TF, Choice
 from sonar_graph.logs.vehicle_setup import (
     METADATA,
-    PartialCalibration,
-    read_calibration,
     read_notes,
 )
 
@@ -154,35 +150,6 @@ class LiveRecord:
         self._channels: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
         self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
-
-    @staticmethod
-    def resumed_calibration(
-        path: Path, given: PartialCalibration | None
-    ) -> PartialCalibration | None:
-        """Fields with which a live run goes on: those of its record, and before them what the user gives now.
-
-        Sensors that it did not use are left out: their mountings may still come. None without either.
-
-        Raises
-        ------
-        CalibrationError
-            When the calibration in the record is invalid.
-        """
-        recording = scan(path, lambda _: Keep.NONE)
-        recorded = read_calibration(recording)
-        config = recorded_config(recording)
-        if recorded is None or config is None:
-            return given
-        values = {
-            name: value
-            for name, value in recorded.model_dump(mode="json").items()
-            if value is not None
-        }
-        for role, table in config.tables.items():
-            if table.get("use") is False:
-                values.pop(role, None)
-        recorded_fields = PartialCalibration(values, str(path))
-        return recorded_fields if given is None else given.over(recorded_fields)
 
     def __enter__(self) -> Self:
         return self

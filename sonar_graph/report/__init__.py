@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from sonar_graph.report.batch_page import write_batch_report
     from sonar_graph.report.batch_summary import lost_told, missing_told, sensors_told
     from sonar_graph.report.comparison_page import write_page, write_report
-    from sonar_graph.report.console import published_counterpart, summary
+    from sonar_graph.report.console import summary
     from sonar_graph.report.paper import write_paper
     from sonar_graph.report.rendering import render
     from sonar_graph.report.sentences import doubt_lines, doubtful_lines
@@ -16,6 +16,6 @@ else:
     __getattr__, __dir__ = at_first_use(__name__)
 
 __all__ = [
-    "doubt_lines", "doubtful_lines", "lost_told", "missing_told", "published_counterpart", "render", "sensors_told",
-    "summary", "write_batch_report", "write_page", "write_paper", "write_report",
+    "doubt_lines", "doubtful_lines", "lost_told", "missing_told", "render", "sensors_told", "summary",
+    "write_batch_report", "write_page", "write_paper", "write_report",
 ]

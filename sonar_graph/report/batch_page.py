@@ -21,8 +21,6 @@ SECTIONS = (
     PageSection("ended", "Runs that ended"),
     PageSection("errors", "Errors"),
     PageSection("consistency", "Consistency"),
-    PageSection("cost", "Time and memory"),
-    PageSection("runs", "Every run"),
     PageSection("protocol", "Protocol"),
     PageSection("provenance", "Provenance"),
 )
@@ -36,7 +34,7 @@ ORIGINS = (
 def write_batch_report(
     batch: RecordedBatch, folder: Path, *, overwrite: bool = False
 ) -> Path:
-    """Write ``report.html``, and each table as CSV and LaTeX into ``tables/``, from the results alone.
+    """Write ``report.html``, and each table as CSV into ``tables/``, from the results alone.
 
     Files that this package did not write are replaced only with ``overwrite``.
 
@@ -76,20 +74,17 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
             for key in metric.keys.values()
             for log, name in groups
         ):
-            drawings = [
-                figures.spread_drawing(batch, metric),
-                figures.difference_drawing(batch, metric, tests),
-            ]
             both = [
                 tables.accuracy_table(batch, metric),
                 tables.difference_table(batch, metric, tests),
             ]
-            shown = [summary.marked(batch, table) for table in both if table.rows]
             chapters.append(
                 {
                     "metric": metric,
-                    "drawings": list(filter(None, drawings)),
-                    "tables": shown,
+                    "drawing": figures.spread_drawing(batch, metric),
+                    "tables": [
+                        summary.marked(batch, table) for table in both if table.rows
+                    ],
                 }
             )
     head = summary.head_metric(batch, metrics)
@@ -101,11 +96,9 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     others = (
         tables.failure_table(batch),
         tables.consistency_table(batch),
-        tables.cost_table(batch),
     )
     # tables leave the page as files, and must state there too what is missing
-    failures, consistency, costs = (summary.marked(batch, table) for table in others)
-    anees = [figures.consistency_drawing(batch, what) for what in ("position", "yaw")]
+    failures, consistency = (summary.marked(batch, table) for table in others)
     # logs may have different numbers of seeds
     seeds = max(len(batch.group(log, name)) for log, name in groups)
     settings: dict[str, str] = {}
@@ -127,7 +120,6 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
                 f"{text} ({count} runs)" if many else text
                 for text, count in counts.items()
             ]
-    runs = tables.run_lists(batch, metrics)
     return {
         "name": batch.name,
         "names": batch.contestants,
@@ -145,32 +137,21 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         "warnings": [
             *summary.reference_told(batch),
             *summary.instants_told(batch),
-            *summary.power_told(tests),
         ],
-        "headlines": summary.headlines(batch, head, tests) if head else [],
         "overview": overview[0] if overview else None,
         "folded_rows": FOLDED_ROWS,
         "estimates": [f"{sentence}." for sentence in ESTIMATES.values()],
         "failures": failures,
-        "failure_drawing": figures.failure_drawing(batch),
+        "unended": tables.unended_table(batch),
         "chapters": chapters,
         "consistency": consistency,
-        "consistency_drawings": list(filter(None, anees)),
-        "costs": costs,
-        "cost_drawing": figures.cost_drawing(batch),
-        "run_lists": [
-            (log, [one for at, one in runs if at == log])
-            for log in dict.fromkeys(at for at, _ in runs)
-        ],
         "tables": [
             *overview,
             failures,
             *(one for chapter in chapters for one in chapter["tables"]),
             consistency,
-            costs,
         ],
         "least_pairs": LEAST_PAIRS,
-        "same_evidence": tables.SAME_EVIDENCE,
         "settings": settings,
         "origins": origins,
         "results": RESULTS,

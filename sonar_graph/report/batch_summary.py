@@ -11,19 +11,16 @@ import numpy as np
 
 from sonar_graph.batch import (
     GOING_ON,
-    LEAST_PAIRS,
     Metric,
     PairedDifference,
     RecordedBatch,
-    holm,
-    least_p,
     summarise,
 )
-from sonar_graph.evaluation import quantile_text
 from sonar_graph.report.batch_tables import (
     GROUP_COLUMNS,
     SIGNIFICANT,
     Tests,
+    shown,
     unit_of,
 )
 from sonar_graph.table import Cell, Column, Table, absent, number, words
@@ -34,7 +31,6 @@ NAMED = 3
 LOWER = "\N{DOWNWARDS ARROW}"
 HIGHER = "\N{UPWARDS ARROW}"
 DIFFERENT = "\N{NOT EQUAL TO}"
-SIDES = {LOWER: "lower", HIGHER: "higher", DIFFERENT: "different"}
 
 
 def failures_told(batch: RecordedBatch) -> list[str]:
@@ -87,38 +83,6 @@ def instants_told(batch: RecordedBatch) -> list[str]:
     ]
 
 
-def power_told(tests: Tests) -> list[str]:
-    """A warning where there are too few pairs for any finding, even if every test of the family were at its best."""
-    families: dict[str, dict[tuple[str, int], PairedDifference]] = {}
-    for (key, log, _), (test, _) in tests.items():
-        # the correction counts all tests of a metric, over logs and estimators
-        families.setdefault(key.rpartition(".")[2], {})[log, id(test)] = test
-    blind: dict[str, str] = {}
-    for family in families.values():
-        pairs = [test.pairs for test in family.values()]
-        # the smallest p values that so many pairs can have at all
-        best = holm(
-            np.array(
-                [
-                    least_p(count) if count >= LEAST_PAIRS else math.nan
-                    for count in pairs
-                ]
-            )
-        )
-        found = zip(family.items(), best.tolist(), strict=True)
-        blind |= {
-            log: test.counted
-            for ((log, _), test), p_value in found
-            if not p_value < SIGNIFICANT
-        }
-    if not blind:
-        return []
-    listed = _few([f"{log} ({counted})" for log, counted in blind.items()])
-    return [
-        f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."
-    ]
-
-
 def _few(names: list[str], joint: str = ", ") -> str:
     """The first names, and the number of the others."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
@@ -149,58 +113,6 @@ def head_metric(batch: RecordedBatch, metrics: list[Metric]) -> Metric | None:
     )
 
 
-def headlines(batch: RecordedBatch, metric: Metric, tests: Tests) -> list[str]:
-    """For each estimate the contestants that differ from the reference, the side, and the number of logs."""
-    own = {
-        place: test
-        for place, test in tests.items()
-        if place[0] in metric.keys.values() and place[1] in batch.logs
-    }
-    # of one log a count of logs would be noise
-    several = len(batch.logs) > 1
-    # one sentence in place of a list of names that are all the same
-    if own and not any(map(mark_of, own.values())):
-        place = " on any one log" if several else ""
-        return [
-            f"{metric.label}: no estimator is told apart from {batch.reference}{place}."
-        ]
-    sentences = []
-    for over, key in metric.keys.items():
-        names = [
-            name
-            for name in _shown(batch, metric, over)
-            if any((key, log, name) in own for log in batch.logs)
-        ]
-        if not names:
-            continue
-        marks = {
-            name: [mark_of(own.get((key, log, name))) for log in batch.logs]
-            for name in names
-        }
-        told = []
-        for mark, word in SIDES.items():
-            counts = {
-                name: found.count(mark)
-                for name, found in marks.items()
-                if mark in found
-            }
-            if counts:
-                listed = ", ".join(
-                    f"{name} ({count})" if several else name
-                    for name, count in counts.items()
-                )
-                told.append(f"{word} with {listed}")
-        alike = ", ".join(name for name, found in marks.items() if not any(found))
-        place = f" (on how many of {len(batch.logs)} logs)" if several and told else ""
-        if alike:
-            told.append(f"{'never' if several else 'not'} told apart: {alike}")
-        subject = f"{over} error" if over else "Error"
-        sentences.append(
-            f"{subject} beside that of {batch.reference}{place}: {'; '.join(told)}."
-        )
-    return sentences
-
-
 def mark_of(found: tuple[PairedDifference, float] | None) -> str:
     """An arrow to the side of most differences to the reference where these are significant; else nothing."""
     if found is None or not found[1] < SIGNIFICANT:
@@ -218,13 +130,13 @@ def mark_of(found: tuple[PairedDifference, float] | None) -> str:
 
 def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
     """Logs down, contestants across: medians, with a mark where a contestant differs from the reference."""
-    shown = [
+    columns_shown = [
         (over, key, name)
         for over, key in metric.keys.items()
         for name in _shown(batch, metric, over)
     ]
     columns = [GROUP_COLUMNS[0]]
-    for over, key, name in shown:
+    for over, key, name in columns_shown:
         # arrows are against this column
         heading = f"{name} (reference)" if name == batch.reference else name
         run = batch.contestants.index(name)
@@ -232,16 +144,14 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
     rows: list[list[Cell]] = []
     for log in batch.logs:
         rows.append([words(log)])
-        for _, key, name in shown:
+        for _, key, name in columns_shown:
             if not batch.is_asked(log, name, key):
                 rows[-1].append(absent(2))
                 continue
             # medians, because a mean over a group with a lost run does not exist
             told = summarise(batch.values(log, name, key))
             found = tests.get((key, log, name))
-            text = quantile_text(
-                told.median * metric.factor, told.median_error * metric.factor
-            )
+            text = shown(told.median * metric.factor)
             note = (
                 f"{told.without} of {told.runs} without a value" if told.without else ""
             )
@@ -341,7 +251,7 @@ def lost_told(batch: RecordedBatch) -> list[str]:
 
 
 def marked(batch: RecordedBatch, table: Table) -> Table:
-    """The table, with a caption that says where runs are missing: tables are also used outside the page."""
+    """The table, whose caption names missing runs: tables are also used outside the page."""
     if not batch.missing:
         return table
     return replace(

@@ -1,4 +1,4 @@
-"""Tables of a batch: failures, errors, differences to the reference, consistency, costs, and each run.
+"""Tables of a batch: failures, errors, differences to the reference, consistency, and runs that did not end.
 
 Statistics: `sonar_graph.batch`. A metric is a family of tests, corrected by Holm (1979).
 """
@@ -11,7 +11,6 @@ import numpy as np
 
 from sonar_graph.batch import (
     ALL_LOGS,
-    KINDS,
     Anees,
     Metric,
     PairedDifference,
@@ -22,38 +21,16 @@ from sonar_graph.batch import (
     failure_rate,
     holm,
     paired,
-    standard_error,
     summarise,
 )
-from sonar_graph.evaluation import (
-    between,
-    format_value,
-    quantile_text,
-    supported,
-    with_error,
-)
+from sonar_graph.evaluation import format_value
 from sonar_graph.table import Cell, Column, Table, absent, count, number, words
 
 SIGNIFICANT = 0.05
 # by column, log and contestant: the differences, and their p value corrected over the tests of the metric
 Tests = dict[tuple[str, str, str], tuple[PairedDifference, float]]
 FAILURES = ("failed", "timeout", "memory", "killed")
-COSTS = {
-    "update_p50_ms": "Update, median (ms)",
-    "update_p99_ms": "Update, 99 % (ms)",
-    "wall_s": "Whole run (s)",
-    "cpu_s": "Processor (s)",
-    "peak_memory_mb": "Memory, rise (MB)",
-}
 QUANTILES = ("10_percent", "90_percent")
-# end of the names of columns with the normalised squared error at a run's last instant
-LATEST = "_end"
-# relative difference of a smoothed ANEES to the causal one up to which it is the same evidence, shown once
-SAME_AT_END = 0.1
-SAME_EVIDENCE = (
-    "At the last instant a smoothed estimate has seen no more than the causal one: it is no second evidence, and is "
-    "shown only where it differs by more than a tenth."
-)
 GROUP_COLUMNS = (
     Column("log", "Log", is_number=False),
     Column("contestant", "Estimator", is_number=False),
@@ -61,7 +38,7 @@ GROUP_COLUMNS = (
 
 
 def unit_of(metric: Metric) -> str:
-    """The shown unit in brackets, after a blank; empty where there is none."""
+    """The shown unit in brackets, after a blank; empty without a unit."""
     return f" ({metric.shown_unit})" if metric.shown_unit else ""
 
 
@@ -78,18 +55,9 @@ def groups_of(batch: RecordedBatch) -> Iterator[tuple[str, str, list[RecordedRun
                 yield log, contestant, group
 
 
-def runs_cell(batch: RecordedBatch, log: str, contestant: str, note: str = "") -> Cell:
-    """The number of a group's runs, with a link to their list."""
-    return count(
-        len(batch.group(log, contestant)),
-        note,
-        link=f"#{group_anchor(batch, log, contestant)}",
-    )
-
-
-def group_anchor(batch: RecordedBatch, log: str, contestant: str) -> str:
-    """The place on the page where the runs of a group are listed."""
-    return f"runs-{batch.logs.index(log)}-{batch.contestants.index(contestant)}"
+def shown(value: float) -> str:
+    """A number with three significant digits, and words for infinity, which stands for runs without a value."""
+    return "no value" if math.isinf(value) else format_value(value)
 
 
 def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
@@ -163,7 +131,7 @@ def failure_table(batch: RecordedBatch) -> Table:
                 rate = failure_rate(len(group) - counts["ok"], len(group))
                 interval = f"{100 * rate.low:.0f} to {100 * rate.high:.0f} %"
                 cells = [
-                    runs_cell(batch, log, contestant),
+                    count(len(group)),
                     *(count(counts[status]) for status in ("ok", *FAILURES)),
                 ]
                 cells.append(
@@ -199,7 +167,7 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
         failed = sum(not run.ended for run in group)
         row = [
             *group_cells(batch, log, contestant),
-            runs_cell(batch, log, contestant, f"{failed} failed" if failed else ""),
+            count(len(group), f"{failed} failed" if failed else ""),
         ]
         for key in metric.keys.values():
             if batch.is_asked(log, contestant, key):
@@ -215,17 +183,16 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
 def summary_cells(told: SampleSummary, factor: float = 1.0) -> list[Cell]:
     """Mean with its error, median, and range of the middle 80 %."""
     note = f"{told.without} of {told.runs} without a value" if told.without else ""
-    text = with_error(told.mean * factor, told.standard_error * factor)
+    text = shown(told.mean * factor)
+    if math.isfinite(told.standard_error):
+        text += f" ± {shown(told.standard_error * factor)}"
     mean = number(told.mean, text, told.standard_error, note=note)
-    median = number(
-        told.median, quantile_text(told.median * factor, told.median_error * factor)
-    )
+    median = number(told.median, shown(told.median * factor))
     # one run has no spread
     if told.runs == 1:
         return [mean, median, absent(2)]
-    low = quantile_text(told.low * factor, told.low_error * factor)
-    high = quantile_text(told.high * factor, told.high_error * factor)
-    return [mean, median, number(told.low, f"{low} to {high}", told.high)]
+    spread = f"{shown(told.low * factor)} to {shown(told.high * factor)}"
+    return [mean, median, number(told.low, spread, told.high)]
 
 
 def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
@@ -266,16 +233,16 @@ def _difference_cells(
     if found is None:
         return [absent(3), absent(), absent(), absent(2)]
     test, p_holm = found
-    error, (low, high) = test.rounding_error * factor, test.interval
-    note = "" if math.isnan(low) else between(low * factor, high * factor, error)
-    median = quantile_text(test.median * factor, test.median_error * factor)
+    low, high = test.interval
+    note = "" if math.isnan(low) else f"{shown(low * factor)} to {shown(high * factor)}"
+    median = shown(test.median * factor)
     # half of the pairs have no value on one side: a word is clearer than an infinite number
     if math.isinf(test.median):
         median = (
             "worse: no value" if test.median > 0 else "better: reference has no value"
         )
     return [
-        number(test.mean, supported(test.mean * factor, error), low, high, note=note),
+        number(test.mean, shown(test.mean * factor), low, high, note=note),
         number(test.median, median),
         Cell(f"{test.smaller} of {test.counted}", (test.smaller,)),
         number(p_holm, p_text(p_holm), test.p_value),
@@ -283,19 +250,8 @@ def _difference_cells(
 
 
 def p_text(p_value: float) -> str:
-    """A p value with two digits, down to one in a thousand; with more where it would else look like 5 % and is not."""
-    # more digits would claim a precision that few seeds do not give
-    if p_value < 1e-3:
-        return "< 0.001"
-    if not p_value < 0.995:
-        return "1.0"
-    # two digits of 0.0496 are 0.05, which looks like no finding
-    texts = [f"{p_value:.{digits}g}" for digits in range(2, 18)]
-    return next(
-        text
-        for text in texts
-        if np.sign(float(text) - SIGNIFICANT) == np.sign(p_value - SIGNIFICANT)
-    )
+    """A p value with three decimals, down to one in a thousand."""
+    return "< 0.001" if p_value < 1e-3 else f"{p_value:.3f}"
 
 
 def _metric_table(
@@ -321,10 +277,10 @@ def _unit_note(metric: Metric) -> str:
 
 
 def anees_of(
-    batch: RecordedBatch, log: str, contestant: str, kind: str, what: str
+    batch: RecordedBatch, log: str, contestant: str, what: str
 ) -> Anees | None:
-    """The ANEES of a group over its runs, at the last instant of each; None where no covariance is reported."""
-    key = f"{kind}.nees_{what}{LATEST}"
+    """The causal ANEES of a group over its runs, at the last instant of each; None where no covariance is reported."""
+    key = f"causal.nees_{what}_end"
     if not batch.is_asked(log, contestant, key):
         return None
     group = batch.group(log, contestant)
@@ -335,142 +291,64 @@ def anees_of(
     )
 
 
-def is_evidence(told: dict[str, Anees | None], kind: str) -> bool:
-    """True where an estimate's ANEES at the last instant adds to that of the causal one.
-
-    At the last instant a smoothed estimate rests on the same measurements as the causal one, and is the same but for a
-    solver's last steps. It differs where a decision is made anew, as on doubtful identities.
-    """
-    causal = told["causal"]
-    own = told[kind]
-    if own is None or causal is None or kind == "causal":
-        return own is not None
-    # NaN is the mean of a group with a failed run, which compares as unequal to itself
-    if math.isnan(causal.mean):
-        return not math.isnan(own.mean)
-    return not abs(own.mean - causal.mean) <= SAME_AT_END * causal.mean
-
-
 def consistency_table(batch: RecordedBatch) -> Table:
-    """ANEES at the last instant of runs that are independent, with its band; a smoothed one only where it differs."""
-    told = {
-        (log, contestant, what): {
-            kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS
-        }
-        for log in batch.logs
-        for contestant in batch.contestants
-        for what in ("position", "yaw")
-    }
-    kinds = [
-        kind for kind in KINDS if any(is_evidence(one, kind) for one in told.values())
-    ]
+    """ANEES at the last instant of runs that are independent, with its band.
+
+    At the last instant a smoothed estimate rests on the same measurements as the causal one: it is no second evidence.
+    """
     columns = [
         *GROUP_COLUMNS,
         Column("of", "Of", is_number=False),
         Column("runs", "Runs"),
         Column("band", "Expected", parts=("low", "high")),
+        Column("anees", "ANEES"),
+        Column("verdict", "Reading", is_number=False),
     ]
-    for kind in kinds:
-        over = kind.capitalize()
-        columns += [
-            Column(f"{kind}_anees", "ANEES", over),
-            Column(f"{kind}_verdict", "Reading", over, is_number=False),
-        ]
     rows = []
-    for (log, contestant, what), both in told.items():
-        known = [one for one in both.values() if one is not None]
-        if not known:
-            continue
-        low, high = known[0].band
-        failed = sum(not run.ended for run in batch.group(log, contestant))
-        cells = [*group_cells(batch, log, contestant), words(what)]
-        cells.append(
-            count(known[0].runs, f"{failed} failed: no average" if failed else "")
-        )
-        cells.append(number(low, f"{low:.2f} to {high:.2f}", high))
-        for kind in kinds:
-            one = both[kind]
-            values = batch.values(log, contestant, f"{kind}.nees_{what}{LATEST}")
-            if one is None:
-                cells += [absent(), words("")]
-            elif not is_evidence(both, kind):
-                cells += [number(one.mean, "as causal"), words("")]
-            else:
-                cells += [
-                    number(one.mean, supported(one.mean, standard_error(values))),
-                    words(one.verdict),
+    for log, contestant, group in groups_of(batch):
+        failed = sum(not run.ended for run in group)
+        for what in ("position", "yaw"):
+            found = anees_of(batch, log, contestant, what)
+            if found is None:
+                continue
+            low, high = found.band
+            note = f"{failed} failed: no average" if failed else ""
+            rows.append(
+                [
+                    *group_cells(batch, log, contestant),
+                    words(what),
+                    count(found.runs, note),
+                    number(low, f"{low:.2f} to {high:.2f}", high),
+                    number(found.mean, shown(found.mean)),
+                    words(found.verdict),
                 ]
-        rows.append(cells)
+            )
     caption = (
-        "Average over runs of the normalised squared error at the last instant, per degree of freedom: 1 is "
-        "consistent, above is over-confident. Expected: the chi-square band that holds 95 % of consistent estimators. "
-        f"{SAME_EVIDENCE}"
+        "Average over runs of the normalised squared error of the causal estimate at the last instant, per degree of "
+        "freedom: 1 is consistent, above is over-confident. Expected: the chi-square band that holds 95 % of consistent "
+        "estimators."
     )
     return Table("consistency", "ANEES of independent runs", caption, columns, rows)
 
 
-def cost_table(batch: RecordedBatch) -> Table:
-    """Time and memory: median and the range of the middle 80 % of runs."""
-    columns = [*GROUP_COLUMNS]
-    # columns that no run has are left out
-    known = [key for key in COSTS if any(key in run.values for run in batch.runs)]
-    for key in known:
-        columns.append(Column(f"{key}_median", "Median", COSTS[key]))
-        columns.append(Column(key, "10 to 90 %", COSTS[key], QUANTILES))
-    rows = []
-    for log, contestant, _ in groups_of(batch):
-        cells = [
-            summary_cells(summarise(batch.values(log, contestant, key)))[1:]
-            for key in known
+def unended_table(batch: RecordedBatch) -> Table:
+    """Runs that did not end, each with its reason and its log."""
+    columns = [
+        *GROUP_COLUMNS,
+        Column("seed", "Seed"),
+        Column("key", "Run", is_number=False),
+        Column("status", "Status", is_number=False),
+        Column("reason", "Reason", is_number=False),
+    ]
+    rows = [
+        [
+            *group_cells(batch, run.log, run.contestant),
+            absent() if run.seed is None else count(run.seed),
+            words(run.key, run.log_file),
+            words(run.status),
+            words(run.reason),
         ]
-        rows.append(
-            [
-                *group_cells(batch, log, contestant),
-                *(cell for pair in cells for cell in pair),
-            ]
-        )
-    caption = (
-        "Measured while other runs went on beside them: compare within this batch only."
-    )
-    return Table("costs", "Time and memory", caption, columns, rows)
-
-
-def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[tuple[str, Table]]:
-    """Every run: logs, each with the table of one contestant, whose name is the `group_anchor`."""
-    lists = []
-    for log, contestant, group in groups_of(batch):
-        shown = [
-            (metric, over, key)
-            for metric in metrics
-            for over, key in metric.keys.items()
-            # a column of dashes would hide those with numbers
-            if any(math.isfinite(run.value(key)) for run in group)
-        ]
-        columns = [
-            Column("seed", "Seed"),
-            Column("key", "Run", is_number=False),
-            Column("status", "Status", is_number=False),
-            *(
-                Column(key, f"{metric.label}{unit_of(metric)}", over)
-                for metric, over, key in shown
-            ),
-        ]
-        rows = []
-        for run in group:
-            seed = absent() if run.seed is None else count(run.seed)
-            row = [
-                seed,
-                words(run.key, run.log_file),
-                Cell(run.status, (run.status,), note=run.reason),
-            ]
-            for metric, _, key in shown:
-                value = run.value(key)
-                row.append(
-                    absent()
-                    if math.isinf(value)
-                    else number(value, format_value(value * metric.factor))
-                )
-            rows.append(row)
-        name = group_anchor(batch, log, contestant)
-        lists.append((log, Table(name, f"{log}, {contestant}", "", columns, rows)))
-    return lists
+        for run in batch.runs
+        if not run.ended
+    ]
+    return Table("unended", "Runs that did not end, and why", "", columns, rows)

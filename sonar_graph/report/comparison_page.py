@@ -10,32 +10,23 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.evaluation import (
-    NONE,
-    UNJUDGED,
     Comparison,
     aligned_to_truth,
     compact_table,
-    confidences,
     format_value,
-    reliability_of,
     repeats_published,
     run_columns,
     score_keys,
     score_table,
-    true_identities,
     write_comparison,
     write_viewer_files,
 )
 from sonar_graph.files import COMPARISON, as_path, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
-from sonar_graph.report.figure_style import inline_svg, sized
-from sonar_graph.report.figures import RAW_VIEW, illustrations, reliability_figure
+from sonar_graph.report.figures import RAW_VIEW, illustrations
 from sonar_graph.report.given_map import given_map_table
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.rendering import PageSection, data_address, html_of, write_html
@@ -46,7 +37,7 @@ from sonar_graph.table import ABSENT, Column, Table, text_table, words
 PAGE = "report.html"
 SECTIONS = (
     PageSection("over-time", "Errors"),
-    PageSection("consistency", "Consistency and time"),
+    PageSection("consistency", "Heading and consistency"),
     PageSection("detections", "Detections"),
     PageSection("recognition", "Sonar images"),
     PageSection("landmarks", "Landmarks"),
@@ -61,7 +52,6 @@ RUN_FILES = {
     "trajectory.tum": "smoothed",
     "causal.tum": "causal",
     "landmarks.csv": "landmarks",
-    "result.json": "params",
 }
 
 
@@ -163,7 +153,6 @@ def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
     content: dict[str, Any] = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
-        "beside_the_paper": sentences.beside_the_paper(comparison),
         "summary": (
             f"{', '.join(run.estimator for run in runs)} on {format_value(round(sequence.duration_s, 1))} s of "
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
@@ -204,7 +193,7 @@ def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
         "nameless": sentences.nameless_landmarks(comparison),
         "paper": PAPER if repeats_published(sequence) else "",
         "outcomes": outcomes,
-        "refused": refused_table(comparison),
+        "refused": sentences.refusal_lines(comparison),
         "recognition": recognition_content(comparison),
         "files": {
             run.estimator: {
@@ -228,7 +217,7 @@ def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
 
 
 def _views(name: str, aligned: Table | None, raw: Table | None) -> dict[str, Table]:
-    """A table by name, and with `RAW_VIEW` the one before alignment where it differs; empty where there is none."""
+    """A table by name, and with `RAW_VIEW` the one before alignment where it differs; empty without a table."""
     if aligned is None or raw is None:
         return {}
     if raw == aligned:
@@ -243,7 +232,6 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
         score_table(comparison),
         *([landmarks] if landmarks else []),
         outcome_table(comparison),
-        refused_table(comparison),
     ]
     return [table for table in tables if table.rows]
 
@@ -322,45 +310,16 @@ def _share(count: Counter[Outcome] | None, outcome: Outcome) -> str:
     return f"{number} ({100 * number / count.total():.1f} %)" if number else "0"
 
 
-def refused_table(comparison: Comparison) -> Table:
-    """Rows of IMU and Doppler log that were not used."""
-    start_ns = comparison.sequence.start_ns
-    columns = [
-        Column("sensor", "Sensor", is_number=False),
-        Column("rows", "Rows"),
-        Column("time", "Time (s)"),
-        Column("reason", "Reason", is_number=False),
-        Column("distance", "Squared distance"),
-        Column("estimators", "Estimators", is_number=False),
-    ]
-    rows = [
-        [
-            row.sensor,
-            str(row.count),
-            row.times(start_ns),
-            row.reason,
-            row.distances() or ABSENT,
-            ", ".join(names),
-        ]
-        for row, names in sentences.refused_by(comparison).items()
-    ]
-    cells = [[words(text) for text in row] for row in rows]
-    return Table("refused", "Which rows were not used, and why", "", columns, cells)
-
-
 def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
-    """Pictures, outcomes, warnings and the reliability of posteriors; None where nothing was recognised here."""
+    """Pictures, outcomes and warnings; None where nothing was recognised here."""
     found = comparison.recognition
     sequence = comparison.sequence
     if found is None:
         return None
     # a recogniser takes a while to load, and most logs have detections
-    from sonar_graph.recognition import (
-        SURE,
-    )
+    from sonar_graph.recognition import SURE
 
     start_ns = sequence.start_ns
-    judged = reliability_of(sequence)
     pictures = []
     for picture in found.shown():
         pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)
@@ -371,20 +330,9 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
         pictures.append(
             {"address": data_address(picture.jpeg, "image/jpeg"), "caption": caption}
         )
-    reliability = ""
-    if judged is not None:
-        description = (
-            f"Reliability of identity posteriors: expected calibration error {judged.expected_error:.3f} over "
-            f"{judged.count.sum()} detections."
-        )
-        with sized():
-            reliability = inline_svg(
-                reliability_figure(judged), "reliability", description
-            )
     return {
         "frames": found.frames,
         "detections": 0 if sequence.detections is None else len(sequence.detections),
-        "named": naming_table(sequence),
         "sure": SURE,
         "topic": PICTURES,
         "pictures": pictures,
@@ -404,8 +352,6 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
             ],
             numbers=False,
         ),
-        "expected_error": None if judged is None else f"{judged.expected_error:.3f}",
-        "reliability": reliability,
     }
 
 
@@ -416,41 +362,4 @@ def _of_truth(sequence: Sequence) -> str:
         "with ground truth"
         if sequence.true_poses
         else "with true positions, but no true orientation"
-    )
-
-
-def naming_table(sequence: Sequence) -> Table | None:
-    """Detections by their true class: named rightly, named wrongly, taken for no landmark; None without truth."""
-    if (
-        sequence.detections is None
-        or sequence.true_poses is None
-        or sequence.true_landmarks is None
-    ):
-        return None
-    # by place, since identities are what is judged
-    labels = true_identities(sequence, sequence.detections)
-    _, named = confidences(sequence.detections)
-
-    def counted(chosen: NDArray[np.bool_]) -> list[str]:
-        return [
-            str(int((chosen & (named != NONE)).sum())),
-            str(int((chosen & (named == NONE)).sum())),
-        ]
-
-    rows = []
-    for identity in sequence.true_landmarks.ids.tolist():
-        seen = labels == identity
-        right = int((seen & (named == identity)).sum())
-        rows.append(
-            [f"landmark {identity}", str(right), *counted(seen & (named != identity))]
-        )
-    rows.append(["no landmark", ABSENT, *counted(labels == NONE)])
-    if np.any(labels == UNJUDGED):
-        rows.append(["cannot be told", ABSENT, *counted(labels == UNJUDGED)])
-    title = "What detections truly are, and what was most probable for the recogniser"
-    return text_table(
-        "naming",
-        title,
-        ["Truly", "named rightly", "named wrongly", "taken for no landmark"],
-        rows,
     )

@@ -1,4 +1,4 @@
-"""The comparison in the terminal: the few numbers that are read first, and the counterpart of the published table."""
+"""The comparison in the terminal: the few numbers that are read first."""
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
@@ -10,11 +10,9 @@ from sonar_graph.evaluation import (
     Comparison,
     headline_metric,
     label,
-    repeats_published,
     score_keys,
 )
 from sonar_graph.report import sentences
-from sonar_graph.report.landmark_table import PAPER, landmark_table
 from sonar_graph.table import ABSENT
 
 # columns after the two position errors; those that no run has are left out
@@ -34,13 +32,9 @@ RECOGNISED_BEFORE = (
     "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "
     "let compare recognise anew: --rule virtual-evidence"
 )
-PUBLISHED_LEGEND = (
-    f"{PAPER}: landmarks from its Table I, of which the errors are, and last minus first position from section III. "
-    "It measured in a real basin and did not know the true path.\nAll else: this run."
-)
 # one draw of a chi-square of three, over three, is above 5.4 once in a thousand times
 FAR_FROM_FITTING = 6.0
-# advice, with what the log says of its own reference: where that lacks something, inspect cannot mend it
+# advice, with the log's note on its own reference: where that lacks something, inspect cannot mend it
 ASK_INSPECT = (
     "NEES far above 1 without landmarks at work: stamps, start or reference{} may be off; "
     "sonar-graph inspect LOG compares reference, clocks and sensors"
@@ -77,7 +71,8 @@ def summary(comparison: Comparison) -> Group:
     table = Table(
         title=Text(comparison.sequence.name, style="bold"), title_justify="left"
     )
-    table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
+    table.box = SIMPLE_HEAD
+    table.padding = (0, 1, 0, 0)
     table.add_column("estimator", no_wrap=True)
     for key, heading in columns.items():
         unit = next(
@@ -105,7 +100,7 @@ def summary(comparison: Comparison) -> Group:
 
 
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
-    """Failures, doubts of the log, what runs say that may follow from these, and the meaning of the columns."""
+    """Failures, warnings about the log, warnings of runs that may follow from these, and the meaning of the columns."""
     lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
     # first, as the numbers above are not to be relied on
     doubtful = sentences.doubtful_lines(comparison)
@@ -161,46 +156,3 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
                 ASK_INSPECT.format(f" (the log says: {known})" if known else ""),
             ]
     return lines
-
-
-def published_counterpart(comparison: Comparison) -> Group | None:
-    """Table I of the 2014 paper and its counterpart; None where the run does not repeat that experiment.
-
-    Landmarks stand across, as in the paper. The numbers are those of the report.
-    """
-    found = (
-        landmark_table(comparison) if repeats_published(comparison.sequence) else None
-    )
-    if found is None:
-        return None
-    texts = [[cell.text for cell in row] for row in found.rows]
-    (split,) = found.sections
-    positions = texts[:split]
-    totals = texts[split:]
-    landmarks = [row[0].removesuffix(", x") for row in positions[::2]]
-    across = _plain_table(
-        "Landmarks: position in metres (estimate minus truth)", ["", *landmarks]
-    )
-    below = _plain_table(
-        "",
-        ["", "RMS", "RMS after\nSE(2)", "last minus\nfirst x", "last minus\nfirst y"],
-    )
-    for place, column in enumerate(found.columns[1:], start=1):
-        below.add_row(column.heading, *(row[place] for row in totals))
-        if any(row[place] != ABSENT for row in positions):
-            for axis in (0, 1):
-                across.add_row(
-                    f"{column.heading} {'xy'[axis]}",
-                    *(row[place] for row in positions[axis::2]),
-                )
-    return Group(across, below, Text(PUBLISHED_LEGEND))
-
-
-def _plain_table(title: str, headings: list[str]) -> Table:
-    table = Table(
-        title=Text(title, style="bold") if title else None, title_justify="left"
-    )
-    table.box, table.padding = SIMPLE_HEAD, 0
-    for number, heading in enumerate(headings):
-        table.add_column(heading, no_wrap=True, justify="right" if number else "left")
-    return table

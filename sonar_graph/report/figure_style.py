@@ -29,7 +29,7 @@ INK = "#1c2024"
 MUTED = "#5d656d"
 RULE = "#d5d9dd"
 TRUTH = "#8b9198"
-# after Okabe and Ito, told apart with any colour vision; darkened where white paper asks for more contrast
+# after Okabe and Ito, distinct with any colour vision; darkened where white paper needs more contrast
 ESTIMATOR_COLOURS = ("#0072b2", "#d55e00", "#00805e", "#a8508a", "#7a6a00", "#5b53b0")
 LINE_STYLES: tuple[Any, ...] = (
     "-",
@@ -83,8 +83,6 @@ class Illustration:
     """Empty where there is nothing to draw."""
     instead: str = ""
     """Sentence in place of the caption where there is nothing to draw."""
-    data: str = ""
-    """The drawn values as CSV, in the units of the results."""
     figure: Figure | None = None
 
 

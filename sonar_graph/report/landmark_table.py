@@ -1,15 +1,11 @@
 """Landmarks in rows, as in Table I of the 2014 paper: true and estimated x and y, the difference in brackets.
 
-Where a run repeats the published experiment, the paper's own table stands beside it, and two rows give the displacement
-from the first to the last position.
+Where a run repeats the published experiment, the paper's own table stands beside it.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from sonar_graph.evaluation import (
-    RETURN_M,
     Comparison,
     fixed,
     landmark_errors,
@@ -19,8 +15,7 @@ from sonar_graph.evaluation import (
     scored_map,
     unaligned,
 )
-from sonar_graph.measurements import Floats
-from sonar_graph.states import LandmarkMap, Trajectory, landmark_name
+from sonar_graph.states import LandmarkMap, landmark_name
 from sonar_graph.table import ABSENT, Column, Table, words
 
 PAPER = "2014 paper"
@@ -28,21 +23,10 @@ PAPER = "2014 paper"
 MOST_LANDMARKS = 30
 DECIMALS = 3
 PAPER_DECIMALS = 2
-PAPER_RETURN_DECIMALS = 4
-
-
-@dataclass(frozen=True)
-class MapColumn:
-    """The source of one column of the table: a run, or the paper."""
-
-    landmarks: LandmarkMap | None
-    path: Trajectory | None = None
-    """None for the paper, whose path is not published."""
-    decimals: int = DECIMALS
 
 
 def coordinate(landmarks: LandmarkMap | None, identity: int, axis: int) -> float | None:
-    """The x or y of a landmark; None where it is not in the map, or there is none."""
+    """The x or y of a landmark; None where it is not in the map, or without a map."""
     if landmarks is None or identity not in landmarks.ids:
         return None
     return float(landmarks.positions[landmarks.ids == identity, axis][0])
@@ -52,49 +36,34 @@ def landmark_table(comparison: Comparison) -> Table | None:
     """The final maps of the runs against the true one, as scored; None where no run has mapped a landmark.
 
     Columns: quantity, true value (where the true landmarks are known), each run with a map, and the paper where its
-    experiment is repeated (then also runs with a path only). Rows: x and y of each landmark; below a section heading
-    the RMS errors and the displacement.
+    experiment is repeated. Rows: x and y of each landmark; below a section heading the RMS errors.
     """
-    runs = comparison.runs
     true = comparison.sequence.true_landmarks
-    repeats = repeats_published(comparison.sequence)
-    mapped = {}
+    maps: dict[str, LandmarkMap] = {}
     # a map may also be aligned because its world is not that of the truth
     is_aligned = comparison.is_aligned
-    for run in runs:
+    for run in comparison.runs:
         if run.landmarks is not None and len(run.landmarks):
             scored = scored_map(run.landmarks, comparison.sequence)
-            mapped[run.estimator] = (
-                run.landmarks if scored is None else scored.landmarks
-            )
+            maps[run.estimator] = run.landmarks if scored is None else scored.landmarks
             is_aligned |= scored is not None and scored.alignment is not None
-    columns = {name: MapColumn(landmarks) for name, landmarks in mapped.items()}
-    # beside the paper also runs with a path only count: it compares returns too
-    if repeats:
-        walked = {
-            run.estimator: run.causal
-            for run in runs
-            if run.causal is not None and len(run.causal)
-        }
-        columns = {
-            name: MapColumn(mapped.get(name), path) for name, path in walked.items()
-        }
-        columns[PAPER] = MapColumn(published_maps()[0], decimals=PAPER_DECIMALS)
-    known = [
-        column.landmarks for column in columns.values() if column.landmarks is not None
-    ]
-    if not known:
+    if not maps:
         return None
+    if repeats_published(comparison.sequence):
+        maps[PAPER] = published_maps()[0]
     rows: list[list[str]] = []
-    for id_ in mapped_ids(comparison, known)[:MOST_LANDMARKS]:
+    for id_ in mapped_ids(comparison, list(maps.values()))[:MOST_LANDMARKS]:
         # the paper gives x and y
         for axis in (0, 1):
             at = coordinate(true, id_, axis)
-            found = [
-                (coordinate(column.landmarks, id_, axis), column.decimals)
-                for column in columns.values()
+            cells = [
+                _with_difference(
+                    coordinate(landmarks, id_, axis),
+                    at,
+                    PAPER_DECIMALS if name == PAPER else DECIMALS,
+                )
+                for name, landmarks in maps.items()
             ]
-            cells = [_with_difference(value, at, decimals) for value, decimals in found]
             rows.append(
                 [
                     f"ID {landmark_name(id_)}, {'xy'[axis]}",
@@ -106,30 +75,22 @@ def landmark_table(comparison: Comparison) -> Table | None:
     if true is not None:
         # below the last landmark
         sections[len(rows)] = "In all"
-        errors = [
-            None if one.landmarks is None else landmark_errors(one.landmarks, true)
-            for one in columns.values()
-        ]
+        errors = [landmark_errors(landmarks, true) for landmarks in maps.values()]
         raw = [fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors]
         aligned = [
-            ABSENT
-            if not e or np.isnan(e.aligned_rmse_m)
-            else fixed(e.aligned_rmse_m, DECIMALS)
+            ABSENT if np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS)
             for e in errors
         ]
         rows += (
             [] if is_aligned else [[f"RMS, {unaligned(comparison.sequence)}", "", *raw]]
         )
         rows.append(["RMS after SE(2) alignment", "", *aligned])
-        if repeats:
-            rows += _return_rows(
-                comparison.sequence.truth, [column.path for column in columns.values()]
-            )
     heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
-    heads += [Column(name, name) for name in columns]
+    heads += [Column(name, name) for name in maps]
     # without a truth its column would be empty
     if true is None:
-        heads, rows = [heads[0], *heads[2:]], [[row[0], *row[2:]] for row in rows]
+        heads = [heads[0], *heads[2:]]
+        rows = [[row[0], *row[2:]] for row in rows]
     caption = "Positions in the map at the end, metres" + (
         "" if true is None else "; in brackets estimate minus truth"
     )
@@ -165,38 +126,6 @@ def landmarks_left_out(comparison: Comparison) -> int:
     """Number of landmarks for which the table has no row."""
     maps = [run.landmarks for run in comparison.runs if run.landmarks is not None]
     return max(0, len(mapped_ids(comparison, maps)) - MOST_LANDMARKS) if maps else 0
-
-
-def _return_rows(
-    truth: Trajectory | None, paths: list[Trajectory | None]
-) -> list[list[str]]:
-    """Last minus first position of the causal estimates, and of the truth at the same instants or nearest to them."""
-
-    def displacement(path: Trajectory) -> Floats:
-        return np.asarray(path.positions[-1] - path.positions[0])
-
-    rows = []
-    for axis in (0, 1):
-        first = ABSENT
-        cells = []
-        for place, path in enumerate(paths):
-            if path is None:
-                cells.append(fixed(RETURN_M[axis], PAPER_RETURN_DECIMALS))
-                continue
-            at = None
-            if truth is not None:
-                # a truth that begins later or ends earlier has a displacement between its own ends
-                ends_ns = np.clip(
-                    path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1]
-                )
-                if ends_ns[0] < ends_ns[1]:  # else they have no time in common
-                    at = float(displacement(truth.at(ends_ns))[axis])
-            cells.append(
-                _with_difference(float(displacement(path)[axis]), at, DECIMALS)
-            )
-            first = _with_difference(at, None, DECIMALS) if place == 0 else first
-        rows.append([f"last minus first position, {'xy'[axis]}", first, *cells])
-    return rows
 
 
 def _with_difference(value: float | None, true: float | None, decimals: int) -> str:

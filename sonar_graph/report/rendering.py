@@ -1,4 +1,4 @@
-"""Rendering: HTML pages from templates, and tables as CSV (for machines) and LaTeX (booktabs, for papers).
+"""Rendering: HTML pages from templates, and tables as CSV.
 
 Everything that comes from a suite, a log or an estimator is escaped.
 """
@@ -18,30 +18,6 @@ from sonar_graph.files import replacing, spelt
 from sonar_graph.table import Table, as_html
 
 FOLDER = "tables"
-LATEX_SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "±": r"$\pm$",
-    "°": r"\textdegree{}",
-    "<": r"$<$",
-    ">": r"$>$",
-    "\N{MINUS SIGN}": "$-$",
-    "\N{EN DASH}": "--",
-    "\N{NO-BREAK SPACE}": "~",
-    "²": r"$^2$",
-    "\N{DOWNWARDS ARROW}": r"$\downarrow$",
-    "\N{UPWARDS ARROW}": r"$\uparrow$",
-    "\N{NOT EQUAL TO}": r"$\neq$",
-    "χ": r"$\chi$",
-}
 
 
 def render(template: str, content: dict[str, Any]) -> str:
@@ -53,12 +29,7 @@ def render(template: str, content: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {
-        "svg": Markup,
-        "csv": as_csv,
-        "latex": as_latex,
-        "address": data_address,
-    }
+    environment.filters |= {"svg": Markup, "address": data_address}
     environment.filters["html"] = lambda table, is_sortable: Markup(
         as_html(table, is_sortable=is_sortable)
     )
@@ -102,26 +73,20 @@ def html_of(kind: str, sections: list[PageSection], content: dict[str, Any]) -> 
     return render("page.html", content | {"kind": kind, "sections": sections})
 
 
-def data_address(text: str | bytes, kind: str) -> str:
+def data_address(content: bytes, kind: str) -> str:
     """Content as an address within the page itself: ``data:KIND;base64,...``."""
-    content = text if isinstance(text, bytes) else text.encode()
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def write_tables(tables: list[Table], folder: Path) -> list[Path]:
-    """Write each table as ``tables/NAME.csv`` and ``tables/NAME.tex`` in a folder; earlier ones are replaced."""
-    written = []
+def write_tables(tables: list[Table], folder: Path) -> None:
+    """Write each table as ``tables/NAME.csv`` in a folder; earlier ones are replaced."""
     for table in tables:
-        for suffix, text in (("csv", as_csv(table)), ("tex", as_latex(table))):
-            path = folder / FOLDER / f"{table.name}.{suffix}"
-            with replacing(path) as partial:
-                partial.write_text(text, "utf-8")
-            written.append(path)
-    return written
+        with replacing(folder / FOLDER / f"{table.name}.csv") as partial:
+            partial.write_text(as_csv(table), "utf-8")
 
 
 def as_csv(table: Table) -> str:
-    """Numbers in full and in the units of the results; empty where there is none. Sections are a first column."""
+    """Numbers in full and in the units of the results; empty cells without a number. Sections are a first column."""
     head = [
         f"{column.key}_{part}" if part else column.key
         for column in table.columns
@@ -165,50 +130,3 @@ def _plain_cell(text: str) -> str:
     except ValueError:
         return f"'{text}"
     return text
-
-
-def as_latex(table: Table) -> str:
-    """A ``table`` with the digits that people are shown; it needs the packages booktabs and textcomp."""
-    above: list[str] = []
-    if any(heading for heading, _ in table.groups):
-        cells = []
-        rules = []
-        first = 1
-        for heading, width in table.groups:
-            cells.append(rf"\multicolumn{{{width}}}{{c}}{{{latex_text(heading)}}}")
-            if heading:
-                rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
-            first += width
-        above = [" & ".join(cells) + r" \\", "".join(rules)]
-    rows = []
-    for place, row in enumerate(table.rows):
-        if place in table.sections:
-            rows.append(
-                rf"\multicolumn{{{len(row)}}}{{l}}{{\textit{{{latex_text(table.sections[place])}}}}} \\"
-            )
-        texts = [
-            f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row
-        ]
-        rows.append(" & ".join(map(latex_text, texts)) + r" \\")
-    lines = [
-        r"% \usepackage{booktabs,textcomp}",
-        r"\begin{table}",
-        r"\centering",
-        rf"\caption{{{latex_text(table.title)}. {latex_text(table.caption)}}}",
-        rf"\label{{tab:{table.name}}}",
-        rf"\begin{{tabular}}{{{''.join('r' if column.is_number else 'l' for column in table.columns)}}}",
-        r"\toprule",
-        *above,
-        " & ".join(latex_text(column.heading) for column in table.columns) + r" \\",
-        r"\midrule",
-        *rows,
-        r"\bottomrule",
-        r"\end{tabular}",
-        r"\end{table}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def latex_text(text: str) -> str:
-    """Text with everything escaped that LaTeX would take for a command."""
-    return "".join(LATEX_SPECIAL.get(character, character) for character in text)

@@ -32,7 +32,7 @@ from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, landmark_name
 
 # the filter with the robust kernel and the gyro bias that filters as published lack
 FAIR = "invariant-ekf"
-# relative difference below which one run says nothing about which of two errors is the smaller one
+# relative difference of two errors below which one run cannot decide which is the smaller one
 TOO_CLOSE = 0.05
 CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
 NO_DETECTIONS = (
@@ -109,7 +109,7 @@ def doubts(comparison: Comparison) -> list[str]:
 def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     """The finding: the estimator nearest to the truth, how far off it is, and what its covariances are worth.
 
-    Before that, where sensors contradict each other beyond doubt, that the results are doubtful.
+    Where sensors contradict each other beyond doubt, the sentence is a warning about that instead.
 
     Where no run has a position error, the reason, or the errors of maps.
 
@@ -244,44 +244,10 @@ def lost_runs(comparison: Comparison) -> list[str]:
     return said
 
 
-def beside_the_paper(comparison: Comparison) -> str | None:
-    """What ekf-slam used in this log beside the paper's equations, one sentence; None without ekf-slam.
-
-    The table of docs/theory/ekf_slam.md has the same rows.
-    """
-    run = next((run for run in comparison.runs if run.estimator == "ekf-slam"), None)
-    if run is None:
-        return None
-    sequence = comparison.sequence
-    calibration = sequence.calibration
-    params = flattened(run.params)
-    # bridged by accelerometers, which the paper does not do
-    longest_s = float(np.diff(sequence.dvl.stamps_ns).max(initial=0)) * 1e-9
-    is_held = calibration.odometry_interpolation == "hold-past"
-    has_gaps = longest_s > calibration.dvl.gap_s and not is_held
-    additions = {
-        "depth": sequence.depth is not None,
-        "gravity for roll and pitch": calibration.use_gravity,
-        "the plane of the calibration": calibration.planar is not None,
-        "the floor's height": calibration.floor is not None,
-        "headings with Huber's kernel and the compass' bias": sequence.heading
-        is not None,
-        "position fixes with Huber's kernel": sequence.positions is not None,
-        "accelerometers and larger noise where the Doppler log has no sample for long": has_gaps,
-        "far_views": has_gaps and params.get("far_views", False),
-        "gate_probability": params.get("gate_probability", 1.0) < 1.0,
-        "kernel_width": params.get("kernel_width", 0.0) > 0.0,
-    }
-    used = [name for name, is_used in additions.items() if is_used]
-    if not used:
-        return "In this log ekf-slam used nothing beside the paper's equations."
-    return f"Beside the paper's equations ekf-slam used in this log: {', '.join(used)}."
-
-
 def doubt_of_identities(comparison: Comparison) -> list[str]:
     """Warnings, a line each: runs for which no detection has an identity, then runs whose map is wrong.
 
-    With true landmarks a map is wrong where they are not; without, where the sightings contradict it.
+    A map is wrong where it contradicts the true landmarks or, where these are unknown, the sightings.
     """
     lines = []
     blind = {}
@@ -416,7 +382,7 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
 
 
 def _landmarks(ids: Iterable[int]) -> str:
-    """The word and the identities; empty where there are none."""
+    """The word and the identities; empty without identities."""
     ids = list(ids)
     return f"landmark{'s' if len(ids) > 1 else ''} {_listed(ids)}" if ids else ""
 
@@ -525,6 +491,6 @@ def withheld_lines(comparison: Comparison) -> list[str]:
         more = len(run.withheld) - MOST_ROWS_NAMED
         if more > 0:
             lines.append(
-                f"{WARNING}: {run.estimator} withheld {more} more: runs/{run.estimator}/result.json has all"
+                f"{WARNING}: {run.estimator} withheld {more} more: comparison.json has all"
             )
     return lines

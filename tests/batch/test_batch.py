@@ -15,7 +15,7 @@ import pytest
 
 from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch import cluster
-from sonar_graph.batch.batch import Batch, limits_of, run_suite
+from sonar_graph.batch.batch import Batch
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.recorded import is_batch, read_batch
 from sonar_graph.batch.result_table import RESULTS, is_timing
@@ -83,33 +83,6 @@ def statuses_after(batch: Batch) -> Counter[str]:
     """Number of runs by status, after all of them were done."""
     batch.run(HERE, LIMITS, nobody)
     return Counter(str(row["status"]) for row in batch.rows().values())
-
-
-def test_a_run_alone_in_another_folder_gives_the_same_bytes(
-    suite, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(cluster, "run_batch", do_here)
-    whole = run_suite(suite, tmp_path / "whole")
-    key = whole.runs[2].key
-    again = run_suite(suite, tmp_path / "again", only=[key])
-    assert [(run.key, run.status) for run in again.runs] == [(key, "ok")]
-    assert [path.name for path in (tmp_path / "again" / "runs").iterdir()] == [key]
-    for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
-        file = Path("runs", key, "runs", "dead-reckoning", name)
-        assert (tmp_path / "again" / file).read_bytes() == (
-            tmp_path / "whole" / file
-        ).read_bytes()
-    paths = [
-        tmp_path / "whole" / "runs" / run.key / "runs" / "dead-reckoning" / "causal.tum"
-        for run in whole.runs
-    ]
-    assert len({path.read_bytes() for path in paths}) == 4, (
-        "other seeds have other bytes"
-    )
-    with pytest.raises(
-        BatchError, match="none of its 4 runs has the key 0123; keys stand in the"
-    ):
-        run_suite(suite, tmp_path / "again", only=["0123"])
 
 
 def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
@@ -259,7 +232,7 @@ def test_failed_runs_are_kept_until_they_are_discarded(
         )
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
-        batch.discard_failed(batch.runs)
+        batch.discard_failed()
         assert statuses_after(batch) == {"ok": 4}
 
 
@@ -300,14 +273,6 @@ def kill(
     monkeypatch.setattr(cluster, "run_batch", killed)
     with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Killed):
         batch.run(HERE, LIMITS, nobody)
-
-
-def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite):
-    file = read_suite(
-        write_suite(HEADER, "timeout_s = 7\nmemory_mb = 900\n", BASIN, DEAD_RECKONING)
-    )
-    assert limits_of(file, None) == Limits(7.0, 900.0)
-    assert limits_of(file, 3.0) == Limits(3.0, 900.0)
 
 
 @pytest.fixture

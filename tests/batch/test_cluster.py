@@ -128,8 +128,8 @@ def test_failures_are_rows_and_the_exit_code_says_so(
     failing = "".join(
         f'[[estimators]]\nname = "{name}"\n' for name in ("sleeps", "broken", "dies")
     )
-    suite = write_suite(HEADER, BASIN, DEAD_RECKONING, failing)
-    with bench(suite, tmp_path / "out", "--workers", "1", "--timeout", "20") as process:
+    suite = write_suite(HEADER, "timeout_s = 20\n", BASIN, DEAD_RECKONING, failing)
+    with bench(suite, tmp_path / "out", "--workers", "1") as process:
         answer, said = process.communicate(timeout=300)
     assert process.returncode == 1
     assert said == ""

@@ -13,7 +13,7 @@ from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.evaluation.run import run_here
 from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
@@ -143,9 +143,9 @@ def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch
 
     def noted(sequence: Sequence, *given: Any, **named: Any) -> Any:
         used.append(sequence)
-        return run_estimator(sequence, *given, **named)
+        return run_here(sequence, *given, **named)
 
-    monkeypatch.setattr(one_run, "run_estimator", noted)
+    monkeypatch.setattr(one_run, "run_here", noted)
     assert perform(run, tmp_path / "run")["status"] == "ok"
     recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
     expected, other = (
@@ -177,24 +177,3 @@ def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         perform(run, tmp_path / "file")
-
-
-def test_estimator_that_changes_during_a_run_gives_no_result(
-    planned, misbehaving, tmp_path, monkeypatch
-):
-    """It is changed after the first look at its source, and before it runs: it may import more of it only then."""
-    module = tmp_path / "site" / "misbehaving.py"
-    run = planned("prints")
-    assert perform(run, tmp_path / "before")["status"] == "failed"
-
-    def changed_and_run(*given: Any, **named: Any) -> object:
-        with module.open("a") as file:
-            file.write("GAIN = 2\n")
-        return run_estimator(*given, **named)
-
-    monkeypatch.setattr(one_run, "run_estimator", changed_and_run)
-    with pytest.raises(
-        BatchError,
-        match=r"the code changed during a run: estimator_source \w+, planned with ",
-    ):
-        perform(run, tmp_path / "after")

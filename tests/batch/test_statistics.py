@@ -102,24 +102,6 @@ def test_runs_without_a_value_lie_at_the_ends_of_quantiles_and_leave_no_mean():
     assert (short.runs, short.without, short.median) == (4, 1, 3.0)
 
 
-def test_each_quantile_has_the_error_of_its_own_values_and_lost_runs_do_not_take_its_digits():
-    values = np.random.default_rng(15).lognormal(0, 1, 30)
-    told = statistics.summarise(values)
-    assert told.low_error == statistics.quantile_error(values, 0.1) != told.high_error
-    assert (
-        told.high_error == statistics.quantile_error(values, 0.9) != told.median_error
-    )
-    lost = np.append(np.random.default_rng(9).normal(0.2, 0.01, 19), 5000.0)
-    assert statistics.standard_error(lost) > 100
-    assert statistics.summarise(lost).median_error < 0.01
-    assert statistics.paired(lost, np.zeros(20)).median_error < 0.01
-    unknown = np.array([1.0, 2.0, 3.0, 4.0, INF, INF, INF])
-    assert statistics.quantile_error(unknown, 0.5) == pytest.approx(math.sqrt(7) / 2), (
-        "that of the lower side"
-    )
-    assert math.isnan(statistics.quantile_error(unknown, 0.9))
-
-
 def test_failing_where_it_was_worse_makes_nobody_better():
     rng = np.random.default_rng(5)
     reference = rng.normal(1, 0.1, 12)
@@ -186,16 +168,12 @@ def test_pairs_of_one_case_make_one_difference(
     assert (told.median, told.mean) == pytest.approx((median, mean), nan_ok=True)
 
 
-def test_a_mean_difference_is_that_of_the_means_of_cases_and_is_rounded_by_pairs_that_have_a_value():
+def test_a_mean_difference_is_that_of_the_means_of_cases():
     own, reference = np.arange(12.0), np.array([1.0, 0.0] * 6)
     halves = statistics.paired(own, reference, [i // 2 for i in range(12)])
     assert halves == replace(
         statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)),
         each="seed",
-    )
-    lost = np.array([1.0, 2.0, 4.0, 5.0, 7.0, 8.0, INF])
-    assert statistics.paired(lost, np.zeros(7)).rounding_error == pytest.approx(
-        stats.sem(lost[:-1])
     )
 
 
@@ -299,14 +277,10 @@ def test_the_exact_test_is_that_of_all_sign_patterns_and_without_ties_and_zeros_
 def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
     assert statistics.signed_rank_p(np.zeros(8)) == 1.0
     assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
-    assert statistics.signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(
-        statistics.least_p(8)
-    )
-    assert (
-        statistics.signed_rank_p(np.arange(1.0, 7.0))
-        == pytest.approx(statistics.least_p(6))
-        == 2**-5
-    )
+    for pairs in (6, 8):
+        assert statistics.signed_rank_p(np.arange(1.0, 1.0 + pairs)) == 2.0 ** (
+            1 - pairs
+        )
     assert (
         statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
         == 1.0

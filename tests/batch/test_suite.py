@@ -117,7 +117,7 @@ def second(entry: str) -> str:
         (
             log(second(POOL)),
             "# second",
-            "logs.1: 'pool' and 'basin' are the same with seed 0",
+            "logs.1: 'pool', dead-reckoning/default, seed 0: is the same run as 'basin'",
         ),
         (
             end(second(DEAD_RECKONING)),
@@ -127,7 +127,7 @@ def second(entry: str) -> str:
         (
             end(ISAM2 + second(AGAIN)),
             "# second",
-            "estimators.2: isam2/again and isam2/default have the same settings",
+            "estimators.2: 'basin', isam2/again, seed 0: is the same run as 'basin', isam2/default",
         ),
         (log("seeds = [1, 1]\n"), "seeds", "list of different whole numbers"),
         (log("seeds = [-1]\n"), "seeds", "logs.0.seeds: expected the number of seeds"),
@@ -146,9 +146,9 @@ def second(entry: str) -> str:
         (end("params = { lag = 3 }\n"), "lag = 3", "it has: gravity_interval_s"),
         (head("metrics = []\n"), "metrics", "metrics"),
         (
-            head('metrics = ["causal.ate_se3"]\n'),
+            head('metrics = ["causal.ate_ra"]\n'),
             "metrics",
-            "did you mean causal.ate_se3_m?",
+            "did you mean causal.ate_raw_m?",
         ),
         (other('log = "no.mcap"\n'), "no.mcap", "no.mcap is not in"),
         (other('log = "suite.toml"\n'), "suite.toml", "not an MCAP file but a text"),

@@ -105,7 +105,7 @@ def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
     assert "written by native code" in outcome.log
     assert "RuntimeError: diverged" in outcome.log
     assert "Traceback" in outcome.log
-    assert "runs/prints/result.json" in outcome.files
+    assert "runs/prints/series.npz" in outcome.files
     assert "diverged" not in runner.perform(planned(), AMPLE).log
     runner.end()
 

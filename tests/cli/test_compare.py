@@ -13,14 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration
-from sonar_graph.cli.compare import DEMO, check_rate
-from sonar_graph.errors import EvaluationError
+from sonar_graph.cli.compare import DEMO
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import write_log
-from sonar_graph.measurements import NS_PER_S, Dvl, Heading, Imu, PositionFixes
+from sonar_graph.measurements import NS_PER_S, Heading, PositionFixes
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import (
     FASTEST_M_S,
@@ -51,13 +49,7 @@ def test_compare_writes_report_numbers_results_and_runs(compared):
         assert (compared / name).stat().st_size > 1000
     for estimator in ("isam2", "ekf-slam", "dead-reckoning"):
         there = {path.name for path in (compared / "runs" / estimator).iterdir()}
-        assert {"trajectory.tum", "causal.tum", "landmarks.csv", "result.json"} <= there
-        assert (
-            json.loads((compared / "runs" / estimator / "result.json").read_text())[
-                "status"
-            ]
-            == "ok"
-        )
+        assert {"trajectory.tum", "causal.tum", "landmarks.csv"} <= there
 
 
 def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(
@@ -135,18 +127,11 @@ def test_failed_run_is_written_and_reported_by_exit_code(
     )
     assert "the filter is tired" in capsys.readouterr().err
     assert "the filter is tired" in (tmp_path / "report.html").read_text()
-    assert (
-        json.loads((tmp_path / "runs" / "dead-reckoning" / "result.json").read_text())[
-            "status"
-        ]
-        == "failed"
-    )
-    assert (
-        json.loads((tmp_path / "runs" / "ekf-slam" / "result.json").read_text())[
-            "status"
-        ]
-        == "ok"
-    )
+    runs = json.loads((tmp_path / "comparison.json").read_text())["runs"]
+    assert {name: run["status"] for name, run in runs.items()} == {
+        "dead-reckoning": "failed",
+        "ekf-slam": "ok",
+    }
 
 
 def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_log_field_by_field(
@@ -310,29 +295,6 @@ def test_demo_drives_the_three_laps_of_the_paper_with_images():
     assert options.laps == PAPER_LAPS
     assert options.image is not None
     assert cruise_speed(options) < FASTEST_M_S
-
-
-def measured_at(stamps_s: list[float]) -> Sequence:
-    stamps_ns = np.round(np.array(stamps_s) * 1e9).astype(np.int64)
-    vectors = np.zeros((len(stamps_ns), 3))
-    dvl = Dvl(stamps_ns, vectors, np.full((len(stamps_ns), 3, 3), np.nan))
-    return Sequence("dive", Calibration(), Imu(stamps_ns, vectors, vectors), dvl)
-
-
-def test_estimates_are_asked_for_at_most_as_often_as_the_imu_measures_or_at_the_default_rate():
-    dive, slow = (
-        measured_at(np.arange(0, 10.01, 0.05).tolist()),
-        measured_at([0.0, 1.0, 2.0]),
-    )
-    one_row = replace(slow, imu=slow.imu.between(0, 10**9))
-    for rate_hz, sequence in ((20.0, dive), (2.0, slow), (2.0, one_row)):
-        check_rate(rate_hz, sequence)
-    with pytest.raises(
-        EvaluationError, match=r"--rate-hz 21: the IMU of dive .* at most 20\.1"
-    ):
-        check_rate(21.0, dive)
-    with pytest.raises(EvaluationError, match=r"give at most 2$"):
-        check_rate(3.0, slow)
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"

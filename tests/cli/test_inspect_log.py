@@ -8,7 +8,6 @@ import pytest
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.evaluation import comparison
 from sonar_graph.logs.inspection import LogSummary
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -105,23 +104,6 @@ def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
     assert "--toml > log.toml" in advice
 
 
-def test_inspect_and_compare_say_what_a_large_log_takes(
-    run, basin, tmp_path, monkeypatch, capsys
-):
-    words = "compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning"
-    assert run("inspect", basin) == run(*words) == 0
-    assert "for each estimator" not in "".join(capsys.readouterr())
-    monkeypatch.setattr(comparison, "LONG_S", 0.0)
-    assert run("inspect", basin) == run(*words) == 0
-    told = capsys.readouterr()
-    assert re.search(
-        r"^large for each estimator: \d+ IMU rows, about 0 min; \d+ detections, .*; 4 landmark identities",
-        told.out,
-        re.MULTILINE,
-    )
-    assert re.search(r"^A large log, for each estimator: \d+ IMU rows, ", told.err)
-
-
 def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
     run, basin, monkeypatch, capsys
 ):
@@ -137,6 +119,6 @@ def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
 
 def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
     log = tmp_path / "victoria_park.mcap"
-    assert run("convert", "victoria-park", "-o", log) == 0
+    assert run("convert", "dataset", "victoria-park", "-o", log) == 0
     assert "3640 landmark detections" in capsys.readouterr().out
     assert run("inspect", log) == 0

@@ -178,7 +178,7 @@ def test_files_without_common_time_are_refused_with_the_offset_that_would_make_b
     assert run("join", far, both[1], "-o", out) == 2
     (line,) = capsys.readouterr().err.splitlines()
     found = re.search(
-        r"far\.mcap: \d+ s from .* on; .*nav\.mcap: \d+ s from .*: no common time; .* \(\+(\d+\.\d+) makes",
+        r"far\.mcap: \d.* s; .*nav\.mcap: \d.* s: no common time; .* \(\+(\d+\.\d+) makes",
         line,
     )
     assert found
@@ -191,12 +191,13 @@ def test_files_without_common_time_are_refused_with_the_offset_that_would_make_b
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
-def test_a_file_of_a_sonar_is_converted_and_what_cannot_tell_must_be_stated(
+def test_an_offset_that_few_images_cannot_show_must_be_stated(
     both, run, tmp_path, capsys
 ):
-    recorded = tmp_path / "dive.aris"
-    recorded.write_bytes(Aris(images(6, 128, 300)).content())
-    first_ns = next(read_sonar_frames(converted(run, recorded))).stamps_ns[0]
+    file = tmp_path / "dive.aris"
+    file.write_bytes(Aris(images(6, 128, 300)).content())
+    recorded = converted(run, file)
+    first_ns = next(read_sonar_frames(recorded)).stamps_ns[0]
     offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
     out = tmp_path / "joined.mcap"
     assert (
@@ -220,10 +221,6 @@ def test_a_file_of_a_sonar_is_converted_and_what_cannot_tell_must_be_stated(
     assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
     assert "as stated; the images do not determine" in capsys.readouterr().out
     assert sum(len(block) for block in read_sonar_frames(out)) == 6
-    assert run("join", tmp_path / "dive.raw", both[1], "-o", out) == 2
-    (tmp_path / "dive.raw").write_bytes(b"x")
-    assert run("join", tmp_path / "dive.raw", both[1], "-o", out) == 2
-    assert "expected an .mcap, .aris or .ddf file" in capsys.readouterr().err
 
 
 def converted(run, recorded: Path) -> Path:

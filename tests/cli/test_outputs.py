@@ -32,10 +32,7 @@ def links(target: Path, folder: Path) -> list[Path]:
     return [symbolic, hard]
 
 
-CONVERSIONS = [
-    f"convert {kind}"
-    for kind in ("rosbag", "didson", "aris", "oculus", "victoria-park --file")
-]
+CONVERSIONS = [f"convert {kind}" for kind in ("rosbag", "didson", "aris", "oculus")]
 
 
 @pytest.mark.parametrize("flags", [(), ("--overwrite",)])
@@ -153,7 +150,7 @@ def test_what_another_program_wrote_is_replaced_only_when_asked_for(
     )
     log.write_bytes(before)
     for command in (
-        ("convert", "victoria-park"),
+        ("convert", "dataset", "victoria-park"),
         ("simulate", "basin", "--duration-s", "120", "--laps", "1"),
     ):
         assert run(*command, "-o", log) == 2
@@ -161,7 +158,7 @@ def test_what_another_program_wrote_is_replaced_only_when_asked_for(
             r"sonar-graph: .*did not write it; .*--overwrite\n", capsys.readouterr().err
         )
         assert log.read_bytes() == before
-    assert run("convert", "victoria-park", "-o", log, "--overwrite") == 0
+    assert run("convert", "dataset", "victoria-park", "-o", log, "--overwrite") == 0
     assert log.read_bytes() != before
 
 
@@ -172,14 +169,14 @@ def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothi
     log.touch()  # an empty file holds nothing to lose
     for told in ("", f"Replaces {log}\n"):
         capsys.readouterr()
-        assert run("convert", "victoria-park", "-o", log) == 0
+        assert run("convert", "dataset", "victoria-park", "-o", log) == 0
         assert capsys.readouterr().err == told
         assert (
             run("simulate", "basin", "--duration-s", "120", "--laps", "1", "-o", log)
             == 0
         )
     (tmp_path / "link.mcap").symlink_to(tmp_path / "missing.mcap")
-    assert run("convert", "victoria-park", "-o", tmp_path / "link.mcap") == 0
+    assert run("convert", "dataset", "victoria-park", "-o", tmp_path / "link.mcap") == 0
     assert (tmp_path / "link.mcap").stat().st_size > 0
 
 
@@ -215,13 +212,12 @@ def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_
 
 OURS = [
     "recognised/1.jpg",
-    "runs/dead-reckoning/result.json",
     "report.html",
     "comparison.json",
 ]
 THEIRS = [
     "recognised/mine.jpg",
-    "runs/mine/result.json",
+    "runs/mine/series.npz",
     ".log.mcap.partial",
     ".partial-log.mcap",
     "log.mcap.part",
@@ -245,5 +241,5 @@ def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
         assert (
             f"holds {ours}, which sonar-graph did not write" in capsys.readouterr().err
         ) == bool(ours)
-    assert run("convert", "victoria-park", "-o", folder / "log.mcap") == 0
+    assert run("convert", "dataset", "victoria-park", "-o", folder / "log.mcap") == 0
     assert {path.read_text() for path in mine} == {"mine"}

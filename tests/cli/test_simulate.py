@@ -105,9 +105,10 @@ def test_simulation_flags_and_settings_reach_the_simulator(
         7,
         "--laps",
         2,
-        "--imu",
-        "mti1",
-        "--no-bias",
+        "--set",
+        "imu=mti1",
+        "--set",
+        "gyro_bias_scale=0.0",
         "--set",
         "wrong_id_rate=0.05",
     )

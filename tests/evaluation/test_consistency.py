@@ -1,20 +1,14 @@
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
-from scipy.spatial.transform import Rotation
-from scipy.stats import binned_statistic, chi2
+from scipy.stats import chi2
 
-from sonar_graph.calibration import Calibration, Mounting, SonarCalibration
 from sonar_graph.evaluation import consistency
 from sonar_graph.evaluation.results import Score
-from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
-from sonar_graph.sequence import Sequence
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, Outcome, Trajectory
 
 angles = st.floats(-3.0, 3.0)
 tilts = st.floats(-1.2, 1.2)
@@ -145,116 +139,6 @@ def test_nis_takes_used_detections_only():
         np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), []
     )
     assert consistency.nis(empty).shape == (0,)
-
-
-@given(st.integers(1, 200), st.integers(0, 2**32 - 1))
-def test_bins_are_those_of_another_implementation(n, seed):
-    rng = np.random.default_rng(seed)
-    confidence, right = rng.uniform(0, 1, n), rng.integers(0, 2, n).astype(float)
-    found = consistency.reliability(confidence, right)
-    means = [
-        binned_statistic(confidence, v, "mean", 10, (0, 1)).statistic
-        for v in (confidence, right)
-    ]
-    count = binned_statistic(confidence, right, "count", 10, (0, 1)).statistic
-    np.testing.assert_array_equal(found.count, count)
-    np.testing.assert_allclose([found.confidence, found.right], means)
-    expected = sum(
-        k / n * abs(c - r) for k, c, r in zip(count, *means, strict=True) if k
-    )
-    assert found.expected_error == pytest.approx(expected)
-
-
-MOUNTING = Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.5, 0.1))
-LANDMARKS_M = np.array([[3.0, 0.5, -1.0], [5.0, -2.0, -1.1]])
-IDS = np.array([11, 7])
-STILL_NS = np.array([0, 10**9])
-
-
-def turning_truth() -> Trajectory:
-    stamps_ns = np.arange(11) * 10**8
-    yaw = Rotation.from_euler(
-        "ZYX",
-        np.column_stack([0.3 * np.arange(11), 0.02 * np.arange(11), np.zeros(11)]),
-    )
-    positions = np.column_stack([0.1 * np.arange(11), np.zeros(11), np.full(11, -0.5)])
-    return Trajectory.without_covariances(stamps_ns, positions, yaw.as_quat())
-
-
-def seen_at(stamp_ns: int, point: np.ndarray) -> tuple[float, float]:
-    """Range and azimuth of a world point, with transforms written out."""
-    truth = turning_truth()
-    row = truth.stamps_ns.tolist().index(stamp_ns)
-    in_body = truth.rotations()[row].inv().apply(point - truth.positions[row])
-    q = (
-        Rotation.from_euler("ZYX", [0.1, 0.5, 0.0])
-        .inv()
-        .apply(in_body - [0.3, 0.1, -0.1])
-    )
-    return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))
-
-
-def run_with(
-    rows: list[tuple[int, float, float]], named: list[int], probability: list[float]
-) -> Sequence:
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    ids, probabilities = np.array(named)[:, None], np.array(probability)[:, None]
-    detections = LandmarkDetections(
-        *columns, np.zeros((len(rows), 2, 2)), ids, probabilities
-    )
-    return Sequence(
-        "hand",
-        Calibration(sonar=SonarCalibration(mounting=MOUNTING)),
-        imu=Imu(STILL_NS, np.zeros((2, 3)), np.zeros((2, 3))),
-        dvl=Dvl(STILL_NS, np.zeros((2, 3)), np.full((2, 3, 3), np.nan)),
-        detections=detections,
-        truth=turning_truth(),
-        true_landmarks=LandmarkMap(IDS, LANDMARKS_M, np.full((2, 3, 3), np.nan)),
-    )
-
-
-def test_a_detection_is_of_the_landmark_that_lies_there():
-    """Two stamps, detections 10 cm off, 25 cm off (cannot be told) and 60 cm off (none)."""
-    rows = []
-    for stamp_ns, landmark in ((2 * 10**8, 0), (6 * 10**8, 1)):
-        r, a = seen_at(stamp_ns, LANDMARKS_M[landmark])
-        off = (0.1, 0.0), (0.0, 0.1 / r), (0.25, 0.0), (0.0, 0.6 / r)
-        rows += [(stamp_ns, r + along, a + turn) for along, turn in off]
-    run = run_with(rows, [0] * 8, [1.0] * 8)
-    labels = consistency.true_identities(run, run.detections)
-    neither = [consistency.UNJUDGED, consistency.NONE]
-    assert labels.tolist() == [11, 11, *neither, 7, 7, *neither]
-
-
-def test_azimuths_are_compared_round_the_circle_and_what_lies_outside_the_truth_is_not_judged():
-    r, a = seen_at(0, LANDMARKS_M[0])
-    rows = [
-        (-5, r, a),
-        (0, r, a),
-        (0, r, a - 2 * np.pi),
-        (0, r, a + np.pi),
-        (10**9, r, a),
-        (10**9 + 1, r, a),
-    ]
-    run = run_with(rows, [0] * 6, [1.0] * 6)
-    labels = consistency.true_identities(run, run.detections)
-    assert labels[[0, 5]].tolist() == [consistency.UNJUDGED] * 2
-    assert labels[1:4].tolist() == [11, 11, consistency.NONE]
-    early = run_with([(-5, r, a)], [0], [1.0])
-    assert consistency.true_identities(early, early.detections).tolist() == [
-        consistency.UNJUDGED
-    ]
-    assert consistency.reliability_of(early) is None
-
-
-def test_nothing_is_judged_without_truth():
-    r, a = seen_at(0, LANDMARKS_M[0])
-    run = run_with([(0, r, a)], [11], [0.9])
-    assert consistency.reliability_of(run) is not None
-    for missing in ("detections", "truth", "true_landmarks"):
-        assert consistency.reliability_of(replace(run, **{missing: None})) is None, (
-            missing
-        )
 
 
 def test_planar_nees_ignores_height():

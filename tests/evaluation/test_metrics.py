@@ -70,11 +70,6 @@ def test_ate_agrees_with_evo(seed):
     )
     raw = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), as_evo(estimate))
     assert metrics.ate_raw_m(estimate, truth) == pytest.approx(raw, abs=1e-9)
-    aligned = as_evo(estimate)
-    aligned.align(as_evo(truth))
-    se3 = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), aligned)
-    assert metrics.ate_se3_m(estimate, truth) == pytest.approx(se3, abs=1e-9)
-    assert se3 < raw / 2
 
 
 def flat(trajectory: Trajectory) -> Trajectory:
@@ -131,7 +126,7 @@ def line(yaws: list[float], positions: list[list[float]]) -> Trajectory:
 
 
 def test_errors_by_hand():
-    """Height, which the plane leaves out; the displacement from start to end; yaw across half a turn."""
+    """Height, which the plane leaves out; yaw across half a turn."""
     truth = line([0.0] * 4, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     estimate = line([0.0] * 4, [[0, 0, 1], [1, 0, 1], [1, 1, -1], [0, 1, -1]])
     assert metrics.ate_raw_m(estimate, truth) == pytest.approx(1.0)
@@ -139,7 +134,6 @@ def test_errors_by_hand():
     assert metrics.ate_se2_m(estimate, truth) == pytest.approx(0.0, abs=1e-12)
     truth = line([np.pi - 0.01] * 3, [[0, 0, 0], [5, 0, 0], [0, 0, 0]])
     estimate = line([-np.pi + 0.02] * 3, [[1, 1, 0], [9, 9, 9], [1.3, 1.4, 0]])
-    assert metrics.return_error_m(estimate, truth) == pytest.approx(0.5)
     np.testing.assert_allclose(
         metrics.yaw_errors_rad(estimate, truth), [0.03] * 3, atol=1e-12
     )

@@ -77,20 +77,17 @@ def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path):
         comparison, replace(comparison.runs[0], withheld=["landmark 3; open: z"])
     )
     write_comparison(comparison, tmp_path)
-    for path, entry in (
-        (tmp_path / "comparison.json", lambda content: content["runs"]["isam2"]),
-        (tmp_path / "runs" / "isam2" / "result.json", lambda content: content),
-    ):
-        told = entry(json.loads(path.read_text()))["refused"]
-        expected = {
-            "sensor": "dvl",
-            "reason": Refusal.OUTLIER.value,
-            "count": 8,
-            "first_ns": 0,
-            "last_ns": 7 * NS,
-        }
-        assert told[0] == {**expected, "least_and_largest_distance": [50.0, 57.0]}
-        assert told[1]["least_and_largest_distance"] is None
+    content = json.loads((tmp_path / "comparison.json").read_text())
+    told = content["runs"]["isam2"]["refused"]
+    expected = {
+        "sensor": "dvl",
+        "reason": Refusal.OUTLIER.value,
+        "count": 8,
+        "first_ns": 0,
+        "last_ns": 7 * NS,
+    }
+    assert told[0] == {**expected, "least_and_largest_distance": [50.0, 57.0]}
+    assert told[1]["least_and_largest_distance"] is None
     restored = read_comparison(tmp_path)
     assert [run.withheld for run in restored.runs] == [["landmark 3; open: z"], [], []]
     for run, again in zip(comparison.runs, restored.runs, strict=True):

@@ -91,9 +91,6 @@ def test_json_is_strict_and_tells_units_and_protocol(folder):
     assert score["unit"] == "m"
     assert "not aligned" in score["protocol"]
     assert index["runs"]["offset"]["params"]["offset_m"] == 0.4
-    assert index["runs"]["offset"]["errors"]["causal"]["rms_xyz_m"] == pytest.approx(
-        [0.0, 0.4, 0.0]
-    )
     assert index["runs"]["broken"]["status"] == "failed"
     assert "diverged" in index["runs"]["broken"]["reason"]
 
@@ -102,25 +99,15 @@ def test_folder_holds_what_other_tools_read_without_code_and_of_a_failed_run_onl
     folder,
 ):
     good, failed = folder / "runs" / "offset", folder / "runs" / "broken"
-    files = "causal.tum", "landmarks.csv", "result.json", "series.npz", "trajectory.tum"
+    files = "causal.tum", "landmarks.csv", "series.npz", "trajectory.tum"
     assert tuple(sorted(path.name for path in good.iterdir())) == files
-    assert sorted(path.name for path in failed.iterdir()) == [
-        "result.json",
-        "series.npz",
-    ]
+    assert [path.name for path in failed.iterdir()] == ["series.npz"]
     causal = file_interface.read_tum_trajectory_file(good / "causal.tum")
     smoothed = file_interface.read_tum_trajectory_file(good / "trajectory.tum")
     np.testing.assert_allclose(causal.positions_xyz[:, 1], 0.4)
     np.testing.assert_allclose(smoothed.positions_xyz[:, 1], 0.2)
     landmarks = (good / "landmarks.csv").read_text("utf-8").splitlines()
     assert [row.split(",")[0] for row in landmarks] == ["id", "7", "9", "20"]
-    result = json.loads((good / "result.json").read_text("utf-8"))
-    assert result["params"]["offset_m"] == 0.4
-    assert result["environment"]["gtsam"]
-    assert result["timings"]["update_median_ms"] > 0
-    assert (
-        "diverged" in json.loads((failed / "result.json").read_text("utf-8"))["reason"]
-    )
     for path in folder.rglob("*.npz"):
         with zipfile.ZipFile(path) as archive:
             for name in archive.namelist():

@@ -32,7 +32,7 @@ def test_a_record_that_is_there_is_not_written_over(tmp_path, capsys):
     (tmp_path / "record.mcap").write_bytes(b"precious")
     code, line = said(capsys, "live", "-o", tmp_path)
     assert code == 2
-    assert "--resume" in line
+    assert "name another folder" in line
     assert (tmp_path / "record.mcap").read_bytes() == b"precious"
 
 
@@ -100,8 +100,10 @@ def test_the_status_has_sigmas_along_the_axes_of_the_world():
 
 
 @pytest.mark.slow
-def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_path):
-    """With both ends as commands: play, live, SIGKILL, live --resume, Ctrl-C, run."""
+def test_a_live_run_equals_the_run_on_its_record_and_a_killed_one_has_a_record(
+    tmp_path,
+):
+    """With both ends as commands: play, live, SIGKILL, live, Ctrl-C, run."""
     world = simulate_mission(MissionOptions(duration_s=40.0, frame_rate_hz=5.0))
     write_log(tmp_path / "log.mcap", world)
     where, go = free_endpoint(), tmp_path / "go"
@@ -109,20 +111,14 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
         [*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go]
     )
     time.sleep(3.0)
+    options = ("--calibration", str(tmp_path / "log.mcap"))
     try:
-        live = begun(
-            tmp_path / "first", where, "--calibration", str(tmp_path / "log.mcap")
-        )
+        killed = begun(tmp_path / "first", where, *options)
+        live = begun(tmp_path / "second", where, *options)
         go.touch()
         time.sleep(12.0)
-        live.kill()
-        live.communicate()
-        live = begun(
-            tmp_path / "second",
-            where,
-            "--resume",
-            str(tmp_path / "first" / "record.mcap"),
-        )
+        killed.kill()
+        killed.communicate()
         assert player.wait(120) == 0
         time.sleep(1.0)
         live.send_signal(signal.SIGINT)
@@ -133,12 +129,12 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
     assert re.search(r"\d s \| x .* ± .* landmarks, .* latency \d+ ms", output)
     assert "report.html" in output
     assert (tmp_path / "second" / "report.html").is_file()
+    assert read_log(tmp_path / "first" / "record.mcap").duration_s > 5.0
     done = subprocess.run(
         [*COMMAND, "run", tmp_path / "second/record.mcap", "-o", tmp_path / "again"],
         check=False,
     )
-    # 3: a record that begins late is doubted, since the start that is stated is of the log's beginning
-    assert done.returncode in (0, 3)
+    assert done.returncode == 0
     for name in ("causal.tum", "trajectory.tum", "landmarks.csv"):
         mine, theirs = (
             (tmp_path / folder / "runs/isam2" / name).read_bytes()
@@ -146,16 +142,6 @@ def test_a_live_run_that_is_killed_and_resumed_equals_the_run_on_its_record(tmp_
         )
         assert mine == theirs
         assert mine.count(b"\n") > 5
-    calibrations = [
-        read_log(tmp_path / folder / "record.mcap").calibration
-        for folder in ("first", "second")
-    ]
-    assert calibrations[0] == calibrations[1]
-    assert (
-        calibrations[1].start.position_m
-        == world.calibration.start.position_m
-        != (0.0, 0.0, 0.0)
-    )
 
 
 def begun(folder, where, *options):

@@ -1,6 +1,5 @@
 """The page of a batch: figures with their data, explanations, the runs that are missing, and panels for each log."""
 
-import base64
 import csv
 import io
 import re
@@ -44,37 +43,7 @@ def html(batch) -> str:
     return render_batch(batch)
 
 
-def test_every_figure_has_its_data(html, batch):
-    figures = re.findall(r'<figure id="figure-([^"]+)"', html)
-    addresses = dict(
-        re.findall(r'href="(data:text/csv[^"]+)" download="([^"]+)\.csv"', html)
-    )
-    by_name = {name: address for address, name in addresses.items()}
-    assert {
-        "failures",
-        "spread-ate-se2-m",
-        "difference-ate-se2-m",
-        "anees-position",
-        "costs",
-    } <= set(figures)
-    assert set(figures) <= set(by_name)
-    text = base64.b64decode(
-        by_name["spread-ate-se2-m"].partition("base64,")[2]
-    ).decode()
-    rows = list(csv.DictReader(io.StringIO(text)))
-    recorded = {
-        (run.key, key): run.value(key)
-        for run in batch.runs
-        for key in (ATE, "smoothed.ate_se2_m")
-    }
-    assert {(row["key"], row["column"]) for row in rows} == set(recorded)
-    assert all(
-        float(row["value"] or "inf") == recorded[row["key"], row["column"]]
-        for row in rows
-    )
-
-
-@pytest.mark.parametrize("count", [1])
+@pytest.mark.parametrize("count", [1, 3])
 def test_few_runs_and_runs_that_all_failed_make_a_page(count):
     batch = drawn_batch(count, logs=LOGS[:1])
     html = render_batch(batch)
@@ -184,7 +153,7 @@ def test_page_and_tables_say_how_many_runs_are_missing_whose_where_and_how_to_go
     )
     assert first < html.index("<table")
     assert "that was done ended well" not in html, "one did not"
-    assert {path.suffix for path in (tmp_path / "tables").iterdir()} == {".csv", ".tex"}
+    assert {path.suffix for path in (tmp_path / "tables").iterdir()} == {".csv"}
     for path in (tmp_path / "tables").glob("*.tex"):
         assert "Not complete: 14 of 60 runs have not been done." in path.read_text(
             "utf-8"
@@ -225,33 +194,18 @@ def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
     assert lost_told(batch) == []
 
 
-@pytest.mark.parametrize(
-    ("logs", "shape"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (4, (2, 3)), (9, (3, 3))]
-)
-def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_headings(
-    logs, shape
-):
-    names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(logs))
-    batch = drawn_batch(1, logs=names)
+def test_logs_stand_below_each_other_with_the_names_of_contestants_at_the_left():
+    names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(4))
     with sized(PAGE_WIDTH_IN):
-        figure, panels = log_panels(batch, list(names), "error (m)")
-    headings = [panel.get_title(loc="left") for panel in panels]
-    assert [heading.replace("\n", " ") for heading in headings] == list(names)
-    assert ["\n" in heading for heading in headings] == [logs > 2] * logs
-    grid = panels[0].get_subplotspec().get_gridspec()
-    assert (len(figure.axes), figure.get_figwidth(), (grid.nrows, grid.ncols)) == (
-        logs,
-        PAGE_WIDTH_IN,
-        shape,
-    )
-    shown = [
-        [label.get_text() for label in panel.get_yticklabels()] for panel in panels
-    ]
-    assert shown == [
-        [""] * 3 if place % shape[1] else batch.contestants for place in range(logs)
-    ]
-    colours = [label.get_color() for label in panels[0].get_yticklabels()]
-    assert colours == [colour(place) for place in range(3)]
-    assert len(set(colours)) == 3
-    bottom, top = panels[0].get_ylim()
-    assert top < 0 < 2 < bottom, "the first contestant is on top"
+        figure, panels = log_panels(
+            drawn_batch(1, logs=names), list(names), "error (m)"
+        )
+    assert [panel.get_title(loc="left") for panel in panels] == list(names)
+    for panel in panels:
+        labels = panel.get_yticklabels()
+        assert [label.get_text() for label in labels] == list(ESTIMATORS)
+        assert [label.get_color() for label in labels] == [colour(k) for k in range(3)]
+    figure.draw_without_rendering()
+    lows = [panel.get_tightbbox().y0 for panel in panels]
+    highs = [panel.get_tightbbox().y1 for panel in panels]
+    assert all(low >= high for low, high in zip(lows, highs[1:], strict=False))

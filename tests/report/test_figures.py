@@ -45,11 +45,6 @@ FIGURES = {
     figures.yaw_figure: ({TIME}, {"yaw (°)"}),
     figures.nees_figure: ({TIME}, {"position NEES / dof", "yaw NEES / dof"}),
     figures.innovation_figure: ({TIME}, {"range (m)", "azimuth (°)"}),
-    figures.nis_figure: ({"NIS"}, {"detections (%)"}),
-    figures.timing_figure: (
-        {"duration of an update (ms)"},
-        {"updates (%)"},
-    ),
 }
 """Every figure, with the labels of its axes."""
 

@@ -9,7 +9,7 @@ from sonar_graph.report.landmark_table import (
     landmark_table,
     landmarks_left_out,
 )
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import LandmarkMap
 from sonar_graph.table import ABSENT
 from tests.synthetic import basin_comparison, only, with_run
 
@@ -112,26 +112,3 @@ def test_totals_are_the_scores_of_all_landmarks():
         "no map, no table"
     )
     assert landmark_table(by_hand(mapped(), mapped((1, 0.0, 0.0)))) is None
-
-
-@pytest.mark.parametrize("begins_later", [0, 3])
-def test_the_return_is_told_against_the_truth_at_the_runs_own_ends(begins_later):
-    """A path that keeps a distance from the truth returns as the truth does; one that drifts by 0.3 m does not."""
-    comparison = repeated()
-    truth = comparison.sequence.truth
-    path = truth.rows(slice(begins_later, None))
-    for drift_m, difference in ((0.0, "(0.000)"), (0.3, "(0.300)")):
-        away = path.positions + np.linspace(
-            [0.5, 0.5, 0.0], [0.5 + drift_m, 0.5 + drift_m, 0.0], len(path)
-        )
-        moved = Trajectory.without_covariances(
-            path.stamps_ns, away, path.quaternions_xyzw
-        )
-        *_, x_row, y_row = rows_of(
-            with_run(comparison, replace(comparison.runs[0], causal=moved))
-        )
-        way = away[-1] - away[0]
-        true = path.positions[-1] - path.positions[0]
-        for axis, row in enumerate((x_row, y_row)):
-            assert row[1] == f"{true[axis]:.3f}".replace("-0.000", "0.000")
-            assert row[2] == f"{way[axis]:.3f} {difference}".replace("-0.000", "0.000")

@@ -195,7 +195,7 @@ def test_a_page_can_be_read_without_seeing_it(page, kind):
     assert all(deeper - level <= 1 for level, deeper in pairwise(levels))
     assert all(attrs.get("scope") for attrs in page.named("th"))
     assert all(len(attrs["aria-label"] or "") > 40 for attrs in page.named("svg"))
-    assert len(page.named("svg")) == {"comparison": 13, "batch": 9}[kind]
+    assert len(page.named("svg")) == {"comparison": 11, "batch": 3}[kind]
     scrolling = [attrs for attrs in page.named("div") if attrs.get("class") == "scroll"]
     assert all(
         attrs.get("aria-label") and attrs.get("tabindex") == "0" for attrs in scrolling

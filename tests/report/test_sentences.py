@@ -11,12 +11,11 @@ import pytest
 from rich.console import Console
 
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
-from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
 from sonar_graph.measurements import Heading
 from sonar_graph.report import sentences
 from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.console import published_counterpart, summary
+from sonar_graph.report.console import summary
 from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.states import (
     FIRST_ANONYMOUS_ID,
@@ -101,20 +100,6 @@ def test_a_nees_is_marked_outside_its_interval_and_never_without(
     assert shown in row
     assert any(mark in shown for mark in "▲▼") or not re.search(f"{shown} [▲▼]", row)
     assert "▲ over-confident, ▼ over-cautious" in text
-
-
-def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of_the_report():
-    comparison = basin_comparison(60)
-    assert published_counterpart(comparison) is None
-    same = replace(
-        comparison,
-        sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]),
-    )
-    text, table = printed(same, 80, published_counterpart(same)), landmark_table(same)
-    assert "…" not in text
-    for row in table.rows:
-        assert all(cell.text in text for cell in row[1:])
-    assert "dead-reckoning x" not in text
 
 
 def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does():
@@ -432,7 +417,7 @@ def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_n
         with_run(calm, replace(calm.runs[0], withheld=messages))
     )
     assert len(lines) == MOST_ROWS_NAMED + 1
-    assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
+    assert lines[-1] == "Warning: isam2 withheld 2 more: comparison.json has all"
     assert sentences.withheld_lines(calm) == []
 
 

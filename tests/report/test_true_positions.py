@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from baselines.dead_reckoning import DeadReckoning
 from sonar_graph.evaluation import (
     compare,
-    run_estimator,
     write_comparison,
     write_viewer_files,
 )
@@ -53,22 +51,3 @@ def test_nothing_about_a_true_heading_is_written(tmp_path):
         for t in m.transforms
     )
     assert np.isnan(comparison.sequence.truth.quaternions_xyzw).all()
-
-
-def test_headings_and_fixes_that_an_estimator_never_asks_for_are_named(monkeypatch):
-    world = aided_world()
-    unaided = replace(world, heading=None, positions=None)
-    process = DeadReckoning.process
-
-    def looking(self, measurements):
-        assert measurements.heading is None or len(measurements.heading)
-        return process(self, measurements)
-
-    monkeypatch.setattr(DeadReckoning, "process", looking)
-    fixes = "positions: none of its 21 rows is used; this estimator takes no positions"
-    assert run_estimator(world, "dead-reckoning").withheld == [fixes]
-    assert run_estimator(unaided, "dead-reckoning").withheld == []
-    assert [
-        run_estimator(world, name).withheld
-        for name in ("ekf-slam", "invariant-ekf", "isam2")
-    ] == [[]] * 3

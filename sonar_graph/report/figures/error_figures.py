@@ -1,4 +1,4 @@
-"""Figures of paths over time: errors, their bounds, the place on the own map, heading and NEES.
+"""Figures of paths over time: errors, their bounds, heading and NEES.
 
 Each is a pure function to a matplotlib figure, None where there is nothing to draw. Estimators keep their colour in all
 figures. Angles are drawn in degrees. Runs share their axes; one whose errors are far larger leaves the picture, because
@@ -12,13 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sonar_graph.evaluation import (
-    Comparison,
-    ErrorSeries,
-    RunResult,
-    own_map_errors,
-    yaw_rad,
-)
+from sonar_graph.evaluation import Comparison, ErrorSeries, RunResult, yaw_rad
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
@@ -87,7 +81,7 @@ def distance_m(run: RunResult, errors: ErrorSeries) -> Floats:
 
 
 def shared_limit(sizes: list[Floats]) -> float:
-    """The largest error that runs show on a common axis: of all, or `LARGER` times that of the best run."""
+    """Upper end of a common axis: the largest error of all runs, at most `LARGER` times that of the best run."""
     # a run without an error of this kind has NaN throughout
     largest = [
         float(np.nanmax(values)) for values in sizes if np.isfinite(values).any()
@@ -96,7 +90,7 @@ def shared_limit(sizes: list[Floats]) -> float:
 
 
 def errors_cut_off(comparison: Comparison) -> list[str]:
-    """Names of runs of which an error leaves the picture."""
+    """Names of runs with an error that leaves the picture."""
     series = _causal_errors(comparison)
     largest = np.array(
         [
@@ -156,29 +150,6 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
     for panel, last, index in zip(axes[0], axes[-1], series, strict=True):
         style.head_panel(panel, comparison.runs[index].estimator, style.colour(index))
         last.set_xlabel(style.TIME_LABEL)
-    return figure
-
-
-def own_map_figure(comparison: Comparison) -> Figure | None:
-    """Causal position error of each run on the map that it had at that instant."""
-    found = {}
-    for index, errors in _causal_errors(comparison).items():
-        run = comparison.runs[index]
-        # at instants at which the map was kept
-        series = own_map_errors(run, comparison.sequence, errors.stamps_ns)
-        if len(series[0]):
-            found[index] = series
-    if not found:
-        return None
-    figure, panel = style.one_panel()
-    for index, (stamps_ns, errors_m) in found.items():
-        seconds = style.seconds_since_start(comparison, stamps_ns)
-        look = style.run_look(index, 1.3) | {"marker": "o", "markersize": 3.5}
-        name = comparison.runs[index].estimator
-        panel.plot(seconds, errors_m, label=name, **look)
-    panel.set_ylim(bottom=0.0)
-    panel.set(xlabel=style.TIME_LABEL, ylabel="own-map error (m)")
-    style.legend_above(figure, panel)
     return figure
 
 

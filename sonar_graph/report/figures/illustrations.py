@@ -45,8 +45,6 @@ class Drawing:
     caption: str = ""
     instead: str = "No run has a path to draw."
     """Sentence where there is nothing to draw."""
-    scores: tuple[str, ...] = ()
-    """Keys of scores that are read out for who does not see the figure."""
     columns: int = 2
     """Columns of a journal that it fills, of two."""
     is_aligned_too: bool = False
@@ -68,7 +66,6 @@ DRAWINGS = {
         "Horizontal distance of the causal position from the truth{and_heading}, {world}. "
         "Left: over time. Right: over the distance travelled.{cut}",
         "{no_errors}",
-        ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
         is_aligned_too=True,
     ),
     "bounds": Drawing(
@@ -76,21 +73,11 @@ DRAWINGS = {
         error_figures.bounds_figure,
         "Causal estimate minus truth, {world}. The shaded band should hold 95 % of the errors. Rows share their scale.",
         "{no_errors}",
-        ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
         is_aligned_too=True,
-    ),
-    "own_map": Drawing(
-        "Where am I on my map?",
-        error_figures.own_map_figure,
-        "Horizontal error of the causal position, aligned by the map of that instant to the true landmarks.",
-        "No run has a map of three true landmarks while the truth is known.",
-        ("causal.own_map_m",),
-        columns=1,
     ),
     "yaw": Drawing(
         "Yaw over time",
         error_figures.yaw_figure,
-        scores=("causal.yaw_rmse_rad",),
         columns=1,
     ),
     "nees": Drawing(
@@ -99,7 +86,6 @@ DRAWINGS = {
         "NEES of the causal estimates per degree of freedom, {world}. Dots are instants, lines are means over a "
         "fortieth of the run. The band holds 95 % of a consistent estimator's values.",
         "{no_errors} NEES needs them.",
-        ("causal.nees_position", "causal.nees_yaw"),
         columns=1,
     ),
     "innovations": Drawing(
@@ -107,22 +93,6 @@ DRAWINGS = {
         detection_figures.innovation_figure,
         "Measured minus predicted range and azimuth. Long runs show an even choice, with the extremes.",
         "No run reports innovations.",
-    ),
-    "nis": Drawing(
-        "Distribution of NIS",
-        detection_figures.nis_figure,
-        "NIS of used detections. Right of the grey curve, innovations are larger than predicted.",
-        "No run reports innovations with their covariances.",
-        ("detections.nis",),
-        columns=1,
-    ),
-    "timing": Drawing(
-        "Time per update",
-        detection_figures.timing_figure,
-        "Share of updates that took at most this time. Dots: median and 99th percentile.",
-        "No run reports durations.",
-        ("time.update_median_ms", "time.update_p99_ms"),
-        columns=1,
     ),
 }
 
@@ -174,14 +144,14 @@ def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]
 
 
 def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
-    """One figure of the page; a map is drawn in two widths, of which the page shows the one that fits."""
+    """One figure of the page; a map is drawn in two widths, and the page shows the one that fits."""
     # a map is drawn twice, because its names cannot be shrunk to a phone
     widths_in = {"": HALF_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
-    numbers = _read_out(comparison, drawing)
+    described = f"{drawing.title}. {drawing.caption}"
     if drawing.draw is map_figure:
         widths_in = {"": HALF_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
-        numbers = sentences.headline(comparison, aligned=comparison.is_aligned)
-    described = f"{drawing.title}. {drawing.caption} {numbers}".strip()
+        finding = sentences.headline(comparison, aligned=comparison.is_aligned)
+        described = f"{described} {finding}"
     svg = ""
     for width, width_in in widths_in.items():
         with sized(width_in):
@@ -189,17 +159,6 @@ def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illust
             if figure is not None:
                 svg += inline_svg(figure, f"{name}{width}", described, width)
     return Illustration(name, drawing.title, drawing.caption, svg, drawing.instead)
-
-
-def _read_out(comparison: Comparison, drawing: Drawing) -> str:
-    """The figure's numbers, run by run, for a reader who does not see it."""
-    parts = []
-    for run in comparison.runs:
-        found = [comparison.score_of(run.estimator, key) for key in drawing.scores]
-        scores = [score.with_unit for score in found if score]
-        if scores:
-            parts.append(f"{run.estimator}: {' and '.join(scores)}")
-    return f"{'; '.join(parts)}." if parts else ""
 
 
 def _instead(comparison: Comparison, drawing: Drawing) -> str:

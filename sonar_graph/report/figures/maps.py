@@ -96,7 +96,7 @@ def landscape(view: Floats) -> Floats:
 
 
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
-    """The true landmarks in the world of the start pose: where they are surveyed in another, the first map tells."""
+    """The true landmarks in the world of the start pose; landmarks of another world are aligned to the first map."""
     true = comparison.sequence.true_landmarks
     # the first map decides, so that all are drawn in one world
     maps = [
