@@ -270,8 +270,10 @@ def range_match(changes: SignalStretch) -> Match:
     by_scale = explained(found.stretches, of_scale, 1)
     if by_scale is None or not found.gain.is_known:
         return found
-    scale = Estimate1D(1.0 + float(by_scale.q[0]), float(by_scale.sigmas[0]))
-    return replace(found, gain=scale)
+    beside_heights = Estimate1D(1.0 + float(by_scale.q[0]), float(by_scale.sigmas[0]))
+    # where ranges change little, a scale and heights look alike: the nearer to 1 of both readings is sure
+    gain = min(found.gain, beside_heights, key=lambda one: abs(one.value - 1.0))
+    return replace(found, gain=gain)
 
 
 DEPTH = Check(
