@@ -102,10 +102,7 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
     if not (is_better and is_clear and is_fit):
         right_handed = candidates[handed > 0]
-        return other_matrix(
-            rows.quadratic_form(np.eye(3)),
-            right_handed[squares[0, handed > 0].argmin()],
-        )
+        return other_matrix(rows, right_handed[squares[0, handed > 0].argmin()])
     # of candidates that fit as well the one that changes least
     changes_least = np.trace(candidates, axis1=1, axis2=2)
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
@@ -123,12 +120,13 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
-def other_matrix(Q: Floats, near: Floats) -> AxesMatch:
+def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
     """Scale or rotation of the Doppler log, near a candidate, that no permutation describes; as read where they fit badly.
 
     Such as those of a log in knots, or of one that looks down and is turned by 45 degrees. A matrix that is neither, and
-    leaves little, mixes axes, as velocities along beams are mixed. Q: quadratic form of `SharedRows`.
+    leaves little, mixes axes, as velocities along beams are mixed.
     """
+    Q = rows.quadratic_form(np.eye(3))
     least = least_of(Q)
     as_read = square_of(Q, np.eye(3))
     most = MOST_LEFT * least
@@ -138,8 +136,13 @@ def other_matrix(Q: Floats, near: Floats) -> AxesMatch:
     ratio = float(np.sqrt(as_read / least))
     identity = np.eye(3).ravel()
     scale = -float(Q[0, 1:] @ identity) / float(identity @ Q[1:, 1:] @ identity)
-    if square_of(Q, scale * np.eye(3)) < most:
-        is_unit = scale > 0 and not 1 / OTHER_UNIT < scale < OTHER_UNIT
+    of_scale = square_of(Q, scale * np.eye(3))
+    if of_scale < most:
+        # in a turn the force is w v: a wrong scale of the gyro about the vertical looks alike but for changes of speed
+        with_gyro = rows.quadratic_form(np.diag([1.0, 1.0, scale]))
+        is_of_dvl = of_scale < square_of(with_gyro, np.eye(3))
+        is_other = not 1 / OTHER_UNIT < scale < OTHER_UNIT
+        is_unit = scale > 0 and is_other and is_of_dvl
         return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)
     R = turned(Q, near)
     left = square_of(Q, R)
