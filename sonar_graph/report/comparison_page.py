@@ -153,6 +153,7 @@ def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
     content: dict[str, Any] = {
         "name": sequence.name,
         "names": [run.estimator for run in runs],
+        "beside_the_paper": sentences.beside_the_paper(comparison),
         "summary": (
             f"{', '.join(run.estimator for run in runs)} on {format_value(round(sequence.duration_s, 1))} s of "
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "

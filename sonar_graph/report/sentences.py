@@ -244,6 +244,40 @@ def lost_runs(comparison: Comparison) -> list[str]:
     return said
 
 
+def beside_the_paper(comparison: Comparison) -> str | None:
+    """What ekf-slam used in this log beside the paper's equations, one sentence; None without ekf-slam.
+
+    The table of docs/theory/ekf_slam.md has the same rows.
+    """
+    run = next((run for run in comparison.runs if run.estimator == "ekf-slam"), None)
+    if run is None:
+        return None
+    sequence = comparison.sequence
+    calibration = sequence.calibration
+    params = flattened(run.params)
+    # bridged by accelerometers, which the paper does not do
+    longest_s = float(np.diff(sequence.dvl.stamps_ns).max(initial=0)) * 1e-9
+    is_held = calibration.odometry_interpolation == "hold-past"
+    has_gaps = longest_s > calibration.dvl.gap_s and not is_held
+    additions = {
+        "depth": sequence.depth is not None,
+        "gravity for roll and pitch": calibration.use_gravity,
+        "the plane of the calibration": calibration.planar is not None,
+        "the floor's height": calibration.floor is not None,
+        "headings with Huber's kernel and the compass' bias": sequence.heading
+        is not None,
+        "position fixes with Huber's kernel": sequence.positions is not None,
+        "accelerometers and larger noise where the Doppler log has no sample for long": has_gaps,
+        "far_views": has_gaps and params.get("far_views", False),
+        "gate_probability": params.get("gate_probability", 1.0) < 1.0,
+        "kernel_width": params.get("kernel_width", 0.0) > 0.0,
+    }
+    used = [name for name, is_used in additions.items() if is_used]
+    if not used:
+        return "In this log ekf-slam used nothing beside the paper's equations."
+    return f"Beside the paper's equations ekf-slam used in this log: {', '.join(used)}."
+
+
 def doubt_of_identities(comparison: Comparison) -> list[str]:
     """Warnings, a line each: runs for which no detection has an identity, then runs whose map is wrong.
 

@@ -17,6 +17,7 @@ from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.tables import score_keys, score_table
 from sonar_graph.recognition.session import with_detections
+from sonar_graph.report import sentences
 from sonar_graph.report.comparison_page import (
     recognition_content,
     render_report,
@@ -201,6 +202,23 @@ def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
             "Positions in the map at the end, metres; in brackets estimate minus truth"
             in text
         )
+
+
+def test_the_page_lists_what_ekf_slam_used_beside_the_paper(comparison, page):
+    """Only where it was compared, and only what the log and the settings give it."""
+    said = sentences.beside_the_paper
+    known = "Beside the paper's equations ekf-slam used in this log: gravity for roll"
+    assert known in page.text
+    assert "kernel_width" not in str(said(comparison))
+    run = next(run for run in comparison.runs if run.estimator == "ekf-slam")
+    robust = replace(run, params=run.params | {"kernel_width": 3.0})
+    assert "kernel_width" in str(said(with_run(comparison, robust)))
+    sequence = comparison.sequence
+    free = sequence.calibration.model_copy(update={"planar": None})
+    moved = replace(comparison, sequence=replace(sequence, calibration=free))
+    assert "plane" in str(said(comparison))
+    assert "plane" not in str(said(moved))
+    assert said(only(comparison, "isam2")) is None
 
 
 @pytest.fixture(scope="module")
