@@ -26,6 +26,7 @@ import numpy as np
 from sonar_graph.calibration import KnownMap
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing, text_of
+from sonar_graph.measurements import FIRST_TOO_LARGE_ID
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse, toml_value
 
@@ -80,6 +81,16 @@ def read_map(path: Path) -> ReadMap:
             warnings.append(
                 f"{path}: covariances of single landmarks, and no correlations between them; the map.toml of a run has them"
             )
+    if max(known.ids) >= FIRST_TOO_LARGE_ID:
+        raise LogError(
+            f"{path}: landmark {max(known.ids)}: give identities below {FIRST_TOO_LARGE_ID}, as detections have them"
+        )
+    variances_m2 = np.diag(known.joint()).reshape(-1, 3)  # (m, 3)
+    if variances_m2.min() <= 0.0:
+        exact = known.ids[int(variances_m2.min(axis=1).argmin())]
+        raise LogError(
+            f"{path}: landmark {exact}: expected variances above 0 m², such as 1e-6 of a survey to 1 mm"
+        )
     # national grids and millimetres are the usual mistakes
     farthest_m = float(np.abs(np.array(known.positions_m)).max())
     if farthest_m > MOST_M:
@@ -122,15 +133,16 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
                 )
             return value
 
-        landmark_id = number("id")
         # a table of floats may hold 4.0, and not 4.5
-        if landmark_id != int(landmark_id):
+        value = number("id")
+        if value != int(value):
             raise LogError(f"{where}: id: expected a whole number, not {row['id']!r}")
-        if int(landmark_id) in ids:
-            raise LogError(
-                f"{where}: landmark {int(landmark_id)} stands twice; keep one line"
-            )
-        ids.append(int(landmark_id))
+        written = row["id"].strip()
+        # a float would round identities of more than 15 digits
+        landmark_id = int(written) if written.isdecimal() else int(value)
+        if landmark_id in ids:
+            raise LogError(f"{where}: landmark {landmark_id} stands twice; keep one line")
+        ids.append(landmark_id)
         places.append([number(column) for column in PLACE])
         if is_marginal:
             block = np.zeros((3, 3))

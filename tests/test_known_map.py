@@ -266,6 +266,7 @@ MISTAKEN = {
     "upside down": (np.diag([1.0, 1.0, -1.0]), "z_m has the wrong sign"),
     "feet": (FEET * np.eye(3), "it is in feet"),
     "mirrored": (np.eye(3)[[1, 0, 2]], "x_m and y_m are swapped"),
+    "NED": (np.diag([1.0, 1.0, -1.0])[[1, 0, 2]], "the axes are north, east, down"),
 }
 
 
@@ -335,6 +336,14 @@ BAD = {
     "a word": (HEAD + "1,a,2,3,0.1\n", "line 2: x_m: expected a number, not 'a'"),
     "a short row": (HEAD + "1,2.0\n", "line 2: y_m: expected a number, not None"),
     "twice": (HEAD + "1,0,2,3,0.1\n1,0,2,3,0.1\n", "line 3: landmark 1 stands twice"),
+    "an id that no graph has": (
+        HEAD + f"{2**56},0,2,3,0.1\n",
+        f"landmark {2**56}: give identities below {2**56}",
+    ),
+    "an exact place": (
+        "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz\n4,0,2,3,0,0,0,0,0,0\n",
+        "landmark 4: expected variances above 0",
+    ),
     "half an id": (HEAD + "1.5,0,2,3,0.1\n", "line 2: id: expected a whole number"),
     "a negative sigma": (
         HEAD + "1,0,2,3,-0.1\n",
@@ -348,6 +357,12 @@ BAD = {
         "give metres from an origin near by",
     ),
 }
+
+
+def test_long_identities_of_a_table_are_not_rounded(tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text(HEAD + "9007199254740993,0,2,3,0.1\n4.0,1,2,3,0.1\n")
+    assert read_map(path).map.ids == (9007199254740993, 4)
 
 
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)

@@ -363,6 +363,15 @@ class Assembly:
         """Gather the calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
         recorded = read_calibration(self._recording)
         values = {} if given is None else given.values
+        if (
+            recorded is not None
+            and recorded.start.source != "stated"
+            and values.get("start")
+        ):
+            # the record's start was not stated: what is stated now replaces it, and the rest is measured again
+            of_others = recorded.model_dump(exclude_unset=True, exclude={"start"})
+            recorded = Calibration.model_validate(of_others)
+            self._notes.pop("log.start", None)
         stated = {} if recorded is None else recorded.model_dump(exclude_unset=True)
         is_recorded = self._is_start_stated
         self._is_start_stated &= not values.get("start")

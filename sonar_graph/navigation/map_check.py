@@ -37,10 +37,11 @@ NEGATED = "z_m has the wrong sign; the world's z points up"
 MIRRORED = (
     "it is a mirror image: x_m and y_m are swapped, or one of them has the wrong sign"
 )
+NORTH_EAST_DOWN = "the axes are north, east, down; the world's z points up"
 MISTAKES = {
     NEGATED: Z_UP,
     MIRRORED: SWAPPED,
-    "the axes are north, east, down; the world's z points up": SWAPPED @ Z_UP,
+    NORTH_EAST_DOWN: SWAPPED @ Z_UP,
     "it is in feet": 0.3048 * np.eye(3),
     "it is in centimetres": 0.01 * np.eye(3),
     "it is in millimetres": 0.001 * np.eye(3),
@@ -74,6 +75,11 @@ def map_fit(sequence: Sequence) -> MapFit:
     is_hidden = shown(negated) - shown(given) > MORE_SHOWN
     gain = 0.0 if start is None else evidence(negated) - evidence(given)
     if is_hidden or gain > math.log(ODDS):
+        T = MISTAKES[NORTH_EAST_DOWN]
+        # the same heights, and x and y exchanged: the other landmarks decide
+        exchanged = followed(sequence, undone(known, T))
+        if evidence(exchanged) - evidence(negated) > math.log(ODDS):
+            return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
     if start is not None:
         return MapFit(start)
