@@ -141,7 +141,9 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         # a float would round identities of more than 15 digits
         landmark_id = int(written) if written.isdecimal() else int(value)
         if landmark_id in ids:
-            raise LogError(f"{where}: landmark {landmark_id} stands twice; keep one line")
+            raise LogError(
+                f"{where}: landmark {landmark_id} stands twice; keep one line"
+            )
         ids.append(landmark_id)
         places.append([number(column) for column in PLACE])
         if is_marginal:

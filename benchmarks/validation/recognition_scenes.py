@@ -29,10 +29,17 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table
-from recognition import ACCEPTED, LITERAL, OURS, digest, normalised, normalised_mean
+from recognition import (
+    ACCEPTED,
+    LITERAL,
+    OURS,
+    digest,
+    normalised,
+    normalised_mean,
+    reliability,
+)
 from recognition_runs import NONE, UNJUDGED, Detections, Run, kept_run
 
-from sonar_graph.evaluation.consistency import reliability
 from sonar_graph.models import MINIMUM_PROBABILITY
 from sonar_graph.simulation import BasinOptions
 from sonar_graph.simulation.sonar_image import ImageOptions

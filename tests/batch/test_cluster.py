@@ -132,7 +132,8 @@ def test_failures_are_rows_and_the_exit_code_says_so(
     with bench(suite, tmp_path / "out", "--workers", "1") as process:
         answer, said = process.communicate(timeout=300)
     assert process.returncode == 1
-    assert said == ""
+    counted = [line.split(":")[0].strip() for line in said.splitlines()]
+    assert counted == ["1 timeout", "1 failed", "1 killed"]
     assert answer.splitlines()[0] == "Runs: 1 ok, 1 failed, 1 killed, 1 timeout"
     rows = pq.read_table(tmp_path / "out" / "results.parquet").to_pylist()
     assert [row["status"] for row in rows] == ["ok", "timeout", "failed", "killed"]

@@ -176,7 +176,7 @@ def test_folded_chapters_of_a_comparison_stand_on_paper(browser, comparison_file
         assert page.evaluate(f"{folded}.every(one => one.checkVisibility())")
 
 
-def test_paper_has_folded_tables_no_buttons_and_light_colours(
+def test_paper_has_folded_tables_and_light_colours(
     browser, page_file, page_of_many_logs, tmp_path
 ):
     shown = "document.querySelector('#table-consistency').checkVisibility()"
@@ -190,12 +190,6 @@ def test_paper_has_folded_tables_no_buttons_and_light_colours(
             assert page.evaluate(shown) is is_shown
     with opened(browser, page_file, DESKTOP, "dark") as (page, _):
         page.emulate_media(media="print")
-        assert (
-            page.evaluate(
-                "getComputedStyle(document.querySelector('.downloads')).display"
-            )
-            == "none"
-        )
         assert (
             sum(_rgb(page.evaluate("getComputedStyle(document.body).backgroundColor")))
             == 3 * 255
@@ -215,7 +209,7 @@ def test_all_figures_are_drawn_in_the_colours_of_the_page(browser, page_file, sc
             "[getComputedStyle(document.querySelector('figure svg text')).fill, "
             "getComputedStyle(document.body).backgroundColor]"
         )
-    assert len(boxes) >= 8
+    assert len(boxes) >= 3
     assert all(box["width"] > 300 and box["marks"] > 10 for box in boxes)
     assert (sum(_rgb(ink)) > sum(_rgb(paper))) == (scheme == "dark")
 
@@ -238,25 +232,6 @@ def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
     assert len(upwards) > 3
     assert list(map(float, upwards)) == sorted(map(float, upwards))
     assert list(map(float, downwards)) == sorted(map(float, downwards), reverse=True)
-
-
-def test_a_number_of_runs_opens_their_list(browser, page_file):
-    with opened(browser, page_file, DESKTOP) as (page, _):
-        page.locator("#table-failures tbody a").first.click()
-        page.wait_for_function(
-            "document.querySelector('#runs-0-0').closest('details').open"
-        )
-        opened_ones = "[...document.querySelectorAll('#runs ~ details[open], #runs ~ details details[open]')]"
-        assert page.evaluate(
-            f"{opened_ones}.every(one => one.contains(document.querySelector('#runs-0-0')))"
-        )
-        assert page.evaluate(f"{opened_ones}.length") == 2, (
-            "the log's and the contestant's"
-        )
-        with page.expect_download() as download:
-            page.get_by_label("Data of this figure (CSV): spread-ate-se2-m").click()
-        text = Path(download.value.path()).read_text("utf-8")
-    assert text.startswith("log,contestant,seed,key,column,value\n")
 
 
 @pytest.mark.skipif(
