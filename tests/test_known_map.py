@@ -282,6 +282,15 @@ def test_a_map_with_other_axes_or_units_is_named_with_the_remedy(dive, T, messag
     assert f"landmark 1 at ({x:.2f}, {y:.2f}, {z:.2f}) m" in finding.text()
 
 
+def test_a_map_of_which_two_landmarks_are_seen_is_not_called_right(dive):
+    known = surveyed(dive)
+    ids = dive.detections.most_probable()[0]
+    seen = dive.detections.rows(np.flatnonzero(np.isin(ids, [1, 2])))
+    (finding,) = map_findings(replace(with_map(dive, known), detections=seen))
+    assert not finding.acts
+    assert "fewer than three of its landmarks" in finding.text()
+
+
 def test_a_right_map_has_no_finding(dive):
     assert not list(map_findings(with_map(dive, surveyed(dive))))
     assert not list(map_findings(with_map(dive, None)))

@@ -61,6 +61,8 @@ class MapFit(NamedTuple):
     """Mistake of the map; empty where none is known."""
     remedy: str = ""
     """Change of the map that undoes it."""
+    is_checked: bool = True
+    """False where fewer than `FEWEST` landmarks were seen within `LONGEST_S`."""
 
 
 def map_fit(sequence: Sequence) -> MapFit:
@@ -70,7 +72,7 @@ def map_fit(sequence: Sequence) -> MapFit:
     start = first_start(sequence)
     given = followed(sequence, known)
     if len({sighting.row for sighting in given.newest()}) < FEWEST:
-        return MapFit(start)
+        return MapFit(start, is_checked=False)
     negated = followed(sequence, undone(known, Z_UP))
     is_hidden = shown(negated) - shown(given) > MORE_SHOWN
     gain = 0.0 if start is None else evidence(negated) - evidence(given)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Start
+from sonar_graph.logs import PartialCalibration, read_log, write_log
 from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.measurements import (
     Depth,
@@ -15,6 +16,7 @@ from sonar_graph.measurements import (
     Imu,
     PositionFixes,
 )
+from sonar_graph.sequence import Sequence
 
 RPY = (0.1, -0.05, 0.7)
 N = 3000
@@ -83,3 +85,25 @@ def test_what_is_stated_stays_and_the_rest_is_measured() -> None:
     assert not is_whole(
         of_place.model_construct(position_m=(0.0, 0.0, 0.0), _fields_set={"position_m"})
     )
+
+
+def test_a_stated_start_replaces_the_measured_one_of_a_converted_log(tmp_path):
+    """Scores count from a stated start: only where none is stated is the truth moved to the estimates."""
+    blocks = moving()
+    calibration, note = with_measured_start(Calibration(), blocks)
+    path = tmp_path / "converted.mcap"
+    write_log(
+        path, Sequence("tables", calibration, notes={"log.start": note}, **blocks)
+    )
+    assert read_log(path).calibration.start.source == "fixes"
+    whole = {"position_m": [1.0, 2.0, -3.0], "rpy_rad": [0.1, -0.05, 0.7]}
+    given = PartialCalibration.parse({"start": whole}, "vehicle.toml")
+    read = read_log(path, calibration=given)
+    assert read.calibration.start.source == "stated"
+    assert read.calibration.start.position_m == (1.0, 2.0, -3.0)
+    assert "log.start" not in read.notes
+    part = PartialCalibration.parse({"start": {"position_m": [1.0, 2.0, -3.0]}}, "x")
+    start = read_log(path, calibration=part).calibration.start
+    assert start.source == "stated"
+    assert start.position_m == (1.0, 2.0, -3.0)
+    assert start.rpy_rad == pytest.approx(calibration.start.rpy_rad, abs=1e-3)
