@@ -13,6 +13,8 @@ from sonar_graph.measurements import Floats
 UNITS = ("s", "ms", "us", "ns")
 RATES_HZ = {"imu": (0.5, 5000.0), "dvl": (0.05, 200.0)}
 """Slowest and fastest rate of a sensor, by role."""
+FASTEST_HZ = 1e4
+"""Fastest rate of any other table."""
 FEWEST_ROWS = 10
 """Rows from which a rate, and a column that never changes, are known."""
 _SIMILAR = 30.0
@@ -90,7 +92,7 @@ def time_units(
 
 def _has_rate_of(role: str, times_s: Floats) -> bool:
     """True where a sensor can have the median rate of its times, or too few are known."""
-    slowest_hz, fastest_hz = RATES_HZ.get(role, (0.0, np.inf))
+    slowest_hz, fastest_hz = RATES_HZ.get(role, (0.0, FASTEST_HZ))
     if len(times_s) < FEWEST_ROWS:
         return True
     # the median: pauses of a sensor do not count

@@ -11,6 +11,7 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.convert import csv_template, read_csv
+from sonar_graph.logs.convert.csv_evidence import time_units
 
 ROWS = 600
 EPOCH_S = 1_777_638_600.0
@@ -335,3 +336,10 @@ def test_a_sonar_without_identities_states_it_by_false(folder):
     config = template(folder)[1]
     assert config["detections"]["ids"] is False
     assert (read_csv(folder, config).detections.candidate_ids == -1).all()
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, "s"), (1e9, "ns")])
+def test_a_table_of_another_clock_is_not_read_as_faster_than_any_sensor(factor, unit):
+    """Seconds since 1970 beside a dive from 0: as nanoseconds they would lie in it, at a gigahertz."""
+    times = {"imu": np.arange(0, 60, 0.02), "truth": factor * (1.76e9 + np.arange(300))}
+    assert time_units(times, {one: one for one in times}, {})["truth"] == [unit]
