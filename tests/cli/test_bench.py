@@ -29,7 +29,7 @@ def test_report_rebuilds_the_page_of_a_batch(run, tmp_path, capsys):
         assert run("report", folder) == 0
         said = capsys.readouterr()
         assert said.out == f"Report: {printable(str(folder / 'report.html'))}\n"
-        assert (folder / "tables" / "difference-ate-se2-m.tex").is_file()
+        assert (folder / "tables" / "difference-ate-se2-m.csv").is_file()
         assert warned in (folder / "report.html").read_text("utf-8")
     assert (
         "Warning: This batch is not complete: 3 of 16 runs have not been done (dead-reckoning 1 of 8"

@@ -136,7 +136,6 @@ WRONG = {
     "convert csv . --config good.toml -o new.csv": r"expected the name of a file that ends in .mcap",
     "inspect dive.mcap --log-config good.toml": r"good\.toml: says which text tables .* csv TABLES --config good\.toml",
     "compare imu.csv -o out": r"a text that begins with 'time,wx.*text tables by `sonar-graph convert csv`",
-    "view dive.mcap --viewer browser": r"dive\.mcap: is a log, .* `sonar-graph compare dive\.mcap -o DIR` makes",
     "inspect bag": r"lost_0\.mcap",
     "compare dive.mcap -o wall": "wall: is a file; give a folder",
     "compare dive.mcap -o out --calibration imu.csv": r"imu\.csv: not TOML",

@@ -18,7 +18,7 @@ from sonar_graph.evaluation import (
     run,
     score_table,
 )
-from sonar_graph.report import batch_figures, comparison_page
+from sonar_graph.report import comparison_page
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.figure_style import ESTIMATOR_COLOURS
@@ -234,7 +234,7 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
 
 
 def test_examples_of_the_front_door_run(tmp_path):
-    for module in (comparison, run, digits, comparison_page, batch_figures):
+    for module in (comparison, run, digits, comparison_page):
         done = doctest.testmod(module)
         assert done.attempted > 0
         assert done.failed == 0, module.__name__
