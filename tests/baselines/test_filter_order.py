@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, KnownMap
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import NS_PER_S, Measurements
 from sonar_graph.navigation import Odometry
@@ -61,6 +61,19 @@ def test_each_detection_has_its_outcome_and_a_refused_one_changes_nothing(kind):
     assert log.innovations[4] == pytest.approx([0.5, 0.0], abs=1e-6)
     assert np.isnan(log.innovations[:4]).all()
     assert slam.landmarks().ids.tolist() == [3]
+
+
+@slam_filters
+def test_each_landmark_of_a_frame_has_its_own_gate(kind):
+    """A landmark of the map that contradicts it is refused beside one that the map does not have."""
+    place = 2.0 * np.array([[np.cos(0.5), np.sin(0.5), 0.0]])
+    known = KnownMap.of([7], place, sigma_m=0.05)
+    slam = begun(kind, Calibration(map=known))
+    now_ns = later(1.0)
+    slam.process(Measurements(now_ns, imu(1), dvl(1), None, seen([later(0.5)])))
+    both = seen([now_ns, now_ns], [2.0, 5.0], [0.1, 0.5], landmark=[[3], [7]])
+    slam.process(Measurements(now_ns, None, None, None, both))
+    assert slam.detections().outcomes == [Outcome.NEW, Outcome.USED, Outcome.GATED]
 
 
 @slam_filters
