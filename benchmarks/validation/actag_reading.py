@@ -78,7 +78,8 @@ def pose_of(truth: FrameTruth) -> gtsam.Pose3:
 
 def run(options: BasinOptions, settings: AcTagSettings) -> dict[str, float]:
     recogniser = AcTagRecogniser(Calibration(), settings.model_dump())
-    before, errors = None, []
+    before = None
+    errors = []
     in_view = decoded = frames = 0
     spent_s = 0.0
     for block in simulate_basin_frames(options, frames_per_block=1):

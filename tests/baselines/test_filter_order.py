@@ -78,6 +78,21 @@ def test_each_landmark_of_a_frame_has_its_own_gate(kind):
 
 @slam_filters
 @pytest.mark.parametrize(
+    ("gate_probability", "outcome"), [(1.0, Outcome.USED), (0.5, Outcome.GATED)]
+)
+def test_a_gate_that_is_stricter_than_that_of_the_map_holds(
+    kind, gate_probability, outcome
+):
+    place = 2.0 * np.array([[np.cos(0.5), np.sin(0.5), 0.0]])
+    known = KnownMap.of([7], place, sigma_m=0.05)
+    slam = begun(kind, Calibration(map=known), gate_probability=gate_probability)
+    off = seen([later(0.5)], 2.15, 0.5, landmark=7)
+    slam.process(Measurements(later(1.0), imu(1), dvl(1), None, off))
+    assert slam.detections().outcomes == [outcome]
+
+
+@slam_filters
+@pytest.mark.parametrize(
     "settings",
     [{"gate_probability": 0.999}, {"kernel_width": 1.5, "gate_probability": 0.999}],
 )
