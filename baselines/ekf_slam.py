@@ -33,10 +33,11 @@ from baselines.kalman import (
     innovation_of,
     judged,
     judged_far,
-    motion_noise,
     polar_covariance,
     stands_on_floor,
     symmetric,
+    view_noise,
+    write_judged,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats, Ints
@@ -219,7 +220,8 @@ def update(x: Floats, P: Floats, H: Floats, e: Floats, R: Floats) -> None:
 @inlined
 def move(x: Floats, by: Floats) -> None:
     """Add to the state, and wrap roll and yaw."""
-    x += by
+    for i in range(len(x)):
+        x[i] += by[i]
     x[ROLL] = wrap_angle(x[ROLL])
     x[YAW] = wrap_angle(x[YAW])
 
@@ -245,16 +247,13 @@ def observe(
         store_row6(T.T @ sight.azimuth_by_body, H, 1, 0)
         store_row(sight.range_by_point, H, 0, at)
         store_row(sight.azimuth_by_point, H, 1, at)
-        noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
+        noise = view_noise(sight, motion, R_z)
         HP, S = innovation_of(P, H, noise)
-        S = symmetric(S)
         # the kernel widens the noise of the detection, not that of the motion
         outcome, widened = judged(e, S, R_z, sighted.gates[k], sonar.kernel_width)
         if outcome != GATED:
             move(x, correction(P, HP, S + widened, e))
-        views.outcome[row] = outcome
-        views.e[row] = e
-        views.S[row] = S
+        write_judged(views, row, outcome, e, S)
 
 
 @compiled

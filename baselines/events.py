@@ -141,20 +141,6 @@ def read_detections(
     return z, noise
 
 
-@compiled
-def depth_values(
-    z_m: Floats, variance_m2: Floats, unknown_m2: float
-) -> tuple[Floats, Floats]:
-    """Columns of `Samples` for depths; ``unknown_m2``: variance where a depth has none."""
-    value = np.zeros((len(z_m), 3))
-    noise = np.zeros((len(z_m), 3, 3))
-    for k in range(len(z_m)):
-        value[k, 2] = z_m[k]
-        is_known = not math.isnan(variance_m2[k])
-        noise[k, 2, 2] = variance_m2[k] if is_known else unknown_m2
-    return value, noise
-
-
 class Felt(NamedTuple):
     """Turn and specific force since an interval of gravity began."""
 

@@ -29,7 +29,6 @@ from baselines.events import (
     Sighted,
     Sonar,
     Views,
-    depth_values,
     feel,
     in_frame,
     in_order,
@@ -364,8 +363,8 @@ class FilterShell(ABC):
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
         z, R_z = read_detections(
-            detections.range_m,
-            detections.azimuth_rad,
+            np.ascontiguousarray(detections.range_m),
+            np.ascontiguousarray(detections.azimuth_rad),
             detections.range_azimuth_cov,
             self._R_z,
         )
@@ -409,8 +408,13 @@ class FilterShell(ABC):
 
     def _depths(self, depth: Depth) -> Samples:
         """Depths, with the calibration's noise where they have none."""
-        value, noise = depth_values(
-            depth.z_m, depth.variance_m2, self.calibration.depth.sigma_m**2
+        value = np.zeros((len(depth), 3))
+        noise = np.zeros((len(depth), 3, 3))
+        value[:, 2] = depth.z_m
+        noise[:, 2, 2] = np.where(
+            np.isnan(depth.variance_m2),
+            self.calibration.depth.sigma_m**2,
+            depth.variance_m2,
         )
         return _samples(depth.stamps_ns, DEPTH, value, noise)
 

@@ -57,10 +57,11 @@ from baselines.kalman import (
     innovation_of,
     judged,
     judged_far,
-    motion_noise,
     polar_covariance,
     stands_on_floor,
     symmetric,
+    view_noise,
+    write_judged,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
@@ -253,16 +254,13 @@ def observe(
         store_row(-1.0 * sight.azimuth_by_point, H, 1, BODY.start)
         store_by_biases(sight.range_by_body, D, H, 0)
         store_by_biases(sight.azimuth_by_body, D, H, 1)
-        noise = R_z + motion_noise(sight.range_by_body, sight.azimuth_by_body, motion)
+        noise = view_noise(sight, motion, R_z)
         HP, S = innovation_of(state.P, H, noise)  # (9)
-        S = symmetric(S)
         # the kernel widens the noise of the detection, not that of the motion
         outcome, widened = judged(e, S, R_z, sighted.gates[m], sonar.kernel_width)
         if outcome != GATED:
             move(state, correction(state.P, HP, S + widened, e))
-        views.outcome[row] = outcome
-        views.e[row] = e
-        views.S[row] = S
+        write_judged(views, row, outcome, e, S)
 
 
 @compiled

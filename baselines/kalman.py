@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from baselines.events import Motion, Sonar
+from baselines.events import Motion, Sonar, Views
 from sonar_graph.measurements import Floats
-from sonar_graph.models import FLOOR_GATE
-from sonar_graph.numerics import Vec6, compiled, inlined, mat6
+from sonar_graph.models import FLOOR_GATE, Sight
+from sonar_graph.numerics import compilable, compiled, inlined, mat6
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 USED = OUTCOME_NUMBERS[Outcome.USED]
@@ -31,28 +31,28 @@ class Judged(NamedTuple):
     """Covariance of the innovation, shape (2, 2)."""
 
 
-@compiled
-def times(H: Floats, A: Floats) -> Floats:
-    """``H A`` for a Jacobian H, whose numbers are mostly zero."""
-    HA = np.zeros((len(H), A.shape[1]))
-    for r in range(len(H)):
-        for k in range(len(A)):
-            # a detection has nine numbers in each row of H
-            if H[r, k] != 0.0:
-                for j in range(A.shape[1]):
-                    HA[r, j] += H[r, k] * A[k, j]
-    return HA
-
-
-@compiled
+@compilable
 def innovation_of(P: Floats, H: Floats, R: Floats) -> tuple[Floats, Floats]:
-    """``H P``, shape (m, n), and ``S = H P H^T + R``, shape (m, m)."""
-    HP = times(H, P)
-    S = times(H, HP.T) + R  # (H P)^T = P H^T
+    """``H P``, shape (m, n), and ``S = H P H^T + R``, shape (m, m), symmetric to the last bit."""
+    m, n = H.shape
+    HP = np.zeros((m, n))
+    S = R.copy()
+    for r in range(m):
+        for k in range(n):
+            # most numbers of a Jacobian are zero: a detection has nine others in each row
+            if H[r, k] != 0.0:
+                for j in range(n):
+                    HP[r, j] += H[r, k] * P[k, j]
+        for i in range(r + 1):
+            HPH = 0.0
+            for k in range(n):
+                HPH += H[i, k] * HP[r, k]
+            S[r, i] += HPH
+            S[i, r] = S[r, i]
     return HP, S
 
 
-@compiled
+@compilable
 def cholesky(S: Floats) -> Floats:
     """Lower triangle L with ``S = L L^T``; NaN on its diagonal where S is not positive definite.
 
@@ -71,7 +71,7 @@ def cholesky(S: Floats) -> Floats:
     return L
 
 
-@compiled
+@compilable
 def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
     """``K e``, shape (n,), with ``K = P H^T S^-1``; P becomes ``P - K S K^T``.
 
@@ -104,24 +104,34 @@ def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
     return Ke
 
 
-@compiled
 def symmetric(A: Floats) -> Floats:
     """``(A + A^T) / 2``."""
     return 0.5 * (A + A.T)
 
 
 @inlined
-def motion_noise(range_by_body: Vec6, azimuth_by_body: Vec6, motion: Motion) -> Floats:
-    """``H_b C H_b^T``, shape (2, 2), of the rows of H_b."""
+def view_noise(sight: Sight, motion: Motion, R_z: Floats) -> Floats:
+    """``R_z + H_b C H_b^T``, shape (2, 2): noise of a view, with that of the motion to it."""
     C = mat6(motion.C)
     # C is the covariance in body axes, as H_b takes them
-    across = range_by_body @ (C @ azimuth_by_body)
-    return np.array(
-        [
-            [range_by_body @ (C @ range_by_body), across],
-            [across, azimuth_by_body @ (C @ azimuth_by_body)],
-        ]
-    )
+    by_azimuth = C @ sight.azimuth_by_body
+    R = R_z.copy()
+    R[0, 0] += sight.range_by_body @ (C @ sight.range_by_body)
+    R[0, 1] += sight.range_by_body @ by_azimuth
+    R[1, 0] = R[0, 1]
+    R[1, 1] += sight.azimuth_by_body @ by_azimuth
+    return R
+
+
+@compilable
+def write_judged(views: Views, row: int, outcome: int, e: Floats, S: Floats) -> None:
+    """Write outcome, innovation and its covariance of a view."""
+    views.outcome[row] = outcome
+    # numbers: for arrays numba compiles the text of an error, which takes a tenth of all
+    for i in range(2):
+        views.e[row, i] = e[i]
+        for j in range(2):
+            views.S[row, i, j] = S[i, j]
 
 
 @compiled

@@ -28,7 +28,7 @@ from sonar_graph.calibration import (
     ImuCalibration,
 )
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.numerics import Vec3, compiled
+from sonar_graph.numerics import Vec3, compilable
 
 UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
 SHORTEST_NS = round(SHORTEST_HOLE_S * 1e9)
@@ -66,7 +66,7 @@ UNTURNED = Turns(False, np.ones(3), np.ones(3), 0.0)
 """With it no interval is a hole."""
 
 
-@compiled
+@compilable
 def typical_ns(stamps: Ints, row: int) -> int:
     """Median of the `ROWS_BEFORE` intervals before a row, of an even number the shorter; 0 without intervals."""
     first = max(row - ROWS_BEFORE, 0)
@@ -83,7 +83,7 @@ def typical_ns(stamps: Ints, row: int) -> int:
     return 0
 
 
-@compiled
+@compilable
 def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
     """Length of the hole before a row; 0 without a hole.
 
@@ -111,7 +111,7 @@ def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
     return -1
 
 
-@compiled
+@compilable
 def error_in_hole(
     turns: Turns, stamps: Ints, rows: int, row: int, t: int, until_ns: int
 ) -> Vec3:
@@ -138,7 +138,7 @@ def error_in_hole(
     )
 
 
-@compiled
+@compilable
 def closed_variance(sigma: float, time_s: float, length_s: float) -> float:
     """Variance of the angle turned, with rates linear between both ends, rad²."""
     a = length_s / time_s
@@ -148,7 +148,7 @@ def closed_variance(sigma: float, time_s: float, length_s: float) -> float:
     return (sigma * time_s) ** 2 * (0.5 * a * a - 6.0 + by_end)
 
 
-@compiled
+@compilable
 def open_variance(sigma: float, time_s: float, length_s: float) -> float:
     """Variance of the angle turned, with the last rate held, rad²."""
     a = length_s / time_s
@@ -158,7 +158,7 @@ def open_variance(sigma: float, time_s: float, length_s: float) -> float:
     return (sigma * time_s) ** 2 * (a * a - 6.0 + by_end)
 
 
-@compiled
+@compilable
 def open_growth(sigma: float, time_s: float, before_s: float, until_s: float) -> float:
     """Growth of `open_variance` from one length of the hole to another, over the time between them, rad²/s."""
     grown = open_variance(sigma, time_s, until_s) - open_variance(

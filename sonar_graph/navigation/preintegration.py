@@ -46,6 +46,7 @@ from sonar_graph.numerics import (
     Mat3,
     Mat6,
     Vec3,
+    compilable,
     compiled,
     cross,
     diagonal,
@@ -445,7 +446,7 @@ def value_at(
     return before + share * (row_of(values, i) - before)
 
 
-@compiled
+@compilable
 def hole_from(
     rows: Rows, imu_rows: int, dvl_rows: int, i: int, k: int, t: int, end_ns: int
 ) -> ImuHole:

@@ -29,20 +29,22 @@ from sonar_graph.measurements import Floats
 # -------------------------------------------------------------------------------- compilation, with a cache on disk
 
 Compiled = TypeVar("Compiled")
+extending: Any = numba.extending
+# nobody calls compiled code from C
+OPTIONS: Any = {"error_model": "numpy", "no_cfunc_wrapper": True}
 COMPILED_IN: Counter[str] = Counter()
 """Number of compiled functions of each module."""
 
 
-def compiled(function: Compiled, *, forceinline: bool = False) -> Compiled:
+def compiled(function: Compiled) -> Compiled:
     """Compile to machine code at the first call; the code is cached beside the source.
 
     It is compiled again when the contents of its file change, or of a file whose compiled functions it can call.
     """
     assert isinstance(function, FunctionType)
     COMPILED_IN[function.__module__] += 1
-    made = numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(
-        function
-    )
+    # the wrapper for C, which nobody calls, would take as long as a small function
+    made = numba.njit(cache=True, **OPTIONS)(function)
     if isinstance(made, Dispatcher):  # a plain function with NUMBA_DISABLE_JIT
         # numba's own stamp is of the function's file alone, and in its older versions of the file's time
         cached = cast(Any, made)._cache._cache_file
@@ -60,16 +62,19 @@ def _readable(load_index: Callable[[], dict[Any, str]]) -> dict[Any, str]:
 
 
 def inlined(function: Compiled) -> Compiled:
-    """Compile as `compiled`, and inline into every caller: for the steps of a loop over samples.
+    """Inline into every compiled caller, and leave to Python elsewhere: for the steps of a loop over samples.
 
     There, tuples stay in registers only within one function. Elsewhere it just costs compile time in every caller.
     """
-    return compiled(function, forceinline=True)
+    assert isinstance(function, FunctionType)
+    COMPILED_IN[function.__module__] += 1
+    make = extending.register_jitable(forceinline=True, **OPTIONS)
+    return cast(Compiled, make(function))
 
 
 def compilable(function: Compiled) -> Compiled:
     """Leave a function to Python, where arrays of any kind need no compilation; compiled functions can call it too."""
-    return cast(Compiled, cast(Any, numba.extending).register_jitable(function))
+    return cast(Compiled, extending.register_jitable(**OPTIONS)(function))
 
 
 def _digest(module: dict[str, Any]) -> str:
@@ -159,7 +164,6 @@ class Mat6(
     """Matrix of four blocks, ``[[a, b], [c, d]]``."""
 
 
-extending: Any = numba.extending
 RULES: dict[str, dict[tuple[type, type], Callable[[Any, Any], Any]]] = {
     "add": {
         (Vec3, Vec3): lambda a, b: Vec3(a.x + b.x, a.y + b.y, a.z + b.z),
@@ -220,10 +224,7 @@ def _compiled_kind(t: types.Type) -> Any:
 
 
 # the same for compiled code, inlined: tuples stay in registers only within one function
-INLINE: Any = {
-    "jit_options": {"forceinline": True, "error_model": "numpy"},
-    "strict": False,
-}
+INLINE: Any = {"jit_options": {"forceinline": True, **OPTIONS}, "strict": False}
 for _op in (
     operator.add,
     operator.iadd,

@@ -22,7 +22,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Depth, Floats, Ints
 from sonar_graph.navigation.dvl_screening.dvl_gate import LONG_INTERVALS, LONG_NS
 from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS
-from sonar_graph.numerics import compiled
+from sonar_graph.numerics import compilable, compiled
 from sonar_graph.states import Refusal, RefusedRow
 
 VERTICAL_M_S = 3.0
@@ -49,7 +49,7 @@ class DepthChain(NamedTuple):
     """True where a vehicle could get from the last sample used to the first of these."""
 
 
-@compiled
+@compilable
 def squared_distance(
     since: DepthChain, to: DepthChain, longest_ns: int = LATEST_NS
 ) -> float:

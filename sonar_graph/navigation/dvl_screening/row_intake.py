@@ -97,7 +97,8 @@ class RowIntake:
         rate = rows.angular_velocity
         force = rows.specific_force
         # a fault of the transmission: the row is refused whole
-        is_used = _are_within(rate, force)
+        is_used = np.ones(len(rate), np.bool_)
+        _write_within(rate, force, is_used)
         if not is_used.all():
             self._refuse("imu", rows.stamps_ns[~is_used], Refusal.BEYOND_SENSOR)
             if not is_used.any():
@@ -252,15 +253,13 @@ class RowIntake:
 
 
 @compiled
-def _are_within(rate: Floats, force: Floats) -> NDArray[np.bool_]:
-    """True for rows whose angular rate and specific force a sensor can measure, or whose force is missing; shape (n,)."""
-    found = np.ones(len(rate), np.bool_)
+def _write_within(rate: Floats, force: Floats, is_within: NDArray[np.bool_]) -> None:
+    """Write False for rows whose angular rate or specific force no sensor can measure; shape (n,)."""
     for k in range(len(rate)):
         for i in range(3):
             # NaN is not beyond
             if abs(rate[k, i]) > MOST_RATE_RAD_S or abs(force[k, i]) > MOST_FORCE_M_S2:
-                found[k] = False
-    return found
+                is_within[k] = False
 
 
 @compiled
