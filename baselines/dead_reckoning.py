@@ -82,12 +82,9 @@ class DeadReckoning:
         has_bias = calibration.imu.gyro_bias_sigma > 0
         self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
         self._pose = calibration.start.pose()
-        start = calibration.start
-        R = self._pose.rotation().matrix()
         # of [theta, rho, bias], theta and rho in body axes
         self._P = np.zeros((9, 9))
-        self._P[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
-        self._P[3:6, 3:6] = R.T @ np.diag(np.square(start.position_sigma_m)) @ R
+        self._P[:6, :6] = calibration.start.covariance()
         self._P[6:, 6:] = np.eye(3) * calibration.imu.gyro_bias_sigma**2
         self._epoch_ns: int | None = None
         self._felt: PreintegratedMotion | None = None

@@ -57,6 +57,10 @@ def test_wrong_field_is_refused_by_source_and_name(values, field):
             "velocity_sigma_m_s.1: expected a number greater than or equal to 0",
         ),
         (
+            {"start": {"rpy_rad": [0.0, 1.57, 0.0]}},
+            "start.rpy_rad: pitch 1.57 is vertical, where roll and yaw turn about one axis",
+        ),
+        (
             {"start": {"rpy_sigma_rad": [0.01, 0.01, -0.01]}},
             "rpy_sigma_rad.2: expected a number greater than or equal to 0",
         ),
