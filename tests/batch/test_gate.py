@@ -39,11 +39,6 @@ def judged(before: RecordedBatch, after: RecordedBatch, folder: Path) -> GateVer
     return gate(after, folder / "before.json")
 
 
-def level(batch: RecordedBatch, column: str, value: float) -> RecordedBatch:
-    """The batch, had a column the same value in every run."""
-    return updated(batch, lambda _: {column: value})
-
-
 def noise(seed: int, mean: float, runs: int = 24) -> np.ndarray:
     return np.random.default_rng(seed).lognormal(np.log(mean), 0.1, runs)
 

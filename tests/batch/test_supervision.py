@@ -3,18 +3,17 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import psutil
 import pytest
 
 from sonar_graph.batch import supervision
-from sonar_graph.batch.store import Limits, PlannedRun
+from sonar_graph.batch.store import Limits
 from sonar_graph.batch.supervision import Runner, perform_watched
 from sonar_graph.errors import BatchError
 
-Planned = Callable[..., PlannedRun]
 AMPLE = Limits(600.0)
 pytestmark = pytest.mark.slow
 

@@ -128,8 +128,6 @@ def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
 
 # --- sonar images ----------------------------------------------------------------------------------------------------
 
-KINDS = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
-
 
 def frames(
     kind: str = "u1", count: int = 3, first: int = 0, beams: int = 4, bins: int = 5

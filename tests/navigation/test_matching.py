@@ -29,12 +29,6 @@ from sonar_graph.states import Trajectory
 
 from .rows import dvl
 
-T_S = np.arange(0, 20, 0.02)
-RATE = np.column_stack(
-    [0.2 * np.sin(T_S), 0.1 * np.cos(0.7 * T_S), 0.3 + 0.2 * np.sin(0.4 * T_S)]
-)
-
-
 OFFSET_S = 0.13
 YAW_RAD = np.radians(3)
 SCALE = 1.01

@@ -30,8 +30,6 @@ from tests.recorded_batches import (
     write_batch,
 )
 
-ATE = "causal.ate_se2_m"
-
 
 @pytest.fixture(scope="module")
 def batch() -> RecordedBatch:

@@ -73,17 +73,6 @@ def assert_binomial(successes: int, trials: int, probability: float) -> None:
     assert low <= successes <= high
 
 
-def point(distance: float, azimuth: float, elevation: float) -> Floats:
-    across = distance * np.cos(elevation)
-    return np.array(
-        [
-            across * np.cos(azimuth),
-            across * np.sin(azimuth),
-            distance * np.sin(elevation),
-        ]
-    )
-
-
 def test_a_perfect_recogniser_reports_exactly_what_is_in_view():
     """Confidently, with room for none; where nothing is in view there is no block."""
     found = detect()

@@ -121,9 +121,6 @@ def test_what_reaches_the_least_probability_is_decided(
     assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
 
 
-FLAT = [0.2] * 4
-
-
 PROBABILITY = 0.95
 
 

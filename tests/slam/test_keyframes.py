@@ -19,7 +19,7 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu
-from sonar_graph.navigation import Odometry, PreintegratedMotion
+from sonar_graph.navigation import Odometry
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam import KeyframeParams
 from sonar_graph.slam.keyframes import Keyframes, average_at_end
@@ -91,13 +91,6 @@ def factor_of(keyframes: Keyframes, kind: type) -> gtsam.NonlinearFactor:
     """The only factor of a kind on the second keyframe."""
     (factor,) = factors_on(keyframes, kind, X(1))
     return factor
-
-
-def see(keyframes: Keyframes, after_s: float) -> PreintegratedMotion:
-    """A frame comes: the motion to it from what is then the newest keyframe."""
-    stamp = int(at(after_s)[0])
-    keyframes.advance(stamp)
-    return keyframes.set_for_frame(stamp, keyframes.motion_since_newest(stamp))
 
 
 def test_every_keyframe_has_its_odometry_gravity_and_plane():

@@ -44,10 +44,6 @@ def run(tracker, frames, step=STILL):
     ]
 
 
-def polar(point) -> tuple[float, float]:
-    return float(np.linalg.norm(point)), float(np.arctan2(point[1], point[0]))
-
-
 def track_at(q, P) -> TrackStates:
     return TrackStates(
         np.array([0]), np.array([q]), np.array([P]), np.array([0.5]), np.array([1])

@@ -38,10 +38,6 @@ def hold_past_motions(sequence):
     return expm(twists * duration[:, None, None])
 
 
-def motion_of(velocity, rate):
-    return expm(np.array([[0, -rate, velocity[0]], [rate, 0, velocity[1]], [0, 0, 0]]))
-
-
 # ---- axes and identities of DLR
 
 
