@@ -13,21 +13,20 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from sonar_graph.batch import batch as batch_module
-from sonar_graph.batch import cluster
-from sonar_graph.batch.batch import Batch
-from sonar_graph.batch.one_run import perform
-from sonar_graph.batch.recorded import is_batch, read_batch
-from sonar_graph.batch.result_table import RESULTS, is_timing
-from sonar_graph.batch.store import (
+from sonar_graph.batch import (
+    RESULTS,
+    Batch,
     Limits,
-    PlannedRun,
-    Progress,
-    RunOutcome,
-    Store,
     Where,
+    cluster,
+    is_batch,
+    read_batch,
+    read_suite,
 )
-from sonar_graph.batch.suite import read_suite
+from sonar_graph.batch import batch as batch_module
+from sonar_graph.batch.one_run import perform
+from sonar_graph.batch.result_table import is_timing
+from sonar_graph.batch.store import PlannedRun, Progress, RunOutcome, Store
 from sonar_graph.errors import BatchError, EvaluationError
 from sonar_graph.files import (
     deferred_interrupt,
@@ -42,11 +41,11 @@ HERE = Where(1)
 
 
 class Killed(BaseException):
-    """Ends a process as SIGKILL does: nobody hears of it."""
+    """Ends a process as SIGKILL does, without a message."""
 
 
 def nobody(_run: PlannedRun, _outcome: RunOutcome) -> None:
-    """Is told of progress."""
+    """Receives progress."""
 
 
 def table(folder: Path) -> list[dict[str, Any]]:
@@ -196,7 +195,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_changed_suite_goes_on_in_the_folder_once_a_run_is_done_and_another_suite_is_refused(
     suite, tmp_path, in_this_process, monkeypatch
 ):
-    folder, text = tmp_path / "out", suite.read_text()
+    folder = tmp_path / "out"
+    text = suite.read_text()
     suite.write_text(text + '[[estimators]]\nname = "no such"\n')
     with pytest.raises(BatchError), Batch.opened(read_suite(suite), folder):
         pass
@@ -256,7 +256,7 @@ def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path
 def kill(
     suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some runs are done and told, and then the process is gone."""
+    """Some runs are done and reported, and then the process is gone."""
 
     def killed(
         runs: list[PlannedRun],
@@ -278,10 +278,8 @@ def kill(
 @pytest.fixture
 def handler(request) -> Iterator[Any]:
     """The handler of interrupts, Python's own or another one; tests must leave it, and that of terminations, as is."""
-    before, terminated = (
-        signal.getsignal(signal.SIGINT),
-        signal.getsignal(signal.SIGTERM),
-    )
+    before = signal.getsignal(signal.SIGINT)
+    terminated = signal.getsignal(signal.SIGTERM)
     given = getattr(request, "param", signal.default_int_handler)
     signal.signal(signal.SIGINT, given)
     yield given

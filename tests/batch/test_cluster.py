@@ -20,9 +20,10 @@ import pyarrow.parquet as pq
 import pytest
 from distributed import LocalCluster
 
+from sonar_graph.batch import Limits, Where
 from sonar_graph.batch import cluster as execution
 from sonar_graph.batch.cluster import run_batch
-from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store, Where
+from sonar_graph.batch.store import PlannedRun, RunOutcome, Store
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
@@ -180,7 +181,7 @@ def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
 def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
     planned, tmp_path, monkeypatch
 ):
-    """The first batch is waiting while the second one, of the same run, fails and cancels what it asked for."""
+    """The first batch is waiting while the second one, of the same run, fails and cancels its requests."""
     done: list[str] = []
     run = planned()
 

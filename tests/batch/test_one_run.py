@@ -5,19 +5,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.batch import one_run
+from sonar_graph.batch import KINDS, one_run
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.result_table import COLUMNS, is_timing
-from sonar_graph.batch.sources import KINDS, LogOptions, SourceKind, fingerprint
+from sonar_graph.batch.sources import LogOptions, SourceKind, fingerprint
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.run import run_here
-from sonar_graph.evaluation.storage import read_comparison
+from sonar_graph.evaluation import compare, read_comparison, run_here
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
+from sonar_graph.simulation import (
+    BasinOptions,
+    LandmarkOptions,
+    add_landmarks,
+    simulate_basin,
+)
 
 
 def numbers(row: dict[str, Any]) -> dict[str, Any]:
@@ -105,10 +107,8 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
         BatchError, match=r"log \S+dive\.mcap: not what it was when the run was planned"
     ):
         perform(replace(planned_short, seed=1), tmp_path / "run")  # not in hand
-    run, read = (
-        replace(of_log(planned(), log), landmarks={}, seed=0),
-        one_run.read_source,
-    )
+    run = replace(of_log(planned(), log), landmarks={}, seed=0)
+    read = one_run.read_source
 
     def read_and_changed(*given: Any) -> Sequence:
         sequence = read(*given)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs, source_hash, versions_of
+from sonar_graph.batch import plan_runs, read_suite
+from sonar_graph.batch.plan import source_hash, versions_of
 from sonar_graph.batch.sources import LOG, fingerprint
 from sonar_graph.batch.store import PlannedRun
-from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -178,10 +178,8 @@ def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite
 def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content(
     write_suite, tmp_path
 ):
-    grid, params = (
-        "grid = { wrong_id_rate = [0.1] }\n",
-        "params = { smoother.lag_s = 14 }\n",
-    )
+    grid = "grid = { wrong_id_rate = [0.1] }\n"
+    params = "params = { smoother.lag_s = 14 }\n"
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
     assert run.asked == {
         "generator": "basin",
@@ -266,7 +264,8 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
 def test_hash_is_taken_once_in_a_process_and_another_sees_a_change_of_equal_size(
     package, hashed
 ):
-    before, code = hashed(), package / "__init__.py"
+    before = hashed()
+    code = package / "__init__.py"
     state = code.stat()
     code.write_text("raise RuntimeError('Imported')\n")
     os.utime(code, ns=(state.st_atime_ns, state.st_mtime_ns))

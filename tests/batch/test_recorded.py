@@ -9,8 +9,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.recorded import ALL_LOGS, RESULTS, is_batch, read_batch
+from sonar_graph.batch import (
+    ALL_LOGS,
+    RESULTS,
+    is_batch,
+    plan_runs,
+    read_batch,
+    read_suite,
+)
 from sonar_graph.batch.result_table import (
     COLUMNS,
     SUITE_METADATA,
@@ -18,13 +24,13 @@ from sonar_graph.batch.result_table import (
     write_results,
 )
 from sonar_graph.batch.store import RunOutcome, Store
-from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import EvaluationError
 from tests.recorded_batches import LOGS, drawn_batch, with_failures, write_batch
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
-ATE, MAP = "causal.ate_se2_m", "landmarks.se2_m"
+ATE = "causal.ate_se2_m"
+MAP = "landmarks.se2_m"
 
 
 def test_a_batch_is_read_as_it_was_written_also_against_another_reference(tmp_path):
@@ -103,7 +109,8 @@ def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(
     write_suite, tmp_path
 ):
     file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
-    runs, store = plan_runs(file), Store(tmp_path / "out")
+    runs = plan_runs(file)
+    store = Store(tmp_path / "out")
     for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
         store.write(
             run.key,

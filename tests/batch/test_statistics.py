@@ -32,7 +32,8 @@ def closed_testing(p_values: list[float]) -> list[float]:
 
 @given(st.lists(shares | st.just(math.nan), min_size=1, max_size=7))
 def test_holm_is_closed_testing_with_bonferroni_of_what_was_tested(p_values):
-    corrected, is_known = statistics.holm(np.array(p_values)), ~np.isnan(p_values)
+    corrected = statistics.holm(np.array(p_values))
+    is_known = ~np.isnan(p_values)
     assert corrected[is_known].tolist() == pytest.approx(
         closed_testing(np.array(p_values)[is_known].tolist())
     )
@@ -42,7 +43,9 @@ def test_holm_is_closed_testing_with_bonferroni_of_what_was_tested(p_values):
 @given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=30))
 def test_the_interval_solves_halls_equation(listed):
     values = np.array(listed)
-    n, mean, deviation = len(values), values.mean(), values.std(ddof=1)
+    n = len(values)
+    mean = values.mean()
+    deviation = values.std(ddof=1)
     assume(deviation > max(1e-9, 1e-6 * np.abs(values).max()))
     g = stats.skew(values)
     for bound, side in zip(statistics.mean_interval(values), (1, -1), strict=True):
@@ -109,10 +112,8 @@ def test_failing_where_it_was_worse_makes_nobody_better():
     worst = np.argsort(own - reference)[-4:]
     survivors = own.copy()
     survivors[worst] = INF
-    whole, told = (
-        statistics.paired(own, reference),
-        statistics.paired(survivors, reference),
-    )
+    whole = statistics.paired(own, reference)
+    told = statistics.paired(survivors, reference)
     kept = np.delete(np.arange(12), worst)
     assert statistics.paired(own[kept], reference[kept]).mean < whole.mean, (
         "over survivors it would look better"
@@ -127,7 +128,8 @@ def test_failing_where_it_was_worse_makes_nobody_better():
 def test_what_logs_share_by_their_seed_is_no_finding():
     rng = np.random.default_rng(12)
     cases = list(range(10)) * 4
-    single, clustered = [], []
+    single = []
+    clustered = []
     for _ in range(200):
         own = np.tile(rng.normal(size=10), 4) + rng.normal(0, 0.3, 40)
         single.append(statistics.paired(own, np.zeros(40)).p_value < 0.05)
@@ -169,7 +171,8 @@ def test_pairs_of_one_case_make_one_difference(
 
 
 def test_a_mean_difference_is_that_of_the_means_of_cases():
-    own, reference = np.arange(12.0), np.array([1.0, 0.0] * 6)
+    own = np.arange(12.0)
+    reference = np.array([1.0, 0.0] * 6)
     halves = statistics.paired(own, reference, [i // 2 for i in range(12)])
     assert halves == replace(
         statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)),

@@ -9,8 +9,7 @@ from typing import Any
 import psutil
 import pytest
 
-from sonar_graph.batch import supervision
-from sonar_graph.batch.store import Limits
+from sonar_graph.batch import Limits, supervision
 from sonar_graph.batch.supervision import Runner, perform_watched
 from sonar_graph.errors import BatchError
 

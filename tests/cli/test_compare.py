@@ -15,17 +15,12 @@ import pytest
 
 from sonar_graph.cli.compare import DEMO
 from sonar_graph.estimator import load_estimator
-from sonar_graph.evaluation.storage import read_comparison
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import write_log
+from sonar_graph.evaluation import read_comparison
+from sonar_graph.logs import read_log, write_log
 from sonar_graph.measurements import NS_PER_S, Heading, PositionFixes
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import (
-    FASTEST_M_S,
-    PAPER_LAPS,
-    BasinOptions,
-    cruise_speed,
-)
+from sonar_graph.simulation import BasinOptions, cruise_speed
+from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +51,8 @@ def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(
     run, basin, tmp_path, capsys
 ):
     assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
-    told, page = capsys.readouterr(), tmp_path / "report.html"
+    told = capsys.readouterr()
+    page = tmp_path / "report.html"
     assert f"Report: {page}" in told.out.splitlines()
     assert "dead-reckoning" in told.out
     assert told.err == ""
@@ -212,7 +208,8 @@ def test_run_and_compare_name_first_what_sensors_contradict_and_nothing_of_a_sou
     run, basin, tmp_path, capsys, spoil, told
 ):
     """Before what follows from it: refused rows, and a map that is far off."""
-    log, out = tmp_path / "spoilt.mcap", tmp_path / "out"
+    log = tmp_path / "spoilt.mcap"
+    out = tmp_path / "out"
     write_log(log, spoil(read_log(basin)))
     told_in = []
     for command, option in (("run", "--estimator"), ("compare", "--estimators")):

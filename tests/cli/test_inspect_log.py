@@ -8,9 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.inspection import LogSummary
-from sonar_graph.logs.writing import write_log
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.logs import LogSummary, write_log
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 
 @pytest.fixture(scope="module")

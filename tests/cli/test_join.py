@@ -16,11 +16,14 @@ from sonar_graph.calibration import (
     SonarCalibration,
     SonarImage,
 )
-from sonar_graph.logs.mcap.writer import recording
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.sonar_images import read_sonar_frames
-from sonar_graph.logs.vehicle_setup import METADATA
-from sonar_graph.logs.writing import sonar_image_messages, write_log
+from sonar_graph.logs import (
+    METADATA,
+    read_log,
+    read_sonar_frames,
+    sonar_image_messages,
+    write_log,
+)
+from sonar_graph.logs.mcap import recording
 from tests.logs.converters.sonar_recordings import Aris, images
 from tests.recognition.imaged_lane import TOPIC, Lane
 
@@ -28,7 +31,7 @@ OFFSET_S = 2.4
 
 
 def images_log(lane: Lane, path: Path, offset_s: float = OFFSET_S) -> Path:
-    """The images by a clock that is behind, in a log that says what their samples mean."""
+    """The images by a clock that is behind, in a log that states what their samples mean."""
     calibration = Calibration(
         sonar=SonarCalibration(image=SonarImage(decibel_span=75.0))
     )
@@ -85,7 +88,8 @@ def bare(lane, tmp_path_factory) -> Path:
         (folder / "whole.mcap").open("rb") as stream,
         (folder / "nav.mcap").open("wb") as out,
     ):
-        writer, channels = Writer(out), {}
+        writer = Writer(out)
+        channels = {}
         writer.start()
         for schema, channel, message in make_reader(stream).iter_messages():
             if channel.topic not in channels:
@@ -108,7 +112,8 @@ def bare(lane, tmp_path_factory) -> Path:
 def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
     lane, both, bare, run, tmp_path
 ):
-    out, expected = tmp_path / "joined.mcap", lane.sequence.calibration.sonar.mounting
+    out = tmp_path / "joined.mcap"
+    expected = lane.sequence.calibration.sonar.mounting
     assert expected != Mounting()
     assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
     joined = read_log(out)
@@ -127,7 +132,8 @@ def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
 def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
     both, bare, run, tmp_path
 ):
-    given, out = tmp_path / "vehicle.toml", tmp_path / "joined.mcap"
+    given = tmp_path / "vehicle.toml"
+    out = tmp_path / "joined.mcap"
     given.write_text(
         "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
         "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"

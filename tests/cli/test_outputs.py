@@ -26,7 +26,8 @@ def foreign_log(path: Path) -> bytes:
 
 def links(target: Path, folder: Path) -> list[Path]:
     """Other names of a file."""
-    symbolic, hard = folder / "symbolic.mcap", folder / "hard.mcap"
+    symbolic = folder / "symbolic.mcap"
+    hard = folder / "hard.mcap"
     symbolic.symlink_to(target)
     hard.hardlink_to(target)
     return [symbolic, hard]
@@ -55,7 +56,8 @@ def test_a_log_made_from_a_file_never_replaces_it(
 def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either(
     basin, run, tmp_path, capsys
 ):
-    part, model = tmp_path / "bag" / "bag_0.mcap", tmp_path / "log.json"
+    part = tmp_path / "bag" / "bag_0.mcap"
+    model = tmp_path / "log.json"
     contents = foreign_log(part), basin.read_bytes()
     model.hardlink_to(basin)
     rosbag = ("convert", "rosbag", part.parent, "-o", part, "--overwrite")
@@ -183,7 +185,8 @@ def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothi
 def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_there(
     run, basin, tmp_path
 ):
-    unreadable, there = tmp_path / "words.mcap", tmp_path / "there"
+    unreadable = tmp_path / "words.mcap"
+    there = tmp_path / "there"
     unreadable.write_text("words")
     there.mkdir()
     for place in (tmp_path / "made" / "below", there, there / "below"):

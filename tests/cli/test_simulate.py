@@ -10,16 +10,16 @@ from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.sonar_images import read_sonar_frames
-from sonar_graph.logs.writing import write_log
-from sonar_graph.simulation.basin import (
+from sonar_graph.logs import read_log, read_sonar_frames, write_log
+from sonar_graph.simulation import (
     BasinOptions,
+    LandmarkOptions,
+    MissionOptions,
+    add_landmarks,
     simulate_basin,
     simulate_basin_frames,
+    simulate_mission,
 )
-from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 SHORT = {
     "duration_s": 120,
@@ -57,10 +57,8 @@ def test_images_and_other_sensors_are_those_of_the_library_in_the_order_of_time(
         said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross",
     )
     options = BasinOptions.model_validate(SHORT)
-    read, made = (
-        list(read_sonar_frames(tmp_path / "a.mcap")),
-        list(simulate_basin_frames(options)),
-    )
+    read = list(read_sonar_frames(tmp_path / "a.mcap"))
+    made = list(simulate_basin_frames(options))
     order = np.argsort([block.stamps_ns[0] for block in read])
     images = np.concatenate([read[k].intensity for k in order])
     np.testing.assert_array_equal(
@@ -69,7 +67,8 @@ def test_images_and_other_sensors_are_those_of_the_library_in_the_order_of_time(
     np.testing.assert_allclose(
         read[0].azimuths_rad, made[0].frames.azimuths_rad, atol=1e-12
     )
-    sequence, expected = read_log(tmp_path / "a.mcap"), simulate_basin(options)
+    sequence = read_log(tmp_path / "a.mcap")
+    expected = simulate_basin(options)
     assert sequence.detections is None
     np.testing.assert_array_equal(
         sequence.imu.angular_velocity, expected.imu.angular_velocity
@@ -148,7 +147,8 @@ def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(
             )
             == 0
         )
-        read, recorded = read_log(new), read_log(log)
+        read = read_log(new)
+        recorded = read_log(log)
         expected = add_landmarks(recorded, LandmarkOptions(seed=seed, spacing_m=4.0))
         np.testing.assert_allclose(
             read.detections.range_m, expected.detections.range_m, atol=1e-6

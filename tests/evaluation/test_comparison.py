@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import EvaluationError, UnknownEstimatorError
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.evaluation import compare, run_estimator
 from sonar_graph.evaluation.scores import (
     landmark_scores,
 )
@@ -47,7 +46,7 @@ OTHER_KEYS = {
 def test_what_sensors_contradict_is_found_of_a_sequence_as_of_the_log_that_is_written_of_it(
     tmp_path, caplog
 ):
-    """Also by the checks of single numbers, and told once: notes of the comparison, log, page and `inspect`."""
+    """Also by the checks of single numbers, and reported once: notes of the comparison, log, page and `inspect`."""
     world = small_world()
     velocity = 1.3 * world.dvl.velocity
     velocity[40:60] = velocity[40]
@@ -158,10 +157,8 @@ def test_all_are_scored_at_the_instants_that_all_have(install):
 
 
 def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
-    together, alone = (
-        compare(straight_sequence(), ["broken", "offset"]),
-        compare(straight_sequence(), ["offset"]),
-    )
+    together = compare(straight_sequence(), ["broken", "offset"])
+    alone = compare(straight_sequence(), ["offset"])
     assert [(run.estimator, run.status) for run in together.runs] == [
         ("broken", "failed"),
         ("offset", "ok"),
@@ -356,7 +353,8 @@ class Few(Moving):
     """Learns its third landmark after ten seconds."""
 
     def landmarks(self) -> LandmarkMap:
-        known, late = super().landmarks(), self.estimates[-1].stamp_ns > 11_000_000_000
+        known = super().landmarks()
+        late = self.estimates[-1].stamp_ns > 11_000_000_000
         rows = slice(0, 3 if late else 2)
         return LandmarkMap(
             known.ids[rows], known.positions[rows], known.covariances[rows]

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import consistency
-from sonar_graph.evaluation.results import Score
+from sonar_graph.evaluation import Score, consistency
 from sonar_graph.states import DetectionLog, Estimate, Outcome, Trajectory
 
 angles = st.floats(-3.0, 3.0)
@@ -28,7 +27,8 @@ def numerical_covariance(pose: gtsam.Pose3, covariance: np.ndarray) -> np.ndarra
     step = 1e-6
     columns = []
     for axis in np.eye(6):
-        plus, minus = pose.retract(step * axis), pose.retract(-step * axis)
+        plus = pose.retract(step * axis)
+        minus = pose.retract(-step * axis)
         yaw = plus.rotation().yaw() - minus.rotation().yaw()
         columns.append(
             np.append(plus.translation() - minus.translation(), yaw) / (2 * step)
@@ -101,7 +101,7 @@ def test_of_healthy_runs_hardly_one_is_called_inconsistent_however_slow_its_erro
     verdicts = [judged(drawn(rng, 600, dof, tau)) for _ in range(200)]
     assert np.mean([verdict == "over-confident" for verdict in verdicts]) <= 0.05
     assert np.mean([verdict == "over-cautious" for verdict in verdicts]) <= 0.08
-    # then a run is worth enough samples to tell errors of twice the size
+    # then a run is worth enough samples to detect errors of twice the size
     fast = tau <= 10
     bad = [judged(2 * drawn(rng, 600, dof, tau)) for _ in range(50)]
     assert np.mean([verdict == "over-confident" for verdict in bad]) >= (
@@ -142,7 +142,8 @@ def test_nis_takes_used_detections_only():
 
 
 def test_planar_nees_ignores_height():
-    pose, above = gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 5.0]))
+    pose = gtsam.Pose3()
+    above = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 5.0]))
     covariance = np.diag([1e-2] * 3 + [1e-2] * 3)
     planar = consistency.error_series(
         single(above, covariance), single(pose, covariance), 2

@@ -42,7 +42,8 @@ def disturbed(truth: Trajectory, seed: int) -> Trajectory:
 def moved(
     path: Trajectory, turn: Rotation, shift: tuple[float, float, float]
 ) -> Trajectory:
-    places, attitudes = turn.apply(path.positions) + shift, turn * path.rotations()
+    places = turn.apply(path.positions) + shift
+    attitudes = turn * path.rotations()
     return Trajectory.without_covariances(path.stamps_ns, places, attitudes.as_quat())
 
 
@@ -218,7 +219,8 @@ def cloud(seed: int, n: int = 30) -> np.ndarray:
 
 @given(seeds, st.sampled_from([2, 3]))
 def test_umeyama_agrees_with_evo(seed, dimension):
-    points, targets = cloud(seed)[:, :dimension], cloud(seed + 1)[:, :dimension]
+    points = cloud(seed)[:, :dimension]
+    targets = cloud(seed + 1)[:, :dimension]
     R, t = metrics.umeyama(points, targets)
     expected_R, expected_t, _ = umeyama_alignment(points.T, targets.T)
     np.testing.assert_allclose(R, expected_R, atol=1e-9)

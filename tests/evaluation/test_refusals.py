@@ -12,16 +12,21 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from sonar_graph.cli.main import main
+from sonar_graph.cli import main
 from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
-from sonar_graph.evaluation.results import MOST_ROWS_NAMED, RunResult, gathered
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.evaluation.storage import read_comparison, write_comparison
-from sonar_graph.logs.writing import write_log
+from sonar_graph.evaluation import (
+    MOST_ROWS_NAMED,
+    RunResult,
+    gathered,
+    read_comparison,
+    run_estimator,
+    write_comparison,
+)
+from sonar_graph.logs import write_log
 from sonar_graph.measurements import Dvl, Heading, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Estimate, Outcome, Refusal, RefusedRow
 from tests.synthetic import late, outlier, refusing, with_run
 
@@ -236,7 +241,8 @@ def begun_at(sequence: Sequence, rows: int) -> Sequence:
 def test_first_rows_before_the_clock_was_set_are_named_and_change_nothing(
     mission, name, rows, step_ns
 ):
-    faulty, known = off_the_clock(mission, rows, step_ns), begun_at(mission, rows)
+    faulty = off_the_clock(mission, rows, step_ns)
+    known = begun_at(mission, rows)
     run = run_estimator(faulty, name)
     assert_same_numbers(run, run_estimator(known, name))
     assert Counter((row.sensor, row.reason) for row in run.refused) == {
@@ -291,10 +297,8 @@ def live(
         (HELD_NS[1], resumed_ns),
         (resumed_ns, sequence.end_ns),
     ):
-        imu, dvl = (
-            sequence.imu.between(after_ns, until_ns),
-            sequence.dvl.between(after_ns, until_ns),
-        )
+        imu = sequence.imu.between(after_ns, until_ns)
+        dvl = sequence.dvl.between(after_ns, until_ns)
         estimator.process(Measurements(until_ns, imu, dvl))
     if late is not None:
         estimator.process(late)
@@ -303,7 +307,8 @@ def live(
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_late_rows_are_named_and_not_used(straight, name):
-    imu, dvl = straight.imu.between(*HELD_NS), straight.dvl.between(*HELD_NS)
+    imu = straight.imu.between(*HELD_NS)
+    dvl = straight.dvl.between(*HELD_NS)
     estimate, refused = live(name, straight, Measurements(straight.end_ns, imu, dvl))
     other, nothing = live(name, straight, None)
     assert not nothing

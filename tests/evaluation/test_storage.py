@@ -10,9 +10,9 @@ from evo.tools import file_interface
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.storage import (
+from sonar_graph.evaluation import (
+    Comparison,
+    compare,
     read_comparison,
     write_comparison,
 )
@@ -98,7 +98,8 @@ def test_json_is_strict_and_tells_units_and_protocol(folder):
 def test_folder_holds_what_other_tools_read_without_code_and_of_a_failed_run_only_its_reason(
     folder,
 ):
-    good, failed = folder / "runs" / "offset", folder / "runs" / "broken"
+    good = folder / "runs" / "offset"
+    failed = folder / "runs" / "broken"
     files = "causal.tum", "landmarks.csv", "series.npz", "trajectory.tum"
     assert tuple(sorted(path.name for path in good.iterdir())) == files
     assert [path.name for path in failed.iterdir()] == ["series.npz"]

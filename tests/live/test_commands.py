@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
+from sonar_graph.cli import main
 from sonar_graph.cli.live import unheard_lines
-from sonar_graph.cli.main import main
 from sonar_graph.live import Prediction
 from sonar_graph.live.outlets import Status
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -106,7 +106,8 @@ def test_a_live_run_equals_the_run_on_its_record_and_a_killed_one_has_a_record(
     """With both ends as commands: play, live, SIGKILL, live, Ctrl-C, run."""
     world = simulate_mission(MissionOptions(duration_s=40.0, frame_rate_hz=5.0))
     write_log(tmp_path / "log.mcap", world)
-    where, go = free_endpoint(), tmp_path / "go"
+    where = free_endpoint()
+    go = tmp_path / "go"
     player = subprocess.Popen(
         [*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go]
     )

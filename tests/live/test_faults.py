@@ -15,19 +15,20 @@ from sonar_graph.live import (
     LiveOptions,
     LiveRun,
     Publisher,
+    definition_of,
     inbox,
     open_session,
     subscribe,
 )
 from sonar_graph.live.outlets import ZenohOutlet
-from sonar_graph.live.zenoh_link import definition_of
 from sonar_graph.logs import LiveRecord
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from tests.live.traffic import free_endpoint, messages_of
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.slow
-PACE, SECOND = 2.5, 10**9
+PACE = 2.5
+SECOND = 10**9
 STALLED = """
 import sys, time
 from sonar_graph.live import open_session
@@ -95,7 +96,7 @@ class Robot(threading.Thread):
 
 
 def lived(folder, endpoint, robot, listener=None, said=None):
-    """A live run on what a robot sends: the run, its outcome, and what was said."""
+    """A live run on what a robot sends: the run, its outcome, and the messages."""
     said = [] if said is None else said
     taken = {}
     with (

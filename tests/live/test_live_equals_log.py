@@ -9,10 +9,14 @@ import pytest
 from sonar_graph import Odometry, load_estimator, read_log, write_log
 from sonar_graph.calibration import Calibration, KnownMap
 from sonar_graph.errors import LogError
-from sonar_graph.live import Engine, LiveOptions, Message, recorded_messages
-from sonar_graph.live.zenoh_link import definition_of
-from sonar_graph.logs import PartialCalibration
-from sonar_graph.logs.live_record import LiveRecord
+from sonar_graph.live import (
+    Engine,
+    LiveOptions,
+    Message,
+    definition_of,
+    recorded_messages,
+)
+from sonar_graph.logs import LiveRecord, PartialCalibration
 from sonar_graph.navigation import make_estimator
 from sonar_graph.testing import aided_world, small_world
 from tests.live.traffic import messages_of
@@ -23,11 +27,13 @@ NS = 1_000_000_000
 def live(path: Path, messages: list[Message], **options):
     with LiveRecord(path) as record:
         engine = Engine(record, definition_of, LiveOptions(**options))
-        generation, steps = 0, []
+        generation = 0
+        steps = []
         for message in messages:
             engine.take(message)
             if engine.generation != generation:
-                generation, steps = engine.generation, []
+                generation = engine.generation
+                steps = []
             for step in engine.steps():
                 steps.append(step)
                 assert len(steps) < 1000, "steps without end"
@@ -174,14 +180,12 @@ def test_a_topic_that_was_chosen_may_come_late(tmp_path):
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
     late_ns = messages[0].arrival_ns + 5 * NS
     with LiveRecord(tmp_path / "record.mcap") as record:
-        engine, waited_for = (
-            Engine(
-                record,
-                definition_of,
-                LiveOptions(topics={"detections": "/sonar/landmarks"}),
-            ),
-            set(),
+        engine = Engine(
+            record,
+            definition_of,
+            LiveOptions(topics={"detections": "/sonar/landmarks"}),
         )
+        waited_for = set()
         for message in messages:
             if message.topic != "/sonar/landmarks" or message.arrival_ns > late_ns:
                 engine.take(message)

@@ -8,19 +8,20 @@ import pytest
 
 from sonar_graph import read_log, write_log
 from sonar_graph.devices import velocity_of_beams
-from sonar_graph.live import Engine, Message
+from sonar_graph.live import Engine, Message, definition_of
 from sonar_graph.live.engine import OVERLOADED
 from sonar_graph.live.live_messages import dropped_messages
-from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.logs import LiveRecord
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import encode, parse_definition
-from sonar_graph.logs.live_record import LiveRecord
 from sonar_graph.testing import small_world
 from tests.live.test_live_equals_log import NS, live
 from tests.live.traffic import messages_of
 
 BLOCKS = ("imu", "dvl", "depth", "heading", "positions", "detections")
-DVL, IMU, DETECTIONS = "/dvl/data", "/imu/data", "/sonar/landmarks"
+DVL = "/dvl/data"
+IMU = "/imu/data"
+DETECTIONS = "/sonar/landmarks"
 
 
 @pytest.fixture
@@ -151,11 +152,13 @@ def first_imu(messages):
 
 
 def scrambled(messages, from_s):
-    """Messages of which some are cut and some have random bytes."""
-    noise, first_ns = np.random.default_rng(0), messages[0].arrival_ns
+    """Messages, some cut and some with random bytes."""
+    noise = np.random.default_rng(0)
+    first_ns = messages[0].arrival_ns
     found = []
     for message in messages:
-        data, draw = bytearray(message.payload), noise.random()
+        data = bytearray(message.payload)
+        draw = noise.random()
         at = int(noise.integers(4, len(data)))
         if (
             message.topic != "/tf_static"
@@ -295,7 +298,8 @@ def assert_equal(engine, steps, path):
     assert [step.end_ns for step in steps] == [step.end_ns for step in replayed]
     for mine, theirs in zip(steps, replayed, strict=True):
         for name in BLOCKS:
-            one, other = getattr(mine, name), getattr(theirs, name)
+            one = getattr(mine, name)
+            other = getattr(theirs, name)
             assert (one is None) == (other is None), name
             for column, values in {} if one is None else vars(one).items():
                 expected = getattr(other, column)
@@ -328,11 +332,9 @@ def test_a_rate_that_is_no_short_number_is_recorded_to_the_bit(tmp_path, message
 
 def test_a_velocity_of_beams_does_not_depend_on_other_pings():
     noise = np.random.default_rng(0)
-    directions, along, valid = (
-        noise.normal(size=(4, 3)),
-        noise.normal(size=(50, 4)),
-        noise.random((50, 4)) < 0.9,
-    )
+    directions = noise.normal(size=(4, 3))
+    along = noise.normal(size=(50, 4))
+    valid = noise.random((50, 4)) < 0.9
     velocity, _ = velocity_of_beams(directions, along, valid, 0.01)
     alone = [
         velocity_of_beams(directions, along[i : i + 1], valid[i : i + 1], 0.01)[0]
@@ -425,7 +427,7 @@ def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_
 def test_detections_that_were_dropped_for_being_behind_are_counted_once(
     tmp_path, messages
 ):
-    """Also where all began anew before, with a sensor that came late."""
+    """Also after a restart with a sensor that came late."""
     late = [
         m
         for m in messages

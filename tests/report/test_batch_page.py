@@ -8,16 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.recorded import RecordedBatch, read_batch
+from sonar_graph.batch import RecordedBatch, read_batch
 from sonar_graph.errors import EvaluationError
+from sonar_graph.report import lost_told, missing_told, write_batch_report
 from sonar_graph.report.batch_figures import log_panels
-from sonar_graph.report.batch_page import render_batch, write_batch_report
-from sonar_graph.report.batch_summary import (
-    absent_told,
-    lost_told,
-    marked,
-    missing_told,
-)
+from sonar_graph.report.batch_page import render_batch
+from sonar_graph.report.batch_summary import absent_told, marked
 from sonar_graph.report.batch_tables import failure_table
 from sonar_graph.report.figure_style import PAGE_WIDTH_IN, colour, sized
 from tests.recorded_batches import (
@@ -79,7 +75,8 @@ def rows(batch: RecordedBatch) -> dict[tuple[str, str], dict[str, object]]:
 def test_missing_runs_are_counted_and_are_no_failures(incomplete):
     counted = rows(incomplete)
     assert len(counted) == 6
-    some, none = counted[LOGS[0], "isam2"], counted[LOGS[0], "ekf-slam"]
+    some = counted[LOGS[0], "isam2"]
+    none = counted[LOGS[0], "ekf-slam"]
     assert (some["runs"], some["ended"], some["failure_rate"], some["not_run"]) == (
         6,
         5,

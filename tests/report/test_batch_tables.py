@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
-from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
-from sonar_graph.evaluation.digits import format_value
+from sonar_graph.batch import ALL_LOGS, KINDS, Metric, RecordedBatch, metrics_of
+from sonar_graph.evaluation import format_value
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.rendering import as_csv, csv_text
@@ -28,7 +27,8 @@ from tests.recorded_batches import (
 
 ATE, YAW = metrics_of(["causal.ate_se2_m", "causal.yaw_rmse_rad"])
 EVERY_METRIC = metrics_of(METRICS)
-KEY, YAW_KEY = "causal.ate_se2_m", "causal.yaw_rmse_rad"
+KEY = "causal.ate_se2_m"
+YAW_KEY = "causal.yaw_rmse_rad"
 BATCH = drawn_batch()
 
 
@@ -121,7 +121,8 @@ def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
     row = row_of(tables.difference_table(BATCH, ATE, tests), "isam2")
     assert float(row[f"{KEY}_difference"]) == pytest.approx((own - reference).mean())
     assert float(row[f"{KEY}_difference_low"]) < float(row[f"{KEY}_difference"])
-    single, corrected = float(row[f"{KEY}_p_holm_single"]), float(row[f"{KEY}_p_holm"])
+    single = float(row[f"{KEY}_p_holm_single"])
+    corrected = float(row[f"{KEY}_p_holm"])
     assert single == pytest.approx(2**-9)
     assert single < corrected <= 12 * single + 1e-12
     assert {log for _, log, _ in tests} == {*LOGS, ALL_LOGS}
@@ -184,7 +185,7 @@ def test_consistency_is_judged_over_runs_by_the_chi_square_band():
 
 
 def test_sections_of_a_table_stand_in_its_csv():
-    """Of two scores of one name a paper must say which is causal."""
+    """Of two scores of one name a paper must mark the causal one."""
     rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
     columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
     table = Table("t", "Scores", "", columns, rows, {0: "Causal", 1: "Smoothed"})

@@ -1,4 +1,4 @@
-"""The page of a comparison says everything that the comparison holds, and what is missing."""
+"""The page of a comparison shows everything that the comparison holds, and what is missing."""
 
 import base64
 import re
@@ -9,21 +9,18 @@ import pytest
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
+    Comparison,
+    Score,
     aligned_to_truth,
     landmark_errors,
+    published_maps,
     rmse,
+    score_keys,
+    score_table,
 )
-from sonar_graph.evaluation.results import Comparison, Score
-from sonar_graph.evaluation.scored_instants import published_maps
-from sonar_graph.evaluation.tables import score_keys, score_table
-from sonar_graph.recognition.session import with_detections
-from sonar_graph.report import sentences
-from sonar_graph.report.comparison_page import (
-    recognition_content,
-    render_report,
-    write_page,
-    write_report,
-)
+from sonar_graph.recognition import with_detections
+from sonar_graph.report import sentences, write_page, write_report
+from sonar_graph.report.comparison_page import recognition_content, render_report
 from sonar_graph.table import Table
 from tests.synthetic import (
     basin_comparison,
@@ -114,10 +111,8 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     assert not any("ekf-slam" in address for address in addresses)
 
 
-UNMEASURED, ENDLESS = (
-    Score(float("nan"), "MB", "Not measured."),
-    Score(float("inf"), "m", "Diverged."),
-)
+UNMEASURED = Score(float("nan"), "MB", "Not measured.")
+ENDLESS = Score(float("inf"), "m", "Diverged.")
 
 
 @pytest.mark.parametrize(
@@ -291,7 +286,8 @@ def test_the_section_shows_pictures_and_counts(recognised, lane_recognition):
         outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()
     }
     assert len(content["pictures"]) == len(lane_recognition.shown()) == 4
-    first, shown = content["pictures"][0], lane_recognition.shown()[0]
+    first = content["pictures"][0]
+    shown = lane_recognition.shown()[0]
     address = first["address"].removeprefix("data:image/jpeg;base64,")
     assert base64.b64decode(address) == shown.jpeg
     seconds = (shown.stamp_ns - recognised.sequence.start_ns) * 1e-9

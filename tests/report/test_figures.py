@@ -13,8 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation.results import Comparison, MapSoFar
-from sonar_graph.evaluation.scored_instants import map_instants, published_maps
+from sonar_graph.evaluation import Comparison, map_instants, published_maps
+from sonar_graph.evaluation.results import MapSoFar
 from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
     arrange,
@@ -24,17 +24,14 @@ from sonar_graph.report.figure_style import (
     logarithmic,
     sized,
 )
+from sonar_graph.report.figures import growth_figure, illustrations, map_figure
 from sonar_graph.report.figures.error_figures import errors_cut_off
-from sonar_graph.report.figures.illustrations import illustrations
-from sonar_graph.report.figures.maps import (
-    enlargement,
-    growth_figure,
-    map_figure,
-)
+from sonar_graph.report.figures.maps import enlargement
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
-TIME, DISTANCE = "time since start (s)", "distance travelled (m)"
+TIME = "time since start (s)"
+DISTANCE = "distance travelled (m)"
 FIGURES = {
     map_figure: ({"world x (m)"}, {"world y (m)"}),
     figures.error_figure: ({TIME, DISTANCE}, {"position error (m)", "yaw error (°)"}),
@@ -115,7 +112,8 @@ def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     name = "ekf-slam"
     figure = figures.bounds_figure(only(comparison, name))
     errors = comparison.errors[name]["causal"]
-    x_line, yaw_line = figure.axes[0].lines[-1], figure.axes[2].lines[-1]
+    x_line = figure.axes[0].lines[-1]
+    yaw_line = figure.axes[2].lines[-1]
     np.testing.assert_allclose(x_line.get_ydata(), errors.position_m[:, 0])
     np.testing.assert_allclose(yaw_line.get_ydata(), np.degrees(errors.yaw_rad))
     seconds = (errors.stamps_ns - errors.stamps_ns[0]) * 1e-9 + 0.5
@@ -235,7 +233,8 @@ def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
 
 def test_ellipses_are_as_large_as_the_caption_says():
     comparison = grown(sigma_m=0.02)
-    figure, factor = growth_figure(comparison), enlargement(comparison)
+    figure = growth_figure(comparison)
+    factor = enlargement(comparison)
     assert factor > 1
     ellipse = next(
         patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)

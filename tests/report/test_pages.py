@@ -67,8 +67,9 @@ class Page(HTMLParser):
 
 
 def test_what_a_log_or_an_estimator_says_is_escaped_everywhere():
-    """Everything that a log, a suite or an estimator can say would run a script."""
-    compared, batch = basin_comparison(60), drawn_batch()
+    """Every text of a log, a suite or an estimator would run a script."""
+    compared = basin_comparison(60)
+    batch = drawn_batch()
     sequence = replace(compared.sequence, name=HOSTILE, notes={HOSTILE: HOSTILE})
     told = replace(compared.runs[0], estimator=HOSTILE, params={HOSTILE: HOSTILE})
     scores = {**compared.scores, HOSTILE: {HOSTILE: Score(1.0, HOSTILE, HOSTILE)}}

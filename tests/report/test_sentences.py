@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
+from sonar_graph.evaluation import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
 from sonar_graph.measurements import Heading
-from sonar_graph.report import sentences
+from sonar_graph.report import sentences, summary
 from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.console import summary
 from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.states import (
     FIRST_ANONYMOUS_ID,
@@ -103,10 +102,8 @@ def test_a_nees_is_marked_outside_its_interval_and_never_without(
 
 
 def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does():
-    comparison, hint = (
-        basin_comparison(60),
-        "sonar-graph inspect LOG compares reference",
-    )
+    comparison = basin_comparison(60)
+    hint = "sonar-graph inspect LOG compares reference"
     blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
     cases = [
         (comparison, "dead-reckoning", 30.0, True),
@@ -266,7 +263,8 @@ def log_of(
 def test_a_map_is_called_wrong_beyond_the_quantile_that_chance_exceeds_once_in_a_billion():
     # of two degrees of freedom, in closed form
     assert np.exp(-sentences.ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)
-    limit_m, rng = SIGMA_M * np.sqrt(sentences.ABSURD), np.random.default_rng(1)
+    limit_m = SIGMA_M * np.sqrt(sentences.ABSURD)
+    rng = np.random.default_rng(1)
     assert sentences.doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
     (line,) = sentences.doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
     assert "landmarks 1, 2, 3 and 4 far outside" in line
@@ -300,10 +298,11 @@ def test_without_true_landmarks_the_innovations_of_used_detections_tell():
         assert [line.partition(");")[0] for line in doubts(log)] == (
             [f"{start} {nis}"] if nis else []
         )
-        assert not doubts(log, has_truth=True)  # the truth says that all is well
+        assert not doubts(log, has_truth=True)  # the truth shows no fault
     for outcome in (Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED):
         assert not doubts(log_of([outcome] * 10, [1.0] * 10))
-    n, rng = 2000, np.random.default_rng(2)
+    n = 2000
+    rng = np.random.default_rng(2)
     unit = replace(
         log_of([Outcome.USED] * n, [0.0] * n),
         innovations=SIGMA_M * rng.standard_normal((n, 2)),
@@ -365,7 +364,7 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
         "3 landmarks matched by identity, 3 of them by place within 1 m"
         in scores["landmarks.raw_m"].protocol
     )
-    # the third is nobody's
+    # the third belongs to no landmark
     off = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])
     (line,) = sentences.doubt_of_identities(off)
     assert "puts landmark 2 far outside its covariance" in line
@@ -387,14 +386,14 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
 
 
 def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_nothing_was():
-    start_ns, calm = basin_comparison(60).sequence.start_ns, basin_comparison(60)
+    start_ns = basin_comparison(60).sequence.start_ns
+    calm = basin_comparison(60)
     refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
-    comparison, line = (
-        with_run(refused, replace(refused.runs[0], withheld=[WITHHELD])),
-        f"Warning: isam2: {WITHHELD}",
-    )
+    comparison = with_run(refused, replace(refused.runs[0], withheld=[WITHHELD]))
+    line = f"Warning: isam2: {WITHHELD}"
     assert sentences.withheld_lines(comparison) == [line]
-    below, page = printed(comparison, 200), render_report(comparison)
+    below = printed(comparison, 200)
+    page = render_report(comparison)
     assert all(line in below for line in [*sentences.refusal_lines(comparison), line])
     assert page.index(line) < page.index("<nav")
     section = page[page.index('id="refused"') : page.index('id="method"')]
