@@ -258,32 +258,6 @@ def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path
     np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
 
 
-def test_a_second_line_of_the_header_with_units(folder, tmp_path):
-    d = dive()
-    k = d.slow
-    header = "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg"
-    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665e-3).T)
-    write(folder / "imu.csv", header, 1e3 * d.s, *columns, sep=";")
-    header = "Time;VelX;VelY;VelZ\nms;mm/s;mm/s;mm/s"
-    write(folder / "dvl.csv", header, 1e3 * d.s[k], *(1e3 * d.velocity[k]).T, sep=";")
-    header = "Time;Depth\nms;cm"
-    write(folder / "depth.csv", header, 1e3 * d.s[k], 100 * d.depth[k], sep=";")
-    assert_is(guessed(folder, tmp_path), d)
-
-
-def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
-    d = dive()
-    k = d.slow
-    paths = [f"/imu/{kind}/{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz"]  # fmt: skip
-    header = ",".join(["__time", *paths])
-    write(folder / "imu.csv", header, EPOCH_S + d.s, *d.rate.T, *d.force.T)
-    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.s[k]]
-    header = "%time,field.header.frame_id,field.velocity.x,field.velocity.y,field.velocity.z,field.depth"
-    columns = (ns, ["dvl"] * len(ns), *d.velocity[k].T, d.depth[k])
-    write(folder / "dvl.csv", header, *columns)
-    assert_is(guessed(folder, tmp_path), d)
-
-
 @pytest.mark.parametrize(
     "form",
     [

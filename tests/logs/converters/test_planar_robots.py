@@ -154,25 +154,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder):
-    (folder / "Robot1_Groundtruth.dat").write_text(f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n")
-    # of another robot
-    (folder / "Robot1_Measurement.dat").write_text(f"{T0}.2 14 1 0\n")
-    late = read_mrclam(folder, 1)
-    assert (len(late.truth), late.detections) == (2, None)
-    assert "origin" in late.notes["start"]
-    (folder / "Robot1_Groundtruth.dat").unlink()
-    never = read_mrclam(folder, 1)
-    assert never.truth is None
-    assert never.true_landmarks is not None
-    assert "no robot truth" in never.notes["truth"]
-    assert (
-        late.calibration.start.position_m
-        == never.calibration.start.position_m
-        == (0.0, 0.0, 0.0)
-    )
-
-
 @pytest.fixture(scope="module", params=[1, 2, 3, 4, 5])
 def sequence(request, unpacked):
     folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
