@@ -12,12 +12,10 @@ from sonar_graph.batch.sources import LogOptions, SourceKind, fingerprint
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation import compare, read_comparison, run_here
+from sonar_graph.evaluation import compare, read_comparison
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
     BasinOptions,
-    LandmarkOptions,
-    add_landmarks,
     simulate_basin,
 )
 
@@ -134,28 +132,6 @@ def log_with_duration(
     log = folder / "dive.mcap"
     log.write_text(str(duration_s))
     return log
-
-
-def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch):
-    log = log_with_duration(tmp_path, monkeypatch, 120)
-    run = replace(of_log(planned(), log), landmarks={}, seed=1)
-    used: list[Sequence] = []
-
-    def noted(sequence: Sequence, *given: Any, **named: Any) -> Any:
-        used.append(sequence)
-        return run_here(sequence, *given, **named)
-
-    monkeypatch.setattr(one_run, "run_here", noted)
-    assert perform(run, tmp_path / "run")["status"] == "ok"
-    recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
-    expected, other = (
-        add_landmarks(recorded, LandmarkOptions(seed=seed)) for seed in (1, 0)
-    )
-    assert map_of(used[0]) == map_of(expected) != map_of(other)
-
-
-def map_of(sequence: Sequence) -> list[list[float]]:
-    return sequence.true_landmarks.positions.tolist()
 
 
 def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(
