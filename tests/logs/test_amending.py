@@ -162,3 +162,18 @@ def test_existing_topics_are_refused_unless_they_are_replaced(
     assert content(twice) == content(source)
     with pytest.raises(LogError, match="is the log itself"):
         write_amended(source, source, [])
+
+
+def test_messages_in_pieces_are_merged_under_a_new_topic(
+    tmp_path,
+):
+    source = foreign_log(tmp_path / "source.mcap")
+    plain = tmp_path / "plain.mcap"
+    streamed = tmp_path / "streamed.mcap"
+    entries = [landmarks(time_ns) for time_ns in (5, 1005, 2005)]
+    write_amended(source, plain, entries)
+    write_amended(source, streamed, [], more=iter(entries))
+    assert content(streamed) == content(plain)
+    taken = next(iter(content(source)))
+    with pytest.raises(LogError, match="is in the log already"):
+        write_amended(source, streamed, [], more=iter([landmarks(5, taken)]))

@@ -18,6 +18,7 @@ from sonar_graph.logs.checks import (
     dead_axes,
     gap_warnings,
     magnitudes,
+    repeated_sightings,
     row_doubts,
     spike_warning,
     stamp_doubts,
@@ -268,6 +269,27 @@ def test_a_quantity_that_repeats_while_others_change_is_stuck(
             f"{quantity} the same to the last bit in 100 rows, 10.000 to 19.900 s"
             in str(found)
         )
+
+
+def test_frames_that_repeat_while_the_vehicle_moves_are_stuck() -> None:
+    """Three sightings a frame; the frames from the tenth on repeat it, or only its azimuth."""
+    frame = np.repeat(np.arange(40), 3)
+    seen = np.random.default_rng(1).uniform(1.0, 9.0, (120, 2))
+    way_m = 0.1 * frame
+    repeated = seen.copy()
+    repeated[30:] = np.tile(seen[27:30], (30, 1))
+    held = seen.copy()
+    held[30:, 1] = 0.4
+    later = frame > 9
+    assert not repeated_sightings(frame, seen, way_m, 0.5).any()
+    np.testing.assert_array_equal(
+        repeated_sightings(frame, repeated, way_m, 0.5), later
+    )
+    # the first of the equal ones may be measured
+    np.testing.assert_array_equal(
+        repeated_sightings(frame, held, way_m, 0.5), later & (np.arange(120) > 30)
+    )
+    assert not repeated_sightings(frame, repeated, 0.01 * way_m, 0.5).any()
 
 
 # --- enough for an estimator ----------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import tomllib
 from collections import Counter
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from mcap.reader import make_reader
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs import (
+    ROLES,
     LogSummary,
     TopicSummary,
     inspect_log,
@@ -20,7 +22,7 @@ from sonar_graph.logs import (
 )
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import Keep, scan
-from sonar_graph.logs.roles import refusal
+from sonar_graph.logs.roles import choose_topic, refusal
 
 from .conftest import Bench, channel_for, chunk_indexes, flip, writing
 
@@ -261,6 +263,48 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
 
 
 # --- the log configuration to start from ---------------------------------------------------------------------------
+
+
+def choices(path: Path, config: LogConfig) -> dict[str, object]:
+    """For each role the topic, others that fit, and the adapter but for the topic that the text names."""
+    recording = scan(path, lambda _: Keep.STAMP)
+    found = {
+        name: choose_topic(role, recording, config) for name, role in ROLES.items()
+    }
+    adapters = {
+        name: c.adapter and c.adapter.model_copy(update={"topic": None})
+        for name, c in found.items()
+    }
+    return {name: (c.topic, c.candidates, adapters[name]) for name, c in found.items()}
+
+
+def test_read_back_unchanged_it_makes_the_same_choices(
+    bench: Bench, make_sequence: Any, tmp_path: Path
+) -> None:
+    imu, dvl = bench.basics()
+    poses = [bench.odometry(bench.t0_ns, 0.0)]
+    pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns, 2e5)])
+    logs = [
+        bench.write(
+            imu, dvl, pressure, ("/odom", "odometry", poses), name="plain.mcap"
+        ),
+        bench.write(imu, dvl, ("/second", "imu", imu[2]), name="two.mcap"),
+        bench.write(imu, name="half.mcap"),
+        tmp_path / "own.mcap",
+    ]
+    write_log(logs[-1], make_sequence())
+    said: list[dict[str, Any]] = [
+        {},
+        {"dvl": {"rotation": [1, 2, 3], "covariance": False}, "depth": {"use": False}},
+        {
+            "truth": {"topic": "/odom"},
+            "imu": {"frame_id": 'a "frame"', "stamp_offset_s": -0.04},
+        },
+    ]
+    for path, tables in product(logs, said):
+        config = LogConfig.parse(tables, "x")
+        again = LogConfig.parse(tomllib.loads(inspect_log(path, config).toml), "again")
+        assert choices(path, config) == choices(path, again)
 
 
 def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.logs import PartialCalibration, read_log, write_log
-from sonar_graph.logs.measured_start import with_measured_start
+from sonar_graph.logs.measured_start import is_whole, with_measured_start
 from sonar_graph.measurements import (
     Depth,
     Dvl,
@@ -70,6 +70,20 @@ def test_each_part_of_the_start_is_within_its_sigma_of_the_truth(
     assert start.source == "fixes"
     assert note.startswith(
         "start pose not stated: height by the first depths; level by gravity"
+    )
+
+
+def test_what_is_stated_stays_and_the_rest_is_measured() -> None:
+    blocks = moving()
+    place = Calibration(start=Start(position_m=(1.0, 2.0, 3.0)))
+    of_place = with_measured_start(place, blocks)[0].start
+    assert of_place.position_m == (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(of_place.rpy_rad[:2], RPY[:2], atol=0.01)
+    heading = Calibration(start=Start(rpy_rad=(0.0, 0.0, 1.0)))
+    assert with_measured_start(heading, blocks)[0].start.rpy_rad == (0.0, 0.0, 1.0)
+    assert is_whole(Start(position_m=(0.0, 0.0, 0.0), rpy_rad=(0.0, 0.0, 0.0)))
+    assert not is_whole(
+        of_place.model_construct(position_m=(0.0, 0.0, 0.0), _fields_set={"position_m"})
     )
 
 

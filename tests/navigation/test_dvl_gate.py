@@ -110,6 +110,20 @@ def test_wrong_ones_of_the_first_rows_are_refused_and_no_others(wrong, hz):
     assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
 
 
+def test_the_start_stays_a_node_with_the_first_accepted_velocity():
+    """Less surely known: by the walk and what the vehicle may have turned since."""
+    rows = start({0: WRONG, 1: WRONG})
+    stamps_ns, velocity, cov = told(rows).rows()[3:6]
+    assert np.array_equal(stamps_ns, rows.stamps_ns)
+    assert np.array_equal(velocity, np.tile([0.3, 0.0, 0.0], (len(rows), 1)))
+    t = (rows.stamps_ns[2] - rows.stamps_ns[0]) * 1e-9
+    walk = Calibration().dvl.velocity_walk_density
+    assert cov[0] == pytest.approx(
+        np.eye(3) * (1e-4 + walk**2 * t + (0.3 * t * 0.3) ** 2)
+    )
+    assert cov[2] == pytest.approx(1e-4 * np.eye(3))
+
+
 def test_wrong_rows_that_go_on_for_long_are_never_believed():
     """The gate widens from the last row that it believed, and doubt begins there too, however the log is cut."""
     ns = stamps(5.0, 60.0)

@@ -258,6 +258,19 @@ def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path
     np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
 
 
+def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
+    d = dive()
+    k = d.slow
+    paths = [f"/imu/{kind}/{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz"]  # fmt: skip
+    header = ",".join(["__time", *paths])
+    write(folder / "imu.csv", header, EPOCH_S + d.s, *d.rate.T, *d.force.T)
+    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.s[k]]
+    header = "%time,field.header.frame_id,field.velocity.x,field.velocity.y,field.velocity.z,field.depth"
+    columns = (ns, ["dvl"] * len(ns), *d.velocity[k].T, d.depth[k])
+    write(folder / "dvl.csv", header, *columns)
+    assert_is(guessed(folder, tmp_path), d)
+
+
 @pytest.mark.parametrize(
     "form",
     [
