@@ -121,7 +121,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_changed_suite_goes_on_in_the_folder_once_a_run_is_done_and_another_suite_is_refused(
+def test_a_changed_suite_resumes_in_its_folder(
     suite, tmp_path, in_this_process, monkeypatch
 ):
     folder = tmp_path / "out"
@@ -234,7 +234,7 @@ def test_interrupt_or_termination_within_the_block_is_told_at_its_end(handler, n
     assert steps == ["went on"]
 
 
-def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is_noticed(
+def test_an_interrupt_swallowed_by_compiled_code_is_noticed(
     handler,
 ):
     with noticed_interrupts() as check:
@@ -248,7 +248,7 @@ def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is
 @pytest.mark.parametrize(
     "handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True
 )
-def test_termination_counts_like_an_interrupt_and_an_interrupt_that_shells_let_be_ignored_stays_so(
+def test_termination_counts_like_an_interrupt(
     handler,
 ):
     with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():

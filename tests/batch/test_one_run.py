@@ -38,9 +38,7 @@ def test_scores_are_those_of_compare_bit_for_bit(planned, tmp_path):
     }
 
 
-def test_same_run_gives_the_same_bits_with_the_last_errors_and_all_libraries_of_its_key(
-    planned, tmp_path
-):
+def test_the_same_run_gives_the_same_bits(planned, tmp_path):
     run = planned()
     row, again = (perform(run, tmp_path / name) for name in ("a", "b"))
     assert numbers(row) == numbers(again)
@@ -75,7 +73,7 @@ def of_log(run: PlannedRun, log: Path) -> PlannedRun:
     )
 
 
-def test_a_log_that_cannot_be_read_and_an_estimator_that_fails_are_rows_with_a_reason(
+def test_failed_logs_and_estimators_are_rows_with_a_reason(
     planned, misbehaving, tmp_path
 ):
     log = tmp_path / "dive.mcap"
@@ -134,9 +132,7 @@ def log_with_duration(
     return log
 
 
-def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(
-    planned, tmp_path
-):
+def test_other_versions_than_planned_give_no_result(planned, tmp_path):
     run = planned()
     for changed, told in (
         (

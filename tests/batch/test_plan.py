@@ -71,7 +71,7 @@ OTHERS = {
 }
 
 
-def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_defaults(
+def test_a_run_s_key_changes_with_all_that_decides_its_numbers(
     write_suite,
 ):
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
@@ -92,7 +92,7 @@ def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_def
     assert same == run.key
 
 
-def test_key_changes_with_the_class_behind_the_name_and_with_the_version_of_python(
+def test_a_run_s_key_changes_with_class_and_python_version(
     write_suite, misbehaving, tmp_path, monkeypatch
 ):
     def anew() -> str:
@@ -128,7 +128,7 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     assert fingerprint(LOG, {"log": str(paths[0])}) == changed
 
 
-def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_be_loaded_is_planned(
+def test_an_estimator_of_another_package_has_its_package_s_hash(
     write_suite, misbehaving
 ):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
@@ -151,9 +151,7 @@ def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 
-def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content(
-    write_suite, tmp_path
-):
+def test_the_request_is_the_suite_with_files_by_content(write_suite, tmp_path):
     grid = "grid = { wrong_id_rate = [0.1] }\n"
     params = "params = { smoother.lag_s = 14 }\n"
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
@@ -201,9 +199,7 @@ def hashed() -> Iterator[Hashed]:
     source_hash.cache_clear()
 
 
-def test_hash_changes_with_code_data_and_names_also_behind_links_that_may_be_circles(
-    package, hashed, tmp_path
-):
+def test_a_hash_changes_with_code_data_and_names(package, hashed, tmp_path):
     (elsewhere := tmp_path / "elsewhere").mkdir()
     (elsewhere / "linked.py").write_text("a = 1\n")
     (elsewhere / "around").symlink_to(package, target_is_directory=True)
@@ -240,7 +236,7 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
 ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'
 
 
-def test_a_log_whose_files_are_absent_is_left_out_where_the_suite_says_how_to_obtain_it(
+def test_an_absent_log_is_left_out_if_the_suite_states_its_source(
     write_suite,
 ):
     obtain = 'obtain = "the data set from its authors"\n'

@@ -68,7 +68,7 @@ def test_pairs_have_the_same_log_and_seed():
     assert len(fewer.pairs(LOGS[0], "isam2", ATE)[0]) == 4
 
 
-def test_a_run_that_did_not_end_is_not_left_out_and_has_no_value_whatever_is_recorded():
+def test_a_run_that_did_not_end_is_a_row_without_values():
     assert math.isinf(replace(drawn_batch(2).runs[0], status="timeout").value(ATE))
     batch = drawn_batch(6)
     for count in (1, 6):

@@ -195,7 +195,7 @@ def test_suites_that_ship_are_sound(path):
         assert plan_runs(file)
 
 
-def test_suites_without_mistakes_are_planned_such_as_the_example_in_the_documentation(
+def test_the_documented_suites_are_planned(
     write_suite,
 ):
     from sonar_graph.batch import suite

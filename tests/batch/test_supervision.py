@@ -71,7 +71,7 @@ def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(
         ("dies-once", AMPLE, "ok", ""),
     ],
 )
-def test_a_run_is_ended_with_the_processes_that_it_starts_and_one_that_is_killed_has_a_second_try(
+def test_a_run_ends_with_its_child_processes(
     planned, misbehaving, estimator, limits, status, reason
 ):
     row = perform_watched(planned(estimator), limits).row
@@ -93,9 +93,7 @@ def is_runner_of_this_test(process: psutil.Process) -> bool:
     return False
 
 
-def test_a_process_is_kept_for_the_next_run_but_after_one_of_another_package(
-    planned, misbehaving
-):
+def test_a_process_is_reused_within_a_package(planned, misbehaving):
     perform_watched(planned(), AMPLE)
     (kept,) = runners()
     perform_watched(planned(), AMPLE)

@@ -46,7 +46,7 @@ def test_compare_writes_report_numbers_results_and_runs(compared):
         assert {"trajectory.tum", "causal.tum", "landmarks.csv"} <= there
 
 
-def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(
+def test_compare_names_the_report_and_report_draws_it_again(
     run, basin, tmp_path, capsys
 ):
     assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
@@ -61,9 +61,7 @@ def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
 
 
-def test_names_that_are_not_utf_8_are_read_and_spelt_out_where_they_are_told(
-    run, basin, tmp_path, capsys
-):
+def test_names_that_are_not_utf_8_are_read_and_escaped(run, basin, tmp_path, capsys):
     odd = basin.rename(tmp_path / "odd\udcff.mcap")
     assert (
         run(
@@ -129,9 +127,7 @@ def test_failed_run_is_written_and_reported_by_exit_code(
     }
 
 
-def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_log_field_by_field(
-    run, basin, tmp_path
-):
+def test_run_uses_the_given_calibration_field_by_field(run, basin, tmp_path):
     moved = tmp_path / "moved.toml"
     moved.write_text("[start]\nposition_m = [100.0, 0.0, -1.0]\n")
     arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
@@ -203,7 +199,7 @@ def aided(sequence: Sequence, sense: float = 1.0, unit: float = 1.0) -> Sequence
         (aided, None),
     ],
 )
-def test_run_and_compare_name_first_what_sensors_contradict_and_nothing_of_a_sound_log(
+def test_run_and_compare_begin_with_grave_findings(
     run, basin, tmp_path, capsys, spoil, told
 ):
     """Before what follows from it: refused rows, and a map that is far off."""

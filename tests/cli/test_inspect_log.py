@@ -30,7 +30,7 @@ def sensor(said: dict, quantity: str) -> dict:
     return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
 
 
-def test_json_has_lever_arm_bias_and_start_as_numbers_unless_nothing_was_compared(log):
+def test_json_has_lever_arm_bias_and_start(log):
     said = answer(log)
     assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(
         -0.2, abs=0.1

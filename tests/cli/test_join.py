@@ -49,7 +49,7 @@ def both(lane, tmp_path_factory) -> tuple[Path, Path]:
     return images_log(lane, folder / "images.mcap"), folder / "nav.mcap"
 
 
-def test_images_come_onto_the_clock_of_the_navigation_with_all_else_as_it_was(
+def test_images_are_moved_to_the_clock_of_the_navigation(
     lane, both, run, tmp_path, capsys
 ):
     out = tmp_path / "joined.mcap"
@@ -141,7 +141,7 @@ def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
     assert "Warning: they do not agree" in capsys.readouterr().out
 
 
-def test_files_without_common_time_are_refused_with_the_offset_that_would_make_both_begin_together(
+def test_files_without_common_time_are_refused_with_an_offset(
     lane, both, run, tmp_path, capsys
 ):
     far = images_log(lane, tmp_path / "far.mcap", offset_s=1.2e9)
@@ -162,9 +162,7 @@ def test_files_without_common_time_are_refused_with_the_offset_that_would_make_b
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
-def test_navigation_that_has_images_already_is_refused_before_the_images_are_read(
-    lane_log, run, tmp_path, capsys
-):
+def test_navigation_with_images_is_refused_at_once(lane_log, run, tmp_path, capsys):
     nothing = tmp_path / "none.aris"
     nothing.write_bytes(b"")
     assert run("join", nothing, lane_log, "-o", tmp_path / "joined.mcap") == 2

@@ -69,9 +69,7 @@ def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
             assert log.read_bytes() == before
 
 
-def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_read_and_written(
-    basin, run, tmp_path
-):
+def test_a_comparison_beside_its_log_can_be_repeated(basin, run, tmp_path):
     before = basin.read_bytes()
     for _ in range(2):
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
@@ -92,9 +90,7 @@ def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_r
             pass
 
 
-def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothing(
-    run, tmp_path, capsys
-):
+def test_commands_can_be_repeated_over_their_results(run, tmp_path, capsys):
     log = tmp_path / "log.mcap"
     log.touch()  # an empty file holds nothing to lose
     for told in ("", f"Replaces {log}\n"):
@@ -110,9 +106,7 @@ def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothi
     assert (tmp_path / "link.mcap").stat().st_size > 0
 
 
-def test_a_refused_command_leaves_no_folder_that_it_made_and_every_one_that_was_there(
-    run, basin, tmp_path
-):
+def test_a_refused_command_leaves_no_new_folder(run, basin, tmp_path):
     unreadable = tmp_path / "words.mcap"
     there = tmp_path / "there"
     unreadable.write_text("words")

@@ -49,7 +49,7 @@ def simulate(path: Path, *more: str, said: str = "Log: ") -> None:
     assert said in result.output
 
 
-def test_images_and_other_sensors_are_those_of_the_library_in_the_order_of_time(
+def test_images_and_sensors_are_those_of_the_library(
     tmp_path,
 ):
     simulate(

@@ -43,9 +43,7 @@ OTHER_KEYS = {
 }
 
 
-def test_what_sensors_contradict_is_found_of_a_sequence_as_of_the_log_that_is_written_of_it(
-    tmp_path, caplog
-):
+def test_contradicting_sensors_are_found_in_sequence_and_log(tmp_path, caplog):
     """Also by the checks of single numbers, and reported once: notes of the comparison, log, page and `inspect`."""
     world = small_world()
     velocity = 1.3 * world.dvl.velocity
@@ -139,7 +137,7 @@ def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
     )
 
 
-def test_without_truth_or_with_too_little_the_rest_is_scored_and_it_is_said(install):
+def test_without_enough_truth_the_rest_is_scored(install):
     comparison = compare(straight_sequence(truth=False), ["offset"])
     keys = set(comparison.scores["offset"])
     assert not any(key.startswith(("causal.", "smoothed.")) for key in keys)
@@ -184,7 +182,7 @@ def test_mistakes_of_the_user_are_raised_before_anything_runs(
             call("dive.mcap")
 
 
-def test_progress_names_the_estimator_and_the_environment_versions_machine_date_and_command(
+def test_the_environment_has_versions_machine_and_command(
     install,
 ):
     install(one=Offset, two=Offset)
@@ -229,9 +227,7 @@ def surveyed_elsewhere(
 
 
 @pytest.mark.parametrize("has_truth", [False, True])
-def test_a_map_in_another_world_is_scored_after_alignment_where_no_path_tells_the_world(
-    install, has_truth
-):
+def test_a_map_in_another_world_is_scored_after_alignment(install, has_truth):
     kind, sequence = surveyed_elsewhere(has_truth=has_truth)
     install(surveyor=kind)
     comparison = compare(sequence, ["surveyor"])
@@ -261,7 +257,7 @@ def test_a_map_in_another_world_is_scored_after_alignment_where_no_path_tells_th
         assert table["ID 1, x"][1].endswith("(0.000)")
 
 
-def test_a_wrong_landmark_is_told_in_another_world_and_does_not_make_the_others_wrong(
+def test_a_wrong_landmark_is_found_in_another_world(
     install,
 ):
     kind, sequence = surveyed_elsewhere({5: 3.0}, has_truth=False)
@@ -270,7 +266,7 @@ def test_a_wrong_landmark_is_told_in_another_world_and_does_not_make_the_others_
     assert "puts landmark 5 far outside its covariance" in line
 
 
-def test_the_normalised_error_of_an_aligned_map_has_the_freedom_that_alignment_leaves(
+def test_the_nees_of_an_aligned_map_has_fewer_degrees_of_freedom(
     install,
 ):
     """Errors drawn from the covariance of the map, which turns with the alignment: 2 k - 3 degrees of freedom."""
@@ -329,7 +325,7 @@ class Few(Moving):
         )
 
 
-def test_the_error_on_its_own_map_does_not_count_how_the_map_moved_and_is_of_the_same_instants_for_all(
+def test_the_error_on_the_own_map_ignores_motion_of_the_map(
     install,
 ):
     install(moving=Moving, few=Few)

@@ -94,7 +94,7 @@ def test_json_is_strict_and_tells_units_and_protocol(folder):
     assert "diverged" in index["runs"]["broken"]["reason"]
 
 
-def test_folder_holds_what_other_tools_read_without_code_and_of_a_failed_run_only_its_reason(
+def test_a_result_folder_is_readable_without_this_package(
     folder,
 ):
     good = folder / "runs" / "offset"

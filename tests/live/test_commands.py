@@ -100,7 +100,7 @@ def test_the_status_has_sigmas_along_the_axes_of_the_world():
 
 
 @pytest.mark.slow
-def test_a_live_run_equals_the_run_on_its_record_and_a_killed_one_has_a_record(
+def test_a_live_run_equals_the_run_on_its_record(
     tmp_path,
 ):
     """With both ends as commands: play, live, SIGKILL, live, Ctrl-C, run."""

@@ -202,9 +202,7 @@ def test_after_a_router_that_restarts_the_run_goes_on(tmp_path, endpoint, messag
 
 
 @pytest.mark.parametrize("may_drop", [True, False])
-def test_only_a_publisher_that_may_drop_is_not_held_up_by_a_subscriber_that_stalls(
-    endpoint, may_drop
-):
+def test_only_a_dropping_publisher_is_not_blocked_by_a_slow_reader(endpoint, may_drop):
     with open_session(listen=[endpoint]) as router:
         publisher = Publisher(
             router,

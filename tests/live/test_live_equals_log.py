@@ -143,7 +143,7 @@ def test_a_record_whose_writer_was_killed_goes_on_as_if_nothing_had_been(tmp_pat
             same_blocks(getattr(mine, name), getattr(theirs, name))
 
 
-def test_what_an_estimator_that_was_behind_did_not_get_is_not_in_the_record(tmp_path):
+def test_rows_that_a_slow_estimator_missed_are_not_recorded(tmp_path):
     write_log(tmp_path / "log.mcap", small_world())
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
     with LiveRecord(tmp_path / "record.mcap") as record:

@@ -126,9 +126,7 @@ def test_a_table_with_missing_runs_is_read_as_one_in_the_order_of_the_plan(
         read_batch(tmp_path)
 
 
-def test_page_and_tables_say_how_many_runs_are_missing_whose_where_and_how_to_go_on(
-    incomplete, tmp_path
-):
+def test_page_and_tables_count_missing_runs(incomplete, tmp_path):
     (told,) = missing_told(incomplete)
     assert told.startswith(
         "This batch is not complete: 14 of 60 runs have not been done (isam2 4 of 20, ekf-slam"

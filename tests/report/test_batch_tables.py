@@ -64,7 +64,7 @@ def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
     )
 
 
-def test_causal_and_smoothed_have_columns_of_their_own_with_full_precision_in_files():
+def test_causal_and_smoothed_errors_have_their_own_columns():
     row = row_of(tables.accuracy_table(BATCH, ATE), "isam2")
     for kind in KINDS:
         key = f"{kind}.ate_se2_m"
@@ -214,7 +214,7 @@ def test_time_and_memory_are_shown_and_not_tested(key):
     assert summary.head_metric(batch, [metric]) is None
 
 
-def test_a_reference_that_never_ended_and_runs_that_were_scored_at_other_instants_are_warned_of():
+def test_a_reference_that_never_ended_raises_a_warning():
     batch = drawn_batch(8)
     assert (
         summary.reference_told(with_failures(batch, "dead-reckoning", LOGS[0], 7)) == []
@@ -235,7 +235,7 @@ def test_a_reference_that_never_ended_and_runs_that_were_scored_at_other_instant
     )
 
 
-def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chance():
+def test_arrows_show_the_side_of_significant_differences():
     batch = replace(
         changed(drawn_batch(), "dead-reckoning", "causal.ate_se2_m", 3.0),
         reference="ekf-slam",

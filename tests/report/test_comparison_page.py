@@ -64,7 +64,7 @@ def test_every_run_score_protocol_and_file_appears(comparison, page):
     assert "runs/dead-reckoning/landmarks.csv" not in addresses
 
 
-def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the_top(
+def test_unknown_scores_and_doubts_are_shown(
     comparison,
 ):
     odd = with_score(
@@ -207,7 +207,7 @@ def test_aligned_errors_and_maps_are_those_of_the_aligned_scores(
             assert rmse(found.horizontal_m) == pytest.approx(wanted.value)
 
 
-def test_without_truth_there_is_no_aligned_view_and_the_plots_name_the_reason():
+def test_without_truth_there_is_no_aligned_view():
     blind = basin_comparison(60, truth=False)
     assert aligned_to_truth(blind) is None
     assert blind.plot_map().get_xlabel() == "world x (m)"

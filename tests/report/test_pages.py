@@ -105,7 +105,7 @@ def test_a_notebook_shows_every_score_under_its_run():
     ]
 
 
-def test_a_notebook_shows_sequences_paths_and_maps_with_their_texts_escaped():
+def test_a_notebook_shows_sequences_paths_and_maps():
     """Whole tables, of a part of a large map, and nothing that a name could run."""
     compared = basin_comparison(60)
     sequence = replace(compared.sequence, name=HOSTILE)
@@ -168,9 +168,7 @@ def test_a_page_fetches_nothing_and_only_that_of_a_batch_has_a_script(page, html
     assert page.named("iframe", "img") == []
 
 
-def test_links_within_the_page_lead_somewhere_and_ids_are_unique_and_the_same_results_make_the_same(
-    page, kind, html
-):
+def test_links_lead_somewhere_and_ids_are_unique(page, kind, html):
     ids = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
     assert len(ids) == len(set(ids))
     targets = {

@@ -26,7 +26,7 @@ def width_in(svg: Path) -> float:
     return float(re.search(r'width="([\d.]+)pt"', svg.read_text("utf-8"))[1]) / 72
 
 
-def test_every_figure_is_there_as_svg_and_pdf_in_the_widths_of_a_journal_with_its_fonts_inside(
+def test_every_figure_is_written_as_svg_and_pdf(
     folder,
 ):
     figures = sorted((folder / "figures").glob("*.svg"))

@@ -70,7 +70,7 @@ def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
     assert "corrects the drift." not in text
 
 
-def test_a_failure_is_told_with_its_reason_as_it_is_and_as_wide_as_the_terminal():
+def test_a_failure_is_printed_with_its_reason():
     reason = "no [bold] odometry covers the stamps of any of the sonar frames that the log holds"
     text = printed(
         with_failure(basin_comparison(60, truth=False), "isam2", reason), width=100
@@ -101,7 +101,7 @@ def test_a_nees_is_marked_outside_its_interval_and_never_without(
     assert "▲ over-confident, ▼ over-cautious" in text
 
 
-def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does():
+def test_odometry_far_from_its_reference_leads_to_inspect():
     comparison = basin_comparison(60)
     hint = "sonar-graph inspect LOG compares reference"
     blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
@@ -158,13 +158,11 @@ def scored(**values: float) -> Comparison:
         *((nees(math.nan), ""), (Score(40.0, "m", ""), "")),
     ],
 )
-def test_consistency_follows_the_interval_and_without_one_or_in_a_wide_one_nothing_is_said(
-    score, verdict
-):
+def test_consistency_follows_the_interval(score, verdict):
     assert score.verdict == verdict
 
 
-def test_without_detections_the_drift_is_explained_and_without_errors_the_headline():
+def test_without_detections_the_drift_is_explained():
     comparison = basin_comparison(60)
     assert sentences.remarks(comparison) == []
     part = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
@@ -197,9 +195,7 @@ def test_without_detections_the_drift_is_explained_and_without_errors_the_headli
         (21, {}, "identities are wrong, or noise is set far too small"),
     ],
 )
-def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(
-    gated, params, advice
-):
+def test_an_estimator_that_rejects_a_fifth_is_called_lost(gated, params, advice):
     log = log_of([Outcome.GATED] * gated + [Outcome.USED] * (100 - gated), [0.1] * 100)
     comparison = basin_comparison(60)
     lost = with_run(
@@ -260,7 +256,7 @@ def log_of(
     )
 
 
-def test_a_map_is_called_wrong_beyond_the_quantile_that_chance_exceeds_once_in_a_billion():
+def test_a_map_is_wrong_beyond_its_quantile():
     # of two degrees of freedom, in closed form
     assert np.exp(-sentences.ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)
     limit_m = SIGMA_M * np.sqrt(sentences.ABSURD)
@@ -385,7 +381,7 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     )
 
 
-def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_nothing_was():
+def test_terminal_and_page_list_refused_and_withheld_rows():
     start_ns = basin_comparison(60).sequence.start_ns
     calm = basin_comparison(60)
     refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
