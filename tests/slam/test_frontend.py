@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
+from scipy.stats import chi2
 
 from sonar_graph.calibration import Start
 from sonar_graph.slam.smoother import Smoother
@@ -18,6 +19,24 @@ CERTAIN = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
 
 def dive_with(smoother: Smoother | None = None, **changes) -> Dive:
     return Dive(CALIBRATION.model_copy(update=changes), smoother=smoother)
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+def test_the_gate_is_the_chi_square_quantile(beyond):
+    """An innovation just inside it is used; just outside it is refused and leaves the graph as it was."""
+    dive = Dive()
+    dive.see(0.0, (5, 3.0, 0.0))
+    dive.see(0.0, (5, 9.0, 0.0))
+    assert dive.outcomes == [Outcome.NEW, Outcome.GATED]
+    before = dive.smoother.graph.size()
+    information = np.linalg.inv(dive.sightings.journal.log().innovation_covs[-1])
+    edge_m = np.sqrt(chi2.ppf(0.99, 2) / information[0, 0])
+    dive.see(0.0, (5, 3.0 + edge_m * (1.001 if beyond else 0.999), 0.0))
+    assert dive.outcomes[-1] is (Outcome.GATED if beyond else Outcome.USED)
+    assert dive.smoother.graph.size() == before + (0 if beyond else 2)
+    assert dive.sightings.journal.log().innovations[1] == pytest.approx(
+        [6.0, 0.0], abs=1e-6
+    )
 
 
 def test_a_frame_older_than_what_was_processed_is_late():

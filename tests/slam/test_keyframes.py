@@ -14,7 +14,7 @@ from sonar_graph.calibration import (
     DvlCalibration,
     ImuCalibration,
 )
-from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.measurements import Depth, Dvl, Heading, Imu
 from sonar_graph.navigation import Odometry
 from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam import KeyframeParams
@@ -26,6 +26,7 @@ from .made import smoother_with
 
 G = 9.80665
 NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0, accel_bias_sigma=0.0)
+EXACT_DVL = DvlCalibration(velocity_sigma_m_s=(1e-7, 1e-7, 1e-7))
 POLICY = KeyframeParams(
     max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0
 )
@@ -182,6 +183,33 @@ def test_frames_between_gaps_tell_all(at_s: list[float], told: list[float]):
     keyframes = keyframes_over_gaps()
     assert shares(keyframes, at_s) == pytest.approx(told)
     assert len(keyframes.stamps_ns) == 1
+
+
+@pytest.mark.parametrize("off", [1.3, 10.0])
+def test_an_outlying_heading_has_the_kernel_s_variance(
+    off,
+):
+    """Four that agree and one beside them, with exact gyros: the mean's information is a sum by hand, k = 1.345."""
+    exact = NO_BIAS.model_copy(update={"gyro_noise_density": 1e-9})
+    keyframes = keyframes_of(Calibration(imu=exact, dvl=EXACT_DVL))
+    sigma = 0.02
+    yaw_rad = np.array([0.0, 0.0, off * sigma, 0.0, 0.0])
+    keyframes.add(
+        level_imu(3.0),
+        steady_dvl(3.0),
+        None,
+        Heading(at(0.3, 0.6, 0.9, 1.2, 1.5), yaw_rad, np.full(5, sigma)),
+    )
+    keyframes.advance(int(at(2.5)[0]))
+    (factor,) = [
+        f
+        for f in factors_of(keyframes.smoother.graph)
+        if list(f.keys()) == [X(1), B(0)] and f.dim() == 1
+    ]
+    doubt = max(1.0, off / 1.345)
+    assert factor.noiseModel().noise().covariance().item() == pytest.approx(
+        sigma**2 / (4 + 1 / doubt), rel=1e-6
+    )
 
 
 def test_fixes_have_the_covariance_of_the_motion_from_their_keyframe():
