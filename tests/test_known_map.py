@@ -15,6 +15,7 @@ from sonar_graph.evaluation import compare
 from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
+from sonar_graph.navigation.map_check import exchanged_identities
 from sonar_graph.navigation.map_start import MapLocator, MapSighting, located
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.given_map import given_map_table, located_line
@@ -289,6 +290,62 @@ def test_a_map_of_which_two_landmarks_are_seen_is_not_called_right(dive):
     (finding,) = map_findings(replace(with_map(dive, known), detections=seen))
     assert not finding.acts
     assert "fewer than three of its landmarks" in finding.text()
+
+
+@pytest.mark.parametrize("shown", [[1], [1, 2]])
+def test_a_wrong_sign_of_z_is_named_by_one_landmark(dive, shown):
+    """By the vertical aperture: at the other side of the surface none of them could be seen."""
+    known = surveyed(dive)
+    places = np.array(known.positions_m) * [1.0, 1.0, -1.0]
+    mistaken = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    ids = dive.detections.most_probable()[0]
+    seen = dive.detections.rows(np.flatnonzero(np.isin(ids, shown)))
+    (finding,) = map_findings(replace(with_map(dive, mistaken), detections=seen))
+    assert finding.grave
+    assert "z_m has the wrong sign" in finding.text()
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (3, 8), (5, 12)])
+def test_two_exchanged_identities_are_named(dive, pair):
+    known = surveyed(dive)
+    a, b = pair
+    ids = [{a: b, b: a}.get(i, i) for i in known.ids]
+    mistaken = KnownMap.of(ids, known.positions_m, sigma_m=SIGMA_M)
+    for start in (None, unknown_start(dive)):
+        (finding,) = map_findings(with_map(dive, mistaken, start))
+        assert finding.grave
+        assert finding.line == f"exchange the ids {a} and {b} in the map"
+
+
+def test_landmarks_that_moved_are_no_exchanged_identities(dive):
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    places[:2, 0] += 3.0
+    moved = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    assert not list(map_findings(with_map(dive, moved)))
+
+
+@pytest.mark.parametrize(
+    ("corners", "expected"),
+    [
+        ([0, 1, 2, 3], set()),
+        ([1, 0, 2, 3], {(1, 0)}),
+        # a square that is turned by half a turn has both diagonals exchanged
+        ([2, 1, 0, 3], {(2, 0), (1, 3)}),
+    ],
+)
+def test_exchanges_that_explain_a_square_as_well_are_all_named(corners, expected):
+    places = np.array(
+        [[0.0, 0.0, -4.0], [6.0, 0.0, -4.0], [6.0, 6.0, -4.0], [0.0, 6.0, -4.0]]
+    )
+    S = 0.05**2 * np.eye(2)
+    sightings = [
+        MapSighting(corner, places[i, :2], S) for i, corner in enumerate(corners)
+    ]
+    known = KnownMap.of(range(4), places, sigma_m=0.05)
+    assert {tuple(sorted(pair)) for pair in exchanged_identities(sightings, known)} == {
+        tuple(sorted(pair)) for pair in expected
+    }
 
 
 def test_a_right_map_has_no_finding(dive):

@@ -144,7 +144,7 @@ class KnownLandmarks:
         if contradicted:
             lines.append(
                 f"landmarks {listed(contradicted)} contradict the map, and too few others agree with it: they have moved,"
-                ' or the start or the map is wrong; source = "map" under [start] finds the start by all of them'
+                " or the start or the map is wrong; `sonar-graph inspect LOG --map FILE` checks both"
             )
         unseen = [i for i in self.ids if i not in self.seen]
         if unseen:

@@ -229,8 +229,10 @@ def lost_runs(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         outcomes = run.detections.outcomes if run.detections else []
         gated = outcomes.count(Outcome.GATED)
+        # a map that the log contradicts has a message of its own, and no other gate mends it
+        is_of_map = any("contradict the map" in text for text in run.withheld)
         # a gate that refuses so much refuses the truth
-        if gated > GATED_SHARE * max(len(outcomes), 1):
+        if gated > GATED_SHARE * max(len(outcomes), 1) and not is_of_map:
             is_smoother = flattened(run.params).get(POLICY) == "gate"
             advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
             without = (

@@ -216,6 +216,8 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(
             f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its"
         )
         assert advice in sentence
+    by_map = replace(lost.runs[1], withheld=["landmarks 1..4 contradict the map, and"])
+    assert sentences.lost_runs(with_run(lost, by_map)) == []
     few = replace(
         log,
         innovations=np.full((100, 2), 0.1),
