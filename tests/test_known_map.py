@@ -441,6 +441,15 @@ def test_a_bad_map_is_refused_with_file_and_remedy(tmp_path, text, message):
     assert len(str(refused.value)) < 300
 
 
+@pytest.mark.parametrize("wrong", ["true", "false", "1.0", "1.5", '"1"', "-1"])
+def test_an_identity_that_is_no_whole_number_is_refused(tmp_path, wrong):
+    path = tmp_path / "map.toml"
+    write_map(path, KnownMap.of([1, 2], np.zeros((2, 3)), sigma_m=0.1))
+    path.write_text(path.read_text().replace("ids = [1, 2]", f"ids = [2, {wrong}]"))
+    with pytest.raises(LogError, match=r"map\.toml: ids: .*whole numbers from 0 on"):
+        read_map(path)
+
+
 def test_a_table_of_a_spreadsheet_with_its_mark_is_read(tmp_path):
     path = tmp_path / "map.csv"
     path.write_text(HEAD + "1,0,2,3,0.1\n", encoding="utf-8-sig")

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration, KnownMap
+from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Measurements
 from sonar_graph.navigation.map_start import (
     ODDS,
@@ -128,20 +128,14 @@ def first_start(sequence: Sequence, known: KnownMap) -> FoundStart | None:
 
 def followed(sequence: Sequence, known: KnownMap) -> MapLocator:
     """The sightings of a map's landmarks in the part of the log that counts."""
-    locator = MapLocator(calibration_with(sequence, known))
-    for locator in locators(sequence, known):
-        pass
-    return locator
-
-
-def calibration_with(sequence: Sequence, known: KnownMap) -> Calibration:
-    """The calibration of a log with another map."""
-    return sequence.calibration.model_copy(update={"map": known})
+    all_of_them = [*locators(sequence, known)]
+    # one locator that takes in window after window
+    return all_of_them[-1] if all_of_them else MapLocator(sequence.calibration)
 
 
 def locators(sequence: Sequence, known: KnownMap) -> Iterator[MapLocator]:
     """The locator of a map after each window that shows its landmarks, in the part of the log that counts."""
-    locator = MapLocator(calibration_with(sequence, known))
+    locator = MapLocator(sequence.calibration.model_copy(update={"map": known}))
     enough = min(ENOUGH, len(known.ids))
     for window in windows(sequence):
         is_late = window.end_ns - sequence.start_ns > LONGEST_S * 1e9

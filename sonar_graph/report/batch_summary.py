@@ -163,7 +163,7 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             )
     caption = (
         f"{LOWER} lower, {HIGHER} higher than {batch.reference} on the same seeds, beyond chance "
-        f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart."
+        f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart.{too_few(metric, tests)}"
     )
     return Table(
         "overview",
@@ -171,6 +171,25 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
         caption,
         columns,
         rows,
+    )
+
+
+def too_few(metric: Metric, tests: Tests) -> str:
+    """A sentence where no difference could be significant with so few seeds, and how many can; else nothing.
+
+    The least two-sided p of n differences is 2 / 2^n, and Holm multiplies it by the number of tests.
+    """
+    keys = metric.keys.values()
+    own = {id(test): test for (key, _, _), (test, _) in tests.items() if key in keys}
+    if not own:
+        return ""
+    most = max(test.pairs for test in own.values())
+    needed = math.floor(1.0 + math.log2(len(own) / SIGNIFICANT)) + 1
+    if most >= needed:
+        return ""
+    many = "seed" if most == 1 else "seeds"
+    return (
+        f" {most} {many} cannot tell any difference apart: it takes at least {needed}."
     )
 
 
