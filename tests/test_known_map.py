@@ -120,7 +120,7 @@ def test_landmarks_that_moved_are_named_and_mapped_anew(dive, kind):
     estimator, told = run(kind, with_map(dive, wrong))
     assert rms_m(dive, told) < 1.2 * rms_m(dive, right) + 1e-3
     (message,) = estimator.withheld()
-    assert message.startswith("landmarks 1, 2 no longer stand where the map has them")
+    assert message.startswith("moved since the map was made: landmarks 1, 2:")
     found = estimator.landmarks()
     away = np.linalg.norm(found.positions - dive.true_landmarks.positions, axis=1)
     assert away[:2].max() < 0.3
@@ -133,7 +133,7 @@ def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
         [*known.ids, 99], [*known.positions_m, (500.0, 0.0, -2.0)], sigma_m=SIGMA_M
     )
     estimator, _ = run(kind, with_map(dive, more))
-    assert estimator.withheld() == ["landmarks of the map that were not seen: 99"]
+    assert estimator.withheld() == ["of the map not seen: landmark 99"]
 
 
 RIGHT = 1.0
@@ -161,8 +161,8 @@ def test_a_landmark_has_moved_if_most_of_its_sightings_contradict_it():
 def test_none_has_moved_where_as_many_contradict_as_agree():
     known = judged([(1, RIGHT)] + [(0, WRONG)] * 9)
     assert known.moved == []
-    assert known.messages()[0].startswith("landmarks 0 contradict the map")
-    assert known.messages()[1] == "landmarks of the map that were not seen: 2..4"
+    assert known.messages()[0].startswith("landmark 0: sightings contradict the map")
+    assert known.messages()[1] == "of the map not seen: landmarks 2..4"
 
 
 LOST = {"position_m": (300.0, -80.0, 0.0), "source": "map"}
@@ -259,7 +259,10 @@ def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):
     wrong = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
     estimator, told = run(EkfSlam, with_map(dive, wrong, unknown_start(dive)))
     assert rms_m(dive, told) < 0.15
-    assert f"landmarks {known.ids[3]} no longer stand" in estimator.withheld()[0]
+    assert (
+        f"moved since the map was made: landmark {known.ids[3]}:"
+        in estimator.withheld()[0]
+    )
 
 
 FEET = 1.0 / 0.3048

@@ -23,6 +23,7 @@ from sonar_graph.report.batch_tables import (
     shown,
     unit_of,
 )
+from sonar_graph.states import counted
 from sonar_graph.table import Cell, Column, Table, absent, number, words
 
 SCORED = "scored_instants"
@@ -187,10 +188,8 @@ def too_few(metric: Metric, tests: Tests) -> str:
     needed = math.floor(1.0 + math.log2(len(own) / SIGNIFICANT)) + 1
     if most >= needed:
         return ""
-    many = "seed" if most == 1 else "seeds"
-    return (
-        f" {most} {many} cannot tell any difference apart: it takes at least {needed}."
-    )
+    seeds = counted(most, "seed")
+    return f" {seeds} cannot tell any difference apart: it takes at least {needed}."
 
 
 def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:
