@@ -52,7 +52,7 @@ class DeadReckoning:
         e = measured up - up,    H = [ [up]x  0  0 ],    K = P H^T (H P H^T + sigma^2 I)^-1, of the tilt alone
         P <- (I - K H) P (I - K H)^T + sigma^2 K K^T
 
-    Depth and detections are not used.
+    Depth, headings, position fixes and detections are not used; `withheld` names headings and fixes.
 
     Parameters
     ----------
@@ -90,6 +90,8 @@ class DeadReckoning:
         self._felt: PreintegratedMotion | None = None
         """Motion since gravity was used, from the epoch with this velocity of the IMU and its variance."""
         self._felt_from: tuple[Floats, float] | None = None
+        self._unused: set[str] = set()
+        """Aids of the log that are not used."""
         self._estimates = CausalEstimates()
         self._journal = DetectionJournal()
 
@@ -102,6 +104,10 @@ class DeadReckoning:
         self._odometry.add(measurements.imu, measurements.dvl)
         # depths are not used here, but judged and listed as by every estimator
         self._odometry.used_depths(measurements.depth)
+        if measurements.heading is not None:
+            self._unused.add("headings")
+        if measurements.positions is not None:
+            self._unused.add("position fixes")
         if measurements.detections is not None:
             self._record(measurements.detections)
         end_ns = measurements.end_ns
@@ -173,6 +179,12 @@ class DeadReckoning:
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, with the reason."""
         return self._odometry.refused
+
+    def withheld(self) -> list[str]:
+        """A line about headings and position fixes of the log, which other estimators use."""
+        if not self._unused:
+            return []
+        return [f"{' and '.join(sorted(self._unused))} of the log are not used"]
 
     def _attitude(self) -> Floats:
         """world_R_body at the newest epoch."""

@@ -18,6 +18,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    field_validator,
     model_validator,
 )
 from pydantic.fields import FieldInfo
@@ -391,6 +392,19 @@ class KnownMap(Section):
     source: str = ""
     """Origin of the map: a survey, or log and estimator of an earlier run."""
 
+    @field_validator("ids", mode="before")
+    @classmethod
+    def _whole(cls, ids: Any) -> Any:
+        # pydantic takes true as 1, and "1" and 1.0 too
+        for given in ids if isinstance(ids, list | tuple) else ():
+            if type(given) is not int or given < 0:
+                reason = (
+                    f"ids: {given!r}: identities of landmarks are whole numbers from 0 on, "
+                    "such as ids = [4, 9]"
+                )
+                raise PydanticCustomError(MISFIT, "{reason}", {"reason": reason})
+        return ids
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not self.ids:
@@ -399,11 +413,6 @@ class KnownMap(Section):
         twice = [i for i, count in Counter(self.ids).items() if count > 1]
         if twice:
             raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
-        if min(self.ids) < 0:
-            reason = (
-                f"{min(self.ids)}: identities of landmarks are whole numbers from 0 on"
-            )
-            raise misfits(type(self), {"ids": reason})
         if len(self.positions_m) != len(self.ids):
             reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
             raise misfits(type(self), {"positions_m": reason})

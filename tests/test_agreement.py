@@ -363,3 +363,14 @@ def test_an_impossible_heading_or_fix_is_named_and_changes_nothing(kind, row):
         (sensor, at_ns, Refusal.UNSOUND)
     ]
     assert max(difference(estimates, run(others, sequence))) < 1e-9
+
+
+def test_dead_reckoning_names_the_headings_and_fixes_that_it_does_not_use():
+    estimator = made(DeadReckoning, aided_world().calibration)
+    run(estimator, aided_world())
+    assert estimator.withheld() == [
+        "headings and position fixes of the log are not used"
+    ]
+    bare = made(DeadReckoning, winding().calibration)
+    run(bare, winding(), 3.7)
+    assert bare.withheld() == []

@@ -15,6 +15,7 @@ from sonar_graph.evaluation import compare
 from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
+from sonar_graph.navigation.map_check import exchanged_identities
 from sonar_graph.navigation.map_start import MapLocator, MapSighting, located
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -117,7 +118,7 @@ def test_landmarks_that_moved_are_named_and_mapped_anew(dive, kind):
     estimator, told = run(kind, with_map(dive, wrong))
     assert rms_m(dive, told) < 1.2 * rms_m(dive, right) + 1e-3
     (message,) = estimator.withheld()
-    assert message.startswith("landmarks 1, 2 no longer stand where the map has them")
+    assert message.startswith("moved since the map was made: landmarks 1, 2:")
     found = estimator.landmarks()
     away = np.linalg.norm(found.positions - dive.true_landmarks.positions, axis=1)
     assert away[:2].max() < 0.3
@@ -211,7 +212,10 @@ def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):
     wrong = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
     estimator, told = run(EkfSlam, with_map(dive, wrong, unknown_start(dive)))
     assert rms_m(dive, told) < 0.15
-    assert f"landmarks {known.ids[3]} no longer stand" in estimator.withheld()[0]
+    assert (
+        f"moved since the map was made: landmark {known.ids[3]}:"
+        in estimator.withheld()[0]
+    )
 
 
 FEET = 1.0 / 0.3048
@@ -242,6 +246,62 @@ def test_a_map_of_which_two_landmarks_are_seen_is_not_called_right(dive):
     (finding,) = map_findings(replace(with_map(dive, known), detections=seen))
     assert not finding.acts
     assert "fewer than three of its landmarks" in finding.text()
+
+
+@pytest.mark.parametrize("shown", [[1], [1, 2]])
+def test_a_wrong_sign_of_z_is_named_by_one_landmark(dive, shown):
+    """By the vertical aperture: at the other side of the surface none of them could be seen."""
+    known = surveyed(dive)
+    places = np.array(known.positions_m) * [1.0, 1.0, -1.0]
+    mistaken = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    ids = dive.detections.most_probable()[0]
+    seen = dive.detections.rows(np.flatnonzero(np.isin(ids, shown)))
+    (finding,) = map_findings(replace(with_map(dive, mistaken), detections=seen))
+    assert finding.grave
+    assert "z_m has the wrong sign" in finding.text()
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (3, 8), (5, 12)])
+def test_two_exchanged_identities_are_named(dive, pair):
+    known = surveyed(dive)
+    a, b = pair
+    ids = [{a: b, b: a}.get(i, i) for i in known.ids]
+    mistaken = KnownMap.of(ids, known.positions_m, sigma_m=SIGMA_M)
+    for start in (None, unknown_start(dive)):
+        (finding,) = map_findings(with_map(dive, mistaken, start))
+        assert finding.grave
+        assert finding.line == f"exchange the ids {a} and {b} in the map"
+
+
+def test_landmarks_that_moved_are_no_exchanged_identities(dive):
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    places[:2, 0] += 3.0
+    moved = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    assert not list(map_findings(with_map(dive, moved)))
+
+
+@pytest.mark.parametrize(
+    ("corners", "expected"),
+    [
+        ([0, 1, 2, 3], set()),
+        ([1, 0, 2, 3], {(1, 0)}),
+        # a square that is turned by half a turn has both diagonals exchanged
+        ([2, 1, 0, 3], {(2, 0), (1, 3)}),
+    ],
+)
+def test_exchanges_that_explain_a_square_as_well_are_all_named(corners, expected):
+    places = np.array(
+        [[0.0, 0.0, -4.0], [6.0, 0.0, -4.0], [6.0, 6.0, -4.0], [0.0, 6.0, -4.0]]
+    )
+    S = 0.05**2 * np.eye(2)
+    sightings = [
+        MapSighting(corner, places[i, :2], S) for i, corner in enumerate(corners)
+    ]
+    known = KnownMap.of(range(4), places, sigma_m=0.05)
+    assert {tuple(sorted(pair)) for pair in exchanged_identities(sightings, known)} == {
+        tuple(sorted(pair)) for pair in expected
+    }
 
 
 def test_a_right_map_has_no_finding(dive):
@@ -335,6 +395,15 @@ def test_a_bad_map_is_refused_with_file_and_remedy(tmp_path, text, message):
         read_map(path)
     assert message in str(refused.value)
     assert len(str(refused.value)) < 300
+
+
+@pytest.mark.parametrize("wrong", ["true", "false", "1.0", "1.5", '"1"', "-1"])
+def test_an_identity_that_is_no_whole_number_is_refused(tmp_path, wrong):
+    path = tmp_path / "map.toml"
+    write_map(path, KnownMap.of([1, 2], np.zeros((2, 3)), sigma_m=0.1))
+    path.write_text(path.read_text().replace("ids = [1, 2]", f"ids = [2, {wrong}]"))
+    with pytest.raises(LogError, match=r"map\.toml: ids: .*whole numbers from 0 on"):
+        read_map(path)
 
 
 def test_a_table_of_a_spreadsheet_with_its_mark_is_read(tmp_path):

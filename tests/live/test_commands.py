@@ -97,6 +97,9 @@ def test_the_status_has_sigmas_along_the_axes_of_the_world():
     )
     again = status.line(dropped=3, latency_ms=0.0, period_s=1.0)
     assert "0 poses/s, 0 estimates/s" in again  # counts are since the line before
+    # after the end of a log
+    assert status.line(dropped=3, latency_ms=0.0, period_s=1.0) == ""
+    assert "| 4 dropped |" in status.line(dropped=4, latency_ms=0.0, period_s=1.0)
 
 
 @pytest.mark.slow

@@ -193,3 +193,6 @@ def test_other_folders_are_refused_with_what_to_do(folder, tmp_path):
         LogError, match=r"empty: is a folder without metadata\.yaml and \.mcap files"
     ):
         read_log(tmp_path / "empty")
+    (tmp_path / "empty" / "imu.csv").write_text("t,x\n")
+    with pytest.raises(LogError, match=r"`sonar-graph convert csv .*empty --toml"):
+        read_log(tmp_path / "empty")

@@ -54,6 +54,19 @@ def overview_of(batch: RecordedBatch) -> Table:
     return summary.overview_table(batch, ATE, compared_runs(batch))
 
 
+@pytest.mark.parametrize("seeds", [4, 6, 8, 9, 12])
+def test_too_few_seeds_to_tell_anything_are_named_with_the_number_needed(seeds):
+    """Holm's correction keeps every p above 5 % exactly as long as the page names more seeds."""
+    tests = compared_runs(drawn_batch(seeds))
+    caption = summary.overview_table(drawn_batch(seeds), ATE, tests).caption
+    n = len({id(test) for test, _ in tests.values()})
+    is_lacking = f"{seeds} seeds cannot tell any difference apart" in caption
+    assert is_lacking == (n * 2.0 ** (1 - seeds) >= 0.05)
+    if is_lacking:
+        needed = int(caption.split()[-1].rstrip("."))
+        assert n * 2.0 ** (1 - needed) < 0.05 <= n * 2.0 ** (2 - needed)
+
+
 def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
     heads = [
         (column.over, column.heading.removesuffix(" (reference)"))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from sonar_graph.calibration import KnownMap
 from sonar_graph.evaluation import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
 from sonar_graph.measurements import Heading
@@ -59,6 +60,7 @@ def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
     keys = (
         "causal.ate_se2_m",
         "smoothed.ate_se2_m",
+        "causal.ate_raw_m",
         "causal.yaw_rmse_rad",
         "causal.nees_yaw",
         "time.update_max_ms",
@@ -70,6 +72,27 @@ def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
     assert "corrects the drift." not in text
 
 
+def test_a_single_estimator_is_not_called_the_nearest():
+    assert sentences.headline(scored(isam2=0.1)).startswith(
+        "isam2 is 0.100\N{NO-BREAK SPACE}m off the truth ("
+    )
+    assert "nearest" in sentences.headline(scored(isam2=0.1, ekf_slam=0.2))
+
+
+def test_aligned_errors_come_first_in_the_terminal_in_a_known_map_too():
+    """So that the numbers of two dives are of one kind."""
+    comparison = basin_comparison(60)
+    known = KnownMap.of([1], [[0.0, 0.0, 0.0]], sigma_m=0.1)
+    calibration = comparison.sequence.calibration.model_copy(update={"map": known})
+    sequence = replace(comparison.sequence, calibration=calibration)
+    texts = [printed(comparison), printed(replace(comparison, sequence=sequence))]
+    for text in texts:
+        heads = text.splitlines()[2].split()
+        assert heads[:3] == ["aligned", "aligned", "raw"]
+        assert "aligned: Horizontal position error, SE(2) aligned" in text
+        assert "raw: Position error, not aligned" in text
+
+
 def test_a_failure_is_printed_with_its_reason():
     reason = "no [bold] odometry covers the stamps of any of the sonar frames that the log holds"
     text = printed(
@@ -77,7 +100,7 @@ def test_a_failure_is_printed_with_its_reason():
     )
     assert f"isam2 failed: {reason}" in text
     assert "causal" not in text, "without truth columns of errors are left out"
-    assert "median" in text
+    assert "med." in text
 
 
 @pytest.mark.parametrize(
@@ -209,6 +232,13 @@ def test_an_estimator_that_rejects_a_fifth_is_called_lost(gated, params, advice)
             f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its"
         )
         assert advice in sentence
+    by_map = replace(
+        lost.runs[1],
+        withheld=[
+            "landmarks 1..4: sightings contradict the map, and too few others agree"
+        ],
+    )
+    assert sentences.lost_runs(with_run(lost, by_map)) == []
     few = replace(
         log,
         innovations=np.full((100, 2), 0.1),
