@@ -20,6 +20,7 @@ from sonar_graph.testing import check_jacobians
 from .graphs import information
 from .made import (
     POSES,
+    graph_of,
     plain,
     random_covariance,
     some_motion,
@@ -231,6 +232,16 @@ def test_a_gravity_direction_that_does_not_fit_leaves_the_yaw_free(pose):
     squared = 2 * in_world.error(tilted)
     assert squared > 10
     assert of_yaw == pytest.approx([0.0, squared], rel=0.01, abs=1e-9)
+
+
+def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
+    pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
+    said = information(factors.planar(X(0), PLANE).values(), values_of(X0=pose), [X(0)])
+    assert np.diag(said) == pytest.approx([2500, 2500, 0, 0, 0, 1e4], abs=1e-6)
+    graph = graph_of(factors.planar(X(0), PLANE).values())
+    assert graph.error(values_of(X0=pose)) < 1e-6
+    off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
+    assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
 
 
 def assert_is_each_of(made, stack, values: gtsam.Values) -> None:
