@@ -167,13 +167,7 @@ def degrees(sequence: Sequence) -> Sequence:
     )
 
 
-def fast(sequence: Sequence) -> Sequence:
-    return replace(
-        sequence, dvl=replace(sequence.dvl, velocity=100 * sequence.dvl.velocity)
-    )
-
-
-def aided(sequence: Sequence, sense: float = 1.0, unit: float = 1.0) -> Sequence:
+def aided(sequence: Sequence, sense: float = 1.0) -> Sequence:
     """With a compass and position fixes of the truth."""
     truth = sequence.truth.at(
         np.arange(sequence.start_ns, sequence.truth.stamps_ns[-1], NS_PER_S)
@@ -184,7 +178,7 @@ def aided(sequence: Sequence, sense: float = 1.0, unit: float = 1.0) -> Sequence
         np.full(len(truth), np.nan),
     )
     fixes = PositionFixes(
-        truth.stamps_ns, unit * truth.positions, np.full((len(truth), 3, 3), np.nan)
+        truth.stamps_ns, truth.positions, np.full((len(truth), 3, 3), np.nan)
     )
     return replace(sequence, heading=heading, positions=fixes)
 
@@ -193,9 +187,7 @@ def aided(sequence: Sequence, sense: float = 1.0, unit: float = 1.0) -> Sequence
     ("spoil", "told"),
     [
         (degrees, "gyro: unit: rates look 57 times too large"),
-        (fast, "DVL: unit: velocities look 100 times too large"),
         (partial(aided, sense=-1.0), "heading: turn over that of the gyros: -1.00"),
-        (partial(aided, unit=1e3), "position fixes: change over that by the path"),
         (aided, None),
     ],
 )
