@@ -111,8 +111,7 @@ def named_late(sequence: Sequence | None = None, share: float = 0.4) -> Sequence
     return anonymous_where(sequence or clean(), seen.stamps_ns < until_ns)
 
 
-@pytest.mark.parametrize("history", ["whole", "bounded"])
-@pytest.mark.parametrize("lag_s", [12.0, 3.0])
+@pytest.mark.parametrize(("history", "lag_s"), [("whole", 12.0), ("bounded", 3.0)])
 def test_what_waits_leaves_with_its_keyframe(history: str, lag_s: float):
     """False detections of a first part, without names, wait when the second begins, in which landmarks are merged."""
     sequence = named_late(
