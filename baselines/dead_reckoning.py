@@ -52,7 +52,7 @@ class DeadReckoning:
         e = measured up - up,    H = [ [up]x  0  0 ],    K = P H^T (H P H^T + sigma^2 I)^-1, of the tilt alone
         P <- (I - K H) P (I - K H)^T + sigma^2 K K^T
 
-    Depth and detections are not used.
+    Depth, headings, position fixes and detections are not used; `withheld` names headings and fixes.
 
     Parameters
     ----------
@@ -82,17 +82,16 @@ class DeadReckoning:
         has_bias = calibration.imu.gyro_bias_sigma > 0
         self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
         self._pose = calibration.start.pose()
-        start = calibration.start
-        R = self._pose.rotation().matrix()
         # of [theta, rho, bias], theta and rho in body axes
         self._P = np.zeros((9, 9))
-        self._P[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
-        self._P[3:6, 3:6] = R.T @ np.diag(np.square(start.position_sigma_m)) @ R
+        self._P[:6, :6] = calibration.start.covariance()
         self._P[6:, 6:] = np.eye(3) * calibration.imu.gyro_bias_sigma**2
         self._epoch_ns: int | None = None
         self._felt: PreintegratedMotion | None = None
         """Motion since gravity was used, from the epoch with this velocity of the IMU and its variance."""
         self._felt_from: tuple[Floats, float] | None = None
+        self._unused: set[str] = set()
+        """Aids of the log that are not used."""
         self._estimates = CausalEstimates()
         self._journal = DetectionJournal()
 
@@ -105,6 +104,10 @@ class DeadReckoning:
         self._odometry.add(measurements.imu, measurements.dvl)
         # depths are not used here, but judged and listed as by every estimator
         self._odometry.used_depths(measurements.depth)
+        if measurements.heading is not None:
+            self._unused.add("headings")
+        if measurements.positions is not None:
+            self._unused.add("position fixes")
         if measurements.detections is not None:
             self._record(measurements.detections)
         end_ns = measurements.end_ns
@@ -176,6 +179,12 @@ class DeadReckoning:
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, with the reason."""
         return self._odometry.refused
+
+    def withheld(self) -> list[str]:
+        """A line about headings and position fixes of the log, which other estimators use."""
+        if not self._unused:
+            return []
+        return [f"{' and '.join(sorted(self._unused))} of the log are not used"]
 
     def _attitude(self) -> Floats:
         """world_R_body at the newest epoch."""

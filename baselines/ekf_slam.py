@@ -330,13 +330,10 @@ class EkfSlam(FilterShell):
         self._x = np.concatenate((np.zeros(MAP), places.ravel()))
         self._x[:3] = start.position_m
         self._x[ROLL:POSE] = angles
-        E = np.array(euler_rates_from_body(angles.x, angles.y))
         self._P = np.zeros((len(self._x), len(self._x)))
         self._P[MAP:, MAP:] = self._known.joint()
         self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self._P[ROLL:POSE, ROLL:POSE] = (
-            E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
-        )
+        self._P[ROLL:POSE, ROLL:POSE] = np.diag(np.square(start.rpy_sigma_rad))
         self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
         self._overturned: list[str] = []
 

@@ -513,7 +513,8 @@ class InvariantEkf(FilterShell):
 def start_state(calibration: Calibration) -> InvariantState:
     """State at the start, without landmarks.
 
-    Errors of the start, ``R = R^ Exp(delta)`` and ``X = X^ + d``, are ``theta = R^ delta``, ``xi_0 = d + [X^]x theta``.
+    Errors of the start, ``R = R^ Exp(delta)`` and ``X = X^ + R^ d``, are ``theta = R^ delta`` and
+    ``xi_0 = R^ d + [X^]x theta``.
     """
     start = calibration.start
     R = np.ascontiguousarray(start.pose().rotation().matrix())
@@ -521,8 +522,8 @@ def start_state(calibration: Calibration) -> InvariantState:
     A = np.zeros((BARE, 6))
     A[THETA, :3] = R
     A[BODY, :3] = cross_matrix(X) @ R
-    A[BODY, 3:] = np.eye(3)
-    P = A @ np.diag(np.square((*start.rpy_sigma_rad, *start.position_sigma_m))) @ A.T
+    A[BODY, 3:] = R
+    P = A @ start.covariance() @ A.T
     P[BETA, BETA] = np.diag(bias_sigmas(calibration)[0] ** 2)
     body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
     return InvariantState(

@@ -18,6 +18,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    field_validator,
     model_validator,
 )
 from pydantic.fields import FieldInfo
@@ -40,6 +41,8 @@ STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS = 5
 SHORTEST_HOLE_S = 0.05
 """Typical intervals and seconds of the IMU without a sample; a hole exceeds both: one lost sample does no harm."""
+LEAST_COSINE = 0.01
+"""Of a start's pitch: nearer to the vertical the sigmas of roll and yaw are those of one rotation."""
 ROWS_BEFORE = 8
 UNTYPICAL_S = 1.0
 """Preceding intervals that define the typical one; longest interval after the very first sample that is no hole."""
@@ -54,6 +57,17 @@ def within(lowest: float, highest: float, expected: str) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+def not_vertical(rpy_rad: tuple[float, float, float]) -> tuple[float, float, float]:
+    """The angles, whose roll and yaw turn about different axes."""
+    pitch = rpy_rad[1]
+    if abs(np.cos(pitch)) < LEAST_COSINE:
+        raise ValueError(
+            f"pitch {pitch:g} is vertical, where roll and yaw turn about one axis;"
+            " give another start (--start), with the vehicle not vertical"
+        )
+    return rpy_rad
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -310,11 +324,11 @@ class Start(Section):
     """World pose of the body at the first instant with IMU and DVL, as a prior."""
 
     position_m: Vector = (0.0, 0.0, 0.0)
-    rpy_rad: Angles = (0.0, 0.0, 0.0)
+    rpy_rad: Annotated[Angles, AfterValidator(not_vertical)] = (0.0, 0.0, 0.0)
     position_sigma_m: Sigmas = (1e-3, 1e-3, 1e-3)
     """Along the world's axes."""
     rpy_sigma_rad: Sigmas = (1e-3, 1e-3, 1e-3)
-    """Small rotations about the body's axes."""
+    """Of roll, pitch and yaw: an error of yaw turns the body about the vertical, so gravity cannot correct it."""
     source: Literal["stated", "fixes", "heading", "vehicle", "map"] = "stated"
     """Where x, y and yaw come from. ``stated``: from the owner; ``fixes``: measured; ``heading``: yaw is measured, x
     and y are zero at the vehicle; ``vehicle``: all three are zero at the vehicle, which defines the world; ``map``:
@@ -323,6 +337,28 @@ class Start(Section):
     def pose(self) -> gtsam.Pose3:
         """world_T_body."""
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.position_m))
+
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of small rotations and shifts of the body in its own axes, rotation first, shape (6, 6).
+
+        A small rotation is ``J [d roll, d pitch, d yaw]``, where J is the inverse of the matrix of the paper's Euler
+        kinematics; a small shift is ``R' d``, where R is the attitude and d is along the world's axes.
+        """
+        roll, pitch, _ = self.rpy_rad
+        J = np.array(
+            [
+                [1.0, 0.0, -np.sin(pitch)],
+                [0.0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
+                [0.0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
+            ]
+        )
+        body_R_world = self.pose().rotation().matrix().T
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = J @ np.diag(np.square(self.rpy_sigma_rad)) @ J.T
+        covariance[3:, 3:] = (
+            body_R_world @ np.diag(np.square(self.position_sigma_m)) @ body_R_world.T
+        )
+        return covariance
 
     def in_map(self) -> Self:
         """The start of a run with a known map: where nothing gives its place, the place is found in the map."""
@@ -356,6 +392,19 @@ class KnownMap(Section):
     source: str = ""
     """Origin of the map: a survey, or log and estimator of an earlier run."""
 
+    @field_validator("ids", mode="before")
+    @classmethod
+    def _whole(cls, ids: Any) -> Any:
+        # pydantic takes true as 1, and "1" and 1.0 too
+        for given in ids if isinstance(ids, list | tuple) else ():
+            if type(given) is not int or given < 0:
+                reason = (
+                    f"ids: {given!r}: identities of landmarks are whole numbers from 0 on, "
+                    "such as ids = [4, 9]"
+                )
+                raise PydanticCustomError(MISFIT, "{reason}", {"reason": reason})
+        return ids
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not self.ids:
@@ -364,11 +413,6 @@ class KnownMap(Section):
         twice = [i for i, count in Counter(self.ids).items() if count > 1]
         if twice:
             raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
-        if min(self.ids) < 0:
-            reason = (
-                f"{min(self.ids)}: identities of landmarks are whole numbers from 0 on"
-            )
-            raise misfits(type(self), {"ids": reason})
         if len(self.positions_m) != len(self.ids):
             reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
             raise misfits(type(self), {"positions_m": reason})

@@ -29,6 +29,7 @@ from sonar_graph.files import replacing, text_of
 from sonar_graph.measurements import FIRST_TOO_LARGE_ID
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse, toml_value
+from sonar_graph.states import counted
 
 PLACE = ("x_m", "y_m", "z_m")
 SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -199,7 +200,7 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     """
     known, warnings = read_map(path)
     start = sequence.calibration.start.in_map()
-    note = f"{len(known.ids)} landmarks of {path.name}"
+    note = f"{counted(len(known.ids), 'landmark')} of {path.name}"
     if start.source == "map":
         note += "; the start is found in it, by identified landmarks"
     # the map has the measurements of this log in it already

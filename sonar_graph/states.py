@@ -45,6 +45,11 @@ ABSENT = "\N{EN DASH}"
 """Stands in tables where there is no number."""
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun, such as ``1 landmark`` and ``4 landmarks``."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def html_table(caption: str, headings: list[str], rows: list[list[str]]) -> str:
     """Plain table of texts for a notebook, all of them escaped."""
     head = " ".join(f"<th>{escape(heading)}</th>" for heading in headings)
@@ -112,7 +117,7 @@ class Trajectory:
 
     def __repr__(self) -> str:
         span = f", {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns" if len(self) else ""
-        return f"Trajectory({len(self)} poses{span})"
+        return f"Trajectory({counted(len(self), 'pose')}{span})"
 
     def _repr_html_(self) -> str:
         """Times, length and extent, for a notebook."""
@@ -351,9 +356,7 @@ class LandmarkMap:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return (
-            f"LandmarkMap({len(self)} landmarks, ids {reprlib.repr(self.ids.tolist())})"
-        )
+        return f"LandmarkMap({counted(len(self), 'landmark')}, ids {reprlib.repr(self.ids.tolist())})"
 
     def _repr_html_(self) -> str:
         """Positions with their standard deviations, for a notebook: of the first `MOST_ROWS` landmarks."""
@@ -383,7 +386,9 @@ class LandmarkMap:
             "sigma y (m)",
             "sigma z (m)",
         ]
-        return html_table(f"Map of {len(self)} landmarks{left_out}", heads, rows)
+        return html_table(
+            f"Map of {counted(len(self), 'landmark')}{left_out}", heads, rows
+        )
 
 
 class Outcome(StrEnum):

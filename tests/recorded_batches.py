@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sonar_graph.batch.recorded import RESULTS, RecordedBatch, RecordedRun
+from sonar_graph.batch import RESULTS, RecordedBatch, RecordedRun
 from sonar_graph.batch.store import SUITE
 
 METRICS = ["causal.ate_se2_m", "causal.yaw_rmse_rad", "landmarks.se2_m"]

@@ -257,20 +257,6 @@ def test_without_sightings_all_are_dead_reckoning():
         )
 
 
-@pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
-def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind):
-    """A constant, unobservable bias: unknown, and the same at all times."""
-    sequence = winding(gyro_bias_sigma=2e-3)
-    reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
-    poses, covariances = difference(
-        run(made(kind, sequence.calibration), sequence, 3.7), reckoned
-    )
-    assert poses < 1e-6
-    assert covariances < 1e-3
-    unaware = run(made(DeadReckoning, winding().calibration), sequence, 3.7)
-    assert difference(unaware, reckoned)[1] > 0.1
-
-
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
     """Rows of a sensor come 2 s late, in a call that ends before the one before: a fix counts, the others cannot."""
@@ -377,3 +363,14 @@ def test_an_impossible_heading_or_fix_is_named_and_changes_nothing(kind, row):
         (sensor, at_ns, Refusal.UNSOUND)
     ]
     assert max(difference(estimates, run(others, sequence))) < 1e-9
+
+
+def test_dead_reckoning_names_the_headings_and_fixes_that_it_does_not_use():
+    estimator = made(DeadReckoning, aided_world().calibration)
+    run(estimator, aided_world())
+    assert estimator.withheld() == [
+        "headings and position fixes of the log are not used"
+    ]
+    bare = made(DeadReckoning, winding().calibration)
+    run(bare, winding(), 3.7)
+    assert bare.withheld() == []

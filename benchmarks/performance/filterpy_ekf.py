@@ -62,10 +62,9 @@ class FilterpySlam:
         start = self.calibration.start
         self.ekf = ExtendedKalmanFilter(dim_x=6, dim_z=1)
         self.ekf.x = np.concatenate([start.position_m, start.pose().rotation().rpy()])
-        E = np.linalg.inv(body_rates(self.ekf.x))
         self.ekf.P = np.zeros((6, 6))
         self.ekf.P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self.ekf.P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+        self.ekf.P[3:, 3:] = np.diag(np.square(start.rpy_sigma_rad))
 
     def pose(self) -> gtsam.Pose3:
         """The body in the world."""

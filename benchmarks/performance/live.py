@@ -34,6 +34,10 @@ from sonar_graph import Imu, write_log
 from sonar_graph.live.zenoh_link import ATTACHMENT, open_session, parse_key
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import write_results
+
 COMMAND = [sys.executable, "-m", "sonar_graph"]
 FILES = ("causal.tum", "trajectory.tum", "landmarks.csv")
 IMU, ODOMETRY, IMAGE, DETECTED = (
@@ -299,6 +303,43 @@ class Case(NamedTuple):
         return is_met
 
 
+TITLE = "Live operation: losses, latency and equality of the record"
+HEADERS = (
+    "case",
+    "lost",
+    "dropped",
+    "differing bytes",
+    "IMU row to pose p50, p99, ms",
+    "bare middleware p50, p99, ms",
+    "prediction p99, own time, us",
+    "of one core",
+    "images, recognised, within 50 ms",
+    "load",
+    "met",
+)
+
+
+def row_of(result, *, is_met):
+    """Row of a case in the table of results."""
+    seconds = f"{result['duration_s']:g} s"
+    seen = "-"
+    if "images" in result:
+        seen = f"{result['images']}, {result['recognised']}, {result['within_50_ms']}"
+    return (
+        f"{result['estimator']}, {seconds}, {result['case']}",
+        result["lost"],
+        result["dropped"],
+        result["differing_bytes"],
+        f"{result['stamp_to_pose_p50_ms']}, {result['stamp_to_pose_p99_ms']}",
+        f"{result['bare_p50_ms']}, {result['bare_p99_ms']}",
+        result["predictor_cpu_p99_us"],
+        f"{result['cpu_share']:.2f}",
+        seen,
+        result["load"],
+        "yes" if is_met else "no",
+    )
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -309,6 +350,9 @@ def main():
     )
     parser.add_argument(
         "--only", type=int, nargs="*", help="numbers of the cases, from 0"
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="write benchmarks/results/live.md"
     )
     given = parser.parse_args()
     long_s, short_s = (60.0, 20.0) if given.quick else (1800.0, 60.0)
@@ -323,6 +367,7 @@ def main():
         ),
     ]
     is_met = True
+    rows = []
     for number, case in enumerate(cases):
         if given.only is not None and number not in given.only:
             continue
@@ -341,6 +386,9 @@ def main():
             )
         print(json.dumps(result), flush=True)
         is_met &= case.is_met(result)
+        rows.append(row_of(result, is_met=case.is_met(result)))
+    if given.write:
+        write_results("live.md", TITLE, HEADERS, rows)
     raise SystemExit(not is_met)
 
 

@@ -14,6 +14,7 @@ from scipy import stats
 
 from sonar_graph.evaluation import anees_interval
 from sonar_graph.measurements import Floats
+from sonar_graph.states import counted
 
 # positive integers: ranks, doubled if there are ties, divided by their common divisor
 Ranks = np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -122,7 +123,7 @@ class PairedDifference:
     @property
     def counted(self) -> str:
         """Number and unit of the differences, such as ``10 seeds``."""
-        return f"{self.pairs} {self.each}{'s' * (self.pairs != 1)}"
+        return counted(self.pairs, self.each)
 
 
 @dataclass(frozen=True)

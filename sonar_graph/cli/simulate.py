@@ -55,6 +55,7 @@ def landmarks(
     """Landmarks along a recorded run, and the detections of a sonar; IMU and DVL stay as recorded."""
     from sonar_graph.logs import write_log
     from sonar_graph.simulation import LandmarkOptions, add_landmarks
+    from sonar_graph.states import counted
 
     given = ({} if seed is None else {"seed": seed}) | nested_settings(settings)
     options = validated(LandmarkOptions, given, "landmarks")
@@ -66,7 +67,7 @@ def landmarks(
     detections = sequence.detections
     placed = sequence.true_landmarks
     echo(
-        f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}"
+        f"{counted(len(placed or ()), 'landmark')}, {counted(len(detections or ()), 'detection')}\nLog: {path}"
     )
 
 

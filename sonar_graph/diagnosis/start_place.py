@@ -75,7 +75,7 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         return
     fit = map_fit(right)
     if not fit.is_checked:
-        why = "fewer than three of its landmarks are seen soon after the start"
+        why = "fewer than three of its landmarks are seen"
         yield Finding("map: axes, unit and sense", unknown(why))
     if fit.mistake:
         yield Finding(

@@ -24,6 +24,7 @@ from sonar_graph.states import (
     Refusal,
     RefusedRow,
     Trajectory,
+    counted,
 )
 from sonar_graph.table import as_html
 
@@ -110,7 +111,7 @@ class RunResult:
     def __repr__(self) -> str:
         end = (
             self.reason
-            or f"{len(self.causal or ())} estimates, {len(self.landmarks or ())} landmarks"
+            or f"{counted(len(self.causal or ()), 'estimate')}, {counted(len(self.landmarks or ()), 'landmark')}"
         )
         if self.withheld:
             more = len(self.withheld) - 1

@@ -76,7 +76,7 @@ class LiveRun:
     show_line
         Called with lines for the user.
     status
-        Called with the line of each second, which replaces the one before; None: it is not made.
+        Called with the line of each second, which replaces the one before, unless it is the same; None: it is not made.
     """
 
     def __init__(
@@ -380,9 +380,12 @@ class LiveRun:
         if self._status is not None:
             gone = dropped.total() + sum(lost.values())
             latency_ms = self._latency_ns * 1e-6
-            self._status(
-                self._now.line(dropped=gone, latency_ms=latency_ms, period_s=period_s)
+            line = self._now.line(
+                dropped=gone, latency_ms=latency_ms, period_s=period_s
             )
+            # after the end of a log there is none
+            if line:
+                self._status(line)
         self._latency_ns = 0
         self._longest_update_s = 0.0
 

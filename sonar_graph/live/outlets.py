@@ -29,7 +29,7 @@ from sonar_graph.logs import detection_messages, landmark_map_message, landmark_
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Decoder, definition, encode, parse_definition
 from sonar_graph.measurements import NS_PER_S, Floats, LandmarkDetections
-from sonar_graph.states import Estimate, LandmarkMap
+from sonar_graph.states import Estimate, LandmarkMap, counted
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF = "tf2_msgs/msg/TFMessage"
@@ -204,6 +204,8 @@ class Status:
     landmarks: int = 0
     detected_ns: int = 0
     """Stamp of the newest frame with a detection; 0: none has come."""
+    last: str = ""
+    """The line before."""
 
     def predicted(self, at: Prediction) -> None:
         """Count a prediction."""
@@ -213,7 +215,16 @@ class Status:
         self.predictions += 1
 
     def line(self, *, dropped: int, latency_ms: float, period_s: float) -> str:
-        """The line, and counts from zero again."""
+        """The line, and counts from zero again; empty where it is the same as before, as after the end of a log."""
+        line = self._line(dropped, latency_ms, period_s)
+        self.predictions = 0
+        self.estimates = 0
+        if line == self.last:
+            return ""
+        self.last = line
+        return line
+
+    def _line(self, dropped: int, latency_ms: float, period_s: float) -> str:
         if self.at is None:
             return "no pose yet: it needs rows of IMU and Doppler log"
         T = self.at.world_T_body
@@ -230,12 +241,10 @@ class Status:
             f"{(self.at.stamp_ns - self.start_ns) / NS_PER_S:.0f} s",
             f"{place} m",
             f"{self.predictions / period_s:.0f} poses/s, {self.estimates / period_s:.0f} estimates/s",
-            f"{self.landmarks} landmarks, {seen}",
+            f"{counted(self.landmarks, 'landmark')}, {seen}",
             f"{dropped} dropped",
             f"latency {latency_ms:.0f} ms",
         ]
-        self.predictions = 0
-        self.estimates = 0
         return " | ".join(parts)
 
 

@@ -10,7 +10,7 @@ that agree have moved: then their sightings are refused, and a message names bot
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from enum import Enum
 
 import numpy as np
@@ -138,18 +138,21 @@ class KnownLandmarks:
                 if self._may_release
                 else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
             )
-            lines.append(
-                f"landmarks {listed(moved)} no longer stand where the map has them: {treated}"
-            )
+            lines.append(f"moved since the map was made: {named(moved)}: {treated}")
         if contradicted:
             lines.append(
-                f"landmarks {listed(contradicted)} contradict the map, and too few others agree with it: they have moved,"
-                ' or the start or the map is wrong; source = "map" under [start] finds the start by all of them'
+                f"{named(contradicted)}: sightings contradict the map, and too few others agree with it: landmarks have "
+                "moved, or the start or the map is wrong; `sonar-graph inspect LOG --map FILE` checks both"
             )
         unseen = [i for i in self.ids if i not in self.seen]
         if unseen:
-            lines.append(f"landmarks of the map that were not seen: {listed(unseen)}")
+            lines.append(f"of the map not seen: {named(unseen)}")
         return lines
+
+
+def named(ids: Collection[int]) -> str:
+    """Landmarks in a message, such as ``landmark 4`` or ``landmarks 1..9``."""
+    return f"landmark{'s' * (len(ids) != 1)} {listed(ids)}"
 
 
 def listed(ids: Iterable[int]) -> str:

@@ -2,12 +2,16 @@
 
 Where the sightings give no start in the map (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
 that then gives a start, with three or more landmarks, is named. A wrong sign of the heights may leave the start where it
-is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, or where the
-evidence (2) of the best start is `ODDS` times as large with it.
+is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, for which one
+landmark is enough, or where the evidence (2) of the best start is `ODDS` times as large with it. Two exchanged identities
+are named by the evidence of the map with that exchange undone: a priori each of the n (n - 1) / 2 exchanges is equally
+probable.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +30,14 @@ from sonar_graph.navigation.map_start import (
 from sonar_graph.sequence import Sequence
 
 LONGEST_S = 300.0
-"""Time after the start within which sightings count: later the odometry has drifted too far."""
+"""Time after the start within which sightings count: later the odometry has drifted. It counts all the same as long as
+fewer than `ENOUGH` landmarks, or not all of a small map, were seen."""
+ENOUGH = 4
+"""Number of landmarks that show an exchange of two identities."""
+NEWEST_OF_EACH = 2
+"""Number of sightings of each landmark in which an exchange is looked for."""
+FEWEST_SIGHTINGS = 5
+"""Number of sightings that tell the sign of the heights by the vertical aperture."""
 WINDOW_S = 5.0
 """Time between two attempts to find the start."""
 FEWEST = 3
@@ -62,19 +73,23 @@ class MapFit(NamedTuple):
     remedy: str = ""
     """Change of the map that undoes it."""
     is_checked: bool = True
-    """False where fewer than `FEWEST` landmarks were seen within `LONGEST_S`."""
+    """False where fewer than `FEWEST` landmarks were seen, and nothing else shows a mistake."""
 
 
 def map_fit(sequence: Sequence) -> MapFit:
     """Fit of a log's first sightings to the map of its calibration."""
     known = sequence.calibration.map
     assert known is not None
-    start = first_start(sequence)
+    start = first_start(sequence, known)
     given = followed(sequence, known)
-    if len({sighting.row for sighting in given.newest()}) < FEWEST:
-        return MapFit(start, is_checked=False)
     negated = followed(sequence, undone(known, Z_UP))
-    is_hidden = shown(negated) - shown(given) > MORE_SHOWN
+    is_hidden = (
+        len(given.sightings) >= FEWEST_SIGHTINGS
+        and shown(negated) - shown(given) > MORE_SHOWN
+    )
+    is_checked = len(seen_rows(given)) >= FEWEST
+    if not (is_checked or is_hidden):
+        return MapFit(start, is_checked=False)
     gain = 0.0 if start is None else evidence(negated) - evidence(given)
     if is_hidden or gain > math.log(ODDS):
         T = MISTAKES[NORTH_EAST_DOWN]
@@ -83,6 +98,9 @@ def map_fit(sequence: Sequence) -> MapFit:
         if evidence(exchanged) - evidence(negated) > math.log(ODDS):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
+    swaps = exchanged_identities(given.sightings, known)
+    if swaps:
+        return MapFit(None, *of_swaps(swaps))
     if start is not None:
         return MapFit(start)
     for mistake, T in MISTAKES.items():
@@ -98,33 +116,97 @@ def map_fit(sequence: Sequence) -> MapFit:
     return MapFit(None)
 
 
-def first_start(sequence: Sequence) -> FoundStart | None:
+def first_start(sequence: Sequence, known: KnownMap) -> FoundStart | None:
     """Start in the map; None where the sightings give none."""
-    locator = MapLocator(sequence.calibration)
-    for window in first_windows(sequence):
+    for locator in locators(sequence, known):
         # at the end of each window instead of each frame
-        if any([*locator.frames_seen(window)]):
-            start = located(locator.newest(), locator.map)
-            if start is not None:
-                return start
+        start = located(locator.newest(), known)
+        if start is not None:
+            return start
     return None
 
 
 def followed(sequence: Sequence, known: KnownMap) -> MapLocator:
     """The sightings of a map's landmarks in the part of the log that counts."""
+    all_of_them = [*locators(sequence, known)]
+    # one locator that takes in window after window
+    return all_of_them[-1] if all_of_them else MapLocator(sequence.calibration)
+
+
+def locators(sequence: Sequence, known: KnownMap) -> Iterator[MapLocator]:
+    """The locator of a map after each window that shows its landmarks, in the part of the log that counts."""
     locator = MapLocator(sequence.calibration.model_copy(update={"map": known}))
-    for window in first_windows(sequence):
-        for _ in locator.frames_seen(window):
-            pass
-    return locator
+    enough = min(ENOUGH, len(known.ids))
+    for window in windows(sequence):
+        is_late = window.end_ns - sequence.start_ns > LONGEST_S * 1e9
+        if is_late and len(seen_rows(locator)) >= enough:
+            return
+        if any([*locator.frames_seen(window)]):
+            yield locator
 
 
-def first_windows(sequence: Sequence) -> Iterator[Measurements]:
-    """Measurements of the part of a log that counts."""
+def seen_rows(locator: MapLocator) -> set[int]:
+    """Rows of the map's landmarks that were seen."""
+    return {sighting.row for sighting in locator.sightings}
+
+
+def exchanged_identities(
+    sightings: list[MapSighting], known: KnownMap
+) -> list[tuple[int, int]]:
+    """Pairs of identities whose exchange makes the sightings fit the map; several where they fit as well, or none."""
+    newest = newest_of_each(sightings)
+    seen = {sighting.row for sighting in newest}
+    if len(seen) < ENOUGH:
+        return []
+    starts = candidates(map_data(newest, known))
+    agreeing = starts[0].agreeing if starts else frozenset()
+    # two that agree may be the exchanged ones, by a start that is turned round
+    doubted = sorted(seen - agreeing if len(agreeing) >= FEWEST else seen)
+    pairs = list(combinations(doubted, 2))
+    found = []
+    for a, b in pairs:
+        swap = {a: b, b: a}
+        renamed = [s._replace(row=swap.get(s.row, s.row)) for s in newest]
+        fitting = candidates(map_data(renamed, known))
+        if fitting and {a, b} <= fitting[0].agreeing:
+            found.append((fitting[0].log_evidence, (a, b)))
+    if not found:
+        return []
+    best = max(log_evidence for log_evidence, _ in found)
+    before = starts[0].log_evidence if starts else -math.inf
+    if best - before <= math.log(ODDS * len(pairs)):
+        return []
+    ids = known.ids
+    return [(ids[a], ids[b]) for fit, (a, b) in found if best - fit < math.log(ODDS)]
+
+
+def newest_of_each(sightings: list[MapSighting]) -> list[MapSighting]:
+    """The newest sightings of every landmark, in the order of time."""
+    count: Counter[int] = Counter()
+    newest = []
+    for sighting in reversed(sightings):
+        count[sighting.row] += 1
+        if count[sighting.row] <= NEWEST_OF_EACH:
+            newest.append(sighting)
+    return newest[::-1]
+
+
+def of_swaps(swaps: list[tuple[int, int]]) -> tuple[str, str]:
+    """Mistake and remedy of exchanged identities."""
+    pairs = " or ".join(f"{min(pair)} and {max(pair)}" for pair in swaps)
+    return (
+        f"identities {pairs} are exchanged, in the map or in the log",
+        f"exchange the ids {pairs} in the map",
+    )
+
+
+def windows(sequence: Sequence) -> Iterator[Measurements]:
+    """Measurements of a log, window by window."""
     step_ns = round(WINDOW_S * 1e9)
-    last_ns = min(sequence.end_ns, sequence.start_ns + round(LONGEST_S * 1e9))
-    instants_ns = np.arange(sequence.start_ns + step_ns, last_ns + step_ns, step_ns)
-    return sequence.replay(np.minimum(instants_ns, last_ns))
+    instants_ns = np.arange(
+        sequence.start_ns + step_ns, sequence.end_ns + step_ns, step_ns
+    )
+    return sequence.replay(np.minimum(instants_ns, sequence.end_ns))
 
 
 def evidence(locator: MapLocator) -> float:

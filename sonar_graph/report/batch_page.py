@@ -12,6 +12,7 @@ from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.figure_style import sized
 from sonar_graph.report.rendering import PageSection, html_of, write_html, write_tables
+from sonar_graph.states import counted
 
 # Tables with more rows are folded on the screen: figures above them show the same
 FOLDED_ROWS = 24
@@ -125,8 +126,8 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         "names": batch.contestants,
         "batch": batch,
         "summary": (
-            f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} "
-            f"seed{'s' * (seeds != 1)} each, compared with {batch.reference}."
+            f"{counted(len(batch.runs), 'run')} of {counted(len(batch.contestants), 'estimator')} on "
+            f"{counted(len(batch.logs), 'log')}, up to {counted(seeds, 'seed')} each, compared with {batch.reference}."
         ),
         "failed": [
             *summary.missing_told(batch),

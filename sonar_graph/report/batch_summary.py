@@ -23,6 +23,7 @@ from sonar_graph.report.batch_tables import (
     shown,
     unit_of,
 )
+from sonar_graph.states import counted
 from sonar_graph.table import Cell, Column, Table, absent, number, words
 
 SCORED = "scored_instants"
@@ -163,7 +164,7 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             )
     caption = (
         f"{LOWER} lower, {HIGHER} higher than {batch.reference} on the same seeds, beyond chance "
-        f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart."
+        f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart.{too_few(metric, tests)}"
     )
     return Table(
         "overview",
@@ -172,6 +173,23 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
         columns,
         rows,
     )
+
+
+def too_few(metric: Metric, tests: Tests) -> str:
+    """A sentence where no difference could be significant with so few seeds, and how many can; else nothing.
+
+    The least two-sided p of n differences is 2 / 2^n, and Holm multiplies it by the number of tests.
+    """
+    keys = metric.keys.values()
+    own = {id(test): test for (key, _, _), (test, _) in tests.items() if key in keys}
+    if not own:
+        return ""
+    most = max(test.pairs for test in own.values())
+    needed = math.floor(1.0 + math.log2(len(own) / SIGNIFICANT)) + 1
+    if most >= needed:
+        return ""
+    seeds = counted(most, "seed")
+    return f" {seeds} cannot tell any difference apart: it takes at least {needed}."
 
 
 def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:

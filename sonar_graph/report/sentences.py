@@ -28,7 +28,7 @@ from sonar_graph.evaluation import (
 )
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
-from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, landmark_name
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, counted, landmark_name
 
 # the filter with the robust kernel and the gyro bias that filters as published lack
 FAIR = "invariant-ekf"
@@ -137,7 +137,9 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     ]
     equals = f", {' and '.join(close)} equally near" if close else ""
     what = label(metric, comparison, HEADLINES)
-    opening = f"{name} is nearest to the truth{equals}: {least.with_unit} off ({what}, causal)"
+    # one estimator is not nearest to anything
+    leads = f"is nearest to the truth{equals}:" if others else "is"
+    opening = f"{name} {leads} {least.with_unit} off{'' if others else ' the truth'} ({what}, causal)"
     # a wrong map can come with a small error by luck
     is_in_doubt = any(
         name in line
@@ -229,8 +231,12 @@ def lost_runs(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         outcomes = run.detections.outcomes if run.detections else []
         gated = outcomes.count(Outcome.GATED)
+        # a map that the log contradicts has a message of its own, and no other gate mends it
+        is_of_map = any(
+            "the map, and too few others agree" in text for text in run.withheld
+        )
         # a gate that refuses so much refuses the truth
-        if gated > GATED_SHARE * max(len(outcomes), 1):
+        if gated > GATED_SHARE * max(len(outcomes), 1) and not is_of_map:
             is_smoother = flattened(run.params).get(POLICY) == "gate"
             advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
             without = (
@@ -408,9 +414,8 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
                 if found
                 else "none is at the place of a true one"
             )
-        counted = "1 landmark" if count == 1 else f"{count} landmarks"
         said.append(
-            f"{run.estimator} found {counted} without a name ({UNKNOWN}); {which}."
+            f"{run.estimator} found {counted(count, 'landmark')} without a name ({UNKNOWN}); {which}."
         )
     return said
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import (
     Calibration,
@@ -188,9 +187,8 @@ def true_calibration(
     position = true.position[0] + options.start_position_sigma_m * rng.standard_normal(
         3
     )
-    turn = Rotation.from_rotvec(
-        options.start_rotation_sigma_rad * rng.standard_normal(3)
-    )
+    true_rpy = rpy_from_rotation(true.world_R_body[0])
+    rpy = true_rpy + options.start_rotation_sigma_rad * rng.standard_normal(3)
     return Calibration(
         imu=imu,
         dvl=DvlCalibration(velocity_sigma_m_s=(sigma_m_s,) * 3, mounting=vehicle.dvl),
@@ -203,7 +201,7 @@ def true_calibration(
         ),
         start=Start(
             position_m=_vector(position),
-            rpy_rad=_vector(rpy_from_rotation(true.world_R_body[0] * turn)),
+            rpy_rad=_vector(rpy),
             position_sigma_m=(options.start_position_sigma_m,) * 3,
             rpy_sigma_rad=(options.start_rotation_sigma_rad,) * 3,
         ),

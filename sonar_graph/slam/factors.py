@@ -257,16 +257,10 @@ def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
 
 
 def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFactor:
-    """Prior of the first keyframe; position sigmas are along the world's axes, rotation sigmas about the body's."""
+    """Prior of the first keyframe."""
     start = calibration.start
-    body_R_world = start.pose().rotation().matrix().T
-    # GTSAM's perturbation of a pose is in its own axes
-    cov = np.zeros((6, 6))
-    cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
-    cov[3:, 3:] = (
-        body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
-    )
-    return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(cov))
+    # GTSAM's perturbation of a pose is in its own axes, too
+    return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(start.covariance()))
 
 
 def map_prior(

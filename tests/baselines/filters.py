@@ -38,7 +38,6 @@ BIAS = np.array([1e-3, -2e-3, 3e-3, 2e-3, 1e-3, -3e-3, 0.02, 0.01, -0.03, 0.04, 
 D_BIAS = np.random.default_rng(11).normal(size=(6, 3))
 NOTHING = np.zeros(6)
 TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
-MOTION_SIGMA = 1e-3
 MOTION_COV = 1e-6 * np.eye(6)
 
 

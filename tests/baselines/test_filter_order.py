@@ -1,10 +1,12 @@
 """Laws of the calls: order, cuts, refusals and outcomes of what a filter is given."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from sonar_graph.calibration import Calibration, KnownMap
+from sonar_graph.calibration import Calibration, KnownMap, Start
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import NS_PER_S, Measurements
 from sonar_graph.navigation import Odometry
@@ -74,6 +76,36 @@ def test_each_landmark_of_a_frame_has_its_own_gate(kind):
     both = seen([now_ns, now_ns], [2.0, 5.0], [0.1, 0.5], landmark=[[3], [7]])
     slam.process(Measurements(now_ns, None, None, None, both))
     assert slam.detections().outcomes == [Outcome.NEW, Outcome.USED, Outcome.GATED]
+
+
+@slam_filters
+def test_known_landmarks_of_a_frame_count_before_a_new_one_is_added(kind):
+    """One frame gives the state of two that are a nanosecond apart: a large turn is not linear in the new landmark."""
+    place = 2.0 * np.array([[np.cos(0.5), np.sin(0.5), 0.0]])
+    known = KnownMap.of([7], place, sigma_m=0.01)
+    start = Start(rpy_sigma_rad=(0.01, 0.01, 0.4))
+    calibration = Calibration(map=known, start=start)
+    at_once, in_turn = (begun(kind, calibration) for _ in range(2))
+    now_ns = later(0.5)
+    both = seen([now_ns, now_ns], [2.0, 5.0], [0.2, -0.4], landmark=[[7], [3]])
+    first, second = (both.rows(np.array([k])) for k in range(2))
+    second = replace(second, stamps_ns=second.stamps_ns + 1)
+    at_once.process(Measurements(later(1.0), imu(1), dvl(1), None, both))
+    in_turn.process(Measurements(now_ns, imu(1).rows(slice(26)), dvl(0.4), None, first))
+    in_turn.process(
+        Measurements(
+            later(1.0),
+            imu(1).rows(slice(26, None)),
+            dvl(1).rows(slice(3, None)),
+            None,
+            second,
+        )
+    )
+    assert at_once.detections().outcomes == [Outcome.USED, Outcome.NEW]
+    assert at_once.landmarks().positions == pytest.approx(
+        in_turn.landmarks().positions, abs=1e-6
+    )
+    assert abs(at_once.detections().innovations[0, 1]) > 0.2
 
 
 @slam_filters

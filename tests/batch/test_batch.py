@@ -1,7 +1,6 @@
 """A batch resumes, loses no run, and ends in time on Ctrl-C."""
 
 import contextlib
-import errno
 import os
 import signal
 import tempfile
@@ -13,22 +12,18 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from sonar_graph.batch import batch as batch_module
-from sonar_graph.batch import cluster
-from sonar_graph.batch.batch import Batch
-from sonar_graph.batch.one_run import perform
-from sonar_graph.batch.recorded import is_batch, read_batch
-from sonar_graph.batch.result_table import RESULTS, is_timing
-from sonar_graph.batch.store import (
+from sonar_graph.batch import (
+    RESULTS,
+    Batch,
     Limits,
-    PlannedRun,
-    Progress,
-    RunOutcome,
-    Store,
     Where,
+    cluster,
+    read_suite,
 )
-from sonar_graph.batch.suite import read_suite
-from sonar_graph.errors import BatchError, EvaluationError
+from sonar_graph.batch.one_run import perform
+from sonar_graph.batch.result_table import is_timing
+from sonar_graph.batch.store import PlannedRun, Progress, RunOutcome, Store
+from sonar_graph.errors import BatchError
 from sonar_graph.files import (
     deferred_interrupt,
     noticed_interrupts,
@@ -42,11 +37,11 @@ HERE = Where(1)
 
 
 class Killed(BaseException):
-    """Ends a process as SIGKILL does: nobody hears of it."""
+    """Ends a process as SIGKILL does, without a message."""
 
 
 def nobody(_run: PlannedRun, _outcome: RunOutcome) -> None:
-    """Is told of progress."""
+    """Receives progress."""
 
 
 def table(folder: Path) -> list[dict[str, Any]]:
@@ -118,73 +113,6 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
     assert len(set(done)) == 3
 
 
-def test_full_disk_is_told_and_loses_no_run_that_is_done(
-    suite, tmp_path, in_this_process, monkeypatch
-):
-    class Full(Store):
-        def write(self, key: str, outcome: RunOutcome) -> None:
-            if len(list((self.folder / "runs").iterdir())) == 2:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            super().write(key, outcome)
-
-    class Done:
-        def __init__(self, run: PlannedRun) -> None:
-            self.run = run
-
-        def result(self) -> RunOutcome:
-            return RunOutcome(perform(self.run, tmp_path / "scratch" / self.run.key))
-
-    def kept(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
-        for run in runs:
-            cluster.keep(run, Done(run), store, nobody)  # type: ignore[arg-type]
-
-    def no_space(*_arguments: Any) -> Path:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(cluster, "run_batch", kept)
-    folder = tmp_path / "out"
-    with (
-        Batch.opened(read_suite(suite), folder) as batch,
-        monkeypatch.context() as patch,
-    ):
-        patch.setattr(batch_module, "write_results", no_space)
-        with pytest.raises(
-            BatchError,
-            match=r"No space left.*2 of 4 runs are done and kept; the same command",
-        ):
-            Batch(batch.file, batch.runs, Full(folder)).run(HERE, LIMITS, nobody)
-    stamps = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/row.json")}
-    monkeypatch.setattr(cluster, "run_batch", do_here)
-    finished(suite, folder)
-    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
-
-
-def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
-    suite, tmp_path, in_this_process, monkeypatch
-):
-    folder = tmp_path / "out"
-    with monkeypatch.context() as patch:
-        kill(suite, folder, 0, patch)
-        assert is_batch(folder)
-        with pytest.raises(
-            EvaluationError,
-            match=r"before any of its runs was done; give the bench command .* again",
-        ):
-            read_batch(folder)
-        kill(suite, folder, 3, patch)
-    batch = read_batch(folder)
-    assert [(run.seed, run.status) for run in batch.runs] == [
-        (0, "ok"),
-        (1, "ok"),
-        (2, "ok"),
-    ]
-    assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
-    finished(suite, folder)
-    whole = read_batch(folder)
-    assert not whole.missing
-    assert whole.runs[:3] == batch.runs
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {
         path.name: path.read_bytes()
@@ -193,10 +121,11 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_changed_suite_goes_on_in_the_folder_once_a_run_is_done_and_another_suite_is_refused(
+def test_a_changed_suite_resumes_in_its_folder(
     suite, tmp_path, in_this_process, monkeypatch
 ):
-    folder, text = tmp_path / "out", suite.read_text()
+    folder = tmp_path / "out"
+    text = suite.read_text()
     suite.write_text(text + '[[estimators]]\nname = "no such"\n')
     with pytest.raises(BatchError), Batch.opened(read_suite(suite), folder):
         pass
@@ -256,7 +185,7 @@ def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path
 def kill(
     suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some runs are done and told, and then the process is gone."""
+    """Some runs are done and reported, and then the process is gone."""
 
     def killed(
         runs: list[PlannedRun],
@@ -278,10 +207,8 @@ def kill(
 @pytest.fixture
 def handler(request) -> Iterator[Any]:
     """The handler of interrupts, Python's own or another one; tests must leave it, and that of terminations, as is."""
-    before, terminated = (
-        signal.getsignal(signal.SIGINT),
-        signal.getsignal(signal.SIGTERM),
-    )
+    before = signal.getsignal(signal.SIGINT)
+    terminated = signal.getsignal(signal.SIGTERM)
     given = getattr(request, "param", signal.default_int_handler)
     signal.signal(signal.SIGINT, given)
     yield given
@@ -307,7 +234,7 @@ def test_interrupt_or_termination_within_the_block_is_told_at_its_end(handler, n
     assert steps == ["went on"]
 
 
-def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is_noticed(
+def test_an_interrupt_swallowed_by_compiled_code_is_noticed(
     handler,
 ):
     with noticed_interrupts() as check:
@@ -321,7 +248,7 @@ def test_an_interrupt_that_compiled_code_swallows_or_turns_into_another_error_is
 @pytest.mark.parametrize(
     "handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True
 )
-def test_termination_counts_like_an_interrupt_and_an_interrupt_that_shells_let_be_ignored_stays_so(
+def test_termination_counts_like_an_interrupt(
     handler,
 ):
     with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():

@@ -9,9 +9,7 @@ from permutation import (
     ALL_SIGNS,
     DRAWN,
     Family,
-    Group,
     clipped,
-    detectable,
     families,
     with_all_logs,
 )
@@ -79,36 +77,3 @@ def test_all_logs_have_one_ratio_a_seed_and_logs_without_seeds_are_cases():
     assert together[ALL_LOGS, "isam2", "error"] == {"a": 1.0, "b": 1.0, "c": 1.0}
     (tested,) = families(together)
     assert tested.groups == [(ALL_LOGS, "isam2", "error")]
-
-
-def drawn(rng: np.random.Generator, seeds: int, *, lost: float, worse: float = 0.0):
-    errors = rng.normal(0, 0.1, (2, 3, 2, seeds)) + math.log(100) * (
-        rng.random((2, 3, 2, seeds)) < lost
-    )
-    ratios = errors[1] - errors[0]
-    ratios[0] += math.log1p(worse)
-    groups = {
-        (f"log {n}", f"contestant {c}", "error"): ratios[c, n]
-        for c in range(3)
-        for n in range(2)
-    }
-    return with_all_logs(
-        {group: dict(enumerate(values.tolist())) for group, values in groups.items()}
-    )
-
-
-def noise(scatter: float, seed: int, cases: int = 8) -> np.ndarray:
-    return np.random.default_rng(seed).normal(0, scatter, cases)
-
-
-def found(
-    groups: dict[Group, np.ndarray],
-    *columns: str,
-    limit: float = 0.0,
-    share: float = 1.0,
-) -> dict[str, float]:
-    return detectable(
-        [Family(list(groups), np.stack(list(groups.values()), axis=1), share)],
-        list(columns),
-        limit,
-    )

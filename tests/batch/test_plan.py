@@ -1,18 +1,15 @@
 """The key of a run changes with all that decides its numbers, and with nothing else."""
 
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs, source_hash, versions_of
+from sonar_graph.batch import plan_runs, read_suite
+from sonar_graph.batch.plan import source_hash, versions_of
 from sonar_graph.batch.sources import LOG, fingerprint
 from sonar_graph.batch.store import PlannedRun
-from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -74,7 +71,7 @@ OTHERS = {
 }
 
 
-def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_defaults(
+def test_a_run_s_key_changes_with_all_that_decides_its_numbers(
     write_suite,
 ):
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
@@ -95,7 +92,7 @@ def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_def
     assert same == run.key
 
 
-def test_key_changes_with_the_class_behind_the_name_and_with_the_version_of_python(
+def test_a_run_s_key_changes_with_class_and_python_version(
     write_suite, misbehaving, tmp_path, monkeypatch
 ):
     def anew() -> str:
@@ -131,28 +128,7 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     assert fingerprint(LOG, {"log": str(paths[0])}) == changed
 
 
-def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
-    """Names and contents of the first three are the same characters one after the other."""
-    for name, files in (
-        ("one", {"a": "b", "c": ""}),
-        ("two", {"a": "", "bc": ""}),
-        ("three", {"abc": ""}),
-    ):
-        (tmp_path / name).mkdir()
-        for file, content in files.items():
-            (tmp_path / name / file).write_text(content)
-
-    def content_of(name: str) -> str:
-        return fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"]
-
-    found = [content_of(name) for name in ("one", "two", "three")]
-    (tmp_path / "three" / "run").symlink_to(tmp_path / "one", target_is_directory=True)
-    found.append(content_of("three"))
-    (tmp_path / "one" / "a").write_text("d")
-    assert len({*found, content_of("three")}) == 5
-
-
-def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_be_loaded_is_planned(
+def test_an_estimator_of_another_package_has_its_package_s_hash(
     write_suite, misbehaving
 ):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
@@ -175,13 +151,9 @@ def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 
-def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content(
-    write_suite, tmp_path
-):
-    grid, params = (
-        "grid = { wrong_id_rate = [0.1] }\n",
-        "params = { smoother.lag_s = 14 }\n",
-    )
+def test_the_request_is_the_suite_with_files_by_content(write_suite, tmp_path):
+    grid = "grid = { wrong_id_rate = [0.1] }\n"
+    params = "params = { smoother.lag_s = 14 }\n"
     (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
     assert run.asked == {
         "generator": "basin",
@@ -227,9 +199,7 @@ def hashed() -> Iterator[Hashed]:
     source_hash.cache_clear()
 
 
-def test_hash_changes_with_code_data_and_names_also_behind_links_that_may_be_circles(
-    package, hashed, tmp_path
-):
+def test_a_hash_changes_with_code_data_and_names(package, hashed, tmp_path):
     (elsewhere := tmp_path / "elsewhere").mkdir()
     (elsewhere / "linked.py").write_text("a = 1\n")
     (elsewhere / "around").symlink_to(package, target_is_directory=True)
@@ -263,66 +233,10 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
     assert hashed() == before
 
 
-def test_hash_is_taken_once_in_a_process_and_another_sees_a_change_of_equal_size(
-    package, hashed
-):
-    before, code = hashed(), package / "__init__.py"
-    state = code.stat()
-    code.write_text("raise RuntimeError('Imported')\n")
-    os.utime(code, ns=(state.st_atime_ns, state.st_mtime_ns))
-    assert (code.stat().st_size, code.stat().st_mtime_ns) == (
-        state.st_size,
-        state.st_mtime_ns,
-    )
-    assert source_hash("hashed_package") == before
-    assert hashed() != before
-
-
-@pytest.mark.slow
-def test_key_changes_with_a_changed_checkout(write_suite, tmp_path):
-    """Another process has a copy of the package in which one comment was added, under the same version."""
-    import baselines
-    import sonar_graph
-
-    for package in (sonar_graph, baselines):
-        folder = Path(str(package.__file__)).parent
-        shutil.copytree(
-            folder,
-            tmp_path / "copy" / folder.name,
-            ignore=shutil.ignore_patterns("__pycache__"),
-        )
-    suite = write_suite(
-        HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "isam2"\n'
-    )
-    here = [run.key for run in plan_runs(read_suite(suite))]
-    assert keys_by(tmp_path / "copy", suite) == here
-    with (tmp_path / "copy" / "baselines" / "dead_reckoning.py").open("a") as file:
-        file.write("# another\n")
-    of_baselines = keys_by(tmp_path / "copy", suite)
-    assert of_baselines[0] != here[0]
-    assert of_baselines[1] == here[1]
-    with (tmp_path / "copy" / "sonar_graph" / "states.py").open("a") as file:
-        file.write("# another\n")
-    assert not {*here, *of_baselines} & set(keys_by(tmp_path / "copy", suite))
-
-
-def keys_by(code: Path, suite: Path) -> list[str]:
-    """Keys as the package in a folder plans them."""
-    program = (
-        f"import sys; sys.path.insert(0, {str(code)!r})\n"
-        "from pathlib import Path; from sonar_graph.batch import plan; from sonar_graph.batch.suite import read_suite\n"
-        f"assert plan.__file__.startswith({str(code)!r})\n"
-        f"print(*(run.key for run in plan.plan_runs(read_suite(Path({str(suite)!r})))))"
-    )
-    return subprocess.run(
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True
-    ).stdout.split()
-
-
 ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'
 
 
-def test_a_log_whose_files_are_absent_is_left_out_where_the_suite_says_how_to_obtain_it(
+def test_an_absent_log_is_left_out_if_the_suite_states_its_source(
     write_suite,
 ):
     obtain = 'obtain = "the data set from its authors"\n'

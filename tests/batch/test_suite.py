@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.suite import METRICS, line_of, read_suite
+from sonar_graph.batch import plan_runs, read_suite
+from sonar_graph.batch.suite import METRICS, line_of
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
@@ -14,11 +14,10 @@ from .conftest import BASIN, DEAD_RECKONING, HEADER
 SUITES = sorted((Path(__file__).parents[2] / "benchmarks" / "suites").glob("*.toml"))
 ISAM2 = '\n[[estimators]]\nname = "isam2"\n'
 LAG_TWICE = "params = { smoother.lag_s = 3 }\ngrid = { smoother.lag_s = [4] }\n"
-AGAIN, PARK = ISAM2 + 'variant = "again"\n', 'dataset = "victoria-park"\n'
-DEAF, POOL = (
-    DEAD_RECKONING.replace("dead-", "deaf-"),
-    BASIN.replace('"basin"\ngen', '"pool"\ngen'),
-)
+AGAIN = ISAM2 + 'variant = "again"\n'
+PARK = 'dataset = "victoria-park"\n'
+DEAF = DEAD_RECKONING.replace("dead-", "deaf-")
+POOL = BASIN.replace('"basin"\ngen', '"pool"\ngen')
 
 
 def line(text: str, word: str) -> int:
@@ -196,7 +195,7 @@ def test_suites_that_ship_are_sound(path):
         assert plan_runs(file)
 
 
-def test_suites_without_mistakes_are_planned_such_as_the_example_in_the_documentation(
+def test_the_documented_suites_are_planned(
     write_suite,
 ):
     from sonar_graph.batch import suite

@@ -3,18 +3,15 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import psutil
 import pytest
 
-from sonar_graph.batch import supervision
-from sonar_graph.batch.store import Limits, PlannedRun
+from sonar_graph.batch import Limits, supervision
 from sonar_graph.batch.supervision import Runner, perform_watched
-from sonar_graph.errors import BatchError
 
-Planned = Callable[..., PlannedRun]
 AMPLE = Limits(600.0)
 pytestmark = pytest.mark.slow
 
@@ -74,7 +71,7 @@ def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(
         ("dies-once", AMPLE, "ok", ""),
     ],
 )
-def test_a_run_is_ended_with_the_processes_that_it_starts_and_one_that_is_killed_has_a_second_try(
+def test_a_run_ends_with_its_child_processes(
     planned, misbehaving, estimator, limits, status, reason
 ):
     row = perform_watched(planned(estimator), limits).row
@@ -96,42 +93,13 @@ def is_runner_of_this_test(process: psutil.Process) -> bool:
     return False
 
 
-def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
-    planned, misbehaving
-):
-    runner = Runner()
-    outcome = runner.perform(planned("prints"), AMPLE)
-    assert outcome.row["status"] == "failed"
-    assert "written by native code" in outcome.log
-    assert "RuntimeError: diverged" in outcome.log
-    assert "Traceback" in outcome.log
-    assert "runs/prints/series.npz" in outcome.files
-    assert "diverged" not in runner.perform(planned(), AMPLE).log
-    runner.end()
-
-
-def test_a_process_is_kept_for_the_next_run_but_after_one_of_another_package(
-    planned, misbehaving
-):
+def test_a_process_is_reused_within_a_package(planned, misbehaving):
     perform_watched(planned(), AMPLE)
     (kept,) = runners()
     perform_watched(planned(), AMPLE)
     assert runners() == [kept]
     perform_watched(planned("prints"), AMPLE)
     assert not runners()
-
-
-def test_order_of_sets_does_not_hang_on_who_started_the_process(
-    planned, misbehaving, monkeypatch
-):
-    reasons = set()
-    for seed in ("1", "2"):
-        monkeypatch.setenv("PYTHONHASHSEED", seed)
-        runner = Runner()
-        reasons.add(runner.perform(planned("sums-over-a-set"), AMPLE).row["reason"])
-        runner.end()
-    (reason,) = reasons
-    assert "mine 7" in str(reason)
 
 
 def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
@@ -156,23 +124,6 @@ def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
         "PlannedRun 600",
     ]
     assert rows[0]["causal.ate_raw_m"] == rows[1]["causal.ate_raw_m"]
-
-
-def test_a_warm_up_that_does_not_end_and_a_process_that_is_not_ready_in_time_are_ended_and_told(
-    planned, monkeypatch
-):
-    run = planned()
-    with monkeypatch.context() as patch:
-        patch.setattr(supervision, "WARM_UP_S", 0.0)
-        row = perform_watched(run, AMPLE).row
-    assert (row["status"], row["reason"]) == ("timeout", "took longer than 0 s")
-    assert not runners()
-    monkeypatch.setattr(supervision, "START_S", 0.0)
-    with pytest.raises(
-        BatchError, match=r"no process for runs on .*: it was not ready after 0 s"
-    ):
-        Runner()
-    assert not runners()
 
 
 def test_process_of_runs_does_not_outlive_who_started_it():

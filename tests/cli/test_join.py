@@ -11,24 +11,25 @@ from mcap.writer import Writer
 
 from sonar_graph.calibration import (
     Calibration,
-    FloorPrior,
     Mounting,
     SonarCalibration,
     SonarImage,
 )
-from sonar_graph.logs.mcap.writer import recording
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.sonar_images import read_sonar_frames
-from sonar_graph.logs.vehicle_setup import METADATA
-from sonar_graph.logs.writing import sonar_image_messages, write_log
-from tests.logs.converters.sonar_recordings import Aris, images
+from sonar_graph.logs import (
+    METADATA,
+    read_log,
+    read_sonar_frames,
+    sonar_image_messages,
+    write_log,
+)
+from sonar_graph.logs.mcap import recording
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 OFFSET_S = 2.4
 
 
 def images_log(lane: Lane, path: Path, offset_s: float = OFFSET_S) -> Path:
-    """The images by a clock that is behind, in a log that says what their samples mean."""
+    """The images by a clock that is behind, in a log that states what their samples mean."""
     calibration = Calibration(
         sonar=SonarCalibration(image=SonarImage(decibel_span=75.0))
     )
@@ -48,7 +49,7 @@ def both(lane, tmp_path_factory) -> tuple[Path, Path]:
     return images_log(lane, folder / "images.mcap"), folder / "nav.mcap"
 
 
-def test_images_come_onto_the_clock_of_the_navigation_with_all_else_as_it_was(
+def test_images_are_moved_to_the_clock_of_the_navigation(
     lane, both, run, tmp_path, capsys
 ):
     out = tmp_path / "joined.mcap"
@@ -85,7 +86,8 @@ def bare(lane, tmp_path_factory) -> Path:
         (folder / "whole.mcap").open("rb") as stream,
         (folder / "nav.mcap").open("wb") as out,
     ):
-        writer, channels = Writer(out), {}
+        writer = Writer(out)
+        channels = {}
         writer.start()
         for schema, channel, message in make_reader(stream).iter_messages():
             if channel.topic not in channels:
@@ -108,7 +110,8 @@ def bare(lane, tmp_path_factory) -> Path:
 def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
     lane, both, bare, run, tmp_path
 ):
-    out, expected = tmp_path / "joined.mcap", lane.sequence.calibration.sonar.mounting
+    out = tmp_path / "joined.mcap"
+    expected = lane.sequence.calibration.sonar.mounting
     assert expected != Mounting()
     assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
     joined = read_log(out)
@@ -122,38 +125,6 @@ def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
     )
     assert joined.calibration.sonar.image.decibel_span == 75.0
     assert "not stated" in joined.notes["log.start"]
-
-
-def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
-    both, bare, run, tmp_path
-):
-    given, out = tmp_path / "vehicle.toml", tmp_path / "joined.mcap"
-    given.write_text(
-        "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
-        "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
-    )
-    for navigation in (bare, both[1]):
-        assert (
-            run(
-                "join",
-                both[0],
-                navigation,
-                "-o",
-                out,
-                "--offset",
-                OFFSET_S,
-                "--calibration",
-                given,
-            )
-            == 0
-        )
-        found = read_log(out).calibration
-        assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
-        assert found.start.position_m == (1.0, 2.0, -0.5)
-        assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
-        assert found.dvl.mounting.rpy_rad == pytest.approx(
-            read_log(navigation).calibration.dvl.mounting.rpy_rad
-        )
 
 
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
@@ -170,7 +141,7 @@ def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
     assert "Warning: they do not agree" in capsys.readouterr().out
 
 
-def test_files_without_common_time_are_refused_with_the_offset_that_would_make_both_begin_together(
+def test_files_without_common_time_are_refused_with_an_offset(
     lane, both, run, tmp_path, capsys
 ):
     far = images_log(lane, tmp_path / "far.mcap", offset_s=1.2e9)
@@ -191,47 +162,7 @@ def test_files_without_common_time_are_refused_with_the_offset_that_would_make_b
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
-def test_an_offset_that_few_images_cannot_show_must_be_stated(
-    both, run, tmp_path, capsys
-):
-    file = tmp_path / "dive.aris"
-    file.write_bytes(Aris(images(6, 128, 300)).content())
-    recorded = converted(run, file)
-    first_ns = next(read_sonar_frames(recorded)).stamps_ns[0]
-    offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
-    out = tmp_path / "joined.mcap"
-    assert (
-        run(
-            "join",
-            recorded,
-            both[1],
-            "-o",
-            out,
-            "--offset",
-            f"{offset_s:.6f}",
-            "--search",
-            2,
-        )
-        == 2
-    )
-    assert (
-        "steps between them could be measured, and 50 are needed; state it"
-        in capsys.readouterr().err
-    )
-    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
-    assert "as stated; the images do not determine" in capsys.readouterr().out
-    assert sum(len(block) for block in read_sonar_frames(out)) == 6
-
-
-def converted(run, recorded: Path) -> Path:
-    out = recorded.with_suffix(".mcap")
-    assert run("convert", "aris", recorded, "-o", out) == 0
-    return out
-
-
-def test_navigation_that_has_images_already_is_refused_before_the_images_are_read(
-    lane_log, run, tmp_path, capsys
-):
+def test_navigation_with_images_is_refused_at_once(lane_log, run, tmp_path, capsys):
     nothing = tmp_path / "none.aris"
     nothing.write_bytes(b"")
     assert run("join", nothing, lane_log, "-o", tmp_path / "joined.mcap") == 2

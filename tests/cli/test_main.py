@@ -35,9 +35,7 @@ def test_no_argument_shows_the_commands(run, capsys):
         assert path[0] in shown
 
 
-def test_help_waits_for_no_heavy_import_conversion_for_no_compiler_and_report_compiles_nothing(
-    run, basin, tmp_path
-):
+def test_help_loads_nothing_heavy(run, basin, tmp_path):
     run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
     heavy = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}
     cache = tmp_path / "cache"

@@ -8,16 +8,14 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.cli.main import main
-from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.writing import sonar_image_messages, write_log
+from sonar_graph.cli import main
+from sonar_graph.logs import sonar_image_messages, write_log
+from sonar_graph.logs.mcap import write_recording
 
 DESIGN = '[[landmark]]\nid = {id}\nname = "plate"\nsize_m = {size_m}\nshapes = [{{ level_db = 12.0, {shape} }}]\n'
 SUITE = 'name = "x"\nreference = "b"\n[[logs]]\nname = "a"\nlog = "a.mcap"\n[[estimators]]\nname = "b"\n'
-CIRCLE, BAR = (
-    "circle_m = [0.0, 0.0, 0.15]",
-    "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]",
-)
+CIRCLE = "circle_m = [0.0, 0.0, 0.15]"
+BAR = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
 
 
 @pytest.fixture(scope="module")

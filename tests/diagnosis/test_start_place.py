@@ -18,9 +18,12 @@ def started(run: Sequence, start: Start) -> Sequence:
     return replace(run, calibration=run.calibration.model_copy(update={"start": start}))
 
 
-def stated(east_m: float = 0.0, turn_rad: float = 0.0) -> Start:
+def stated(
+    east_m: float = 0.0, turn_rad: float = 0.0, yaw_sigma_rad: float = 0.01
+) -> Start:
     """The right start, moved and turned."""
     return Start(
+        rpy_sigma_rad=(0.01, 0.01, yaw_sigma_rad),
         position_m=(PLACE[0] + east_m, PLACE[1], PLACE[2]),
         rpy_rad=(*BASIN.calibration.start.rpy_rad[:2], YAW_RAD + turn_rad),
     )
@@ -48,6 +51,12 @@ def test_without_a_truth_the_map_contradicts_a_wrong_start(start):
     run = started(replace(BASIN, truth=None), start)
     assert grave(run) == ["start pose: distance of the first landmarks from the map"]
     assert grave(replace(run, true_landmarks=None)) == []
+
+
+def test_the_yaw_sigma_of_a_start_makes_the_places_of_landmarks_unsure():
+    run = replace(BASIN, truth=None)
+    assert grave(started(run, stated(turn_rad=1.0)))
+    assert not grave(started(run, stated(turn_rad=1.0, yaw_sigma_rad=1.0)))
 
 
 def test_a_start_that_defines_the_world_contradicts_nothing():

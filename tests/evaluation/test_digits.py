@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from sonar_graph.evaluation.digits import fixed, format_value
+from sonar_graph.evaluation import fixed, format_value
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
+from sonar_graph.cli import main
 from sonar_graph.cli.live import unheard_lines
-from sonar_graph.cli.main import main
 from sonar_graph.live import Prediction
 from sonar_graph.live.outlets import Status
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -97,16 +97,20 @@ def test_the_status_has_sigmas_along_the_axes_of_the_world():
     )
     again = status.line(dropped=3, latency_ms=0.0, period_s=1.0)
     assert "0 poses/s, 0 estimates/s" in again  # counts are since the line before
+    # after the end of a log
+    assert status.line(dropped=3, latency_ms=0.0, period_s=1.0) == ""
+    assert "| 4 dropped |" in status.line(dropped=4, latency_ms=0.0, period_s=1.0)
 
 
 @pytest.mark.slow
-def test_a_live_run_equals_the_run_on_its_record_and_a_killed_one_has_a_record(
+def test_a_live_run_equals_the_run_on_its_record(
     tmp_path,
 ):
     """With both ends as commands: play, live, SIGKILL, live, Ctrl-C, run."""
     world = simulate_mission(MissionOptions(duration_s=40.0, frame_rate_hz=5.0))
     write_log(tmp_path / "log.mcap", world)
-    where, go = free_endpoint(), tmp_path / "go"
+    where = free_endpoint()
+    go = tmp_path / "go"
     player = subprocess.Popen(
         [*COMMAND, "play", tmp_path / "log.mcap", "--listen", where, "--after", go]
     )

@@ -15,19 +15,20 @@ from sonar_graph.live import (
     LiveOptions,
     LiveRun,
     Publisher,
+    definition_of,
     inbox,
     open_session,
     subscribe,
 )
 from sonar_graph.live.outlets import ZenohOutlet
-from sonar_graph.live.zenoh_link import definition_of
 from sonar_graph.logs import LiveRecord
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from tests.live.traffic import free_endpoint, messages_of
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.slow
-PACE, SECOND = 2.5, 10**9
+PACE = 2.5
+SECOND = 10**9
 STALLED = """
 import sys, time
 from sonar_graph.live import open_session
@@ -95,7 +96,7 @@ class Robot(threading.Thread):
 
 
 def lived(folder, endpoint, robot, listener=None, said=None):
-    """A live run on what a robot sends: the run, its outcome, and what was said."""
+    """A live run on what a robot sends: the run, its outcome, and the messages."""
     said = [] if said is None else said
     taken = {}
     with (
@@ -169,18 +170,6 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
     assert_equals_log(outcome, tmp_path, 150)
 
 
-def test_a_sender_that_ends_is_missed(tmp_path, endpoint, messages, monkeypatch):
-    monkeypatch.setattr(inbox, "SILENT_S", 0.5)
-    outcome, _, said = lived(
-        tmp_path,
-        endpoint,
-        Robot(endpoint, [m for m in messages if at_s(messages, m) < 10]),
-    )
-    missed = [line.partition(":")[0] for line in said if ": nothing since " in line]
-    assert {"/imu/data", "/dvl/data"} <= set(missed)
-    assert_equals_log(outcome, tmp_path, 50)
-
-
 def test_a_clock_that_is_set_ahead_by_a_minute_costs_messages_by_name_only(
     tmp_path, endpoint, messages
 ):
@@ -202,16 +191,6 @@ def test_a_clock_that_is_set_ahead_by_a_minute_costs_messages_by_name_only(
     assert_equals_log(outcome, tmp_path, 100)
 
 
-def test_a_burst_at_ten_times_the_pace_loses_nothing(tmp_path, endpoint, messages):
-    robot = Robot(
-        endpoint, messages, pace_at=lambda at_s: 10 * PACE if 8 < at_s < 14 else PACE
-    )
-    outcome, counts, _ = lived(tmp_path, endpoint, robot)
-    assert not counts["lost"]
-    assert sum(counts["received"].values()) == len(messages)
-    assert_equals_log(outcome, tmp_path, 150)
-
-
 def test_after_a_router_that_restarts_the_run_goes_on(tmp_path, endpoint, messages):
     robot = Robot(endpoint, messages, breaks_at_s=10.0)
     outcome, counts, _ = lived(tmp_path, endpoint, robot)
@@ -222,44 +201,8 @@ def test_after_a_router_that_restarts_the_run_goes_on(tmp_path, endpoint, messag
     assert_equals_log(outcome, tmp_path, 150)
 
 
-def test_a_viewer_that_stalls_delays_nobody(tmp_path, endpoint, messages):
-    """A subscriber that is stopped does not hold up poses for another, nor the run."""
-    arrived = []
-
-    def listener(where):
-        viewer = subprocess.Popen(
-            [sys.executable, "-c", STALLED, where], stdout=subprocess.PIPE, text=True
-        )
-        assert viewer.stdout.readline() == "listening\n"
-        viewer.send_signal(signal.SIGSTOP)
-        session = open_session([where])
-        subscriber = session.declare_subscriber(
-            "0/sonar_graph/odometry/**",
-            lambda s: arrived.append((time.monotonic(), s.payload.to_bytes())),
-        )
-        stalled.append((viewer, session, subscriber))
-        return subscriber
-
-    stalled = []
-    try:
-        outcome, counts, _ = lived(
-            tmp_path, endpoint, Robot(endpoint, messages), listener
-        )
-    finally:
-        for viewer, session, _ in stalled:
-            viewer.kill()
-            viewer.communicate()
-            session.close()
-    assert not counts["lost"]
-    assert len(arrived) > 500
-    assert max(np.diff([at for at, _ in arrived])) < 2.0
-    assert_equals_log(outcome, tmp_path, 150)
-
-
 @pytest.mark.parametrize("may_drop", [True, False])
-def test_only_a_publisher_that_may_drop_is_not_held_up_by_a_subscriber_that_stalls(
-    endpoint, may_drop
-):
+def test_only_a_dropping_publisher_is_not_blocked_by_a_slow_reader(endpoint, may_drop):
     with open_session(listen=[endpoint]) as router:
         publisher = Publisher(
             router,

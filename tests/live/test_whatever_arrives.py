@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
-from sonar_graph.devices import velocity_of_beams
-from sonar_graph.live import Engine, Message
-from sonar_graph.live.engine import OVERLOADED
-from sonar_graph.live.live_messages import dropped_messages
-from sonar_graph.live.zenoh_link import definition_of
+from sonar_graph.live import Message, definition_of
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import encode, parse_definition
-from sonar_graph.logs.live_record import LiveRecord
 from sonar_graph.testing import small_world
 from tests.live.test_live_equals_log import NS, live
 from tests.live.traffic import messages_of
 
 BLOCKS = ("imu", "dvl", "depth", "heading", "positions", "detections")
-DVL, IMU, DETECTIONS = "/dvl/data", "/imu/data", "/sonar/landmarks"
+DVL = "/dvl/data"
+IMU = "/imu/data"
+DETECTIONS = "/sonar/landmarks"
 
 
 @pytest.fixture
@@ -151,11 +148,13 @@ def first_imu(messages):
 
 
 def scrambled(messages, from_s):
-    """Messages of which some are cut and some have random bytes."""
-    noise, first_ns = np.random.default_rng(0), messages[0].arrival_ns
+    """Messages, some cut and some with random bytes."""
+    noise = np.random.default_rng(0)
+    first_ns = messages[0].arrival_ns
     found = []
     for message in messages:
-        data, draw = bytearray(message.payload), noise.random()
+        data = bytearray(message.payload)
+        draw = noise.random()
         at = int(noise.integers(4, len(data)))
         if (
             message.topic != "/tf_static"
@@ -295,7 +294,8 @@ def assert_equal(engine, steps, path):
     assert [step.end_ns for step in steps] == [step.end_ns for step in replayed]
     for mine, theirs in zip(steps, replayed, strict=True):
         for name in BLOCKS:
-            one, other = getattr(mine, name), getattr(theirs, name)
+            one = getattr(mine, name)
+            other = getattr(theirs, name)
             assert (one is None) == (other is None), name
             for column, values in {} if one is None else vars(one).items():
                 expected = getattr(other, column)
@@ -324,21 +324,6 @@ def test_rotated_axes_give_the_same_bits_for_one_message_and_for_all(
 def test_a_rate_that_is_no_short_number_is_recorded_to_the_bit(tmp_path, messages):
     engine, steps = live(tmp_path / "record.mcap", messages, rate_hz=100 / 3)
     assert_equal(engine, steps, tmp_path / "record.mcap")
-
-
-def test_a_velocity_of_beams_does_not_depend_on_other_pings():
-    noise = np.random.default_rng(0)
-    directions, along, valid = (
-        noise.normal(size=(4, 3)),
-        noise.normal(size=(50, 4)),
-        noise.random((50, 4)) < 0.9,
-    )
-    velocity, _ = velocity_of_beams(directions, along, valid, 0.01)
-    alone = [
-        velocity_of_beams(directions, along[i : i + 1], valid[i : i + 1], 0.01)[0]
-        for i in range(50)
-    ]
-    assert velocity.tobytes() == np.concatenate(alone).tobytes()
 
 
 def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):
@@ -383,61 +368,3 @@ def test_what_is_waited_for_is_said_once(tmp_path, messages):
         <= 4
     )
     assert not engine.waits_for
-
-
-def test_rows_that_are_sound_count_beside_others_that_are_not(tmp_path, messages):
-    """One range of two that is not a number does not cost the other."""
-    stamps = doppler_stamps(messages)
-    half = [detections(at, 1) for at in stamps]
-    half = [
-        m._replace(
-            payload=m.payload.replace(struct.pack("<d", 6.0), struct.pack("<d", np.nan))
-        )
-        for m in half
-    ]
-    engine, steps = live(
-        tmp_path / "record.mcap", in_order(without(messages, DETECTIONS) + half)
-    )
-    assert (
-        sum(len(step.detections) for step in steps if step.detections is not None) > 90
-    )
-    assert_equal(engine, steps, tmp_path / "record.mcap")
-
-
-def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_came(
-    tmp_path, messages
-):
-    first_ns = messages[0].arrival_ns
-    late = [
-        m for m in messages if m.topic != DETECTIONS or m.arrival_ns > first_ns + 9 * NS
-    ]
-    second = [
-        m._replace(topic="/dvl2/data")
-        for m in messages
-        if m.topic == DVL and m.arrival_ns > first_ns + 5 * NS
-    ]
-    engine, steps = live(tmp_path / "record.mcap", in_order(late + second))
-    assert engine.generation == 1
-    assert any(step.detections is not None for step in steps)
-    assert_equal(engine, steps, tmp_path / "record.mcap")
-
-
-def test_detections_that_were_dropped_for_being_behind_are_counted_once(
-    tmp_path, messages
-):
-    """Also where all began anew before, with a sensor that came late."""
-    late = [
-        m
-        for m in messages
-        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
-    ]
-    with LiveRecord(tmp_path / "first.mcap") as record:
-        engine = Engine(record, definition_of)
-        for message in late:
-            engine.take(message)
-            for step in engine.steps():
-                if engine.generation == 1:
-                    engine.without_detections(step, message.arrival_ns)
-    dropped = dropped_messages(tmp_path / "first.mcap")
-    assert engine.counts.dropped == {(DETECTIONS, OVERLOADED): len(dropped)}
-    assert dropped

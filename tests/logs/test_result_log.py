@@ -1,7 +1,6 @@
 """Results, their messages and layouts for viewers, as other libraries decode them."""
 
 import json
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,8 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -25,14 +22,12 @@ from sonar_graph.logs import (
     write_result,
 )
 from sonar_graph.logs.mcap import Outgoing, write_recording
-from sonar_graph.logs.result_log import source_names
 from sonar_graph.logs.viewer_messages import (
     GREY,
     Layer,
     Scene,
     foxglove_layout,
     picture_messages,
-    position_ellipsoids,
 )
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -186,21 +181,6 @@ def test_rosbags_re_encodes_every_message_to_the_same_bytes(
         assert count > 80
 
 
-def test_paths_stay_small_on_long_runs(make_sequence, tmp_path):
-    long = straight(0, 20_000)
-    write_result(
-        tmp_path / "r.mcap", make_sequence(), {"isam2": (long, long, NO_LANDMARKS)}
-    )
-    with (tmp_path / "r.mcap").open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        lengths = [
-            len(path.poses)
-            for _, _, _, path in reader.iter_decoded_messages(["/isam2/path"])
-        ]
-    assert sum(lengths[:-1]) < 12_000
-    assert 4_000 < lengths[-1] <= 5_001
-
-
 def turning(seed: int, n: int = 60) -> Trajectory:
     """Poses with every number different, at odd instants."""
     rng = np.random.default_rng(seed)
@@ -256,26 +236,6 @@ def test_poses_survive_to_the_bit_in_a_result(make_sequence, tmp_path):
         text = (tmp_path / layout).read_text("utf-8")
         assert "/a/pose_ellipsoid" in text
         assert "/unsure/pose_ellipsoid" not in text
-
-
-@given(st.lists(st.text(max_size=6), max_size=6))
-def test_source_names_are_unique_ros_names(
-    estimators,
-):
-    names = source_names(estimators)
-    assert len(names) == len(set(names)) == len(estimators)
-    assert not {"ground_truth", "tf", "tf_static"} & set(names)
-    assert all(
-        re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) for name in names
-    )
-    close = source_names(["ekf-slam", "ekf_slam", "isam2", "2d", "ground-truth"])
-    assert close == [
-        "ekf_slam",
-        "ekf_slam_2",
-        "isam2",
-        "estimator_2d",
-        "ground_truth_2",
-    ]
 
 
 # --- ellipsoids -----------------------------------------------------------------------------------------------------
@@ -336,33 +296,6 @@ def test_landmarks_are_drawn_as_ellipsoids_of_their_covariance(
     )
 
 
-def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(
-    tmp_path: Path,
-) -> None:
-    """Its covariance is in the body's axes, the ellipsoid is drawn in those of the map."""
-    rng = np.random.default_rng(5)
-    root = rng.normal(size=(3, 6, 6))
-    covariances = root @ root.transpose(0, 2, 1)
-    covariances[1] = np.nan
-    rotations = Rotation.random(3, rng)
-    positions = rng.normal(size=(3, 3))
-    trajectory = Trajectory(
-        np.array([10, 20, 30]), positions, rotations.as_quat(), covariances
-    )
-    markers = [
-        array.markers[0]
-        for array in drawn(tmp_path, position_ellipsoids("/pose", trajectory, GREY))
-    ]
-    assert [marker.header.stamp.nanosec for marker in markers] == [10, 30]
-    for marker, row in zip(markers, (0, 2), strict=True):
-        samples = rng.multivariate_normal(np.zeros(6), covariances[row], 50_000)[:, 3:]
-        sampled = rotations[row].apply(samples) + positions[row]
-        within = axes(marker).inv().apply(sampled - xyz(marker.pose.position)) / (
-            xyz(marker.scale) / 2
-        )
-        assert abs(np.mean(np.sum(within**2, axis=1) < 1) - 0.95) < 0.005
-
-
 # --- pictures ----------------------------------------------------------------------------------------------
 
 
@@ -408,26 +341,6 @@ DRAWN_BY_RVIZ = {f"rviz_default_plugins/{kind}": kind for kind in SAME_NAME}
 DRAWN_BY_RVIZ["rviz_default_plugins/PoseWithCovariance"] = "PoseWithCovarianceStamped"
 """By plugins_description.xml of rviz_default_plugins."""
 """Of the types that we write; nav_msgs/Odometry is not drawn by Lichtblick 1.28."""
-
-
-def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
-    """A subscriber that requests more than is offered gets nothing at all."""
-    with AnyReader([result.path]) as reader:
-        offered = {
-            c.topic: [q.durability.name for q in c.ext.offered_qos_profiles]
-            for c in reader.connections
-        }
-    asked = {
-        d["Topic"]["Value"]: d["Topic"]["Durability Policy"]
-        for d in result.rviz["Displays"]
-        if "Topic" in d
-    }
-    assert set(asked.values()) == {"Volatile", "Transient Local"}
-    for topic, durability in asked.items():
-        assert offered[topic] == (
-            ["TRANSIENT_LOCAL"] if durability == "Transient Local" else []
-        )
-    assert (offered["/tf_static"], offered["/tf"]) == (["TRANSIENT_LOCAL"], [])
 
 
 # --- size -----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from scipy.integrate import cumulative_trapezoid
 
 from sonar_graph import Calibration, Dvl, Imu, Sequence
 from sonar_graph.logs import read_log, row_notes, unfelt_zeros, write_log
@@ -45,15 +44,6 @@ def drive(rate_hz: float, speed_of, noise_m_s: float = 0.01) -> Sequence:
 def cruise(t: Floats) -> Floats:
     """Half a metre a second, more or less."""
     return 0.5 + 0.2 * np.sin(0.4 * t)
-
-
-def stop(t: Floats) -> Floats:
-    """At rest from 20 to 35 s, reached and left within half a second."""
-    braked = np.clip(np.maximum(20.0 - t, t - 35.0) / 0.5, 0.0, 1.0)
-    smooth = cumulative_trapezoid(braked, t, initial=0.0)
-    width = 0.2
-    mean = np.interp(t + width, t, smooth) - np.interp(t - width, t, smooth)
-    return 0.5 * np.clip(mean / (2 * width), 0.0, 1.0)
 
 
 def without_lock(run: Sequence, begin_s: float, end_s: float) -> Sequence:

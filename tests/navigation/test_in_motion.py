@@ -1,6 +1,5 @@
 """Alignment of simulated vehicles that sway and turn; truth by formulas and by differences of attitudes."""
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -109,11 +108,6 @@ def test_a_noiseless_run_gives_what_was_put_in():
     assert error_of(align_in_motion(imu, dvl, KNOWN), truth) == pytest.approx(
         np.zeros(5), abs=2e-6
     )
-
-
-def spoilt(dvl: Dvl, rows: np.ndarray) -> Dvl:
-    """These rows hold impossible values."""
-    return replace(dvl, velocity=np.where(rows[:, None], 50.0, dvl.velocity))
 
 
 @pytest.mark.slow

@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
@@ -68,49 +65,12 @@ def test_a_sighting_is_of_what_truly_lies_there():
         ), place
 
 
-@given(st.integers(0, 27))
-def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
-    stamp_ns = int(lane.sequence.truth.stamps_ns[50 * second])
-    _, range_m, azimuth_rad = confusion_fit.true_objects(lane.sequence, stamp_ns)
-    motion = lane.path.at(np.array([float(second)]))
-    mounting = lane.sequence.calibration.sonar.mounting
-    body_R_sonar = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
-    for row, landmark in enumerate(lane.sequence.true_landmarks.positions):
-        in_body = motion.world_R_body[0].inv().apply(landmark - motion.position[0])
-        q = body_R_sonar.inv().apply(in_body - np.array(mounting.translation_m))
-        assert range_m[row] == pytest.approx(np.linalg.norm(q), abs=1e-6)
-        assert azimuth_rad[row] == pytest.approx(np.arctan2(q[1], q[0]), abs=1e-6)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def few_frames_are_enough():
     """A lane is shorter than what one would calibrate on."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sonar_graph.recognition.confusion_fit.LEAST_FRAMES", 8)
         yield
-
-
-@pytest.fixture(scope="module")
-def measured(lane_log) -> Confusion:
-    return confusion_fit.calibrate([(lane_log, read_log(lane_log))])
-
-
-def test_logs_count_together(lane_log, measured):
-    run = read_log(lane_log)
-    twice = confusion_fit.calibrate(
-        [(lane_log, run), (lane_log, replace(run, notes={}))]
-    )
-    said = twice.provenance
-    once = measured.provenance
-    assert (said["logs"], said["what they are"]) == (
-        "lane.mcap, lane.mcap",
-        "a lane; recorded",
-    )
-    for name in ("frames of landmark 1", "tracks of landmark 1"):
-        assert int(said[name]) == 2 * int(once[name])
-    assert (
-        np.diag(twice.matrix) > np.diag(measured.matrix)
-    ).all()  # more tracks allow more certainty
 
 
 STRANGERS = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
@@ -135,17 +95,6 @@ def test_logs_in_which_landmarks_cannot_be_labelled_are_refused_by_name(
         confusion_fit.calibrate(
             [(lane_log, replace(read_log(lane_log), **changes))], designs=designs
         )
-
-
-def test_frames_outside_the_truth_are_not_labelled(lane_log, measured):
-    run = read_log(lane_log)
-    late = run.truth.rows(
-        run.truth.stamps_ns >= run.truth.stamps_ns[len(run.truth.stamps_ns) // 3]
-    )
-    model = confusion_fit.calibrate([(lane_log, replace(run, truth=late))])
-    assert "landmark 1: " in model.provenance["confusion matrix"]
-    assert model.matrix[0] == PRIOR.matrix[0]
-    assert "confusion matrix" not in measured.provenance
 
 
 PRIOR = confusion_for(DEFAULT_DESIGNS)
@@ -248,25 +197,6 @@ def test_sigmas_are_root_mean_squares_at_the_usual_bound():
         (squares + 8 * before) / [607, 608],
         rtol=1e-9,
     )
-
-
-@pytest.mark.parametrize(("power", "within"), [(1.0, 0.05), (2.2, 0.05)])
-def test_the_power_of_the_bound_fits_good_and_bad_fits_alike(
-    power: float, within: float
-):
-    """Bounds spread over a factor of 30, of range and azimuth apart, and errors that grow with their power."""
-    fits = replace(_fits(2000, 0.1), range_per_height=np.zeros(6000))
-    rng = np.random.default_rng(3)
-    times = np.exp(rng.uniform(-1.7, 1.7, (6000, 2)))
-    spread = replace(fits, bound_m=BOUND * times, error_m=fits.error_m * times**power)
-    model = confusion_fit.estimate_confusion(spread, (1, 2), {})
-    assert model.bound_power == pytest.approx(power, rel=within)
-    seen = fits.label < 2
-    nis = spread.error_m**2 / np.diagonal(
-        model.range_azimuth_cov(spread.bound_m, np.ones(6000)), axis1=1, axis2=2
-    )
-    for rows in (seen[:, None] & (times > 2), seen[:, None] & (times < 0.5)):
-        assert nis[rows].mean() == pytest.approx(1, abs=0.12)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])

@@ -1,4 +1,4 @@
-"""The page of a comparison says everything that the comparison holds, and what is missing."""
+"""The page of a comparison shows everything that the comparison holds, and what is missing."""
 
 import base64
 import re
@@ -9,21 +9,18 @@ import pytest
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
+    Comparison,
+    Score,
     aligned_to_truth,
     landmark_errors,
+    published_maps,
     rmse,
+    score_keys,
+    score_table,
 )
-from sonar_graph.evaluation.results import Comparison, Score
-from sonar_graph.evaluation.scored_instants import published_maps
-from sonar_graph.evaluation.tables import score_keys, score_table
-from sonar_graph.recognition.session import with_detections
-from sonar_graph.report import sentences
-from sonar_graph.report.comparison_page import (
-    recognition_content,
-    render_report,
-    write_page,
-    write_report,
-)
+from sonar_graph.recognition import with_detections
+from sonar_graph.report import sentences, write_report
+from sonar_graph.report.comparison_page import recognition_content, render_report
 from sonar_graph.table import Table
 from tests.synthetic import (
     basin_comparison,
@@ -67,7 +64,7 @@ def test_every_run_score_protocol_and_file_appears(comparison, page):
     assert "runs/dead-reckoning/landmarks.csv" not in addresses
 
 
-def test_scores_nobody_foresaw_are_shown_too_and_doubts_about_a_log_stand_at_the_top(
+def test_unknown_scores_and_doubts_are_shown(
     comparison,
 ):
     odd = with_score(
@@ -114,10 +111,8 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     assert not any("ekf-slam" in address for address in addresses)
 
 
-UNMEASURED, ENDLESS = (
-    Score(float("nan"), "MB", "Not measured."),
-    Score(float("inf"), "m", "Diverged."),
-)
+UNMEASURED = Score(float("nan"), "MB", "Not measured.")
+ENDLESS = Score(float("inf"), "m", "Diverged.")
 
 
 @pytest.mark.parametrize(
@@ -148,45 +143,6 @@ def test_page_is_whole_whatever_is_missing(comparison, change):
     page = Page(render_report(change(comparison)))
     assert "basin-three-laps" in page.text
     assert re.findall(r"\b(nan|NaN|inf|None)\b", page.text) == []
-
-
-def test_without_landmarks_no_figure_of_them_is_announced(comparison):
-    alone = only(comparison, "dead-reckoning")
-    blind = replace(alone, sequence=replace(alone.sequence, detections=None))
-    unmapped = replace(blind, sequence=replace(blind.sequence, true_landmarks=None))
-    for shown, is_announced in ((alone, True), (blind, False), (unmapped, False)):
-        html = render_report(shown)
-        figures = re.findall(r'<figure id="figure-([\w-]+)"', html)
-        assert figures == [
-            *("map", "map-raw", "errors", "errors-raw", "bounds", "bounds-raw"),
-            *("yaw", "nees"),
-        ]
-        assert (
-            html.count("No run reports what became of")
-            == html.count('<a href="#detections">')
-            == is_announced
-        )
-        assert ("Ellipses hold" in html) == (shown is not unmapped)
-    assert "The log has no landmark detections" in html
-    assert {"growth", "innovations"} <= set(
-        re.findall(r'<figure id="figure-(\w+)"', render_report(comparison))
-    )
-
-
-@pytest.mark.parametrize("planar", [True, False], ids=["planar", "3-D"])
-def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
-    page = Page(render_report(basin_comparison(60, planar=planar, truth=False)))
-    assert "The log has no ground truth" in page.text
-    assert "Per update, median" in page.text
-    assert "Position error, not aligned" not in page.text
-    assert len(page.named("svg")) == 4, "the map in two widths, and no aligned view"
-    assert "show-raw" not in page.text
-
-
-@pytest.mark.slow
-def test_a_long_mission_still_makes_a_small_page(tmp_path):
-    write_page(basin_comparison(4078), tmp_path)
-    assert (tmp_path / "report.html").stat().st_size < 3_000_000
 
 
 def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
@@ -251,7 +207,7 @@ def test_aligned_errors_and_maps_are_those_of_the_aligned_scores(
             assert rmse(found.horizontal_m) == pytest.approx(wanted.value)
 
 
-def test_without_truth_there_is_no_aligned_view_and_the_plots_name_the_reason():
+def test_without_truth_there_is_no_aligned_view():
     blind = basin_comparison(60, truth=False)
     assert aligned_to_truth(blind) is None
     assert blind.plot_map().get_xlabel() == "world x (m)"
@@ -291,7 +247,8 @@ def test_the_section_shows_pictures_and_counts(recognised, lane_recognition):
         outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()
     }
     assert len(content["pictures"]) == len(lane_recognition.shown()) == 4
-    first, shown = content["pictures"][0], lane_recognition.shown()[0]
+    first = content["pictures"][0]
+    shown = lane_recognition.shown()[0]
     address = first["address"].removeprefix("data:image/jpeg;base64,")
     assert base64.b64decode(address) == shown.jpeg
     seconds = (shown.stamp_ns - recognised.sequence.start_ns) * 1e-9
@@ -303,19 +260,6 @@ def test_the_section_shows_pictures_and_counts(recognised, lane_recognition):
     assert recognition_content(basin_comparison()) is None, (
         "a comparison without images"
     )
-
-
-def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
-    warnings = [(recognised.sequence.start_ns + 1_250_000_000, "<b> & so on")]
-    warned = replace(
-        recognised, recognition=replace(recognised.recognition, warnings=warnings)
-    )
-    content = recognition_content(warned)
-    assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
-    page = render_report(warned).split('<h2 id="recognition"')[1].split("</section>")[0]
-    assert all(shown in page for shown in ("1.25", "&lt;b&gt; &amp; so on"))
-    assert "<b> & so on" not in page
-    assert page.count("data:image/jpeg;base64,") == 4
 
 
 def test_a_folder_that_cannot_be_written_is_named_in_one_line(tmp_path) -> None:

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation import Comparison, published_maps
+from sonar_graph.evaluation import Comparison
 from sonar_graph.report.landmark_table import (
     MOST_LANDMARKS,
     landmark_table,
@@ -40,15 +40,6 @@ def by_hand(estimated: LandmarkMap, true: LandmarkMap | None) -> Comparison:
     comparison = only(basin_comparison(8), "isam2")
     changed = with_run(comparison, replace(comparison.runs[0], landmarks=estimated))
     return replace(changed, sequence=replace(comparison.sequence, true_landmarks=true))
-
-
-def repeated(instants: int = 60) -> Comparison:
-    """The published landmarks in a synthetic run."""
-    comparison = basin_comparison(instants)
-    return replace(
-        comparison,
-        sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]),
-    )
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ from sonar_graph.evaluation import (
     write_comparison,
     write_viewer_files,
 )
-from sonar_graph.report import write_report
-from sonar_graph.report.console import summary
+from sonar_graph.report import summary, write_report
 from sonar_graph.states import Trajectory
 from sonar_graph.testing import aided_world
 from tests.logs.conftest import decode

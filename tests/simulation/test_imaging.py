@@ -14,12 +14,8 @@ from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.sonar_image import (
-    FrameSimulator,
     ImagedFrames,
-    ImageOptions,
 )
-from sonar_graph.simulation.sonar_image.frames import frame_truth
-from sonar_graph.simulation.sonar_image.scene import block, place
 
 SLOW = {"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0}
 
@@ -35,23 +31,6 @@ def blocks(**image: object) -> Iterator[ImagedFrames]:
 @pytest.fixture(scope="module")
 def run() -> tuple[Sequence, list[ImagedFrames]]:
     return simulate_basin(options()), list(blocks())
-
-
-def test_asking_for_images_leaves_all_other_sensors_alone(
-    run,
-):
-    sequence = run[0]
-    plain = simulate_basin(BasinOptions.model_validate(SLOW))
-    assert sequence.detections is None
-    assert plain.detections is not None
-    assert "image model" in sequence.notes["ours"]
-    np.testing.assert_array_equal(
-        sequence.imu.angular_velocity, plain.imu.angular_velocity
-    )
-    np.testing.assert_array_equal(sequence.dvl.velocity, plain.dvl.velocity)
-    np.testing.assert_array_equal(
-        sequence.true_landmarks.positions, plain.true_landmarks.positions
-    )
 
 
 def test_truth_of_frames_is_that_of_the_run(run):
@@ -132,25 +111,6 @@ def test_time_offset_moves_stamps_and_sound_speed_scales_ranges(
     np.testing.assert_array_equal(late.ranges_m, plain.ranges_m)
     for frames in (late, wrong):
         np.testing.assert_array_equal(frames.intensity, plain.intensity)
-
-
-def test_share_in_view_falls_from_one_to_zero_across_the_edge_of_the_fan():
-    disc = place(
-        -1, "disc", block(0.2, 0.2, 0.0, 6.0), 0.1, np.array([1.7, 0.0, 0.0]), 0.0
-    )
-    simulator = FrameSimulator(ImageOptions(texture_shape=None), [disc], 0.0)
-    tilt = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
-    # roughly, for a tilted fan
-    edge_m = 1.7 * np.tan(np.radians(14.25)) / np.cos(np.radians(30)) * 0.95
-    positions = np.array([[0.0, y, 0.95] for y in (0.0, edge_m, 1.0)])
-    truth = frame_truth(positions, Rotation.concatenate([tilt] * 3), simulator)
-    assert truth.share_in_view[0, 0] == 1
-    assert 0.2 < truth.share_in_view[1, 0] < 0.9
-    assert truth.share_in_view[2, 0] == 0
-    np.testing.assert_allclose(
-        truth.range_m()[:, 0], np.linalg.norm(positions - [1.7, 0, 0], axis=1)
-    )
-    assert truth.azimuth_rad()[2, 0] < 0  # the sonar is to the left of the disc
 
 
 def squares(path: Path, ids: list[int]) -> Path:

@@ -5,17 +5,16 @@ from itertools import product
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import X
 from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
 from sonar_graph.models import Kernel
-from sonar_graph.slam import GaussianKernel, RobustKernel, factors
+from sonar_graph.slam import GaussianKernel, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.mixture import (
     REPEATED_LOSS,
-    Errors,
     IdentityPosterior,
     Mixture,
     RecogniserErrors,
@@ -24,7 +23,7 @@ from sonar_graph.slam.landmarks.mixture import (
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.smoother import Sightline
 
-from .made import plain, polar, values_of
+from .made import polar, values_of
 
 ERRORS = RecogniserErrors()
 LOG_U = -np.log(20.0)
@@ -112,53 +111,6 @@ def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
     assert trapezoid(
         np.exp(kernel.log_normaliser - kernel.loss(e)), e
     ) == pytest.approx(1.0, abs=1e-6)
-
-
-def losses(kernel: Kernel, noise: Floats) -> Floats:
-    """That of the graph's factors and that of the mixture, shape (n, 2), of points at elevation 0 all about one."""
-    estimator = kernel.estimator()
-    values = values_of(X0=gtsam.Pose3(), L7=np.zeros(3))
-    found = []
-    z = np.array([3.0, 0.2])
-    robust = (
-        (lambda model: gtsam.noiseModel.Robust.Create(estimator, model))
-        if estimator
-        else plain
-    )
-    made = factors.landmark_sighting(
-        X(0), L(7), gtsam.Pose3(), z, noise, robust
-    ).values()
-    errors = Errors(
-        [Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), noise, None)], values
-    )
-    for size, angle in product([0.3, 1.0, 3.0, 12.0], np.linspace(0.0, 2 * np.pi, 13)):
-        r, a = z + np.linalg.cholesky(noise) @ (
-            size * np.array([np.cos(angle), np.sin(angle)])
-        )
-        point = np.array([r * np.cos(a), r * np.sin(a), 0.0])
-        values.update(L(7), point)
-        theirs = sum(factor.error(values) for factor in made)
-        found.append((theirs, float(kernel.loss(errors.of(point[None])).sum())))
-    return np.array(found)
-
-
-def test_a_new_detections_components_are_predictive_densities() -> None:
-    """Of three landmarks, one of them across the cut of the azimuth; of one that is not in the graph, and of none."""
-    rng = np.random.default_rng(2)
-    A = rng.standard_normal((3, 2, 2))
-    S = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(2)
-    z = np.array([3.0, 3.1])
-    expected = np.array([[3.2, 3.0], [2.0, -3.1], [3.5, 2.0]])
-    said = {4: 0.6, 5: 0.3}
-    found = MIXTURE.at_first(IdentityPosterior(said), [7, 4, 9], z, expected, S)
-    for k, i in enumerate((7, 4, 9)):
-        density = multivariate_normal.logpdf(
-            wrapped(z - expected[k]), np.zeros(2), S[k]
-        )
-        assert found[i] == pytest.approx(density + log_weights(said, i)[0])
-    assert found[5] == pytest.approx(LOG_U + log_weights(said, 5)[0])
-    assert found[None] == pytest.approx(LOG_U + log_weights(said, 5)[1])
-    assert found.keys() == {7, 4, 9, 5, None}
 
 
 @pytest.mark.parametrize("seed", range(4))

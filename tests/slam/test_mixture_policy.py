@@ -8,7 +8,6 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.calibration import FloorPrior
-from sonar_graph.measurements import Floats
 from sonar_graph.models import Kernel
 from sonar_graph.slam import (
     GaussianKernel,
@@ -147,15 +146,7 @@ def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:
     assert np.linalg.norm(values.atPoint3(L(9)) - PLACES[9]) < 0.1
 
 
-def at(after_s: float, landmark_id: int, off: Floats = np.zeros(2)) -> Floats:  # noqa: B008
-    """What is seen, without noise."""
-    return np.array([spherical(0.5 * after_s, PLACES[landmark_id]) + off])
-
-
 # A small world, in which all choices can be tried --------------------------------------------------------------------
-
-IDS = (7, 4, None)
-POSES = [small.world().atPose3(X(k)) for k in range(6)]
 
 
 def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:

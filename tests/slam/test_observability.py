@@ -11,7 +11,6 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.measurements import Measurements
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -61,17 +60,9 @@ def test_a_range_leaves_open_what_is_across_it() -> None:
     assert left.axes() == "z"
 
 
-ROW = 40
-
-
 @cache
 def mission() -> Sequence:
     return simulate_mission(MissionOptions(duration_s=30.0, imu="mti1"))
-
-
-def without(row: int, sensor: str = "detections") -> Sequence:
-    block = getattr(mission(), sensor)
-    return replace(mission(), **{sensor: block.rows(np.arange(len(block)) != row)})
 
 
 def run(sequence: Sequence) -> tuple[Isam2, list[Estimate]]:
@@ -99,67 +90,40 @@ def numbers(outcome: tuple[Isam2, list[Estimate]]) -> np.ndarray:
 
 
 FAULTS = [
-    ("detections", "range_azimuth_cov", np.zeros((2, 2))),
-    ("detections", "range_azimuth_cov", np.full((2, 2), 1e-4)),
-    ("detections", "range_azimuth_cov", np.diag([np.inf, 1e-4])),
-    ("detections", "range_m", 0.0),
-    ("dvl", "velocity_cov", np.diag([1e-4, 1e-4, -1e-4])),
-    ("depth", "variance_m2", 0.0),
-    ("depth", "variance_m2", np.inf),
+    ("detections", 40, "range_azimuth_cov", np.zeros((2, 2))),
+    ("detections", 45, "range_azimuth_cov", np.full((2, 2), 1e-4)),
+    ("detections", 50, "range_azimuth_cov", np.diag([np.inf, 1e-4])),
+    ("detections", 55, "range_m", 0.0),
+    ("dvl", 40, "velocity_cov", np.diag([1e-4, 1e-4, -1e-4])),
+    ("depth", 40, "variance_m2", 0.0),
+    ("depth", 45, "variance_m2", np.inf),
 ]
 
 
-@pytest.mark.parametrize(
-    ("sensor", "column", "value"),
-    FAULTS,
-    ids=lambda value: str(value).replace("\n", ""),
-)
-def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(
-    sensor, column, value
-):
-    block = getattr(mission(), sensor)
-    values = getattr(block, column).copy()
-    values[ROW] = value
-    changed = replace(mission(), **{sensor: replace(block, **{column: values})})
-    faulty = run(changed)
-    known = run(without(ROW, sensor))
-    assert np.array_equal(numbers(faulty), numbers(known))
-    stamp_ns = block.stamps_ns[ROW]
-    if sensor == "detections":
-        log = faulty[0].detections()
-        assert [
-            log.stamps_ns[k]
-            for k, outcome in enumerate(log.outcomes)
-            if outcome is Outcome.UNSOUND
-        ] == [stamp_ns]
-        assert len(log) == len(mission().detections)
-    else:
-        refused = [
-            row for row in faulty[0].refused_rows() if row.reason is Refusal.UNSOUND
-        ]
-        assert [(row.sensor, row.stamp_ns) for row in refused] == [(sensor, stamp_ns)]
-
-
-def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
-    fine, late = (
-        Isam2(mission().calibration, Odometry(mission().calibration)) for _ in range(2)
-    )
-    for step in mission().replay(mission().instants(0.5)):
-        half_ns = (step.depth.stamps_ns[0] + step.depth.stamps_ns[-1]) // 2
-        parts = step.depth.between(0, half_ns), step.depth.between(half_ns, step.end_ns)
-        now = replace(step, depth=parts[1])
-        estimates = fine.process(now), late.process(now)
-        for estimator, estimate in zip((fine, late), estimates, strict=True):
-            assert estimate is not None
-            estimator.process(
-                replace(step, imu=None, dvl=None, detections=None, depth=None)
-            )
-        late.process(Measurements(step.end_ns, depth=parts[0]))
-    assert np.array_equal(fine.trajectory().positions, late.trajectory().positions)
-    assert not fine.refused_rows()
-    assert {(row.sensor, row.reason) for row in late.refused_rows()} == {
-        ("depth", Refusal.LATE)
-    }
+def test_rows_that_are_no_measurements_are_refused_and_change_nothing():
+    spoilt = whole = mission()
+    for sensor, row, column, value in FAULTS:
+        block = getattr(spoilt, sensor)
+        values = getattr(block, column).copy()
+        values[row] = value
+        spoilt = replace(spoilt, **{sensor: replace(block, **{column: values})})
+    stamps_ns = {sensor: [] for sensor, *_ in FAULTS}
+    for sensor, found in stamps_ns.items():
+        block = getattr(mission(), sensor)
+        rows = [row for name, row, *_ in FAULTS if name == sensor]
+        found += block.stamps_ns[rows].tolist()
+        left = np.delete(np.arange(len(block)), rows)
+        whole = replace(whole, **{sensor: block.rows(left)})
+    faulty = run(spoilt)
+    assert np.array_equal(numbers(faulty), numbers(run(whole)))
+    log = faulty[0].detections()
+    is_unsound = [outcome is Outcome.UNSOUND for outcome in log.outcomes]
+    assert log.stamps_ns[is_unsound].tolist() == stamps_ns.pop("detections")
+    assert len(log) == len(mission().detections)
+    refused = faulty[0].refused_rows()
+    assert all(row.reason is Refusal.UNSOUND for row in refused)
+    for sensor, found in stamps_ns.items():
+        assert [row.stamp_ns for row in refused if row.sensor == sensor] == found
 
 
 @pytest.mark.parametrize(

@@ -104,26 +104,3 @@ def test_good_frames_have_no_fault_on_the_scale_of_the_calibration():
     assert "sonar.image.full_scale" in (
         FrameCheck(SonarImage(full_scale=4095)).judge(_frame(1, wide)).fault or ""
     )
-
-
-def test_a_new_window_is_used_from_its_second_frame_on():
-    check = FrameCheck()
-    assert check.judge(_frame(1)) == GOOD
-    faults, changes = zip(
-        *(check.judge(_frame(n, end_m=3.0)) for n in (2, 3, 4)), strict=True
-    )
-    assert [fault is None for fault in faults] == [False, True, True]
-    assert [change is None for change in changes] == [True, False, True]
-    assert "10 x 40, 1.00 m to 3.00 m" in changes[1]
-
-
-def test_windows_that_alternate_lose_one_frame():
-    check = FrameCheck()
-    faults = [
-        check.judge(_frame(stamp, end_m=2.0 + stamp % 2)).fault for stamp in range(1, 9)
-    ]
-    assert [number for number, fault in enumerate(faults) if fault] == [1]
-    check = FrameCheck()
-    for stamp in range(1, 20):
-        shifted = _frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp)
-        assert check.judge(shifted) == GOOD

@@ -29,6 +29,11 @@ def log_parts(path: Path) -> list[Path]:
         file for file in path.iterdir() if file.suffix == ".mcap" and file.is_file()
     ]
     if not files:
+        if any(path.glob("*.csv")):
+            raise LogError(
+                f"{path}: is a folder of CSV tables; `sonar-graph convert csv {path} --toml > dive.toml` begins their "
+                f"description, `sonar-graph convert csv {path} --config dive.toml -o dive.mcap` makes a log of them"
+            )
         raise LogError(
             f"{path}: is a folder without {METADATA_FILE} and .mcap files; give a log, or the folder of a bag that "
             "`ros2 bag record` wrote"

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import SHIPPED, LogConfig, read_log_config, table_text
+from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.logs.adapters.log_config import toml_value
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
@@ -53,24 +53,6 @@ def test_a_topic_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(MissingTopicError, match=message):
         foreign.read(toml=toml)
-
-
-SHIPPED_ADAPTERS = [
-    (role, offer.adapter) for role, offers in SHIPPED.items() for offer in offers
-]
-
-
-@pytest.mark.parametrize(
-    ("role", "adapter"),
-    SHIPPED_ADAPTERS,
-    ids=lambda value: getattr(value, "type", value),
-)
-def test_every_shipped_adapter_survives_as_a_table(role: str, adapter: Any) -> None:
-    values = tomllib.loads(table_text(role, "/a topic", adapter, None))
-    config = LogConfig.parse(values, "x")
-    assert adapter.model_copy(update={"topic": "/a topic"}) in config.adapters(
-        role, adapter.type
-    )
 
 
 LEAVES = (

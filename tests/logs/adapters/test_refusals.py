@@ -10,7 +10,6 @@ from tests.logs.adapters.conftest import at, dvl, imu
 from tests.logs.conftest import vector
 
 ROWS = 20
-TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 DENIED = {"angular_velocity_covariance": [-1.0] + [0.0] * 8}
 PACKETS = (
     "/pd0",

@@ -1,11 +1,8 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Slerp
 
-from sonar_graph.logs.adapters import east_north_up
 from sonar_graph.logs.convert import read_akit
 
 LATITUDE = 0.5733
@@ -59,31 +56,6 @@ def test_axes_times_and_start_are_those_of_the_files(folder):
     assert np.allclose(
         sequence.calibration.start.position_m, sequence.truth.positions[1]
     )
-
-
-@given(st.floats(-1.3, 1.3), st.floats(-3, 3))
-def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, longitude):
-    e2 = 6.69437999014e-3
-    a = 6378137.0
-    d = 1e-6
-    meridian = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5
-    vertical = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-    heights = np.array([-5.0, -5.0, -5.0, -2.0])
-    enu = east_north_up(
-        latitude + np.array([0, d, 0, 0]),
-        longitude + np.array([0, 0, d, 0]),
-        heights,
-        (latitude, longitude, 0.0),
-    )
-    assert np.allclose(enu[1] - enu[0], [0, (meridian - 5) * d, 0], rtol=0, atol=1e-4)
-    assert np.allclose(
-        enu[2] - enu[0],
-        [(vertical - 5) * np.cos(latitude) * d, 0, 0],
-        rtol=0,
-        atol=1e-4,
-    )
-    assert np.allclose(enu[3] - enu[0], [0, 0, 3], rtol=0, atol=1e-4)
-    assert np.allclose(enu[0], [0, 0, -5], rtol=0, atol=1e-6)
 
 
 def test_the_start_is_where_a_reference_that_is_late_turns_as_the_gyros_do(tmp_path):

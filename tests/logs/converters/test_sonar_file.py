@@ -26,7 +26,6 @@ from .sonar_recordings import (
 )
 
 COUNT = 7
-MIB = 1 << 20
 EVERY = list(range(COUNT))
 PICTURES = images(COUNT, 48, 50)
 RECORDINGS = {
