@@ -360,6 +360,10 @@ class Start(Section):
         )
         return covariance
 
+    def states(self, *names: str) -> bool:
+        """True where the owner states these fields, instead of their defaults or measured ones."""
+        return self.source == "stated" and self.model_fields_set.issuperset(names)
+
     def in_map(self) -> Self:
         """The start of a run with a known map: where nothing gives its place, the place is found in the map."""
         # heading and vehicle give no place in the world

@@ -20,8 +20,7 @@ from common import make_parser, note, print_figures, print_table
 from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, Vehicle, make_vehicle
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.diagnosis import Finding, check_sensors, doubts
-from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.measurements import (
     Depth,
     Dvl,
@@ -337,8 +336,8 @@ TRUE_VALUES = {
 
 def fires(fault: Fault, log: Sequence, size: float) -> bool:
     """True where a finding of the fault's quantity asks for an action."""
-    found = doubts(fault.spoil(log, size), LogConfig())
-    return any(re.search(fault.quantity, finding.quantity) for finding in found)
+    found = check_sensors(fault.spoil(log, size))
+    return any(f.acts and re.search(fault.quantity, f.quantity) for f in found)
 
 
 def limit_of(fault: Fault, logs: list[Sequence]) -> float:

@@ -84,8 +84,7 @@ def csv(
     overwrite: Overwrite = False,
 ) -> None:
     """Tables of any vehicle: IMU, Doppler log, depth, heading, fixes, detections, truth; delimiters are found."""
-    from sonar_graph.diagnosis import doubts
-    from sonar_graph.logs.adapters import LogConfig
+    from sonar_graph.diagnosis import check_sensors
     from sonar_graph.logs.convert import csv_template, read_csv
 
     if toml:
@@ -108,7 +107,7 @@ def csv(
             echo(f"{heading}: {sequence.notes[subject]}", err=True)
     # the log states this start from now on, as if its owner had
     echo(f"start: {sequence.notes['log.start']}", err=True)
-    for finding in doubts(sequence, LogConfig()):
+    for finding in check_sensors(sequence):
         if finding.quantity.endswith(": unit"):
             echo(
                 f"warning: {finding.quantity}: {finding.text()} (or in {config}, and convert again)",

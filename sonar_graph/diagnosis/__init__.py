@@ -2,8 +2,8 @@
 
 # fmt: off
 from sonar_graph.diagnosis.findings import Finding
-from sonar_graph.diagnosis.sensor_check import check_sensors, compared, doubts, trusted
+from sonar_graph.diagnosis.sensor_check import check_sensors, compared, trusted
 
 __all__ = [
-    "Finding", "check_sensors", "compared", "doubts", "trusted",
+    "Finding", "check_sensors", "compared", "trusted",
 ]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sonar_graph.diagnosis.causes import (
     AS_GOOD,
@@ -20,27 +20,29 @@ from sonar_graph.diagnosis.causes import (
     OF_RANGES,
     PITCH,
     SONAR_TURN,
-    Advice,
     Cause,
     cause_of,
     of_scale,
-    other_world,
-    scale_line,
     step_text,
-    unused,
 )
 from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     IN_CALIBRATION,
     IN_LOG_CONFIG,
     NO_NEED,
+    Advice,
     Finding,
     Gravity,
-    gravity_of,
+    contradiction,
     in_degrees,
+    judged,
     matters,
     numbers,
+    other_world,
+    scale_line,
+    shift_line,
     unknown,
+    unused,
 )
 from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.diagnosis.sightings import sighting_changes
@@ -140,6 +142,8 @@ class Check:
     is_angle: bool = False
     causes: tuple[Cause, ...] = ()
     """What else may be wrong."""
+    other_lines: Mapping[str, str] = field(default_factory=dict)
+    """Lines for units that no scale puts right."""
     step_unit: str = ""
     """Unit of steps; empty where steps are not looked for."""
 
@@ -147,11 +151,6 @@ class Check:
     def is_sighting(self) -> bool:
         """True for the checks of landmarks, whose identities may be wrong."""
         return self.role == "detections"
-
-    def slips(self, sequence: Sequence) -> bool:
-        """True for sightings from wheels, whose odometry has a scale of its own."""
-        is_wheeled = sequence.calibration.odometry_interpolation == "hold-past"
-        return self.is_sighting and is_wheeled
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,6 +336,10 @@ POSITIONS = Check(
         f"`scale = {config.number('dvl', 'scale', 1.0) * gain:.4g}` under [dvl]",
     ),
     least_lag_s=0.3,
+    other_lines={
+        "degrees": f"`geodetic`, with the fields of latitude and longitude, under [positions] {IN_LOG_CONFIG}",
+        MINUTES: "write them as decimal degrees",
+    },
     causes=(OF_FIXES,),
     step_unit="m",
 )
@@ -403,159 +406,210 @@ def findings_of(
 ) -> list[Finding]:
     """Rows of the report for a comparison: gain and lag, with cause and line where one is wrong."""
     quantity = check.quantity or f"{check.name}: change over that by {check.against}"
-    sigma = check.sigma(sequence)
+    if not found.gain.is_known:
+        return [Finding(quantity, found.gain)]
     still = "too little turning"
     if not check.is_angle:
         still = f"too little motion for {check.name}"
-    size = abs(found.gain.value)
-    if not found.gain.is_known:
-        return [Finding(quantity, found.gain)]
+    sigma = check.sigma(sequence)
+    size = max(1.0, abs(found.gain.value))
     by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
     found = found.less_certain(float(np.hypot(by_slow, check.systematic)))
-    if not found.moved * max(1.0, size) > LEAST_MOVED * sigma:
+    if not found.moved * size > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
-    gain = found.gain.limited(LARGEST_GAIN_SIGMA * max(1.0, size), still)
-    row = Finding(quantity, gain, cause=NO_NEED)
-    fault = grave_fault(check, replace(found, gain=gain), sequence, config)
-    if fault is None:
-        # a gain that is a unit has no other cause, unless that fits better
-        most = 1 / AS_GOOD if unit_of(check, gain) else AS_GOOD
-        known = sequence.calibration
-        by_cause = cause_of(check.name, check.causes, found, known, most)
-        if by_cause is not None:
-            return [by_cause]
-        fault = odd_gain(check, replace(found, gain=gain), sequence, config)
-    if fault is None:
-        fault = other_values(check, found, sigma)
+    gain = found.gain.limited(LARGEST_GAIN_SIGMA * size, still)
+    one = Comparison(
+        check, quantity, replace(found, gain=gain), sigma, sequence, config
+    )
+    fault = next(filter(None, (find(one) for find in FAULTS)), None)
     if fault is not None:
-        grave = Gravity.GRAVE
-        return [replace(row, cause=fault.cause, line=fault.line, gravity=grave)]
+        return [fault]
     if not gain.is_known:
         return [Finding(quantity, gain)]
-    error = abs(size - 1.0) * check.reach(sequence, found)
-    # a scale matters only where its error shows beside the noise of a row
-    is_off = matters(replace(gain, value=size - 1.0), check.least_scale)
-    # another sense or unit has been named, where the changes fit one
-    if is_off and not 1 / OTHER_UNIT < gain.value < OTHER_UNIT:
-        reason = f"its few changes do not follow {check.against}"
-        return [Finding(quantity, unknown(reason))]
-    acts = is_off and error > sigma and not check.slips(sequence)
-    if acts:
-        advice = check.scaled(config, size)
-        row = replace(
+    return one.small_faults()
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A comparison in which the vehicle moves enough, and the faults that it may show."""
+
+    check: Check
+    quantity: str
+    found: Match
+    sigma: float
+    """Of a row."""
+    sequence: Sequence
+    config: LogConfig
+
+    @property
+    def size(self) -> float:
+        """Of the gain, without its sign."""
+        return abs(self.found.gain.value)
+
+    @property
+    def is_late(self) -> bool:
+        """True where the delay is sure."""
+        return matters(self.found.lag, self.check.least_lag_s)
+
+    @property
+    def slips(self) -> bool:
+        """True for sightings from wheels, whose odometry has a scale of its own."""
+        is_wheeled = self.sequence.calibration.odometry_interpolation == "hold-past"
+        return self.check.is_sighting and is_wheeled
+
+    @property
+    def unit(self) -> str:
+        """The unit that the gain looks like, within its interval; empty: none."""
+        size = max(self.size, 1e-12)
+        near = {
+            unit: abs(np.log(size * factor))
+            for unit, factor in self.check.units.items()
+        }
+        unit = min(near, key=near.__getitem__, default="")
+        tolerance = max(UNIT_TOLERANCE, ACTING_SIGMAS * self.found.gain.sigma / size)
+        return unit if unit and near[unit] < min(tolerance, MOST_UNIT_TOLERANCE) else ""
+
+    def contradiction(self, cause: str, line: str) -> Finding:
+        """The row of the gain with a cause."""
+        return contradiction(self.quantity, cause, line, self.found.gain)
+
+    def stuck(self) -> Finding | None:
+        """No change where the reference has some; a wrong unit may make a gain small too."""
+        moved = self.found.moved
+        is_flat = self.size + 4 * self.found.gain.sigma < HARDLY
+        if not is_flat or self.unit or moved <= STUCK_MOVED * self.sigma:
+            return None
+        verb = "turns" if self.check is HEADING else "changes"
+        return self.contradiction(
+            f"it hardly {verb} where {self.check.against} do: stuck, or not of the body",
+            unused(self.check.role),
+        )
+
+    def jumps(self) -> Finding | None:
+        """Steps; a wrong scale or delay shows in steps too where the motion has some."""
+        is_right = abs(self.found.gain.value - 1.0) < STEP_GAIN_ERROR
+        ratio = 1.0 if is_right and not self.is_late else STEP_RATIO
+        unit = self.check.step_unit
+        steps = unit and step_text(self.found, self.sigma, unit, ratio)
+        if not steps:
+            return None
+        return self.contradiction(
+            f"it jumps against {self.check.against}, {steps}",
+            f"{unused(self.check.role)} leaves it out",
+        )
+
+    def opposite(self) -> Finding | None:
+        """Another sense, of a sensor that agrees with its reference otherwise."""
+        found = self.found
+        is_opposite = found.gain.is_known and found.gain.value < 0
+        if not (is_opposite or found.is_mirrored) or found.misfit >= MOST_MISFIT:
+            return None
+        sense = self.check.sense(self.config)
+        return self.contradiction(sense.cause, sense.line)
+
+    def of_cause(self) -> Finding | None:
+        """A cause of the check's own; a gain that is a unit has another one only where that fits better."""
+        most = 1 / AS_GOOD if self.unit else AS_GOOD
+        known = self.sequence.calibration
+        return cause_of(self.check.name, self.check.causes, self.found, known, most)
+
+    def other_unit(self) -> Finding | None:
+        """A gain that is surely far from 1 of a sensor that agrees with its reference otherwise."""
+        check = self.check
+        found = self.found
+        size = self.size
+        most = SLIPPING_UNIT if self.slips else OTHER_UNIT
+        is_sure = matters(replace(found.gain, value=size - 1.0), 0.0)
+        if not is_sure or 1 / most < size < most or found.misfit > MOST_MISFIT:
+            return None
+        unit = self.unit
+        if not unit and size < 1 and self.is_late:
+            return self.contradiction(
+                f"it follows {check.against} {found.lag.value:.2g} s late and {size:.2g} times as far: smoothed by the "
+                "sensor or its driver",
+                unused(check.role),
+            )
+        times = 1.0 / check.units[unit] if unit else size
+        return self.contradiction(
+            f"it changes {size:.3g} times as much as by {check.against}: {unit or 'another unit'}?",
+            check.other_lines.get(unit)
+            or scale_line(check.role, check.scale_key, self.config, times),
+        )
+
+    def unrelated(self) -> Finding | None:
+        """Changes that have nothing to do with the reference."""
+        check = self.check
+        found = self.found
+        # sightings that contradict the motion are wrong identities as a rule, which the estimators name
+        if check.is_sighting or found.misfit < MOST_MISFIT:
+            return None
+        if found.scatter < LARGEST_SCATTER * self.sigma and not found.is_mirrored:
+            return None
+        return self.contradiction(
+            f"{100 * found.misfit:.0f} % of its changes are not those by {check.against}, {found.scatter:.3g} apart "
+            "typically: another sensor's values, or wrong axes?",
+            f"{unused(check.role)} leaves it out",
+        )
+
+    def small_faults(self) -> list[Finding]:
+        """Scale and delay."""
+        size = self.size
+        gain = self.found.gain
+        off = replace(gain, value=size - 1.0)
+        error = abs(off.value) * self.check.reach(self.sequence, self.found)
+        # a scale matters only where its error shows beside the noise of a row
+        is_off = matters(off, self.check.least_scale)
+        # another sense or unit has been named, where the changes fit one
+        if is_off and not 1 / OTHER_UNIT < gain.value < OTHER_UNIT:
+            reason = f"its few changes do not follow {self.check.against}"
+            return [Finding(self.quantity, unknown(reason))]
+        row = Finding(self.quantity, gain, cause=NO_NEED)
+        if is_off and error > self.sigma and not self.slips:
+            advice = self.check.scaled(self.config, size)
+            row = replace(
+                row,
+                cause=f"it changes {size:.3g} times as much",
+                consequence=f"up to {error:.2g}",
+                line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
+                gravity=self.gravity(error),
+            )
+        # wheels start to slip in turns: no delay of a sensor
+        if not self.found.lag.is_known or self.slips:
+            return [row]
+        return [row, self.delay()]
+
+    def gravity(self, error: float) -> Gravity:
+        """Class of a finding by the error that it makes."""
+        return Gravity.GRAVE if error > GRAVE_ERROR * self.sigma else Gravity.ACT
+
+    def delay(self) -> Finding:
+        """Row for a delay of the sensor."""
+        check = self.check
+        lag = self.found.lag
+        known = lag.limited(LARGEST_LAG_SIGMA_S, "too little changes in the motion")
+        name = f"{check.name} against {check.against}: delay"
+        row = Finding(name, known, "s", NO_NEED)
+        error = abs(lag.value) * self.found.rate
+        if not matters(known, check.least_lag_s) or error < self.sigma:
+            return row
+        return replace(
             row,
-            cause=f"it changes {size:.3g} times as much",
-            consequence=f"up to {error:.2g}",
-            line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
-            gravity=gravity_of(acts, error > GRAVE_ERROR * sigma),
+            cause=f"its rows come too {'late' if lag.value > 0 else 'early'}",
+            consequence=f"an error of {error:.2g} typically",
+            line=shift_line(check.role, self.config, -lag.value),
+            gravity=self.gravity(error),
         )
-    # wheels start to slip in turns: no delay of a sensor
-    if not found.lag.is_known or check.slips(sequence):
-        return [row]
-    return [row, lag_finding(check, found, sigma, config)]
 
 
-def grave_fault(
-    check: Check, found: Match, sequence: Sequence, config: LogConfig
-) -> Advice | None:
-    """Cause and line of a fault beyond doubt: stuck, a jump, or another sense; None without one."""
-    gain = found.gain
-    size = abs(gain.value)
-    sigma = check.sigma(sequence)
-    # a wrong unit may make a gain small too
-    is_flat = size + 4 * gain.sigma < HARDLY and found.moved > STUCK_MOVED * sigma
-    if is_flat and not unit_of(check, gain):
-        verb = "turns" if check is HEADING else "changes"
-        cause = f"it hardly {verb} where {check.against} do: stuck, or not of the body"
-        return Advice(cause, unused(check.role))
-    # a wrong scale or delay shows in steps where the motion has some
-    is_right = abs(gain.value - 1.0) < STEP_GAIN_ERROR
-    is_right &= not matters(found.lag, check.least_lag_s)
-    ratio = 1.0 if is_right else STEP_RATIO
-    jumps = check.step_unit and step_text(found, sigma, check.step_unit, ratio)
-    if jumps:
-        cause = f"it jumps against {check.against}, {jumps}"
-        return Advice(cause, f"{unused(check.role)} leaves it out")
-    # another sense or unit is one where the sensor agrees with it
-    is_borne_out = found.misfit < MOST_MISFIT
-    is_opposite = found.is_mirrored or (gain.is_known and gain.value < 0)
-    return check.sense(config) if is_opposite and is_borne_out else None
-
-
-def odd_gain(
-    check: Check, found: Match, sequence: Sequence, config: LogConfig
-) -> Advice | None:
-    """A gain that is surely far from 1 of a sensor that agrees with its reference otherwise; None without one."""
-    gain = found.gain
-    size = abs(gain.value)
-    other_unit = SLIPPING_UNIT if check.slips(sequence) else OTHER_UNIT
-    is_sure = matters(replace(gain, value=size - 1.0), 0.0)
-    is_far = is_sure and not 1 / other_unit < size < other_unit
-    if not is_far or found.misfit > MOST_MISFIT:
-        return None
-    return unit_advice(check, found, config)
-
-
-def other_values(check: Check, found: Match, sigma: float) -> Advice | None:
-    """Changes that have nothing to do with the reference; None: they have."""
-    # sightings that contradict the motion are wrong identities as a rule, which the estimators name
-    if check.is_sighting or found.misfit < MOST_MISFIT:
-        return None
-    if found.scatter < LARGEST_SCATTER * sigma and not found.is_mirrored:
-        return None
-    return Advice(
-        f"{100 * found.misfit:.0f} % of its changes are not those by {check.against}, {found.scatter:.3g} apart "
-        "typically: another sensor's values, or wrong axes?",
-        f"{unused(check.role)} leaves it out",
-    )
-
-
-def unit_of(check: Check, gain: Estimate1D) -> str:
-    """The unit that a gain looks like, within its interval; empty: none."""
-    size = max(abs(gain.value), 1e-12)
-    near = {unit: abs(np.log(size * factor)) for unit, factor in check.units.items()}
-    unit = min(near, key=near.__getitem__, default="")
-    tolerance = max(UNIT_TOLERANCE, ACTING_SIGMAS * gain.sigma / size)
-    return unit if unit and near[unit] < min(tolerance, MOST_UNIT_TOLERANCE) else ""
-
-
-def unit_advice(check: Check, found: Match, config: LogConfig) -> Advice:
-    """Question for the unit, and the line."""
-    gain = abs(found.gain.value)
-    unit = unit_of(check, found.gain)
-    if not unit and gain < 1 and matters(found.lag, check.least_lag_s):
-        return Advice(
-            f"it follows {check.against} {found.lag.value:.2g} s late and {gain:.2g} times as far: smoothed by the sensor "
-            "or its driver",
-            unused(check.role),
-        )
-    times = 1.0 / check.units[unit] if unit else gain
-    line = scale_line(check.role, check.scale_key, config, times)
-    if check is POSITIONS and unit == "degrees":
-        line = f"`geodetic`, with the fields of latitude and longitude, under [positions] {IN_LOG_CONFIG}"
-    if unit == MINUTES:
-        line = "write them as decimal degrees"
-    question = f"{unit or 'another unit'}?"
-    return Advice(
-        f"it changes {gain:.3g} times as much as by {check.against}: {question}", line
-    )
-
-
-def lag_finding(check: Check, found: Match, sigma: float, config: LogConfig) -> Finding:
-    """Row for a delay of the sensor."""
-    lag = found.lag.limited(LARGEST_LAG_SIGMA_S, "too little changes in the motion")
-    row = Finding(f"{check.name} against {check.against}: delay", lag, "s", NO_NEED)
-    error = abs(lag.value) * found.rate
-    if not matters(lag, check.least_lag_s) or error < sigma:
-        return row
-    total_s = config.number(check.role, "stamp_offset_s", 0.0) - lag.value
-    return replace(
-        row,
-        cause=f"its rows come too {'late' if lag.value > 0 else 'early'}",
-        consequence=f"an error of {error:.2g} typically",
-        line=f"`stamp_offset_s = {total_s:.3f}` under [{check.role}] {IN_LOG_CONFIG}",
-        gravity=gravity_of(True, error > GRAVE_ERROR * sigma),
-    )
+FAULTS = (
+    Comparison.stuck,
+    Comparison.jumps,
+    Comparison.opposite,
+    Comparison.of_cause,
+    Comparison.other_unit,
+    Comparison.unrelated,
+)
+"""In the order in which they are looked for: each hides those after it."""
 
 
 LEAST_BIAS_S = 30.0
@@ -584,11 +638,10 @@ def vertical_bias(
         yaw_rad = np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
     else:
         return None
-    quantity = VERTICAL_BIAS
     bias = unknown(f"too little time beside {source}")
     motion = motion or BodyMotion.of(sequence)
     if motion is None:
-        return Finding(quantity, bias, "rad/s")
+        return Finding(VERTICAL_BIAS, bias, "rad/s")
     t = motion.since_origin(stamps_ns)
     drift_rad = motion.reference(motion.yaw_rad)(t) - yaw_rad
     # against time itself, whose gain is the rate
@@ -601,9 +654,6 @@ def vertical_bias(
         bias = replace(found.gain, sigma=max(found.gain.sigma, slope, 1e-9))
     imu = sequence.calibration.imu
     allowed = imu.gyro_bias_sigma
-    if not matters(bias, LEAST_BIAS_RAD_S, allowed):
-        cause = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
-        return Finding(quantity, bias, "rad/s", cause)
     up = np.median(motion.up, axis=0)
     up = up / np.linalg.norm(up)
     turned_rad = abs(bias.value) * sequence.duration_s
@@ -614,21 +664,32 @@ def vertical_bias(
         # the truth drifts from nothing
         is_known = sequence.heading is not None and all(one.is_known for one in of_axes)
         sigma = float(np.linalg.norm([one.sigma for one in of_axes] * up))
-        apart = replace(bias, value=bias.value - float(known @ up))
-        if is_known and matters(apart, LEAST_BIAS_RAD_S, sigma):
+        apart = bias.minus(float(known @ up))
+        if (
+            is_known
+            and matters(bias, LEAST_BIAS_RAD_S, allowed)
+            and matters(apart, LEAST_BIAS_RAD_S, sigma)
+        ):
             return heading_drift(replace(apart, value=-apart.value), turned_rad)
     # the line is in the axes of the IMU
     body_R_imu = imu.mounting.pose().rotation().matrix()
     more_rad_s = (level_rad_s + bias.value * up) @ body_R_imu
     whole = np.add(imu.gyro_bias_rad_s, more_rad_s)
-    return Finding(
-        quantity,
+    row = Finding(
+        VERTICAL_BIAS,
         bias,
         "rad/s",
         cause=f"by {source}, {np.degrees(bias.value):.3g}°/s beyond the calibration's sigma of {allowed:.2g}",
         consequence=f"a turn of {np.degrees(turned_rad):.3g}° over the log",
         line=f"`imu.gyro_bias_rad_s = {numbers(whole, 5)}` {IN_CALIBRATION}",
-        gravity=gravity_of(True, turned_rad > LARGE_TURN_RAD),
+    )
+    return judged(
+        row,
+        bias,
+        LEAST_BIAS_RAD_S,
+        allowed=allowed,
+        large=LARGE_TURN_RAD / max(sequence.duration_s, 1e-9),
+        fits=f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}",
     )
 
 
@@ -642,7 +703,7 @@ def heading_drift(drift: Estimate1D, turned_rad: float) -> Finding:
         "disturbed",
         consequence=f"a turn of {np.degrees(turned_rad):.3g}° over the log",
         line=unused(HEADING.role),
-        gravity=gravity_of(True, turned_rad > LARGE_TURN_RAD),
+        gravity=Gravity.GRAVE if turned_rad > LARGE_TURN_RAD else Gravity.ACT,
     )
 
 
@@ -671,34 +732,35 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     sigma_m = sequence.calibration.positions.sigma_m[2]
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
-    is_stated = sequence.calibration.start.source == "stated"
     cause = (
         "another origin, sign or unit of the depths, or another height of the fixes?"
     )
     line = f"{unused('depth')} leaves the depths out"
-    if is_stated:
+    if sequence.calibration.start.states():
         cause = "the depths begin at the stated start: only the heights of the fixes are wrong, of another origin or sign"
-        before = np.array(config.table("positions").get("origin_m", np.zeros(3)), float)
-        moved = numbers(np.add(before, (0.0, 0.0, off_m)), 2)
-        line = f"`origin_m = {moved}` under [positions] {IN_LOG_CONFIG}"
+        line = origin_line(config, (0.0, 0.0, off_m), 2)
         if "log.origin" in sequence.notes:
             line = f"an `origin_deg_m` that is {off_m:+.2f} m higher, in geodetic under [positions] {IN_LOG_CONFIG}"
-    yield Finding(
+    yield contradiction(
         "depth: height of the position fixes over it",
+        cause,
+        line,
         Estimate1D(off_m, sigma_m),
         "m",
-        cause=cause,
-        line=line,
-        gravity=Gravity.GRAVE,
     )
+
+
+def origin_line(config: LogConfig, off_m: ArrayLike, digits: int) -> str:
+    """Line that adds to a configured origin of the position fixes."""
+    before = np.array(config.table("positions").get("origin_m", np.zeros(3)), float)
+    return f"`origin_m = {numbers(before + off_m, digits)}` under [positions] {IN_LOG_CONFIG}"
 
 
 def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     """A stated start that is at another height than the first depths; nothing where they agree."""
     depth = sequence.depth
     start = sequence.calibration.start
-    is_stated = start.source == "stated" and "position_m" in start.model_fields_set
-    if depth is None or not is_stated:
+    if depth is None or not start.states("position_m"):
         return
     first = max(int(np.searchsorted(depth.stamps_ns, sequence.start_ns)) - 1, 0)
     rows_m = depth.z_m[first : first + FIRST_ROWS]
@@ -712,22 +774,20 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     if abs(off_m) <= FARTHEST_FROM_START_M + climbed_m + ACTING_SIGMAS * sigma_m:
         return
     x, y, z = start.position_m
-    is_gauge = abs(abs(off_m) - ATMOSPHERE_M) < ATMOSPHERE_SHARE * ATMOSPHERE_M
-    of_air = (
-        f"`atmosphere_pa = 0` under [depth] {IN_LOG_CONFIG} where pressures are counted from the surface, since so much "
-        "water weighs as much as the air; "
-        if is_gauge
-        else ""
-    )
-    yield Finding(
+    of_air = ""
+    if abs(abs(off_m) - ATMOSPHERE_M) < ATMOSPHERE_SHARE * ATMOSPHERE_M:
+        of_air = (
+            f"`atmosphere_pa = 0` under [depth] {IN_LOG_CONFIG} where pressures are counted from the surface, since so "
+            "much water weighs as much as the air; "
+        )
+    yield contradiction(
         "depth: distance from the start",
-        Estimate1D(off_m, sequence.calibration.depth.sigma_m),
-        "m",
         cause=f"the height begins at {height_m:.2f} m, the start of the calibration is at {height_m - off_m:.2f} m: an "
         "altimeter, another sign, unit or origin, or a wrong start?",
         line=f"{of_air}{unused('depth')} leaves the depths out, scale = -1 there is for depths downwards; "
         f"`start.position_m = {numbers((x, y, z + off_m), 2)}` {IN_CALIBRATION} where the depths are right",
-        gravity=Gravity.GRAVE,
+        estimate=Estimate1D(off_m, sequence.calibration.depth.sigma_m),
+        unit="m",
     )
 
 
@@ -749,8 +809,7 @@ def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Find
     """First headings that differ from a stated start; nothing where they agree, or no start is stated."""
     heading = right.heading
     start = right.calibration.start
-    is_stated = start.source == "stated" and "rpy_rad" in start.model_fields_set
-    if heading is None or not is_stated:
+    if heading is None or not start.states("rpy_rad"):
         return
     first = max(int(np.searchsorted(heading.stamps_ns, right.start_ns)) - 1, 0)
     t = motion.since_origin(heading.stamps_ns[first : first + FIRST_ROWS])
@@ -766,13 +825,12 @@ def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Find
     )
     if not matters(error, LARGE_TURN_RAD):
         return
-    yield Finding(
+    yield contradiction(
         "heading: turn from that of the start",
+        "another north, sense or unit of the headings, or a wrong start?",
+        f"`world` and `yaw_offset_rad` under [heading] {IN_LOG_CONFIG}, or `start.rpy_rad` {IN_CALIBRATION}",
         in_degrees(error),
         "°",
-        cause="another north, sense or unit of the headings, or a wrong start?",
-        line=f"`world` and `yaw_offset_rad` under [heading] {IN_LOG_CONFIG}, or `start.rpy_rad` {IN_CALIBRATION}",
-        gravity=Gravity.GRAVE,
     )
 
 
@@ -823,7 +881,7 @@ def heading_turn(
         cause=f"{first}either its world, north or mounting is another",
         line=f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}; or the Doppler log is turned on the "
         f"vehicle: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}",
-        gravity=gravity_of(True, abs(angle.value) > large_rad),
+        gravity=Gravity.GRAVE if abs(angle.value) > large_rad else Gravity.ACT,
     )
 
 
@@ -908,14 +966,13 @@ def position_findings(
         and share * count >= FEWEST_JUMPS
     ):
         sigma = float(np.sqrt(share * (1 - share) / count))
-        yield Finding(
+        yield contradiction(
             "position fixes: jumps",
-            Estimate1D(100 * share, 100 * sigma),
-            "%",
             cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart are farther from each other than the vehicle moves by its "
             "Doppler log and their noise allows: angles, another scale, or of another thing?",
             line=f"{unused('positions')} leaves them out; or they are worse than `positions.sigma_m` {IN_CALIBRATION}",
-            gravity=Gravity.GRAVE,
+            estimate=Estimate1D(100 * share, 100 * sigma),
+            unit="%",
         )
         return
     if rows[0].estimate.reason.startswith("too few"):
@@ -938,8 +995,7 @@ def led_to_fixes(
     None where the owner does not state the start's place and heading, or fixes are too few.
     """
     start = right.calibration.start
-    is_stated = {"position_m", "rpy_rad"} <= start.model_fields_set
-    if not is_stated or start.source != "stated":
+    if not start.states("position_m", "rpy_rad"):
         return None
     if any(start_heading_findings(right, motion)):
         return None
@@ -1001,11 +1057,10 @@ def distance_finding(
         off = near
     else:
         return row
-    before = np.array(config.table("positions").get("origin_m", np.zeros(3)), float)
     return replace(
         row,
         cause=f"they begin {place}, beyond their noise and the way to them: a map grid (UTM), or another scale, place or "
         "start heading?",
-        line=f"`origin_m = {numbers(before + off, 1)}` under [positions] {IN_LOG_CONFIG} {more}",
+        line=f"{origin_line(config, off, 1)} {more}",
         gravity=Gravity.GRAVE,
     )

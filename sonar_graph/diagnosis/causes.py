@@ -15,11 +15,12 @@ from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
+    Advice,
     Finding,
-    Gravity,
+    contradiction,
     in_degrees,
     numbers,
-    unknown,
+    unused,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.signals import (
@@ -32,7 +33,6 @@ from sonar_graph.diagnosis.signals import (
 )
 from sonar_graph.diagnosis.start import turned_mounting
 from sonar_graph.diagnosis.turn_rate import integral_of, residual
-from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 
@@ -49,31 +49,6 @@ BEST_NOISE_M_S = 0.01
 JUMPING = 2.0
 """Ratio of a change to that of the path beyond which it shows no direction."""
 LONGEST_LIST = 3
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What may be wrong, and the line that mends it."""
-
-    cause: str
-    line: str
-
-
-def scale_line(role: str, key: str, config: LogConfig, gain: float) -> str:
-    """Line that divides a configured scale by a gain."""
-    scale = config.number(role, key, 1.0) / gain
-    return f"`{key} = {scale:.4g}` under [{role}] {IN_LOG_CONFIG}"
-
-
-def unused(role: str) -> str:
-    """Line that leaves a sensor out."""
-    return f"`use = false` under [{role}] {IN_LOG_CONFIG}"
-
-
-def other_world(config: LogConfig, role: str) -> str:
-    """The world that is not the configured one, as a setting."""
-    is_ned = config.table(role).get("world", "enu") == "ned"
-    return f'`world = "{"enu" if is_ned else "ned"}"` under [{role}] {IN_LOG_CONFIG}'
 
 
 @dataclass(frozen=True)
@@ -278,13 +253,12 @@ def cause_of(
     value = float(result.q[0].real if is_signed else np.linalg.norm(result.q))
     estimate = Estimate1D(value, float(np.max(result.sigmas)))
     advice = cause.advice(result.q, calibration)
-    return Finding(
+    return contradiction(
         f"{name}: {cause.name}",
+        advice.cause,
+        advice.line,
         in_degrees(estimate) if cause.unit == "°" else estimate,
         cause.unit,
-        cause=advice.cause,
-        line=advice.line,
-        gravity=Gravity.GRAVE,
     )
 
 
@@ -317,14 +291,13 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
             texts.append(f"by {step.size:.2g} m/s at {step.seconds:.1f} s")
     if not texts:
         return None
-    return Finding(
+    return contradiction(
         "DVL: steps",
-        unknown("wrong velocities"),
+        estimate="wrong velocities",
         cause=f"velocities change {' and '.join(texts[:LONGEST_LIST])} while the accelerometers feel nothing: bottom lock "
         "lost, such as a change to the water, or values repeated",
         line=f"leave the rows without bottom lock out (`lock` under [dvl] {IN_LOG_CONFIG}), or that part by --start and "
         "--end",
-        gravity=Gravity.GRAVE,
     )
 
 

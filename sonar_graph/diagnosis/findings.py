@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.navigation.alignment import Estimate1D
 
 INTERVAL_SIGMAS = 1.96
@@ -105,23 +106,38 @@ class Finding:
         }
 
 
-def gravity_of(acts: object, grave: object = True) -> Gravity:
-    """Class of a finding by whether it needs an action."""
-    if not acts:
-        return Gravity.FINE
-    return Gravity.GRAVE if grave else Gravity.ACT
+def contradiction(
+    quantity: str,
+    cause: str,
+    line: str,
+    estimate: Estimate1D | str,
+    unit: str = "",
+    consequence: str = "",
+) -> Finding:
+    """A grave finding; without a number a word instead of the estimate."""
+    if isinstance(estimate, str):
+        estimate = unknown(estimate)
+    return Finding(quantity, estimate, unit, cause, consequence, line, Gravity.GRAVE)
 
 
 def judged(
-    row: Finding, error: Estimate1D, least: float, large: float = np.inf
+    row: Finding,
+    error: Estimate1D,
+    least: float,
+    *,
+    allowed: float = 0.0,
+    large: float = np.inf,
+    fits: str = NO_NEED,
 ) -> Finding:
-    """The row itself where an error matters, grave where it is large; else what it was compared with fits.
+    """The row itself where an error matters, grave where it is large; else only what fits.
 
-    ``error``: of the value that the calibration or the log has; ``least``: error from which on results change.
+    ``error``: of the value that the calibration or the log has; ``least``: error from which on results change;
+    ``allowed``: sigma by which the calibration allows it.
     """
-    if not matters(error, least):
-        return replace(row, cause=NO_NEED, consequence="", line="")
-    return replace(row, gravity=gravity_of(True, abs(error.value) > large))
+    if not matters(error, least, allowed):
+        return replace(row, cause=fits, consequence="", line="")
+    is_large = abs(error.value) > large
+    return replace(row, gravity=Gravity.GRAVE if is_large else Gravity.ACT)
 
 
 def unknown(reason: str) -> Estimate1D:
@@ -191,3 +207,34 @@ def signed_axes(P: np.ndarray) -> list[str]:
         ("-" if row[axis] < 0 else "") + "xyz"[axis]
         for row, axis in zip(P, largest, strict=True)
     ]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What may be wrong, and the line that mends it."""
+
+    cause: str
+    line: str
+
+
+def scale_line(role: str, key: str, config: LogConfig, gain: float) -> str:
+    """Line that divides a configured scale by a gain."""
+    scale = config.number(role, key, 1.0) / gain
+    return f"`{key} = {scale:.4g}` under [{role}] {IN_LOG_CONFIG}"
+
+
+def shift_line(role: str, config: LogConfig, shift_s: float) -> str:
+    """Line that adds to a configured offset of stamps."""
+    total_s = config.number(role, "stamp_offset_s", 0.0) + shift_s
+    return f"`stamp_offset_s = {total_s:.3f}` under [{role}] {IN_LOG_CONFIG}"
+
+
+def unused(role: str) -> str:
+    """Line that leaves a sensor out."""
+    return f"`use = false` under [{role}] {IN_LOG_CONFIG}"
+
+
+def other_world(config: LogConfig, role: str) -> str:
+    """The world that is not the configured one, as a setting."""
+    is_ned = config.table(role).get("world", "enu") == "ned"
+    return f'`world = "{"enu" if is_ned else "ned"}"` under [{role}] {IN_LOG_CONFIG}'

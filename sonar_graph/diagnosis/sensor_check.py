@@ -19,7 +19,6 @@ from sonar_graph.diagnosis.aiding_check import (
     CHECKS,
     DEPTH,
     HEADING,
-    HEADING_TURN,
     POSITIONS,
     RANGE,
     VERTICAL_BIAS,
@@ -40,11 +39,14 @@ from sonar_graph.diagnosis.findings import (
     NO_NEED,
     Finding,
     Gravity,
+    contradiction,
     in_degrees,
     judged,
     matters,
     notes_of,
     numbers,
+    scale_line,
+    shift_line,
     signed_axes,
     unknown,
     with_interval,
@@ -72,9 +74,15 @@ from sonar_graph.diagnosis.start import (
     without_bias,
 )
 from sonar_graph.diagnosis.start_place import map_findings, start_place_findings
-from sonar_graph.diagnosis.turn_rate import turn_rate_finding
-from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair, is_heading_stated
-from sonar_graph.diagnosis.units import coarse_findings, force_scale, wrong_units
+from sonar_graph.diagnosis.turn_rate import scaled_gyros, turn_rate_finding
+from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
+from sonar_graph.diagnosis.units import (
+    DVL_UNIT,
+    WRONG_UNIT,
+    coarse_findings,
+    force_scale,
+    wrong_units,
+)
 from sonar_graph.logs import (
     DRIFTING,
     FELT_ALONG,
@@ -99,6 +107,8 @@ from sonar_graph.navigation.alignment import (
 from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
+DVL_AXES = "DVL axes"
+WRONG_AXES = "wrong axes"
 ANY_AXES = "axes of gyros, accelerometers or Doppler log"
 NO_AXES = "no axes of the vehicle"
 CONTRADICTED = "they contradict each other"
@@ -241,9 +251,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if any(f.acts and f.quantity.endswith(PITCH.name) for f in by_motion):
         lever = [Finding(ARM, unknown("IMU or Doppler log is pitched"), "m")]
     reference = list(reference_findings(right, config, tilt))
-    if is_heading_stated(right):
-        pitch = tilt.angle(1)
-        off = replace(pitch, value=pitch.value - right.calibration.start.rpy_rad[1])
+    if right.calibration.start.states("rpy_rad"):
+        off = tilt.angle(1).minus(right.calibration.start.rpy_rad[1])
         by_motion, is_imu = pitched_one(by_motion, off, right.calibration)
         # a start by a pitched IMU is as wrong as its mounting
         if is_imu:
@@ -307,29 +316,6 @@ def rate_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     return [finding for finding in found if finding is not None]
 
 
-def doubts(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Findings to act on, without the slower comparison of Doppler log and accelerometers (`check_sensors`).
-
-    All grave ones of axes, units and aiding sensors are among them. Of a heading that is turned against known positions
-    only a large turn.
-    """
-    if faults := wrong_units(sequence, config):
-        return faults
-    right = without_gravity(without_stuck(sequence))
-    if spoilt_by(right):
-        return []
-    if coarse := coarse_findings(right):
-        return coarse
-    forces, right = force_findings(right, config)
-    axes, right = tried_axes(right, config)
-    if any(finding.estimate.reason == NO_AXES for finding in axes):
-        return [*forces, *axes]
-    if rates := rate_findings(right, config):
-        return worst_first([*forces, *axes, *rates])
-    found = worst_first([*forces, *axes, *motion_findings(right, config)])
-    return [f for f in found if f.acts and (f.grave or f.quantity != HEADING_TURN)]
-
-
 def by_late_imu(
     of_dvl: list[Finding], by_motion: list[Finding], config: LogConfig
 ) -> tuple[list[Finding], list[Finding]]:
@@ -339,17 +325,14 @@ def by_late_imu(
     if not (late.acts and delays):
         return of_dvl, by_motion
     for delay in delays:
-        together = replace(
-            delay.estimate, value=delay.estimate.value + late.estimate.value
-        )
+        together = delay.estimate.minus(-late.estimate.value)
         if matters(together, LEAST_TOGETHER_S, late.estimate.sigma):
             return of_dvl, by_motion
-    total_s = config.number("imu", "stamp_offset_s", 0.0) - late.estimate.value
     names = " and ".join(delay.quantity.partition(" against")[0] for delay in delays)
     of_imu = replace(
         late,
         cause=f"{names} differ from the IMU by as much: the IMU's own stamps are wrong",
-        line=f"`stamp_offset_s = {total_s:.3f}` under [imu] {IN_LOG_CONFIG}",
+        line=shift_line("imu", config, -late.estimate.value),
     )
     return [of_imu, *others], [f for f in by_motion if f not in delays]
 
@@ -419,14 +402,8 @@ def tried_axes(sequence: Sequence, config: LogConfig) -> tuple[list[Finding], Se
 
 def no_axes_finding(quantity: str, cause: str) -> Finding:
     """Gyros, accelerometers and Doppler log that no axes bring together."""
-    return Finding(
-        quantity,
-        unknown(NO_AXES),
-        cause=cause,
-        line="name a `topic` under [dvl] or [imu] with values in axes of the vehicle or of the sensor "
-        f"{IN_LOG_CONFIG}",
-        gravity=Gravity.GRAVE,
-    )
+    line = f"name a `topic` under [dvl] or [imu] with values in axes of the vehicle or of the sensor {IN_LOG_CONFIG}"
+    return contradiction(quantity, cause, line, NO_AXES)
 
 
 def axes_findings(
@@ -441,7 +418,7 @@ def axes_findings(
     ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
     if ratio is not None:
         cause = f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle"
-        return [no_axes_finding("DVL axes", cause)], sequence
+        return [no_axes_finding(DVL_AXES, cause)], sequence
     found = match_axes(sequence.imu, sequence.dvl, calibration)
     if found is None:
         return [], sequence
@@ -453,7 +430,7 @@ def axes_findings(
             f"velocities change as the IMU measures, {found.ratio:.2g} times closer, "
             "with axes that are no rotation: along beams, or of wrong scale"
         )
-        return [no_axes_finding("DVL axes", cause)], sequence
+        return [no_axes_finding(DVL_AXES, cause)], sequence
     if found.scale != 1.0:
         return scaled_dvl(found, sequence, config)
     is_as_read = (found.gyro == np.eye(3)).all() and (found.dvl == np.eye(3)).all()
@@ -474,12 +451,12 @@ def axes_findings(
             "have it"
         )
         findings.append(gyro_axes_finding(found.gyro, cause, sequence, config))
-        sequence = turned_gyros(sequence, found.gyro)
+        sequence = scaled_gyros(sequence, found.gyro)
     turn = vertical_turn(found.dvl)
     if turn is not None:
         pair = TurnedPair(sequence, turn)
         cause = axes_cause(found)
-        findings.append(pair.finding("DVL axes", unknown("wrong axes"), cause))
+        findings.append(pair.finding(DVL_AXES, unknown(WRONG_AXES), cause))
         sequence = pair.corrected()
     elif (found.dvl != np.eye(3)).any():
         axes = found.dvl if found.is_vertical_sure else upright(found.dvl, sequence)
@@ -492,14 +469,10 @@ def scaled_dvl(
     found: AxesMatch, sequence: Sequence, config: LogConfig
 ) -> tuple[list[Finding], Sequence]:
     """Another unit of the velocities, and the sequence with it put right."""
-    scale = config.number("dvl", "scale", 1.0) * found.scale
-    finding = Finding(
-        "DVL: unit",
-        unknown("wrong unit"),
-        cause=f"velocities change {1 / found.scale:.3g} times as much as the IMU measures",
-        line=f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}",
-        gravity=Gravity.GRAVE,
-    )
+    times = 1 / found.scale
+    cause = f"velocities change {times:.3g} times as much as the IMU measures"
+    line = scale_line("dvl", "scale", config, times)
+    finding = contradiction(DVL_UNIT, cause, line, WRONG_UNIT)
     dvl = sequence.dvl
     scaled = Dvl(dvl.stamps_ns, found.scale * dvl.velocity, dvl.velocity_cov)
     return [finding], replace(sequence, dvl=scaled)
@@ -521,13 +494,12 @@ def force_axes(
         ", ".join(f'"{name}"' for name in signed_axes(np.round(axes)))
         for axes in (rotation, rate_axes)
     ]
-    finding = Finding(
+    finding = contradiction(
         "accelerometer axes",
-        unknown("wrong axes"),
+        estimate=WRONG_AXES,
         cause=f"forces change as gyros and Doppler log have it, {found.ratio:.2g} times closer, about the axes "
         f"({', '.join(signed_axes(found.dvl.T))})",
         line=f"`rotation = [{lines[0]}]` and `angular_velocity_axes = [{lines[1]}]` under [imu] {IN_LOG_CONFIG}",
-        gravity=Gravity.GRAVE,
     )
     imu = sequence.imu
     force = imu.specific_force @ turn.T
@@ -543,12 +515,11 @@ def gyro_axes_finding(
     given = config.table("imu").get("angular_velocity_axes", ("x", "y", "z"))
     driver = body_R_imu.T @ axes @ body_R_imu @ axes_matrix(given)
     names = ", ".join(f'"{name}"' for name in signed_axes(np.round(driver)))
-    return Finding(
+    return contradiction(
         "gyro axes",
-        unknown("wrong axes"),
-        cause=f"{cause}, and the accelerometers have the right ones",
-        line=f"`angular_velocity_axes = [{names}]` under [imu] {IN_LOG_CONFIG}",
-        gravity=Gravity.GRAVE,
+        f"{cause}, and the accelerometers have the right ones",
+        f"`angular_velocity_axes = [{names}]` under [imu] {IN_LOG_CONFIG}",
+        WRONG_AXES,
     )
 
 
@@ -588,13 +559,7 @@ def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
         names = ", ".join(f'"{name}"' for name in signed_axes(driver))
         cause += ": mirrored, the driver gives one axis the wrong sign"
         line = f"`rotation = [{names}]` under [dvl] {IN_LOG_CONFIG}, after which the mounting counts"
-    return Finding(
-        "DVL axes",
-        unknown("wrong axes"),
-        cause=cause,
-        line=line,
-        gravity=Gravity.GRAVE,
-    )
+    return contradiction(DVL_AXES, cause, line, WRONG_AXES)
 
 
 def axes_cause(found: AxesMatch) -> str:
@@ -612,14 +577,6 @@ def vertical_turn(axes: Floats) -> float | None:
     is_turn = axes[2, 2] == 1.0 and np.linalg.det(axes) > 0
     yaw_rad = float(np.arctan2(axes[1, 0], axes[0, 0]))
     return yaw_rad if is_turn and yaw_rad else None
-
-
-def turned_gyros(sequence: Sequence, axes: Floats) -> Sequence:
-    """Sequence with rates about other axes of the body."""
-    R = sequence.calibration.imu.mounting.pose().rotation().matrix()
-    imu = sequence.imu
-    rate = imu.angular_velocity @ (R.T @ axes @ R).T
-    return replace(sequence, imu=replace(imu, angular_velocity=rate))
 
 
 def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
@@ -650,7 +607,7 @@ def motion_findings(
     if len(against_gyros) > 1:
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
-        right = turned_gyros(right, Z_NEGATED)
+        right = scaled_gyros(right, Z_NEGATED)
         motion = BodyMotion.of(right)
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
@@ -705,18 +662,16 @@ def dvl_findings(
         "turn the DVL's mounting",
         line=f"`dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
     )
-    scale = config.number("dvl", "scale", 1.0) * found.scale.value
     scaled = Finding(
         "DVL scale",
         found.scale,
         cause="scale the DVL's velocities",
-        line=f"`scale = {scale:.4f}` under [dvl] {IN_LOG_CONFIG}",
+        line=scale_line("dvl", "scale", config, 1.0 / found.scale.value),
     )
-    error = replace(found.scale, value=found.scale.value - 1)
     return [
-        judged(late, offset, LEAST_OFFSET_S, LARGE_OFFSET_S),
-        judged(turned, found.yaw, LEAST_YAW_RAD, LARGE_TURN_RAD),
-        judged(scaled, error, LEAST_SCALE, LARGE_SCALE),
+        judged(late, offset, LEAST_OFFSET_S, large=LARGE_OFFSET_S),
+        judged(turned, found.yaw, LEAST_YAW_RAD, large=LARGE_TURN_RAD),
+        judged(scaled, found.scale.minus(1.0), LEAST_SCALE, large=LARGE_SCALE),
     ]
 
 
@@ -732,7 +687,7 @@ def brought_apart(before: Sequence, after: Sequence) -> str:
         agrees = check.compare(after, second)
         if agreed is None or agrees is None or not agrees.gain.is_known:
             continue
-        off = replace(agrees.gain, value=agrees.gain.value - 1.0)
+        off = agrees.gain.minus(1.0)
         error = abs(off.value) - abs(agreed.gain.value - 1.0)
         # the same rows twice, whose noise is common to both; a gain that would be right in itself decides nothing
         is_worse = error > PAIRED_SIGMAS * agrees.gain.sigma
@@ -756,14 +711,9 @@ def contradicted(finding: Finding, names: str) -> Finding:
 
 def offset_row(name: str, offset: Estimate1D, role: str, config: LogConfig) -> Finding:
     """Row for a time offset of the stamps of a role."""
-    total_s = config.number(role, "stamp_offset_s", 0.0) + offset.value
-    return Finding(
-        f"{name}: time offset",
-        offset,
-        "s",
-        "shift its stamps",
-        line=f"`stamp_offset_s = {total_s:.3f}` under [{role}] {IN_LOG_CONFIG}",
-    )
+    line = shift_line(role, config, offset.value)
+    quantity = f"{name}: time offset"
+    return Finding(quantity, offset, "s", "shift its stamps", line=line)
 
 
 def with_instant(offset: Estimate1D, imu: Imu) -> Estimate1D:
@@ -802,7 +752,7 @@ def surest_bias(
         if tilt.is_rest and (not driven.is_known or at_rest.sigma < driven.sigma):
             pair, other = other, pair
         (bias, source), (rival, of_rival) = pair, other
-        apart = replace(bias, value=rival.value - bias.value)
+        apart = bias.minus(rival.value)
         # a bias that changed is one row with both numbers
         if rival.is_known and matters(apart, LEAST_BIAS_RAD_S, rival.sigma):
             source += f" ({of_rival} {with_interval(rival, 'rad/s')})"
@@ -818,7 +768,7 @@ def with_vertical(bias: Estimates3D, vertical: Estimate1D, up: Floats) -> Estima
     axis = int(np.argmax(np.abs(up)))
     beside = sum(one.value * up[k] for k, one in enumerate(bias) if k != axis)
     by_heading = (vertical.value - beside) / up[axis]
-    apart = replace(vertical, value=by_heading - bias[axis].value)
+    apart = replace(vertical, value=by_heading).minus(bias[axis].value)
     if matters(apart, LEAST_BIAS_RAD_S, bias[axis].sigma):
         return bias
     estimates = [(bias[axis].value, bias[axis].sigma), (by_heading, vertical.sigma)]
@@ -831,12 +781,13 @@ def without_acting_bias(
 ) -> tuple[Sequence, Estimates3D]:
     """The sequence with the bias that its line states, and what is left of the bias."""
     calibration = sequence.calibration
-    stated = with_bias(bias, calibration.imu)
+    acting = acting_bias(bias, calibration.imu)
     x, y, z = (
-        replace(one, value=one.value - acting.value)
-        for one, acting in zip(bias, acting_bias(bias, calibration.imu), strict=True)
+        one.minus(stated.value) for one, stated in zip(bias, acting, strict=True)
     )
-    calibration = calibration.model_copy(update={"imu": stated})
+    calibration = calibration.model_copy(
+        update={"imu": with_bias(bias, calibration.imu)}
+    )
     return replace(sequence, calibration=calibration), (x, y, z)
 
 
@@ -893,13 +844,12 @@ def noise_findings(sequence: Sequence) -> Iterator[Finding]:
         rest = f"from {found.still_s:.0f} s of rest"
         fits = f"{rest}; the calibration's {given:.2g} fits, {NO_NEED}"
         row = Finding(quantity, estimate, unit, fits)
-        error = replace(estimate, value=estimate.value - given)
         is_other = estimate.value > 0 and given > 0
         if is_other:
             is_other = abs(np.log(estimate.value / given)) > np.log(
                 LARGEST_DENSITY_RATIO
             )
-        if (is_other or not given) and matters(error, 0.0):
+        if (is_other or not given) and matters(estimate.minus(given), 0.0):
             line = f"`imu.{key} = {estimate.value:.2g}` {IN_CALIBRATION}"
             cause = f"{rest}, not the calibration's {given:.2g}"
             row = replace(row, cause=cause, line=line, gravity=Gravity.ACT)

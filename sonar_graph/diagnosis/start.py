@@ -14,7 +14,6 @@ from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     NO_NEED,
     Finding,
-    gravity_of,
     in_degrees,
     judged,
     matters,
@@ -58,7 +57,6 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
     """
     if not any(estimate.is_known for estimate in found.lever):
         return [Finding(ARM, found.lever[0], "m")]
-    given = given_arm(calibration)
     # the line has all three axes; those that fit stay as they are
     wrong = arm_error(found, calibration)
     imu = np.subtract(calibration.imu.mounting.translation_m, wrong)
@@ -68,15 +66,14 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
         f"`dvl.mounting.translation_m = {numbers(dvl, 3)}`"
     )
     rows = list[Finding]()
-    for axis, estimate, place, error in zip(
-        AXES, found.lever, given, wrong, strict=True
+    for axis, estimate, place in zip(
+        AXES, found.lever, given_arm(calibration), strict=True
     ):
-        fits = f"the calibration's {place:+.2f} m fits, {NO_NEED}"
-        row = Finding(f"{ARM}, {axis}", estimate, "m", fits)
-        if error:
-            cause = f"not the calibration's {place:+.2f} m"
-            row = replace(row, cause=cause, line=line, gravity=gravity_of(True, False))
-        rows.append(row)
+        of_calibration = f"the calibration's {place:+.2f} m"
+        name = f"{ARM}, {axis}"
+        row = Finding(name, estimate, "m", f"not {of_calibration}", line=line)
+        fits = f"{of_calibration} fits, {NO_NEED}"
+        rows.append(judged(row, estimate.minus(place), LEAST_LEVER_M, fits=fits))
     return said_once(rows)
 
 
@@ -88,10 +85,7 @@ def given_arm(calibration: Calibration) -> Floats:
 
 def arm_error(found: DvlMatch, calibration: Calibration) -> Floats:
     """Error of the calibration's arm, shape (3,), m; 0 along an axis on which nothing need be done."""
-    errors = [
-        replace(estimate, value=estimate.value - given)
-        for estimate, given in zip(found.lever, given_arm(calibration), strict=True)
-    ]
+    errors = map(Estimate1D.minus, found.lever, given_arm(calibration))
     return np.array([e.value if matters(e, LEAST_LEVER_M) else 0.0 for e in errors])
 
 
@@ -148,18 +142,19 @@ def bias_findings(
         f"`imu.gyro_bias_sigma = {right.gyro_bias_sigma:.2g}` {IN_CALIBRATION}"
     )
     turned_rad = D_heading @ [one.value for one in acting_bias(bias, imu)]
-    is_grave = abs(turned_rad) > LARGE_TURN_RAD
+    # all axes together turn the vehicle
+    large = 0.0 if abs(turned_rad) > LARGE_TURN_RAD else np.inf
     rows = list[Finding]()
     for axis, estimate, source in zip(AXES, bias, sources, strict=True):
+        cause = f"{source}, beyond the calibration's sigma of {allowed:.2g}"
+        row = Finding(f"{BIAS}, {axis}", estimate, "rad/s", cause, line=line)
         fits = (
             f"{source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
         )
-        row = Finding(f"{BIAS}, {axis}", estimate, "rad/s", fits)
-        if matters(estimate, LEAST_BIAS_RAD_S, allowed):
-            cause = f"{source}, beyond the calibration's sigma of {allowed:.2g}"
-            gravity = gravity_of(True, is_grave)
-            row = replace(row, cause=cause, line=line, gravity=gravity)
-        rows.append(row)
+        least = LEAST_BIAS_RAD_S
+        rows.append(
+            judged(row, estimate, least, allowed=allowed, large=large, fits=fits)
+        )
     return said_once(rows)
 
 
@@ -309,7 +304,7 @@ def tilt_findings(
         f"`start.rpy_rad = {numbers((roll.value, pitch.value, yaw_rad), 4)}`, `start.rpy_sigma_rad = "
         f"[{roll.sigma:.2g}, {pitch.sigma:.2g}, {start.rpy_sigma_rad[2]:.2g}]` {IN_CALIBRATION}"
     )
-    if start.source == "stated" and "rpy_rad" in start.model_fields_set:
+    if start.states("rpy_rad"):
         turned = calibration.imu.mounting
         for about, angle, stated_rad in zip(
             "xy", (roll, pitch), start.rpy_rad, strict=False
@@ -322,18 +317,22 @@ def tilt_findings(
     for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
         given = start.rpy_rad[axis]
         stated = f"the calibration's {np.degrees(given):+.2f}°"
-        error = replace(angle, value=wrap_angle(angle.value - given))
         row = Finding(
             f"start {name}: value",
             in_degrees(angle),
             "°",
-            f"{found.said}; {stated} fits, {NO_NEED}",
+            f"{found.said}, not {stated}",
+            line=line,
         )
-        if matters(error, LEAST_TILT_RAD, start.rpy_sigma_rad[axis]):
-            cause = f"{found.said}, not {stated}"
-            gravity = gravity_of(True, abs(error.value) > LARGE_TURN_RAD)
-            row = replace(row, cause=cause, line=line, gravity=gravity)
-        rows.append(row)
+        of_row = judged(
+            row,
+            replace(angle, value=wrap_angle(angle.value - given)),
+            LEAST_TILT_RAD,
+            allowed=start.rpy_sigma_rad[axis],
+            large=LARGE_TURN_RAD,
+            fits=f"{found.said}; {stated} fits, {NO_NEED}",
+        )
+        rows.append(of_row)
     return said_once(rows)
 
 

@@ -19,7 +19,7 @@ from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     IN_CALIBRATION,
     Finding,
-    Gravity,
+    contradiction,
     numbers,
     unknown,
 )
@@ -45,8 +45,7 @@ SUREST = 0.9
 
 def start_place_findings(right: Sequence, motion: BodyMotion) -> Iterator[Finding]:
     """Distance of a stated start from the truth or, without one, of the first landmarks from their true places."""
-    start = right.calibration.start
-    if start.source != "stated" or "position_m" not in start.model_fields_set:
+    if not right.calibration.start.states("position_m"):
         return
     by_truth = truth_finding(right, motion)
     if by_truth is not None:
@@ -65,12 +64,11 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
     seen = set(right.detections.most_probable()[0].tolist())
     named = {i for i in seen if 0 <= i < FIRST_ANONYMOUS_ID}
     if named and named.isdisjoint(known.ids):
-        yield Finding(
+        yield contradiction(
             "map: identities",
-            unknown("none in common"),
-            cause=f"none of the map's identities {listed(known.ids)} was seen; seen: {listed(named)}",
-            line="give the map of this place, with the identities of the log",
-            gravity=Gravity.GRAVE,
+            f"none of the map's identities {listed(known.ids)} was seen; seen: {listed(named)}",
+            "give the map of this place, with the identities of the log",
+            "none in common",
         )
         return
     fit = map_fit(right)
@@ -78,12 +76,11 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         why = "fewer than three of its landmarks are seen"
         yield Finding("map: axes, unit and sense", unknown(why))
     if fit.mistake:
-        yield Finding(
+        yield contradiction(
             "map: places",
-            unknown("the sightings do not fit it"),
-            cause=f"the sightings contradict the map: {fit.mistake}",
-            line=fit.remedy,
-            gravity=Gravity.GRAVE,
+            f"the sightings contradict the map: {fit.mistake}",
+            fit.remedy,
+            "the sightings do not fit it",
         )
         return
     start = right.calibration.start
@@ -98,13 +95,12 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
     if is_near or float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
         return
     stated_x, stated_y, _ = start.position_m
-    yield Finding(
+    yield contradiction(
         "start pose",
-        unknown("the map has it elsewhere"),
+        estimate="the map has it elsewhere",
         cause=f"landmarks of the map place it at ({x:.2f}, {y:.2f}) m with a yaw of {wrap_angle(yaw):.3f} rad, not at "
         f"({stated_x:.2f}, {stated_y:.2f}) m with {start.rpy_rad[2]:.3f} rad: another start, or a map of another frame?",
-        line='`start.source = "map"` ' + IN_CALIBRATION,
-        gravity=Gravity.GRAVE,
+        line=f'`start.source = "map"` {IN_CALIBRATION}',
     )
 
 
@@ -127,14 +123,13 @@ def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
     if off_m <= FARTHEST_M + way_m + ACTING_SIGMAS * sigma_m:
         return None
     place = (float(true[0]), float(true[1]), z)
-    return Finding(
+    return contradiction(
         "start position: distance from the truth",
-        Estimate1D(off_m, sigma_m),
-        "m",
+        estimate=Estimate1D(off_m, sigma_m),
+        unit="m",
         cause=f"the truth begins {off_m:.2f} m from the start of the calibration: a log that is joined after its beginning, "
         "or another world of the truth?",
         line=f"`start.position_m = {numbers(place, 2)}` {IN_CALIBRATION}",
-        gravity=Gravity.GRAVE,
     )
 
 
@@ -175,14 +170,13 @@ def map_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
     sigma_m = float(np.hypot(sigma_of(right), reach_m * start.rpy_sigma_rad[2]))
     if not off_m > FARTHEST_M + ACTING_SIGMAS * sigma_m:
         return None
-    return Finding(
+    return contradiction(
         "start pose: distance of the first landmarks from the map",
-        Estimate1D(off_m, sigma_m),
-        "m",
+        estimate=Estimate1D(off_m, sigma_m),
+        unit="m",
         cause=f"seen from the start of the calibration, landmarks are {off_m:.2f} m from their true places: another start, "
         "another world of the map, or a log that is joined after its beginning?",
         line=f"`start.position_m` and `start.rpy_rad` {IN_CALIBRATION}",
-        gravity=Gravity.GRAVE,
     )
 
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
-    IN_LOG_CONFIG,
     Finding,
-    Gravity,
+    contradiction,
     matters,
+    scale_line,
 )
 from sonar_graph.diagnosis.motion_signals import (
     UP_OVER_S,
@@ -121,16 +121,16 @@ def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
         return None
     found = compared.match
     is_wrong = is_contradicted(found, sequence)
-    is_off = matters(replace(found.gain, value=found.gain.value - 1.0), 0.0)
+    is_off = matters(found.gain.minus(1.0), 0.0)
     if not (is_wrong or (is_off and compared.excess > LEAST_EXCESS)):
         return None
-    row = Finding(
+    row = contradiction(
         TURN_RATE,
-        found.gain,
+        estimate=found.gain,
+        line="",
         cause=f"accelerometers and Doppler log turn otherwise ({100 * found.misfit:.0f} % is left): rates about the "
         "vertical are dead, clipped, filtered or of another scale",
         consequence="headings and positions are wrong from the first turn on",
-        gravity=Gravity.GRAVE,
     )
     rate_hz = NS_PER_S / float(np.median(np.diff(sequence.imu.stamps_ns)))
     causes = {
@@ -141,9 +141,8 @@ def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
     for factor, why in causes.items():
         right = rate_match(scaled_gyros(sequence, factor * np.eye(3)))
         if is_wrong and right and is_borne_out(right.match, sequence):
-            scale = config.number("imu", "angular_velocity_scale", 1.0) * factor
             cause = f"accelerometers and Doppler log turn otherwise: {why}"
-            line = f"`angular_velocity_scale = {scale:.4g}` under [imu] {IN_LOG_CONFIG}"
+            line = scale_line("imu", "angular_velocity_scale", config, 1.0 / factor)
             return replace(row, cause=cause, line=line)
     for factor in (1.0 / found.gain.value, *VERTICAL_FACTORS):
         right = rate_match(scaled_gyros(sequence, np.diag([1.0, 1.0, factor])))

@@ -14,7 +14,7 @@ from sonar_graph.diagnosis.aiding_check import POSITIONS, RANGE
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     Finding,
-    Gravity,
+    contradiction,
     numbers,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
@@ -60,9 +60,8 @@ class TurnedPair:
             motion = BodyMotion.of(right)
             if motion is None:
                 return ""
-            if self.is_near_course(right, motion) and (
-                role == "imu" or is_heading_stated(right)
-            ):
+            is_sure = role == "imu" or right.calibration.start.states("rpy_rad")
+            if is_sure and self.is_near_course(right, motion):
                 return role
             ranges = RANGE.compare(right, motion)
             if ranges is not None and ranges.gain.is_known:
@@ -75,12 +74,12 @@ class TurnedPair:
 
     def is_near_course(self, right: Sequence, motion: BodyMotion) -> bool:
         """True where the fixes move from the start as the heading there and the Doppler log have it."""
-        if right.heading is None and not is_heading_stated(right):
+        start = right.calibration.start
+        if right.heading is None and not start.states("rpy_rad"):
             return False
         course = POSITIONS.compare(right, motion)
         if course is None or not course.angle.is_known or course.is_mirrored:
             return False
-        start = right.calibration.start
         sigma = np.hypot(course.angle.sigma, start.rpy_sigma_rad[2])
         off_rad = abs(wrap_angle(course.angle.value - start.rpy_rad[2]))
         return bool(off_rad + 2 * sigma < NEAR * abs(self.yaw_rad))
@@ -99,21 +98,14 @@ class TurnedPair:
             "imu": f"{of_imu} {IN_CALIBRATION}",
         }
         either = f"{of_dvl} {IN_CALIBRATION} or, if that mounting is sure, {of_imu}"
-        return Finding(
+        return contradiction(
             quantity.replace("DVL", "IMU") if role == "imu" else quantity,
+            f"{cause}: {who} turned on the vehicle, or its driver has other axes",
+            lines.get(role, either),
             estimate,
             "°" if estimate.is_known else "",
-            cause=f"{cause}: {who} turned on the vehicle, or its driver has other axes",
-            line=lines.get(role, either),
-            gravity=Gravity.GRAVE,
         )
 
     def corrected(self) -> Sequence:
         """The sequence with the wrong mounting put right; that of the Doppler log where nothing decides."""
         return self.as_if(self.wrong_one() or "dvl")
-
-
-def is_heading_stated(sequence: Sequence) -> bool:
-    """True where the owner states the heading at the start."""
-    start = sequence.calibration.start
-    return start.source == "stated" and "rpy_rad" in start.model_fields_set

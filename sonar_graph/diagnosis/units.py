@@ -5,7 +5,6 @@ no proof. docs/theory/sensor_check.md.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -13,12 +12,10 @@ from scipy.ndimage import median_filter
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
-    NO_NEED,
     Finding,
-    Gravity,
-    gravity_of,
-    matters,
-    unknown,
+    contradiction,
+    judged,
+    scale_line,
 )
 from sonar_graph.diagnosis.sightings import sighting_pairs
 from sonar_graph.logs.adapters import LogConfig
@@ -30,6 +27,8 @@ FASTEST_M_S = 20.0
 """Implausible over the bottom for a twentieth of a log."""
 FASTEST_TURN_RAD_S = 2.0
 """Implausible for a twentieth of a log, 115 degrees a second."""
+DVL_UNIT = "DVL: unit"
+WRONG_UNIT = "wrong unit"
 SPEEDS = {"cm/s": 1e-2, "mm/s": 1e-3}
 """Factor to m/s."""
 FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
@@ -94,15 +93,14 @@ def coarse_findings(sequence: Sequence) -> list[Finding]:
         step = coarse_step(values)
         if step / 2 <= COARSE_SIGMAS * sigma:
             continue
-        finding = Finding(
+        finding = contradiction(
             f"{name}: resolution",
-            Estimate1D(step, 0.0),
-            unit,
+            estimate=Estimate1D(step, 0.0),
+            unit=unit,
             cause=f"values come in steps, most rows repeat, and the stated noise of {sigma:.2g} is far below: rounded or "
             "cut by the driver",
             consequence=f"an error of {step / 2:.2g} typically where they are cut",
             line=f"record all digits, or state {line.format(step / 2)} {IN_CALIBRATION}",
-            gravity=Gravity.GRAVE,
         )
         found.append(finding)
     return found
@@ -125,17 +123,6 @@ def coarse_step(values: Floats) -> float:
     return coarsest
 
 
-def unit_finding(sensor: str, cause: str, line: str) -> Finding:
-    """A grave finding without a number."""
-    return Finding(
-        f"{sensor}: unit",
-        unknown("wrong unit"),
-        cause=cause,
-        line=line,
-        gravity=Gravity.GRAVE,
-    )
-
-
 def velocity_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     """Speeds that no vehicle has, or that change ranges to landmarks far too much."""
     speed_m_s = exceeded_by_few(sequence.dvl.velocity)
@@ -154,8 +141,11 @@ def velocity_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     if speed_m_s > FASTEST_M_S and unit != "mm/s":
         line += f"; mm/s if the vehicle moves at {speed_m_s * SPEEDS['mm/s']:.2g} m/s"
     times = 1 / SPEEDS[unit]
-    yield unit_finding(
-        "DVL", f"velocities look {times:.0f} times too large ({why}): {unit}?", line
+    yield contradiction(
+        DVL_UNIT,
+        f"velocities look {times:.0f} times too large ({why}): {unit}?",
+        line,
+        WRONG_UNIT,
     )
 
 
@@ -170,10 +160,11 @@ def rate_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     else:
         return
     scale = config.number("imu", "angular_velocity_scale", 1.0) * np.radians(1.0)
-    yield unit_finding(
-        "gyro",
+    yield contradiction(
+        "gyro: unit",
         f"rates look {doubt}: degrees a second?",
         f"`angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}",
+        WRONG_UNIT,
     )
 
 
@@ -188,10 +179,11 @@ def force_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     if abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
         return
     scale = config.number("imu", "linear_acceleration_scale", 1.0) * FORCES[unit]
-    yield unit_finding(
-        "accelerometer",
+    yield contradiction(
+        "accelerometer: unit",
         f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}?",
         f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}",
+        WRONG_UNIT,
     )
 
 
@@ -204,17 +196,14 @@ def force_scale(sequence: Sequence, config: LogConfig) -> Finding | None:
         return None
     imu = sequence.calibration.imu
     scale = Estimate1D(typical / gravity, imu.accel_bias_sigma / gravity)
-    row = Finding("accelerometer scale", scale, cause=NO_NEED)
-    error = replace(scale, value=scale.value - 1)
-    if not matters(error, LEAST_FORCE_SCALE):
-        return row
-    key = config.number("imu", "linear_acceleration_scale", 1.0) / scale.value
-    return replace(
-        row,
+    row = Finding(
+        "accelerometer scale",
+        scale,
         cause=f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²",
-        line=f"`linear_acceleration_scale = {key:.4g}` under [imu] {IN_LOG_CONFIG}",
-        gravity=gravity_of(True, abs(error.value) > LARGE_FORCE_SCALE),
+        line=scale_line("imu", "linear_acceleration_scale", config, scale.value),
     )
+    error = scale.minus(1.0)
+    return judged(row, error, LEAST_FORCE_SCALE, large=LARGE_FORCE_SCALE)
 
 
 def tilt_rates(imu: Imu) -> tuple[float, float] | None:

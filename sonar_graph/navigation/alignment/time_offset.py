@@ -287,6 +287,10 @@ class Estimate1D:
         known = self.is_known and self.sigma <= sigma_limit
         return self if known or not self.is_known else replace(self, reason=reason)
 
+    def minus(self, value: float) -> Estimate1D:
+        """The number less one that is known."""
+        return replace(self, value=self.value - value)
+
 
 @dataclass(frozen=True, eq=False)
 class OffsetFit:
