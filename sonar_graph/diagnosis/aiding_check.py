@@ -617,7 +617,7 @@ LEAST_BIAS_S = 30.0
 
 def vertical_bias(
     sequence: Sequence,
-    motion: BodyMotion | None = None,
+    motion: BodyMotion,
     of_axes: Estimates3D | None = None,
 ) -> Finding | None:
     """Bias of the gyros about the vertical, by a heading or by true orientations; None without either.
@@ -639,9 +639,6 @@ def vertical_bias(
     else:
         return None
     bias = unknown(f"too little time beside {source}")
-    motion = motion or BodyMotion.of(sequence)
-    if motion is None:
-        return Finding(VERTICAL_BIAS, bias, "rad/s")
     t = motion.since_origin(stamps_ns)
     drift_rad = motion.reference(motion.yaw_rad)(t) - yaw_rad
     # against time itself, whose gain is the rate
@@ -792,12 +789,10 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
 
 
 def heading_findings(
-    right: Sequence, config: LogConfig, motion: BodyMotion | None = None
+    found: Match | None, right: Sequence, config: LogConfig, motion: BodyMotion
 ) -> Iterator[Finding]:
     """Sense, scale and delay of the heading; where right, the angle by which it is off the world of the positions."""
-    motion = motion or BodyMotion.of(right)
-    found = None if motion is None else HEADING.compare(right, motion)
-    if motion is None or found is None:
+    if found is None:
         return
     rows = findings_of(HEADING, found, right, config)
     yield from rows
@@ -904,8 +899,6 @@ def way_m(right: Sequence, at_ns: np.ndarray) -> np.ndarray:
     is_measured = np.isfinite(right.dvl.velocity).all(axis=1)
     stamps_ns = right.dvl.stamps_ns[is_measured]
     speed = np.linalg.norm(right.dvl.velocity[is_measured], axis=1)
-    if len(speed) < 2:
-        return np.zeros(len(at_ns))
     steps_s = np.diff(stamps_ns) / NS_PER_S
     mean_speed = (speed[1:] + speed[:-1]) / 2
     # nothing is known of a gap but how fast the vehicle goes elsewhere
@@ -924,8 +917,6 @@ def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
     t = fixes.stamps_ns
     dvl_ns = right.dvl.stamps_ns[np.isfinite(right.dvl.velocity).all(axis=1)]
     later = np.searchsorted(t, t + JUMP_NS)
-    if not len(dvl_ns):
-        return 0.0, 0
     i = np.flatnonzero((later < len(t)) & (t >= dvl_ns[0]))
     i = i[t[later[i]] <= dvl_ns[-1]]
     if not len(i):
@@ -943,16 +934,13 @@ def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
 
 
 def position_findings(
-    right: Sequence, config: LogConfig, motion: BodyMotion | None = None
+    found: Match | None, right: Sequence, config: LogConfig, motion: BodyMotion
 ) -> Iterator[Finding]:
     """Unit and delay of the position fixes, jumps that no vehicle makes, and their distance from start or origin."""
     fixes = right.positions
-    if fixes is None:
+    if fixes is None or found is None:
         return
-    motion = motion or BodyMotion.of(right)
-    found = None if motion is None else POSITIONS.compare(right, motion)
-    few = Match.unknown("too few fixes beside the Doppler log")
-    rows = findings_of(POSITIONS, found or few, right, config)
+    rows = findings_of(POSITIONS, found, right, config)
     # changes that the path does not explain may be jumps, which are a better name
     if rows[0].grave and "%" not in rows[0].advice:
         yield rows[0]
@@ -1023,7 +1011,7 @@ def led_to_fixes(
 
 
 def distance_finding(
-    right: Sequence, fixes: PositionFixes, motion: BodyMotion | None, config: LogConfig
+    right: Sequence, fixes: PositionFixes, motion: BodyMotion, config: LogConfig
 ) -> Finding:
     """Distance of the first fixes from the start, and whether they begin far from it or from the world's origin.
 
@@ -1041,7 +1029,7 @@ def distance_finding(
     from_origin_m = float(np.hypot(*near[:2]))
     sigma_m = float(np.hypot(noise_m, start_m))
     allowed_m = 5.0 * sigma_m + path_m
-    led = None if motion is None else led_to_fixes(right, fixes, motion)
+    led = led_to_fixes(right, fixes, motion)
     if led is not None:
         off, sigma_m = led
         allowed_m = 5.0 * sigma_m + FARTHEST_FROM_START_M

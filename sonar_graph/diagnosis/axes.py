@@ -26,7 +26,7 @@ from sonar_graph.navigation.alignment import (
     means_over,
     stretches_of,
 )
-from sonar_graph.numerics import running_rotations
+from sonar_graph.numerics import columns_at, running_integral, running_rotations
 
 MEAN_OVER_S = 1.0
 LONGEST_S = 240.0
@@ -243,10 +243,10 @@ class SharedRows:
         f = imu.specific_force[first] @ body_R_imu.T
         body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
         return cls(
-            increments(imu_s, w, grid_s),
-            increments(imu_s, f, grid_s),
+            np.diff(columns_at(grid_s, imu_s, running_integral(imu_s, w)), axis=0),
+            np.diff(columns_at(grid_s, imu_s, running_integral(imu_s, f)), axis=0),
             row,
-            np.column_stack([np.interp(t, imu_s, column) for column in w.T]),
+            columns_at(t, imu_s, w),
             dvl.velocity[inside] @ body_R_dvl.T,
             np.subtract(
                 calibration.dvl.mounting.translation_m,
@@ -294,11 +294,3 @@ def runs_of(t: Floats, holes: np.ndarray) -> Iterator[tuple[slice, int]]:
         together = max(1, round(MEAN_OVER_S / interval_s))
         if (run.stop - run.start) // together > FEWEST_CHANGES:
             yield run, together
-
-
-def increments(t: Floats, values: Floats, grid_s: Floats) -> Floats:
-    """Integrals of columns over the steps of a grid, by the trapezoid rule, shape (n - 1, 3)."""
-    areas = (values[1:] + values[:-1]) / 2 * np.diff(t)[:, None]
-    total = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
-    at_grid = np.column_stack([np.interp(grid_s, t, column) for column in total.T])
-    return np.diff(at_grid, axis=0)

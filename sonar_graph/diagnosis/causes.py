@@ -32,8 +32,9 @@ from sonar_graph.diagnosis.signals import (
     steps,
 )
 from sonar_graph.diagnosis.start import turned_mounting
-from sonar_graph.diagnosis.turn_rate import integral_of, residual
+from sonar_graph.diagnosis.turn_rate import residual
 from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.numerics import running_integral
 from sonar_graph.sequence import Sequence
 
 AS_GOOD = 1.1
@@ -284,7 +285,7 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
     for part in np.unique(motion.parts):
         rows = np.flatnonzero(motion.parts == part)
         t = motion.seconds[rows]
-        by_forces = felt.impulse_m_s[rows] - integral_of(t, gravity[rows])
+        by_forces = felt.impulse_m_s[rows] - running_integral(t, gravity[rows])
         # a wrong unit of velocities was found before
         found = steps(t, felt.velocity_m_s[rows], by_forces, BEST_NOISE_M_S, ratio=1.0)
         for step in found:

@@ -12,18 +12,16 @@ log: rows are numbered by the part without one that they belong to, and referenc
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis.signals import SignalStretch, Values, root_mean_square
 from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
 from sonar_graph.navigation.alignment import InertialPath
+from sonar_graph.numerics import columns_at, running_integral
 from sonar_graph.sequence import Sequence
 
-Number = TypeVar("Number", np.float64, np.complex128)
 UP_OVER_S = 1.0
 """Time over which the felt direction of up is averaged."""
 STRETCH_S = 120.0
@@ -111,7 +109,7 @@ class BodyMotion:
         up = np.einsum("nji,nj->ni", C, up_in_path)
         is_held = calibration.odometry_interpolation == "hold-past"
         # at the IMU's rate, since turns are faster than rows of the Doppler log
-        yaw_at_imu = integral(
+        yaw_at_imu = running_integral(
             path.seconds, yaw_rate(path, t, up_in_path), is_held=is_held
         )
         yaw_rad = np.interp(t, path.seconds, yaw_at_imu)
@@ -125,9 +123,9 @@ class BodyMotion:
             parts=np.concatenate([[0], np.cumsum(breaks)]),
             up=up,
             yaw_rad=np.asarray(yaw_rad, np.float64),
-            height_m=integral(t, np.sum(v * up, axis=1), is_held=is_held),
-            path_m=integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
-            ahead_m=integral(t, level_v.real, is_held=is_held),
+            height_m=running_integral(t, np.sum(v * up, axis=1), is_held=is_held),
+            path_m=running_integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
+            ahead_m=running_integral(t, level_v.real, is_held=is_held),
             felt=felt,
         )
 
@@ -234,24 +232,11 @@ def part_edges(path: InertialPath, t: Floats, side: str) -> Floats:
     return path.seconds[np.searchsorted(path.parts, part, side="right") - 1]
 
 
-def integral(
-    t: Floats, values: NDArray[Number], *, is_held: bool = False
-) -> NDArray[Number]:
-    """Running integral from zero: by the trapezoid rule, or of values that hold for the time before them."""
-    means = values[1:] if is_held else (values[1:] + values[:-1]) / 2
-    return np.concatenate([np.zeros(1, values.dtype), np.cumsum(means * np.diff(t))])
-
-
-def columns_at(at: Floats, t: Floats, values: Floats) -> Floats:
-    """Columns of values at other times, linear in between."""
-    return np.column_stack([np.interp(at, t, column) for column in values.T])
-
-
 def smoothed(t: Floats, values: Floats) -> Floats:
     """Columns averaged over `UP_OVER_S`, or as they are where rows are farther apart."""
     if np.median(np.diff(t)) >= UP_OVER_S / 2:
         return values
-    total = np.column_stack([integral(t, column) for column in values.T])
+    total = running_integral(t, values)
     begin = np.maximum(t - UP_OVER_S / 2, t[0])
     end = np.minimum(t + UP_OVER_S / 2, t[-1])
     gained = columns_at(end, t, total) - columns_at(begin, t, total)

@@ -626,7 +626,7 @@ def motion_findings(
         )
         if match is not None and not is_range_wrong:
             found += findings_of(check, match, right, config)
-    of_heading = list(heading_findings(right, config, motion))
+    of_heading = list(heading_findings(matches[HEADING], right, config, motion))
     is_heading_wrong = any(
         f.quantity == HEADING.quantity and f.acts for f in of_heading
     )
@@ -637,7 +637,7 @@ def motion_findings(
     # positions, where there are any, give the angle itself
     if not any(f.acts for f in of_heading):
         found += start_heading_findings(right, motion)
-    found += position_findings(right, config, motion)
+    found += position_findings(matches[POSITIONS], right, config, motion)
     # a wrong unit of either makes another height too
     if not any(f.grave for f in found):
         found += fix_height_findings(right, config)

@@ -400,7 +400,9 @@ def median_changes(e: Floats, rows: int) -> Floats:
 
 def centred(values: Values, stretch: SignalStretch) -> Values:
     """Values about their mean, but for changes."""
-    return np.asarray(values - np.nanmean(values) * stretch.has_offset)
+    known = values[np.isfinite(values)]
+    has_mean = stretch.has_offset and len(known)
+    return np.asarray(values - known.mean()) if has_mean else values
 
 
 def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
@@ -417,8 +419,10 @@ def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
 
 
 def root_mean_square(parts: list[Values]) -> float:
-    """Of the finite values of all parts."""
-    return float(np.sqrt(np.nanmean(np.abs(np.concatenate(parts)) ** 2)))
+    """Of the finite values of all parts; NaN without any."""
+    values = np.concatenate(parts)
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.abs(values) ** 2))) if len(values) else np.nan
 
 
 def weighted(estimates: list[tuple[float, float]]) -> Estimate1D:

@@ -25,12 +25,12 @@ from sonar_graph.diagnosis.findings import (
 from sonar_graph.diagnosis.motion_signals import (
     UP_OVER_S,
     BodyMotion,
-    integral,
     smoothed,
 )
 from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, match
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.numerics import running_integral
 from sonar_graph.sequence import Sequence
 
 GRAVITY_OVER_S = 30.0
@@ -94,7 +94,7 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
     noise = max(float(np.sqrt(np.mean(off_along**2))), 1e-12)
     excess = float(np.sqrt(np.mean(off_across**2))) / noise
     # averaged as the forces are
-    turned = integral_of(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
+    turned = running_integral(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
     by_rate = np.gradient(smoothed(t, turned), t, axis=0)
     by_velocity = np.gradient(smoothed(t, felt.velocity_m_s), t, axis=0) - by_rate
     found = gain_along(motion, by_rate, r, across)
@@ -207,11 +207,6 @@ def gain_along(
     x = y + np.sum(r * direction, axis=1)
     rows = motion.stretches(t, y, lambda at: np.interp(at, t, x))
     return match(rows, find_lag=False)
-
-
-def integral_of(t: Floats, columns: Floats) -> Floats:
-    """Running integrals of columns, shape (n, 3)."""
-    return np.column_stack([integral(t, column) for column in columns.T])
 
 
 def residual(motion: BodyMotion, gravity_m_s2: Floats) -> Floats:

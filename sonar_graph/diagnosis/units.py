@@ -21,6 +21,7 @@ from sonar_graph.diagnosis.sightings import sighting_pairs
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats, Imu
 from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.numerics import columns_at, running_integral
 from sonar_graph.sequence import Sequence
 
 FASTEST_M_S = 20.0
@@ -248,13 +249,12 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
     calibration = sequence.calibration
     v = dvl.velocity[rows] @ calibration.dvl.mounting.pose().rotation().matrix().T
     v = median_filter(v, size=(MEDIAN_ROWS, 1))  # outliers would add up
-    steps = (v[1:] + v[:-1]) / 2 * np.diff(dvl_s)[:, None]
-    path = np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    moved = [np.interp(t[j], dvl_s, p) - np.interp(t[i], dvl_s, p) for p in path.T]
+    path = running_integral(dvl_s, v)
+    moved = columns_at(t[j], dvl_s, path) - columns_at(t[i], dvl_s, path)
     azimuth = seen.azimuth_rad
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
     u = ahead @ calibration.sonar.mounting.pose().rotation().matrix().T
-    by_dvl = np.abs(np.einsum("ak,ka->k", moved, (u[i] + u[j]) / 2))
+    by_dvl = np.abs(np.einsum("ka,ka->k", moved, (u[i] + u[j]) / 2))
     measured = np.abs(seen.range_m[j] - seen.range_m[i])
     least = calibration.sonar.range_sigma_m
     # the range of a landmark abeam hardly changes: a change below the noise does not count

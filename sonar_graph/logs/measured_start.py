@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.logs.adapters import plain_lines
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
-from sonar_graph.numerics import running_rotations
+from sonar_graph.numerics import columns_at, running_integral, running_rotations
 
 NEAREST_ROWS = 5
 """Rows about the start whose median counts, so that one wrong row does not."""
@@ -82,9 +82,6 @@ class FirstPath:
         # turns are counted from the start on
         C = C[np.searchsorted(t, 0.0, side="right") - 1].T @ C
         force = np.einsum("nij,nj->ni", C, imu.specific_force[rows] @ body_R_imu.T)
-        F = np.vstack(
-            [np.zeros(3), np.cumsum((force[1:] + force[:-1]) / 2 * dt, axis=0)]
-        )
         seconds = (dvl.stamps_ns - start_ns) * 1e-9
         is_inside = (
             (seconds >= 0) & (seconds <= t[-1]) & np.isfinite(dvl.velocity).all(axis=1)
@@ -93,17 +90,15 @@ class FirstPath:
         at = C[np.searchsorted(t, seconds, side="right") - 1]
         body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
         velocity = np.einsum("nij,nj->ni", at, dvl.velocity[is_inside] @ body_R_dvl.T)
-        impulse = np.column_stack([np.interp(seconds, t, column) for column in F.T])
+        impulse = columns_at(seconds, t, running_integral(t, force))
         return cls(seconds, velocity, impulse)
 
     def moved(self, seconds: Floats) -> Floats:
         """C v integrated from the start to some instants, shape (n, 3), m."""
         if len(self.seconds) < 2:
             return np.zeros((len(seconds), 3))
-        steps = np.diff(self.seconds)[:, None]
-        means = (self.velocity[1:] + self.velocity[:-1]) / 2
-        p = np.vstack([np.zeros(3), np.cumsum(means * steps, axis=0)])
-        return np.column_stack([np.interp(seconds, self.seconds, x) for x in p.T])
+        path = running_integral(self.seconds, self.velocity)
+        return columns_at(seconds, self.seconds, path)
 
     def up(self, calibration: Calibration) -> tuple[Floats, float] | None:
         """The world's up at the start, shape (3,), and its sigma in rad; None without gravity in the accelerometers."""
@@ -252,9 +247,9 @@ def _turned(
     level_R_body = Rotation.from_euler("ZYX", [0.0, tilt_rad[1], tilt_rad[0]])
     body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
     rate = (imu.angular_velocity - calibration.imu.gyro_bias_rad_s) @ body_R_imu.T
-    about_up = rate @ level_R_body.as_matrix()[2]
-    steps = (about_up[1:] + about_up[:-1]) / 2 * np.diff(imu.stamps_ns) * 1e-9
-    turn = np.append(0.0, np.cumsum(steps))
+    about_up = np.asarray(rate @ level_R_body.as_matrix()[2], np.float64)
+    seconds = np.asarray((imu.stamps_ns - start_ns) * 1e-9, np.float64)
+    turn = running_integral(seconds, about_up)
     at = np.interp(at_ns, imu.stamps_ns, turn)
     return np.asarray(at - np.interp(start_ns, imu.stamps_ns, turn))
 
@@ -292,8 +287,7 @@ def yaw_by_fixes(
 ) -> tuple[float, float]:
     """Yaw at the start and its sigma, rad, that turns the path by gyros and Doppler log into that of the fixes."""
     level = level_R_body.apply(path.velocity) @ [1.0, 1j, 0.0]
-    steps = (level[1:] + level[:-1]) / 2 * np.diff(path.seconds)
-    p = np.concatenate([[0.0], np.cumsum(steps)])
+    p = running_integral(path.seconds, level)
     is_inside = (t >= 0) & (t <= path.seconds.max(initial=0.0))
     if np.count_nonzero(is_inside) < FEWEST_FIXES:
         return 0.0, UNKNOWN_YAW_SIGMA_RAD

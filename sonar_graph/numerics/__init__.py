@@ -1,4 +1,4 @@
-"""Compiled functions, and rotations, vectors and matrices inside them; quantiles of chi-square."""
+"""Compiled functions, and rotations, vectors and matrices inside them; quantiles of chi-square; integrals."""
 
 # fmt: off
 from sonar_graph.numerics.chi_square import chi_square_exceeded, chi_square_quantile, chi_square_share
@@ -9,12 +9,13 @@ from sonar_graph.numerics.matrices import (
     cross, cross_matrix, curvature, diagonal, exp_and_mean, inlined, mat, mat6, outer, quaternion, rodrigues, rotation_log,
     running_rotations, skew, store, store6, store_all, store_row, store_row6, store_vector, vec,
 )
+from sonar_graph.numerics.series import columns_at, running_integral
 
 __all__ = [
     "I3", "LOWER_LEFT", "LOWER_RIGHT", "Mat3", "Mat6", "O3", "UPPER_RIGHT", "Vec3", "Vec6", "ZERO",
-    "chi_square_exceeded", "chi_square_quantile", "chi_square_share", "chord_inverse", "compilable", "compiled",
-    "compiled_beside",
-    "compiling_s", "cross", "cross_matrix", "curvature", "diagonal", "exp_and_mean", "inlined",
-    "mat", "mat6", "needs_compiling", "outer", "quaternion", "rodrigues", "rotation_log", "running_rotations", "skew",
+    "chi_square_exceeded", "chi_square_quantile", "chi_square_share", "chord_inverse", "columns_at", "compilable",
+    "compiled", "compiled_beside", "compiling_s", "cross", "cross_matrix", "curvature", "diagonal", "exp_and_mean",
+    "inlined", "mat", "mat6", "needs_compiling", "outer", "quaternion", "rodrigues", "rotation_log", "running_integral",
+    "running_rotations", "skew",
     "store", "store6", "store_all", "store_row", "store_row6", "store_vector", "vec",
 ]

@@ -87,7 +87,8 @@ def test_a_turn_in_a_hole_of_the_imu_is_no_bias_of_the_gyros(
     found = aiding_check.vertical_bias(run, motion)
     assert found is not None
     assert (abs(found.estimate.value) < 1e-3) == is_broken
-    rows = list(aiding_check.heading_findings(run, LogConfig(), motion))
+    match = aiding_check.HEADING.compare(run, motion)
+    rows = list(aiding_check.heading_findings(match, run, LogConfig(), motion))
     assert not (is_broken and any(row.acts for row in rows))
 
 

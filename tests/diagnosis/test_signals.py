@@ -92,3 +92,17 @@ def test_an_interval_is_of_few_blocks_by_hand() -> None:
     )
     (sigma,) = fit.sigmas()
     assert sigma == pytest.approx(SMALL_SAMPLE * np.sqrt(n * n / (n - 1)) / n)
+
+
+def test_a_reference_that_is_known_nowhere_gives_no_warning():
+    """In one of two stretches; and beside the rows, where it has no derivative."""
+    known = SignalStretch(T, wave(T), wave)
+    unknown = SignalStretch(T + 200.0, wave(T), lambda at: np.nan * at)
+    found = match([known, unknown])
+    assert found.gain.value == pytest.approx(1.0)
+    at_rows = SignalStretch(
+        T, wave(T), lambda at: np.where(np.isin(at, T), wave(at), np.nan)
+    )
+    found = match([at_rows], find_lag=False)
+    assert found.gain.value == pytest.approx(1.0)
+    assert np.isnan(found.rate)
