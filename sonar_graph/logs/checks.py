@@ -6,6 +6,7 @@ Nothing is corrected here. Each check returns sentences for the notes of a seque
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
 
+Mask = NDArray[np.bool_]
 MOST_NAMED = 3
 """Gaps or stretches of one kind that are named one by one; of more, the longest."""
 LEAST_PART_UPWARDS = 0.7
@@ -181,7 +183,7 @@ def _dvl_gap_warnings(
         )
 
 
-def is_partial(dvl: Dvl) -> NDArray[np.bool_]:
+def is_partial(dvl: Dvl) -> Mask:
     """Rows that leave a direction of the velocity unmeasured, shape (n,)."""
     variances = np.trace(dvl.velocity_cov, axis1=1, axis2=2)
     return np.asarray(variances > 0.5 * UNMEASURED_M_S**2)
@@ -204,7 +206,7 @@ def imu_holes(stamps_ns: Ints) -> Ints:
     return _gaps_where(is_hole, stamps_ns)
 
 
-def _gaps_where(chosen: NDArray[np.bool_], stamps_ns: Ints) -> Ints:
+def _gaps_where(chosen: Mask, stamps_ns: Ints) -> Ints:
     before = np.flatnonzero(chosen)
     return np.column_stack((stamps_ns[before], stamps_ns[before + 1]))
 
@@ -374,8 +376,7 @@ def fresh_rows(values: Floats) -> Floats:
 
     Rows of a sensor that is frozen are all alike, and have a finding of their own.
     """
-    moves = np.any(values[1:] != values[:-1], axis=1)
-    fresh = values[1:][moves]
+    fresh = values[1:][differing(values)]
     return fresh if len(fresh) >= FEWEST_FRESH else fresh[:0]
 
 
@@ -511,17 +512,14 @@ def stuck_warning(
     row, shape (n,), a stretch counts only where the vehicle is not at rest, and where its m of n rows, with a share p that
     repeats the row before, come by chance less than once in a thousand such logs, ``n p^(m - 1) < 0.001``.
     """
-    differs = np.any(values[1:] != values[:-1], axis=1)
-    first, last = runs_of(differs)
-    is_long = (stamps_ns[last] - stamps_ns[first] > STUCK_S * 1e9) & (
-        last - first + 1 >= STUCK_ROWS
-    )
+    runs = Runs.of(differing(values))
+    is_long = runs.are_long(stamps_ns, STUCK_S, STUCK_ROWS)
     if way_m is not None:
         # resolution alone makes short stretches of equal rows
-        is_long &= ~_may_be_chance(differs, last - first)
-        duration_s = np.maximum((stamps_ns[last] - stamps_ns[first]) / 1e9, 1e-9)
-        is_long &= (way_m[last] - way_m[first]) / duration_s > FASTEST_RESTING_M_S
-    is_zero = ~np.any(values[first], axis=1)
+        is_long &= ~runs.may_be_chance()
+        duration_s = np.maximum(runs.span(stamps_ns) / 1e9, 1e-9)
+        is_long &= runs.span(way_m) / duration_s > FASTEST_RESTING_M_S
+    is_zero = ~np.any(values[runs.first], axis=1)
     texts = []
     for chosen, what in (
         (is_long & is_zero, "exactly zero"),
@@ -529,32 +527,73 @@ def stuck_warning(
     ):
         if not chosen.any():
             continue
-        begin = first[chosen]
-        end = last[chosen]
-        rows = end - begin + 1
-        times = f"{_longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))} s after the first"
-        more = (
-            f" of {len(rows)} stretches, the longest" if len(rows) > MOST_NAMED else ","
-        )
-        texts.append(f"{what} in {rows.sum()} rows{more} {times}")
+        rows, times = runs.text(chosen, stamps_ns)
+        count = np.count_nonzero(chosen)
+        more = f" of {count} stretches, the longest" if count > MOST_NAMED else ","
+        texts.append(f"{what} in {rows} rows{more} {times} s after the first")
     if not texts:
         return None
     return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be sending without lock"
 
 
-def runs_of(differs: NDArray[np.bool_]) -> tuple[Ints, Ints]:
-    """First and last rows of runs of equal rows; ``differs``: whether each row but the first differs from the one before."""
-    first = np.concatenate([[0], np.flatnonzero(differs) + 1])
-    last = np.concatenate([first[1:] - 1, [len(differs)]])
-    return first, last
+def differing(values: NDArray[Any]) -> Mask:
+    """True for each row but the first, shape (n - 1,), that differs from the row before."""
+    return np.asarray(np.any(values[1:] != values[:-1], axis=1))
 
 
-def _may_be_chance(differs: NDArray[np.bool_], repeated: Ints) -> NDArray[np.bool_]:
-    """Stretches whose number of repeated rows comes by chance once in a thousand logs of a coarse sensor, shape (k,)."""
-    if not differs.any():
-        return np.zeros(len(repeated), bool)
-    share = 1.0 - float(differs.mean())
-    return np.asarray((len(differs) + 1) * share**repeated >= 1e-3)
+class Runs(NamedTuple):
+    """Runs of successive rows that are equal."""
+
+    first: Ints
+    """First row of each, shape (k,)."""
+    last: Ints
+
+    @classmethod
+    def of(cls, differs: Mask) -> "Runs":
+        """Runs by whether each row but the first differs from the row before."""
+        first = np.concatenate([[0], np.flatnonzero(differs) + 1])
+        return cls(first, np.concatenate([first[1:] - 1, [len(differs)]]))
+
+    @property
+    def rows(self) -> Ints:
+        """Number of rows of each, shape (k,)."""
+        return self.last - self.first + 1
+
+    def span(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Change of values, shape (n,), from the first row of each run to its last, shape (k,)."""
+        return np.asarray(values[self.last] - values[self.first])
+
+    def are_long(self, stamps_ns: Ints, seconds: float, fewest: int) -> Mask:
+        """Runs that last longer and have at least so many rows, shape (k,)."""
+        return np.asarray(
+            (self.span(stamps_ns) > seconds * 1e9) & (self.rows >= fewest)
+        )
+
+    def may_be_chance(self) -> Mask:
+        """Runs whose number of repeated rows comes by chance once in a thousand logs of a coarse sensor, shape (k,)."""
+        changes = len(self.first) - 1
+        if not changes:
+            return np.zeros(1, bool)
+        n = int(self.last[-1]) + 1
+        share = 1.0 - changes / (n - 1)
+        return np.asarray(n * share ** (self.rows - 1) >= 1e-3)
+
+    def mask(self, chosen: Mask) -> Mask:
+        """Rows of the chosen runs, shape (n,)."""
+        return np.repeat(chosen, self.rows)
+
+    def repeats(self, chosen: Mask) -> Mask:
+        """Rows of the chosen runs but for the first of each, which was measured, shape (n,)."""
+        found = self.mask(chosen)
+        found[self.first] = False
+        return found
+
+    def text(self, chosen: Mask, stamps_ns: Ints) -> tuple[int, str]:
+        """Number of rows of the chosen runs, and the times of the longest, in seconds after the first stamp."""
+        rows = self.rows[chosen]
+        begin_ns = stamps_ns[self.first[chosen]]
+        end_ns = stamps_ns[self.last[chosen]]
+        return int(rows.sum()), _longest(begin_ns, end_ns, rows, int(stamps_ns[0]))
 
 
 def stuck_rows(
@@ -563,7 +602,7 @@ def stuck_rows(
     others: Mapping[str, tuple[Ints, Floats]],
     *,
     may_rest: bool = False,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mask of rows, shape (n,), of values, shape (n, k), that repeat to the bit while all others change.
 
     A vehicle at rest in a simulator repeats all sensors. Noise never repeats, so that one sensor that repeats alone is
@@ -571,23 +610,21 @@ def stuck_rows(
 
     ``others``: stamps and values of the other sensors, by name. ``may_rest``: zeros are a value at rest.
     """
-    differs = np.any(values[1:] != values[:-1], axis=1)
-    first, last = runs_of(differs)
-    chosen = (stamps_ns[last] - stamps_ns[first] > SURELY_STUCK_S * 1e9) & (
-        last - first + 1 >= SURELY_STUCK_ROWS
-    )
-    chosen &= ~_may_be_chance(differs, last - first)
+    runs = Runs.of(differing(values))
+    chosen = runs.are_long(stamps_ns, SURELY_STUCK_S, SURELY_STUCK_ROWS)
+    chosen &= ~runs.may_be_chance()
     if may_rest:
-        chosen &= values[first].any(axis=1)
-    for stretch in np.flatnonzero(chosen).tolist():
-        begin_ns, end_ns = stamps_ns[[first[stretch], last[stretch]]].tolist()
-        chosen[stretch] = all(
+        chosen &= values[runs.first].any(axis=1)
+    for run in np.flatnonzero(chosen).tolist():
+        begin_ns = int(stamps_ns[runs.first[run]])
+        end_ns = int(stamps_ns[runs.last[run]])
+        chosen[run] = all(
             _changes(at_ns, rows, begin_ns, end_ns) for at_ns, rows in others.values()
         )
-    return np.repeat(chosen, last - first + 1)
+    return runs.mask(chosen)
 
 
-def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, NDArray[np.bool_]]:
+def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, Mask]:
     """Masks of rows of IMU and Doppler log that are stuck, by quantity, as of `stuck_rows`."""
     rows = {
         "angular rate": (imu.stamps_ns, imu.angular_velocity),
@@ -602,17 +639,14 @@ def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
-def stuck_doubt(stamps_ns: Ints, stuck: NDArray[np.bool_], quantity: str) -> str | None:
+def stuck_doubt(stamps_ns: Ints, stuck: Mask, quantity: str) -> str | None:
     """Doubt about a quantity with stuck rows, shape (n,); None without any."""
     if not stuck.any():
         return None
-    edges = np.diff(np.concatenate([[0], stuck.astype(int), [0]]))
-    begin = np.flatnonzero(edges > 0)
-    end = np.flatnonzero(edges < 0) - 1
-    rows = end - begin + 1
-    times = _longest(stamps_ns[begin], stamps_ns[end], rows, int(stamps_ns[0]))
+    runs = Runs.of(stuck[1:] != stuck[:-1])
+    rows, times = runs.text(stuck[runs.first], stamps_ns)
     return (
-        f"{quantity} the same to the last bit in {rows.sum()} rows, {times} s after the first, while the other sensors "
+        f"{quantity} the same to the last bit in {rows} rows, {times} s after the first, while the other sensors "
         "change: stuck; results are wrong from there on, and the part before is read by --end"
     )
 
@@ -630,24 +664,26 @@ UNFELT = "with a velocity of 0 that the accelerometers contradict"
 UNLIKELY_ZEROS = "of exactly 0, far from the rows beside them"
 
 
-def unfelt_zeros(imu: Imu, dvl: Dvl, calibration: Calibration) -> NDArray[np.bool_]:
+def unfelt_zeros(imu: Imu, dvl: Dvl, calibration: Calibration) -> Mask:
     """Mask of rows of zeros, shape (n,), in stretches that the vehicle reaches or leaves by a step it does not feel.
 
     With C the turn by the gyros and F = int C f dt, the differences x = C v - F are a straight line in time, whose slope is
     gravity. A line through the rows on one side of the zeros predicts -F at the first of them. At rest the prediction
     holds; without bottom lock it is off by the velocity.
     """
-    is_zero: NDArray[np.bool_] = np.asarray(~dvl.velocity.any(axis=1))
-    found = np.zeros(len(dvl), bool)
-    edges = np.flatnonzero(np.diff(is_zero.astype(int), prepend=0, append=0))
-    for begin, end in edges.reshape(-1, 2).tolist():
-        before = np.arange(max(begin - ROWS_BESIDE, 0), begin + 1)
-        after = np.arange(end - 1, min(end + ROWS_BESIDE, len(dvl)))
-        found[begin:end] = any(
+    is_zero: Mask = np.asarray(~dvl.velocity.any(axis=1))
+    runs = Runs.of(is_zero[1:] != is_zero[:-1])
+    chosen = is_zero[runs.first]
+    for run in np.flatnonzero(chosen).tolist():
+        first = int(runs.first[run])
+        last = int(runs.last[run])
+        before = np.arange(max(first - ROWS_BESIDE, 0), first + 1)
+        after = np.arange(last, min(last + 1 + ROWS_BESIDE, len(dvl)))
+        chosen[run] = any(
             is_unfelt(imu, dvl, calibration, rows, zero)
-            for rows, zero in ((before, begin), (after, end - 1))
+            for rows, zero in ((before, first), (after, last))
         )
-    return found
+    return runs.mask(chosen)
 
 
 def is_unfelt(
@@ -689,11 +725,10 @@ def _changes(stamps_ns: Ints, values: Floats, begin_ns: int, end_ns: int) -> boo
     inside = values[(stamps_ns >= begin_ns) & (stamps_ns <= end_ns)]
     if len(inside) < 2:
         return False
-    differs = np.any(inside[1:] != inside[:-1], axis=1)
-    return bool(differs.mean() >= LEAST_CHANGING)
+    return bool(differing(inside).mean() >= LEAST_CHANGING)
 
 
-def unlikely_zeros(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
+def unlikely_zeros(values: Floats, moved: Floats, least: float) -> Mask:
     """Mask of rows of zeros, shape (n,), that are farther from the rows beside them than the vehicle moves.
 
     ``values``, shape (n, k), ``moved`` and ``least`` as of `repeats`. Drivers send zeros where they have no value.
@@ -715,24 +750,23 @@ def unlikely_zeros(values: Floats, moved: Floats, least: float) -> NDArray[np.bo
     return mask
 
 
-def repeats(values: Floats, moved: Floats, least: float) -> NDArray[np.bool_]:
+def repeats(values: Floats, moved: Floats, least: float) -> Mask:
     """Mask of rows, shape (n,), that repeat the row before to the bit while the vehicle moves: a stuck sensor.
 
     ``values``, shape (n, k), and ``moved``, what the vehicle has moved until each row by other sensors, have one unit.
     A stretch counts where the vehicle moves in it by more than ``least`` and three steps of the sensor's resolution.
     """
-    differs = np.any(np.diff(values, axis=0) != 0, axis=1)
     # the smallest difference of any two values of a sensor is its resolution
     gaps = [np.diff(np.unique(np.round(column, 6))) for column in values.T]
     resolution = float(np.min(np.concatenate(gaps), initial=np.inf))
     if np.isfinite(resolution):
         least = max(least, RESOLUTIONS * resolution)
-    return _repeated_while_moving(differs, moved, least)
+    return _repeated_while_moving(differing(values), moved, least)
 
 
 def repeated_sightings(
     frame: Ints, sightings: Floats, moved: Floats, least: float
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mask of sightings, shape (n,), that repeat what came before to the bit while the vehicle moves.
 
     Either a whole frame repeats the frame before, or one coordinate has one value for all landmarks of several frames.
@@ -755,7 +789,7 @@ def repeated_sightings(
 
 def repeated_frames(
     frame: Ints, sightings: Floats, moved: Floats, least: float
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mask of sightings, shape (n,), whose whole frame repeats the frame before, as of `repeated_sightings`."""
     begins = np.flatnonzero(np.diff(frame, prepend=frame[0] - 1))
     parts = np.split(sightings, begins[1:])
@@ -768,19 +802,10 @@ def repeated_frames(
     return np.repeat(is_stuck, [len(part) for part in parts])
 
 
-def _repeated_while_moving(
-    differs: NDArray[np.bool_], moved: Floats, least: float
-) -> NDArray[np.bool_]:
+def _repeated_while_moving(differs: Mask, moved: Floats, least: float) -> Mask:
     """Rows, shape (n,), that do not differ from the row before in a stretch over which the vehicle moves by a length."""
-    first, last = runs_of(differs)
-    is_stuck = np.abs(moved[last] - moved[first]) > least
-    mask = np.zeros(len(differs) + 1, bool)
-    for begin, end in zip(
-        first[is_stuck].tolist(), last[is_stuck].tolist(), strict=True
-    ):
-        # the first row of a stretch was measured
-        mask[begin + 1 : end + 1] = True
-    return mask
+    runs = Runs.of(differs)
+    return runs.repeats(np.abs(runs.span(moved)) > least)
 
 
 def way_by(

@@ -28,7 +28,6 @@ from sonar_graph.files import as_path, spelt
 from sonar_graph.logs.adapters import (
     ADAPTERS,
     Adapter,
-    DepthAdapter,
     DetectionRowsAdapter,
     DvlAdapter,
     LandmarkRowsAdapter,
@@ -235,9 +234,8 @@ def _measurements(
     doubts: list[str] = []
     for role, table in tables.items():
         adapter = adapters[role]
-        if isinstance(adapter, DepthAdapter):
-            assumed = adapter.assumption(calibration.gravity_m_s2)
-            notes |= {"log.depth": assumed} if assumed else {}
+        if assumed := adapter.assumption(calibration.gravity_m_s2):
+            notes["log.depth"] = assumed
         # axes of the vehicle: a mounting is of the calibration, which tables do not have
         rows, dropped = rows_of(adapter, table, calibration, np.eye(3), origin)
         faults = [f"{count} {fault}" for fault, count in dropped.items()]
