@@ -418,7 +418,7 @@ def findings_of(
     if not found.moved * size > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
     gain = found.gain.limited(LARGEST_GAIN_SIGMA * size, still)
-    one = Comparison(
+    one = SensorComparison(
         check, quantity, replace(found, gain=gain), sigma, sequence, config
     )
     fault = next(filter(None, (find(one) for find in FAULTS)), None)
@@ -430,7 +430,7 @@ def findings_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class SensorComparison:
     """A comparison in which the vehicle moves enough, and the faults that it may show."""
 
     check: Check
@@ -602,12 +602,12 @@ class Comparison:
 
 
 FAULTS = (
-    Comparison.stuck,
-    Comparison.jumps,
-    Comparison.opposite,
-    Comparison.of_cause,
-    Comparison.other_unit,
-    Comparison.unrelated,
+    SensorComparison.stuck,
+    SensorComparison.jumps,
+    SensorComparison.opposite,
+    SensorComparison.of_cause,
+    SensorComparison.other_unit,
+    SensorComparison.unrelated,
 )
 """In the order in which they are looked for: each hides those after it."""
 
