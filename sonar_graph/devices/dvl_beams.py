@@ -15,6 +15,8 @@ from sonar_graph.measurements import Floats
 
 UNMEASURED_M_S = 100.0
 """Standard deviation along a direction that no beam measured."""
+PARTIAL_M2_S2 = 0.5 * UNMEASURED_M_S**2
+"""Sum of variances beyond which a direction is unmeasured."""
 _LEAST_SHARE = 1e-6
 """Share of the largest information below which a direction counts as not measured."""
 
@@ -72,3 +74,10 @@ def velocity_of_beams(
         velocity[rows] = (inverse @ along)[:, :, 0]
         covariance[rows] = (axes * variances) @ axes.T
     return velocity, covariance
+
+
+def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
+    """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
+    return np.asarray(
+        velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > PARTIAL_M2_S2
+    )

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.devices import is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation import is_partial
 from sonar_graph.navigation.alignment import (
     cross_matrices,
     holes_before,

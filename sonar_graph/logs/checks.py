@@ -19,7 +19,7 @@ from sonar_graph.calibration import (
     Calibration,
     Mounting,
 )
-from sonar_graph.devices import UNMEASURED_M_S
+from sonar_graph.devices import is_partial
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
 
@@ -154,7 +154,7 @@ def _dvl_gap_warnings(
     imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int
 ) -> Iterator[str]:
     """Gaps of the Doppler log, grouped by how estimators bridge them."""
-    partial = is_partial(dvl)
+    partial = is_partial(dvl.velocity_cov)
     whole_ns = dvl.stamps_ns[~partial]
     partial_ns = dvl.stamps_ns[partial]
     if len(whole_ns) and whole_ns[0] > start_ns:
@@ -181,12 +181,6 @@ def _dvl_gap_warnings(
         yield (
             f"dvl: no velocity {times}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)"
         )
-
-
-def is_partial(dvl: Dvl) -> Mask:
-    """Rows that leave a direction of the velocity unmeasured, shape (n,)."""
-    variances = np.trace(dvl.velocity_cov, axis1=1, axis2=2)
-    return np.asarray(variances > 0.5 * UNMEASURED_M_S**2)
 
 
 def imu_holes(stamps_ns: Ints) -> Ints:
@@ -823,7 +817,7 @@ def way_by(
             @ calibration.imu.mounting.pose().rotation().matrix()[2]
         )
     else:
-        whole = np.isfinite(dvl.velocity).all(axis=1) & ~is_partial(dvl)
+        whole = np.isfinite(dvl.velocity).all(axis=1) & ~is_partial(dvl.velocity_cov)
         if not whole.any():
             return np.zeros(len(at_ns))
         rows = dvl.rows(np.flatnonzero(whole))

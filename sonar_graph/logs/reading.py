@@ -13,6 +13,7 @@ from typing import Any, Never
 import numpy as np
 
 from sonar_graph.calibration import Calibration, Mounting
+from sonar_graph.devices import is_partial
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, spelt
 from sonar_graph.logs.adapters import (
@@ -38,7 +39,6 @@ from sonar_graph.logs.checks import (
     UNLIKELY_ZEROS,
     axes_warning,
     gap_warnings,
-    is_partial,
     repeated_sightings,
     repeats,
     row_doubts,
@@ -699,7 +699,7 @@ def require_use(file: str, imu: Imu, dvl: Dvl, advice: str = "") -> None:
             f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit?"
             f"{_likely_unit(imu, dvl) or advice} See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
         )
-    if is_partial(dvl).all():
+    if is_partial(dvl.velocity_cov).all():
         largest_m2_s2 = float(np.nanmax(dvl.velocity_cov))
         raise LogError(
             f"{file}: DVL: none of its {len(dvl)} rows measures a velocity in all directions: too few valid beams (three "

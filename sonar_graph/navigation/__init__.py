@@ -8,8 +8,7 @@ from sonar_graph.motion import Motions, MotionSource, PreintegratedMotion
 from sonar_graph.navigation.map_check import MapFit, map_fit
 from sonar_graph.navigation.map_start import make_estimator
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.samples import is_partial
 
 __all__ = [
-    "MapFit", "MotionSource", "Motions", "Odometry", "PreintegratedMotion", "is_partial", "make_estimator", "map_fit",
+    "MapFit", "MotionSource", "Motions", "Odometry", "PreintegratedMotion", "make_estimator", "map_fit",
 ]

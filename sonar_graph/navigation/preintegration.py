@@ -187,12 +187,11 @@ def no_steps(n: int) -> Floats:
 START = no_steps(1)
 
 
-def motions_over(
-    rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
-) -> Motions:
-    """Motions over intervals, each from its own known rows."""
-    sums = no_steps(len(intervals.start_ns))
-    C, D = add_steps(
+def add_to(
+    sums: Floats, rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
+) -> tuple[Floats, Floats]:
+    """Add the steps of intervals to their sums, shape (n, 20, 3); returns covariances and derivatives by the bias."""
+    return add_steps(
         rows,
         intervals,
         sensors.gyro_density,
@@ -200,6 +199,14 @@ def motions_over(
         *removed,
         sums.reshape(-1, 3),
     )
+
+
+def motions_over(
+    rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
+) -> Motions:
+    """Motions over intervals, each from its own known rows."""
+    sums = no_steps(len(intervals.start_ns))
+    C, D = add_to(sums, rows, intervals, sensors, removed)
     # numba compiles another version for arrays that are views
     dR = np.ascontiguousarray(sums[:, :3])
     dp = np.ascontiguousarray(sums[:, P])
@@ -255,14 +262,7 @@ class Stretch(NamedTuple):
         sums = self.sums.copy()
         # the Earth's rotation is known in the frame where the motion begins
         here = removed.after(self.before)
-        C, D = add_steps(
-            rows,
-            intervals,
-            sensors.gyro_density,
-            sensors.body_p_dvl,
-            *here,
-            sums.reshape(-1, 3),
-        )
+        C, D = add_to(sums, rows, intervals, sensors, here)
         return Stretch(self.start_ns, end_ns, self.bias, self.before, sums, C[0], D[0])
 
     @property

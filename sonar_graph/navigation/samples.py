@@ -18,8 +18,6 @@ LATEST_NS = np.iinfo(np.int64).max
 WINDOW_NS = 5_000_000_000
 """Window before an epoch in which gravity is measured should bottom lock be lost there: long enough for 1 mm/s² with
 samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
-PARTIAL_M2_S2 = 0.5 * UNMEASURED_M_S**2
-"""Sum of variances beyond which a direction is unmeasured."""
 
 
 class VelocityRow(NamedTuple):
@@ -139,13 +137,6 @@ def in_numbers(velocity_cov: Floats, unknown: Floats) -> Floats:
     unmeasured = infinite[:, :, None] | infinite[:, None, :]
     numbers = np.where(np.isnan(velocity_cov), unknown, velocity_cov)
     return np.where(unmeasured, UNMEASURED_M_S**2 * np.eye(3), numbers)
-
-
-def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
-    """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
-    return np.asarray(
-        velocity_cov.diagonal(axis1=1, axis2=2).sum(axis=1) > PARTIAL_M2_S2
-    )
 
 
 def finite_vector(name: str, values: ArrayLike, size: int) -> Floats:

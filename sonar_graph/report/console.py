@@ -99,7 +99,7 @@ def summary(comparison: Comparison) -> Group:
             )
             cells.append(Text(score.text() + mark if score else ABSENT))
         table.add_row(Text(name), *cells)
-    return Group(table, Text("\n".join(_lines_below(comparison))))
+    return Group(table, Text("\n".join(["", *_lines_below(comparison)])))
 
 
 def _lines_below(comparison: Comparison) -> list[str]:

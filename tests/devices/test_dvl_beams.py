@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices import UNMEASURED_M_S, velocity_of_beams
-from sonar_graph.navigation import is_partial
+from sonar_graph.devices import UNMEASURED_M_S, is_partial, velocity_of_beams
 
 TILT = np.radians(30.0)
 SIGMA = 0.02

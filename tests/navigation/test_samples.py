@@ -16,7 +16,7 @@ from sonar_graph.calibration import (
     ImuCalibration,
     Mounting,
 )
-from sonar_graph.devices import UNMEASURED_M_S
+from sonar_graph.devices import UNMEASURED_M_S, is_partial
 from sonar_graph.measurements import Dvl
 from sonar_graph.navigation import Odometry, samples
 from sonar_graph.navigation.dvl_screening import RowIntake
@@ -139,4 +139,4 @@ def test_an_infinite_variance_is_a_direction_not_measured():
         found[1], [[2.0, 0.0, 0.1], [0.0, UNMEASURED_M_S**2, 0.0], [0.1, 0.0, 4.0]]
     )
     np.testing.assert_array_equal(found[2], unsaid)
-    np.testing.assert_array_equal(samples.is_partial(cov), [False, True, False])
+    np.testing.assert_array_equal(is_partial(cov), [False, True, False])

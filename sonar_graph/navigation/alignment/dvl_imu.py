@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.devices import is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.alignment.at_rest import in_body_axes
 from sonar_graph.navigation.alignment.time_offset import (
@@ -38,7 +39,6 @@ from sonar_graph.navigation.alignment.time_offset import (
     search_offset,
 )
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
-from sonar_graph.navigation.samples import is_partial
 from sonar_graph.numerics import running_rotations
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.devices import is_partial
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment.at_rest import (
@@ -37,7 +38,7 @@ from sonar_graph.navigation.alignment.at_rest import (
 )
 from sonar_graph.navigation.alignment.dvl_imu import InertialPath, cross_matrices
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
-from sonar_graph.navigation.samples import in_numbers, is_partial
+from sonar_graph.navigation.samples import in_numbers
 from sonar_graph.numerics import chi_square_exceeded
 
 FEWEST = 10

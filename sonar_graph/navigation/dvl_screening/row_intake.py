@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
+from sonar_graph.devices import PARTIAL_M2_S2, is_partial
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.dvl_screening.depth_gate import USED, DepthGate
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
@@ -28,12 +29,10 @@ from sonar_graph.navigation.dvl_screening.dvl_gate import (
 from sonar_graph.navigation.samples import (
     EARLIEST_NS,
     LATEST_NS,
-    PARTIAL_M2_S2,
     StampedRows,
     VelocityRow,
     VelocityRows,
     in_numbers,
-    is_partial,
 )
 from sonar_graph.numerics import compiled
 from sonar_graph.states import Refusal, RefusedRow

@@ -5,7 +5,7 @@ width of a beam at half power, ``D = 0.886 wavelength / width``: its first side 
 values: docs/theory/sonar_image.md.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -108,27 +108,28 @@ DIDSON = ImagingSonar(
 )
 """High frequency, shortest extended window. The lens is the measured one: beams 0.37° apart at the centre, 0.21° at the
 edge. Length of the pulse: ours."""
-ARIS_3000 = DIDSON.model_copy(
-    update={
-        "frequency_hz": 3.0e6,
-        "beams": 128,
-        "azimuth_span_rad": np.radians(30.0),
-        "beam_width_rad": np.radians(0.2),
-        "elevation_span_rad": np.radians(15.0),
-        "lens_cubic": None,
-    }
+
+
+def same_window(**changes: Any) -> ImagingSonar:
+    """A sonar over the window of the DIDSON, with beams equally spaced."""
+    return DIDSON.model_copy(update={"lens_cubic": None, **changes})
+
+
+ARIS_3000 = same_window(
+    frequency_hz=3.0e6,
+    beams=128,
+    azimuth_span_rad=np.radians(30.0),
+    beam_width_rad=np.radians(0.2),
+    elevation_span_rad=np.radians(15.0),
 )
-"""ARIS Explorer 3000 with all beams, over the same window. Beams equally spaced: its lens is not simulated."""
-OCULUS_M1200D = DIDSON.model_copy(
-    update={
-        "frequency_hz": 2.1e6,
-        "beams": 512,
-        "azimuth_span_rad": np.radians(60.0),
-        "beam_width_rad": np.radians(0.4),
-        "elevation_span_rad": np.radians(12.0),
-        "firing_groups": 1,
-        "lens_cubic": None,
-    }
+"""ARIS Explorer 3000 with all beams; its lens is not simulated."""
+OCULUS_M1200D = same_window(
+    frequency_hz=2.1e6,
+    beams=512,
+    azimuth_span_rad=np.radians(60.0),
+    beam_width_rad=np.radians(0.4),
+    elevation_span_rad=np.radians(12.0),
+    firing_groups=1,
 )
 """Oculus M1200d, high frequency; an electronic array, which forms all beams from one ping."""
 SonarName = Literal["didson", "aris3000", "oculus1200"]
