@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import COMPASS, EkfSlam
+from baselines.events import Motion
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.measurements import Measurements
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -18,6 +19,7 @@ from sonar_graph.states import Outcome
 from .runs import (
     BENCHMARKS,
     CIRCLE_S,
+    STANDARD_FORCE,
     begun,
     circle,
     circle_calibration,
@@ -57,6 +59,34 @@ def test_dead_reckoning_ignores_detections_and_says_so():
     assert one.world_T_body.equals(other.world_T_body, 0.0)
     assert told.detections().outcomes == [Outcome.IGNORED] * (CIRCLE_S + 1)
     assert len(told.landmarks()) == 0
+
+
+def test_a_gap_adds_what_an_unknown_gyro_bias_does_to_the_displacement():
+    """``sigma^2 J J^T``, J the derivative of the displacement over the gap by the bias."""
+    sigma = 0.01
+    end_ns = later(3.0)
+    slam = begun(
+        EkfSlam,
+        Calibration(use_gravity=False, imu=ImuCalibration(gyro_bias_sigma=sigma)),
+    )
+    gyro = imu(3, (0.05, -0.1, 0.2), STANDARD_FORCE + np.array([0.1, -0.2, 0.0]))
+    covariance = slam.process(
+        Measurements(end_ns, gyro, dvl(1, (0.4, 0.1, 0.0)))
+    ).covariance
+
+    over = slam.odometry.motion(slam.state()[0], end_ns, np.zeros(3))
+    dR = over.i_T_j.rotation().matrix()
+    dp = over.i_T_j.translation()
+    J = over.D_bias[3:]
+    C = over.covariance.copy()
+    C[3:, 3:] += sigma**2 * J @ J.T
+    expected = slam.pose_after(
+        Motion(np.ascontiguousarray(dR), dp, C, over.D_bias, np.zeros(3))
+    )[2]
+    assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    # else the order would not be seen
+    assert np.abs(J @ J.T - J.T @ J).max() > 0.05 * np.linalg.norm(J) ** 2
+    assert sigma**2 * np.linalg.norm(J) ** 2 > 0.1 * np.trace(covariance[3:, 3:])
 
 
 @pytest.mark.slow
