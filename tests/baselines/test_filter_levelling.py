@@ -20,6 +20,7 @@ from sonar_graph.states import Outcome, Refusal
 from .runs import (
     NO_FORCE,
     STANDARD_FORCE,
+    T0_NS,
     depths,
     dvl,
     estimate_after,
@@ -50,6 +51,23 @@ def test_gravity_tells_roll_and_pitch_and_nothing_else_does(kind, is_felt):
         atol=1e-3 if is_felt else 1e-9,
     )
     assert sigma.max() < 2.5e-3 if is_felt else sigma.min() > 0.19
+
+
+@slam_filters
+def test_an_accelerating_vehicle_is_not_taken_for_a_tilted_one(kind):
+    seconds = 10
+    acceleration = 0.2
+    doppler = dvl(seconds, rate_hz=10)
+    velocity = np.outer((doppler.stamps_ns - T0_NS) * 1e-9, [acceleration, 0.0, 0.0])
+    force = STANDARD_FORCE + np.array([acceleration, 0.0, 0.0])
+    rows = imu(seconds, force=force, rate_hz=100), replace(doppler, velocity=velocity)
+    estimate = estimate_after(
+        kind, Calibration(start=Start(rpy_sigma_rad=(0.05, 0.05, 1e-3))), seconds, *rows
+    )
+    assert_allclose(estimate.world_T_body.rotation().rpy(), 0.0, atol=1e-6)
+    assert estimate.world_T_body.translation()[0] == pytest.approx(
+        0.5 * acceleration * seconds**2, abs=1e-6
+    )
 
 
 @slam_filters

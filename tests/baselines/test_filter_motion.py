@@ -19,6 +19,8 @@ from sonar_graph.states import Outcome
 from .runs import (
     BENCHMARKS,
     CIRCLE_S,
+    CIRCLE_START,
+    NO_FORCE,
     STANDARD_FORCE,
     begun,
     circle,
@@ -30,6 +32,26 @@ from .runs import (
     later,
     seen,
 )
+
+
+@every_filter
+def test_the_earth_s_rotation_is_removed_at_its_latitude(kind):
+    latitude = 0.7
+    earth = 7.292115e-5 * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    felt = CIRCLE_START.pose().rotation().matrix().T @ earth
+    rows = imu(CIRCLE_S, felt, NO_FORCE), dvl(CIRCLE_S)
+    aware = circle_calibration().model_copy(
+        update={"earth_rate_latitude_rad": latitude}
+    )
+    turned = [
+        CIRCLE_START.pose()
+        .between(estimate_after(kind, c, CIRCLE_S, *rows).world_T_body)
+        .rotation()
+        .rpy()
+        for c in (aware, circle_calibration())
+    ]
+    assert np.abs(turned[0]).max() < 1e-9
+    assert np.abs(turned[1]).max() > 5e-4
 
 
 @every_filter
