@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import COMPASS, EkfSlam
+from baselines.events import Motion
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.measurements import Measurements
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -18,6 +19,9 @@ from sonar_graph.states import Outcome
 from .runs import (
     BENCHMARKS,
     CIRCLE_S,
+    CIRCLE_START,
+    NO_FORCE,
+    STANDARD_FORCE,
     begun,
     circle,
     circle_calibration,
@@ -28,6 +32,26 @@ from .runs import (
     later,
     seen,
 )
+
+
+@every_filter
+def test_the_earth_s_rotation_is_removed_at_its_latitude(kind):
+    latitude = 0.7
+    earth = 7.292115e-5 * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    felt = CIRCLE_START.pose().rotation().matrix().T @ earth
+    rows = imu(CIRCLE_S, felt, NO_FORCE), dvl(CIRCLE_S)
+    aware = circle_calibration().model_copy(
+        update={"earth_rate_latitude_rad": latitude}
+    )
+    turned = [
+        CIRCLE_START.pose()
+        .between(estimate_after(kind, c, CIRCLE_S, *rows).world_T_body)
+        .rotation()
+        .rpy()
+        for c in (aware, circle_calibration())
+    ]
+    assert np.abs(turned[0]).max() < 1e-9
+    assert np.abs(turned[1]).max() > 5e-4
 
 
 @every_filter
@@ -57,6 +81,34 @@ def test_dead_reckoning_ignores_detections_and_says_so():
     assert one.world_T_body.equals(other.world_T_body, 0.0)
     assert told.detections().outcomes == [Outcome.IGNORED] * (CIRCLE_S + 1)
     assert len(told.landmarks()) == 0
+
+
+def test_a_gap_adds_what_an_unknown_gyro_bias_does_to_the_displacement():
+    """``sigma^2 J J^T``, J the derivative of the displacement over the gap by the bias."""
+    sigma = 0.01
+    end_ns = later(3.0)
+    slam = begun(
+        EkfSlam,
+        Calibration(use_gravity=False, imu=ImuCalibration(gyro_bias_sigma=sigma)),
+    )
+    gyro = imu(3, (0.05, -0.1, 0.2), STANDARD_FORCE + np.array([0.1, -0.2, 0.0]))
+    covariance = slam.process(
+        Measurements(end_ns, gyro, dvl(1, (0.4, 0.1, 0.0)))
+    ).covariance
+
+    over = slam.odometry.motion(slam.state()[0], end_ns, np.zeros(3))
+    dR = over.i_T_j.rotation().matrix()
+    dp = over.i_T_j.translation()
+    J = over.D_bias[3:]
+    C = over.covariance.copy()
+    C[3:, 3:] += sigma**2 * J @ J.T
+    expected = slam.pose_after(
+        Motion(np.ascontiguousarray(dR), dp, C, over.D_bias, np.zeros(3))
+    )[2]
+    assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    # else the order would not be seen
+    assert np.abs(J @ J.T - J.T @ J).max() > 0.05 * np.linalg.norm(J) ** 2
+    assert sigma**2 * np.linalg.norm(J) ** 2 > 0.1 * np.trace(covariance[3:, 3:])
 
 
 @pytest.mark.slow

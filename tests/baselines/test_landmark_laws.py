@@ -259,6 +259,19 @@ def test_linear_is_what_errs_by_less_than_the_noise():
     assert not far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4]))
 
 
+@pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])
+def test_the_gate_is_an_ellipse_of_a_correlated_innovation(direction):
+    """Range and azimuth correlated by 0.9: along the long axis far more passes than across it."""
+    S = np.array([[4.0, 1.8], [1.8, 1.0]])
+    threshold = chi_square_quantile(0.999, 2)
+    e = np.array(direction) * np.sqrt(
+        threshold / (direction @ np.linalg.solve(S, direction))
+    )
+    assert admitted(0.999 * e, S, gate_probability=0.999)[0] == USED
+    assert admitted(1.001 * e, S, gate_probability=0.999)[0] == GATED
+    assert admitted(1e3 * e, S)[0] == USED
+
+
 def admitted(e, S, R_z=NOISE, *, gate_probability=1.0, kernel_width=0.0):
     """Judgement by these settings."""
     gate = math.sqrt(chi2.ppf(gate_probability, 2))

@@ -137,3 +137,17 @@ def test_nis_takes_used_detections_only():
         np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), []
     )
     assert consistency.nis(empty).shape == (0,)
+
+
+def test_planar_nees_ignores_height():
+    pose = gtsam.Pose3()
+    above = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 5.0]))
+    covariance = np.diag([1e-2] * 3 + [1e-2] * 3)
+    planar = consistency.error_series(
+        single(above, covariance), single(pose, covariance), 2
+    )
+    spatial = consistency.error_series(
+        single(above, covariance), single(pose, covariance), 3
+    )
+    assert planar.nees_position[0] == pytest.approx(1.0)
+    assert spatial.nees_position[0] == pytest.approx(1.0 + 2500.0)

@@ -227,6 +227,19 @@ def test_umeyama_agrees_with_evo(seed, dimension):
     np.testing.assert_allclose(t, expected_t, atol=1e-9)
 
 
+def test_yaw_alignment_leaves_a_tilt():
+    np.testing.assert_allclose(
+        metrics.align_se3(np.ones((5, 3)), np.full((5, 3), 3.0)).apply(np.ones((5, 3))),
+        3.0,
+    )
+    points = cloud(0)
+    tilted = points @ Rotation.from_euler("x", 0.2).as_matrix().T
+    assert (
+        metrics.rmse(metrics.align_se3(points, tilted).apply(points) - tilted) < 1e-10
+    )
+    assert metrics.rmse(metrics.align_yaw(points, tilted).apply(points) - tilted) > 0.1
+
+
 @pytest.mark.parametrize("shapes", [((0, 3), (0, 3)), ((4, 3), (5, 3))])
 def test_unpaired_points_are_refused(shapes):
     with pytest.raises(EvaluationError, match="paired points"):

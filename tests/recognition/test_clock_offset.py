@@ -81,6 +81,14 @@ def test_an_offset_is_searched_about_what_was_stated(lane, steps):
     assert abs(found.seconds - 50.3) < 3 * found.sigma_s + 0.01
 
 
+def test_steps_that_err_wildly_are_left_out(lane, steps):
+    wild: list[PlanarStep] = list(steps)
+    for k in range(5, len(wild), 17):
+        wild[k] = replace(wild[k], motion=np.array([0.15, -0.3, 0.3]))
+    found = estimated(lane, wild, 0.9)
+    assert abs(found.seconds - 0.9) < 3 * found.sigma_s + 0.02
+
+
 def replaced(steps: list[PlanarStep], motions: Floats) -> list[PlanarStep]:
     return [
         replace(step, motion=motion)

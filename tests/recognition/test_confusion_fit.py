@@ -73,6 +73,11 @@ def few_frames_are_enough():
         yield
 
 
+@pytest.fixture(scope="module")
+def measured(lane_log) -> Confusion:
+    return confusion_fit.calibrate([(lane_log, read_log(lane_log))])
+
+
 STRANGERS = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
 """The designs of two landmarks under other identities."""
 
@@ -95,6 +100,17 @@ def test_logs_in_which_landmarks_cannot_be_labelled_are_refused_by_name(
         confusion_fit.calibrate(
             [(lane_log, replace(read_log(lane_log), **changes))], designs=designs
         )
+
+
+def test_frames_outside_the_truth_are_not_labelled(lane_log, measured):
+    run = read_log(lane_log)
+    late = run.truth.rows(
+        run.truth.stamps_ns >= run.truth.stamps_ns[len(run.truth.stamps_ns) // 3]
+    )
+    model = confusion_fit.calibrate([(lane_log, replace(run, truth=late))])
+    assert "landmark 1: " in model.provenance["confusion matrix"]
+    assert model.matrix[0] == PRIOR.matrix[0]
+    assert "confusion matrix" not in measured.provenance
 
 
 PRIOR = confusion_for(DEFAULT_DESIGNS)
@@ -197,6 +213,25 @@ def test_sigmas_are_root_mean_squares_at_the_usual_bound():
         (squares + 8 * before) / [607, 608],
         rtol=1e-9,
     )
+
+
+@pytest.mark.parametrize(("power", "within"), [(1.0, 0.05), (2.2, 0.05)])
+def test_the_power_of_the_bound_fits_good_and_bad_fits_alike(
+    power: float, within: float
+):
+    """Bounds spread over a factor of 30, of range and azimuth apart, and errors that grow with their power."""
+    fits = replace(_fits(2000, 0.1), range_per_height=np.zeros(6000))
+    rng = np.random.default_rng(3)
+    times = np.exp(rng.uniform(-1.7, 1.7, (6000, 2)))
+    spread = replace(fits, bound_m=BOUND * times, error_m=fits.error_m * times**power)
+    model = confusion_fit.estimate_confusion(spread, (1, 2), {})
+    assert model.bound_power == pytest.approx(power, rel=within)
+    seen = fits.label < 2
+    nis = spread.error_m**2 / np.diagonal(
+        model.range_azimuth_cov(spread.bound_m, np.ones(6000)), axis1=1, axis2=2
+    )
+    for rows in (seen[:, None] & (times > 2), seen[:, None] & (times < 0.5)):
+        assert nis[rows].mean() == pytest.approx(1, abs=0.12)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])

@@ -235,6 +235,20 @@ def test_gravity_corrects_a_start_that_is_tilted_wrongly(is_force_measured: bool
         assert last.tilt_sigma_rad >= 0.1
 
 
+def test_tilt_is_as_uncertain_as_gyros_make_it():
+    """Between two looks at gravity: white noise and a bias, from the start's variance."""
+    imu = MOUNTED.imu.model_copy(
+        update={"gyro_bias_sigma": 0.003, "gyro_noise_density": 0.002}
+    )
+    run = with_start(
+        at_rest(imu=imu, use_gravity=False), rpy_sigma_rad=(0.01, 0.02, 0.5)
+    )
+    (view,) = views_after(run, 0.8)
+    assert view.tilt_sigma_rad**2 == pytest.approx(
+        0.02**2 + 0.002**2 * 0.8 + (0.003 * 0.8) ** 2, rel=1e-6
+    )
+
+
 def test_depth_corrects_a_start_that_is_too_high_by_the_variances_of_both():
     """By hand; a sample may state its own variance."""
     run = with_start(
@@ -255,3 +269,46 @@ def test_depth_corrects_a_start_that_is_too_high_by_the_variances_of_both():
         assert later.height_sigma_m == pytest.approx(
             np.sqrt(0.1**2 * (1 - gain) + 0.01**2), rel=1e-2
         )
+
+
+@pytest.mark.parametrize("every", [1, 12])
+def test_height_follows_the_doppler_log_between_depth_samples(path, exact, every: int):
+    """One sample only; the vehicle climbs by centimetres and sways by degrees, also between two frames."""
+    stamps_ns = frames_of(exact, 49)[::every]
+    _, views = along(replace(exact, depth=exact.depth.rows(slice(0, 2))), stamps_ns)
+    true = [pose.translation()[2] - FLOOR_Z_M for pose in sonar_poses(path, stamps_ns)]
+    assert np.ptp(true) > 0.02
+    np.testing.assert_allclose([view.height_m for view in views], true, atol=6e-3)
+    assert (np.diff([view.height_sigma_m for view in views[2:]]) > 0).all()
+
+
+def test_doppler_noise_is_in_height_and_steps_gyro_noise_in_steps():
+    """At rest, by hand: 20 samples a second of 1 mm/s, over a second; the gyros' own variance is 300 times that.
+
+    The lever arm from body to sonar turns with the gyros' error.
+    """
+    gyro = 0.004**2
+    doppler = 1e-3**2 / 20
+    imu = MOUNTED.imu.model_copy(
+        update={"gyro_noise_density": 0.004, "gyro_bias_sigma": 0.0}
+    )
+    run = at_rest(imu=imu, dvl=MOUNTED.dvl.model_copy(update={"mounting": Mounting()}))
+    run = replace(run, depth=run.depth.rows(slice(0, 2)))
+    (_, step), (before, after) = along(
+        run, [run.start_ns + SECOND_NS, run.start_ns + 2 * SECOND_NS]
+    )
+    assert after.height_sigma_m**2 - before.height_sigma_m**2 == pytest.approx(
+        doppler, rel=0.1
+    )
+    assert gyro > 300 * doppler
+    R = BODY_T_SONAR.rotation().matrix()
+    lever = BODY_T_SONAR.translation()
+    skew = np.array(
+        [[0, -lever[2], lever[1]], [lever[2], 0, -lever[0]], [-lever[1], lever[0], 0]]
+    )
+    turning = np.vstack([R.T, R.T @ skew.T])
+    moving = np.vstack([np.zeros((3, 3)), R.T])
+    expected = gyro * turning @ turning.T + doppler * moving @ moving.T
+    np.testing.assert_allclose(
+        step.covariance, expected, atol=0.03 * np.abs(expected).max()
+    )

@@ -1,5 +1,6 @@
 """Each condition of a scene obeys its own law, and the basin without any is as it was."""
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -19,6 +20,8 @@ from sonar_graph.simulation import (
 from sonar_graph.simulation.basin import FLOOR_Z_M, UNKNOWN_OBJECTS, YSHARK
 from sonar_graph.simulation.sonar_image import (
     SCENES,
+    SONARS,
+    FrameSimulator,
     ImageOptions,
     SeabedObject,
     place_landmark,
@@ -28,6 +31,7 @@ from sonar_graph.simulation.sonar_image import (
 from sonar_graph.simulation.sonar_image.scene import CELL_M, CELLS, scatterers
 from sonar_graph.simulation.sonar_image.strangers import GROUPS
 
+TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
 BARE = {
     "cross_talk_db": None,
     "tvg_error_db": 0.0,
@@ -36,6 +40,7 @@ BARE = {
     "multipath": False,
 }
 BARE |= {"noise_db": None, "drop_probability": 0.0, "speckle": "frame"}
+EVEN = SONARS["didson"].model_copy(update={"lens_cubic": None})
 GOLDEN = [
     [68, 98, 140, 138, 139, 103, 109, 98, 66],
     [90, 135, 115, 93, 140, 138, 80, 141, 66],
@@ -56,6 +61,13 @@ OTHERS_XY_M = [
 TRIANGLE = DEFAULT_DESIGNS[2]
 
 
+def mean_intensity(made: FrameSimulator, height_m: float, frames: int) -> Floats:
+    """Of one place, over scatterers drawn again for each frame."""
+    place = np.array([0.0, 0.0, height_m])
+    levels = [made.level_db(place, TILT, n).astype(float) for n in range(frames)]
+    return np.mean([10 ** (one / 10) for one in levels], axis=0)
+
+
 def landmark(seed: int = 0, **conditions: object) -> SeabedObject:
     options = ImageOptions.model_validate(conditions)
     placed = place_landmark(
@@ -66,6 +78,8 @@ def landmark(seed: int = 0, **conditions: object) -> SeabedObject:
 
 FRESH = landmark()
 MATERIAL = ~np.isnan(FRESH.amplitude)
+FOAM = FRESH.amplitude > 1
+PLATE = FRESH.amplitude < 1
 
 
 def test_flush_landmarks_without_conditions_make_the_golden_image():
@@ -100,6 +114,14 @@ def test_a_preset_gives_what_is_not_given():
         ImageOptions(scene="calm")
 
 
+def test_contrast_changes_bright_parts_and_not_the_plate():
+    worn = landmark(contrast_db=-4.5, plate_db=0.0)
+    np.testing.assert_allclose(20 * np.log10(worn.amplitude[FOAM]), 12 - 4.5, atol=1e-4)
+    np.testing.assert_allclose(20 * np.log10(worn.amplitude[PLATE]), 0.0, atol=1e-4)
+    np.testing.assert_array_equal(np.isnan(worn.amplitude), ~MATERIAL)
+    np.testing.assert_array_equal(worn.relief_m, FRESH.relief_m)
+
+
 @pytest.mark.parametrize(
     ("name", "share"), [("sediment", 0.25), ("sediment", 1.0), ("fouling", 0.4)]
 )
@@ -115,6 +137,16 @@ def test_patches_not_pixels_cover_the_share_that_is_asked_for(name: str, share: 
     assert np.array_equal(other.amplitude, worn.amplitude, equal_nan=True) == (
         share == 1.0
     )
+
+
+def test_a_drowned_landmark_echoes_as_the_floor_does():
+    flat = replace(landmark(sediment=1.0), relief_m=np.zeros_like(FRESH.relief_m))
+    options = ImageOptions.model_validate(BARE)
+    with_, without = (
+        mean_intensity(FrameSimulator(options, o, 0.0, 0, EVEN), 0.95, 4)
+        for o in ([flat], [])
+    )
+    np.testing.assert_allclose(with_, without, rtol=1e-5)
 
 
 @pytest.mark.parametrize("length_m", [0.03, 0.06])

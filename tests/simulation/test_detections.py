@@ -144,6 +144,25 @@ def test_false_detections_come_at_the_stated_rate_all_over_the_fan():
     assert_binomial(int((confused.most_probable()[1] > 0.9).sum()), len(confused), 0.3)
 
 
+def test_a_share_of_all_detections_names_nothing():
+    """The others, and where all of them are, stay as they were."""
+    named, some = (
+        detect(false_detections_per_frame=0.5, anonymous_share=share)
+        for share in (0.0, 0.3)
+    )
+    is_anonymous = (some.candidate_ids < 0).all(axis=1)
+    assert_binomial(int(is_anonymous.sum()), len(some), 0.3)
+    assert np.all(some.id_probability[is_anonymous] == 0)
+    for name in ("id_probability", "candidate_ids"):
+        assert np.array_equal(
+            getattr(some, name)[~is_anonymous], getattr(named, name)[~is_anonymous]
+        )
+    assert np.array_equal(
+        [some.range_m, some.azimuth_rad], [named.range_m, named.azimuth_rad]
+    )
+    assert (detect(anonymous_share=1.0).candidate_ids < 0).all()
+
+
 NS = 1_000_000_000
 
 

@@ -14,8 +14,12 @@ from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.sonar_image import (
+    FrameSimulator,
     ImagedFrames,
+    ImageOptions,
 )
+from sonar_graph.simulation.sonar_image.frames import frame_truth
+from sonar_graph.simulation.sonar_image.scene import block, place
 
 SLOW = {"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0}
 
@@ -111,6 +115,25 @@ def test_time_offset_moves_stamps_and_sound_speed_scales_ranges(
     np.testing.assert_array_equal(late.ranges_m, plain.ranges_m)
     for frames in (late, wrong):
         np.testing.assert_array_equal(frames.intensity, plain.intensity)
+
+
+def test_share_in_view_falls_from_one_to_zero_across_the_edge_of_the_fan():
+    disc = place(
+        -1, "disc", block(0.2, 0.2, 0.0, 6.0), 0.1, np.array([1.7, 0.0, 0.0]), 0.0
+    )
+    simulator = FrameSimulator(ImageOptions(texture_shape=None), [disc], 0.0)
+    tilt = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
+    # roughly, for a tilted fan
+    edge_m = 1.7 * np.tan(np.radians(14.25)) / np.cos(np.radians(30)) * 0.95
+    positions = np.array([[0.0, y, 0.95] for y in (0.0, edge_m, 1.0)])
+    truth = frame_truth(positions, Rotation.concatenate([tilt] * 3), simulator)
+    assert truth.share_in_view[0, 0] == 1
+    assert 0.2 < truth.share_in_view[1, 0] < 0.9
+    assert truth.share_in_view[2, 0] == 0
+    np.testing.assert_allclose(
+        truth.range_m()[:, 0], np.linalg.norm(positions - [1.7, 0, 0], axis=1)
+    )
+    assert truth.azimuth_rad()[2, 0] < 0  # the sonar is to the left of the disc
 
 
 def squares(path: Path, ids: list[int]) -> Path:

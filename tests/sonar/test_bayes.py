@@ -9,6 +9,7 @@ from sonar_graph.sonar import EVIDENCE, Confusion, IdentityParams
 from sonar_graph.sonar.bayes import (
     Beliefs,
     bounded_evidence,
+    independent_share,
     jeffrey,
 )
 from sonar_graph.sonar.tracker import Association
@@ -73,6 +74,19 @@ def test_evidence_is_bounded_and_the_order_of_frames_does_not_matter(seed: int):
         for o in ([LOOKS_LIKE_1, other, other], [other, other, LOOKS_LIKE_1])
     )
     assert forth == pytest.approx(back)
+
+
+def test_news_follow_from_the_autocorrelation_of_a_triangle():
+    """By numerical convolution: a lens that sends and receives weighs its aperture by a triangle."""
+    places = np.linspace(-0.5, 0.5, 2001)
+    triangle = np.maximum(0.07 - np.abs(places), 0.0)
+    autocorrelation = np.convolve(triangle, triangle, mode="same")
+    moved = np.array([-1.0, 0.0, 0.01, 0.03, 0.0357, 0.05, 0.07, 0.09, 0.12, 0.14, 1.0])
+    expected = (
+        1 - np.interp(moved, places, autocorrelation / autocorrelation.max()) ** 2
+    )
+    np.testing.assert_allclose(independent_share(moved, 0.14), expected, atol=1e-3)
+    assert expected[4] == pytest.approx(0.5, abs=0.01)
 
 
 CONFUSION = Confusion(
