@@ -35,7 +35,6 @@ from sonar_graph.diagnosis.findings import (
     Gravity,
     contradiction,
     in_degrees,
-    judged,
     matters,
     numbers,
     other_world,
@@ -651,6 +650,9 @@ def vertical_bias(
         bias = replace(found.gain, sigma=max(found.gain.sigma, slope, 1e-9))
     imu = sequence.calibration.imu
     allowed = imu.gyro_bias_sigma
+    if not matters(bias, LEAST_BIAS_RAD_S, allowed):
+        cause = f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+        return Finding(VERTICAL_BIAS, bias, "rad/s", cause)
     up = np.median(motion.up, axis=0)
     up = up / np.linalg.norm(up)
     turned_rad = abs(bias.value) * sequence.duration_s
@@ -662,31 +664,20 @@ def vertical_bias(
         is_known = sequence.heading is not None and all(one.is_known for one in of_axes)
         sigma = float(np.linalg.norm([one.sigma for one in of_axes] * up))
         apart = bias.minus(float(known @ up))
-        if (
-            is_known
-            and matters(bias, LEAST_BIAS_RAD_S, allowed)
-            and matters(apart, LEAST_BIAS_RAD_S, sigma)
-        ):
+        if is_known and matters(apart, LEAST_BIAS_RAD_S, sigma):
             return heading_drift(replace(apart, value=-apart.value), turned_rad)
     # the line is in the axes of the IMU
     body_R_imu = imu.mounting.pose().rotation().matrix()
     more_rad_s = (level_rad_s + bias.value * up) @ body_R_imu
     whole = np.add(imu.gyro_bias_rad_s, more_rad_s)
-    row = Finding(
+    return Finding(
         VERTICAL_BIAS,
         bias,
         "rad/s",
         cause=f"by {source}, {np.degrees(bias.value):.3g}°/s beyond the calibration's sigma of {allowed:.2g}",
         consequence=f"a turn of {np.degrees(turned_rad):.3g}° over the log",
         line=f"`imu.gyro_bias_rad_s = {numbers(whole, 5)}` {IN_CALIBRATION}",
-    )
-    return judged(
-        row,
-        bias,
-        LEAST_BIAS_RAD_S,
-        allowed=allowed,
-        large=LARGE_TURN_RAD / max(sequence.duration_s, 1e-9),
-        fits=f"by {source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}",
+        gravity=Gravity.GRAVE if turned_rad > LARGE_TURN_RAD else Gravity.ACT,
     )
 
 
